@@ -61,7 +61,7 @@ def _shape_set(
         finally:
             if problem:
                 report(
-                    "gate and relay of the heater are off"
+                    "relay and gate of the heater are off, as measured, and no current flows"
                     if run.heat_is_off
                     else "THE HEATER DOES NOT CONFIRM THAT ITS GATE AND RELAY ARE OFF: turn the key to Off"
                 )

@@ -151,7 +151,8 @@ class ShapeSettingConfig(ProcessConfig):
     greatest_initial_uncertainty: Annotated[float, Gt(0), Le(0.1)] = 0.003
     """Greatest relative uncertainty of the initial resistance; 0.002 is worth some 10 K."""
     rod_cooling_s: Annotated[float, Ge(0), Le(3600)] = 120.0
-    """Time after a heating that did not cool down to its end, before an initial resistance is measured again, s."""
+    """Time after a heating before an initial resistance is measured again, s; none is needed where the rod has cooled
+    under the heater to 5 K above `initial_c`."""
     greatest_target_c: Annotated[float, Gt(0), Le(1000)] = 600.0
     """Greatest target in the middle of the rod, C: Nitinol loses its structure above."""
     longest_cooling_s: Positive = 600.0

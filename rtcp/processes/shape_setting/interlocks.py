@@ -76,7 +76,7 @@ TABLE: Final = (
     Rule(Row.BUTTON, (_I, _M, _I), "both channels of the remote's button are closed"),
     Rule(Row.ROBOT_CIRCUIT, (_I, _I, _M), "both channels of the robot's safety circuit are closed"),
     Rule(Row.ARMS_PERMITTED, (_I, _I, _M), "each arm may move: in Hand mode its enabling device is held"),
-    Rule(Row.ARMS_ENGAGED, (_I, _I, _M), "each arm holds or moves, and its emergency stop is released"),
+    Rule(Row.ARMS_ENGAGED, (_I, _I, _M), "each arm holds and does not move, and its emergency stop is released"),
     Rule(Row.PLATFORM, (_I, _M, _M), "the heater's platform is enabled: it holds or moves"),
     Rule(Row.COMMANDER, (_I, _M, _M), "who commanded pulses or heat holds the lease"),
     Rule(Row.KEY_DISCREPANCY, (_F, _F, _F), "the key is at Manual and at Auto for longer than `discrepancy_s`"),

@@ -150,8 +150,8 @@ class ResistanceNotMeasured(Refusal):
 
 
 class RodStillHot(Refusal):
-    """the rod was heated {elapsed_s:.0f} s ago and has not cooled down under the heater: an initial resistance is
-    measured {wait_s:.0f} s after it (rod_cooling_s)"""
+    """the rod was hot {elapsed_s:.0f} s ago and may still be: an initial resistance is measured {wait_s:.0f} s after it
+    (rod_cooling_s)"""
 
     elapsed_s: float
     wait_s: float
@@ -209,17 +209,18 @@ class CoolingBegun(Event, number=131):
 
 
 class ShapeSet(Event, number=132):
-    """the middle of the rod has cooled to {middle_c:.5g} C, the relay is open: the rod can be released"""
+    """the middle of the rod has cooled to {middle_c:.5g} C, the relay opens: the rod can be released"""
 
     middle_c: float
 
 
 class HeatStopped(ProcessEnded, number=133):
-    """the heater was stopped from outside: gate and relay are off; arm it to heat again"""
+    """the heater was stopped from outside: gate and relay are commanded off; arm it to heat again"""
 
 
 class HeatEnded(ProcessEnded, number=134):
-    """the interlock {row} ended the heat in mode {mode}: gate and relay are off; restore it, then arm the heater"""
+    """the interlock {row} ended the heat in mode {mode}: gate and relay are commanded off; restore it, then arm the
+    heater"""
 
     row: Row
     mode: Mode
@@ -235,7 +236,7 @@ class ResistanceUncertain(ProcessEnded, number=139):
 
 
 class CoolingTooLong(ProcessEnded, number=140):
-    """the middle of the rod has {middle_c:.5g} C after {limit_s:g} s of cooling (longest_cooling_s): the relay is open;
+    """the middle of the rod has {middle_c:.5g} C after {limit_s:g} s of cooling (longest_cooling_s): the relay opens;
     the profile's cool_c may be below what the rod's resistance returns to"""
 
     middle_c: float
@@ -243,8 +244,8 @@ class CoolingTooLong(ProcessEnded, number=140):
 
 
 class HeaterTripped(ProcessEnded, number=135):
-    """the interlock {row} tripped at {value:.5g}, limit {limit:.5g}: gate and relay are off; remove the cause, then
-    reset_trips"""
+    """the interlock {row} tripped at {value:.5g}, limit {limit:.5g}: gate and relay are commanded off; remove the
+    cause, then reset_trips"""
 
     row: Row
     value: float
@@ -256,14 +257,14 @@ class TripsReset(Event, number=136):
 
 
 class TargetNotReached(ProcessEnded, number=137):
-    """the middle of the rod has {middle_c:.5g} C after {longest_s:g} s (longest_s): gate and relay are off; check the
-    battery and the profile's limits"""
+    """the middle of the rod has {middle_c:.5g} C after {longest_s:g} s (longest_s): gate and relay are commanded off;
+    check the battery and the profile's limits"""
 
     middle_c: float
     longest_s: float
 
 
 class ArmedTooLong(ProcessEnded, number=138):
-    """the heater was armed for {armed_s:g} s (armed_s) without pulses or heat: its relay is open; arm it again"""
+    """the heater was armed for {armed_s:g} s (armed_s) without pulses or heat: its relay opens; arm it again"""
 
     armed_s: float

@@ -61,6 +61,9 @@ _BUSY: Final = _HEAT | {HeaterState.MEASURING, HeaterState.COOLING}
 _HOT: Final = _HEAT | {HeaterState.COOLING}
 _HALF: Final = 0.5
 """Between the levels of a digital channel."""
+_COLD_K: Final = 5.0
+"""Rise over `initial_c` at which a rod counts as cold, K."""
+_DEAD: Final = 1 << Row.LOST_CYCLE | 1 << Row.STALE_INPUT
 _NO_AGE: Final = 9999.0
 """s; a record is also written as JSON, which has no infinity."""
 _FIELDS: Final = (
@@ -72,6 +75,11 @@ _FIELDS: Final = (
     Field("latched", "uint32", "", "Rows that have latched, a bit each."),
     Field("gate", "uint8", "", "What the gate is commanded; 1: on."),
     Field("relay", "uint8", "", "What the relay is commanded; 1: closed."),
+    Field("relay_closed", "uint8", "", "Mirror contact of the relay; 1: closed."),
+    Field("gate_sense", "uint8", "", "Measured state of the gate; 1: on throughout the conversion."),
+    Field("current", "float64", "A", "Measured current through the rod."),
+    Field("inputs_alive", "uint8", "", "1: the inputs come, and their counters run; 0: they are old."),
+    Field("rod_hot_s", "float64", "s", "Time for which the rod may be hot, and is not measured; 0: it is cold."),
     Field("resistance", "float64", "ohm", "Of the newest conversion with the gate on throughout."),
     Field("resistance_age", "float64", "s", "Its age; 9999: there is none."),
     Field("initial_resistance", "float64", "ohm", "Mean of the pulses; 0: not measured."),
@@ -128,7 +136,7 @@ class ShapeSetting(Process):
         self._lease = 0
         self._elapsed_s = self._pulse_s = self._hold_s = 0.0
         self._since_heat_s = inf
-        """Since the rod was heated without a cool-down to its end, s."""
+        """Since the rod was hot, s; infinite: it has cooled to its initial temperature under the heater."""
         self._pending: list[Event] = []
         """Events of commands and of `safe`; the next cycle reports them."""
 
@@ -384,7 +392,8 @@ class ShapeSetting(Process):
             self._open()
             # The rod is taken out now: the next one is measured anew.
             self.initial.forget()
-            self.state, self._since_heat_s = HeaterState.DONE, inf
+            self.state = HeaterState.DONE
+            self._since_heat_s = inf if middle <= self._profile.initial_c + _COLD_K else 0.0
         elif self._hold_s > self._config.longest_cooling_s:
             context.report(CoolingTooLong(middle, self._config.longest_cooling_s))
             self._open()
@@ -418,11 +427,14 @@ class ShapeSetting(Process):
     def publish(self, values: list[Any], at: int) -> None:
         """Write the values of `_FIELDS`."""
         interlocks, meter, initial, control = self.interlocks, self.meter, self.initial, self.control
+        inputs = self.inputs
         ratio, scale = self.ratio, self._scale
         values[at : at + len(_FIELDS)] = (
             self.state, self.state in _BUSY, interlocks.mode, interlocks.cause,
             interlocks.forbids(self.supervision.holds), interlocks.latched,
-            self.gate, interlocks.closed,
+            self.gate, interlocks.closed, inputs.relay_closed, inputs.gate_sense, inputs.current,
+            self._before_ns > 0 and not self.supervision.holds & _DEAD,
+            max(self._config.rod_cooling_s - self._since_heat_s, 0.0),
             meter.resistance, min(meter.age_s, _NO_AGE), initial.value, initial.uncertainty,
             ratio, scale.ratio_for_middle(self.ramp.setpoint_c), self.ramp.setpoint_c,
             scale.mean(ratio) if ratio else 0.0, scale.middle(ratio) if ratio else 0.0, self.uncertainty_k,

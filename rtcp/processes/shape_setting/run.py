@@ -8,10 +8,10 @@ import signal
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,11 @@ Array = npt.NDArray[np.float64]
 SAMPLE_S: Final = 0.2
 """Interval at which the heater's fields are kept for the report, s."""
 _RELAY_S: Final = 2.0
+"""Time for the relay to close or open, s."""
+_HEAT_FIRST_S, _STOP_S = 0.5, 4.0
+"""At an early end: how long the stop of the arms waits for that of the heat, and the longest time for all of it, s."""
+_NO_CURRENT_A: Final = 0.5
+"""Below this the measured current is none, A."""
 _RESISTANCE_SHARE: Final = 0.2
 """Largest relative deviation of the initial resistance from that by alloy and dimensions; another phase: 7 to 20 %."""
 _GHOSTS, _GHOST_STRIDE = 4, 4
@@ -42,6 +47,7 @@ _FIELDS: Final = (
     "ratio", "target_ratio", "setpoint_middle", "mean_temperature", "middle_temperature", "average_current",
     "target_current", "energy",
 )  # fmt: skip
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)
 _VIRTUAL_BOX: Final = (0x00000A55, 0x00000010)
 _BEND, _ACT, _FRACTION, _CELLS_AT, _HIGHEST = 0x2010, 0x2013, 0x2021, 0x2025, 0x2026
 _CELLS: Final = 48
@@ -98,7 +104,7 @@ class ShapeSettingRun:
         self._heater = self._robot.processes[self._name]
         self.outcome = Outcome()
         self.heat_is_off = False
-        """Whether a run that ended early has seen gate and relay off."""
+        """Whether a run that ended early has measured that relay, gate and current are off."""
         self._began = time.monotonic()
         self.plan: BendingPlan = plan_motion(cell.config, job.holders, job.steps(), pose_of(job.held), job.near)
         """The motion that bends the rod."""
@@ -200,17 +206,11 @@ class ShapeSettingRun:
 
     def _await_relay(self, closed: bool) -> None:
         until = time.monotonic() + _RELAY_S
-        while self._relay_closed() is not closed:
+        while bool(self._heater.fields["relay_closed"]) is not closed:
             if time.monotonic() > until:
                 what = "close" if closed else "open"
                 raise RtcpError("fault", f"the heater's relay did not {what} within {_RELAY_S:g} s: see its feedback")
             time.sleep(0.02)
-
-    def _relay_closed(self) -> bool:
-        config = next(one for one in self._member.config.processes if one.name == self._name)
-        assert isinstance(config, ShapeSettingConfig)
-        slave, _, channel = config.relay_closed.partition(".")
-        return bool(self._robot.status().raw["devices"][slave][channel]["value"])
 
     def _socket(self) -> Path:
         return control_socket(self._member.directory)
@@ -275,33 +275,68 @@ class ShapeSettingRun:
 
     def _stop(self) -> None:
         """Heat first, then motion; what does not answer keeps nothing from stopping."""
-        with _undisturbed():
+        with undisturbed():
             self._stop_all()
 
     def _stop_all(self) -> None:
-        # Over connections of their own: an interrupt has left those of the cell in the middle of an answer.
-        with contextlib.suppress(Exception), Robot("shape-set: stop", self._socket()) as robot:
-            robot.command("stop_heating")
-        with contextlib.suppress(Exception):
-            self._cell.halt()
-        with contextlib.suppress(Exception), Robot("shape-set: report", self._socket()) as robot:
-            heater = robot.processes[self._name]
-            self._note_interlocks(heater)
-            fields = heater.fields
-            self.heat_is_off = not fields["gate"] and not fields["relay"]
+        # Over connections of their own: an interrupt has left those of the cell in the middle of an answer. In threads
+        # that nobody has to wait for: a frozen gateway answers after its timeout, or never.
+        until = time.monotonic() + _STOP_S
+        commanded = threading.Event()
+        threads = [_begin_thread(self._stop_heat, commanded)]
+        commanded.wait(_HEAT_FIRST_S)
+        threads += [_begin_thread(_halt, member) for member in self._cell.config.members]
+        for thread in threads:
+            thread.join(max(0.0, until - time.monotonic()))
+
+    def _stop_heat(self, commanded: threading.Event) -> None:
+        try:
+            with contextlib.suppress(Exception), Robot("shape-set: stop", self._socket()) as robot:
+                robot.command("stop_heating")
+                commanded.set()
+                heater = robot.processes[self._name]
+                self.heat_is_off = _await_off(heater)
+                self._note_interlocks(heater)
+        finally:
+            commanded.set()
+
+
+def _begin_thread(call: Callable[..., None], *arguments: Any) -> threading.Thread:
+    thread = threading.Thread(target=call, args=arguments, daemon=True)
+    thread.start()
+    return thread
+
+
+def _halt(member: Member) -> None:
+    with contextlib.suppress(Exception), Robot("shape-set: stop", control_socket(member.directory)) as robot:
+        robot.halt()
+
+
+def _await_off(heater: Process) -> bool:
+    """Wait for the relay to open; return whether relay, gate and current are off by what is measured."""
+    until = time.monotonic() + _RELAY_S
+    while not (is_off := _is_off(heater.fields)) and time.monotonic() < until:
+        time.sleep(0.02)
+    return is_off
+
+
+def _is_off(fields: Mapping[str, Any]) -> bool:
+    off = not fields["relay_closed"] and not fields["gate_sense"] and abs(fields["current"]) < _NO_CURRENT_A
+    return off and bool(fields["inputs_alive"])
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Ignore a second Ctrl-C meanwhile."""
+def undisturbed() -> Iterator[None]:
+    """Ignore a second Ctrl-C, and what else ends a command, meanwhile."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class VirtualRod:

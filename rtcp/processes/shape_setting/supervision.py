@@ -11,8 +11,6 @@ from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.interlocks import TABLE, Mode, Row
 from rtcp.processes.shape_setting.resistance import ResistanceMeter
 
-_ENGAGED: Final = frozenset({State.HOLDING, State.MOVING, State.STOPPING})
-"""States of an arm that holds the rod."""
 _PLATFORM: Final = frozenset({State.HOLDING, State.MOVING})
 """Enabled: every emergency stop, that of a partner too, every fault and `rtcp disable` lead out of these."""
 
@@ -200,7 +198,7 @@ class Supervision:
         oldest_ns = 0
         for arm in self._arms:
             permitted = permitted and arm.motion_allowed
-            engaged = engaged and arm.state in _ENGAGED and not arm.emergency_stop
+            engaged = engaged and arm.state is State.HOLDING and not arm.emergency_stop
             oldest_ns = max(oldest_ns, now_ns - arm.time_ns)
         self.values[Row.ARM_LOST] = oldest_ns * 1e-9
         lost = oldest_ns > self._silence_ns

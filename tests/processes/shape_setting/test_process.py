@@ -33,6 +33,7 @@ from rtcp.processes.shape_setting.messages import (
     ResistanceNotMeasured,
     RodNotConfirmed,
     RodPhase,
+    RodStillHot,
     ShapeSet,
     StartHeating,
     StopHeating,
@@ -114,6 +115,39 @@ def test_a_record_has_a_number_for_every_field() -> None:
     assert (record["state"], record["busy"], record["relay"], record["cause"]) == (4, 1, 1, 31)
     assert record["initial_resistance"] == pytest.approx(0.34, rel=1e-2)
     assert record["middle_temperature"] == pytest.approx(rig.celsius, abs=15.0)
+
+
+def record(rig: Rig) -> dict[str, float]:
+    values: list[float] = [0.0] * len(rig.heater.fields())
+    rig.heater.publish(values, 0)
+    return dict(zip((field.name for field in rig.heater.fields()), values, strict=True))
+
+
+def test_a_record_has_what_is_measured_beside_what_is_commanded() -> None:
+    rig = Rig()
+    rig.heat()
+    rig.forced.update(relay_closed=1.0, gate_sense=1.0, current=30.0)
+    rig.send(StopHeating())
+    rig.cycle()
+    shown = record(rig)
+    assert (shown["gate"], shown["relay"]) == (0, 0)
+    assert (shown["relay_closed"], shown["gate_sense"], shown["current"], shown["inputs_alive"]) == (1, 1, 30.0, 1)
+    rig.context.good = False
+    rig.cycle()
+    assert not record(rig)["inputs_alive"]
+
+
+@pytest.mark.parametrize(("cool_c", "is_hot"), [(300.0, True), (24.0, False)])
+def test_a_rod_that_was_not_cooled_to_its_initial_temperature_is_not_measured_after_its_heating(
+    cool_c: float, is_hot: bool
+) -> None:
+    rig = Rig()
+    rig.loss = 1.0
+    rig.heat(state=HeaterState.DONE, target_c=350.0, cool_c=cool_c)
+    assert bool(record(rig)["rod_hot_s"]) is is_hot
+    rig.cycle(20)
+    rig.arm()
+    assert isinstance(rig.send(CONFIRMED), RodStillHot) is is_hot
 
 
 def test_the_limits_of_current_and_power_hold_the_target() -> None:
@@ -261,6 +295,13 @@ def disengage_arm(rig: Rig) -> None:
     rig.partners["left"].state = State.READY
 
 
+def let_arm(state: State) -> Cause:
+    def change(rig: Rig) -> None:
+        rig.partners["right"].state = state
+
+    return change
+
+
 def release_enabling_device(rig: Rig) -> None:
     rig.partners["left"].motion_allowed = False
 
@@ -288,6 +329,8 @@ CAUSES: list[tuple[Row, Mode, int, Cause]] = [
     (Row.ROBOT_CIRCUIT, Mode.AUTO, 1, force(circuit_b=0)),
     (Row.ARMS_PERMITTED, Mode.AUTO, 1, release_enabling_device),
     (Row.ARMS_ENGAGED, Mode.AUTO, 1, disengage_arm),
+    (Row.ARMS_ENGAGED, Mode.AUTO, 1, let_arm(State.MOVING)),
+    (Row.ARMS_ENGAGED, Mode.AUTO, 1, let_arm(State.STOPPING)),
     (Row.ARMS_ENGAGED, Mode.AUTO, 1, stop_arm),
     (Row.PLATFORM, Mode.MANUAL, 1, fault_platform),
     (Row.COMMANDER, Mode.MANUAL, 1, leave_commander),
