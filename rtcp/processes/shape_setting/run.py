@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import signal
 import struct
@@ -11,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 import numpy as np
 import numpy.typing as npt
@@ -26,9 +27,10 @@ from rtcp.ipc.runtime_directory import control_socket
 from rtcp.processes.rod import BendingPlan, Equilibrium, Release, plan_motion, release, set_fraction, shoot
 from rtcp.processes.rod.bending import HALF_TURN, plan_approach
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
-from rtcp.processes.shape_setting.interlocks import TABLE
+from rtcp.processes.shape_setting.interlocks import TABLE, Mode
 from rtcp.processes.shape_setting.job import Job, pose_of
-from rtcp.processes.shape_setting.profile import HeatProfile, heat_command, temperatures_along
+from rtcp.processes.shape_setting.messages import HeatingStarted
+from rtcp.processes.shape_setting.profile import HeatProfile, heat_command, target_ratio, temperatures_along
 
 Array = npt.NDArray[np.float64]
 SAMPLE_S: Final = 0.2
@@ -91,7 +93,8 @@ class ShapeSettingRun:
         confirm: called where people do something at the rod; returns when they have.
 
     Raises:
-        Refused: the cell has no heater, or the bend cannot be planned; nothing has moved.
+        Refused: the cell has no heater, another run works with it, somebody uses the heater, the rod may be hot, or the
+            bend cannot be planned; nothing has moved.
     """
 
     def __init__(
@@ -105,9 +108,12 @@ class ShapeSettingRun:
         self.outcome = Outcome()
         self.heat_is_off = False
         """Whether a run that ended early has measured that relay, gate and current are off."""
+        self._lock = _lock(self._member.directory.parent / "shape-set.lock")
+        self._check_heater()
         self._began = time.monotonic()
         self.plan: BendingPlan = plan_motion(cell.config, job.holders, job.steps(), pose_of(job.held), job.near)
         """The motion that bends the rod."""
+        self._check_arms()
 
     def run(self) -> Outcome:
         """Do all of it; whatever ends it early turns the heat off first, then stops the arms.
@@ -125,7 +131,39 @@ class ShapeSettingRun:
         finally:
             with contextlib.suppress(OSError):
                 ghost.unlink(missing_ok=True)
+            self._lock.close()
         return self.outcome
+
+    def _check_heater(self) -> None:
+        """Raise where the heater is another's, or where arms would move with a hot rod."""
+        fields = self._heater.fields
+        if fields["busy"] or fields["relay"]:
+            raise RtcpError(
+                "refused",
+                f"the heater is {self._heater.state}: somebody uses it; `rtcp --name {self._member.name} process "
+                f"{self._name} stop_heating` ends that",
+                "heater_in_use",
+            )
+        if fields["rod_hot_s"]:
+            raise RtcpError(
+                "refused",
+                f"the rod of the heating before may be hot: no arm moves for {fields['rod_hot_s']:.0f} s "
+                "(rod_cooling_s)",
+                "rod_hot",
+                {"wait_s": fields["rod_hot_s"]},
+            )
+
+    def _check_arms(self) -> None:
+        """Raise where the heater does not supervise the arms that hold the rod."""
+        config = next(one for one in self._member.config.processes if one.name == self._name)
+        assert isinstance(config, ShapeSettingConfig)
+        if missing := [name for name in self._job.holders if name not in config.arms]:
+            raise RtcpError(
+                "refused",
+                f"the arm {missing[0]} is to hold the rod, the heater supervises {', '.join(config.arms) or 'none'}: "
+                f"name it in `arms` of the process {self._name}, {self._member.config.source}",
+                "arm_not_supervised",
+            )
 
     def _draw(self, path: Path) -> None:
         """Let the panels of the arms draw the rod along its bend: some curves of points in the world, m."""
@@ -145,7 +183,6 @@ class ShapeSettingRun:
         cell, heater = self._cell, self._heater
         last = self.plan.steps[-1]
         self.outcome.wanted, self.outcome.s, self.outcome.strain = last.p, last.s, last.largest_strain
-        heater.command("stop_heating")
         self._confirm("the chucks hold nothing, nothing stands between the arms")
         self._begin("arms are enabled and go to where the straight rod is gripped")
         for robot in cell.arms.values():
@@ -160,9 +197,9 @@ class ShapeSettingRun:
         virtual = VirtualRod(self._robot) if _is_virtual(self._member) else None
         if virtual is not None:
             virtual.renew()
-        heater.command("set_heat_profile", **asdict(heat_command(self._profile)))
         self._begin("the initial resistance is measured")
         self._arm()
+        self._set_profile()
         heater.command("measure_resistance", straight_and_unloaded=True, phase="austenite")
         self.outcome.initial_resistance = float(heater.fields["initial_resistance"])
         heater.command("stop_heating")
@@ -176,8 +213,11 @@ class ShapeSettingRun:
             virtual.bend(held)
         self._begin(f"heating to {self._profile.target_c:g} C in the middle, hold {self._profile.hold_s:g} s, cooling")
         self._arm()
+        since = max((one.number for one in self._robot.events()), default=0)
+        self._set_profile()
         with self._sampling():
             heater.command("start_heating")
+        self._check_target(since)
         self.outcome.energy = float(heater.fields["energy"])
         self._note_interlocks(heater)
         self._begin("the rod has cooled: release")
@@ -198,7 +238,35 @@ class ShapeSettingRun:
                 {"resistance": found, "expected": expected},
             )
 
+    def _set_profile(self) -> None:
+        self._heater.command("set_heat_profile", **asdict(heat_command(self._profile)))
+
+    def _check_target(self, since: int) -> None:
+        """Raise where the heating since an event was not to this profile: another client may set one at any time."""
+        expected = self._profile.target_c, target_ratio(self._profile)
+        heated = [
+            (one.fields["target_c"], one.fields["ratio"])
+            for one in self._robot.events(since)
+            if one.name == HeatingStarted.name
+        ]
+        if not heated or not np.allclose(heated, expected, rtol=1e-6, atol=0.0):
+            found = ", ".join(f"{target:g} C at the ratio {ratio:.5g}" for target, ratio in heated) or "nothing"
+            raise RtcpError(
+                "fault",
+                f"the heater was to heat to {expected[0]:g} C at the ratio {expected[1]:.5g}, it reports {found}: "
+                "another client has changed the profile; this rod is not set as the report says",
+                "profile_changed",
+            )
+
     def _arm(self) -> None:
+        mode = self._heater.fields["mode"]
+        if mode != Mode.AUTO:
+            raise RtcpError(
+                "refused",
+                f"the key is at {Mode(mode).name.capitalize()}, where the heater does not supervise the arms: turn it "
+                "to Auto",
+                "key_not_at_auto",
+            )
         if self._robot.state is State.READY:
             self._robot.enable()
         self._heater.command("arm_heater")
@@ -384,6 +452,21 @@ class VirtualRod:
     def _act(self, what: int) -> None:
         self._disable()
         self._robot.sdo_write(self._slave, _ACT, 1, bytes((what,)))
+
+
+def _lock(path: Path) -> TextIO:
+    """Return a file that is locked until it is closed; raises Refused where another run has it."""
+    try:
+        file = path.open("a")
+    except OSError as error:
+        raise RtcpError("refused", f"{path} cannot be written: {error.strerror}", "no_lock") from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        message = f"another `rtcp shape-set` works with this cell (it holds {path}): wait for its end"
+        raise RtcpError("refused", message, "shape_set_runs") from None
+    return file
 
 
 def _heater_of(cell: Cell) -> tuple[Member, str]:

@@ -12,9 +12,13 @@ from typing import Any
 
 import pytest
 
-from rtcp.api import RtcpError
+from rtcp.api import RtcpError, State
 from rtcp.api.cell import rod_file
+from rtcp.config.find import default_config
 from rtcp.processes.shape_setting import run as module
+from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.interlocks import Mode
+from rtcp.processes.shape_setting.profile import read_profile, target_ratio
 from rtcp.processes.shape_setting.run import Outcome, ShapeSettingRun
 
 
@@ -56,6 +60,7 @@ def make_run(tmp_path: Path) -> ShapeSettingRun:
     run._member = members[1]  # type: ignore[assignment]
     run._cell = SimpleNamespace(config=SimpleNamespace(members=members))  # type: ignore[assignment]
     run._name, run.outcome, run.heat_is_off = "heater", Outcome(), False
+    run._lock = module._lock(tmp_path / "shape-set.lock")
     return run
 
 
@@ -130,3 +135,104 @@ def test_a_second_signal_keeps_nothing_from_stopping(number: signal.Signals) -> 
     with module.undisturbed():
         os.kill(os.getpid(), number)
     assert signal.getsignal(number) is before
+
+
+# -- what is checked before arms move and heat begins ------------------------------------------------------------------
+
+
+def with_heater(
+    run: ShapeSettingRun, events: Sequence[tuple[str, dict[str, float]]] = (), **fields: float
+) -> list[str]:
+    """Give a run a heater with fields and events; return where its commands will be."""
+    commands: list[str] = []
+
+    def command(name: str, **_: float) -> None:
+        commands.append(name)
+
+    shown = {"busy": 0, "relay": 0, "rod_hot_s": 0.0, "mode": Mode.AUTO, "relay_closed": 1, **fields}
+    run._heater = SimpleNamespace(fields=shown, state="armed", command=command)  # type: ignore[assignment]
+    run._robot = SimpleNamespace(  # type: ignore[assignment]
+        state=State.HOLDING, events=lambda since: [SimpleNamespace(name=name, fields=known) for name, known in events]
+    )
+    run._member.name = "heater"  # type: ignore[misc]
+    return commands
+
+
+def test_a_second_run_is_refused_while_the_first_one_works(tmp_path: Path) -> None:
+    file = tmp_path / "shape-set.lock"
+    first = module._lock(file)
+    with pytest.raises(RtcpError, match=str(file)) as raised:
+        module._lock(file)
+    assert raised.value.reason == "shape_set_runs"
+    first.close()
+    module._lock(file).close()
+    with pytest.raises(RtcpError, match="cannot be written"):
+        module._lock(tmp_path / "none" / "shape-set.lock")
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [({"busy": 1}, "heater_in_use"), ({"relay": 1}, "heater_in_use"), ({"rod_hot_s": 90.0}, "rod_hot"), ({}, "")],
+)
+def test_nothing_begins_while_another_uses_the_heater_or_the_rod_may_be_hot(
+    tmp_path: Path, fields: dict[str, float], reason: str
+) -> None:
+    run = make_run(tmp_path)
+    commands = with_heater(run, **fields)
+    if reason:
+        with pytest.raises(RtcpError) as raised:
+            run._check_heater()
+        assert raised.value.reason == reason
+    else:
+        run._check_heater()
+    assert commands == []
+
+
+def test_the_heater_has_to_supervise_both_arms(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    config = ShapeSettingConfig("shape_setting", "heater", arms=("left",))
+    run._member.config = SimpleNamespace(processes=[config], source="heater.yaml")  # type: ignore[misc, assignment]
+    run._job = SimpleNamespace(holders={"left": None})  # type: ignore[assignment]
+    run._check_arms()
+    run._job.holders["right"] = None  # type: ignore[assignment]
+    with pytest.raises(RtcpError, match=r"the arm right .* the heater supervises left: .* heater\.yaml"):
+        run._check_arms()
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_the_heater_is_armed_with_the_key_at_auto_only(tmp_path: Path, mode: Mode) -> None:
+    run = make_run(tmp_path)
+    commands = with_heater(run, mode=mode)
+    if mode is Mode.AUTO:
+        run._arm()
+        assert commands == ["arm_heater"]
+    else:
+        with pytest.raises(RtcpError, match=f"the key is at {mode.name.capitalize()}"):
+            run._arm()
+        assert commands == []
+
+
+@pytest.mark.parametrize(
+    ("heated", "is_right"),
+    [
+        ([(510.0, 1.0)], True),
+        ([(592.0, 1.0)], False),
+        ([(510.0, 1.02)], False),
+        ([(510.0, 1.0)] * 2, True),
+        ([], False),
+    ],
+)
+def test_a_heating_to_another_profile_ends_the_run_with_an_error(
+    tmp_path: Path, heated: list[tuple[float, float]], is_right: bool
+) -> None:
+    run = make_run(tmp_path)
+    run._profile = read_profile(default_config().parent / "shape_setting" / "nitinol.yaml")
+    assert run._profile.target_c == 510.0
+    ratio = target_ratio(run._profile)
+    with_heater(run, *(("heating_started", {"target_c": target, "ratio": by * ratio}) for target, by in heated))
+    if is_right:
+        run._check_target(0)
+    else:
+        with pytest.raises(RtcpError, match="510 C") as raised:
+            run._check_target(0)
+        assert raised.value.reason == "profile_changed"
