@@ -65,7 +65,10 @@ class StepPlan:
 
 
 def rod_file(cell: Path) -> Path:
-    """Return the file in the runtime directory of a cell with the curves of the rod that its arms are to bend."""
+    """Return the file in the runtime directory of a cell with the rod that its arms are to bend.
+
+    It has `pid`, its writer, and `curves`, each a list of points in the world, m.
+    """
     return cell / "rod.json"
 
 

@@ -170,7 +170,7 @@ class ShapeSettingConfig(ProcessConfig):
     pulse of 1.5 ms every 50 ms is as much as it loses."""
     cooling_interval_s: _Short = 1.0
     """The same while the rod cools, s: each pulse heats by some 0.3 to 0.8 K."""
-    armed_s: Positive = 300.0
+    armed_s: Positive = 30.0
     """Longest time of an armed heater without pulses or heat, s."""
     longest_s: Positive = 900.0
     """Longest time of ramp and hold, s."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from math import inf
+from types import MappingProxyType
+from typing import Final
 
 from rtcp.ipc.commands import ANYWHERE, AT_REST, Command, ProcessCommand
 from rtcp.ipc.events import Event, ProcessEnded
@@ -58,8 +61,40 @@ class MeasureResistance(ProcessCommand):
     """The phase that the operator confirms; only austenite is measured, whose line the profile has."""
 
 
+class ProfileKey(IntEnum):
+    """A number of `SetHeatProfile`, by its position there."""
+
+    INITIAL_C = 0
+    CHUCK_C = 1
+    KELVIN_PER_RATIO = 2
+    MEAN_BY_MIDDLE = 3
+    UNCERTAINTY_K = 4
+    TARGET_C = 5
+    RAMP_K_S = 6
+    HOLD_S = 7
+    COOL_C = 8
+    MAX_CURRENT = 9
+    MAX_POWER = 10
+
+
+PROFILE_RANGES: Final = MappingProxyType({
+    ProfileKey.INITIAL_C: (-20.0, 200.0),
+    ProfileKey.CHUCK_C: (-20.0, 200.0),
+    ProfileKey.KELVIN_PER_RATIO: (500.0, 100_000.0),
+    ProfileKey.MEAN_BY_MIDDLE: (0.1, 1.0),
+    ProfileKey.UNCERTAINTY_K: (0.0, 1000.0),
+    ProfileKey.TARGET_C: (50.0, 600.0),
+    ProfileKey.RAMP_K_S: (0.1, 500.0),
+    ProfileKey.HOLD_S: (0.0, inf),
+    ProfileKey.COOL_C: (20.0, 400.0),
+    ProfileKey.MAX_CURRENT: (0.1, 300.0),
+    ProfileKey.MAX_POWER: (0.1, 5000.0),
+})  # fmt: skip
+"""Least and greatest values of a profile's numbers; the configuration narrows target and hold further."""
+
+
 class SetHeatProfile(Command):
-    """Set what is heated to next: a profile's numbers (`rtcp.processes.shape_setting.profile`)."""
+    """Set what is heated to next: a profile's numbers (`rtcp.processes.shape_setting.profile`, `PROFILE_RANGES`)."""
 
     states = AT_REST
     initial_c: float
@@ -161,9 +196,27 @@ class NoHeatProfile(Refusal):
     """there is no heat profile: set_heat_profile first"""
 
 
+class ProfileNumberOutOfRange(Refusal):
+    """the profile's {quantity}: found {value:.6g}, allowed is a number from {least:g} to {greatest:g}"""
+
+    quantity: ProfileKey
+    value: float
+    least: float
+    greatest: float
+
+
+class CoolingOutOfRange(Refusal):
+    """cool_c: found {cool_c:.6g}, allowed is more than initial_c, {initial_c:.6g}, and less than target_c,
+    {target_c:.6g}: correct the profile"""
+
+    cool_c: float
+    initial_c: float
+    target_c: float
+
+
 class ProfileOutOfRange(Refusal):
     """the profile cannot be heated to: {target_c:.6g} C in the middle is a ratio of {ratio:.4g}, the limit is
-    {limit:.4g} (greatest_ratio), and all numbers have to be finite and positive: correct the profile"""
+    {limit:.4g} (greatest_ratio): correct the profile"""
 
     target_c: float
     ratio: float

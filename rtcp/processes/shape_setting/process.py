@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from math import hypot, inf, isfinite
+from math import hypot, inf
 from typing import Any, Final
 
 from rtcp.control.part import PartContext
@@ -19,11 +18,13 @@ from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.control import CurrentControl, Ramp
 from rtcp.processes.shape_setting.interlocks import Interlocks, Mode, Row, first_row
 from rtcp.processes.shape_setting.messages import (
+    PROFILE_RANGES,
     ArmedTooLong,
     ArmHeater,
     BatteryLow,
     CauseRemains,
     CoolingBegun,
+    CoolingOutOfRange,
     CoolingTooLong,
     HeatEnded,
     HeaterArmed,
@@ -35,6 +36,8 @@ from rtcp.processes.shape_setting.messages import (
     HoldBegun,
     MeasureResistance,
     NoHeatProfile,
+    ProfileKey,
+    ProfileNumberOutOfRange,
     ProfileOutOfRange,
     ResetTrips,
     ResistanceMeasured,
@@ -177,28 +180,20 @@ class ShapeSetting(Process):
     def _set_profile(self, command: SetHeatProfile) -> Refusal | None:
         if self.state not in _AT_REST and self.state is not HeaterState.ARMED:
             return WrongHeaterState(self.state, HeaterState.ARMED)
-        numbers = [float(getattr(command, entry.name)) for entry in fields(command)]
-        finite = all(map(isfinite, numbers))
-        positive = finite and all(
-            number > 0.0
-            for number in (
-                command.kelvin_per_ratio, command.mean_by_middle, command.ramp_k_s, command.max_current,
-                command.max_power,
-            )
-        )  # fmt: skip
-        limit = self._config.greatest_ratio
-        scale, ratio = self._scale, 0.0
-        if positive:
-            scale = RatioScale(
-                command.initial_c, command.kelvin_per_ratio, command.chuck_c, command.mean_by_middle
-            )  # fmt: skip
-            ratio = scale.ratio_for_middle(command.target_c)
-        sound = positive and command.hold_s >= 0.0 and command.uncertainty_k >= 0.0 and command.mean_by_middle <= 1.0
-        if not sound or not command.initial_c < command.target_c or not command.cool_c < command.target_c:
-            return ProfileOutOfRange(command.target_c, ratio, limit)
         config = self._config
-        if not ratio < limit or command.target_c > config.greatest_target_c or command.hold_s >= config.longest_s:
-            return ProfileOutOfRange(command.target_c, ratio, limit)
+        greatest_of = {ProfileKey.TARGET_C: config.greatest_target_c, ProfileKey.HOLD_S: config.longest_s}
+        for key, (least, most) in PROFILE_RANGES.items():
+            value, greatest = getattr(command, key.name.lower()), min(most, greatest_of.get(key, most))
+            if not least <= value <= greatest:
+                return ProfileNumberOutOfRange(key, value, least, greatest)
+        if not command.initial_c < command.cool_c < command.target_c:
+            return CoolingOutOfRange(command.cool_c, command.initial_c, command.target_c)
+        scale = RatioScale(
+            command.initial_c, command.kelvin_per_ratio, command.chuck_c, command.mean_by_middle
+        )  # fmt: skip
+        ratio = scale.ratio_for_middle(command.target_c)
+        if not ratio < config.greatest_ratio:
+            return ProfileOutOfRange(command.target_c, ratio, config.greatest_ratio)
         self._profile, self._scale = command, scale
         return None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import os
 import signal
 import struct
 import threading
@@ -172,7 +173,8 @@ class ShapeSettingRun:
         made = path.with_suffix(".new")
         # What a panel does not draw is no reason not to begin.
         with contextlib.suppress(OSError):
-            made.write_text(json.dumps(curves[chosen][:, ::_GHOST_STRIDE].round(4).tolist()))
+            points = curves[chosen][:, ::_GHOST_STRIDE].round(4).tolist()
+            made.write_text(json.dumps({"pid": os.getpid(), "curves": points}))
             made.replace(path)
 
     def _begin(self, what: str) -> None:

@@ -27,7 +27,7 @@ PERIOD_S = 0.0005
 LATENCY = 2
 """Cycles from the gate's command to the conversion that shows it."""
 CONFIG = ShapeSettingConfig("shape_setting", "heater", arms=("left", "right"), relay_close_s=0.005, relay_open_s=0.005)
-PROFILE = SetHeatProfile(20.0, 20.0, 5000.0, 1.0, 5.0, 500.0, 200.0, 0.2, 450.0, 50.0, 1000.0)
+PROFILE = SetHeatProfile(20.0, 20.0, 5000.0, 1.0, 5.0, 500.0, 200.0, 0.2, 400.0, 50.0, 1000.0)
 CONFIRMED = MeasureResistance(True, RodPhase.AUSTENITE)
 LEASE = 7
 

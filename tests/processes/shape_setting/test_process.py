@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import random
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import product
 
 import pytest
@@ -16,10 +17,12 @@ from rtcp.ipc.states import State
 from rtcp.processes import ProcessSetup, Signal
 from rtcp.processes.shape_setting.interlocks import Mode, Row
 from rtcp.processes.shape_setting.messages import (
+    PROFILE_RANGES,
     ArmedTooLong,
     ArmHeater,
     BatteryLow,
     CauseRemains,
+    CoolingOutOfRange,
     HeatEnded,
     HeaterState,
     HeaterTripped,
@@ -27,6 +30,8 @@ from rtcp.processes.shape_setting.messages import (
     HeatStopped,
     MeasureResistance,
     NoHeatProfile,
+    ProfileKey,
+    ProfileNumberOutOfRange,
     ProfileOutOfRange,
     ResetTrips,
     ResistanceMeasured,
@@ -66,7 +71,7 @@ def test_a_profile_heats_holds_cools_and_opens_the_relay(mode: Mode) -> None:
     assert isinstance(rig.context.events[-1], ShapeSet)
     assert not rig.relay
     assert not rig.gate
-    assert rig.celsius == pytest.approx(450.0, abs=30.0)
+    assert rig.celsius == pytest.approx(400.0, abs=30.0)
 
 
 def test_a_hold_and_its_energy_count_the_time_of_skipped_ticks() -> None:
@@ -237,15 +242,38 @@ def test_pulses_wait_for_the_relay() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("key", "value"),
     [
-        {"target_c": 2000.0}, {"target_c": float("nan")}, {"kelvin_per_ratio": 0.0}, {"max_current": -1.0},
-        {"hold_s": -1.0}, {"cool_c": 600.0}, {"initial_c": 510.0}, {"mean_by_middle": 1.5},
+        ("target_c", 601.0), ("target_c", math.nan), ("target_c", math.inf), ("kelvin_per_ratio", 1e308),
+        ("kelvin_per_ratio", 0.0), ("max_current", -1.0), ("max_current", 301.0), ("max_power", 1e-300),
+        ("hold_s", -1.0), ("hold_s", CONFIG.longest_s + 1.0), ("initial_c", -4000.0), ("chuck_c", 1e308),
+        ("cool_c", 401.0), ("mean_by_middle", 1.5), ("mean_by_middle", 1e-300), ("ramp_k_s", 1e308),
+        ("uncertainty_k", -1.0),
     ],
 )  # fmt: skip
-def test_a_profile_out_of_range_is_refused(wrong: dict[str, float]) -> None:
-    rig = Rig()
-    assert isinstance(refused(rig, replace(PROFILE, **wrong)), ProfileOutOfRange)
+def test_a_number_of_a_profile_out_of_range_is_refused_by_its_name(key: str, value: float) -> None:
+    refusal = refused(Rig(), replace(PROFILE, **{key: value}))
+    assert isinstance(refusal, ProfileNumberOutOfRange)
+    assert refusal.quantity.name.lower() == key
+    assert not refusal.least <= refusal.value <= refusal.greatest
+
+
+def test_a_heater_may_narrow_the_target() -> None:
+    refusal = refused(Rig(replace(CONFIG, greatest_target_c=400.0)), PROFILE)
+    assert refusal == ProfileNumberOutOfRange(ProfileKey.TARGET_C, 500.0, 50.0, 400.0)
+
+
+@pytest.mark.parametrize("wrong", [{"cool_c": 20.0}, {"target_c": 400.0}, {"initial_c": 200.0, "cool_c": 100.0}])
+def test_a_profile_cools_to_between_its_initial_temperature_and_its_target(wrong: dict[str, float]) -> None:
+    assert isinstance(refused(Rig(), replace(PROFILE, **wrong)), CoolingOutOfRange)
+
+
+def test_a_profile_beyond_the_plausible_ratio_is_refused() -> None:
+    assert isinstance(refused(Rig(), replace(PROFILE, kelvin_per_ratio=500.0)), ProfileOutOfRange)
+
+
+def test_the_ranges_are_those_of_all_numbers_of_a_profile() -> None:
+    assert [key.name.lower() for key in PROFILE_RANGES] == [entry.name for entry in fields(PROFILE)]
 
 
 def test_a_weak_battery_is_refused() -> None:

@@ -140,9 +140,7 @@ def test_a_second_signal_keeps_nothing_from_stopping(number: signal.Signals) -> 
 # -- what is checked before arms move and heat begins ------------------------------------------------------------------
 
 
-def with_heater(
-    run: ShapeSettingRun, events: Sequence[tuple[str, dict[str, float]]] = (), **fields: float
-) -> list[str]:
+def with_heater(run: ShapeSettingRun, *events: tuple[str, dict[str, float]], **fields: float) -> list[str]:
     """Give a run a heater with fields and events; return where its commands will be."""
     commands: list[str] = []
 
