@@ -262,7 +262,8 @@ class CoolingBegun(Event, number=131):
 
 
 class ShapeSet(Event, number=132):
-    """the middle of the rod has cooled to {middle_c:.5g} C, the relay opens: the rod can be released"""
+    """the middle of the rod has {middle_c:.5g} C, the relay opens: the rod can be released; do not touch it above
+    60 C"""
 
     middle_c: float
 

@@ -42,6 +42,8 @@ _HEAT_FIRST_S, _STOP_S = 0.5, 4.0
 """At an early end: how long the stop of the arms waits for that of the heat, and the longest time for all of it, s."""
 _NO_CURRENT_A: Final = 0.5
 """Below this the measured current is none, A."""
+_TOUCH_C: Final = 60.0
+"""Temperature above which people are told not to touch the rod, C."""
 _RESISTANCE_SHARE: Final = 0.2
 """Largest relative deviation of the initial resistance from that by alloy and dimensions; another phase: 7 to 20 %."""
 _GHOSTS, _GHOST_STRIDE = 4, 4
@@ -135,6 +137,11 @@ class ShapeSettingRun:
             self._lock.close()
         return self.outcome
 
+    @property
+    def middle_c(self) -> float | None:
+        """Newest temperature in the middle of the rod, C; None: none was measured."""
+        return next((one for one in reversed(self.outcome.samples["middle_temperature"]) if one), None)
+
     def _check_heater(self) -> None:
         """Raise where the heater is another's, or where arms would move with a hot rod."""
         fields = self._heater.fields
@@ -222,9 +229,10 @@ class ShapeSettingRun:
         self._check_target(since)
         self.outcome.energy = float(heater.fields["energy"])
         self._note_interlocks(heater)
-        self._begin("the rod has cooled: release")
+        warmth = _warmth(self.middle_c)
+        self._begin(f"release: {warmth}")
         self._finish(held, virtual)
-        self._confirm("open the chucks and take the rod out; the arms stay where they are")
+        self._confirm(f"open the chucks and take the rod out, {warmth}; the arms stay where they are")
 
     def _check_resistance(self) -> None:
         """Compare the initial resistance with that of the rod by its alloy and dimensions."""
@@ -454,6 +462,13 @@ class VirtualRod:
     def _act(self, what: int) -> None:
         self._disable()
         self._robot.sdo_write(self._slave, _ACT, 1, bytes((what,)))
+
+
+def _warmth(middle_c: float | None) -> str:
+    """Return how hot the middle of the rod is, in words."""
+    if middle_c is None:
+        return "the temperature of the rod is not known: do not touch it"
+    return f"its middle has {middle_c:.0f} C" + (": HOT, do not touch it" if middle_c > _TOUCH_C else "")
 
 
 def _lock(path: Path) -> TextIO:

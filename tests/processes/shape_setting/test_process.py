@@ -176,6 +176,7 @@ def test_a_rod_that_does_not_get_hot_ends_the_heating_after_its_longest_time() -
 
 
 def test_an_armed_heater_that_nobody_uses_opens_its_relay() -> None:
+    assert CONFIG.armed_s == 30.0
     rig = Rig(replace(CONFIG, armed_s=0.5))
     rig.arm()
     rig.cycle(950)

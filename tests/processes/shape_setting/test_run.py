@@ -234,3 +234,17 @@ def test_a_heating_to_another_profile_ends_the_run_with_an_error(
         with pytest.raises(RtcpError, match="510 C") as raised:
             run._check_target(0)
         assert raised.value.reason == "profile_changed"
+
+
+@pytest.mark.parametrize(
+    ("middle_c", "said"),
+    [(396.2, "its middle has 396 C: HOT, do not touch it"), (48.0, "its middle has 48 C"), (None, "is not known")],
+)
+def test_a_rod_that_is_released_is_said_to_be_as_hot_as_it_is(
+    tmp_path: Path, middle_c: float | None, said: str
+) -> None:
+    run = make_run(tmp_path)
+    run.outcome.samples["middle_temperature"] = [] if middle_c is None else [510.0, middle_c, 0.0]
+    assert run.middle_c == middle_c
+    assert said in module._warmth(run.middle_c)
+    assert ("HOT" in module._warmth(run.middle_c)) is (middle_c == 396.2)
