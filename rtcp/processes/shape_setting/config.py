@@ -118,6 +118,8 @@ class ShapeSettingConfig(ProcessConfig):
     """Time of the relay to open, s."""
     gate_cycles: _Cycles = 8
     """Cycles after a command to the gate until its feedback has to agree."""
+    leakage_current: Positive = 0.5
+    """Greatest measured current with the gate off, A: more is a gate that leaks, or an offset."""
     lost_cycles: _Cycles = 1
     """Cycles in a row without inputs that latch; the gate is off in the first already."""
     stale_cycles: _Cycles = 4

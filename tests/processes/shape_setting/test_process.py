@@ -454,6 +454,33 @@ def test_a_gate_that_stays_on_trips_within_its_cycles() -> None:
     assert not rig.relay
 
 
+@pytest.mark.parametrize("state", [HeaterState.ARMED, HeaterState.COOLING])
+def test_a_current_with_the_gate_off_trips_as_the_gate_does(state: HeaterState) -> None:
+    rig = Rig()
+    if state is HeaterState.ARMED:
+        rig.arm()
+    else:
+        rig.heat(state=state)
+    rig.forced["current"] = 0.4
+    rig.cycle(CONFIG.gate_cycles + 2)
+    assert rig.relay
+    rig.forced["current"] = -1.0
+    rig.cycle(CONFIG.gate_cycles + 2)
+    assert rig.heater.interlocks.latched == 1 << Row.GATE_FEEDBACK
+    assert not rig.relay
+
+
+def test_a_ratio_that_falls_in_a_pause_faster_than_a_rod_cools_is_too_steep() -> None:
+    rig = Rig(replace(CONFIG, cooling_interval_s=0.5))
+    rig.heat(state=HeaterState.COOLING)
+    rig.cycle(1500)
+    assert rig.relay
+    rig.initial *= 0.88
+    rig.cycle(1100)
+    assert rig.heater.interlocks.cause is Row.STEEP_GRADIENT
+    assert not rig.relay
+
+
 def test_a_gate_that_never_comes_on_trips_within_its_cycles() -> None:
     rig = Rig()
     rig.arm()
