@@ -138,7 +138,8 @@ class ShapeSetting(Process):
         self.energy = self.uncertainty_k = 0.0
         self._lease = 0
         self._elapsed_s = self._pulse_s = self._hold_s = 0.0
-        self._since_heat_s = inf
+        # What the platform before has heated is not known here.
+        self._since_heat_s = inf if setup.since_before_s is None else setup.since_before_s
         """Since the rod was hot, s; infinite: it has cooled to its initial temperature under the heater."""
         self._pending: list[Event] = []
         """Events of commands and of `safe`; the next cycle reports them."""

@@ -155,6 +155,14 @@ def test_a_rod_that_was_not_cooled_to_its_initial_temperature_is_not_measured_af
     assert isinstance(rig.send(CONFIRMED), RodStillHot) is is_hot
 
 
+@pytest.mark.parametrize(("since_before_s", "is_hot"), [(0.0, True), (90.0, True), (121.0, False), (None, False)])
+def test_after_a_restart_a_rod_is_not_measured_before_it_is_cold(since_before_s: float | None, is_hot: bool) -> None:
+    rig = Rig(since_before_s=since_before_s)
+    rig.arm()
+    assert bool(record(rig)["rod_hot_s"]) is is_hot
+    assert isinstance(rig.send(CONFIRMED), RodStillHot) is is_hot
+
+
 def test_the_limits_of_current_and_power_hold_the_target() -> None:
     rig = Rig()
     rig.heat(max_current=5.0)
