@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 _LEAD_S, _LONGEST_LEAD_S = 0.25, 9.0
 """From the commands of a motion in step to its beginning: every arm has checked it by then, and allows 10 s."""
+_INTERRUPT_S: Final = 3.0
+"""Longest wait for a halt, and for what it ends, after an interrupt, s."""
 _LEAD_SHARE: Final = 3.0
 """Of the time that planning took: checking takes about as long."""
 _SAYS_LESS = {"partner_stopped": 2, "partner_not_ready": 2, "partner_left": 1, "partner_silent": 1}
@@ -65,7 +68,10 @@ class StepPlan:
 
 
 def rod_file(cell: Path) -> Path:
-    """Return the file in the runtime directory of a cell with the curves of the rod that its arms are to bend."""
+    """Return the file in the runtime directory of a cell with the rod that its arms are to bend.
+
+    It has `pid`, its writer, and `curves`, each a list of points in the world, m.
+    """
     return cell / "rod.json"
 
 
@@ -337,6 +343,10 @@ class Cell:
 
     # -- in parallel --------------------------------------------------------------------------------------------------
 
+    def _halt_quietly(self) -> None:
+        with contextlib.suppress(RtcpError):
+            self.halt()
+
     def _each(self, call: Callable[[Robot], T]) -> dict[str, T]:
         return self._all(lambda name, robot: call(robot))
 
@@ -356,18 +366,33 @@ class Cell:
         chosen = [name for name in members if names is None or name in names]
         if not chosen:
             return {}
-        with ThreadPoolExecutor(len(chosen)) as pool:
-            futures: dict[str, Future[T]] = {name: pool.submit(call, name, members[name]) for name in chosen}
+        futures: dict[str, Future[T]] = {name: Future() for name in chosen}
+
+        def work(name: str) -> None:
             try:
-                errors = {name: future.exception() for name, future in futures.items()}
-            except BaseException:
-                with contextlib.suppress(RtcpError):
-                    self.halt()
-                raise
+                futures[name].set_result(call(name, members[name]))
+            except BaseException as error:
+                futures[name].set_exception(error)
+
+        threads = [_begin_thread(work, name) for name in chosen]
+        try:
+            errors = {name: future.exception() for name, future in futures.items()}
+        except BaseException:
+            # Not for longer: a gateway that is frozen does not keep an interrupt from its end.
+            until = time.monotonic() + _INTERRUPT_S
+            for thread in (_begin_thread(self._halt_quietly), *threads):
+                thread.join(max(0.0, until - time.monotonic()))
+            raise
         failed = {name: error for name, error in errors.items() if error is not None}
         if not failed:
             return {name: future.result() for name, future in futures.items()}
         raise most_telling(failed)
+
+
+def _begin_thread(call: Callable[..., None], *arguments: Any) -> Thread:
+    thread = Thread(target=call, args=arguments, daemon=True)
+    thread.start()
+    return thread
 
 
 def most_telling(failed: Mapping[str, BaseException]) -> BaseException:

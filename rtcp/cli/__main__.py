@@ -118,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = ExitCode.INTERNAL
     try:
         sys.stdout.flush()  # here, so that a closed pipe causes no message at exit
-    except BrokenPipeError:
+    except OSError:
         mute()
     return int(code)
 

@@ -539,7 +539,7 @@ class Methods:
                     given[name] = hint[given[name].upper()]
                 elif hint == Joints:
                     self._check_count(name, given[name], len(self._config.joints))
-            if "hold_s" in hints:
+            if _expires(kind):
                 given["hold_s"] = _left(given["hold_s"], sent_s)
             command = kind(**given)
             if streams:
@@ -608,15 +608,19 @@ def _parameters_of(function: Any) -> Checker[Any]:
 def _parameters_of_command(kind: Any) -> Checker[Any]:
     """Return what checks the fields of a command; one with a hold time needs none, and has `sent_s` beside."""
     hints = _fields_of(kind)
-    held = "hold_s" in hints
+    held = _expires(kind)
     defaults = {one.name: one.default for one in dataclasses.fields(kind)}
     fields: list[tuple[str, Any, Any]] = [
-        (name, _parameter(hint), field(default=HOLD_S) if name == "hold_s" else field(default=defaults[name]))
+        (name, _parameter(hint), field(default=HOLD_S) if held and name == "hold_s" else field(default=defaults[name]))
         for name, hint in hints.items()
     ]
     if held:
         fields.append(("sent_s", float | None, field(default=None)))
     return Checker(make_dataclass(kind.name, fields, frozen=True, kw_only=True))
+
+
+def _expires(kind: type[Command]) -> bool:
+    return issubclass(kind, MotionCommand) and "hold_s" in _fields_of(kind)
 
 
 def _fields_of(kind: Any) -> dict[str, Any]:

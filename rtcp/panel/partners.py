@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -20,6 +21,8 @@ _STEP = ("no", "waits to begin", "moves", "brakes", "no", "no")
 """Phases of a motion in step, by the number in the record: `rtcp.motion.step_group.StepPhase`."""
 _SILENT_NS = 1_000_000_000
 """A record as old as this says nothing of now."""
+_ROD_S = 3600.0
+"""Longest time for which a rod is drawn, s."""
 
 
 class Partners:
@@ -72,9 +75,14 @@ class Partners:
             return [round(a + b, 4) for a, b in zip(applied(back.rotation, (x, y, z)), back.position, strict=True)]
 
         try:
-            curves = json.loads(rod_file(self.own.directory.parent).read_text())
-            return [[seen(point) for point in curve] for curve in curves]
-        except (OSError, ValueError, TypeError):
+            file = rod_file(self.own.directory.parent)
+            rod = json.loads(file.read_text())
+            os.kill(rod["pid"], 0)
+            if time.time() - file.stat().st_mtime > _ROD_S:
+                return []
+            return [[seen(point) for point in curve] for curve in rod["curves"]]
+        except (OSError, OverflowError, ValueError, TypeError, KeyError):
+            # Also where its writer has died (`os.kill`).
             return []
 
     def close(self) -> None:

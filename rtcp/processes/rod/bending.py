@@ -124,7 +124,7 @@ def plan_motion(
         near: joint positions, rad, that choose between the configurations of an arm.
 
     Raises:
-        Invalid: not two arms of the cell.
+        Invalid: not two arms of the cell, or not a number in `near` for each joint.
         Refused: `arm_out_of_reach`, `rod_collision`, `arms_too_near`, `rod_strain`, `rod_unstable`, with what, where,
             the value and what is allowed; nothing is begun.
     """
@@ -135,6 +135,9 @@ def plan_motion(
             f"chucks: found {', '.join(chucks) or 'none'}, near: found {', '.join(near) or 'none'}, allowed are two "
             f"arms of {', '.join(names)}, the same in both",
         )
+    for name, q in near.items():
+        if len(q) != (count := len(cell.member(name).config.joints)):
+            raise RtcpError("invalid", f"near of {name}: found {len(q)} numbers, allowed are {count}, one a joint")
     for step in steps[1:]:
         check(step)
     holders = {name: _Holder(cell.member(name), chuck, cell.clearance) for name, chuck in chucks.items()}

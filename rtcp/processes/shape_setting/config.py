@@ -118,6 +118,8 @@ class ShapeSettingConfig(ProcessConfig):
     """Time of the relay to open, s."""
     gate_cycles: _Cycles = 8
     """Cycles after a command to the gate until its feedback has to agree."""
+    leakage_current: Positive = 0.5
+    """Greatest measured current with the gate off, A: more is a gate that leaks, or an offset."""
     lost_cycles: _Cycles = 1
     """Cycles in a row without inputs that latch; the gate is off in the first already."""
     stale_cycles: _Cycles = 4
@@ -151,7 +153,8 @@ class ShapeSettingConfig(ProcessConfig):
     greatest_initial_uncertainty: Annotated[float, Gt(0), Le(0.1)] = 0.003
     """Greatest relative uncertainty of the initial resistance; 0.002 is worth some 10 K."""
     rod_cooling_s: Annotated[float, Ge(0), Le(3600)] = 120.0
-    """Time after a heating that did not cool down to its end, before an initial resistance is measured again, s."""
+    """Time after a heating before an initial resistance is measured again, s; none is needed where the rod has cooled
+    under the heater to 5 K above `initial_c`."""
     greatest_target_c: Annotated[float, Gt(0), Le(1000)] = 600.0
     """Greatest target in the middle of the rod, C: Nitinol loses its structure above."""
     longest_cooling_s: Positive = 600.0
@@ -169,7 +172,7 @@ class ShapeSettingConfig(ProcessConfig):
     pulse of 1.5 ms every 50 ms is as much as it loses."""
     cooling_interval_s: _Short = 1.0
     """The same while the rod cools, s: each pulse heats by some 0.3 to 0.8 K."""
-    armed_s: Positive = 300.0
+    armed_s: Positive = 30.0
     """Longest time of an armed heater without pulses or heat, s."""
     longest_s: Positive = 900.0
     """Longest time of ramp and hold, s."""

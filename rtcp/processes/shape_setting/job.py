@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import pi
 from pathlib import Path
 from typing import Annotated
 
@@ -13,13 +14,14 @@ from kinematics import Pose
 from rtcp.config.cell import Base
 from rtcp.config.document import Finding, read
 from rtcp.config.model import MOST_AXES, ConfigError
-from rtcp.config.numbers import Angle, Name, Positive
+from rtcp.config.numbers import FractionOfPi, Name
 from rtcp.config.validation import Checker, rule
 from rtcp.processes.rod import Chuck, Equilibrium, Rod, bend, pre_bend
 from rtcp.processes.shape_setting.profile import HeatProfile, read_profile
 
 _Place = Base
 _SAME_M = 1e-3
+_Turns = Annotated[float, FractionOfPi(), Ge(-4 * pi), Le(4 * pi)]
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,9 @@ class ChuckKeys:
     """Name of the arm in the cell."""
     pose: _Place
     """The chuck's mouth on the flange, its x axis out of the chuck, along the rod."""
-    radius: Positive
+    radius: Annotated[float, Gt(0), Le(0.2)]
     """Radius of the chuck, m."""
-    near: Annotated[tuple[Angle, ...], MinLen(1), MaxLen(MOST_AXES)]
+    near: Annotated[tuple[_Turns, ...], MinLen(1), MaxLen(MOST_AXES)]
     """Joint positions that choose between the configurations of the arm, rad."""
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from math import inf
+from types import MappingProxyType
+from typing import Final
 
 from rtcp.ipc.commands import ANYWHERE, AT_REST, Command, ProcessCommand
 from rtcp.ipc.events import Event, ProcessEnded
@@ -58,8 +61,40 @@ class MeasureResistance(ProcessCommand):
     """The phase that the operator confirms; only austenite is measured, whose line the profile has."""
 
 
+class ProfileKey(IntEnum):
+    """A number of `SetHeatProfile`, by its position there."""
+
+    INITIAL_C = 0
+    CHUCK_C = 1
+    KELVIN_PER_RATIO = 2
+    MEAN_BY_MIDDLE = 3
+    UNCERTAINTY_K = 4
+    TARGET_C = 5
+    RAMP_K_S = 6
+    HOLD_S = 7
+    COOL_C = 8
+    MAX_CURRENT = 9
+    MAX_POWER = 10
+
+
+PROFILE_RANGES: Final = MappingProxyType({
+    ProfileKey.INITIAL_C: (-20.0, 200.0),
+    ProfileKey.CHUCK_C: (-20.0, 200.0),
+    ProfileKey.KELVIN_PER_RATIO: (500.0, 100_000.0),
+    ProfileKey.MEAN_BY_MIDDLE: (0.1, 1.0),
+    ProfileKey.UNCERTAINTY_K: (0.0, 1000.0),
+    ProfileKey.TARGET_C: (50.0, 600.0),
+    ProfileKey.RAMP_K_S: (0.1, 500.0),
+    ProfileKey.HOLD_S: (0.0, inf),
+    ProfileKey.COOL_C: (20.0, 400.0),
+    ProfileKey.MAX_CURRENT: (0.1, 300.0),
+    ProfileKey.MAX_POWER: (0.1, 5000.0),
+})  # fmt: skip
+"""Least and greatest values of a profile's numbers; the configuration narrows target and hold further."""
+
+
 class SetHeatProfile(Command):
-    """Set what is heated to next: a profile's numbers (`rtcp.processes.shape_setting.profile`)."""
+    """Set what is heated to next: a profile's numbers (`rtcp.processes.shape_setting.profile`, `PROFILE_RANGES`)."""
 
     states = AT_REST
     initial_c: float
@@ -150,8 +185,8 @@ class ResistanceNotMeasured(Refusal):
 
 
 class RodStillHot(Refusal):
-    """the rod was heated {elapsed_s:.0f} s ago and has not cooled down under the heater: an initial resistance is
-    measured {wait_s:.0f} s after it (rod_cooling_s)"""
+    """the rod was hot {elapsed_s:.0f} s ago and may still be: an initial resistance is measured {wait_s:.0f} s after it
+    (rod_cooling_s)"""
 
     elapsed_s: float
     wait_s: float
@@ -161,9 +196,27 @@ class NoHeatProfile(Refusal):
     """there is no heat profile: set_heat_profile first"""
 
 
+class ProfileNumberOutOfRange(Refusal):
+    """the profile's {quantity}: found {value:.6g}, allowed is a number from {least:g} to {greatest:g}"""
+
+    quantity: ProfileKey
+    value: float
+    least: float
+    greatest: float
+
+
+class CoolingOutOfRange(Refusal):
+    """cool_c: found {cool_c:.6g}, allowed is more than initial_c, {initial_c:.6g}, and less than target_c,
+    {target_c:.6g}: correct the profile"""
+
+    cool_c: float
+    initial_c: float
+    target_c: float
+
+
 class ProfileOutOfRange(Refusal):
     """the profile cannot be heated to: {target_c:.6g} C in the middle is a ratio of {ratio:.4g}, the limit is
-    {limit:.4g} (greatest_ratio), and all numbers have to be finite and positive: correct the profile"""
+    {limit:.4g} (greatest_ratio): correct the profile"""
 
     target_c: float
     ratio: float
@@ -209,17 +262,19 @@ class CoolingBegun(Event, number=131):
 
 
 class ShapeSet(Event, number=132):
-    """the middle of the rod has cooled to {middle_c:.5g} C, the relay is open: the rod can be released"""
+    """the middle of the rod has {middle_c:.5g} C, the relay opens: the rod can be released; do not touch it above
+    60 C"""
 
     middle_c: float
 
 
 class HeatStopped(ProcessEnded, number=133):
-    """the heater was stopped from outside: gate and relay are off; arm it to heat again"""
+    """the heater was stopped from outside: gate and relay are commanded off; arm it to heat again"""
 
 
 class HeatEnded(ProcessEnded, number=134):
-    """the interlock {row} ended the heat in mode {mode}: gate and relay are off; restore it, then arm the heater"""
+    """the interlock {row} ended the heat in mode {mode}: gate and relay are commanded off; restore it, then arm the
+    heater"""
 
     row: Row
     mode: Mode
@@ -235,7 +290,7 @@ class ResistanceUncertain(ProcessEnded, number=139):
 
 
 class CoolingTooLong(ProcessEnded, number=140):
-    """the middle of the rod has {middle_c:.5g} C after {limit_s:g} s of cooling (longest_cooling_s): the relay is open;
+    """the middle of the rod has {middle_c:.5g} C after {limit_s:g} s of cooling (longest_cooling_s): the relay opens;
     the profile's cool_c may be below what the rod's resistance returns to"""
 
     middle_c: float
@@ -243,8 +298,8 @@ class CoolingTooLong(ProcessEnded, number=140):
 
 
 class HeaterTripped(ProcessEnded, number=135):
-    """the interlock {row} tripped at {value:.5g}, limit {limit:.5g}: gate and relay are off; remove the cause, then
-    reset_trips"""
+    """the interlock {row} tripped at {value:.5g}, limit {limit:.5g}: gate and relay are commanded off; remove the
+    cause, then reset_trips"""
 
     row: Row
     value: float
@@ -256,14 +311,14 @@ class TripsReset(Event, number=136):
 
 
 class TargetNotReached(ProcessEnded, number=137):
-    """the middle of the rod has {middle_c:.5g} C after {longest_s:g} s (longest_s): gate and relay are off; check the
-    battery and the profile's limits"""
+    """the middle of the rod has {middle_c:.5g} C after {longest_s:g} s (longest_s): gate and relay are commanded off;
+    check the battery and the profile's limits"""
 
     middle_c: float
     longest_s: float
 
 
 class ArmedTooLong(ProcessEnded, number=138):
-    """the heater was armed for {armed_s:g} s (armed_s) without pulses or heat: its relay is open; arm it again"""
+    """the heater was armed for {armed_s:g} s (armed_s) without pulses or heat: its relay opens; arm it again"""
 
     armed_s: float

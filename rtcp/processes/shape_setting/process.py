@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from math import hypot, inf, isfinite
+from math import hypot, inf
 from typing import Any, Final
 
 from rtcp.control.part import PartContext
@@ -19,11 +18,13 @@ from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.control import CurrentControl, Ramp
 from rtcp.processes.shape_setting.interlocks import Interlocks, Mode, Row, first_row
 from rtcp.processes.shape_setting.messages import (
+    PROFILE_RANGES,
     ArmedTooLong,
     ArmHeater,
     BatteryLow,
     CauseRemains,
     CoolingBegun,
+    CoolingOutOfRange,
     CoolingTooLong,
     HeatEnded,
     HeaterArmed,
@@ -35,6 +36,8 @@ from rtcp.processes.shape_setting.messages import (
     HoldBegun,
     MeasureResistance,
     NoHeatProfile,
+    ProfileKey,
+    ProfileNumberOutOfRange,
     ProfileOutOfRange,
     ResetTrips,
     ResistanceMeasured,
@@ -61,6 +64,9 @@ _BUSY: Final = _HEAT | {HeaterState.MEASURING, HeaterState.COOLING}
 _HOT: Final = _HEAT | {HeaterState.COOLING}
 _HALF: Final = 0.5
 """Between the levels of a digital channel."""
+_COLD_K: Final = 5.0
+"""Rise over `initial_c` at which a rod counts as cold, K."""
+_DEAD: Final = 1 << Row.LOST_CYCLE | 1 << Row.STALE_INPUT
 _NO_AGE: Final = 9999.0
 """s; a record is also written as JSON, which has no infinity."""
 _FIELDS: Final = (
@@ -72,6 +78,11 @@ _FIELDS: Final = (
     Field("latched", "uint32", "", "Rows that have latched, a bit each."),
     Field("gate", "uint8", "", "What the gate is commanded; 1: on."),
     Field("relay", "uint8", "", "What the relay is commanded; 1: closed."),
+    Field("relay_closed", "uint8", "", "Mirror contact of the relay; 1: closed."),
+    Field("gate_sense", "uint8", "", "Measured state of the gate; 1: on throughout the conversion."),
+    Field("current", "float64", "A", "Measured current through the rod."),
+    Field("inputs_alive", "uint8", "", "1: the inputs come, and their counters run; 0: they are old."),
+    Field("rod_hot_s", "float64", "s", "Time for which the rod may be hot, and is not measured; 0: it is cold."),
     Field("resistance", "float64", "ohm", "Of the newest conversion with the gate on throughout."),
     Field("resistance_age", "float64", "s", "Its age; 9999: there is none."),
     Field("initial_resistance", "float64", "ohm", "Mean of the pulses; 0: not measured."),
@@ -127,8 +138,9 @@ class ShapeSetting(Process):
         self.energy = self.uncertainty_k = 0.0
         self._lease = 0
         self._elapsed_s = self._pulse_s = self._hold_s = 0.0
-        self._since_heat_s = inf
-        """Since the rod was heated without a cool-down to its end, s."""
+        # What the platform before has heated is not known here.
+        self._since_heat_s = inf if setup.since_before_s is None else setup.since_before_s
+        """Since the rod was hot, s; infinite: it has cooled to its initial temperature under the heater."""
         self._pending: list[Event] = []
         """Events of commands and of `safe`; the next cycle reports them."""
 
@@ -169,28 +181,20 @@ class ShapeSetting(Process):
     def _set_profile(self, command: SetHeatProfile) -> Refusal | None:
         if self.state not in _AT_REST and self.state is not HeaterState.ARMED:
             return WrongHeaterState(self.state, HeaterState.ARMED)
-        numbers = [float(getattr(command, entry.name)) for entry in fields(command)]
-        finite = all(map(isfinite, numbers))
-        positive = finite and all(
-            number > 0.0
-            for number in (
-                command.kelvin_per_ratio, command.mean_by_middle, command.ramp_k_s, command.max_current,
-                command.max_power,
-            )
-        )  # fmt: skip
-        limit = self._config.greatest_ratio
-        scale, ratio = self._scale, 0.0
-        if positive:
-            scale = RatioScale(
-                command.initial_c, command.kelvin_per_ratio, command.chuck_c, command.mean_by_middle
-            )  # fmt: skip
-            ratio = scale.ratio_for_middle(command.target_c)
-        sound = positive and command.hold_s >= 0.0 and command.uncertainty_k >= 0.0 and command.mean_by_middle <= 1.0
-        if not sound or not command.initial_c < command.target_c or not command.cool_c < command.target_c:
-            return ProfileOutOfRange(command.target_c, ratio, limit)
         config = self._config
-        if not ratio < limit or command.target_c > config.greatest_target_c or command.hold_s >= config.longest_s:
-            return ProfileOutOfRange(command.target_c, ratio, limit)
+        greatest_of = {ProfileKey.TARGET_C: config.greatest_target_c, ProfileKey.HOLD_S: config.longest_s}
+        for key, (least, most) in PROFILE_RANGES.items():
+            value, greatest = getattr(command, key.name.lower()), min(most, greatest_of.get(key, most))
+            if not least <= value <= greatest:
+                return ProfileNumberOutOfRange(key, value, least, greatest)
+        if not command.initial_c < command.cool_c < command.target_c:
+            return CoolingOutOfRange(command.cool_c, command.initial_c, command.target_c)
+        scale = RatioScale(
+            command.initial_c, command.kelvin_per_ratio, command.chuck_c, command.mean_by_middle
+        )  # fmt: skip
+        ratio = scale.ratio_for_middle(command.target_c)
+        if not ratio < config.greatest_ratio:
+            return ProfileOutOfRange(command.target_c, ratio, config.greatest_ratio)
         self._profile, self._scale = command, scale
         return None
 
@@ -384,7 +388,8 @@ class ShapeSetting(Process):
             self._open()
             # The rod is taken out now: the next one is measured anew.
             self.initial.forget()
-            self.state, self._since_heat_s = HeaterState.DONE, inf
+            self.state = HeaterState.DONE
+            self._since_heat_s = inf if middle <= self._profile.initial_c + _COLD_K else 0.0
         elif self._hold_s > self._config.longest_cooling_s:
             context.report(CoolingTooLong(middle, self._config.longest_cooling_s))
             self._open()
@@ -418,11 +423,14 @@ class ShapeSetting(Process):
     def publish(self, values: list[Any], at: int) -> None:
         """Write the values of `_FIELDS`."""
         interlocks, meter, initial, control = self.interlocks, self.meter, self.initial, self.control
+        inputs = self.inputs
         ratio, scale = self.ratio, self._scale
         values[at : at + len(_FIELDS)] = (
             self.state, self.state in _BUSY, interlocks.mode, interlocks.cause,
             interlocks.forbids(self.supervision.holds), interlocks.latched,
-            self.gate, interlocks.closed,
+            self.gate, interlocks.closed, inputs.relay_closed, inputs.gate_sense, inputs.current,
+            self._before_ns > 0 and not self.supervision.holds & _DEAD,
+            max(self._config.rod_cooling_s - self._since_heat_s, 0.0),
             meter.resistance, min(meter.age_s, _NO_AGE), initial.value, initial.uncertainty,
             ratio, scale.ratio_for_middle(self.ramp.setpoint_c), self.ramp.setpoint_c,
             scale.mean(ratio) if ratio else 0.0, scale.middle(ratio) if ratio else 0.0, self.uncertainty_k,

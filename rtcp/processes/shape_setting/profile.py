@@ -12,12 +12,12 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from rtcp.config.document import Finding, read
 from rtcp.config.numbers import NotNegative
 from rtcp.config.validation import Checker, rule
-from rtcp.processes.shape_setting.messages import SetHeatProfile
+from rtcp.processes.shape_setting.messages import PROFILE_RANGES, ProfileKey, SetHeatProfile
 from rtcp.processes.shape_setting.temperature import (
     Alloy,
     ColdEnds,
@@ -27,16 +27,20 @@ from rtcp.processes.shape_setting.temperature import (
     ratio_scale,
 )
 
-_Room = Annotated[float, Ge(-20), Le(200)]
+# What the loop checks again.
+_RANGES = {key: (Ge(least), Le(greatest)) for key, (least, greatest) in PROFILE_RANGES.items()}
+_ROOM, _TARGET, _RAMP = _RANGES[ProfileKey.INITIAL_C], _RANGES[ProfileKey.TARGET_C], _RANGES[ProfileKey.RAMP_K_S]
+_COOL, _CURRENT, _POWER = (_RANGES[key] for key in (ProfileKey.COOL_C, ProfileKey.MAX_CURRENT, ProfileKey.MAX_POWER))
+_Room = Annotated[float, _ROOM[0], _ROOM[1]]
 
 
 @dataclass(frozen=True)
 class Limits:
     """What the heater does not exceed with this rod."""
 
-    current: Annotated[float, Gt(0), Le(300)] = 50.0
+    current: Annotated[float, _CURRENT[0], _CURRENT[1]] = 50.0
     """Greatest average current, A."""
-    power: Annotated[float, Gt(0), Le(5000)] = 500.0
+    power: Annotated[float, _POWER[0], _POWER[1]] = 500.0
     """Greatest average power, W."""
 
 
@@ -46,13 +50,13 @@ class HeatProfile:
 
     alloy: Alloy
     ends: ColdEnds
-    target_c: Annotated[float, Ge(50), Le(600)]
+    target_c: Annotated[float, _TARGET[0], _TARGET[1]]
     """Temperature in the middle of the rod, C; Nitinol loses its structure above 600 C."""
     hold_s: NotNegative
     """Time at the target, s."""
-    ramp_k_s: Annotated[float, Ge(0.1), Le(500)] = 50.0
+    ramp_k_s: Annotated[float, _RAMP[0], _RAMP[1]] = 50.0
     """Rise of the setpoint in the middle, K/s."""
-    cool_c: Annotated[float, Ge(20), Le(400)] = 80.0
+    cool_c: Annotated[float, _COOL[0], _COOL[1]] = 80.0
     """Temperature in the middle at which the relay opens and the rod can be released, C."""
     initial_c: _Room = 20.0
     """Temperature of the rod when its initial resistance is measured, C: of the room, or of a preheat above Af."""

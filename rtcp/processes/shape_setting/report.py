@@ -32,10 +32,10 @@ def write_report(folder: Path, job: Job, profile: HeatProfile, outcome: Outcome,
         problem: what ended the run early; empty: nothing.
     """
     along = _temperatures(profile, outcome)
-    drawn = (_shapes(folder, outcome), _heat(folder, outcome), _along(folder, along), _set(folder, outcome))
-    pictures = [picture for picture in drawn if picture]
     facts = _facts(job, profile, outcome, problem)
     (folder / "report.json").write_text(json.dumps(_plain(facts, outcome, along), indent=1))
+    drawn = (_shapes(folder, outcome), _heat(folder, outcome), _along(folder, along), _set(folder, outcome))
+    pictures = [picture for picture in drawn if picture]
     rows = "".join(f"<tr><th scope=row>{html.escape(k)}<td>{html.escape(str(v))}" for k, v in facts.items())
     steps = "".join(f"<tr><td>{at:.1f} s<td>{html.escape(what)}" for at, what in outcome.steps)
     interlocks = "".join(f"<tr><th scope=row>{name}<td>{state}" for name, state in outcome.interlocks.items())

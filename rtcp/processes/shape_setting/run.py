@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import os
 import signal
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TextIO
 
 import numpy as np
 import numpy.typing as npt
@@ -26,14 +28,22 @@ from rtcp.ipc.runtime_directory import control_socket
 from rtcp.processes.rod import BendingPlan, Equilibrium, Release, plan_motion, release, set_fraction, shoot
 from rtcp.processes.rod.bending import HALF_TURN, plan_approach
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
-from rtcp.processes.shape_setting.interlocks import TABLE
+from rtcp.processes.shape_setting.interlocks import TABLE, Mode
 from rtcp.processes.shape_setting.job import Job, pose_of
-from rtcp.processes.shape_setting.profile import HeatProfile, heat_command, temperatures_along
+from rtcp.processes.shape_setting.messages import HeatingStarted
+from rtcp.processes.shape_setting.profile import HeatProfile, heat_command, target_ratio, temperatures_along
 
 Array = npt.NDArray[np.float64]
 SAMPLE_S: Final = 0.2
 """Interval at which the heater's fields are kept for the report, s."""
 _RELAY_S: Final = 2.0
+"""Time for the relay to close or open, s."""
+_HEAT_FIRST_S, _STOP_S = 0.5, 4.0
+"""At an early end: how long the stop of the arms waits for that of the heat, and the longest time for all of it, s."""
+_NO_CURRENT_A: Final = 0.5
+"""Below this the measured current is none, A."""
+_TOUCH_C: Final = 60.0
+"""Temperature above which people are told not to touch the rod, C."""
 _RESISTANCE_SHARE: Final = 0.2
 """Largest relative deviation of the initial resistance from that by alloy and dimensions; another phase: 7 to 20 %."""
 _GHOSTS, _GHOST_STRIDE = 4, 4
@@ -42,6 +52,7 @@ _FIELDS: Final = (
     "ratio", "target_ratio", "setpoint_middle", "mean_temperature", "middle_temperature", "average_current",
     "target_current", "energy",
 )  # fmt: skip
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)
 _VIRTUAL_BOX: Final = (0x00000A55, 0x00000010)
 _BEND, _ACT, _FRACTION, _CELLS_AT, _HIGHEST = 0x2010, 0x2013, 0x2021, 0x2025, 0x2026
 _CELLS: Final = 48
@@ -85,7 +96,8 @@ class ShapeSettingRun:
         confirm: called where people do something at the rod; returns when they have.
 
     Raises:
-        Refused: the cell has no heater, or the bend cannot be planned; nothing has moved.
+        Refused: the cell has no heater, another run works with it, somebody uses the heater, the rod may be hot, or the
+            bend cannot be planned; nothing has moved.
     """
 
     def __init__(
@@ -98,10 +110,13 @@ class ShapeSettingRun:
         self._heater = self._robot.processes[self._name]
         self.outcome = Outcome()
         self.heat_is_off = False
-        """Whether a run that ended early has seen gate and relay off."""
+        """Whether a run that ended early has measured that relay, gate and current are off."""
+        self._lock = _lock(self._member.directory.parent / "shape-set.lock")
+        self._check_heater()
         self._began = time.monotonic()
         self.plan: BendingPlan = plan_motion(cell.config, job.holders, job.steps(), pose_of(job.held), job.near)
         """The motion that bends the rod."""
+        self._check_arms()
 
     def run(self) -> Outcome:
         """Do all of it; whatever ends it early turns the heat off first, then stops the arms.
@@ -119,7 +134,44 @@ class ShapeSettingRun:
         finally:
             with contextlib.suppress(OSError):
                 ghost.unlink(missing_ok=True)
+            self._lock.close()
         return self.outcome
+
+    @property
+    def middle_c(self) -> float | None:
+        """Newest temperature in the middle of the rod, C; None: none was measured."""
+        return next((one for one in reversed(self.outcome.samples["middle_temperature"]) if one), None)
+
+    def _check_heater(self) -> None:
+        """Raise where the heater is another's, or where arms would move with a hot rod."""
+        fields = self._heater.fields
+        if fields["busy"] or fields["relay"]:
+            raise RtcpError(
+                "refused",
+                f"the heater is {self._heater.state}: somebody uses it; `rtcp --name {self._member.name} process "
+                f"{self._name} stop_heating` ends that",
+                "heater_in_use",
+            )
+        if fields["rod_hot_s"]:
+            raise RtcpError(
+                "refused",
+                f"the rod of the heating before may be hot: no arm moves for {fields['rod_hot_s']:.0f} s "
+                "(rod_cooling_s)",
+                "rod_hot",
+                {"wait_s": fields["rod_hot_s"]},
+            )
+
+    def _check_arms(self) -> None:
+        """Raise where the heater does not supervise the arms that hold the rod."""
+        config = next(one for one in self._member.config.processes if one.name == self._name)
+        assert isinstance(config, ShapeSettingConfig)
+        if missing := [name for name in self._job.holders if name not in config.arms]:
+            raise RtcpError(
+                "refused",
+                f"the arm {missing[0]} is to hold the rod, the heater supervises {', '.join(config.arms) or 'none'}: "
+                f"name it in `arms` of the process {self._name}, {self._member.config.source}",
+                "arm_not_supervised",
+            )
 
     def _draw(self, path: Path) -> None:
         """Let the panels of the arms draw the rod along its bend: some curves of points in the world, m."""
@@ -128,7 +180,8 @@ class ShapeSettingRun:
         made = path.with_suffix(".new")
         # What a panel does not draw is no reason not to begin.
         with contextlib.suppress(OSError):
-            made.write_text(json.dumps(curves[chosen][:, ::_GHOST_STRIDE].round(4).tolist()))
+            points = curves[chosen][:, ::_GHOST_STRIDE].round(4).tolist()
+            made.write_text(json.dumps({"pid": os.getpid(), "curves": points}))
             made.replace(path)
 
     def _begin(self, what: str) -> None:
@@ -139,7 +192,6 @@ class ShapeSettingRun:
         cell, heater = self._cell, self._heater
         last = self.plan.steps[-1]
         self.outcome.wanted, self.outcome.s, self.outcome.strain = last.p, last.s, last.largest_strain
-        heater.command("stop_heating")
         self._confirm("the chucks hold nothing, nothing stands between the arms")
         self._begin("arms are enabled and go to where the straight rod is gripped")
         for robot in cell.arms.values():
@@ -154,9 +206,9 @@ class ShapeSettingRun:
         virtual = VirtualRod(self._robot) if _is_virtual(self._member) else None
         if virtual is not None:
             virtual.renew()
-        heater.command("set_heat_profile", **asdict(heat_command(self._profile)))
         self._begin("the initial resistance is measured")
         self._arm()
+        self._set_profile()
         heater.command("measure_resistance", straight_and_unloaded=True, phase="austenite")
         self.outcome.initial_resistance = float(heater.fields["initial_resistance"])
         heater.command("stop_heating")
@@ -170,13 +222,17 @@ class ShapeSettingRun:
             virtual.bend(held)
         self._begin(f"heating to {self._profile.target_c:g} C in the middle, hold {self._profile.hold_s:g} s, cooling")
         self._arm()
+        since = max((one.number for one in self._robot.events()), default=0)
+        self._set_profile()
         with self._sampling():
             heater.command("start_heating")
+        self._check_target(since)
         self.outcome.energy = float(heater.fields["energy"])
         self._note_interlocks(heater)
-        self._begin("the rod has cooled: release")
+        warmth = _warmth(self.middle_c)
+        self._begin(f"release: {warmth}")
         self._finish(held, virtual)
-        self._confirm("open the chucks and take the rod out; the arms stay where they are")
+        self._confirm(f"open the chucks and take the rod out, {warmth}; the arms stay where they are")
 
     def _check_resistance(self) -> None:
         """Compare the initial resistance with that of the rod by its alloy and dimensions."""
@@ -192,7 +248,35 @@ class ShapeSettingRun:
                 {"resistance": found, "expected": expected},
             )
 
+    def _set_profile(self) -> None:
+        self._heater.command("set_heat_profile", **asdict(heat_command(self._profile)))
+
+    def _check_target(self, since: int) -> None:
+        """Raise where the heating since an event was not to this profile: another client may set one at any time."""
+        expected = self._profile.target_c, target_ratio(self._profile)
+        heated = [
+            (one.fields["target_c"], one.fields["ratio"])
+            for one in self._robot.events(since)
+            if one.name == HeatingStarted.name
+        ]
+        if not heated or not np.allclose(heated, expected, rtol=1e-6, atol=0.0):
+            found = ", ".join(f"{target:g} C at the ratio {ratio:.5g}" for target, ratio in heated) or "nothing"
+            raise RtcpError(
+                "fault",
+                f"the heater was to heat to {expected[0]:g} C at the ratio {expected[1]:.5g}, it reports {found}: "
+                "another client has changed the profile; this rod is not set as the report says",
+                "profile_changed",
+            )
+
     def _arm(self) -> None:
+        mode = self._heater.fields["mode"]
+        if mode != Mode.AUTO:
+            raise RtcpError(
+                "refused",
+                f"the key is at {Mode(mode).name.capitalize()}, where the heater does not supervise the arms: turn it "
+                "to Auto",
+                "key_not_at_auto",
+            )
         if self._robot.state is State.READY:
             self._robot.enable()
         self._heater.command("arm_heater")
@@ -200,17 +284,11 @@ class ShapeSettingRun:
 
     def _await_relay(self, closed: bool) -> None:
         until = time.monotonic() + _RELAY_S
-        while self._relay_closed() is not closed:
+        while bool(self._heater.fields["relay_closed"]) is not closed:
             if time.monotonic() > until:
                 what = "close" if closed else "open"
                 raise RtcpError("fault", f"the heater's relay did not {what} within {_RELAY_S:g} s: see its feedback")
             time.sleep(0.02)
-
-    def _relay_closed(self) -> bool:
-        config = next(one for one in self._member.config.processes if one.name == self._name)
-        assert isinstance(config, ShapeSettingConfig)
-        slave, _, channel = config.relay_closed.partition(".")
-        return bool(self._robot.status().raw["devices"][slave][channel]["value"])
 
     def _socket(self) -> Path:
         return control_socket(self._member.directory)
@@ -275,33 +353,68 @@ class ShapeSettingRun:
 
     def _stop(self) -> None:
         """Heat first, then motion; what does not answer keeps nothing from stopping."""
-        with _undisturbed():
+        with undisturbed():
             self._stop_all()
 
     def _stop_all(self) -> None:
-        # Over connections of their own: an interrupt has left those of the cell in the middle of an answer.
-        with contextlib.suppress(Exception), Robot("shape-set: stop", self._socket()) as robot:
-            robot.command("stop_heating")
-        with contextlib.suppress(Exception):
-            self._cell.halt()
-        with contextlib.suppress(Exception), Robot("shape-set: report", self._socket()) as robot:
-            heater = robot.processes[self._name]
-            self._note_interlocks(heater)
-            fields = heater.fields
-            self.heat_is_off = not fields["gate"] and not fields["relay"]
+        # Over connections of their own: an interrupt has left those of the cell in the middle of an answer. In threads
+        # that nobody has to wait for: a frozen gateway answers after its timeout, or never.
+        until = time.monotonic() + _STOP_S
+        commanded = threading.Event()
+        threads = [_begin_thread(self._stop_heat, commanded)]
+        commanded.wait(_HEAT_FIRST_S)
+        threads += [_begin_thread(_halt, member) for member in self._cell.config.members]
+        for thread in threads:
+            thread.join(max(0.0, until - time.monotonic()))
+
+    def _stop_heat(self, commanded: threading.Event) -> None:
+        try:
+            with contextlib.suppress(Exception), Robot("shape-set: stop", self._socket()) as robot:
+                robot.command("stop_heating")
+                commanded.set()
+                heater = robot.processes[self._name]
+                self.heat_is_off = _await_off(heater)
+                self._note_interlocks(heater)
+        finally:
+            commanded.set()
+
+
+def _begin_thread(call: Callable[..., None], *arguments: Any) -> threading.Thread:
+    thread = threading.Thread(target=call, args=arguments, daemon=True)
+    thread.start()
+    return thread
+
+
+def _halt(member: Member) -> None:
+    with contextlib.suppress(Exception), Robot("shape-set: stop", control_socket(member.directory)) as robot:
+        robot.halt()
+
+
+def _await_off(heater: Process) -> bool:
+    """Wait for the relay to open; return whether relay, gate and current are off by what is measured."""
+    until = time.monotonic() + _RELAY_S
+    while not (is_off := _is_off(heater.fields)) and time.monotonic() < until:
+        time.sleep(0.02)
+    return is_off
+
+
+def _is_off(fields: Mapping[str, Any]) -> bool:
+    off = not fields["relay_closed"] and not fields["gate_sense"] and abs(fields["current"]) < _NO_CURRENT_A
+    return off and bool(fields["inputs_alive"])
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Ignore a second Ctrl-C meanwhile."""
+def undisturbed() -> Iterator[None]:
+    """Ignore a second Ctrl-C, and what else ends a command, meanwhile."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class VirtualRod:
@@ -349,6 +462,28 @@ class VirtualRod:
     def _act(self, what: int) -> None:
         self._disable()
         self._robot.sdo_write(self._slave, _ACT, 1, bytes((what,)))
+
+
+def _warmth(middle_c: float | None) -> str:
+    """Return how hot the middle of the rod is, in words."""
+    if middle_c is None:
+        return "the temperature of the rod is not known: do not touch it"
+    return f"its middle has {middle_c:.0f} C" + (": HOT, do not touch it" if middle_c > _TOUCH_C else "")
+
+
+def _lock(path: Path) -> TextIO:
+    """Return a file that is locked until it is closed; raises Refused where another run has it."""
+    try:
+        file = path.open("a")
+    except OSError as error:
+        raise RtcpError("refused", f"{path} cannot be written: {error.strerror}", "no_lock") from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        message = f"another `rtcp shape-set` works with this cell (it holds {path}): wait for its end"
+        raise RtcpError("refused", message, "shape_set_runs") from None
+    return file
 
 
 def _heater_of(cell: Cell) -> tuple[Member, str]:

@@ -11,10 +11,13 @@ from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.interlocks import TABLE, Mode, Row
 from rtcp.processes.shape_setting.resistance import ResistanceMeter
 
-_ENGAGED: Final = frozenset({State.HOLDING, State.MOVING, State.STOPPING})
-"""States of an arm that holds the rod."""
 _PLATFORM: Final = frozenset({State.HOLDING, State.MOVING})
 """Enabled: every emergency stop, that of a partner too, every fault and `rtcp disable` lead out of these."""
+
+_COOLING: Final = 0.15
+"""Greatest fall of the ratio of a rod that cools, 1/s: more than twice that of one of 0.3 mm at 500 C."""
+_STEP: Final = 0.01
+"""Fall of the ratio that passes at once: noise and contacts."""
 
 
 class Inputs:
@@ -89,7 +92,7 @@ class Supervision:
         self._lost = Steadiness(config.lost_cycles - 1)
         self._last_sample = self._last_alive = -1.0
         self._relay = Feedback(config.relay_close_s / period_s, config.relay_open_s / period_s)
-        self._gate = Feedback(config.gate_cycles, config.gate_cycles)
+        self._gate, self._leakage = (Feedback(config.gate_cycles, config.gate_cycles) for _ in range(2))
         self._gradient_s = config.gradient_s
         self._anchor = self._anchor_age_s = 0.0
         self._period_s = period_s
@@ -159,6 +162,7 @@ class Supervision:
             # Inputs are those of a cycle before: no time runs.
             self._relay.follow(relay)
             self._gate.follow(gate)
+            self._leakage.follow(gate)
             return self._finish(holds | is_lost << Row.LOST_CYCLE | self.holds & _TIMED)
         for row, steadiness, differ in (
             (Row.KEY_DISCREPANCY, self._key, inputs.key_auto and inputs.key_manual),
@@ -171,7 +175,8 @@ class Supervision:
         if self._relay.differs(relay, inputs.relay_closed):
             holds |= 1 << Row.RELAY_FEEDBACK
         values[Row.RELAY_FEEDBACK] = self._relay.waited * self._period_s
-        if self._gate.differs(gate, inputs.gate_sense):
+        leaks = not abs(inputs.current) <= config.leakage_current
+        if self._gate.differs(gate, inputs.gate_sense) | self._leakage.differs(gate, gate or leaks):
             holds |= 1 << Row.GATE_FEEDBACK
         values[Row.GATE_FEEDBACK] = self._gate.waited * self._period_s
         is_stale = self._sample.exceeds(inputs.sample == self._last_sample)
@@ -200,7 +205,7 @@ class Supervision:
         oldest_ns = 0
         for arm in self._arms:
             permitted = permitted and arm.motion_allowed
-            engaged = engaged and arm.state in _ENGAGED and not arm.emergency_stop
+            engaged = engaged and arm.state is State.HOLDING and not arm.emergency_stop
             oldest_ns = max(oldest_ns, now_ns - arm.time_ns)
         self.values[Row.ARM_LOST] = oldest_ns * 1e-9
         lost = oldest_ns > self._silence_ns
@@ -221,9 +226,13 @@ class Supervision:
                 holds |= 1 << Row.IMPLAUSIBLE_RATIO
         if self._anchor:
             # At once on a step, which is a contact that moves; over `gradient_s` on a slope, above the noise.
-            change = abs(meter.resistance / self._anchor - 1.0)
-            values[Row.STEEP_GRADIENT] = change / max(self._anchor_age_s, self._gradient_s)
-            if values[Row.STEEP_GRADIENT] > config.greatest_gradient:
+            change, limit = meter.resistance / self._anchor - 1.0, config.greatest_gradient
+            span_s = max(self._anchor_age_s, self._gradient_s)
+            if change < 0.0:
+                # Also after a pause, in which a step would pass for a slope: no rod cools faster.
+                limit = min(limit, (_COOLING * span_s + _STEP) / span_s)
+            values[Row.STEEP_GRADIENT], self.limits[Row.STEEP_GRADIENT] = abs(change) / span_s, limit
+            if values[Row.STEEP_GRADIENT] > limit:
                 holds |= 1 << Row.STEEP_GRADIENT
         if not self._anchor or self._anchor_age_s >= self._gradient_s:
             self._anchor, self._anchor_age_s = meter.resistance, 0.0

@@ -222,3 +222,8 @@ def test_arms_that_the_cell_does_not_have_are_invalid() -> None:
         plan_motion(CELL, {"left": CHUCK, "middle": CHUCK}, bend(ROD, END), HELD, NEAR)
     with pytest.raises(Invalid):
         plan_motion(CELL, {"left": CHUCK}, bend(ROD, END), HELD, NEAR)
+
+
+def test_near_has_a_number_for_each_joint() -> None:
+    with pytest.raises(Invalid, match="near of left: found 1 numbers, allowed are 6"):
+        plan_motion(CELL, CHUCKS, bend(ROD, END), HELD, {**NEAR, "left": (1.0,)})

@@ -27,7 +27,7 @@ PERIOD_S = 0.0005
 LATENCY = 2
 """Cycles from the gate's command to the conversion that shows it."""
 CONFIG = ShapeSettingConfig("shape_setting", "heater", arms=("left", "right"), relay_close_s=0.005, relay_open_s=0.005)
-PROFILE = SetHeatProfile(20.0, 20.0, 5000.0, 1.0, 5.0, 500.0, 200.0, 0.2, 450.0, 50.0, 1000.0)
+PROFILE = SetHeatProfile(20.0, 20.0, 5000.0, 1.0, 5.0, 500.0, 200.0, 0.2, 400.0, 50.0, 1000.0)
 CONFIRMED = MeasureResistance(True, RodPhase.AUSTENITE)
 LEASE = 7
 
@@ -53,7 +53,11 @@ class Rig:
     """`cycle` lets one pass; `forced` are inputs that do not follow the hardware."""
 
     def __init__(
-        self, config: ShapeSettingConfig = CONFIG, resistance: float = 0.34, heat_capacity: float = 0.75
+        self,
+        config: ShapeSettingConfig = CONFIG,
+        resistance: float = 0.34,
+        heat_capacity: float = 0.75,
+        since_before_s: float | None = None,
     ) -> None:
         self.config = config
         names = [text for _, _, text in config.channels()]
@@ -66,7 +70,9 @@ class Rig:
         self.commands = [False] * LATENCY
         self.relay_cycles = 0
         self.arms_follow = True
-        setup = ProcessSetup(PERIOD_S, {name: Signal(self.values, name) for name in names}, self.partners)
+        setup = ProcessSetup(
+            PERIOD_S, {name: Signal(self.values, name) for name in names}, self.partners, since_before_s
+        )
         self.heater = ShapeSetting(config, setup)
         self.set(battery_voltage=12.5, fuse_ok=1, chassis_voltage=5.0)
         for arm in self.partners.values():

@@ -34,6 +34,7 @@ def test_the_example_is_a_job_with_its_profile() -> None:
 
 
 ARC = "arc: {angle: 0.9, side: [0, 1]}"
+LEFT = "{arm: left, pose: {position: [0, 0, 0.12], rpy: [0, -pi/2, 0]}, radius: 0.02, near: [0, 0, 0.8, 0, -0.77, 0]}"
 ROD = "rod: {length: 0.3, diameter: 0.001}"
 
 
@@ -52,6 +53,8 @@ ROD = "rod: {length: 0.3, diameter: 0.001}"
         (ROD, "rod: {length: 0.2, diameter: 0.001}", "arc.yaml:4: rod.length: found 0.2 m, the profile nitinol.yaml"),
         (ROD, "rod: {length: 0.3, diameter: 0.001, colour: red}", "arc.yaml:4: rod.colour: "),
         ("arm: right", "arm: left", 'arc.yaml:16: chucks[1].arm: found "left" twice'),
+        (LEFT, LEFT.replace("0.02", "1e300"), "arc.yaml:15: chucks[0].radius: found 1e+300"),
+        (LEFT, LEFT.replace("near: [0,", "near: [1e300,"), "arc.yaml:15: chucks[0].near[0]: found 1e+300"),
         ("approach_speed: 0.3", "approach_speed: 3", "arc.yaml:18: approach_speed: found 3"),
         ("approach_speed: 0.3", "approach_sped: 0.3", "arc.yaml:18: approach_sped: "),
         ("heat: nitinol.yaml", "heat: other.yaml", "other.yaml"),

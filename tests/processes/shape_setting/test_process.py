@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import random
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import product
 
 import pytest
@@ -16,10 +17,12 @@ from rtcp.ipc.states import State
 from rtcp.processes import ProcessSetup, Signal
 from rtcp.processes.shape_setting.interlocks import Mode, Row
 from rtcp.processes.shape_setting.messages import (
+    PROFILE_RANGES,
     ArmedTooLong,
     ArmHeater,
     BatteryLow,
     CauseRemains,
+    CoolingOutOfRange,
     HeatEnded,
     HeaterState,
     HeaterTripped,
@@ -27,12 +30,15 @@ from rtcp.processes.shape_setting.messages import (
     HeatStopped,
     MeasureResistance,
     NoHeatProfile,
+    ProfileKey,
+    ProfileNumberOutOfRange,
     ProfileOutOfRange,
     ResetTrips,
     ResistanceMeasured,
     ResistanceNotMeasured,
     RodNotConfirmed,
     RodPhase,
+    RodStillHot,
     ShapeSet,
     StartHeating,
     StopHeating,
@@ -65,7 +71,7 @@ def test_a_profile_heats_holds_cools_and_opens_the_relay(mode: Mode) -> None:
     assert isinstance(rig.context.events[-1], ShapeSet)
     assert not rig.relay
     assert not rig.gate
-    assert rig.celsius == pytest.approx(450.0, abs=30.0)
+    assert rig.celsius == pytest.approx(400.0, abs=30.0)
 
 
 def test_a_hold_and_its_energy_count_the_time_of_skipped_ticks() -> None:
@@ -116,6 +122,47 @@ def test_a_record_has_a_number_for_every_field() -> None:
     assert record["middle_temperature"] == pytest.approx(rig.celsius, abs=15.0)
 
 
+def record(rig: Rig) -> dict[str, float]:
+    values: list[float] = [0.0] * len(rig.heater.fields())
+    rig.heater.publish(values, 0)
+    return dict(zip((field.name for field in rig.heater.fields()), values, strict=True))
+
+
+def test_a_record_has_what_is_measured_beside_what_is_commanded() -> None:
+    rig = Rig()
+    rig.heat()
+    rig.forced.update(relay_closed=1.0, gate_sense=1.0, current=30.0)
+    rig.send(StopHeating())
+    rig.cycle()
+    shown = record(rig)
+    assert (shown["gate"], shown["relay"]) == (0, 0)
+    assert (shown["relay_closed"], shown["gate_sense"], shown["current"], shown["inputs_alive"]) == (1, 1, 30.0, 1)
+    rig.context.good = False
+    rig.cycle()
+    assert not record(rig)["inputs_alive"]
+
+
+@pytest.mark.parametrize(("cool_c", "is_hot"), [(300.0, True), (24.0, False)])
+def test_a_rod_that_was_not_cooled_to_its_initial_temperature_is_not_measured_after_its_heating(
+    cool_c: float, is_hot: bool
+) -> None:
+    rig = Rig()
+    rig.loss = 1.0
+    rig.heat(state=HeaterState.DONE, target_c=350.0, cool_c=cool_c)
+    assert bool(record(rig)["rod_hot_s"]) is is_hot
+    rig.cycle(20)
+    rig.arm()
+    assert isinstance(rig.send(CONFIRMED), RodStillHot) is is_hot
+
+
+@pytest.mark.parametrize(("since_before_s", "is_hot"), [(0.0, True), (90.0, True), (121.0, False), (None, False)])
+def test_after_a_restart_a_rod_is_not_measured_before_it_is_cold(since_before_s: float | None, is_hot: bool) -> None:
+    rig = Rig(since_before_s=since_before_s)
+    rig.arm()
+    assert bool(record(rig)["rod_hot_s"]) is is_hot
+    assert isinstance(rig.send(CONFIRMED), RodStillHot) is is_hot
+
+
 def test_the_limits_of_current_and_power_hold_the_target() -> None:
     rig = Rig()
     rig.heat(max_current=5.0)
@@ -137,6 +184,7 @@ def test_a_rod_that_does_not_get_hot_ends_the_heating_after_its_longest_time() -
 
 
 def test_an_armed_heater_that_nobody_uses_opens_its_relay() -> None:
+    assert CONFIG.armed_s == 30.0
     rig = Rig(replace(CONFIG, armed_s=0.5))
     rig.arm()
     rig.cycle(950)
@@ -203,15 +251,38 @@ def test_pulses_wait_for_the_relay() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("key", "value"),
     [
-        {"target_c": 2000.0}, {"target_c": float("nan")}, {"kelvin_per_ratio": 0.0}, {"max_current": -1.0},
-        {"hold_s": -1.0}, {"cool_c": 600.0}, {"initial_c": 510.0}, {"mean_by_middle": 1.5},
+        ("target_c", 601.0), ("target_c", math.nan), ("target_c", math.inf), ("kelvin_per_ratio", 1e308),
+        ("kelvin_per_ratio", 0.0), ("max_current", -1.0), ("max_current", 301.0), ("max_power", 1e-300),
+        ("hold_s", -1.0), ("hold_s", CONFIG.longest_s + 1.0), ("initial_c", -4000.0), ("chuck_c", 1e308),
+        ("cool_c", 401.0), ("mean_by_middle", 1.5), ("mean_by_middle", 1e-300), ("ramp_k_s", 1e308),
+        ("uncertainty_k", -1.0),
     ],
 )  # fmt: skip
-def test_a_profile_out_of_range_is_refused(wrong: dict[str, float]) -> None:
-    rig = Rig()
-    assert isinstance(refused(rig, replace(PROFILE, **wrong)), ProfileOutOfRange)
+def test_a_number_of_a_profile_out_of_range_is_refused_by_its_name(key: str, value: float) -> None:
+    refusal = refused(Rig(), replace(PROFILE, **{key: value}))
+    assert isinstance(refusal, ProfileNumberOutOfRange)
+    assert refusal.quantity.name.lower() == key
+    assert not refusal.least <= refusal.value <= refusal.greatest
+
+
+def test_a_heater_may_narrow_the_target() -> None:
+    refusal = refused(Rig(replace(CONFIG, greatest_target_c=400.0)), PROFILE)
+    assert refusal == ProfileNumberOutOfRange(ProfileKey.TARGET_C, 500.0, 50.0, 400.0)
+
+
+@pytest.mark.parametrize("wrong", [{"cool_c": 20.0}, {"target_c": 400.0}, {"initial_c": 200.0, "cool_c": 100.0}])
+def test_a_profile_cools_to_between_its_initial_temperature_and_its_target(wrong: dict[str, float]) -> None:
+    assert isinstance(refused(Rig(), replace(PROFILE, **wrong)), CoolingOutOfRange)
+
+
+def test_a_profile_beyond_the_plausible_ratio_is_refused() -> None:
+    assert isinstance(refused(Rig(), replace(PROFILE, kelvin_per_ratio=500.0)), ProfileOutOfRange)
+
+
+def test_the_ranges_are_those_of_all_numbers_of_a_profile() -> None:
+    assert [key.name.lower() for key in PROFILE_RANGES] == [entry.name for entry in fields(PROFILE)]
 
 
 def test_a_weak_battery_is_refused() -> None:
@@ -261,6 +332,13 @@ def disengage_arm(rig: Rig) -> None:
     rig.partners["left"].state = State.READY
 
 
+def let_arm(state: State) -> Cause:
+    def change(rig: Rig) -> None:
+        rig.partners["right"].state = state
+
+    return change
+
+
 def release_enabling_device(rig: Rig) -> None:
     rig.partners["left"].motion_allowed = False
 
@@ -288,6 +366,8 @@ CAUSES: list[tuple[Row, Mode, int, Cause]] = [
     (Row.ROBOT_CIRCUIT, Mode.AUTO, 1, force(circuit_b=0)),
     (Row.ARMS_PERMITTED, Mode.AUTO, 1, release_enabling_device),
     (Row.ARMS_ENGAGED, Mode.AUTO, 1, disengage_arm),
+    (Row.ARMS_ENGAGED, Mode.AUTO, 1, let_arm(State.MOVING)),
+    (Row.ARMS_ENGAGED, Mode.AUTO, 1, let_arm(State.STOPPING)),
     (Row.ARMS_ENGAGED, Mode.AUTO, 1, stop_arm),
     (Row.PLATFORM, Mode.MANUAL, 1, fault_platform),
     (Row.COMMANDER, Mode.MANUAL, 1, leave_commander),
@@ -379,6 +459,33 @@ def test_a_gate_that_stays_on_trips_within_its_cycles() -> None:
     rig.forced.update(gate_sense=1.0, current=30.0, voltage=30.0 * rig.resistance)
     rig.cycle(CONFIG.gate_cycles + 1)
     assert rig.heater.interlocks.latched & 1 << Row.GATE_FEEDBACK
+    assert not rig.relay
+
+
+@pytest.mark.parametrize("state", [HeaterState.ARMED, HeaterState.COOLING])
+def test_a_current_with_the_gate_off_trips_as_the_gate_does(state: HeaterState) -> None:
+    rig = Rig()
+    if state is HeaterState.ARMED:
+        rig.arm()
+    else:
+        rig.heat(state=state)
+    rig.forced["current"] = 0.4
+    rig.cycle(CONFIG.gate_cycles + 2)
+    assert rig.relay
+    rig.forced["current"] = -1.0
+    rig.cycle(CONFIG.gate_cycles + 2)
+    assert rig.heater.interlocks.latched == 1 << Row.GATE_FEEDBACK
+    assert not rig.relay
+
+
+def test_a_ratio_that_falls_in_a_pause_faster_than_a_rod_cools_is_too_steep() -> None:
+    rig = Rig(replace(CONFIG, cooling_interval_s=0.5))
+    rig.heat(state=HeaterState.COOLING)
+    rig.cycle(1500)
+    assert rig.relay
+    rig.initial *= 0.88
+    rig.cycle(1100)
+    assert rig.heater.interlocks.cause is Row.STEEP_GRADIENT
     assert not rig.relay
 
 

@@ -39,7 +39,7 @@ KEY_OFF, CIRCUIT_OPEN, ONE_CHANNEL = 0x30, 0x01, 0x11
 
 def short_profile() -> HeatProfile:
     profile = read_profile(ROOT / "config" / "shape_setting" / "nitinol.yaml")
-    return replace(profile, hold_s=0.3, ramp_k_s=300.0, initial_c=20.0, chuck_c=20.0, cool_c=480.0)
+    return replace(profile, hold_s=0.3, ramp_k_s=300.0, initial_c=20.0, chuck_c=20.0, cool_c=400.0)
 
 
 class Platform(Simulation):
