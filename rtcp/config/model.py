@@ -45,7 +45,7 @@ class HasBox(Protocol):
         """Name of the box; None: the only one."""
 
 
-PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator"})
+PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator", "tool"})
 """Parts of the cycle that are no devices: their fields have names of their own."""
 VIRTUAL = "virtual"
 """Name of the bus that is a segment in software."""
@@ -498,6 +498,18 @@ class JoystickConfig:
 
 
 @dataclass(frozen=True)
+class NamedTerminal:
+    """A terminal of the IO box that programs use by a name."""
+
+    name: Name
+    """Name for programs (`robot.io`); unique among inputs and outputs, no dot, not that of a function."""
+    number: Terminal
+    """Terminal of the IO box; none of a box is used twice."""
+    box: Name | None = None
+    """IO box of the terminal; needed with several boxes."""
+
+
+@dataclass(frozen=True)
 class InputsConfig:
     """Inputs with a meaning; one that is left out does not exist."""
 
@@ -508,6 +520,8 @@ class InputsConfig:
     """Active: motion is allowed. Release stops; pressing again moves nothing until a new command."""
     emergency_stop: EmergencyStopConfig | None = None
     """Active: pressed."""
+    named: tuple[NamedTerminal, ...] = ()
+    """Inputs that programs read by a name."""
 
 
 @dataclass(frozen=True)
@@ -522,6 +536,8 @@ class OutputsConfig:
     """Output terminal: toggled each cycle, for an oscilloscope."""
     box: Name | None = None
     """IO box of these outputs; needed with several boxes."""
+    named: tuple[NamedTerminal, ...] = ()
+    """Outputs that programs set by a name."""
 
 
 @dataclass(frozen=True)
@@ -784,6 +800,22 @@ class ArmConfig(ArmSettings):
         boxes = self.boxes
         named = None if user is None else user.box
         return named if named is not None else boxes[0] if boxes else ""
+
+    def terminals(self, section: InputsConfig | OutputsConfig) -> dict[str, tuple[str, int]]:
+        """Return box and number of each terminal that a section names, by its name or the key of its function."""
+        if not self.boxes:
+            return {}
+        found: dict[str, tuple[str, int]] = {}
+        for key, value in vars(section).items():
+            if isinstance(value, int):
+                found[key] = self.box_of(section if isinstance(section, OutputsConfig) else None), value
+            elif isinstance(value, tuple):
+                found |= {one.name: (self.box_of(one), one.number) for one in value}
+            elif isinstance(value, InputConfig):
+                found[key] = self.box_of(value), value.number
+            elif isinstance(value, JoystickConfig):
+                found |= {name: (self.box_of(value), one) for name, one in vars(value).items() if isinstance(one, int)}
+        return found
 
 
 # -- motion files ------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
 
 from rtcp.config.document import Finding, KeyPath, dotted
 from rtcp.config.find import registered
@@ -24,11 +25,14 @@ from rtcp.config.model import (
     EthercatBus,
     GripperConfig,
     HasBox,
+    InputsConfig,
     Joint,
     KeepOut,
     Kinematics,
     MechanicalLimit,
     MotionFile,
+    NamedTerminal,
+    OutputsConfig,
     Pdo,
     PdoEntry,
     Point,
@@ -311,6 +315,7 @@ def _inputs(arm: ArmFile) -> Terminals:
     for key in ("arm_toggle", "enabling_switch", "emergency_stop"):
         if terminal := getattr(arm.inputs, key):
             yield ("inputs", key), terminal, ((("inputs", key, "number"), terminal.number),)
+    yield from _named("inputs", arm.inputs.named)
 
 
 def _outputs(arm: ArmFile) -> Terminals:
@@ -319,6 +324,24 @@ def _outputs(arm: ArmFile) -> Terminals:
         yield ("outputs",), arm.outputs, found
     if arm.gripper and arm.gripper.output is not None:
         yield ("gripper",), arm.gripper, ((("gripper", "output"), arm.gripper.output),)
+    yield from _named("outputs", arm.outputs.named)
+
+
+def _named(section: str, terminals: Sequence[NamedTerminal]) -> Terminals:
+    for i, terminal in enumerate(terminals):
+        where = (section, "named", i)
+        yield where, terminal, (((*where, "number"), terminal.number),)
+
+
+@rule(ArmFile, "inputs", "outputs")
+def _terminal_names(arm: ArmFile) -> Iterator[Finding]:
+    sections = (("inputs", arm.inputs.named), ("outputs", arm.outputs.named))
+    names = [((section, "named", i, "name"), one.name) for section, named in sections for i, one in enumerate(named)]
+    yield from _repeated(names, "name")
+    functions = {one.name for kind in (InputsConfig, OutputsConfig) for one in fields(kind)} | set(JOYSTICK_TERMINALS)
+    for where, name in names:
+        if name in functions or "." in name:
+            yield where, f'found the text "{name}", allowed is a name without a dot that is not that of a function'
 
 
 def _repeated_by_box(terminals: Terminals, what: str) -> Iterator[Finding]:

@@ -91,7 +91,8 @@ class Planner:
         arm = self._config.arm
         if arm is None:
             file = self._config.source
-            raise RtcpError("refused", f"the geometry of the arm is unknown: the key kinematics is missing in {file}")
+            message = f"the geometry of the arm is unknown: the key kinematics is missing in {file}"
+            raise RtcpError("refused", message, "no_geometry")
         limits = zip(self.limits.low, self.limits.high, self.limits.velocity, strict=True)
         return dataclasses.replace(arm, limits=tuple(JointLimit(*three) for three in limits))
 
@@ -111,10 +112,15 @@ class Planner:
         """Return the joint positions, rad, nearest to `q_now` that bring the tool to `pose` (m, rad)."""
         _require_pose(pose, "pose")
         found = InverseKinematics(self._model()).solve_near(Pose.from_xyzrpy(*pose), q_now)
+        message, fields = f"the pose cannot be reached: {found.reason}", {"distance": found.out_of_reach}
+        if found.q is None and found.limited >= 0:
+            joint = self._config.joints[found.limited].name
+            raise RtcpError("refused", message, "joint_limited", {"axis": found.limited, "joint": joint})
         if found.q is None:
-            raise RtcpError("refused", f"the pose cannot be reached: {found.reason}")
+            raise RtcpError("refused", message, "out_of_reach", fields)
         if box := self._zone_at(found.q):
-            raise RtcpError("refused", f"the pose cannot be reached: the arm would be in {box}")
+            message = f"the pose cannot be reached: the arm would be in {box}"
+            raise RtcpError("refused", message, "in_box", {"box": box})
         return list(found.q)
 
     def moved_by(self, q: Sequence[float], offset: Sequence[float], frame: JogFrame) -> Pose:
@@ -124,6 +130,11 @@ class Planner:
             return here @ moved
         x, y, z = (a + b for a, b in zip(here.position, moved.position, strict=True))
         return Pose((x, y, z), times(moved.rotation, here.rotation))
+
+    def pose_at(self, q: Sequence[float]) -> list[float]:
+        """Return the pose of the tool, x y z, m, rx ry rz, rad, at joint positions, rad, inside the limits or not."""
+        pose = forward(self._model(), q)
+        return [*pose.position, *pose.rpy]
 
     def path(self, stops: Sequence[Stop], q_now: Sequence[float], speed: float | None) -> Plan:
         """Return the plan of a path from `q_now` to each stop in turn, its lines and arcs at most at `speed`, m/s.
@@ -229,8 +240,7 @@ class MotionActions:
 
     async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
         """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
-        if len(q) != self._count:
-            raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
+        self._require_joints(q, "q")
         async with self._channel.lease(caller) as lease:
             return await self._move(lease, q, speed, synchronized, self._says_accepted(caller))
 
@@ -478,8 +488,7 @@ class MotionActions:
         """Return the way of a motion to `q`, along lines, or of a trajectory, that would begin now."""
         here = self.plan_start()
         if q is not None:
-            if len(q) != self._count:
-                raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
+            self._require_joints(q, "q")
             found = await asyncio.to_thread(self._planner.joint_move, q, here, speed, synchronized)
             if isinstance(found, Refusal):
                 raise self._channel.error("refused", found)
@@ -531,6 +540,22 @@ class MotionActions:
 
         async with self._channel.lease(caller) as lease:
             return await self._run(lease, command, _UNPLANNED_S, command.name, position)
+
+    async def fk(self, q: Sequence[float]) -> Json:
+        """Return the pose of the tool at joint positions, rad."""
+        self._require_joints(q, "q")
+        return {"pose": self._planner.pose_at(q)}
+
+    async def ik(self, pose: Sequence[float], near: Sequence[float] | None) -> Json:
+        """Return the joint positions nearest to `near`, or to where the arm is, that bring the tool to a pose."""
+        if near is not None:
+            self._require_joints(near, "near")
+        start = self.plan_start() if near is None else near
+        return {"q": await asyncio.to_thread(self._planner.joints_at, pose, start)}
+
+    def _require_joints(self, q: Sequence[float], key: str) -> None:
+        if len(q) != self._count:
+            raise RtcpError("invalid", f"{key}: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
 
     def _joints(self, q: Sequence[float]) -> Sequence[float]:
         if len(q) != self._count:
