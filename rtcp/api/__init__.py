@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rtcp.api.async_robot import AsyncRobot, connect_async
     from rtcp.api.cell import Cell, connect_cell
     from rtcp.api.feed import Feed
+    from rtcp.api.program import Program
     from rtcp.api.stream import Stream
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "Levels",
     "NotRunning",
     "Preview",
+    "Program",
     "Progress",
     "RecordSchema",
     "RecorderStatus",
@@ -84,6 +86,10 @@ def __getattr__(name: str) -> Any:
         from rtcp.api.feed import Feed
 
         return Feed
+    if name == "Program":
+        from rtcp.api.program import Program
+
+        return Program
     if name == "Stream":
         from rtcp.api.stream import Stream
 

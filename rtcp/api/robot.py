@@ -417,14 +417,18 @@ class Methods:
         line: bool = False,
         synchronized: bool = True,
         approach: bool = False,
+        stops: Sequence[Mapping[str, Any]] = (),
+        start: Sequence[float] | None = None,
     ) -> Call[Preview]:
-        """Plan what `move_joints(q)`, `move_pose(pose)` or `run(file)` would do now; nothing moves, no lease is needed.
+        """Plan what `move_joints(q)`, `move_pose(pose)`, `run(file)` or `run_path(stops)` would do now; nothing moves.
+
+        No lease is needed. A path may also begin at the joint positions `start`, rad.
 
         Raises:
             Refused: what the motion would be refused with, or that its way leads through a box.
-            Invalid: not exactly one of `q`, `pose` and `file`, or one with mistakes.
+            Invalid: not exactly one of `q`, `pose`, `file` and `stops`, or one with mistakes.
         """
-        params = {
+        params: dict[str, Any] = {
             "q": None if q is None else list(q),
             "pose": None if pose is None else list(pose),
             "file": file,
@@ -433,6 +437,8 @@ class Methods:
             "synchronized": synchronized,
             "approach": approach,
         }
+        if stops:
+            params |= {"stops": [dict(stop) for stop in stops], "start": None if start is None else list(start)}
         return Call("preview", params, partial(result, Preview))
 
     # -- streaming commands -------------------------------------------------------------------------------------------

@@ -859,10 +859,70 @@ class Stop:
 
 
 @dataclass(frozen=True)
+class NamedPose:
+    """A place of a program; it has either `pose` or `q`."""
+
+    name: Name
+    """By which steps name it."""
+    pose: _Coordinates | None = None
+    """x, y, z, rx, ry, rz of the tool, m and rad."""
+    q: _Coordinates | None = None
+    """Joint positions, rad."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of a program: one of `move`, `line`, `arc`, `gripper`, `output`, `wait_for`, `wait_s` and `run`."""
+
+    move: Name | None = None
+    """Move to this pose by the joints."""
+    line: Name | None = None
+    """Move to this pose on a straight line."""
+    arc: Name | None = None
+    """Move to this pose on the arc through `via`."""
+    via: Name | None = None
+    """Pose through whose place an arc leads."""
+    angle: Angle | None = None
+    """Angle to travel on the circle through the three places, rad; None: up to the pose."""
+    speed: Positive | None = None
+    """Speed of the tool, m/s; None: that of the file. By the joints: of the fastest one, rad/s."""
+    blend: NotNegative = 0.0
+    """Radius within which the corner to the next motion is rounded, m; 0: the tool rests."""
+    gripper: Literal["open", "close"] | None = None
+    """Open or close the gripper."""
+    output: Name | None = None
+    """Set this output to `value`."""
+    wait_for: Name | None = None
+    """Wait until this input has `value`."""
+    value: bool = True
+    """Level of an output or an input."""
+    timeout_s: Positive | None = None
+    """Longest wait for an input, s; None: for ever."""
+    wait_s: Positive | None = None
+    """Time to wait, s."""
+    run: Name | None = None
+    """Run this part."""
+    times: Annotated[int, Ge(0), Le(1_000_000)] = 1
+    """How often a part runs; 0: for ever."""
+
+
+@dataclass(frozen=True)
+class ProgramPart:
+    """Steps that are run by name."""
+
+    name: Name
+    """By which steps name it."""
+    steps: Annotated[tuple[Step, ...], MinLen(1), MaxLen(MOST_POINTS)]
+
+
+@dataclass(frozen=True)
 class MotionFile:
-    """A motion: either `trajectory` or `path` has entries."""
+    """A motion: one of `trajectory`, `path` and `program` has entries."""
 
     trajectory: Annotated[tuple[Point, ...], MaxLen(MOST_POINTS)] = ()
     path: Annotated[tuple[Stop, ...], MaxLen(MOST_POINTS)] = ()
     speed: Positive | None = None
-    """Speed of the tool on a path, m/s; None: `cartesian.speed` of the arm's file."""
+    """Speed of the tool on paths and in programs, m/s; None: `cartesian.speed` of the arm's file."""
+    poses: Annotated[tuple[NamedPose, ...], MaxLen(MOST_POINTS)] = ()
+    program: Annotated[tuple[Step, ...], MaxLen(MOST_POINTS)] = ()
+    parts: Annotated[tuple[ProgramPart, ...], MaxLen(MOST_POINTS)] = ()

@@ -369,14 +369,21 @@ class Methods:
         line: bool = False,
         synchronized: bool = True,
         approach: bool = False,
+        stops: tuple[Stop, ...] = (),
+        start: Numbers | None = None,
     ) -> Json:
-        """Plan a motion as `move_joints`, `move_pose` or `run` would, and move nothing.
+        """Plan a motion as `move_joints`, `move_pose`, `run` or `run_path` would, and move nothing.
 
+        It begins where the arm is commanded, or, of a path, at the joint positions `start`, rad.
         Returns `path`, configurations along it, rad, `duration_s`, and of lines `length_m` and `slowed`; refused with
         what would refuse it, or where its way leads through a box.
         """
-        if (q is not None) + (pose is not None) + (file is not None) != 1:
-            raise RtcpError("invalid", "found none or several of q, pose and file, allowed is one of them")
+        if (q is not None) + (pose is not None) + (file is not None) + bool(stops) != 1:
+            raise RtcpError("invalid", "found none or several of q, pose, file and stops, allowed is one of them")
+        if start is not None:
+            self._check_count("start", start, len(self._config.joints))
+        if stops:
+            return await self._motion.preview(None, stops, (), speed, synchronized, start)
         if file is not None:
             return await self._motion.preview_file(file, approach)
         if pose is not None:

@@ -153,7 +153,7 @@ class Planner:
 
             return plan_path(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
         except PlanRefused as refused:
-            raise RtcpError("refused", str(refused)) from None
+            raise RtcpError("refused", str(refused), type(refused).__name__) from None
 
     def trajectory(self, points: Sequence[Point], q_now: Sequence[float], moving: bool = False) -> Plan:
         """Return the plan of a trajectory that begins at `q_now`; or, `moving`, on the way there."""
@@ -273,6 +273,9 @@ class MotionActions:
         """Run a motion file."""
         # In a thread, as all planning: leases are renewed meanwhile.
         points, stops, speed = await asyncio.to_thread(self._planner.read, file)
+        if not (stops or points):
+            text = f"{file} holds a program, which steps of a client run: `rtcp run` or `rtcp.Program`"
+            raise RtcpError("refused", text, "program")
         if stops:
             return await self.run_path(caller, stops, speed, approach)
         return await self.run_trajectory(caller, points, approach)
@@ -484,9 +487,10 @@ class MotionActions:
         points: Sequence[Point],
         speed: float | None,
         synchronized: bool,
+        start: Sequence[float] | None = None,
     ) -> Json:
-        """Return the way of a motion to `q`, along lines, or of a trajectory, that would begin now."""
-        here = self.plan_start()
+        """Return the way of a motion to `q`, of a path, or of a trajectory, from now on, or from `start`, rad."""
+        here = self.plan_start() if start is None else list(start)
         if q is not None:
             self._require_joints(q, "q")
             found = await asyncio.to_thread(self._planner.joint_move, q, here, speed, synchronized)
@@ -512,6 +516,8 @@ class MotionActions:
     async def preview_file(self, file: str, approach: bool) -> Json:
         """Return the way of a motion file; with `approach` it begins at its first point."""
         points, stops, speed = await asyncio.to_thread(self._planner.read, file)
+        if not (stops or points):
+            raise RtcpError("refused", f"{file} holds a program: `rtcp run --dry` plans it", "program")
         if not approach:
             return await self.preview(None, stops, points, speed, True)
         first = points[0].q if points else stops[0].q
