@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import kinematics.compiled  # noqa: F401  first: it says whether the others are imported compiled
 from kinematics.capsules import Placed, capsules, distance, self_pairs
 from kinematics.damped_least_squares import NumericResult, solve_numeric
-from kinematics.forward import forward, forward_batch, frames
+from kinematics.forward import forward, forward_batch, frames, twist_batch
 from kinematics.gravity import gravity_torques
 from kinematics.inverse import InverseKinematics
 from kinematics.jacobian import JointVelocity, jacobian, joint_velocity, manipulability, singularity_distances
@@ -52,6 +52,7 @@ __all__ = [
     "singularity_distances",
     "solve_numeric",
     "to_urdf",
+    "twist_batch",
 ]
 
 

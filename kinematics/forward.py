@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import cos, sin
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from kinematics.model import JOINTS, ArmModel
 from kinematics.pose import IDENTITY, Pose, as_floats, require_finite
@@ -65,31 +65,14 @@ def forward_batch(model: ArmModel, q: npt.ArrayLike) -> tuple[npt.NDArray[np.flo
     """
     import numpy as np  # here, because the loop's process imports this module and must not load numpy
 
-    angles = np.asarray(q, dtype=np.float64)
-    if angles.ndim != 2 or angles.shape[1] != JOINTS:
-        raise ValueError(f"q has shape {angles.shape}; expected (N, {JOINTS})")
-    if not np.isfinite(angles).all():
-        row, joint = np.argwhere(~np.isfinite(angles))[0]
-        raise ValueError(f"q[{row}, {joint}] is {angles[row, joint]}; a finite number is required")
+    angles = _batch(q, "q")
     positions = np.empty((len(angles), 3))
     rotations = np.empty((len(angles), 3, 3))
-    base = np.eye(3)[:, :, None]
     tool = np.reshape(model.tool.rotation, (3, 3))
     for start in range(0, len(angles), _BLOCK):
         block = slice(start, start + _BLOCK)
-        theta = np.ascontiguousarray(angles[block].T) + [[row.offset] for row in model.rows]
-        x, y, z = base  # axes and origin of the frame: (3, n)
-        origin = np.zeros((3, 1))
-        for (sa, ca, a, d, _), s, c in zip(model.constants, np.sin(theta), np.cos(theta), strict=True):
-            origin = origin + a * x if a else origin
-            if sa == 0.0:
-                y, z = ca * y, ca * z
-            elif ca == 0.0:
-                y, z = sa * z, -sa * y
-            else:
-                y, z = ca * y + sa * z, ca * z - sa * y
-            origin = origin + d * z if d else origin
-            x, y = c * x + s * y, c * y - s * x
+        for frame in _frames_batch(model, angles[block]):
+            x, y, z, origin = frame  # the last is the flange
         for length, axis in zip(model.tool.position, (x, y, z), strict=True):
             origin = origin + length * axis if length else origin
         if model.tool.rotation != IDENTITY.rotation:
@@ -98,6 +81,59 @@ def forward_batch(model: ArmModel, q: npt.ArrayLike) -> tuple[npt.NDArray[np.flo
         for j, axis in enumerate((x, y, z)):
             rotations[block, :, j] = axis.T
     return positions, rotations
+
+
+def twist_batch(model: ArmModel, q: npt.ArrayLike, velocity: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Velocities of the tool in N configurations, (N, 6): vx, vy, vz, m/s, and wx, wy, wz, rad/s, in the base frame.
+
+    `q`, rad, and `velocity` of the joints, rad/s, have the shape (N, 6). The product `jacobian(q) velocity`, as the sum
+    over the joints of z_i qd_i x (p - p_i) and of z_i qd_i. Raises ValueError as `forward_batch`.
+    """
+    import numpy as np
+
+    angles, rates = _batch(q, "q"), _batch(velocity, "velocity")
+    twists = np.empty((len(angles), JOINTS))
+    tools, _ = forward_batch(model, angles)
+    for start in range(0, len(angles), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        tool, turn, move = tools[block].T, np.zeros((3, 1)), np.zeros((3, 1))
+        for rate, (_, _, z, origin) in zip(rates[block].T, _frames_batch(model, angles[block]), strict=True):
+            turn = turn + rate * z
+            move = move + np.cross(rate * z, tool - origin, axis=0)
+        twists[block, :3], twists[block, 3:] = move.T, turn.T
+    return twists
+
+
+def _batch(given: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
+    import numpy as np
+
+    values = np.asarray(given, dtype=np.float64)
+    if values.ndim != 2 or values.shape[1] != JOINTS:
+        raise ValueError(f"{name} has shape {values.shape}; expected (N, {JOINTS})")
+    if not np.isfinite(values).all():
+        row, joint = np.argwhere(~np.isfinite(values))[0]
+        raise ValueError(f"{name}[{row}, {joint}] is {values[row, joint]}; a finite number is required")
+    return values
+
+
+def _frames_batch(model: ArmModel, angles: npt.NDArray[np.float64]) -> Iterator[tuple[Any, Any, Any, Any]]:
+    """Yield the axes x, y, z and the origin of frames 1 to 6, each (3, n) or (3, 1), for angles (n, 6)."""
+    import numpy as np
+
+    theta = np.ascontiguousarray(angles.T) + [[row.offset] for row in model.rows]
+    x, y, z = np.eye(3)[:, :, None]
+    origin = np.zeros((3, 1))
+    for (sa, ca, a, d, _), s, c in zip(model.constants, np.sin(theta), np.cos(theta), strict=True):
+        origin = origin + a * x if a else origin
+        if sa == 0.0:
+            y, z = ca * y, ca * z
+        elif ca == 0.0:
+            y, z = sa * z, -sa * y
+        else:
+            y, z = ca * y + sa * z, ca * z - sa * y
+        origin = origin + d * z if d else origin
+        x, y = c * x + s * y, c * y - s * x
+        yield x, y, z, origin
 
 
 def _checked(model: ArmModel, q: Sequence[float]) -> Sequence[float]:

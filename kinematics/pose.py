@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 Vector: TypeAlias = tuple[float, float, float]
 Rotation: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
@@ -82,6 +86,19 @@ def rpy_from_rotation(rotation: Rotation) -> Vector:
     sx, cx = math.sin(rx), math.cos(rx)
     # rz from Rx(-rx) R instead of r00, r01: beside the singular orientation the error of rx then cancels in R
     return rx, ry, math.atan2(cx * r10 + sx * r20, cx * r11 + sx * r21)
+
+
+def rpy_batch(rotations: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """`rpy_from_rotation` of N matrices, (N, 3, 3): angles (N, 3), rad."""
+    import numpy as np  # here, because the loop's process imports this module and must not load numpy
+
+    r = rotations
+    cosine = np.hypot(r[:, 1, 2], r[:, 2, 2])
+    singular = cosine < _SINGULAR_COSINE
+    rx = np.where(singular, np.arctan2(r[:, 2, 1], r[:, 1, 1]), np.arctan2(-r[:, 1, 2], r[:, 2, 2]))
+    sx, cx = np.sin(rx), np.cos(rx)
+    rz = np.arctan2(cx * r[:, 1, 0] + sx * r[:, 2, 0], cx * r[:, 1, 1] + sx * r[:, 2, 1])
+    return np.column_stack([rx, np.arctan2(r[:, 0, 2], cosine), np.where(singular, 0.0, rz)])
 
 
 def orthonormality_error(rotation: Rotation) -> float:

@@ -10,11 +10,13 @@ from rtcp.api.results import (
     EventRecord,
     GripperRest,
     JointLimits,
+    Levels,
     Preview,
     Progress,
     RecorderStatus,
     Status,
     Streamed,
+    Terminals,
     Zero,
 )
 from rtcp.api.robot import Robot, connect
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from rtcp.api.async_robot import AsyncRobot, connect_async
     from rtcp.api.cell import Cell, connect_cell
     from rtcp.api.feed import Feed
+    from rtcp.api.program import Program
     from rtcp.api.stream import Stream
 
 __all__ = [
@@ -44,8 +47,10 @@ __all__ = [
     "Invalid",
     "JogFrame",
     "JointLimits",
+    "Levels",
     "NotRunning",
     "Preview",
+    "Program",
     "Progress",
     "RecordSchema",
     "RecorderStatus",
@@ -58,6 +63,7 @@ __all__ = [
     "Status",
     "Stream",
     "Streamed",
+    "Terminals",
     "TimedOut",
     "Zero",
     "connect",
@@ -80,6 +86,10 @@ def __getattr__(name: str) -> Any:
         from rtcp.api.feed import Feed
 
         return Feed
+    if name == "Program":
+        from rtcp.api.program import Program
+
+        return Program
     if name == "Stream":
         from rtcp.api.stream import Stream
 

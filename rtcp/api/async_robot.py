@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
-from rtcp.api.results import Progress, result
+from rtcp.api.results import Pose, Positions, Progress, result
 from rtcp.api.robot import Call, Methods
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.client import ANSWER_TIMEOUT_S, client_name, connection_error
@@ -84,6 +84,14 @@ class AsyncRobot(Methods):
     async def state(self) -> State:
         """Return the state of the machine now."""
         return (await self.status()).state
+
+    async def positions(self) -> Positions:
+        """Return the measured joint positions now, rad."""
+        return (await self.status()).positions
+
+    async def pose(self) -> Pose | None:
+        """Return the measured pose of the tool now, x y z, m, rx ry rz, rad; None: the geometry is unknown."""
+        return (await self.status()).pose
 
     async def _carry_out(self, call: Call[T]) -> T:
         writer, number = self._writer, next(self._numbers)

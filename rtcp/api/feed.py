@@ -21,6 +21,7 @@ from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.recording import ERROR, INFORMATION, WARNING
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.ipc.session import SessionError, read_session
+from rtcp.ipc.tool_motion import ToolMotion
 
 Records: TypeAlias = npt.NDArray[np.void]
 """Cycle records, oldest first: a structured array with a field a signal (`docs/recording.md`)."""
@@ -37,7 +38,8 @@ class Feed:
     Attributes:
         config: what was started.
         period_ns: of a cycle.
-        schema: of the records: name, type, unit and meaning of each field.
+        schema: of the records: name, type, unit and meaning of each field; those of the tool (`rtcp.ipc.tool_motion`)
+            are computed here.
 
     Raises:
         NotRunning: no platform runs there.
@@ -52,7 +54,8 @@ class Feed:
         except (BlackboardError, SessionError) as error:
             raise _not_running(directory, str(error)) from error
         self.period_ns = self._observer.period_ns
-        self.schema = self._observer.schema
+        self._tool = ToolMotion(self.config.arm, self._observer.schema)
+        self.schema = self._tool.schema
         self._loop = select.poll()
         try:
             self._process = os.pidfd_open(self._observer.loop_pid)
@@ -107,11 +110,12 @@ class Feed:
         if missing:
             instant = int(records["time_ns"][0]) if len(records) else time.monotonic_ns()
             self._gaps.append(_gap("cycles", first, self._at, missing, instant))
-        return records, missing
+        return self._tool.add(records), missing
 
     def latest(self) -> Records | None:
         """Return the newest cycle record, shape (1,), whether it was read before or not; None before the first."""
-        return self._observer.latest()
+        latest = self._observer.latest()
+        return None if latest is None else self._tool.add(latest)
 
     def last_event(self) -> str:
         """Return the newest event in words, also one from before; empty before the first."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
@@ -12,6 +12,8 @@ from rtcp.ipc.states import ControlMode, DriveMode, State
 T = TypeVar("T")
 Positions = tuple[float, ...]
 """rad, or rad/s, or Nm: one number a joint."""
+Pose = tuple[float, ...]
+"""Six numbers: x y z, m, rx ry rz, rad, R = Rx Ry Rz; or their velocities."""
 
 
 def result(kind: type[T], found: Mapping[str, Any]) -> T:
@@ -51,6 +53,12 @@ class Status:
     goal: Positions | None
     """Joint positions at the end of the motion under way, rad; None: nothing moves, the arm stops, or the motion has no
     known end (jog, stream, a package's own command)."""
+    pose: Pose | None
+    """Measured pose of the tool, x y z, m, rx ry rz, rad, R = Rx Ry Rz, base frame; None: the geometry is unknown."""
+    tool_velocity: Pose | None
+    """Measured velocity of the tool, vx vy vz, m/s, wx wy wz, rad/s, along and about the axes of the base; or None."""
+    commanded_pose: Pose | None
+    """Pose of the tool at `commanded_positions`; or None."""
     robot: RobotStatus
     """As ROS-Industrial has it."""
     holder: str
@@ -61,7 +69,7 @@ class Status:
     @classmethod
     def from_json(cls, found: Mapping[str, Any]) -> Status:
         """Read the answer of the method `status`."""
-        joints = found["joints"]
+        joints, tool = found["joints"], found["tool"] or {}
         return cls(
             state=State[found["state"].upper()],
             message=found["message"],
@@ -73,11 +81,18 @@ class Status:
             torques=tuple(joints["actual_torque"]),
             commanded_positions=tuple(joints["commanded_position"]),
             sent_positions=tuple(joints["sent_position"]),
-            goal=None if found["goal"] is None else tuple(found["goal"]),
+            goal=_tuple(found["goal"]),
+            pose=_tuple(tool.get("pose")),
+            tool_velocity=_tuple(tool.get("velocity")),
+            commanded_pose=_tuple(tool.get("commanded_pose")),
             robot=RobotStatus(**found["robot"]),
             holder=found["lease"]["holder"],
             raw=found,
         )
+
+
+def _tuple(numbers: Sequence[float] | None) -> tuple[float, ...] | None:
+    return None if numbers is None else tuple(numbers)
 
 
 def _mode(kind: Any, name: str) -> Any:
@@ -156,6 +171,41 @@ class Streamed:
     state: State
     positions: Positions
     """Actual positions, rad."""
+
+
+class Levels(Mapping[str, bool]):
+    """Levels of inputs or outputs by name, True: high; also by `box.number` where a terminal has another name."""
+
+    def __init__(self, terminals: Sequence[Mapping[str, Any]]) -> None:
+        self._levels = {one["name"]: bool(one["value"]) for one in terminals}
+        self._names = {f"{one['box']}.{one['number']}": one["name"] for one in terminals}
+
+    def __getitem__(self, name: str) -> bool:
+        if name not in self._levels and name not in self._names:
+            raise KeyError(f"{name}: allowed is one of {', '.join(self._levels) or 'none: there is no IO box'}")
+        return self._levels[self._names.get(name, name)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._levels)
+
+    def __len__(self) -> int:
+        return len(self._levels)
+
+    def __repr__(self) -> str:
+        return repr(self._levels)
+
+
+@dataclass(frozen=True)
+class Terminals:
+    """The IO boxes at one instant."""
+
+    inputs: Levels
+    outputs: Levels
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any]) -> Terminals:
+        """Read the answer of the method `read_io`."""
+        return cls(Levels(found["inputs"]), Levels(found["outputs"]))
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,15 @@ from rtcp.api.results import (
     EventRecord,
     GripperRest,
     JointLimits,
+    Levels,
+    Pose,
+    Positions,
     Preview,
     Progress,
     RecorderStatus,
     Status,
     Streamed,
+    Terminals,
     Zero,
     result,
 )
@@ -413,14 +417,18 @@ class Methods:
         line: bool = False,
         synchronized: bool = True,
         approach: bool = False,
+        stops: Sequence[Mapping[str, Any]] = (),
+        start: Sequence[float] | None = None,
     ) -> Call[Preview]:
-        """Plan what `move_joints(q)`, `move_pose(pose)` or `run(file)` would do now; nothing moves, no lease is needed.
+        """Plan what `move_joints(q)`, `move_pose(pose)`, `run(file)` or `run_path(stops)` would do now; nothing moves.
+
+        No lease is needed. A path may also begin at the joint positions `start`, rad.
 
         Raises:
             Refused: what the motion would be refused with, or that its way leads through a box.
-            Invalid: not exactly one of `q`, `pose` and `file`, or one with mistakes.
+            Invalid: not exactly one of `q`, `pose`, `file` and `stops`, or one with mistakes.
         """
-        params = {
+        params: dict[str, Any] = {
             "q": None if q is None else list(q),
             "pose": None if pose is None else list(pose),
             "file": file,
@@ -429,6 +437,8 @@ class Methods:
             "synchronized": synchronized,
             "approach": approach,
         }
+        if stops:
+            params |= {"stops": [dict(stop) for stop in stops], "start": None if start is None else list(start)}
         return Call("preview", params, partial(result, Preview))
 
     # -- streaming commands -------------------------------------------------------------------------------------------
@@ -499,11 +509,55 @@ class Methods:
 
         return Call("open_stream", {}, Stream.from_json)
 
-    # -- outputs, limits, zero, objects -------------------------------------------------------------------------------
+    # -- kinematics ---------------------------------------------------------------------------------------------------
 
     @Method
-    def set_output(self, output: int, value: bool, box: str | None = None) -> Call[None]:
-        """Set a digital output, counted from 1, of an IO box; `box`: its slave, needed with several."""
+    def fk(self, q: Sequence[float]) -> Call[Pose]:
+        """Return the pose of the tool, x y z, m, rx ry rz, rad, at joint positions, rad, within their limits or not."""
+        return Call("fk", {"q": list(q)}, lambda found: tuple(found["pose"]))
+
+    @Method
+    def ik(self, pose: Sequence[float], near: Sequence[float] | None = None) -> Call[Positions]:
+        """Return the joint positions, rad, that bring the tool to a pose, m and rad, under the limits in force.
+
+        Args:
+            pose: x y z, m, and rx ry rz, rad, with R = Rx Ry Rz.
+            near: rad; of several solutions the nearest to these; None: to where the arm is.
+
+        Raises:
+            Refused: reason `out_of_reach` (`distance`, m, 0: only the orientation), `joint_limited` (`axis`, `joint`),
+                `in_box` (`box`: which, in words), `no_geometry`.
+        """
+        params = {"pose": list(pose), "near": None if near is None else list(near)}
+        return Call("ik", params, lambda found: tuple(found["q"]))
+
+    # -- inputs, outputs, limits, zero, objects -----------------------------------------------------------------------
+
+    @Method
+    def read_io(self) -> Call[Terminals]:
+        """Return the levels of all inputs and outputs of the IO boxes."""
+        return Call("read_io", {}, Terminals.from_json)
+
+    @Method
+    def wait_io(self, name: str, value: bool = True, timeout_s: float | None = None) -> Call[None]:
+        """Return when an input, or an output, has a level; a level of one cycle counts. Needs no lease.
+
+        Args:
+            name: of `inputs.named` or `outputs.named` in the arm's file, of a function there, or `box.number`.
+            value: the level; True: high.
+            timeout_s: s; None: for ever.
+
+        Raises:
+            TimedOut: reason `level_not_reached` (`name`, `value`, `timeout_s`).
+            Invalid: reason `unknown_terminal` (`name`, `allowed`).
+        """
+        return Call("wait_io", {"name": name, "value": value, "timeout_s": timeout_s}, _nothing)
+
+    @Method
+    def set_output(self, output: int | str, value: bool, box: str | None = None) -> Call[None]:
+        """Set a digital output, by its name (`wait_io`) or counted from 1, of an IO box; `box`: needed with several."""
+        if isinstance(output, str):
+            return Call("write_io", {"name": output, "value": value}, _nothing)
         return Call("set_output", {"output": output, "value": value, "box": box}, _nothing)
 
     @Method
@@ -679,6 +733,21 @@ class Robot(Methods):
         return self.status().state
 
     @property
+    def positions(self) -> Positions:
+        """Measured joint positions now, rad."""
+        return self.status().positions
+
+    @property
+    def pose(self) -> Pose | None:
+        """Measured pose of the tool now, x y z, m, rx ry rz, rad; None: the geometry is unknown."""
+        return self.status().pose
+
+    @property
+    def io(self) -> Io:
+        """Inputs and outputs by their names."""
+        return Io(self)
+
+    @property
     def processes(self) -> dict[str, Process]:
         """The processes beside motion, by their names."""
         found = self.status().raw["processes"]
@@ -686,6 +755,39 @@ class Robot(Methods):
 
     def _carry_out(self, call: Call[T]) -> T:
         return call.result(self._client.call(call.method, call.params, _reader(call)))
+
+
+class Io:
+    """Inputs and outputs of a robot: `robot.io["part_present"]`, `robot.io["blower"] = True`. True is a high level.
+
+    Names are those of `inputs.named` and `outputs.named` in the arm's file, of the functions there, and `box.number`.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+
+    @property
+    def inputs(self) -> Levels:
+        """Levels of all inputs now."""
+        return self._robot.read_io().inputs
+
+    @property
+    def outputs(self) -> Levels:
+        """Levels of all outputs now."""
+        return self._robot.read_io().outputs
+
+    def __getitem__(self, name: str) -> bool:
+        """Return the level of an input, or else of an output; raises KeyError."""
+        terminals = self._robot.read_io()
+        return terminals.inputs[name] if name in terminals.inputs else terminals.outputs[name]
+
+    def __setitem__(self, name: str, value: bool) -> None:
+        """Set an output; raises as `Robot.set_output`."""
+        self._robot.set_output(name, value)
+
+    def wait(self, name: str, value: bool = True, timeout_s: float | None = None) -> None:
+        """Wait as `Robot.wait_io`."""
+        self._robot.wait_io(name, value, timeout_s)
 
 
 class Process:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from kinematics.forward import frames
+from kinematics.forward import forward, frames
 from kinematics.model import ArmModel
 from kinematics.pose import IDENTITY, Pose
 
@@ -29,8 +29,10 @@ _LIGHT = np.array((0.3, -0.5, 0.8)) / np.linalg.norm((0.3, -0.5, 0.8))
 _SIDES, _SAME = 28, 1e-6
 
 
-def draw(model: ArmModel, q: Sequence[float], out: Path) -> None:
-    """Draw the arm at `q` (six rad) into a file; its ending chooses the format.
+def draw(model: ArmModel, q: Sequence[float], out: Path, paths: Sequence[Sequence[Sequence[float]]] = ()) -> None:
+    """Draw the arm at `q` (six rad) into a file, and the way of the tool on paths of the joints.
+
+    The file's ending chooses the format.
 
     Raises:
         OSError: it cannot be written.
@@ -41,10 +43,16 @@ def draw(model: ArmModel, q: Sequence[float], out: Path) -> None:
     way = np.array(_corners(model, poses))
     centre, half = _room(way, size)
     figure = Figure(figsize=(11.0, 7.2))
-    _in_space(figure.add_axes((0.0, 0.0, 0.68, 0.90), projection="3d"), way, poses, size, centre, half)
+    space = figure.add_axes((0.0, 0.0, 0.68, 0.90), projection="3d")
+    _in_space(space, way, poses, size, centre, half)
+    tools = [np.array([forward(model, one).position for one in path]) for path in paths]
+    for tool in tools:
+        space.plot(*tool.T, color=TOOL, lw=1.5, zorder=4)
     for bottom, plane, title in ((0.53, (0, 2), "from the side"), (0.07, (0, 1), "from above")):
         axes = figure.add_axes((0.74, bottom, 0.24, 0.36), title=title)
         _outline(axes, way, poses, plane, centre, half)
+        for tool in tools:
+            axes.plot(*tool[:, plane].T, color=TOOL, lw=1.2)
     joints = ", ".join(f"{value:.4g}" for value in q)
     figure.text(0.02, 0.965, f"{model.name} at q = ({joints}) rad", fontsize=13, weight="bold")
     figure.text(0.02, 0.935, _tool(poses[-1]), fontsize=10)

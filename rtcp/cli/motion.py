@@ -15,6 +15,7 @@ from rtcp.cli.arguments import (
     POSE,
     AsJson,
     as_written,
+    check_picture,
     finite,
     joint_values,
     number,
@@ -232,16 +233,71 @@ def _arc(
 
 @commands.command("run")
 def _run(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A trajectory or a path, in YAML or CSV.")],
+    file: Annotated[
+        Path | None, typer.Argument(metavar="FILE", help="A trajectory, a path or a program: docs/motion.md.")
+    ] = None,
     approach: Annotated[bool, option("--approach", "First move to the start of the motion, by the joints.")] = False,
+    dry: Annotated[bool, option("--dry", "Plan it from where the arm is, and move nothing.")] = False,
+    picture: Annotated[Path | None, option("--picture", "FILE", "With --dry: draw the way of the tool.")] = None,
+    schema: Annotated[bool, option("--schema", "Print the JSON schema of motion files, for editors.")] = False,
 ) -> None:
     """Execute a motion file, checked as a whole first; returns when it is done. Ctrl-C stops it."""
-    from rtcp.config.motion_file import read_motion
+    from rtcp.config.motion_file import json_schema, read_motion
 
-    read_motion(file)  # reports mistakes in the file also without a platform
-    with stoppable("run") as robot, progress() as shown:
-        arrived = robot.run(str(file.absolute()), approach, shown)
-    report(arrival(arrived))
+    if schema:
+        emit_json(json_schema())
+        return
+    if file is None:
+        raise CommandError("FILE is missing: a motion file, docs/motion.md")
+    motion = read_motion(file)  # reports mistakes in the file also without a platform
+    if picture is not None:
+        check_picture("--picture", picture)
+        if not dry:
+            raise CommandError("--picture is for a plan: give --dry too")
+    if motion.program and approach:
+        raise CommandError("--approach is for trajectories and paths: a program begins where the arm is")
+    if dry:
+        _dry(file, bool(motion.program), approach, picture)
+    elif motion.program:
+        from rtcp.api.program import Program
+
+        program = Program(file)
+        with stoppable("run") as robot:
+            program.run(robot, lambda line, text: report(f"{file}:{line}: {text}"))
+        report("the program is complete")
+    else:
+        with stoppable("run") as robot, progress() as shown:
+            arrived = robot.run(str(file.absolute()), approach, shown)
+        report(arrival(arrived))
+
+
+def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None) -> None:
+    """Plan a file and show what would be done."""
+    with connect("run --dry") as robot:
+        if is_program:
+            from rtcp.api.program import Program
+
+            planned = [(one.line, one.plan) for one in Program(file).check(robot)]
+        else:
+            planned = [(1, robot.preview(file=str(file.absolute()), approach=approach))]
+    listed = table(("line", "duration, s", "length, m", "part of the speed"))
+    for line, plan in planned:
+        length = "" if not plan.length_m else f"{plan.length_m:.3f}"
+        listed.add_row(str(line), f"{plan.duration_s:.2f}", length, "" if plan.slowed is None else f"{plan.slowed:.0%}")
+    show(listed)
+    report(f"{len(planned)} motions in {sum(plan.duration_s for _, plan in planned):.1f} s; nothing has moved")
+    if picture is not None:
+        from rtcp.cli.arm_plot import draw
+        from rtcp.ipc.runtime_directory import runtime_directory
+        from rtcp.ipc.session import read_session
+
+        model = read_session(runtime_directory()).config.arm
+        if model is None:
+            raise CommandError(
+                "--picture: the geometry of the arm is unknown: the key kinematics is missing in its file"
+            )
+        draw(model, planned[0][1].path[0], picture, [plan.path for _, plan in planned])
+        report(f"picture: {picture}")
 
 
 def arrival(arrived: Arrival) -> str:

@@ -5,6 +5,7 @@ The picture fits 80 columns and reads without colour.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -212,6 +213,8 @@ def _facts(status: Json) -> Table:
         joystick = status["joystick"]
         rows.add_row("joystick", f"{joystick['mode']}, controls the {'arm' if joystick['controls_arm'] else 'chair'}")
     rows.add_row("drives", _drives(status))
+    if status["tool"] is not None:
+        rows.add_row("tool", _tool(status["tool"]))
     rows.add_row("frames", _frames(status))
     if status["dc"] is not None:
         rows.add_row("clocks", _clocks(status))
@@ -235,6 +238,13 @@ def _drives(status: Json) -> str:
     if len(set(states)) == 1:
         return str(states[0])
     return ", ".join(f"{name} {state}" for name, state in zip(status["joint_names"], states, strict=True))
+
+
+def _tool(tool: Json) -> str:
+    """Return the measured pose of the tool and how fast it moves."""
+    position, angles = (" ".join(f"{one:+.4f}" for one in tool["pose"][at : at + 3]) for at in (0, 3))
+    speed, turn = (math.hypot(*tool["velocity"][at : at + 3]) for at in (0, 3))
+    return f"{position} m, {angles} rad, {speed:.3f} m/s, {turn:.3f} rad/s"
 
 
 def _value(name: str, value: Any, unit: str) -> str:

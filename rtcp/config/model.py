@@ -45,7 +45,7 @@ class HasBox(Protocol):
         """Name of the box; None: the only one."""
 
 
-PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator"})
+PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator", "tool"})
 """Parts of the cycle that are no devices: their fields have names of their own."""
 VIRTUAL = "virtual"
 """Name of the bus that is a segment in software."""
@@ -498,6 +498,18 @@ class JoystickConfig:
 
 
 @dataclass(frozen=True)
+class NamedTerminal:
+    """A terminal of the IO box that programs use by a name."""
+
+    name: Name
+    """Name for programs (`robot.io`); unique among inputs and outputs, no dot, not that of a function."""
+    number: Terminal
+    """Terminal of the IO box; none of a box is used twice."""
+    box: Name | None = None
+    """IO box of the terminal; needed with several boxes."""
+
+
+@dataclass(frozen=True)
 class InputsConfig:
     """Inputs with a meaning; one that is left out does not exist."""
 
@@ -508,6 +520,8 @@ class InputsConfig:
     """Active: motion is allowed. Release stops; pressing again moves nothing until a new command."""
     emergency_stop: EmergencyStopConfig | None = None
     """Active: pressed."""
+    named: tuple[NamedTerminal, ...] = ()
+    """Inputs that programs read by a name."""
 
 
 @dataclass(frozen=True)
@@ -522,6 +536,8 @@ class OutputsConfig:
     """Output terminal: toggled each cycle, for an oscilloscope."""
     box: Name | None = None
     """IO box of these outputs; needed with several boxes."""
+    named: tuple[NamedTerminal, ...] = ()
+    """Outputs that programs set by a name."""
 
 
 @dataclass(frozen=True)
@@ -785,6 +801,22 @@ class ArmConfig(ArmSettings):
         named = None if user is None else user.box
         return named if named is not None else boxes[0] if boxes else ""
 
+    def terminals(self, section: InputsConfig | OutputsConfig) -> dict[str, tuple[str, int]]:
+        """Return box and number of each terminal that a section names, by its name or the key of its function."""
+        if not self.boxes:
+            return {}
+        found: dict[str, tuple[str, int]] = {}
+        for key, value in vars(section).items():
+            if isinstance(value, int):
+                found[key] = self.box_of(section if isinstance(section, OutputsConfig) else None), value
+            elif isinstance(value, tuple):
+                found |= {one.name: (self.box_of(one), one.number) for one in value}
+            elif isinstance(value, InputConfig):
+                found[key] = self.box_of(value), value.number
+            elif isinstance(value, JoystickConfig):
+                found |= {name: (self.box_of(value), one) for name, one in vars(value).items() if isinstance(one, int)}
+        return found
+
 
 # -- motion files ------------------------------------------------------------------------------------------------------
 
@@ -827,10 +859,70 @@ class Stop:
 
 
 @dataclass(frozen=True)
+class NamedPose:
+    """A place of a program; it has either `pose` or `q`."""
+
+    name: Name
+    """By which steps name it."""
+    pose: _Coordinates | None = None
+    """x, y, z, rx, ry, rz of the tool, m and rad."""
+    q: _Coordinates | None = None
+    """Joint positions, rad."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of a program: one of `move`, `line`, `arc`, `gripper`, `output`, `wait_for`, `wait_s` and `run`."""
+
+    move: Name | None = None
+    """Move to this pose by the joints."""
+    line: Name | None = None
+    """Move to this pose on a straight line."""
+    arc: Name | None = None
+    """Move to this pose on the arc through `via`."""
+    via: Name | None = None
+    """Pose through whose place an arc leads."""
+    angle: Angle | None = None
+    """Angle to travel on the circle through the three places, rad; None: up to the pose."""
+    speed: Positive | None = None
+    """Speed of the tool, m/s; None: that of the file. By the joints: of the fastest one, rad/s."""
+    blend: NotNegative = 0.0
+    """Radius within which the corner to the next motion is rounded, m; 0: the tool rests."""
+    gripper: Literal["open", "close"] | None = None
+    """Open or close the gripper."""
+    output: Name | None = None
+    """Set this output to `value`."""
+    wait_for: Name | None = None
+    """Wait until this input has `value`."""
+    value: bool = True
+    """Level of an output or an input."""
+    timeout_s: Positive | None = None
+    """Longest wait for an input, s; None: for ever."""
+    wait_s: Positive | None = None
+    """Time to wait, s."""
+    run: Name | None = None
+    """Run this part."""
+    times: Annotated[int, Ge(0), Le(1_000_000)] = 1
+    """How often a part runs; 0: for ever."""
+
+
+@dataclass(frozen=True)
+class ProgramPart:
+    """Steps that are run by name."""
+
+    name: Name
+    """By which steps name it."""
+    steps: Annotated[tuple[Step, ...], MinLen(1), MaxLen(MOST_POINTS)]
+
+
+@dataclass(frozen=True)
 class MotionFile:
-    """A motion: either `trajectory` or `path` has entries."""
+    """A motion: one of `trajectory`, `path` and `program` has entries."""
 
     trajectory: Annotated[tuple[Point, ...], MaxLen(MOST_POINTS)] = ()
     path: Annotated[tuple[Stop, ...], MaxLen(MOST_POINTS)] = ()
     speed: Positive | None = None
-    """Speed of the tool on a path, m/s; None: `cartesian.speed` of the arm's file."""
+    """Speed of the tool on paths and in programs, m/s; None: `cartesian.speed` of the arm's file."""
+    poses: Annotated[tuple[NamedPose, ...], MaxLen(MOST_POINTS)] = ()
+    program: Annotated[tuple[Step, ...], MaxLen(MOST_POINTS)] = ()
+    parts: Annotated[tuple[ProgramPart, ...], MaxLen(MOST_POINTS)] = ()

@@ -11,6 +11,8 @@ A trajectory, by time and joints, or a path, by poses that straight lines connec
       - {pose: [-0.5, 0.1, 0.6, 0, 0, 0]}
       - {q: [0, 0.3, pi/2, 0, 0.3, 0], speed: 0.05}
 
+Or a program: steps by named poses, with waits, inputs, outputs, the gripper and parts (`rtcp.api.program` runs it).
+
 The same in CSV, recognized by its header: `t,q1,..,q6` with `,v1,..,v6` and `,a1,..,a6` if given, or `x,y,z,rx,ry,rz`
 with `,speed` if given.
 """
@@ -20,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
 import rtcp.config.rules  # noqa: F401 its rules hold for motion files too
 from rtcp.config.document import Document, read, text_of
@@ -37,6 +40,16 @@ def read_motion(path: Path) -> MotionFile:
     Raises:
         ConfigError: one sentence per mistake, with its line.
     """
+    return read_document(path)[1]
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON schema of motion files in YAML."""
+    return _FILE.json_schema()
+
+
+def read_document(path: Path) -> tuple[Document, MotionFile]:
+    """Return the document too, which knows the line of every key; raises as `read_motion`."""
     ending = path.suffix.lower()
     if ending not in (".csv", ".yaml", ".yml"):
         raise ConfigError([f'{path}: the ending "{path.suffix}" selects no form; allowed are .yaml, .yml and .csv'])
@@ -44,7 +57,7 @@ def read_motion(path: Path) -> MotionFile:
     motion, findings = _FILE.check(document.data)
     if motion is None or problems:
         raise ConfigError(problems + document.sentences(findings))
-    return motion
+    return document, motion
 
 
 def _read_csv(path: Path) -> tuple[Document, list[str]]:

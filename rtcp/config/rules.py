@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
 
 from rtcp.config.document import Finding, KeyPath, dotted
 from rtcp.config.find import registered
@@ -24,16 +25,21 @@ from rtcp.config.model import (
     EthercatBus,
     GripperConfig,
     HasBox,
+    InputsConfig,
     Joint,
     KeepOut,
     Kinematics,
     MechanicalLimit,
     MotionFile,
+    NamedPose,
+    NamedTerminal,
+    OutputsConfig,
     Pdo,
     PdoEntry,
     Point,
     Range,
     StartupSdo,
+    Step,
     Stop,
     integer_range,
 )
@@ -311,6 +317,7 @@ def _inputs(arm: ArmFile) -> Terminals:
     for key in ("arm_toggle", "enabling_switch", "emergency_stop"):
         if terminal := getattr(arm.inputs, key):
             yield ("inputs", key), terminal, ((("inputs", key, "number"), terminal.number),)
+    yield from _named("inputs", arm.inputs.named)
 
 
 def _outputs(arm: ArmFile) -> Terminals:
@@ -319,6 +326,24 @@ def _outputs(arm: ArmFile) -> Terminals:
         yield ("outputs",), arm.outputs, found
     if arm.gripper and arm.gripper.output is not None:
         yield ("gripper",), arm.gripper, ((("gripper", "output"), arm.gripper.output),)
+    yield from _named("outputs", arm.outputs.named)
+
+
+def _named(section: str, terminals: Sequence[NamedTerminal]) -> Terminals:
+    for i, terminal in enumerate(terminals):
+        where = (section, "named", i)
+        yield where, terminal, (((*where, "number"), terminal.number),)
+
+
+@rule(ArmFile, "inputs", "outputs")
+def _terminal_names(arm: ArmFile) -> Iterator[Finding]:
+    sections = (("inputs", arm.inputs.named), ("outputs", arm.outputs.named))
+    names = [((section, "named", i, "name"), one.name) for section, named in sections for i, one in enumerate(named)]
+    yield from _repeated(names, "name")
+    functions = {one.name for kind in (InputsConfig, OutputsConfig) for one in fields(kind)} | set(JOYSTICK_TERMINALS)
+    for where, name in names:
+        if name in functions or "." in name:
+            yield where, f'found the text "{name}", allowed is a name without a dot that is not that of a function'
 
 
 def _repeated_by_box(terminals: Terminals, what: str) -> Iterator[Finding]:
@@ -560,12 +585,76 @@ def _stop(stop: Stop) -> Iterator[Finding]:
         yield ("by_joints",), "found via beside it, allowed is one of them"
 
 
+@rule(NamedPose)
+def _named_pose(pose: NamedPose) -> Iterator[Finding]:
+    if (pose.pose is None) == (pose.q is None):
+        yield (), f"found {'neither' if pose.pose is None else 'both'} of pose and q; one of them is needed"
+
+
+_VERBS = ("move", "line", "arc", "gripper", "output", "wait_for", "wait_s", "run")
+_OF_VERBS = {
+    "via": ("arc",),
+    "angle": ("arc",),
+    "speed": ("move", "line", "arc"),
+    "blend": ("move", "line", "arc"),
+    "value": ("output", "wait_for"),
+    "timeout_s": ("wait_for",),
+    "times": ("run",),
+}
+"""Keys of a step, and those of which one has to stand beside each."""
+
+
+@rule(Step)
+def _step(step: Step) -> Iterator[Finding]:
+    found = [verb for verb in _VERBS if getattr(step, verb) is not None]
+    if len(found) != 1:
+        yield (), f"found {' and '.join(found) or 'none of them'}, allowed is one of {', '.join(_VERBS)}"
+        return
+    for key, verbs in _OF_VERBS.items():
+        default = next(one.default for one in fields(Step) if one.name == key)
+        if getattr(step, key) != default and found[0] not in verbs:
+            yield (key,), f"found beside {found[0]}, allowed beside {' or '.join(verbs)}"
+    if step.arc is not None and step.via is None:
+        yield ("arc",), "an arc needs via beside it"
+
+
+@rule(MotionFile, "poses", "program", "parts")
+def _program(motion: MotionFile) -> Iterator[Finding]:
+    poses, parts = [one.name for one in motion.poses], [one.name for one in motion.parts]
+    for key, names in (("poses", poses), ("parts", parts)):
+        for at, name in enumerate(names):
+            if name in names[:at]:
+                yield (key, at, "name"), f'found "{name}" twice, allowed is once'
+    lists: list[tuple[tuple[str | int, ...], tuple[Step, ...]]] = [(("program",), motion.program)]
+    lists += [(("parts", at, "steps"), part.steps) for at, part in enumerate(motion.parts)]
+    for where, steps in lists:
+        for at, step in enumerate(steps):
+            for key in ("move", "line", "arc", "via", "run"):
+                name, allowed = getattr(step, key), parts if key == "run" else poses
+                if name is not None and name not in allowed:
+                    yield (*where, at, key), f'found "{name}", allowed is one of {", ".join(allowed) or "none"}'
+    calls = {part.name: {step.run for step in part.steps if step.run is not None} for part in motion.parts}
+    for at, name in enumerate(parts):
+        reached, ahead = set[str](), set(calls[name])
+        while ahead:
+            one = ahead.pop()
+            if one not in reached:
+                reached.add(one)
+                ahead |= calls.get(one, set())
+        if name in reached:
+            yield ("parts", at, "steps"), f'the part "{name}" runs itself; parts may only run others'
+
+
 @rule(MotionFile, EVERY_KEY)
 def _one_form(motion: MotionFile) -> Iterator[Finding]:
-    if not motion.trajectory and not motion.path:
-        yield (), "neither trajectory nor path has entries; one of them is needed"
-    if motion.trajectory and motion.path:
-        yield ("path",), "a file holds a trajectory or a path, found both; write two files"
+    found = [key for key in ("trajectory", "path", "program") if getattr(motion, key)]
+    if not found:
+        yield (), "none of trajectory, path and program has entries; one of them is needed"
+    if len(found) > 1:
+        yield (found[1],), f"a file holds one of trajectory, path and program, found {' and '.join(found)}"
+    for key in ("poses", "parts"):
+        if getattr(motion, key) and not motion.program:
+            yield (key,), "found without program, allowed beside it"
     if motion.trajectory and motion.speed is not None:
         yield ("speed",), "a speed is for a path; a trajectory's follows from its times"
 

@@ -70,7 +70,12 @@ def _schema_with(check: Rule[Any]) -> Callable[[Any, Any], Any]:
             raise ValidationError.from_exception_data("rules", wrong)
         return value
 
-    return lambda source, handler: core_schema.no_info_after_validator_function(run, handler(source))
+    def schema(source: Any, handler: Any) -> Any:
+        inner = handler(source)
+        # Its name goes to the schema with the rule: by it pydantic finds the schema where the class is used again.
+        return core_schema.no_info_after_validator_function(run, inner, ref=inner.pop("ref", None))
+
+    return schema
 
 
 class Checker(Generic[T]):
@@ -117,6 +122,12 @@ class Checker(Generic[T]):
         findings += self._file_findings(made, data, invalid, more)
         return (None if findings else made), findings
 
+    def json_schema(self) -> dict[str, Any]:
+        """Return the JSON schema of such a file, for editors; it has no rules between values."""
+        found = self._adapter.json_schema()
+        made: dict[str, Any] = _with_pi({"$defs": found["$defs"], **found["items"]})
+        return {"$schema": "https://json-schema.org/draft/2020-12/schema", **made}
+
     def read(self, document: Document, *more: FileRule) -> T:
         """Return the object of a file; `more` rules as of `check`.
 
@@ -160,6 +171,17 @@ def _adapter_of(kind: type) -> TypeAdapter[Any]:
     # Pydantic takes a configuration for a dataclass only from outside: from the list around it.
     around: Any = types.GenericAlias(list, (kind,))
     return TypeAdapter(around, config=_STRICT)
+
+
+def _with_pi(schema: Any) -> Any:
+    """Return a schema whose numbers may be written with pi."""
+    if isinstance(schema, list):
+        return [_with_pi(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    if schema.get("type") == "number":
+        return {"anyOf": [schema, {"type": "string", "pattern": "pi"}]}
+    return {key: _with_pi(value) for key, value in schema.items()}
 
 
 def _validated(adapter: TypeAdapter[Any], data: object) -> Any:

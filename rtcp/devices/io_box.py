@@ -6,7 +6,14 @@ import struct
 from collections.abc import Sequence
 from typing import Any, Final
 
-from rtcp.config.model import GripperConfig, InputConfig, InputsConfig, OutputsConfig, SlaveConfig
+from rtcp.config.model import (
+    GripperConfig,
+    InputConfig,
+    InputsConfig,
+    NamedTerminal,
+    OutputsConfig,
+    SlaveConfig,
+)
 from rtcp.devices.driver import DeviceError, Driver
 from rtcp.fieldbus.pdo import TYPES, ImageLayout
 from rtcp.ipc.schema import Field
@@ -245,7 +252,8 @@ class JoystickInput:
         self._debounce = round(joystick.debounce_ms * 1e-3 / cycle_s)
         self._byte_at = (min(numbers) - 1) // 8 * 8
         others = (config.arm_toggle, config.enabling_switch, config.emergency_stop)
-        switches = [switch for switch in others if switch is not None]
+        switches: list[InputConfig | NamedTerminal] = [one for one in others if one is not None]
+        switches += config.named
         # What names no box hangs on the only one.
         same_box = [switch for switch in switches if switch.box == joystick.box or None in (switch.box, joystick.box)]
         meant = sum(1 << switch.number - 1 for switch in same_box)

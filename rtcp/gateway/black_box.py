@@ -24,6 +24,7 @@ from rtcp.ipc.observer import EventRecord, Observer
 from rtcp.ipc.recording import About, FaultRecording, Moment, RecordingError, listed, versions, write
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import State
+from rtcp.ipc.tool_motion import ToolMotion
 
 SILENT_S = 1.0
 """A loop that has published nothing for so long hangs."""
@@ -307,9 +308,9 @@ class BlackBox:
             notes=(*_lacking(records, at, silent_s), *notes),
             timeline=timeline,
         )
-        return FaultRecording(
-            about, {name: records[name] for name in self._observer.schema.names}, self._observer.schema
-        )
+        tool = ToolMotion(config.arm, self._observer.schema)
+        records = tool.add(records)
+        return FaultRecording(about, {name: records[name] for name in tool.schema.names}, tool.schema)
 
     def _timeline(self, fault: FaultRecord, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
         """Return what was said in the recording's time, and what of that is lost."""

@@ -31,6 +31,7 @@ from rtcp.gateway.motion_actions import MotionActions, Planner
 from rtcp.gateway.process_actions import ProcessActions
 from rtcp.gateway.recordings import Recordings
 from rtcp.gateway.status_snapshot import StatusSnapshot
+from rtcp.gateway.terminals import Terminals
 from rtcp.gateway.tolerances import Tolerances
 from rtcp.ipc import commands
 from rtcp.ipc.commands import COMMANDS, Command, MotionCommand, ProcessCommand
@@ -123,6 +124,7 @@ class Methods:
         self._limits = LimitSettings(channel, limits, directory)
         self._motion = MotionActions(channel, Planner(config, limits))
         self._processes = ProcessActions(channel, config)
+        self._terminals = Terminals(channel)
         self._cell = CellActions(session, self._motion, limits)
         self.table = self._table()
 
@@ -367,19 +369,40 @@ class Methods:
         line: bool = False,
         synchronized: bool = True,
         approach: bool = False,
+        stops: tuple[Stop, ...] = (),
+        start: Numbers | None = None,
     ) -> Json:
-        """Plan a motion as `move_joints`, `move_pose` or `run` would, and move nothing.
+        """Plan a motion as `move_joints`, `move_pose`, `run` or `run_path` would, and move nothing.
 
+        It begins where the arm is commanded, or, of a path, at the joint positions `start`, rad.
         Returns `path`, configurations along it, rad, `duration_s`, and of lines `length_m` and `slowed`; refused with
         what would refuse it, or where its way leads through a box.
         """
-        if (q is not None) + (pose is not None) + (file is not None) != 1:
-            raise RtcpError("invalid", "found none or several of q, pose and file, allowed is one of them")
+        if (q is not None) + (pose is not None) + (file is not None) + bool(stops) != 1:
+            raise RtcpError("invalid", "found none or several of q, pose, file and stops, allowed is one of them")
+        if start is not None:
+            self._check_count("start", start, len(self._config.joints))
+        if stops:
+            return await self._motion.preview(None, stops, (), speed, synchronized, start)
         if file is not None:
             return await self._motion.preview_file(file, approach)
         if pose is not None:
             return await self._motion.preview_pose(pose, speed, line)
         return await self._motion.preview(q, (), (), speed, synchronized)
+
+    @method(at_once=True)
+    async def fk(self, caller: Caller, q: Numbers) -> Json:
+        """Return the `pose` of the tool, x y z, m, rx ry rz, rad, at joint positions, rad."""
+        return await self._motion.fk(q)
+
+    @method(at_once=True)
+    async def ik(self, caller: Caller, pose: Numbers, near: Numbers | None = None) -> Json:
+        """Return the joint positions `q`, rad, nearest to `near` or to where the arm is, that bring the tool to `pose`.
+
+        Refused with reason `out_of_reach` (`distance`, m), `joint_limited` (`axis`, `joint`), `in_box` (`box`), or
+        `no_geometry`.
+        """
+        return await self._motion.ik(pose, near)
 
     @method()
     async def run(self, caller: Caller, file: str, approach: bool = False) -> Json:
@@ -525,6 +548,27 @@ class Methods:
         async with self.channel.lease(caller) as lease:
             await self.channel.send(lease, commands.SetOutput(output, value, boxes.index(box) if box else 0))
         return {}
+
+    @method(at_once=True)
+    async def read_io(self, caller: Caller) -> Json:
+        """Return `inputs` and `outputs`: `name`, `box`, `number` and level `value` of all terminals of the IO boxes."""
+        return self._terminals.read()
+
+    @method()
+    async def write_io(self, caller: Caller, name: str, value: bool) -> Json:
+        """Set the digital output of a name (`outputs.named`, or `box.number`) as `set_output` does."""
+        return await self._terminals.write(caller, name, value)
+
+    @method(at_once=True)
+    async def wait_io(
+        self,
+        caller: Caller,
+        name: str,
+        value: bool = True,
+        timeout_s: Annotated[float, Ge(0)] | None = None,
+    ) -> Json:
+        """Return when the input or output of a name has the level `value`, if only for a cycle; without lease."""
+        return await self._terminals.wait(caller, name, value, timeout_s)
 
     # -- commands without a function of their own ---------------------------------------------------------------------
 

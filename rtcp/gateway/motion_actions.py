@@ -91,7 +91,8 @@ class Planner:
         arm = self._config.arm
         if arm is None:
             file = self._config.source
-            raise RtcpError("refused", f"the geometry of the arm is unknown: the key kinematics is missing in {file}")
+            message = f"the geometry of the arm is unknown: the key kinematics is missing in {file}"
+            raise RtcpError("refused", message, "no_geometry")
         limits = zip(self.limits.low, self.limits.high, self.limits.velocity, strict=True)
         return dataclasses.replace(arm, limits=tuple(JointLimit(*three) for three in limits))
 
@@ -111,10 +112,15 @@ class Planner:
         """Return the joint positions, rad, nearest to `q_now` that bring the tool to `pose` (m, rad)."""
         _require_pose(pose, "pose")
         found = InverseKinematics(self._model()).solve_near(Pose.from_xyzrpy(*pose), q_now)
+        message, fields = f"the pose cannot be reached: {found.reason}", {"distance": found.out_of_reach}
+        if found.q is None and found.limited >= 0:
+            joint = self._config.joints[found.limited].name
+            raise RtcpError("refused", message, "joint_limited", {"axis": found.limited, "joint": joint})
         if found.q is None:
-            raise RtcpError("refused", f"the pose cannot be reached: {found.reason}")
+            raise RtcpError("refused", message, "out_of_reach", fields)
         if box := self._zone_at(found.q):
-            raise RtcpError("refused", f"the pose cannot be reached: the arm would be in {box}")
+            message = f"the pose cannot be reached: the arm would be in {box}"
+            raise RtcpError("refused", message, "in_box", {"box": box})
         return list(found.q)
 
     def moved_by(self, q: Sequence[float], offset: Sequence[float], frame: JogFrame) -> Pose:
@@ -124,6 +130,11 @@ class Planner:
             return here @ moved
         x, y, z = (a + b for a, b in zip(here.position, moved.position, strict=True))
         return Pose((x, y, z), times(moved.rotation, here.rotation))
+
+    def pose_at(self, q: Sequence[float]) -> list[float]:
+        """Return the pose of the tool, x y z, m, rx ry rz, rad, at joint positions, rad, inside the limits or not."""
+        pose = forward(self._model(), q)
+        return [*pose.position, *pose.rpy]
 
     def path(self, stops: Sequence[Stop], q_now: Sequence[float], speed: float | None) -> Plan:
         """Return the plan of a path from `q_now` to each stop in turn, its lines and arcs at most at `speed`, m/s.
@@ -142,7 +153,7 @@ class Planner:
 
             return plan_path(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
         except PlanRefused as refused:
-            raise RtcpError("refused", str(refused)) from None
+            raise RtcpError("refused", str(refused), type(refused).__name__) from None
 
     def trajectory(self, points: Sequence[Point], q_now: Sequence[float], moving: bool = False) -> Plan:
         """Return the plan of a trajectory that begins at `q_now`; or, `moving`, on the way there."""
@@ -229,8 +240,7 @@ class MotionActions:
 
     async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
         """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
-        if len(q) != self._count:
-            raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
+        self._require_joints(q, "q")
         async with self._channel.lease(caller) as lease:
             return await self._move(lease, q, speed, synchronized, self._says_accepted(caller))
 
@@ -263,6 +273,9 @@ class MotionActions:
         """Run a motion file."""
         # In a thread, as all planning: leases are renewed meanwhile.
         points, stops, speed = await asyncio.to_thread(self._planner.read, file)
+        if not (stops or points):
+            text = f"{file} holds a program, which steps of a client run: `rtcp run` or `rtcp.Program`"
+            raise RtcpError("refused", text, "program")
         if stops:
             return await self.run_path(caller, stops, speed, approach)
         return await self.run_trajectory(caller, points, approach)
@@ -474,12 +487,12 @@ class MotionActions:
         points: Sequence[Point],
         speed: float | None,
         synchronized: bool,
+        start: Sequence[float] | None = None,
     ) -> Json:
-        """Return the way of a motion to `q`, along lines, or of a trajectory, that would begin now."""
-        here = self.plan_start()
+        """Return the way of a motion to `q`, of a path, or of a trajectory, from now on, or from `start`, rad."""
+        here = self.plan_start() if start is None else list(start)
         if q is not None:
-            if len(q) != self._count:
-                raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
+            self._require_joints(q, "q")
             found = await asyncio.to_thread(self._planner.joint_move, q, here, speed, synchronized)
             if isinstance(found, Refusal):
                 raise self._channel.error("refused", found)
@@ -503,6 +516,8 @@ class MotionActions:
     async def preview_file(self, file: str, approach: bool) -> Json:
         """Return the way of a motion file; with `approach` it begins at its first point."""
         points, stops, speed = await asyncio.to_thread(self._planner.read, file)
+        if not (stops or points):
+            raise RtcpError("refused", f"{file} holds a program: `rtcp run --dry` plans it", "program")
         if not approach:
             return await self.preview(None, stops, points, speed, True)
         first = points[0].q if points else stops[0].q
@@ -531,6 +546,22 @@ class MotionActions:
 
         async with self._channel.lease(caller) as lease:
             return await self._run(lease, command, _UNPLANNED_S, command.name, position)
+
+    async def fk(self, q: Sequence[float]) -> Json:
+        """Return the pose of the tool at joint positions, rad."""
+        self._require_joints(q, "q")
+        return {"pose": self._planner.pose_at(q)}
+
+    async def ik(self, pose: Sequence[float], near: Sequence[float] | None) -> Json:
+        """Return the joint positions nearest to `near`, or to where the arm is, that bring the tool to a pose."""
+        if near is not None:
+            self._require_joints(near, "near")
+        start = self.plan_start() if near is None else near
+        return {"q": await asyncio.to_thread(self._planner.joints_at, pose, start)}
+
+    def _require_joints(self, q: Sequence[float], key: str) -> None:
+        if len(q) != self._count:
+            raise RtcpError("invalid", f"{key}: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
 
     def _joints(self, q: Sequence[float]) -> Sequence[float]:
         if len(q) != self._count:

@@ -33,6 +33,7 @@ from rtcp.ipc.schema import (
 )
 from rtcp.ipc.session import Processes, Session, is_running
 from rtcp.ipc.states import ControlMode, DriveMode, DriveState, State
+from rtcp.ipc.tool_motion import ToolMotion
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.realtime.statistics import SlidingPercentiles, diagnose
@@ -75,6 +76,7 @@ class StatusSnapshot:
         self.names = Names(session.config, session.partners)
         self.limits = Limits(session.config)
         """In force."""
+        self._tool = None if session.config.arm is None else ToolMotion(session.config.arm, observer.schema)
         self._at = max(observer.head - 1, 0)
         self._event = 0
         self._text = 0
@@ -258,6 +260,15 @@ class StatusSnapshot:
             for position, (slave, (al, code), health) in enumerate(found, 1)
         ]
 
+    def _tool_motion(self, record: np.void) -> dict[str, list[float]] | None:
+        """Return measured pose, velocity and commanded pose of the tool, m and rad; None without geometry."""
+        if self._tool is None:
+            return None
+        q = np.stack([record["actual_position"], record["commanded_position"]])
+        poses, velocities = self._tool.of(q, np.stack([record["actual_velocity"]] * 2))
+        found = {"pose": poses[0], "velocity": velocities[0], "commanded_pose": poses[1]}
+        return {name: [round(one, 7) for one in values.tolist()] for name, values in found.items()}
+
     def _devices(self, record: np.void) -> dict[str, dict[str, dict[str, Any]]]:
         """Return value and unit of what each slave that is no drive publishes, by slave and field."""
         found: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in self._session.config.boxes}
@@ -333,6 +344,7 @@ class StatusSnapshot:
                 for name in PER_JOINT
                 if record[name].dtype.kind == "f"
             },
+            "tool": self._tool_motion(record),
             # An arm that stops does not go there any more.
             "goal": None
             if goal is None or problem or state is not State.MOVING

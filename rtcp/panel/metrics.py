@@ -82,6 +82,15 @@ class PlatformCollector(Collector):
                 family.add_metric([joint], value)
             yield family
 
+        for key, first, unit in (
+            ("pose", 0, "metres"), ("pose", 3, "radians"),
+            ("velocity", 0, "metres_per_second"), ("velocity", 3, "radians_per_second"),
+        ):  # fmt: skip
+            family = GaugeMetricFamily(f"rtcp_tool_{key}_{unit}", f"Measured {key} of the tool.", labels=["axis"])
+            for axis, value in zip("xyz", (raw["tool"] or {}).get(key, ())[first:], strict=False):
+                family.add_metric([axis], value)
+            yield family
+
         devices = GaugeMetricFamily(
             "rtcp_device_value", "What a slave that is no drive publishes.", labels=["device", "field", "unit"]
         )

@@ -134,7 +134,7 @@ class Channels:
         self._machine = self._json_channel("/machine", {"type": "object", "title": "rtcp.Machine"})
         self._log = self._json_channel("/log", LOG_SCHEMA)
         self._last: npt.NDArray[np.int64] | None = None
-        self._inputs, self._outputs = terminals(config, config.inputs), terminals(config, config.outputs)
+        self._inputs, self._outputs = config.terminals(config.inputs), config.terminals(config.outputs)
         self._outputs.pop("heartbeat", None)  # it changes in every cycle
         for places, which in ((self._inputs, "inputs"), (self._outputs, "outputs")):
             for name in [name for name, (box, _) in places.items() if box_field(box, which) not in schema.names]:
@@ -248,21 +248,6 @@ def urdf_of(config: ArmConfig) -> str:
 
 Terminal = tuple[str, int]
 """Box and number, from 1."""
-
-
-def terminals(config: ArmConfig, section: Any) -> dict[str, Terminal]:
-    """Return the terminals that a section of inputs or outputs names, by the name of the key."""
-    if not config.boxes:
-        return {}
-    found: dict[str, Terminal] = {}
-    for key, value in vars(section).items():
-        if isinstance(value, int):
-            found[key] = config.box_of(section), value
-        elif hasattr(value, "number"):
-            found[key] = config.box_of(value), value.number
-        elif hasattr(value, "box"):
-            found |= {name: (config.box_of(value), one) for name, one in vars(value).items() if isinstance(one, int)}
-    return found
 
 
 def box_field(box: str, which: str) -> str:

@@ -7,6 +7,7 @@ import dataclasses
 import gc
 import inspect
 import pydoc
+import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
@@ -292,3 +293,43 @@ def test_a_connection_that_the_platform_closes_fails_every_call_that_waits(tmp_p
                 await robot.status()
 
     asyncio.run(work())
+
+
+def test_inputs_and_outputs_are_mappings_by_name_and_by_place(robot: Robot, loop: FakeLoop) -> None:
+    loop.inputs, loop.outputs = 1 << 9, 1 << 4
+    robot.wait_io("emergency_stop", True, 2.0)
+    inputs, outputs = robot.io.inputs, robot.io.outputs
+    assert [name for name, value in inputs.items() if value] == ["emergency_stop"]
+    assert inputs["io.10"]
+    assert "io.17" not in inputs
+    assert [name for name, value in outputs.items() if value] == ["io.5"]
+    assert robot.io["emergency_stop"]
+    assert robot.io["io.10"]
+    with pytest.raises(KeyError, match=r"none: allowed is one of state_lamp, .*io\.16"):
+        robot.io["none"]
+    robot.io["io.6"] = True
+    assert loop.received(SetOutput) == [SetOutput(6, True)]
+
+
+def test_a_wait_for_an_input_of_another_thread_ends_with_it(robot: Robot, loop: FakeLoop) -> None:
+    threading.Timer(0.1, lambda: setattr(loop, "inputs", 1 << 11)).start()
+    robot.io.wait("io.12", True, timeout_s=5.0)
+    with pytest.raises(rtcp.TimedOut) as late:
+        robot.io.wait("io.12", False, timeout_s=0.1)
+    assert (late.value.reason, late.value.fields["name"]) == ("level_not_reached", "io.12")
+
+
+def test_pose_fk_and_ik_are_the_same_in_both_robots(directory: Path, robot: Robot, loop: FakeLoop) -> None:
+    loop.q = [0.1, 0.3, 1.5, 0.2, 0.5, 0.4]
+    time.sleep(0.05)
+    assert robot.positions == pytest.approx(loop.q)
+    pose = robot.fk(loop.q)
+    assert robot.pose == pytest.approx(pose, abs=1e-6)
+    assert robot.status().tool_velocity == (0.0,) * 6
+    assert robot.ik(pose) == pytest.approx(loop.q, abs=1e-9)
+
+    async def asked(other: AsyncRobot) -> Any:
+        return await other.pose(), await other.positions(), await other.ik(await other.fk(loop.q), near=loop.q)
+
+    found = run(directory, asked)
+    assert [found[0], found[1], found[2]] == [pytest.approx(one, abs=1e-6) for one in (pose, loop.q, loop.q)]

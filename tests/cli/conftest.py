@@ -116,6 +116,8 @@ def status() -> dict[str, Any]:
         },
         "start_to_op_s": 1.5,
         "pids": {"loop": 11, "gateway": 12, "segment": 13},
+        "tool": {"pose": [0.1, -0.2, 0.9, 0.0, 0.5, -1.0], "velocity": [0.03, 0.04, 0.0, 0.0, 0.0, 0.2],
+                 "commanded_pose": [0.1, -0.2, 0.9, 0.0, 0.5, -1.0]},
         "goal": None,
         "lease": {"holder": ""},
         "messages": [],

@@ -61,8 +61,11 @@ def test_a_path_in_csv(write: Write) -> None:
 
 POINT = "  - {t: 0, q: [0, 0]}\n"
 YAML = [
-    ("{}", "neither trajectory nor path has entries; one of them is needed"),
-    ("trajectory:\n" + POINT + "path:\n  - {q: [0, 0, 0, 0, 0, 0]}\n", "a file holds a trajectory or a path"),
+    ("{}", "none of trajectory, path and program has entries; one of them is needed"),
+    (
+        "trajectory:\n" + POINT + "path:\n  - {q: [0, 0, 0, 0, 0, 0]}\n",
+        "a file holds one of trajectory, path and program, found trajectory and path",
+    ),
     ("speed: 0.1\ntrajectory:\n" + POINT, "a speed is for a path"),
     ("speed: 0\npath:\n  - {q: [0, 0, 0, 0, 0, 0]}\n", "motion.yaml:1: speed: "),
     ("trajectry:\n" + POINT, "motion.yaml:1: trajectry: "),

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.config.model import EmergencyStopConfig, InputConfig, InputsConfig, JoystickConfig
+from rtcp.config.model import EmergencyStopConfig, InputConfig, InputsConfig, JoystickConfig, NamedTerminal
 from rtcp.devices.io_box import JoystickInput
 
 CYCLE = 0.0005
@@ -42,6 +42,12 @@ def test_each_code_of_the_table_means_what_it_says(code, meaning):
     assert stick.valid
     assert stick.code == code
     assert shown(stick) == meaning
+
+
+def test_an_input_beside_the_joysticks_that_has_a_name_leaves_its_code_as_it_is():
+    stick = held(stick_of(named=(NamedTerminal("part", 8),)), 62 | 1 << 7, 1)
+    assert (stick.valid, shown(stick)) == (True, TABLE[62])
+    assert not held(stick_of(), 62 | 1 << 7, 1).valid
 
 
 def test_of_the_256_bytes_only_those_of_the_table_are_codes():

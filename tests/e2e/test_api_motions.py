@@ -6,6 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
@@ -14,7 +15,8 @@ import pytest
 
 import rtcp
 from rtcp.api import Arrival, AsyncRobot, Robot, State
-from rtcp.ipc.runtime_directory import control_socket
+from rtcp.ipc.runtime_directory import control_socket, segment_control
+from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import Platform, kill
 
 pytestmark = pytest.mark.alone
@@ -90,6 +92,42 @@ def test_a_motion_that_would_replace_and_is_refused_leaves_the_other_as_it_is(sh
         return await first
 
     assert run(shared, moves).positions[0] == pytest.approx(0.3, abs=1e-3)
+
+
+def test_a_program_knows_the_tool_and_waits_for_an_input_and_sets_an_output(shared: Platform, robot: Robot) -> None:
+    pose = robot.fk(robot.positions)
+    assert robot.pose == pytest.approx(pose, abs=2e-3)
+    raised = [*pose[:2], pose[2] + 0.03, *pose[3:]]
+    feed = rtcp.Feed(shared.directory)
+    arrival = robot.move_joints(robot.ik(raised))
+    records, _ = feed.records()
+    feed.close()
+    assert robot.pose == pytest.approx(raised, abs=2e-3)
+    assert robot.ik(robot.fk(arrival.positions)) == pytest.approx(arrival.positions, abs=1e-6)
+    # The way that the record's velocity of the tool adds up to is that of its pose.
+    speeds, steps = records["tool_vz"][1:], np.diff(records["time_ns"]) * 1e-9
+    assert float(speeds @ steps) == pytest.approx(records["tool_z"][-1] - records["tool_z"][0], abs=3e-3)
+    assert records["tool_z"][-1] - records["tool_z"][0] == pytest.approx(0.03, abs=2e-3)
+    with pytest.raises(rtcp.Refused) as refused:
+        robot.ik([9.0, *pose[1:]])
+    assert refused.value.reason == "out_of_reach"
+
+    assert not robot.io["io.12"]
+    with SegmentClient(segment_control(shared.directory)) as segment, ThreadPoolExecutor(1) as program:
+        other = rtcp.connect("another program", control_socket(shared.directory))
+        waiting = program.submit(other.io.wait, "io.12", True, 10.0)
+        time.sleep(0.1)
+        assert not waiting.done()
+        segment.fault({"fault": "input", "number": 12, "how": "high"})
+        waiting.result(10.0)
+        other.close()
+    robot.io["io.5"] = True
+    robot.wait_io("io.5", True, 2.0)
+    assert robot.io.outputs["io.5"]
+    robot.io["io.5"] = False
+    with pytest.raises(rtcp.Refused) as refused:
+        robot.io["state_lamp"] = True
+    assert refused.value.reason == "reserved_output"
 
 
 @pytest.mark.parametrize("rate_hz", [100, 1000, 2000])

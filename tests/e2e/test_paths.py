@@ -182,3 +182,30 @@ def test_the_command_line_runs_a_circle_and_refuses_what_is_none(enabled: Platfo
         enabled.rtcp("step", *wrong, check=2)
     with pytest.raises(RtcpError, match="offset: found 2 numbers"):
         robot.move_by([0.0, 0.1])
+
+
+def test_a_program_is_planned_drawn_and_run(enabled: Platform, robot: Robot, tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "motion.md").read_text()
+    text = next(block for block in page.split("```yaml\n")[1:] if "parts:" in block).split("```")[0]
+    file, picture = tmp_path / "program.yaml", tmp_path / "way.png"
+    file.write_text("".join(line for line in text.splitlines(True) if "wait_for" not in line and "output" not in line))
+    before = robot.status().commanded_positions
+    planned = enabled.rtcp("run", str(file), "--dry", "--picture", str(picture))
+    assert "nothing has moved" in planned.stdout
+    assert picture.stat().st_size > 10_000
+    assert robot.status().commanded_positions == before
+    feed = rtcp.Feed(enabled.directory)
+    said = enabled.rtcp("run", str(file)).stdout
+    assert "program.yaml:16: 3 motions in one" in said
+    assert said.rstrip().endswith("the program is complete")
+    sent, _ = places(feed)
+    feed.close()
+    assert np.ptp(sent[:, 1]) > 0.13
+    assert robot.status().commanded_positions == pytest.approx(HERE, abs=1e-6)
+    file.write_text(text.replace("pose: [-0.66, 0.1, 0.23", "pose: [-3, 0.1, 0.23"))
+    refused = enabled.rtcp("run", str(file), check=3)
+    assert f"{file}:" in refused.stderr
+    assert robot.status().commanded_positions == pytest.approx(HERE, abs=1e-6)
+    assert enabled.rtcp("run", "--schema").stdout.startswith("{")
+    with pytest.raises(RtcpError, match="holds a program"):
+        robot.run(str(file))

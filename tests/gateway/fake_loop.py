@@ -14,26 +14,28 @@ from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunT
 from rtcp.ipc.events import Event, ZeroSet
 from rtcp.ipc.layout import PLAN_COLUMNS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
 from rtcp.ipc.refusals import Malformed, Refusal
-from rtcp.ipc.schema import arm_schema
+from rtcp.ipc.schema import Field, RecordSchema, arm_schema
 from rtcp.ipc.states import ControlMode, State
 from tests.records import numbers
 
 C = TypeVar("C", bound=Command)
 JOINTS = 6
 GRIPPER_AT = 0.4
+BOX = tuple(Field(f"io_{which}", "uint16", part="io") for which in ("inputs", "outputs"))
 _FOR_EVER = 1_000_000_000
 
 
 class FakeLoop:
     """Publishes a record a millisecond, answers commands and requests for the service thread.
 
-    What came: `commands`, `plans`, `requests`. What a test may set: `state`, `control_mode`, `q`; by kind of command
-    `refusals`, `ends` (where it leads) and `reports` (events that it leads to at once); `event_at_the_end` of a motion
-    that ends by itself, `ends_in`, the state then, and `moves_for`, its duration in turns of about a millisecond.
+    What came: `commands`, `plans`, `requests`. What a test may set: `state`, `control_mode`, `q`, `inputs`; by kind
+    of command `refusals`, `ends` (where it leads) and `reports` (events that it leads to at once);
+    `event_at_the_end` of a motion that ends by itself, `ends_in`, the state then, and `moves_for`, its duration in
+    turns of about a millisecond.
     """
 
     def __init__(self, path: Path, q: Sequence[float] = (0.0,) * JOINTS, state: State = State.READY) -> None:
-        self.board = Blackboard(path, arm_schema(JOINTS), 500_000)
+        self.board = Blackboard(path, RecordSchema((*arm_schema(JOINTS).fields, *BOX)), 500_000)
         self.commands: list[Command] = []
         self.plans: list[list[list[float]]] = []
         self.requests: list[dict[str, Any]] = []
@@ -55,6 +57,7 @@ class FakeLoop:
         self.control_mode = ControlMode.JOINT
         self.state = state
         self.q = list(q)
+        self.inputs = self.outputs = 0
 
     def clear(self) -> None:
         """Forget what came and what was set."""
@@ -104,6 +107,7 @@ class FakeLoop:
     def _publish(self) -> None:
         told = {"time_ns": time.monotonic_ns(), "state": self.state, "control_mode": self.control_mode}
         told |= dict.fromkeys(("actual_position", "commanded_position", "sent_position"), self.q)
+        told |= {"io_inputs": self.inputs, "io_outputs": self.outputs}
         self.board.publish(numbers(self.board.schema, **told))
 
     def _handle(self) -> None:

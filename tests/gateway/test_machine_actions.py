@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -104,6 +105,54 @@ def test_an_output_of_two_boxes_is_switched_at_the_named_one(tmp_path: Path) -> 
             error = arm.error("set_output", output=3, value=True, **box)
             assert (error.kind, str(error)) == ("invalid", f"box: {found}, allowed is one of io, desk")
         assert arm.loop.commands == [SetOutput(3, True, 1)]
+
+
+def test_a_wait_ends_with_the_level_and_needs_no_lease(arm: FakePlatform) -> None:
+    async def pressed() -> None:
+        waiting = asyncio.create_task(arm.call("wait_io", {"name": "arm_toggle", "timeout_s": 5.0}))
+        await asyncio.sleep(0.05)
+        assert not waiting.done()
+        assert arm.observer.holder() == ""
+        arm.loop.inputs = 1 << 8
+        await waiting
+
+    arm.run(pressed)
+    arm.ask("wait_io", name="io.9", timeout_s=0.0)
+
+
+def test_a_level_that_does_not_come_is_a_timeout_with_its_fields(arm: FakePlatform) -> None:
+    error = arm.error("wait_io", name="io.12", value=True, timeout_s=0.05)
+    assert (error.kind, error.reason) == ("timeout", "level_not_reached")
+    assert error.fields == {"name": "io.12", "value": True, "timeout_s": 0.05}
+    assert str(error) == "io.12 was not high within 0.05 s"
+
+
+def test_terminals_are_read_by_the_names_of_their_functions_or_by_box_and_number(arm: FakePlatform) -> None:
+    arm.loop.inputs, arm.loop.outputs = 1 << 9 | 1 << 15, 1 << 3
+    arm.show()
+    found = arm.ask("read_io")
+    levels = {which: {one["name"]: one["value"] for one in found[which]} for which in ("inputs", "outputs")}
+    assert (len(levels["inputs"]), len(levels["outputs"])) == (16, 16)
+    assert [name for name, value in levels["inputs"].items() if value] == ["emergency_stop", "io.16"]
+    assert [name for name, value in levels["outputs"].items() if value] == ["gripper"]
+
+
+def test_an_output_that_the_file_names_is_set_at_its_own_box(tmp_path: Path) -> None:
+    file = two_boxes(tmp_path / "config")
+    named = "outputs:\n  named: [{name: blower, number: 5, box: io}]\n"
+    file.write_text(file.read_text().replace("outputs:\n", named))
+    with fake_platform(tmp_path, Q, config=load(file)) as arm:
+        arm.ask("write_io", name="blower", value=True)
+        arm.ask("write_io", name="io.5", value=False)
+        assert arm.loop.commands == [SetOutput(5, True, 0), SetOutput(5, False, 0)]
+
+
+def test_a_terminal_that_is_none_is_refused_with_those_there_are(arm: FakePlatform) -> None:
+    error = arm.error("write_io", name="emergency_stop", value=True)  # an input
+    assert (error.kind, error.reason, error.fields["name"]) == ("invalid", "unknown_terminal", "emergency_stop")
+    assert error.fields["allowed"][:5] == ["state_lamp", "motion_lamp", "heartbeat", "gripper", "io.5"]
+    assert arm.error("wait_io", name="io.17").reason == "unknown_terminal"
+    assert arm.loop.commands == []
 
 
 def test_objects_are_read_at_any_time_and_written_in_state_ready_only(arm: FakePlatform) -> None:

@@ -333,6 +333,38 @@ def test_a_preview_is_refused_with_what_would_refuse_the_move(arm: FakePlatform)
     assert "cannot be reached" in str(arm.error("preview", pose=[5.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
+def test_ik_inverts_fk_near_the_arm_or_near_what_is_given(arm: FakePlatform) -> None:
+    pose = arm.ask("fk", q=THERE)["pose"]
+    assert arm.ask("ik", pose=pose)["q"] == pytest.approx(THERE, abs=1e-9)
+    turned = [*THERE[:3], 1.0, 0.5, -0.5]
+    flipped = [*THERE[:3], 1.0 - math.pi, -0.5, math.pi - 0.5]
+    pose = arm.ask("fk", q=turned)["pose"]
+    for near in (turned, flipped):
+        assert arm.ask("ik", pose=pose, near=near)["q"] == pytest.approx(near, abs=1e-9)
+    assert (arm.loop.commands, arm.observer.holder()) == ([], "")
+
+
+def test_ik_is_refused_with_how_far_or_which_joint_or_which_box(arm: FakePlatform) -> None:
+    far = arm.error("ik", pose=[5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert (far.kind, far.reason) == ("refused", "out_of_reach")
+    assert far.fields["distance"] > 3.0
+    low, high = arm.config.cartesian.keep_out[0].min, arm.config.cartesian.keep_out[0].max
+    middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+    boxed = [arm.error("ik", pose=[*middle, rx, ry, 0.0]) for rx in (0.0, 1.5, 3.0) for ry in (-1.5, 0.0, 1.5)]
+    assert {"in_box"} <= {error.reason for error in boxed} <= {"in_box", "joint_limited", "out_of_reach"}
+    assert all(error.fields["box"] for error in boxed if error.reason == "in_box")
+    arm.ask("set_limits", changes={"joint1.max": 0.2})
+    limited = arm.error("ik", pose=arm.ask("fk", q=[1.0, *BENT[1:]])["pose"])
+    assert limited.reason in ("joint_limited", "in_box")
+
+
+@pytest.mark.parametrize(("method", "key"), [("fk", "q"), ("ik", "near")])
+def test_a_configuration_with_too_few_joints_is_invalid(arm: FakePlatform, method: str, key: str) -> None:
+    pose = {"pose": [0.0] * 6} if method == "ik" else {}
+    error = arm.error(method, **pose, **{key: [0.0] * 5})
+    assert (error.kind, str(error)) == ("invalid", f"{key}: found 5 numbers, allowed are 6: one a joint, rad")
+
+
 FOLDED = [1.0, -1.9, 2.3, -2.9, -1.1, -0.2]
 """The forearm lies on the base."""
 ITSELF = "a collision with itself (the base and the link of joint3)"

@@ -7,8 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from kinematics.forward import forward
+from kinematics.jacobian import jacobian
 from rtcp.config import default_config, load
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.gateway import status_snapshot
@@ -37,9 +40,9 @@ class Written:
         self.observer = Observer(path)
         self.snapshot = StatusSnapshot(self.observer, Session(load(default_config()), "virtual", "ecat0", 0, 0), {})
 
-    def publish(self, state: State, moves: int = 0, wkc: int = 21, held: int = 0) -> None:
+    def publish(self, state: State, moves: int = 0, wkc: int = 21, held: int = 0, **joints: Any) -> None:
         told = {"state": state, "moves": moves, "wkc": wkc, "wkc_expected": 21, "flags": FLAG_DC_LOCKED, "held": held}
-        self.board.publish(numbers(self.board.schema, **told, time_ns=time.monotonic_ns()))
+        self.board.publish(numbers(self.board.schema, **told, time_ns=time.monotonic_ns(), **joints))
 
     @property
     def status(self) -> dict[str, Any]:
@@ -135,6 +138,17 @@ def test_a_silent_loop_is_reported_with_the_way_out_and_its_last_values_do_not_c
     assert " s; the drives' watchdog stops them" in status["message"]
     assert "`rtcp stop`, then `rtcp start`, if it stays so" in status["message"]
     assert (status["wkc"]["actual"], status["dc"]["locked"], status["goal"]) == (-1, False, None)
+
+
+def test_pose_and_velocity_of_the_tool_are_those_of_the_measured_joints(written: Written) -> None:
+    q, rates = [0.1, 0.3, 1.5, -0.2, 0.5, 0.4], [0.2, -0.1, 0.05, 0.3, -0.4, 1.0]
+    written.publish(State.HOLDING, actual_position=q, actual_velocity=rates, commanded_position=[0.0] * JOINTS)
+    tool, model = written.status["tool"], load(default_config()).arm
+    assert model is not None
+    for name, joints in (("pose", q), ("commanded_pose", [0.0] * JOINTS)):
+        pose = forward(model, joints)
+        assert tool[name] == pytest.approx([*pose.position, *pose.rpy], abs=1e-7)
+    assert tool["velocity"] == pytest.approx(np.array(jacobian(model, q)) @ rates, abs=1e-7)
 
 
 def test_one_lost_frame_is_one_cycle_of_the_last_second_and_not_the_platforms_state(written: Written) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from kinematics.damped_least_squares import solve_numeric
-from kinematics.forward import forward, forward_batch, frames
+from kinematics.forward import forward, forward_batch, frames, twist_batch
 from kinematics.inverse import InverseKinematics
 from kinematics.jacobian import jacobian, joint_velocity
 from kinematics.model import ArmModel
-from kinematics.pose import IDENTITY, Pose
+from kinematics.pose import IDENTITY, Pose, rpy_batch
 from tests.kinematics.arms import chain, matrix, random_configurations, with_general_rows, with_tool
 
 
@@ -137,3 +137,26 @@ def test_angles_in_an_array_of_any_type_are_as_those_in_a_list(assistive: ArmMod
         lambda given: solve_numeric(assistive, pose, given),
     ):
         assert function(q) == function(plain)
+
+
+@pytest.mark.parametrize("change", [replace, with_tool, with_general_rows])
+def test_twist_batch_agrees_with_the_jacobian(change, either):
+    model = change(either)
+    q, velocity = random_configurations(model, 300), np.random.default_rng(4).normal(0.0, 1.0, (300, 6))
+    expected = [np.array(jacobian(model, row)) @ rates for row, rates in zip(q.tolist(), velocity, strict=True)]
+    assert twist_batch(model, q, velocity) == pytest.approx(np.array(expected), abs=1e-13)
+
+
+def test_a_velocity_that_is_not_finite_is_named_with_its_place(either):
+    velocity = np.zeros((2, 6))
+    velocity[1, 3] = nan
+    with pytest.raises(ValueError, match=r"velocity\[1, 3\] is nan; a finite number is required"):
+        twist_batch(either, np.zeros((2, 6)), velocity)
+
+
+def test_rpy_batch_agrees_with_the_angles_of_each_pose_also_where_ry_is_a_right_angle(either):
+    q = random_configurations(either, 300)
+    poses = [forward(either, row) for row in q.tolist()]
+    poses += [Pose.from_xyzrpy(0.0, 0.0, 0.0, 0.3, sign * pi / 2, 0.4) for sign in (1, -1)]
+    rotations = np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3)
+    assert rpy_batch(rotations) == pytest.approx(np.array([pose.rpy for pose in poses]), abs=1e-12)

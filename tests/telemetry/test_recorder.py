@@ -37,6 +37,7 @@ from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import DriveState
+from rtcp.ipc.tool_motion import POSE, VELOCITY
 from tests.records import numbers
 
 CONFIG = load(default_config())
@@ -366,7 +367,11 @@ def test_a_recording_ends_before_the_disk_is_full(loop: Loop) -> None:
 @pytest.mark.parametrize(
     ("given", "reason", "fields"),
     [
-        ({"signals": ("time_ns", "nothing")}, "unknown_signal", {"signal": "nothing", "allowed": list(SCHEMA.names)}),
+        (
+            {"signals": ("time_ns", "nothing")},
+            "unknown_signal",
+            {"signal": "nothing", "allowed": [*SCHEMA.names, *POSE, *VELOCITY]},
+        ),
         ({"out": "/proc/nowhere"}, "not_writable", {"file": "/proc/nowhere", "error": "No such file or directory"}),
         (
             {"out": "/tmp/one.csv", "formats": ("mcap",)},

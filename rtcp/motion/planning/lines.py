@@ -16,7 +16,7 @@ from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.config.model import MOST_POINTS, CartesianConfig, Stop
 from rtcp.motion.planning.interpolation import Quaternion, quaternion, rotation, turn_between, turned_by
-from rtcp.motion.planning.plan import KIND, LINE, Plan, PlanRefused, ZoneAt
+from rtcp.motion.planning.plan import KIND, LINE, AlreadyThere, Plan, PlanRefused, ZoneAt
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
@@ -98,7 +98,7 @@ def plan_lines(
             q, here = joints[-1], goal
         check_branch(stop, q, where, model)
     if not rows:
-        raise PlanRefused("the tool is already where the path leads, there is nothing to move")
+        raise AlreadyThere("the tool is already where the path leads, there is nothing to move")
     duration = 0.0
     for at in range(len(rows) - 1, -1, -1):
         duration += rows[at][18]

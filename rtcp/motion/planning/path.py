@@ -36,7 +36,7 @@ from rtcp.motion.planning.lines import (
     speed_of,
     straight,
 )
-from rtcp.motion.planning.plan import Plan, PlanRefused, PlanTooFast, ZoneAt
+from rtcp.motion.planning.plan import AlreadyThere, Plan, PlanRefused, PlanTooFast, ZoneAt
 from rtcp.motion.planning.time_law import Array, Bounds, TimeLaw
 from rtcp.motion.planning.trajectories import plan_trajectory
 
@@ -122,7 +122,7 @@ def plan_path(
         raise PlanRefused(f"the path has {len(stops)} stops, at most {MOST_POINTS} are allowed")
     legs = _legs(model, limits, cartesian, q_now, stops, speed, zone_at)
     if not legs:
-        raise PlanRefused("the arm is already where the path leads, there is nothing to move")
+        raise AlreadyThere("the arm is already where the path leads, there is nothing to move")
     points: list[Point] = [_rest(0.0, tuple(q_now))]
     slowed = 1.0
     for section in _sections(model, cartesian, legs):

@@ -49,6 +49,10 @@ class PlanRefused(ValueError):
     """The plan cannot be carried out; the message is a sentence with the place, what was found and what is allowed."""
 
 
+class AlreadyThere(PlanRefused):
+    """The arm is where the motion leads."""
+
+
 class PlanTooFast(PlanRefused):
     """A joint would exceed its limit of velocity, acceleration or jerk: the same plan in more time may pass."""
 

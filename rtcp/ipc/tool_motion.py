@@ -1,0 +1,72 @@
+"""The motion of the tool: fields that a reader computes from a cycle record, beside those that the loop publishes.
+
+In the loop this would add 164 to the 232 thousand instructions of a cycle that holds (`benchmarks/instructions.py hold
+--source`); a reader has the time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from kinematics.forward import forward_batch, twist_batch
+from kinematics.model import ArmModel
+from kinematics.pose import rpy_batch
+from rtcp.ipc.observer import numpy_fields
+from rtcp.ipc.schema import Field, RecordSchema
+
+POSE = ("tool_x", "tool_y", "tool_z", "tool_rx", "tool_ry", "tool_rz")
+VELOCITY = ("tool_vx", "tool_vy", "tool_vz", "tool_wx", "tool_wy", "tool_wz")
+_DESCRIPTIONS = ("Measured position of the tool.", "Measured angle of the tool, R = Rx Ry Rz.",
+                 "Measured velocity of the tool.", "Measured angular velocity of the tool.")  # fmt: skip
+FIELDS = tuple(
+    Field(name, "float64", unit, f"{description[:-1]}, base frame.", part="tool")
+    for at, (unit, description) in enumerate(zip(("m", "rad", "m/s", "rad/s"), _DESCRIPTIONS, strict=True))
+    for name in (*POSE, *VELOCITY)[3 * at : 3 * at + 3]
+)
+_SOURCES = {"actual_position", "actual_velocity"}
+
+
+class ToolMotion:
+    """Adds the fields of the tool to cycle records; of an arm without geometry it adds none.
+
+    Args:
+        model: the arm; None: its geometry is unknown.
+        schema: of the records.
+
+    Attributes:
+        schema: of the records with these fields.
+    """
+
+    def __init__(self, model: ArmModel | None, schema: RecordSchema) -> None:
+        self._model = model if set(schema.names) >= _SOURCES else None
+        self.schema = schema if self._model is None else RecordSchema((*schema.fields, *FIELDS))
+
+    def add(self, records: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+        """Return the records, shape (n,), with the fields of the tool."""
+        if self._model is None:
+            return records
+        before = records.dtype.itemsize
+        extended = np.dtype([*records.dtype.descr, *numpy_fields(RecordSchema(FIELDS))])
+        found = np.empty(len(records), extended)
+        if len(records):
+            rows = found.view(np.uint8).reshape(len(records), -1)
+            rows[:, :before] = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), -1)
+            motion = np.column_stack(self.of(records["actual_position"], records["actual_velocity"]))
+            rows[:, before:] = np.ascontiguousarray(motion, "<f8").view(np.uint8)
+        return found
+
+    def of(
+        self, q: npt.NDArray[np.float64], velocity: npt.NDArray[np.float64]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return poses and velocities of the tool, both (n, 6), at joint positions, rad, and velocities, rad/s, (n, 6).
+
+        NaN where a joint's value is not finite.
+        """
+        assert self._model is not None
+        known = np.asarray(np.isfinite(np.hstack([q, velocity])).all(axis=1))
+        q, velocity = np.where(known[:, None], q, 0.0), np.where(known[:, None], velocity, 0.0)
+        positions, rotations = forward_batch(self._model, q)
+        poses, twists = np.column_stack([positions, rpy_batch(rotations)]), twist_batch(self._model, q, velocity)
+        poses[~known], twists[~known] = np.nan, np.nan
+        return poses, twists

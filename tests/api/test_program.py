@@ -1,0 +1,170 @@
+"""Programs: their steps in order, joined where they are blended, by a robot that notes what it is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtcp.api import Preview, RtcpError
+from rtcp.api.program import Program
+from rtcp.config.model import ConfigError
+
+TEXT = """
+speed: 0.1
+poses:
+  - {name: home, q: [0, 0, 0, 0, 0, 0]}
+  - {name: right, pose: [0.1, 0, 0, 0, 0, 0]}
+  - {name: below, pose: [0.2, 0, 0, 0, 0, 0]}
+program:
+  - {move: home, speed: 0.4}
+  - {run: round, times: 3}
+  - {gripper: open}
+  - {output: lamp, value: false}
+  - {wait_for: start, timeout_s: 2}
+  - {wait_s: 0.001}
+parts:
+  - name: round
+    steps:
+      - {line: right, blend: 0.02}
+      - {arc: below, via: home, angle: pi, blend: 0.01}
+      - {run: twice}
+  - name: twice
+    steps:
+      - {line: home}
+"""
+
+
+class NotingRobot:
+    """Stands for a `Robot`: notes calls, and refuses the motion whose number is `refused`."""
+
+    def __init__(self, refused: int = -1, reason: str | None = None) -> None:
+        self.done: list[Any] = []
+        self.planned: list[Any] = []
+        self._refused, self._reason = refused, reason
+        self.io = self
+
+    def status(self) -> Any:
+        return SimpleNamespace(commanded_positions=(0.5,) * 6)
+
+    def fk(self, q: Sequence[float]) -> list[float]:
+        return [9.0, 8.0, 7.0, *q[:3]]
+
+    def preview(self, stops: Sequence[dict[str, Any]], start: Sequence[float], speed: float) -> Preview:
+        if len(self.planned) == self._refused:
+            raise RtcpError("refused", "the line cannot be", self._reason)
+        self.planned.append((list(stops), list(start), speed))
+        return Preview((tuple(start), (float(len(self.planned)),) * 6), 1.0)
+
+    def run_path(self, stops: Sequence[dict[str, Any]], speed: float) -> None:
+        self.done.append([stop.get("pose", stop.get("q"))[0] for stop in stops])
+
+    def gripper(self, opened: bool) -> None:
+        self.done.append(f"gripper {opened}")
+
+    def __setitem__(self, name: str, value: bool) -> None:
+        self.done.append(f"{name} {value}")
+
+    def wait(self, name: str, value: bool, timeout_s: float) -> None:
+        self.done.append(f"wait {name} {value} {timeout_s:g}")
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Callable[..., Program]:
+    def made(text: str = TEXT) -> Program:
+        file = tmp_path / "program.yaml"
+        file.write_text(text)
+        return Program(file)
+
+    return made
+
+
+def test_steps_are_carried_out_in_order_and_blended_ones_are_one_motion(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+    said: list[tuple[int, str]] = []
+    program().run(robot, lambda line, text: said.append((line, text)))
+    rounds = [[0.1, 0.2, 0]] * 3
+    assert robot.done == [[0], *rounds, "gripper True", "lamp False", "wait start True 2"]
+    assert [line for line, _ in said] == [8, 17, 17, 17, 10, 11, 12, 13]
+
+
+def test_all_is_planned_from_where_the_motion_before_ends_and_loops_twice(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+    found = program().check(robot)
+    assert [one.line for one in found] == [8, 17, 17]
+    assert [start for _, start, _ in robot.planned] == [[0.5] * 6, [1.0] * 6, [2.0] * 6]
+    stops = robot.planned[1][0]
+    assert stops[0] == {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], "blend": 0.02, "by_joints": False}
+    assert stops[1]["via"] == [9.0, 8.0, 7.0]
+    assert stops[1]["angle"] == pytest.approx(3.14159, abs=1e-4)
+    assert robot.planned[0][0] == [{"q": [0.0] * 6, "blend": 0.0, "by_joints": True, "speed": 0.4}]
+    assert not robot.done
+
+
+def test_a_motion_that_is_refused_keeps_all_from_beginning_and_names_its_line(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot(refused=1)
+    with pytest.raises(RtcpError, match=r"program\.yaml:17: the line cannot be"):
+        program().run(robot)
+    assert not robot.done
+
+
+def test_a_motion_to_where_the_arm_is_is_passed_over(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot(refused=0, reason="AlreadyThere")
+    plan = robot.preview
+
+    def preview(**given: Any) -> Preview:
+        try:
+            found: Preview = plan(**given)
+        finally:
+            robot._refused = -1
+        return found
+
+    robot.preview = preview
+    assert [one.line for one in program().check(robot)] == [17, 17]
+
+
+def test_a_program_for_ever_is_planned_and_goes_on(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+    made = program(TEXT.replace("times: 3", "times: 0"))
+    assert len(made.check(robot)) == 3
+
+    def stop(line: int, text: str) -> None:
+        if len(robot.done) == 50:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        made.run(robot, stop)
+    assert robot.done[1:] == [[0.1, 0.2, 0]] * 49
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("line: home", "line: hoem", '22: parts[1].steps[0].line: found "hoem", allowed is one of home, right, below'),
+        ("run: twice", "run: round", 'parts[0].steps: the part "round" runs itself'),
+        ("line: home", "run: round", "runs itself"),
+        ("via: home, ", "", "18: parts[0].steps[1].arc: an arc needs via beside it"),
+        ("{gripper: open}", "{gripper: open, speed: 1}", "10: program[2].speed: found beside gripper"),
+        ("{gripper: open}", "{gripper: open, wait_s: 1}", "10: program[2]: found gripper and wait_s"),
+        ("{gripper: open}", "{}", "10: program[2]: found none of them"),
+        ("name: below", "name: right", '6: poses[2].name: found "right" twice'),
+        ("times: 3", "times: -1", "9: program[1].times: found -1"),
+        ("q: [0, 0, 0, 0, 0, 0]", "q: [0, 0]", "4: poses[0].q"),
+        ("program:", "path: [{q: [0, 0, 0, 0, 0, 0]}]\nprogram:", "a file holds one of trajectory, path and program"),
+    ],
+)
+def test_a_mistake_is_a_sentence_with_its_line(
+    program: Callable[..., Program], old: str, new: str, sentence: str
+) -> None:
+    assert old in TEXT
+    with pytest.raises(ConfigError) as wrong:
+        program(TEXT.replace(old, new, 1))
+    assert any(sentence in problem for problem in wrong.value.problems), wrong.value.problems
+
+
+def test_a_file_without_a_program_says_what_runs_it(program: Callable[..., Program]) -> None:
+    with pytest.raises(ConfigError, match="it holds no program"):
+        program("path:\n  - {q: [0, 0, 0, 0, 0, 0]}\n")
