@@ -93,15 +93,24 @@ def twist_batch(model: ArmModel, q: npt.ArrayLike, velocity: npt.ArrayLike) -> n
 
     angles, rates = _batch(q, "q"), _batch(velocity, "velocity")
     twists = np.empty((len(angles), JOINTS))
-    tools, _ = forward_batch(model, angles)
     for start in range(0, len(angles), _BLOCK):
         block = slice(start, start + _BLOCK)
-        tool, turn, move = tools[block].T, np.zeros((3, 1)), np.zeros((3, 1))
-        for rate, (_, _, z, origin) in zip(rates[block].T, _frames_batch(model, angles[block]), strict=True):
-            turn = turn + rate * z
-            move = move + np.cross(rate * z, tool - origin, axis=0)
-        twists[block, :3], twists[block, 3:] = move.T, turn.T
+        turn, moment = np.zeros((3, len(angles[block]))), np.zeros((3, len(angles[block])))
+        for rate, frame in zip(rates[block].T, _frames_batch(model, angles[block]), strict=True):
+            x, y, z, origin = frame
+            turn += rate * z
+            moment += _cross(rate * z, origin)
+        tool = sum((length * axis for length, axis in zip(model.tool.position, (x, y, z), strict=True)), origin)
+        twists[block, :3], twists[block, 3:] = (_cross(turn, tool) - moment).T, turn.T
     return twists
+
+
+def _cross(one: Any, other: Any) -> npt.NDArray[np.float64]:
+    """The vector product of arrays (3, n); `numpy.cross` takes longer than all else here."""
+    import numpy as np
+
+    (a, b, c), (x, y, z) = one, other
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
 def _batch(given: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from kinematics.forward import forward_batch, twist_batch
 from kinematics.model import ArmModel
 from kinematics.pose import rpy_batch
-from rtcp.ipc.observer import numpy_fields
+from rtcp.ipc.observer import numpy_fields, record_type
 from rtcp.ipc.schema import Field, RecordSchema
 
 POSE = ("tool_x", "tool_y", "tool_z", "tool_rx", "tool_ry", "tool_rz")
@@ -41,18 +41,18 @@ class ToolMotion:
     def __init__(self, model: ArmModel | None, schema: RecordSchema) -> None:
         self._model = model if set(schema.names) >= _SOURCES else None
         self.schema = schema if self._model is None else RecordSchema((*schema.fields, *FIELDS))
+        self._kind = np.dtype([*record_type(schema).descr, *numpy_fields(RecordSchema(FIELDS))])
 
     def add(self, records: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
-        """Return the records, shape (n,), with the fields of the tool."""
+        """Return records of the ring, shape (n,), with the fields of the tool."""
         if self._model is None:
             return records
         before = records.dtype.itemsize
-        extended = np.dtype([*records.dtype.descr, *numpy_fields(RecordSchema(FIELDS))])
-        found = np.empty(len(records), extended)
+        found = np.empty(len(records), self._kind)
         if len(records):
             rows = found.view(np.uint8).reshape(len(records), -1)
             rows[:, :before] = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), -1)
-            motion = np.column_stack(self.of(records["actual_position"], records["actual_velocity"]))
+            motion = np.hstack(self.of(records["actual_position"], records["actual_velocity"]))
             rows[:, before:] = np.ascontiguousarray(motion, "<f8").view(np.uint8)
         return found
 
@@ -64,9 +64,10 @@ class ToolMotion:
         NaN where a joint's value is not finite.
         """
         assert self._model is not None
-        known = np.asarray(np.isfinite(np.hstack([q, velocity])).all(axis=1))
-        q, velocity = np.where(known[:, None], q, 0.0), np.where(known[:, None], velocity, 0.0)
+        known = np.flatnonzero(np.isfinite(np.hstack([q, velocity])).all(axis=1))
+        if len(known) < len(q):
+            poses, twists = np.full((2, len(q), 6), np.nan)
+            poses[known], twists[known] = self.of(q[known], velocity[known])
+            return poses, twists
         positions, rotations = forward_batch(self._model, q)
-        poses, twists = np.column_stack([positions, rpy_batch(rotations)]), twist_batch(self._model, q, velocity)
-        poses[~known], twists[~known] = np.nan, np.nan
-        return poses, twists
+        return np.hstack([positions, rpy_batch(rotations)]), twist_batch(self._model, q, velocity)

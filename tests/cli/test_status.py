@@ -26,6 +26,16 @@ def test_status_shows_state_joints_slaves_times_and_clocks(platform: Any, rtcp: 
         assert shown in ended.out
 
 
+def test_status_shows_the_pose_and_the_speeds_of_the_tool_where_the_geometry_is_known(
+    platform: Any, rtcp: Callable[..., Any]
+) -> None:
+    line = "+0.1000 -0.2000 +0.9000 m, +0.0000 +0.5000 -1.0000 rad, 0.050 m/s, 0.200 rad/s"
+    assert line in " ".join(rtcp("status").out.split())
+    platform.status["tool"] = None
+    shown = rtcp("status")
+    assert (shown.code, " m/s" in shown.out) == (0, False)
+
+
 def test_status_fits_eighty_columns_without_colour_in_a_pipe(platform: Any, rtcp: Callable[..., Any]) -> None:
     platform.status["message"] = "a long sentence about what went wrong with the drive of joint 3 " * 3
     platform.status["realtime"]["notes"] = ["SCHED_FIFO is refused to this user: allow it by rtprio in limits.conf"] * 2

@@ -463,6 +463,8 @@ def test_health_draws_the_cycle_and_serves_it_to_prometheus(page: Page, holding:
     assert {one.labels["state"] for one in found["rtcp_state"].samples if one.value} == {"fault"}
     assert found["rtcp_cycles"].samples[0].value > 0
     assert len(found["rtcp_joint_position_radians"].samples) == 6
+    assert len(found["rtcp_tool_pose_metres"].samples) == 3
+    assert found["rtcp_tool_pose_metres"].samples[2].value > 0.0
     drawn = set(re.findall(r"\brtcp_\w+", (REPOSITORY / "config/grafana/rtcp.json").read_text()))
     assert drawn
     assert drawn <= {sample.name for family in found.values() for sample in family.samples}
