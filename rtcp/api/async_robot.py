@@ -85,6 +85,10 @@ class AsyncRobot(Methods):
         """Return the state of the machine now."""
         return (await self.status()).state
 
+    async def speed_override(self) -> float:
+        """Return the fraction of its speed at which the arm moves."""
+        return (await self.status()).speed_override
+
     async def _carry_out(self, call: Call[T]) -> T:
         writer, number = self._writer, next(self._numbers)
         if writer is None or writer.is_closing():

@@ -21,10 +21,13 @@ from ruckig import (
 )
 
 from rtcp.motion.limits import Limits
+from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 LONGEST_S: Final = 600.0
-"""A move that would take longer is refused: ruckig's own arithmetic ends at about 7600 s."""
+"""A move that would take longer, at a speed override of 1, is refused."""
+SLOWED_S: Final = 5000.0
+"""A speed override makes no way last longer than about this, s: ruckig's own arithmetic ends at about 7600 s."""
 # ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: with a little more
 # jerk it is not on the border any more. With less of it a joint at its speed limit would pass that.
 _JERK_SCALES = (1.0, 1.0 + 1e-4, 1.0 + 1e-3, 1.0 - 1e-2)
@@ -116,10 +119,16 @@ class JointMotion:
         period_s: the cycle, s.
         velocity, acceleration, jerk: bounds of each joint, shape (n,), rad/s, rad/s^2, rad/s^3; read when a motion
             begins, which keeps them to its end.
+        speed_override: scales the speeds of a move, also while it is under way; None: always 1.
     """
 
     def __init__(
-        self, period_s: float, velocity: Sequence[float], acceleration: Sequence[float], jerk: Sequence[float]
+        self,
+        period_s: float,
+        velocity: Sequence[float],
+        acceleration: Sequence[float],
+        jerk: Sequence[float],
+        speed_override: SpeedOverride | None = None,
     ) -> None:
         n = len(velocity)
         self._otg = Ruckig(n, period_s)
@@ -135,6 +144,13 @@ class JointMotion:
         self._active = self._inputs[0]
         self._target = Setpoint(n)
         self._velocity_limit, self._acceleration_limit, self._jerk_limit = velocity, acceleration, jerk
+        self._speed_override = speed_override or SpeedOverride()
+        self._fraction = 1.0
+        """Speed override that the move under way is planned with."""
+        self._fastest, self._jerk = self._zero, self._zero
+        """Of the move under way at a speed override of 1."""
+        self._begun_s = 0.0
+        """Time from the begin of the move to that of its present plan, s."""
         self.phase = Phase.HOLD
         self.failed = False
         """Whether ruckig refused its input; the setpoints stand since."""
@@ -171,7 +187,27 @@ class JointMotion:
             return False
         self._active = move
         self._begin(Phase.MOVE)
+        self._fraction = 1.0
+        self._fastest = [min(speed, limit) for limit in self._velocity_limit]
+        self._jerk = move.max_jerk
         return True
+
+    def _change_speed(self, fraction: float) -> None:
+        """Plan the rest of the move with a fraction of its speeds; without a plan it goes on, and this is tried again.
+
+        The joints slow down to the new bound first, under their accelerations and jerks.
+        """
+        last, move = self._active, self._inputs[1] if self._active is self._inputs[0] else self._inputs[0]
+        move.current_position, move.current_velocity = last.current_position, last.current_velocity
+        move.current_acceleration, move.target_acceleration = last.current_acceleration, self._zero
+        move.target_position, move.target_velocity = last.target_position, self._zero
+        move.synchronization, move.max_acceleration = last.synchronization, last.max_acceleration
+        way = zip(self._fastest, last.target_position, last.current_position, strict=True)
+        move.max_velocity = [max(fraction * fastest, abs(end - here) / SLOWED_S) for fastest, end, here in way]
+        if find_way(self._otg, move, self._jerk, self._plan):
+            self._otg.reset()
+            self._active, self._fraction = move, fraction
+            self._begun_s = self.elapsed_s
 
     @property
     def planned_duration_s(self) -> float:
@@ -200,7 +236,7 @@ class JointMotion:
     def _begin(self, phase: Phase) -> None:
         self.phase = phase
         self.failed = False
-        self.elapsed_s = 0.0
+        self.elapsed_s = self._begun_s = 0.0
 
     def _carry_over(self, given: InputParameter, state: ArmState) -> None:
         given.current_position = state.commanded
@@ -221,7 +257,9 @@ class JointMotion:
             target.position = state.commanded
             target.velocity = self._zero
             return target
-        output = self._output
+        output, fraction = self._output, self._speed_override.fraction
+        if fraction != self._fraction and self.phase is Phase.MOVE:
+            self._change_speed(fraction)
         try:
             result = self._otg.update(self._active, output)
         except (RuckigError, ValueError):
@@ -234,8 +272,8 @@ class JointMotion:
             return target
         target.position = output.new_position
         target.velocity = output.new_velocity
-        self.duration_s = output.trajectory.duration
-        self.elapsed_s = output.time
+        self.duration_s = self._begun_s + output.trajectory.duration
+        self.elapsed_s = self._begun_s + output.time
         if result == Result.Finished:
             target.velocity = self._zero
             self.phase = Phase.HOLD

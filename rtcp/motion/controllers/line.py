@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import asin, atan2, hypot, sqrt
 from typing import Final, NamedTuple
 
-from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError
+from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
@@ -26,6 +26,7 @@ from rtcp.ipc.events import (
 )
 from rtcp.ipc.refusals import DamagedRow, PathNeedsRest, PathStartsElsewhere, Refusal
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
+from rtcp.motion.joint_motion import SLOWED_S, find_way
 from rtcp.motion.planning.interpolation import quaternion, rotation, turn_between, turned_by
 from rtcp.motion.planning.plan import damaged_line, read_row
 from rtcp.motion.state import ArmState, Phase, Setpoint
@@ -65,6 +66,9 @@ class LineController(Controller):
         self._halt.control_interface = ControlInterface.Velocity
         self._halt.target_velocity = [0.0]
         self._active = self._way
+        self._fraction = 1.0
+        """Speed override that the present piece is planned with."""
+        self._plan = Trajectory(1)
         self._output = OutputParameter(1)
         self._velocity = [0.0] * n
         self._near = [0.0] * n
@@ -130,6 +134,21 @@ class LineController(Controller):
         way.max_velocity, way.max_acceleration, way.max_jerk = [row[14]], [row[15]], [row[16]]
         self._otg.reset()
         self._active = way
+        self._fraction = 1.0
+
+    def _change_speed(self, fraction: float) -> None:
+        """Plan the rest of the piece with a fraction of its speed; without a plan this is tried again."""
+        way, row, before = self._way, self._piece, self._way.max_velocity
+        way.max_velocity = [min(max(fraction * row[14], 1.0 / SLOWED_S), row[14])]
+        if not find_way(self._otg, way, [row[16]], self._plan):
+            way.max_velocity, way.max_jerk = before, [row[16]]
+            return
+        assert self._rows is not None
+        later_s = read_row(self._rows, self._row + 1)[18] if self._row < self._count - 1 else 0.0
+        self.duration_s = self.elapsed_s + self._plan.duration + later_s / fraction
+        self._done_s = self.elapsed_s
+        self._fraction = fraction
+        self._otg.reset()
 
     def stop(self, state: ArmState) -> None:
         """Brake along the line, as fast as the piece's acceleration and jerk allow."""
@@ -168,6 +187,8 @@ class LineController(Controller):
     def _go_along(self, state: ArmState) -> MotionEnded | None:
         """Write the setpoints of the next cycle, or return why the line cannot go on."""
         output = self._output
+        if self.speed_override.fraction != self._fraction and self.phase is Phase.MOVE:
+            self._change_speed(self.speed_override.fraction)
         try:
             result = self._otg.update(self._active, output)
         except (RuckigError, ValueError):
