@@ -36,7 +36,14 @@ from rtcp.ipc.commands import (
     SetZero,
     Shutdown,
 )
-from rtcp.ipc.events import ControlModeChanged, GripperCloses, GripperOpens, LimitsChanged, SpeedOverrideChanged, ZeroSet
+from rtcp.ipc.events import (
+    ControlModeChanged,
+    GripperCloses,
+    GripperOpens,
+    LimitsChanged,
+    SpeedOverrideChanged,
+    ZeroSet,
+)
 from rtcp.ipc.layout import PLANS
 from rtcp.ipc.refusals import (
     ClockNotLocked,

@@ -21,13 +21,11 @@ from ruckig import (
 )
 
 from rtcp.motion.limits import Limits
-from rtcp.motion.speed_override import SpeedOverride
+from rtcp.motion.speed_override import SpeedOverride, TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 LONGEST_S: Final = 600.0
-"""A move that would take longer, at a speed override of 1, is refused."""
-SLOWED_S: Final = 5000.0
-"""A speed override makes no way last longer than about this, s: ruckig's own arithmetic ends at about 7600 s."""
+"""A move that would take longer is refused: ruckig's own arithmetic ends at about 7600 s."""
 # ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: with a little more
 # jerk it is not on the border any more. With less of it a joint at its speed limit would pass that.
 _JERK_SCALES = (1.0, 1.0 + 1e-4, 1.0 + 1e-3, 1.0 - 1e-2)
@@ -119,7 +117,7 @@ class JointMotion:
         period_s: the cycle, s.
         velocity, acceleration, jerk: bounds of each joint, shape (n,), rad/s, rad/s^2, rad/s^3; read when a motion
             begins, which keeps them to its end.
-        speed_override: scales the speeds of a move, also while it is under way; None: always 1.
+        speed_override: at which a move passes; None: always at 1.
     """
 
     def __init__(
@@ -133,7 +131,7 @@ class JointMotion:
         n = len(velocity)
         self._otg = Ruckig(n, period_s)
         self._output = OutputParameter(n)
-        self._plan = Trajectory(n)
+        self._plan, self._spare = Trajectory(n), Trajectory(n)
         # A move is planned beside the one that runs, and takes over only when the plan succeeds.
         self._inputs = [InputParameter(n), InputParameter(n), InputParameter(n)]
         self._stop = self._inputs[2]
@@ -144,13 +142,11 @@ class JointMotion:
         self._active = self._inputs[0]
         self._target = Setpoint(n)
         self._velocity_limit, self._acceleration_limit, self._jerk_limit = velocity, acceleration, jerk
+        self._period_s = period_s
         self._speed_override = speed_override or SpeedOverride()
-        self._fraction = 1.0
-        """Speed override that the move under way is planned with."""
-        self._fastest, self._jerk = self._zero, self._zero
-        """Of the move under way at a speed override of 1."""
-        self._begun_s = 0.0
-        """Time from the begin of the move to that of its present plan, s."""
+        self._time_scale = TimeScale()
+        self._is_scaled = False
+        """Whether the move under way has ever been slower than planned: from then on it follows its plan by itself."""
         self.phase = Phase.HOLD
         self.failed = False
         """Whether ruckig refused its input; the setpoints stand since."""
@@ -183,31 +179,12 @@ class JointMotion:
             max(min(speed, limit), abs(now))
             for limit, now in zip(self._velocity_limit, move.current_velocity, strict=True)
         ]  # fmt: skip
-        if not find_way(self._otg, move, self._jerk_limit, self._plan) or self._plan.duration > LONGEST_S:
+        if not find_way(self._otg, move, self._jerk_limit, self._spare) or self._spare.duration > LONGEST_S:
             return False
+        self._plan, self._spare = self._spare, self._plan
         self._active = move
         self._begin(Phase.MOVE)
-        self._fraction = 1.0
-        self._fastest = [min(speed, limit) for limit in self._velocity_limit]
-        self._jerk = move.max_jerk
         return True
-
-    def _change_speed(self, fraction: float) -> None:
-        """Plan the rest of the move with a fraction of its speeds; without a plan it goes on, and this is tried again.
-
-        The joints slow down to the new bound first, under their accelerations and jerks.
-        """
-        last, move = self._active, self._inputs[1] if self._active is self._inputs[0] else self._inputs[0]
-        move.current_position, move.current_velocity = last.current_position, last.current_velocity
-        move.current_acceleration, move.target_acceleration = last.current_acceleration, self._zero
-        move.target_position, move.target_velocity = last.target_position, self._zero
-        move.synchronization, move.max_acceleration = last.synchronization, last.max_acceleration
-        way = zip(self._fastest, last.target_position, last.current_position, strict=True)
-        move.max_velocity = [max(fraction * fastest, abs(end - here) / SLOWED_S) for fastest, end, here in way]
-        if find_way(self._otg, move, self._jerk, self._plan):
-            self._otg.reset()
-            self._active, self._fraction = move, fraction
-            self._begun_s = self.elapsed_s
 
     @property
     def planned_duration_s(self) -> float:
@@ -236,7 +213,8 @@ class JointMotion:
     def _begin(self, phase: Phase) -> None:
         self.phase = phase
         self.failed = False
-        self.elapsed_s = self._begun_s = 0.0
+        self.elapsed_s = 0.0
+        self._is_scaled = False
 
     def _carry_over(self, given: InputParameter, state: ArmState) -> None:
         given.current_position = state.commanded
@@ -257,9 +235,9 @@ class JointMotion:
             target.position = state.commanded
             target.velocity = self._zero
             return target
-        output, fraction = self._output, self._speed_override.fraction
-        if fraction != self._fraction and self.phase is Phase.MOVE:
-            self._change_speed(fraction)
+        if self._is_scaled or (self._speed_override.fraction != 1.0 and self.phase is Phase.MOVE):
+            return self._follow_plan(state)
+        output = self._output
         try:
             result = self._otg.update(self._active, output)
         except (RuckigError, ValueError):
@@ -272,11 +250,35 @@ class JointMotion:
             return target
         target.position = output.new_position
         target.velocity = output.new_velocity
-        self.duration_s = self._begun_s + output.trajectory.duration
-        self.elapsed_s = self._begun_s + output.time
+        self.duration_s = output.trajectory.duration
+        self.elapsed_s = output.time
         if result == Result.Finished:
             target.velocity = self._zero
             self.phase = Phase.HOLD
         else:
             output.pass_to_input(self._active)
+        return target
+
+    def _follow_plan(self, state: ArmState) -> Setpoint:
+        """Return the setpoints of the next cycle at the speed override: the same way, whose time passes more slowly."""
+        target, plan, scale, dt = self._target, self._plan, self._time_scale, self._period_s
+        if not self._is_scaled:
+            scale.begin()
+            self._is_scaled, self.duration_s = True, plan.duration
+        before, goal = scale.speed, self._speed_override.fraction
+        speed = 1.0
+        if not goal == before == 1.0:
+            # Where the cycle ends hardly depends on how much u changes.
+            _, along, _ = plan.at_time(self.elapsed_s + (before + 0.5 * scale.rate * dt) * dt)
+            bounds, jerk = self._acceleration_limit, self._jerk_limit
+            speed = scale.step(goal, along, state.commanded_velocity, bounds, jerk, dt)
+        self.elapsed_s = min(self.elapsed_s + 0.5 * (before + speed) * dt, self.duration_s)
+        target.position, along, bend = plan.at_time(self.elapsed_s)
+        target.velocity = [speed * v for v in along]
+        # What a stop, or another move, begins with.
+        rate = scale.rate
+        self._active.current_acceleration = [speed * speed * a + rate * v for a, v in zip(bend, along, strict=True)]
+        if self.elapsed_s >= self.duration_s:
+            target.velocity = self._zero
+            self.phase = Phase.HOLD
         return target

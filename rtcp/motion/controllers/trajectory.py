@@ -7,7 +7,6 @@ follows the speed override.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
 from typing import ClassVar, Final, NamedTuple
 
 from ruckig import InputParameter, Ruckig, Trajectory
@@ -39,6 +38,7 @@ from rtcp.motion.planning.plan import (
     first_not_finite,
     read_row,
 )
+from rtcp.motion.speed_override import TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 AT_START_RAD: Final = 1e-3
@@ -50,14 +50,6 @@ _EXACT: Final = 1e-12
 _AT_ONCE_S: Final = 1e-9
 _SLACK: Final = 1e-6
 _INSIDE = 1.0 - 1e-9
-_MOST_RATE: Final = 50.0
-_MOST_JERK: Final = 2000.0
-"""1/s and 1/s^2: bounds of how fast the path's time stops where no joint moves."""
-_STILL: Final = 1e-9
-_OF_LIMIT: Final = 0.99
-"""Share of a joint's acceleration that a change of speed uses, so that what is between two cycles keeps to it too."""
-_LANDING: Final = 0.8
-"""Share of the jerk with which u reaches a goal: it may have to end sooner, where the path becomes steeper."""
 
 
 class NoApproach(NamedTuple):
@@ -120,80 +112,6 @@ class Approach:
         self._found, self._spare = self._spare, self._found
         self.duration_s = self._found.duration
         return None
-
-
-class TimeScale:
-    """How fast the path's own time s passes: at 1, slower, or ever slower until it stands.
-
-    A point p(s) of the path is passed with the velocity p'(s) u, where u = ds/dt is between 0 and 1. In each cycle
-    u changes as fast as every joint's acceleration and jerk allow. `speed` is u, `rate` is du/dt, 1/s.
-    """
-
-    def __init__(self) -> None:
-        self.speed = 1.0
-        self.rate = 0.0
-
-    def begin(self) -> None:
-        """Start at full speed."""
-        self.speed, self.rate = 1.0, 0.0
-
-    def step(
-        self,
-        goal: float,
-        along: Sequence[float],
-        velocity: Sequence[float],
-        acceleration: Sequence[float],
-        jerk: Sequence[float],
-        dt: float,
-    ) -> float:
-        """Return u at the end of the next cycle.
-
-        Args:
-            goal: what u is led to, 0 to 1; 0: to rest.
-            along: p'(s), rad/s, at the point that the cycle ends at.
-            velocity: what was commanded last, rad/s.
-            acceleration, jerk: bounds of each joint, rad/s^2, rad/s^3.
-            dt: the cycle, s.
-        """
-        now, low, high, most = self.speed, 0.0, 1.0, _MOST_JERK
-        for at_full, before, bound, jerks in zip(along, velocity, acceleration, jerk, strict=True):
-            steep = at_full if at_full >= 0.0 else -at_full
-            if steep > 1e-6:
-                # |p' u - v| <= a dt, and what the jerk leaves of du/dt's change.
-                signed = before if at_full > 0.0 else -before
-                room = _OF_LIMIT * bound * dt
-                least, largest = (signed - room) / steep, (signed + room) / steep
-                low = least if least > low else low
-                high = largest if largest < high else high
-                allowed = jerks / steep
-                most = allowed if allowed < most else most
-        last, change = self.rate, most * dt
-        if goal == 0.0:
-            rate = last - change
-            # So steep that the rate comes back to 0 together with the speed.
-            landing = -sqrt(2.0 * most * now)
-            rate = rate if rate > landing else landing
-        else:
-            # The same in both directions; the goal may move meanwhile, so the rate never changes by more.
-            landing = sqrt(2.0 * _LANDING * most * (goal - now if goal > now else now - goal))
-            rate = landing if goal > now else -landing
-            rate = rate if rate > last - change else last - change
-            rate = rate if rate < last + change else last + change
-        rate = rate if rate > -_MOST_RATE else -_MOST_RATE
-        rate = rate if rate < _MOST_RATE else _MOST_RATE
-        speed = now + rate * dt
-        most_speed = speed if rate > 0.0 else now
-        speed = speed if speed < high else high
-        speed = speed if speed > low else low
-        speed = speed if speed < most_speed else most_speed
-        if goal == 0.0:
-            if speed < _STILL or (low == 0.0 and speed < change * dt):
-                speed = 0.0
-        elif low <= goal <= high and -change * dt < speed - goal < change * dt and -change <= last <= change:
-            speed, now = goal, goal  # from here on it rests there
-        self.rate = (speed - now) / dt
-        self.speed = speed
-        return speed
 
 
 class TrajectoryController(Controller):
