@@ -16,9 +16,9 @@ SLOW = ("--cycle-us", "2000")
 """A cycle that a loaded machine keeps: what is tested here is how the commands start and end it."""
 
 FIELDS = {
-    "state": str, "speed_override": float, "drive_mode": str, "bus": str, "cycle_ns": int, "cycles": int, "missed": int, "wkc": dict,
+    "state": str, "drive_mode": str, "bus": str, "cycle_ns": int, "cycles": int, "missed": int, "wkc": dict,
     "slaves": list, "joints": dict, "devices": dict, "processes": dict, "wakeup_us": dict, "exchange_us": dict,
-    "compute_us": dict, "dc": dict, "realtime": dict, "pids": dict,
+    "compute_us": dict, "dc": dict, "realtime": dict, "pids": dict, "speed_override": float,
 }  # fmt: skip
 
 

@@ -25,7 +25,6 @@ from rtcp.motion.controllers.trajectory import TrajectoryController
 from rtcp.motion.controllers.velocity import VelocityController
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.trajectories import plan_trajectory
-from rtcp.motion.state import Phase
 from tests.samples import examples
 
 PERIOD = 0.0005
@@ -72,7 +71,7 @@ def accelerations(drive: Any, cycle: Callable[[], None]) -> list[float]:
     return [(v - u) / PERIOD for u, v in zip(before, drive.state.commanded_velocity, strict=True)]
 
 
-# -- how fast -----------------------------------------------------------------------------------------------------------
+# -- how fast ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fraction", [0.05, 0.5])
@@ -178,7 +177,7 @@ def test_a_jog_of_the_tool_is_scaled(drive: Any, frame: JogFrame) -> None:
         assert hypot(*(y - x for x, y in zip(a, b, strict=True))) / PERIOD == pytest.approx(0.04 * fraction, rel=1e-3)
 
 
-# -- within the limits, on the path -------------------------------------------------------------------------------------
+# -- within the limits, on the path -----------------------------------------------------------------------------------
 
 
 @settings(max_examples=examples(5))
@@ -288,7 +287,7 @@ def test_jogs_and_velocities_keep_accelerations(new_drive: Any, given: tuple[int
     assert drive.cuts == 0
 
 
-# -- what is not slowed -------------------------------------------------------------------------------------------------
+# -- what is not slowed -----------------------------------------------------------------------------------------------
 
 
 def test_at_1_a_trajectory_is_the_same_to_the_bit(new_drive: Any, memory: Any) -> None:
