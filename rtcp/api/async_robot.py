@@ -93,6 +93,10 @@ class AsyncRobot(Methods):
         """Return the measured pose of the tool now, x y z, m, rx ry rz, rad; None: the geometry is unknown."""
         return (await self.status()).pose
 
+    async def speed_override(self) -> float:
+        """Return the fraction of its speed at which the arm moves."""
+        return (await self.status()).speed_override
+
     async def _carry_out(self, call: Call[T]) -> T:
         writer, number = self._writer, next(self._numbers)
         if writer is None or writer.is_closing():

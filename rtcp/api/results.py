@@ -63,6 +63,8 @@ class Status:
     """As ROS-Industrial has it."""
     holder: str
     """Who commands the arm; empty: nobody."""
+    speed_override: float
+    """Fraction of its speed at which the arm moves, 0.01 to 1."""
     raw: Mapping[str, Any]
     """Everything that `rtcp status --json` prints."""
 
@@ -87,6 +89,7 @@ class Status:
             commanded_pose=_tuple(tool.get("commanded_pose")),
             robot=RobotStatus(**found["robot"]),
             holder=found["lease"]["holder"],
+            speed_override=found["speed_override"],
             raw=found,
         )
 

@@ -191,6 +191,19 @@ class Methods:
         return Call("mode", {"name": name if isinstance(name, str) else name.name.lower()}, _nothing)
 
     @Method
+    def set_speed_override(self, fraction: float) -> Call[None]:
+        """Move at a fraction of the speed from now on, also what is under way; streams and torques are not slowed.
+
+        Args:
+            fraction: 0.01 to 1. Anyone may lower it; raising it takes the lease for a moment.
+
+        Raises:
+            Refused: it is raised while another commander holds the lease.
+            Invalid: not a number from 0.01 to 1.
+        """
+        return Call("set_speed_override", {"fraction": fraction}, _nothing)
+
+    @Method
     def stop(self) -> Call[tuple[str, ...]]:
         """End the platform: stop the arm, disable the drives, leave the bus.
 
@@ -746,6 +759,11 @@ class Robot(Methods):
     def io(self) -> Io:
         """Inputs and outputs by their names."""
         return Io(self)
+
+    @property
+    def speed_override(self) -> float:
+        """Fraction of its speed at which the arm moves."""
+        return self.status().speed_override
 
     @property
     def processes(self) -> dict[str, Process]:

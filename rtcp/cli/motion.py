@@ -93,6 +93,19 @@ def _mode(
     report(f"mode {name.lower()}")
 
 
+@commands.command("speed")
+def _speed(
+    percent: Annotated[float | None, typer.Argument(metavar="[PERCENT]", help="1 to 100; without it: show it.")] = None,
+) -> None:
+    """Set the speed override: the share of its speed at which the arm moves, also in a motion under way."""
+    if percent is not None and not 1.0 <= percent <= 100.0:
+        raise CommandError(f"PERCENT {percent:g} is not allowed: 1 to 100 % of the speed")
+    with connect("speed") as robot:
+        if percent is not None:
+            robot.set_speed_override(percent / 100.0)
+        report(f"the speed override is {100.0 * robot.speed_override:.3g} %")
+
+
 @commands.command("output")
 def _output(
     number: Annotated[int, typer.Argument(metavar="N", help="Output of the IO box, from 1.")],

@@ -15,6 +15,7 @@ from rtcp.motion.controllers.controller import Controller, ControllerSetup, load
 from rtcp.motion.controllers.jog import JogController
 from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveWriter
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
+from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import Phase
 from rtcp.motion.step_group import StepGroup
 
@@ -41,8 +42,11 @@ class Arm(JointGroup):
         joints = config.joints
         super().__init__("arm", arm_fields(len(joints)), config, drives)
         self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
+        self.speed_override = SpeedOverride()
         self.controllers: dict[type[Command], Controller] = load_controllers(
-            ControllerSetup(config, self.limits, self.trajectory_guard, self.period_s, plan, self.group)
+            ControllerSetup(
+                config, self.limits, self.trajectory_guard, self.period_s, plan, self.group, self.speed_override
+            )
         )
         """By the commands that they accept."""
         self._holder = self.controllers[MoveJoints]
@@ -86,6 +90,7 @@ class Arm(JointGroup):
             self.output_limiter.held | self.trajectory_guard.held | controller.held,
             controller.elapsed_s,
             controller.duration_s,
+            self.speed_override.fraction,
         )
         n, at = len(self.drives), at + len(ARM_MODES)
         values[at : at + 4 * n] = (*state.actual, *state.actual_velocity, *state.actual_torque, *state.commanded)

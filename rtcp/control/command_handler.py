@@ -32,10 +32,18 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetSpeedOverride,
     SetZero,
     Shutdown,
 )
-from rtcp.ipc.events import ControlModeChanged, GripperCloses, GripperOpens, LimitsChanged, ZeroSet
+from rtcp.ipc.events import (
+    ControlModeChanged,
+    GripperCloses,
+    GripperOpens,
+    LimitsChanged,
+    SpeedOverrideChanged,
+    ZeroSet,
+)
 from rtcp.ipc.layout import PLANS
 from rtcp.ipc.refusals import (
     ClockNotLocked,
@@ -62,6 +70,7 @@ from rtcp.ipc.refusals import (
     PartnerStopPressed,
     Refusal,
     ReservedOutput,
+    SpeedOverrideOutOfRange,
     TorqueLimitTooLow,
     TorquePresent,
     UnknownAxis,
@@ -74,6 +83,7 @@ from rtcp.ipc.refusals import (
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.controllers.stream import StreamController
 from rtcp.motion.limits import read
+from rtcp.motion.speed_override import LOWEST
 
 MOST_LIMIT_ROWS: Final = 64
 """`MOST_AXES` joints and more boxes than an arm is configured with: all are checked in one cycle."""
@@ -111,6 +121,7 @@ class CommandHandler:
             SetOutput: self._set_output,
             MoveGripper: self._move_gripper,
             SetLimits: self._set_limits,
+            SetSpeedOverride: self._set_speed_override,
             SetZero: self._set_zero,
             Home: self._home,
             Shutdown: self._shut_down,
@@ -325,6 +336,17 @@ class CommandHandler:
                     return TorqueLimitTooLow(axis, abs(held), most)
         arm.set_limits(new)
         self._blackboard.event(LimitsChanged())
+        return None
+
+    def _set_speed_override(self, command: SetSpeedOverride, lease: int) -> Refusal | None:
+        override, wanted = self._arm.speed_override, command.fraction
+        if not LOWEST <= wanted <= 1.0:
+            return SpeedOverrideOutOfRange(wanted, LOWEST)
+        if wanted > override.fraction and not (lease and self._context.lease_held(lease)):
+            return NoLease()
+        if wanted != override.fraction:
+            override.fraction = wanted
+            self._blackboard.event(SpeedOverrideChanged(wanted))
         return None
 
     def _set_output(self, command: SetOutput, lease: int) -> Refusal | None:

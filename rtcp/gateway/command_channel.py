@@ -50,12 +50,18 @@ class Caller:
 
 class _Waiter(Generic[T]):
     def __init__(
-        self, look: Callable[[], T | None], timeout_s: float, timed_out: Callable[[], RtcpError], interval_s: float
+        self,
+        look: Callable[[], T | None],
+        timeout_s: float,
+        timed_out: Callable[[], RtcpError],
+        interval_s: float,
+        pace: Callable[[], float],
     ) -> None:
         self.interval_s = interval_s
         self._look = look
-        self._until = monotonic() + timeout_s
+        self._left_s, self._before = timeout_s, monotonic()
         self._timed_out = timed_out
+        self._pace = pace
         self.outcome: asyncio.Future[T] = asyncio.get_running_loop().create_future()
 
     def update(self) -> None:
@@ -64,7 +70,10 @@ class _Waiter(Generic[T]):
             return
         try:
             found = self._look()
-            if found is None and monotonic() > self._until:
+            now = monotonic()
+            self._left_s -= self._pace() * (now - self._before)
+            self._before = now
+            if found is None and self._left_s < 0.0:
                 raise self._timed_out()
         except Exception as error:
             self.outcome.set_exception(error)
@@ -124,6 +133,10 @@ class CommandChannel:
         """Control mode in the latest record."""
         found = int(self.record()["control_mode"])
         return ControlMode(found) if found in tuple(ControlMode) else None
+
+    def speed_override(self) -> float:
+        """Return the speed override in the latest record."""
+        return float(self.record()["speed_override"])
 
     def joints(self, name: str) -> list[float]:
         """Return a field of the latest record, one number a joint."""
@@ -200,10 +213,16 @@ class CommandChannel:
         await self.run(lease, command, lambda: True, _ANSWER_S, command.name)
 
     async def run(
-        self, lease: int, command: Command, outcome: Callable[[], T | None], timeout_s: float, what: str
+        self,
+        lease: int,
+        command: Command,
+        outcome: Callable[[], T | None],
+        timeout_s: float,
+        what: str,
+        pace: Callable[[], float] = lambda: 1.0,
     ) -> T:
         """Send a command and wait until `outcome` returns something; it is called from the first record on that knows
-        of the command, and may raise."""
+        of the command, and may raise. `pace`: how fast the time passes of which there is `timeout_s`."""
         head = await self.accept(lease, command)
 
         def look() -> T | None:
@@ -213,7 +232,7 @@ class CommandChannel:
         def timed_out() -> RtcpError:
             return RtcpError("timeout", f"{what} took longer than {timeout_s:.1f} s: the machine is {self.state.words}")
 
-        return await self.wait(look, timeout_s, timed_out)
+        return await self.wait(look, timeout_s, timed_out, pace=pace)
 
     async def accept(self, lease: int, command: Command) -> int:
         """Send a command; return, once the loop has accepted it, the number of the last record without it.
@@ -259,9 +278,10 @@ class CommandChannel:
         timeout_s: float,
         timed_out: Callable[[], RtcpError],
         interval_s: float = _POLL_S,
+        pace: Callable[[], float] = lambda: 1.0,
     ) -> T:
         """Return what `look` returns, once that is not None; it is called at least every `interval_s` and may raise."""
-        waiter = _Waiter(look, timeout_s, timed_out, interval_s)
+        waiter = _Waiter(look, timeout_s, timed_out, interval_s, pace)
         self._waiters.append(waiter)
         self._has_waiters.set()
         try:
@@ -398,6 +418,10 @@ class StreamingCommands:
         lease, _ = self._leases.pop(connection, (0, 0))
         if lease:
             self._channel.observer.release(lease)
+
+    def lease_of(self, connection: int) -> int:
+        """Return the lease of what a connection moves; 0: it moves nothing."""
+        return self._leases.get(connection, (0, 0))[0]
 
     def _lease(self, caller: Caller) -> tuple[int, int]:
         held = self._leases.get(caller.connection)

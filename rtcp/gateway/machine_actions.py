@@ -20,6 +20,7 @@ from rtcp.ipc.commands import (
     Reset,
     SetControlMode,
     SetDriveMode,
+    SetSpeedOverride,
     SetZero,
     Shutdown,
 )
@@ -135,6 +136,17 @@ class MachineActions:
             changed = channel.reaching(wanted, frozenset(), "the mode change", since)
             await channel.run(lease, command, changed, _MODE_S, "the mode change")
         return {"mode": name}
+
+    async def set_speed_override(self, caller: Caller, fraction: float, lease: int) -> Json:
+        """Change the speed override; `lease`: one that the caller holds already, 0: none."""
+        channel = self._channel
+        channel.check_loop()
+        if lease or fraction <= channel.speed_override():
+            await channel.send(lease, SetSpeedOverride(fraction))
+        else:
+            async with channel.lease(caller) as acquired:
+                await channel.send(acquired, SetSpeedOverride(fraction))
+        return {}
 
     # -- gripper, zero, homing ----------------------------------------------------------------------------------------
 

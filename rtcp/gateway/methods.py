@@ -41,6 +41,7 @@ from rtcp.ipc.observer import Observer
 from rtcp.ipc.session import Session, SessionError, read_json, read_processes
 from rtcp.ipc.states import ControlMode, JogFrame
 from rtcp.motion.limits import Limits
+from rtcp.motion.speed_override import LOWEST
 
 HOLD_S = 0.25
 """Hold time of a command that gives none."""
@@ -213,6 +214,15 @@ class Methods:
     async def mode(self, caller: Caller, name: str) -> Json:
         """Change the control mode (joint, cartesian, joystick, velocity, torque) or the drive mode (csp, csv, cst)."""
         return await self.machine.mode(caller, name)
+
+    @method(at_once=True)
+    async def set_speed_override(self, caller: Caller, fraction: Annotated[float, Ge(LOWEST), Le(1)]) -> Json:
+        """Move at a `fraction` of the speed from now on, 0.01 to 1, also what is under way.
+
+        Anyone may lower it. Raising it needs the lease: refused with its holder while another commands the arm.
+        """
+        lease = self._streaming.lease_of(caller.connection)
+        return await self.machine.set_speed_override(caller, fraction, lease)
 
     @method()
     async def move_gripper(self, caller: Caller, open: bool) -> Json:

@@ -658,7 +658,8 @@ class MotionActions:
             return arrived()
 
         try:
-            return await channel.run(lease, command, outcome, timeout_s, what)
+            # A motion that the speed override slows down has so much more time.
+            return await channel.run(lease, command, outcome, timeout_s, what, channel.speed_override)
         except asyncio.CancelledError:
             if self._motion is motion and channel.is_shared(lease):
                 await channel.accept(0, Halt())  # the lease does not end, with which it would stop

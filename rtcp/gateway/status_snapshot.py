@@ -321,6 +321,7 @@ class StatusSnapshot:
             "limited_by": limits,
             "drive_mode": _name(DriveMode, int(record["drive_mode"])),
             "control_mode": _name(ControlMode, control_mode),
+            "speed_override": float(record["speed_override"]),
             "joystick": {
                 "mode": JOYSTICK_MODES[int(record["joystick_mode"]) % len(JOYSTICK_MODES)],
                 "controls_arm": bool(flags & FLAG_ARM_HAS_JOYSTICK),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,7 +20,7 @@ class Tolerances:
     goal: Sequence[float]
     """Of the measured position from the last point, at the end."""
     time_s: float
-    """How much later than planned the arm may be inside `goal`."""
+    """How much later than planned the arm may be inside `goal`, at a speed override of 1."""
 
 
 class Violation(Exception):
@@ -42,16 +41,20 @@ class Tracking:
         self._tolerances = tolerances
         self._end = end
         self._at = channel.observer.head
-        self._until = time.monotonic() + duration_s + tolerances.time_s
+        self._left_s = duration_s + tolerances.time_s
+        self._time_ns = int(channel.record()["time_ns"])
 
     def look(self) -> None:
         """Raise Violation where the path was left, or where the end is late."""
         records, _ = self._channel.observer.since(self._at)
         if len(records):
             self._at = int(records["number"][-1])
+            # The planned time passes at the speed override.
+            self._left_s -= 1e-9 * float(np.diff(records["time_ns"], prepend=self._time_ns) @ records["speed_override"])
+            self._time_ns = int(records["time_ns"][-1])
             off = np.abs(records["actual_position"] - records["commanded_position"]).max(axis=0)
             self._compare("path_tolerance_violated", off.tolist(), self._tolerances.path, "on its way")
-        if time.monotonic() > self._until:
+        if self._left_s < 0.0:
             positions = self._channel.joints("actual_position")
             off = [abs(a - b) for a, b in zip(positions, self._end, strict=True)]
             self._compare("goal_tolerance_violated", off, self._tolerances.goal, "when its time was up")

@@ -132,6 +132,14 @@ class SetLimits(Command):
     rows: int
 
 
+class SetSpeedOverride(Command):
+    """Move at a fraction of the speed from now on, 0.01 to 1. Anyone may lower it; raising it takes the lease."""
+
+    states = ANYWHERE
+    needs_lease = False
+    fraction: float
+
+
 class SetZero(Command):
     """Set what a drive shows where its axis is at 0."""
 

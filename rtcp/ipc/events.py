@@ -97,6 +97,12 @@ class LimitsChanged(Event, number=31):
     """the limits were changed"""
 
 
+class SpeedOverrideChanged(Event, number=53):
+    """the speed override is {fraction:.0%}"""
+
+    fraction: float
+
+
 class ControlModeChanged(Event, number=30):
     """control mode {mode}"""
 

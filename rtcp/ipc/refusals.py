@@ -252,6 +252,19 @@ class HoldTimeOutOfRange(Refusal):
     limit: float
 
 
+class SpeedOverrideOutOfRange(Refusal):
+    """speed override {value:.6g} is not allowed: a fraction of the speed from {lowest:g} to 1"""
+
+    value: float
+    lowest: float
+
+
+class SpeedOverridden(Refusal):
+    """the speed override of this arm is {fraction:.0%}: a motion in step runs at 100 % only (`rtcp speed 100`)"""
+
+    fraction: float
+
+
 class StreamPointDropped(Refusal):
     """the target came {late_s:.6g} s late or out of order: it was dropped"""
 

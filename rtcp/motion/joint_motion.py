@@ -21,6 +21,7 @@ from ruckig import (
 )
 
 from rtcp.motion.limits import Limits
+from rtcp.motion.speed_override import SpeedOverride, TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 LONGEST_S: Final = 600.0
@@ -116,15 +117,21 @@ class JointMotion:
         period_s: the cycle, s.
         velocity, acceleration, jerk: bounds of each joint, shape (n,), rad/s, rad/s^2, rad/s^3; read when a motion
             begins, which keeps them to its end.
+        speed_override: at which a move passes; None: always at 1.
     """
 
     def __init__(
-        self, period_s: float, velocity: Sequence[float], acceleration: Sequence[float], jerk: Sequence[float]
+        self,
+        period_s: float,
+        velocity: Sequence[float],
+        acceleration: Sequence[float],
+        jerk: Sequence[float],
+        speed_override: SpeedOverride | None = None,
     ) -> None:
         n = len(velocity)
         self._otg = Ruckig(n, period_s)
         self._output = OutputParameter(n)
-        self._plan = Trajectory(n)
+        self._plan, self._spare = Trajectory(n), Trajectory(n)
         # A move is planned beside the one that runs, and takes over only when the plan succeeds.
         self._inputs = [InputParameter(n), InputParameter(n), InputParameter(n)]
         self._stop = self._inputs[2]
@@ -135,6 +142,11 @@ class JointMotion:
         self._active = self._inputs[0]
         self._target = Setpoint(n)
         self._velocity_limit, self._acceleration_limit, self._jerk_limit = velocity, acceleration, jerk
+        self._period_s = period_s
+        self._speed_override = speed_override or SpeedOverride()
+        self._time_scale = TimeScale()
+        self._is_scaled = False
+        """Whether the move under way has ever been slower than planned: from then on it follows its plan by itself."""
         self.phase = Phase.HOLD
         self.failed = False
         """Whether ruckig refused its input; the setpoints stand since."""
@@ -167,8 +179,9 @@ class JointMotion:
             max(min(speed, limit), abs(now))
             for limit, now in zip(self._velocity_limit, move.current_velocity, strict=True)
         ]  # fmt: skip
-        if not find_way(self._otg, move, self._jerk_limit, self._plan) or self._plan.duration > LONGEST_S:
+        if not find_way(self._otg, move, self._jerk_limit, self._spare) or self._spare.duration > LONGEST_S:
             return False
+        self._plan, self._spare = self._spare, self._plan
         self._active = move
         self._begin(Phase.MOVE)
         return True
@@ -201,6 +214,7 @@ class JointMotion:
         self.phase = phase
         self.failed = False
         self.elapsed_s = 0.0
+        self._is_scaled = False
 
     def _carry_over(self, given: InputParameter, state: ArmState) -> None:
         given.current_position = state.commanded
@@ -221,6 +235,8 @@ class JointMotion:
             target.position = state.commanded
             target.velocity = self._zero
             return target
+        if self._is_scaled or (self._speed_override.fraction != 1.0 and self.phase is Phase.MOVE):
+            return self._follow_plan(state)
         output = self._output
         try:
             result = self._otg.update(self._active, output)
@@ -241,4 +257,28 @@ class JointMotion:
             self.phase = Phase.HOLD
         else:
             output.pass_to_input(self._active)
+        return target
+
+    def _follow_plan(self, state: ArmState) -> Setpoint:
+        """Return the setpoints of the next cycle at the speed override: the same way, whose time passes more slowly."""
+        target, plan, scale, dt = self._target, self._plan, self._time_scale, self._period_s
+        if not self._is_scaled:
+            scale.begin()
+            self._is_scaled, self.duration_s = True, plan.duration
+        before, goal = scale.speed, self._speed_override.fraction
+        speed = 1.0
+        if not goal == before == 1.0:
+            # Where the cycle ends hardly depends on how much u changes.
+            _, along, _ = plan.at_time(self.elapsed_s + (before + 0.5 * scale.rate * dt) * dt)
+            bounds, jerk = self._acceleration_limit, self._jerk_limit
+            speed = scale.step(goal, along, state.commanded_velocity, bounds, jerk, dt)
+        self.elapsed_s = min(self.elapsed_s + 0.5 * (before + speed) * dt, self.duration_s)
+        target.position, along, bend = plan.at_time(self.elapsed_s)
+        target.velocity = [speed * v for v in along]
+        # What a stop, or another move, begins with.
+        rate = scale.rate
+        self._active.current_acceleration = [speed * speed * a + rate * v for a, v in zip(bend, along, strict=True)]
+        if self.elapsed_s >= self.duration_s:
+            target.velocity = self._zero
+            self.phase = Phase.HOLD
         return target

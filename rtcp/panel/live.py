@@ -597,6 +597,7 @@ class Live:
             "message": raw["message"],
             "drive_mode": raw["drive_mode"],
             "control_mode": raw["control_mode"],
+            "speed_override": f"{100.0 * raw['speed_override']:.3g} %",
             "holder": raw["lease"]["holder"],
             "age_s": round(raw["lost_s"] + max(0, time.monotonic_ns() - raw["time_ns"]) * 1e-9, 1),
             "bus": raw["bus"],

@@ -128,6 +128,20 @@ def button(label: str, handler: Handler | None = None, *, when: str = "", plain:
     return made
 
 
+def speed_override(view: View) -> None:
+    """Show the speed override, and buttons that set it."""
+
+    def set_to(percent: int) -> Handler:
+        done = f"The speed override is {percent} %"
+        return lambda: view.act(lambda robot: robot.set_speed_override(percent / 100.0), done)
+
+    with ui.element("div").classes("buttons").props('role=group aria-label="Speed override"'):
+        text("span", "Speed override ")
+        shown("speed_override", tag="b")
+        for percent in (5, 25, 50, 100):
+            button(f"{percent} %", set_to(percent), plain=True)
+
+
 def on_click(element: Element, handler: Handler) -> None:
     """Call `handler` for a click; what it commands is judged by when the person has clicked."""
 

@@ -28,7 +28,7 @@ from rtcp.panel.access import Access, Sessions, Visitor, password_file, password
 from rtcp.panel.arm_view import ArmView
 from rtcp.panel.live import Live
 from rtcp.panel.metrics import exposition
-from rtcp.panel.page import View, no_geometry, shown, text
+from rtcp.panel.page import View, no_geometry, shown, speed_override, text
 from rtcp.panel.pages import arm, cell, health, jog, limits, processes, recorder, scope, segment, start, targets
 
 _STATIC = Path(__file__).parent / "static"
@@ -211,6 +211,8 @@ class Panel:
                 f"document.querySelector('#menu a[data-path=\"{path}\"]')?.setAttribute('aria-current', 'page')"
             )
             with ui.element("section").classes("page"):
+                if beside_arm and self._live.config is not None:
+                    speed_override(view)
                 try:
                     if inspect.isawaitable(found := build(view)):
                         await found

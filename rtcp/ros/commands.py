@@ -274,6 +274,10 @@ class Commander:
         self._may_enable = True
         return "the drives are enabled"
 
+    async def set_speed_override(self, fraction: float) -> None:
+        """speed_override: move at a fraction of the speed from now on, also what is under way."""
+        await (await self.connected()).set_speed_override(fraction)
+
     async def disable(self) -> str:
         """robot_disable: stop, remove the torque; return a sentence."""
         self._may_enable = False

@@ -182,6 +182,10 @@ class GroupRobot:
         left = await self._all(AsyncRobot.reset)
         return next(one for one in _WORST if one in left.values())
 
+    async def set_speed_override(self, fraction: float) -> None:
+        """Set it of all arms; below 1 motions in step are refused."""
+        await self._all(lambda robot: robot.set_speed_override(fraction))
+
     async def halt(self) -> None:
         """Stop every motion."""
         await self._all(AsyncRobot.halt)
@@ -393,6 +397,7 @@ class GroupStates:
                 max(one.stamp_ns for one in found), modes.pop() if len(modes) == 1 else RobotMode.UNKNOWN,
                 any_of("e_stopped"), all_of("drives_powered"), all_of("motion_possible"), any_of("in_motion"),
                 any_of("in_error"), next((one.error_code for one in found if one.error_code), 0),
+                min(one.speed_override for one in found),
             )
         )  # fmt: skip
 

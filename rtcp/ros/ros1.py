@@ -28,6 +28,7 @@ from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from industrial_msgs.msg import RobotStatus as RobotStatusMessage
 from industrial_msgs.srv import CmdJointTrajectory, CmdJointTrajectoryResponse, StopMotion, StopMotionResponse
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger, TriggerResponse
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -149,6 +150,7 @@ class Publications:
             "feedback_states", FollowJointTrajectoryFeedback, queue_size=100, tcp_nodelay=True
         )
         self._status = rospy.Publisher("robot_status", RobotStatusMessage, queue_size=10, tcp_nodelay=True)
+        self._speed_override = rospy.Publisher("speed_override_state", Float64, queue_size=10)
         self._diagnostics = rospy.Publisher("/diagnostics", DiagnosticArray, queue_size=10)
         self._tf = rospy.Publisher("/tf", TFMessage, queue_size=100, tcp_nodelay=True)
 
@@ -201,6 +203,8 @@ class Publications:
         for name in ("mode", "e_stopped", "drives_powered", "motion_possible", "in_motion", "in_error"):
             getattr(message, name).val = getattr(status, name)
         self._status.publish(message)
+        if status.speed_override > 0.0:
+            self._speed_override.publish(status.speed_override)
 
     def diagnostics(self, diagnostics: Diagnostics) -> None:
         """Publish diagnostics."""
@@ -228,6 +232,7 @@ class Commands:
             ("joint_path_command", JointTrajectory, lambda m: self.commander.begin_trajectory(_trajectory(m))),
             ("joint_command", JointTrajectoryPoint, lambda m: self.commander.command_point(_point(m))),
             ("joint_trajectory", JointTrajectory, lambda m: self.commander.command_joints(_trajectory(m))),
+            ("speed_override", Float64, lambda m: self.commander.set_speed_override(m.data)),
         ):
             rospy.Subscriber(topic, kind, self._begin, (topic, carry_out), queue_size=100, tcp_nodelay=True)
         rospy.Service("joint_path_command", CmdJointTrajectory, self._path)

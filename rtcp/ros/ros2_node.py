@@ -52,12 +52,14 @@ OUT: Mapping[str, str] = {
     "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "tf": "tf2_msgs/msg/TFMessage",
     "robot_description": "std_msgs/msg/String",
+    "speed_override_state": "std_msgs/msg/Float64",
 }
 """Topics that are published, with their types."""
 IN: Mapping[str, str] = {
     "joint_command": _POINT,
     "joint_path_command": _TRAJECTORY,
     "joint_trajectory": _TRAJECTORY,
+    "speed_override": "std_msgs/msg/Float64",
 }
 """Topics that are taken."""
 SERVICES: Mapping[str, str] = {
@@ -170,6 +172,8 @@ class Commands:
             command = self.commander.command_point(point_of(message))
         elif topic == "joint_trajectory":
             command = self.commander.command_joints(trajectory_of(message))
+        elif topic == "speed_override":
+            command = self.commander.set_speed_override(float(message.data))
         else:
             command = self.commander.begin_trajectory(trajectory_of(message))
 
@@ -271,9 +275,11 @@ class Publications:
         self._wire.publish_feedback(feedback)
 
     def status(self, status: RobotStatus) -> None:
-        """Publish robot_status."""
+        """Publish robot_status, and speed_override_state where it is known."""
         if status.in_error is TriState.TRUE:
             self._note_stop()
+        if status.speed_override > 0.0:
+            self._publish("speed_override_state", data=status.speed_override)
         if "robot_status" not in self._wire.topics:
             return
         make = self._make

@@ -34,7 +34,7 @@ _STALE_NS = _SECOND_NS // 2
 """Age at which a record, or a measured value in one, says nothing about now: far beyond the stalls of a busy host."""
 _AT_REST = 0.01
 """Measured speed below which a joint stands, rad/s: drives report some counts of noise."""
-_CHANGES = ("state", "flags", "control_mode", "fault", "limit")
+_CHANGES = ("state", "flags", "control_mode", "fault", "limit", "speed_override")
 _IN_ERROR = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING)
 _AT_REST_STATES = (State.READY, State.ENABLING, State.HOLDING, State.STOPPED_BY_LIMIT)
 _TAKES_MOTIONS = (ControlMode.JOINT, ControlMode.CARTESIAN)
@@ -70,6 +70,8 @@ class RobotStatus:
     in_error: TriState = TriState.UNKNOWN
     error_code: int = 0
     """Number of the event (`docs/machine.md`); 0: no error."""
+    speed_override: float = 0.0
+    """Fraction of its speed at which the arm moves; of a group the smallest; 0: nothing is known."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,7 @@ def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: boo
         in_motion,
         TriState(found.in_error),
         found.error_code,
+        float(record["speed_override"]),
     )
 
 
@@ -173,7 +176,7 @@ class StatePublisher:
         """Cycle of the last sample, CLOCK_MONOTONIC."""
         self._last: Any = None
         """Newest record; None: none yet."""
-        self._level: tuple[int, ...] = ()
+        self._level: tuple[float, ...] = ()
         """Its fields `_CHANGES`."""
 
     def step(self, wait_s: float) -> None:

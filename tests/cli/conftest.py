@@ -71,6 +71,7 @@ def status() -> dict[str, Any]:
         "message": "enabled: the arm holds",
         "limited_by": {},
         "control_mode": "joint",
+        "speed_override": 1.0,
         "drive_mode": "csp",
         "joystick": {"mode": "X-Y", "controls_arm": True},
         "robot": {"mode": "auto", "e_stopped": False, "drives_powered": True, "motion_possible": True,

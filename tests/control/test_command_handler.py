@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from math import inf
+from math import inf, nan
 
 import pytest
 
@@ -29,10 +29,12 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetSpeedOverride,
     SetZero,
     Shutdown,
     StreamPosition,
 )
+from rtcp.ipc.events import SpeedOverrideChanged
 from rtcp.ipc.refusals import (
     ClockNotLocked,
     DriveModeChanging,
@@ -47,6 +49,7 @@ from rtcp.ipc.refusals import (
     PositionOutOfRange,
     Refusal,
     SpeedOutOfRange,
+    SpeedOverrideOutOfRange,
     UnknownOutput,
     WrongCount,
 )
@@ -56,7 +59,7 @@ from .rig import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, LoopRig, Step, 
 
 HEARTBEAT = 0x0004
 """Output 3, which is toggled each cycle."""
-ANYONE = {"disable", "halt", "shutdown"}
+ANYONE = {"disable", "halt", "set_speed_override", "shutdown"}
 """Commands that need no lease: they make the arm safer."""
 READY = [SetOutput(5, True), SetZero(0, 0.0), Enable(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT),
          MoveGripper(False), SetLimits(0, 1)]  # fmt: skip
@@ -117,6 +120,51 @@ def test_a_command_that_makes_the_arm_safer_is_accepted_from_anyone(rig: LoopRig
     rig.bring_to(State.MOVING)
     assert rig.send(command, lease=0).refusal is None
     assert rig.state is not State.MOVING
+
+
+# -- the speed override ---------------------------------------------------------------------------------------------
+
+
+def speed_overrides(rig: LoopRig) -> list[float]:
+    events = (record.event for record in rig.events)
+    return [event.fraction for event in events if isinstance(event, SpeedOverrideChanged)]
+
+
+def test_anyone_lowers_the_speed_override_and_its_raise_takes_the_lease(rig: LoopRig) -> None:
+    rig.bring_to(State.MOVING)
+    for fraction, lease, refusal in (
+        (0.5, 0, None),
+        (0.5, 0, None),
+        (0.6, 0, NoLease()),
+        (0.6, 12345, NoLease()),
+        (0.6, rig.lease, None),
+        (0.01, 12345, None),
+    ):
+        assert rig.send(SetSpeedOverride(fraction), lease=lease).refusal == refusal
+        shown = rig.observer.latest()[0]
+        assert shown["speed_override"] == rig.arm.speed_override.fraction
+    assert speed_overrides(rig) == [0.5, 0.6, 0.01]
+    assert rig.state is State.MOVING
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.0099, 1.0001, 2.0, -0.5, nan, inf])
+def test_a_speed_override_out_of_its_range_is_refused(rig: LoopRig, fraction: float) -> None:
+    rig.start()
+    refusal = rig.send(SetSpeedOverride(fraction)).refusal
+    assert isinstance(refusal, SpeedOverrideOutOfRange)
+    assert "a fraction of the speed from 0.01 to 1" in rig.names.message(refusal)
+    assert rig.arm.speed_override.fraction == 1.0
+    assert speed_overrides(rig) == []
+
+
+def test_a_speed_override_outlasts_a_halt_and_disabling(rig: LoopRig) -> None:
+    rig.bring_to(State.MOVING)
+    rig.do(SetSpeedOverride(0.3))
+    rig.do(Halt())
+    rig.until(State.HOLDING)
+    rig.do(Disable())
+    rig.until(State.READY)
+    assert rig.arm.speed_override.fraction == 0.3
 
 
 # -- moves ----------------------------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetSpeedOverride,
     SetZero,
     Shutdown,
     StreamPosition,
@@ -92,6 +93,7 @@ halt             .     =     .     =     stop  =     =     =     .     .     .  
 set_output       .     =     =     =     =     =     =     =     .     =     .     .     .
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
 set_limits       .     =     .     =     =     .     =     .     .     =     =     .     .
+set_speed_override = = =     =     =     =     =     =     =     =     =     =     =
 set_zero         .     =     .     .     .     .     .     .     .     .     .     .     .
 home             .     .     .     home  .     .     .     .     .     .     .     .     .
 shutdown         close close close close close close close close close close close close =
@@ -118,7 +120,8 @@ COMMANDS: dict[str, Command] = {
         RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
         Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
         MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
-        MoveGripper(False), SetLimits(0, 1), SetZero(0, 0.0), Home(0), Shutdown(),
+        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), SetZero(0, 0.0), Home(0),
+        Shutdown(),
     )
 }  # fmt: skip
 """One of each kind, with fields that nobody could refuse."""

@@ -55,6 +55,7 @@ class FakeLoop:
         self.moves_for = 40
         self._left = 0
         self.control_mode = ControlMode.JOINT
+        self.speed_override = 1.0
         self.state = state
         self.q = list(q)
         self.inputs = self.outputs = 0
@@ -106,6 +107,7 @@ class FakeLoop:
 
     def _publish(self) -> None:
         told = {"time_ns": time.monotonic_ns(), "state": self.state, "control_mode": self.control_mode}
+        told["speed_override"] = self.speed_override
         told |= dict.fromkeys(("actual_position", "commanded_position", "sent_position"), self.q)
         told |= {"io_inputs": self.inputs, "io_outputs": self.outputs}
         self.board.publish(numbers(self.board.schema, **told))

@@ -54,7 +54,7 @@ def publications(wire: Kept) -> Publications:
 def test_every_topic_is_published(wire: Kept, publications: Publications) -> None:
     publications.connected(CONFIG)
     publications.joints(JOINTS, SAMPLE)
-    publications.status(RobotStatus(1, RobotMode.AUTO, error_code=7))
+    publications.status(RobotStatus(1, RobotMode.AUTO, error_code=7, speed_override=0.5))
     publications.diagnostics(Diagnostics(1, 2, "fault", (("state", "fault"),)))
     assert wire.messages.keys() == OUT.keys()
     status = wire.messages["robot_status"]

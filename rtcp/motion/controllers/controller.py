@@ -24,6 +24,7 @@ from rtcp.ipc.states import ControlMode
 from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.limits import Limits
+from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import ArmState, Phase, Setpoint
 from rtcp.motion.step_group import StepGroup
 
@@ -47,6 +48,7 @@ class ControllerSetup:
     """Returns the rows of a slot of the plan area (`rtcp.motion.planning.plan`)."""
     group: StepGroup = field(default_factory=StepGroup)
     """Partners in a cell, and the motion in step."""
+    speed_override: SpeedOverride = field(default_factory=SpeedOverride)
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -72,6 +74,7 @@ class Controller:
         self.config = setup.config
         self.limits = limits
         self.period_s = setup.period_s
+        self.speed_override = setup.speed_override
         self.phase = Phase.HOLD
         self.ended: MotionEnded | None = None
         """Why it ended the motion by itself; None from the beginning of each motion on."""
@@ -80,7 +83,9 @@ class Controller:
         self.held = 0
         """What keeps the motion below the commanded velocity in this cycle: `HELD_...` of `rtcp.ipc.schema`."""
         self.setpoint = Setpoint(len(limits.velocity))
-        self.motion = JointMotion(setup.period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self.motion = JointMotion(
+            setup.period_s, limits.velocity, limits.acceleration, limits.jerk, setup.speed_override
+        )
         """Brings the joints to rest; free for other use before that."""
         self._rows_in = setup.plan
         self._joints = range(len(limits.velocity))

@@ -18,6 +18,7 @@ from rtcp.ipc.refusals import (
     BrakesOutOfRange,
     DamagedRow,
     Refusal,
+    SpeedOverridden,
     StartOutOfReach,
     WrongRowCount,
     WrongState,
@@ -67,6 +68,8 @@ class InStepController(TrajectoryController):
         group = self._group
         if continues or self.phase:
             return WrongState(command.number, State.MOVING)
+        if self.speed_override.fraction < 1.0:
+            return SpeedOverridden(self.speed_override.fraction)
         ahead_s = 1e-9 * (command.start_ns - state.now_ns)
         if not 0.0 < ahead_s <= LONGEST_WAIT_S:
             return StartOutOfReach(ahead_s, LONGEST_WAIT_S)

@@ -198,12 +198,15 @@ class JogController(Controller):
         return target
 
     def _turned(self, tool: Pose) -> list[float]:
-        """Return what is wanted along the base's axes."""
-        asked = self._asked
+        """Return what is wanted along the base's axes, at the speed override."""
+        asked, wanted, fraction = self._asked, self._wanted, self.speed_override.fraction
+        if fraction != 1.0:
+            for i in range(6):
+                wanted[i] = fraction * asked[i]
+            asked = wanted
         if not self._in_tool:
             return asked
         a, b, c, d, e, f = asked
-        wanted = self._wanted
         wanted[0], wanted[1], wanted[2] = applied(tool.rotation, (a, b, c))
         wanted[3], wanted[4], wanted[5] = applied(tool.rotation, (d, e, f))
         return wanted

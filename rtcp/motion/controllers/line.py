@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import asin, atan2, hypot, sqrt
 from typing import Final, NamedTuple
 
-from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError
+from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
@@ -26,8 +26,10 @@ from rtcp.ipc.events import (
 )
 from rtcp.ipc.refusals import DamagedRow, PathNeedsRest, PathStartsElsewhere, Refusal
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
+from rtcp.motion.joint_motion import find_way
 from rtcp.motion.planning.interpolation import quaternion, rotation, turn_between, turned_by
 from rtcp.motion.planning.plan import damaged_line, read_row
+from rtcp.motion.speed_override import TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 LINES_MOST: Final = 256
@@ -65,6 +67,12 @@ class LineController(Controller):
         self._halt.control_interface = ControlInterface.Velocity
         self._halt.target_velocity = [0.0]
         self._active = self._way
+        self._time_scale = TimeScale()
+        self._plan = Trajectory(1)
+        """Of the rest of the piece, since it became slower than planned."""
+        self._is_scaled = False
+        self._fraction = self._plan_s = 0.0
+        """How far the tool is on the piece, and since when it is, by the time of its plan, s."""
         self._output = OutputParameter(1)
         self._velocity = [0.0] * n
         self._near = [0.0] * n
@@ -130,6 +138,7 @@ class LineController(Controller):
         way.max_velocity, way.max_acceleration, way.max_jerk = [row[14]], [row[15]], [row[16]]
         self._otg.reset()
         self._active = way
+        self._is_scaled = False
 
     def stop(self, state: ArmState) -> None:
         """Brake along the line, as fast as the piece's acceleration and jerk allow."""
@@ -167,14 +176,10 @@ class LineController(Controller):
 
     def _go_along(self, state: ArmState) -> MotionEnded | None:
         """Write the setpoints of the next cycle, or return why the line cannot go on."""
-        output = self._output
-        try:
-            result = self._otg.update(self._active, output)
-        except (RuckigError, ValueError):
-            result = Result.Error
+        result = self._step()
         if result < 0:
             return ControllerFailed()
-        fraction: float = output.new_position[0]
+        fraction: float = self._fraction
         x, y, z = self._from
         along, across, up = self._way_m
         turned = turned_by(self._rotation, self._axis, fraction * self._angle) if self._angle else self._rotation
@@ -204,14 +209,47 @@ class LineController(Controller):
                     return SingularityReached(which, distance, self._nearest[which])
         self._near = position if not self._rest_counts else list(q)
         self.setpoint.position, self.setpoint.velocity = position, velocity
-        self.elapsed_s = self._done_s + output.time
+        self.elapsed_s = self._done_s + self._plan_s
         if result == Result.Finished:
             self._piece_ended = self.phase is Phase.MOVE and self._row < self._count - 1
             if not self._piece_ended:
                 self.phase = Phase.HOLD
-        else:
-            output.pass_to_input(self._active)
         return None
+
+    def _step(self) -> Result:
+        """Go on along the piece by one cycle, at the speed override."""
+        if self.phase is Phase.MOVE and (self._is_scaled or self.speed_override.fraction != 1.0):
+            # Without a plan, which is a matter of rounding, it is tried again in the next cycle.
+            if not self._is_scaled and find_way(self._otg, self._way, [self._piece[16]], self._plan):
+                self._is_scaled, self._done_s, self._plan_s = True, self.elapsed_s, 0.0
+                self._time_scale.begin()
+            if self._is_scaled:
+                return self._follow_plan()
+        output = self._output
+        try:
+            result = self._otg.update(self._active, output)
+        except (RuckigError, ValueError):
+            return Result.Error
+        self._fraction, self._plan_s = output.new_position[0], output.time
+        if result == Result.Working:
+            output.pass_to_input(self._active)
+        return result
+
+    def _follow_plan(self) -> Result:
+        way, plan, scale, dt = self._way, self._plan, self._time_scale, self.period_s
+        before, goal = scale.speed, self.speed_override.fraction
+        speed = 1.0
+        if not goal == before == 1.0:
+            # Where the cycle ends hardly depends on how much u changes.
+            _, along, _ = plan.at_time(self._plan_s + (before + 0.5 * scale.rate * dt) * dt)
+            speed = scale.step(goal, along, way.current_velocity, way.max_acceleration, way.max_jerk, dt)
+        self._plan_s = min(self._plan_s + 0.5 * (before + speed) * dt, plan.duration)
+        position, (along_it,), (bend,) = plan.at_time(self._plan_s)
+        self._fraction = position[0]
+        # What a stop begins with.
+        way.current_position, way.current_velocity = position, [speed * along_it]
+        way.current_acceleration = [speed * speed * bend + scale.rate * along_it]
+        return Result.Finished if self._plan_s >= plan.duration else Result.Working
 
     def _due(self) -> bool:
         """Whether some ms have passed since the singularities were looked at: the tool has moved 1 mm at most."""

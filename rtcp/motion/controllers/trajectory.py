@@ -1,12 +1,12 @@
 """Timed joint waypoints, cubic or quintic in between; `rtcp.motion.planning` checked the plan as a whole.
 
-The arm gets to a first waypoint that is later than 0 by an `Approach`, and stops along the path by a `Slowdown`.
+The arm gets to a first waypoint that is later than 0 by an `Approach`; by a `TimeScale` it stops along the path, and
+follows the speed override.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
 from typing import ClassVar, Final, NamedTuple
 
 from ruckig import InputParameter, Ruckig, Trajectory
@@ -38,6 +38,7 @@ from rtcp.motion.planning.plan import (
     first_not_finite,
     read_row,
 )
+from rtcp.motion.speed_override import TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 AT_START_RAD: Final = 1e-3
@@ -49,12 +50,6 @@ _EXACT: Final = 1e-12
 _AT_ONCE_S: Final = 1e-9
 _SLACK: Final = 1e-6
 _INSIDE = 1.0 - 1e-9
-_MOST_RATE: Final = 50.0
-_MOST_JERK: Final = 2000.0
-"""1/s and 1/s^2: bounds of how fast the path's time stops where no joint moves."""
-_STILL: Final = 1e-9
-_OF_LIMIT: Final = 0.99
-"""Share of a joint's acceleration that a slowdown uses, so that what is between two cycles keeps to it too."""
 
 
 class NoApproach(NamedTuple):
@@ -119,65 +114,6 @@ class Approach:
         return None
 
 
-class Slowdown:
-    """Comes to rest along a path: the path's own time s passes ever slower until it stands.
-
-    A point p(s) of the path is passed with the velocity p'(s) u, where u = ds/dt falls from 1 to 0. In each cycle
-    u falls as fast as every joint's acceleration and jerk allow. `speed` is u, `rate` is du/dt, 1/s.
-    """
-
-    def __init__(self) -> None:
-        self.speed = 1.0
-        self.rate = 0.0
-
-    def begin(self) -> None:
-        """Start at full speed."""
-        self.speed, self.rate = 1.0, 0.0
-
-    def step(
-        self,
-        along: Sequence[float],
-        velocity: Sequence[float],
-        acceleration: Sequence[float],
-        jerk: Sequence[float],
-        dt: float,
-    ) -> float:
-        """Return u at the end of the next cycle.
-
-        Args:
-            along: p'(s), rad/s, at the point that the cycle ends at.
-            velocity: what was commanded last, rad/s.
-            acceleration, jerk: bounds of each joint, rad/s^2, rad/s^3.
-            dt: the cycle, s.
-        """
-        now, low, high, most = self.speed, 0.0, 1.0, _MOST_JERK
-        for at_full, before, bound, jerks in zip(along, velocity, acceleration, jerk, strict=True):
-            steep = at_full if at_full >= 0.0 else -at_full
-            if steep > 1e-6:
-                # |p' u - v| <= a dt, and what the jerk leaves of du/dt's change.
-                signed = before if at_full > 0.0 else -before
-                room = _OF_LIMIT * bound * dt
-                least, largest = (signed - room) / steep, (signed + room) / steep
-                low = least if least > low else low
-                high = largest if largest < high else high
-                allowed = jerks / steep
-                most = allowed if allowed < most else most
-        rate = self.rate - most * dt
-        # So steep that the rate comes back to 0 together with the speed.
-        landing = -sqrt(2.0 * most * now)
-        rate = rate if rate > landing else landing
-        rate = rate if rate > -_MOST_RATE else -_MOST_RATE
-        speed = now + rate * dt
-        speed = speed if speed < high else high
-        speed = speed if speed > low else low
-        speed = speed if speed < now else now
-        if speed < _STILL or (low == 0.0 and speed < most * dt * dt):
-            speed = 0.0
-        self.rate = (speed - now) / dt
-        self.speed = speed
-        return speed
-
-
 class TrajectoryController(Controller):
     """Accepts `RunTrajectory`, and `ExtendTrajectory` while an open one is under way."""
 
@@ -187,7 +123,7 @@ class TrajectoryController(Controller):
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
         n = len(self._zero)
-        self._slowdown = Slowdown()
+        self._time_scale = TimeScale()
         self._approach = Approach(setup.limits)
         self._approach_s = 0.0
         self._position = [0.0] * n
@@ -228,6 +164,7 @@ class TrajectoryController(Controller):
         if refusal is not None:
             return refusal
         self.begin()
+        self._time_scale.begin()
         self._fade_s = self._approach_s = 0.0
         if first[0] == 0.0:
             self._fade_out(state, first, last[0])
@@ -298,30 +235,31 @@ class TrajectoryController(Controller):
         """Brake along the path, as fast as the joints' limits allow."""
         if self.phase is Phase.MOVE:
             self.phase = Phase.STOP
-            self._slowdown.begin()
 
     def advance(self, state: ArmState) -> Setpoint:
         """Return the setpoints of the next cycle."""
         target, dt = self.setpoint, self.period_s
-        if self.phase is Phase.MOVE:
+        scale, moves = self._time_scale, self.phase is Phase.MOVE
+        goal = self.speed_override.fraction if moves else 0.0
+        before = scale.speed
+        if goal == before == 1.0:
             if (damaged := self._go_to(self.elapsed_s + dt)) is not None:
                 return self.give_up(state, damaged)
             self.elapsed_s = min(self.elapsed_s + dt, self.duration_s)
             speed = 1.0
         else:
-            slowdown, limits = self._slowdown, self.limits
-            before = slowdown.speed
-            # Where the cycle ends hardly depends on how much slower it gets.
-            if (damaged := self._go_to(self.elapsed_s + (before + 0.5 * slowdown.rate * dt) * dt)) is not None:
+            limits = self.limits
+            # Where the cycle ends hardly depends on how much u changes.
+            if (damaged := self._go_to(self.elapsed_s + (before + 0.5 * scale.rate * dt) * dt)) is not None:
                 return self.give_up(state, damaged)
-            speed = slowdown.step(self._velocity, state.commanded_velocity, limits.acceleration, limits.jerk, dt)
+            speed = scale.step(goal, self._velocity, state.commanded_velocity, limits.acceleration, limits.jerk, dt)
             self.elapsed_s = min(self.elapsed_s + 0.5 * (before + speed) * dt, self.duration_s)
             if (damaged := self._go_to(self.elapsed_s)) is not None:
                 return self.give_up(state, damaged)
             velocity = self._velocity
             for i in self._joints:
                 velocity[i] *= speed
-        if speed == 0.0:
+        if speed == 0.0 and not moves:
             self.phase = Phase.HOLD
         elif self.elapsed_s >= self.duration_s - _AT_ONCE_S and (ended := self._arrive()) is not None:
             return self.give_up(state, ended)

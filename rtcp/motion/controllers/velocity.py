@@ -101,9 +101,10 @@ class VelocityController(Controller):
 
     def _note_range(self, goals: list[float], speeds: Sequence[float], before: Sequence[float]) -> None:
         """Set `held` to the first joint that the edge of its range makes slower than it is wanted, rad/s."""
+        fraction = self.speed_override.fraction
         for i, wanted in enumerate(self._wanted):
             speed = abs(speeds[i])
-            if goals[4 * i] == 1.0 and speed < abs(wanted) - _SLOWEST_RAD_S and speed <= abs(before[i]):
+            if goals[4 * i] == 1.0 and speed < fraction * abs(wanted) - _SLOWEST_RAD_S and speed <= abs(before[i]):
                 self.held = (i + 1) << HELD_RANGE_AT
                 return
 
@@ -116,8 +117,9 @@ class VelocityController(Controller):
     def _goals(self, state: ArmState) -> list[float]:
         """Return what each joint goes to: four numbers each, of which the first says whether it is a position."""
         goals: list[float] = []
-        limits = self.limits
-        for i, wanted in enumerate(self._wanted):
+        limits, fraction = self.limits, self.speed_override.fraction
+        for i, asked in enumerate(self._wanted):
+            wanted = fraction * asked
             acceleration, jerk, now = limits.acceleration[i], limits.jerk[i], state.commanded_velocity[i]
             edge = limits.high[i] if wanted > 0.0 else limits.low[i]
             stopping_distance = edge - state.commanded[i] if wanted > 0.0 else state.commanded[i] - edge
