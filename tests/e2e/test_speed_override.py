@@ -1,0 +1,101 @@
+"""The speed override on a real socket between real processes: what is sent slows down and speeds up under way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rtcp
+from rtcp.api import Robot
+from rtcp.ipc.runtime_directory import control_socket
+from tests.e2e.conftest import Platform
+
+pytestmark = pytest.mark.alone
+
+HERE = [0.0, -0.2, 2.0, 0.0, 1.0, 0.0]
+THERE = [0.9, *HERE[1:]]
+
+
+@pytest.fixture
+def robot(enabled: Platform) -> Iterator[Robot]:
+    with rtcp.connect("who moves", control_socket(enabled.directory)) as robot:
+        robot.set_speed_override(1.0)
+        robot.move_joints(HERE)
+        yield robot
+    with rtcp.connect("who cleans up", control_socket(enabled.directory)) as robot:
+        robot.set_speed_override(1.0)
+
+
+def circle(robot: Robot) -> Any:
+    assert robot.pose is not None
+    x, y, z, *turn = robot.pose
+    return robot.move_arc([x, y + 0.1, z - 0.1], [x, y, z - 0.2, *turn], 6.283, 0.2)
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        pytest.param(lambda robot: robot.move_joints(THERE, 0.3), id="joints"),
+        pytest.param(lambda robot: robot.run_trajectory([{"t": 0.0, "q": HERE}, {"t": 4.0, "q": THERE}]), id="points"),
+        pytest.param(lambda robot: robot.move_by([0.0, 0.2, 0.0, 0.0, 0.0, 0.0], speed=0.06), id="line"),
+        pytest.param(circle, id="circle"),
+    ],
+)
+def test_a_motion_under_way_slows_down_and_speeds_up_again(
+    shared: Platform, robot: Robot, motion: Callable[[Robot], Any]
+) -> None:
+    feed = rtcp.Feed(shared.directory)
+    with rtcp.connect("who slows", control_socket(shared.directory)) as other, ThreadPoolExecutor(1) as pool:
+        going = pool.submit(motion, robot)
+        time.sleep(1.2)
+        other.set_speed_override(0.1)
+        time.sleep(1.5)
+        assert not going.done()
+        with pytest.raises(rtcp.Refused, match="who moves"):
+            other.set_speed_override(0.2)
+        status = other.status()
+        assert status.speed_override == other.speed_override == pytest.approx(0.1)
+        other.halt()
+        with pytest.raises(rtcp.RtcpError):
+            going.result()
+        # Nobody holds the lease now.
+        other.set_speed_override(1.0)
+        robot.move_joints(HERE)
+        records, missing = feed.records()
+    assert not missing
+    period_s = feed.period_ns * 1e-9
+    feed.close()
+    answered = records["wkc"] == records["wkc_expected"]
+    speed = np.abs(np.diff(records["sent_position"], axis=0)).max(axis=1) / period_s
+    slow = (records["speed_override"][1:] < 0.2) & answered[1:] & answered[:-1]
+    first = int(np.argmax(slow))
+    before, after = speed[max(first - 200, 0) : first], speed[slow][len(speed[slow]) // 2 :]
+    assert np.median(after) < 0.25 * np.median(before)
+    change = np.abs(np.diff(np.diff(records["sent_position"], axis=0), axis=0)).max(axis=1) / period_s**2
+    whole = answered[:-2] & answered[1:-1] & answered[2:]
+    assert change[whole].max() <= 1.02 * min(joint.acceleration for joint in feed.config.joints)
+
+
+def test_the_command_line_shows_and_sets_it(enabled: Platform, robot: Robot) -> None:
+    assert "100" in enabled.rtcp("speed").stdout
+    enabled.rtcp("speed", "30")
+    assert "30" in enabled.rtcp("speed").stdout
+    assert "30" in enabled.rtcp("status").stdout
+    began = time.monotonic()
+    arrival = robot.move_joints([0.3, *HERE[1:]], 0.3)
+    assert time.monotonic() - began > 2.5
+    assert arrival.positions[0] == pytest.approx(0.3, abs=1e-3)
+    robot.halt()
+    robot.disable()
+    robot.enable()
+    assert robot.speed_override == pytest.approx(0.3)
+    for wrong in ("0", "101", "nan", "fast"):
+        enabled.rtcp("speed", wrong, check=2)
+        assert robot.speed_override == pytest.approx(0.3)
+    with pytest.raises(rtcp.Invalid, match="from 0.01 to 1"):
+        robot.set_speed_override(0.0)
