@@ -30,7 +30,7 @@ LET_IN_BY_OTHERS = {"typing_extensions"}
 """annotated_types imports it where it is installed."""
 
 ROS = {"actionlib", "control_msgs", "diagnostic_msgs", "geometry_msgs", "industrial_msgs", "rosgraph", "rospy",
-       "sensor_msgs", "std_srvs", "tf2_msgs", "trajectory_msgs"}  # fmt: skip
+       "sensor_msgs", "std_msgs", "std_srvs", "tf2_msgs", "trajectory_msgs"}  # fmt: skip
 ROS_FILES = {"rtcp/ros/ros1.py", "rtcp/ros/ros1_latency.py"}
 """Modules of ROS 1: Debian's, or generated. The node and the client that measures it import them, once
 `rtcp.ros.ros1_messages` has found them."""

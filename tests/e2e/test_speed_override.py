@@ -97,5 +97,5 @@ def test_the_command_line_shows_and_sets_it(enabled: Platform, robot: Robot) -> 
     for wrong in ("0", "101", "nan", "fast"):
         enabled.rtcp("speed", wrong, check=2)
         assert robot.speed_override == pytest.approx(0.3)
-    with pytest.raises(rtcp.Invalid, match="from 0.01 to 1"):
+    with pytest.raises(rtcp.Invalid, match=r"from 0\.01 to 1"):
         robot.set_speed_override(0.0)

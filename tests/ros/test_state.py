@@ -184,6 +184,7 @@ def test_without_a_platform_the_status_is_unknown_and_no_joints_come(heard: Hear
         -1,
         -1,
         0,
+        0.0,
     ]
     assert (entry.level, entry.message, entry.values) == (3, "no platform runs: start one", (("connected", "false"),))
     assert heard.samples == []

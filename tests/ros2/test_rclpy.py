@@ -95,13 +95,14 @@ def test_every_topic_is_published(ros: Ros) -> None:
     def publish() -> bool:
         ros.publications.connected(CONFIG)
         ros.publications.joints(tuple("abcdef"), SAMPLE)
-        ros.publications.status(RobotStatus(1, error_code=3))
+        ros.publications.status(RobotStatus(1, error_code=3, speed_override=0.5))
         ros.publications.diagnostics(Diagnostics(1, 2, "fault"))
         return all(received.values())
 
     until(publish, "each topic")
     assert list(received["joint_states"][0].position) == list(SAMPLE.position)
     assert list(received["robot_status"][0].error_codes) == [3]
+    assert received["speed_override_state"][0].data == 0.5
     assert received["diagnostics"][0].status[0].level == b"\2"
 
 
@@ -120,12 +121,16 @@ def test_commands_reach_the_arm(ros: Ros, arm: FakeArm, topic: str, quality: str
     qos = QoSProfile(depth=10, reliability=ReliabilityPolicy[quality])
     publisher = ros.node.create_publisher(ros.skin.class_of(IN[topic]), topic, qos)
     trajectory = ros.trajectory()
+    message, expected = {
+        "joint_command": (trajectory.points[0], HERE),
+        "speed_override": (ros.make(IN["speed_override"], data=0.5), 0.5),
+    }.get(topic, (trajectory, [list(HERE), [0.0, 0.0, 0.0]]))
 
     def publish() -> list[Any]:
-        publisher.publish(trajectory.points[0] if topic == "joint_command" else trajectory)
+        publisher.publish(message)
         return commanded(arm, topic)
 
-    assert until(publish, "the command")[0][1] == (HERE if topic == "joint_command" else [list(HERE), [0.0, 0.0, 0.0]])
+    assert until(publish, "the command")[0][1] == expected
 
 
 def test_services_answer_with_the_reason(ros: Ros, arm: FakeArm, caplog: pytest.LogCaptureFixture) -> None:
