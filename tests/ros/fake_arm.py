@@ -82,9 +82,6 @@ class FakeArm:
         self.refuse_or_keep("halt")
         await self.stopped.wait()
 
-    async def set_speed_override(self, fraction: float) -> None:
-        self.refuse_or_keep("set_speed_override", fraction)
-
     async def disable(self) -> None:
         self.refuse_or_keep("disable")
         self.set_status(drives_powered=TriState.FALSE)

@@ -82,6 +82,9 @@ class FakeArm:
         status = SimpleNamespace(joint_names=NAMES, commanded_positions=self.commanded, state=self.state)
         return cast(Status, status)
 
+    async def set_speed_override(self, fraction: float) -> None:
+        self.calls.append(("speed_override", fraction))
+
     async def enable(self) -> None:
         self.calls.append("enable")
         self.state = State.HOLDING
