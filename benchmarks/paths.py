@@ -1,11 +1,12 @@
 """Paths with arcs and blends: times beside those with rests, and random programs through the simulated loop.
 
-    python benchmarks/paths.py --programs 10000 --seed 1
+    python benchmarks/paths.py --programs 200 --plans 10000 --seed 1
 
 The table has one program of ten ways, with rests and with blends of several radii: its duration, the largest distance
 of the blended path from the one with rests, and the share of the commanded speed at the slowest place. Random programs
 run on the in-process bus; every frame that a drive gets is decoded and checked as in `tests/sessions`: limits of
-position, velocity and acceleration, boxes, the arm itself.
+position, velocity and acceleration, boxes, the arm itself. That takes minutes for each hundred, so `--plans` plans more
+of them only, and samples what their rows make of every joint, 40 places between two rows.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 from random import Random
 
 import numpy as np
+from scipy.interpolate import BPoly
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -34,7 +36,7 @@ from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning import preview
 from rtcp.motion.planning.path import plan_path
-from rtcp.motion.planning.plan import Plan, PlanRefused
+from rtcp.motion.planning.plan import ACCELERATIONS, POSITIONS, VELOCITIES, Plan, PlanRefused
 from tests.sessions.driver import Driver
 
 HERE = (0.0, -0.2, 2.0, 0.0, 1.0, 0.0)
@@ -150,6 +152,38 @@ def run_programs(config: ArmConfig, count: int, seed: int, minutes: float) -> No
     driver.close()
 
 
+def plan_programs(config: ArmConfig, count: int, seed: int, minutes: float) -> None:
+    """Plan random programs, each from where the one before ends, and print how near their rows come to the limits."""
+    assert config.arm is not None
+    random, limits, ends_at = Random(seed), Limits(config), time.monotonic() + 60.0 * minutes
+    low, high, fastest, strongest = (
+        np.array(one) for one in (limits.low, limits.high, limits.velocity, limits.acceleration)
+    )
+    done = refused = rows = 0
+    most, seconds = np.zeros(2), 0.0
+    q = HERE
+    for _ in range(count):
+        if time.monotonic() > ends_at:
+            break
+        program = [random_stop(random, config) for _ in range(random.randint(1, 8))]
+        try:
+            plan = plan_path(config.arm, limits, config.cartesian, q, program)
+        except PlanRefused:
+            refused, q = refused + 1, HERE
+            continue
+        points = np.array(plan.rows)
+        t, places = points[:, 0], [points[:, at : at + 6] for at in (POSITIONS, VELOCITIES, ACCELERATIONS)]
+        curve = BPoly.from_derivatives(t, np.stack(places, axis=1))
+        at = (t[:-1, None] + np.diff(t)[:, None] * np.linspace(0.0, 1.0, 41)).ravel()
+        where, speed, change = (curve(at, nu) for nu in range(3))
+        assert (where >= low - 1e-6).all()
+        assert (where <= high + 1e-6).all()
+        most = np.maximum(most, [(np.abs(speed) / fastest).max(), (np.abs(change) / strongest).max()])
+        done, rows, seconds, q = done + 1, rows + len(points), seconds + plan.duration_s, plan.end
+    print(f"{done} programs planned, {refused} refused, {rows} rows, {seconds / 3600:.1f} h of motion")
+    print(f"largest velocity {most[0]:.4f}, largest acceleration {most[1]:.4f} of the limits; no position beyond them")
+
+
 def _away(q: Sequence[float]) -> bool:
     return max(abs(a - b) for a, b in zip(q, HERE, strict=True)) > 1e-3
 
@@ -159,11 +193,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--programs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=inf)
+    parser.add_argument("--plans", type=int, default=200)
+    parser.add_argument("--minutes", type=float, default=inf, help="longest time for each of both")
     given = parser.parse_args()
     config = load(default_config())
     print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, Python {platform.python_version()}")
     table(config)
+    plan_programs(config, given.plans, given.seed, given.minutes)
     run_programs(config, given.programs, given.seed, given.minutes)
 
 
