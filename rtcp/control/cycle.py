@@ -78,7 +78,6 @@ class Cycle:
         discipline: Discipline | None,
         now: Callable[[], int] = monotonic_ns,
         partners: Partners | None = None,
-        since_before_s: float | None = None,
     ) -> None:
         self.devices = devices = make_devices(config)
         boxes = {device.name: device.driver for device in devices if isinstance(device.driver, IoBox)}
@@ -88,7 +87,7 @@ class Cycle:
         self.operator = Operator(config, boxes, gripper)
         context = Context(
             config, self.arm, gripper, self.operator, devices, blackboard, service, discipline, partners,
-            make_processes(config, devices, partners, since_before_s),
+            make_processes(config, devices, partners),
         )  # fmt: skip
         self.joints = context.joints
         self.machine = StateMachine(context, partners)

@@ -132,9 +132,7 @@ def _work(master: Master, session: Session, directory: Path, report: Report) -> 
         config.cycle.priority,
         config.ethercat.watch_ms * 1e-3,
     )
-    cycle = Cycle(
-        config, data, blackboard, service, discipline, partners=partners, since_before_s=session.since_before_s
-    )
+    cycle = Cycle(config, data, blackboard, service, discipline, partners=partners)
     if partners is not None:
         service.look_around = partners.open
     realtime = scheduling.Realtime()

@@ -48,17 +48,9 @@ class ProcessSetup:
         period_s: the cycle, s.
         signals: of the slaves, by SLAVE.CHANNEL.
         partners: the newest records of the partners in the cell, by name; read anew in every cycle.
-        since_before_s: time since the platform before ended, s; 0: not in order; None: there was none.
     """
 
-    def __init__(
-        self,
-        period_s: float,
-        signals: Mapping[str, Signal],
-        partners: Mapping[str, Partner],
-        since_before_s: float | None = None,
-    ) -> None:
-        self.since_before_s = since_before_s
+    def __init__(self, period_s: float, signals: Mapping[str, Signal], partners: Mapping[str, Partner]) -> None:
         self.period_s = period_s
         self.signals = signals
         self.partners = partners
@@ -174,9 +166,7 @@ class ProcessPart(Part):
             self._fail(error)
 
 
-def make_processes(
-    config: ArmConfig, devices: Sequence[Device], partners: Partners | None, since_before_s: float | None = None
-) -> list[ProcessPart]:
+def make_processes(config: ArmConfig, devices: Sequence[Device], partners: Partners | None) -> list[ProcessPart]:
     """Return a part for each process of the configuration; raises PluginError."""
     inputs = {
         f"{device.name}.{name}": Signal(device.driver.values, name)
@@ -191,7 +181,7 @@ def make_processes(
     records: dict[str, Partner] = {}
     if partners is not None:
         records = {one.name: record for one, record in zip(partners.members, partners.group.members, strict=True)}
-    setup = ProcessSetup(config.cycle.period_us * 1e-6, {**inputs, **outputs}, records, since_before_s)
+    setup = ProcessSetup(config.cycle.period_us * 1e-6, {**inputs, **outputs}, records)
     made = []
     for number, keys in enumerate(config.processes):
         entry = EntryPoint(keys.kind, keys.PROCESS, keys.ENTRY_POINTS)

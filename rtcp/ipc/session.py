@@ -166,8 +166,6 @@ class Session:
     """The cell that the arm belongs to."""
     name: str = ""
     """Name of the platform; that of the arm in the cell."""
-    since_before_s: float | None = None
-    """Time since the platform before ended here, s; 0: it did not end in order; None: there was none."""
 
     @property
     def partners(self) -> tuple[str, ...]:
@@ -232,16 +230,6 @@ def read_json(path: Path, kind: type[T]) -> T:
 
 def _exit_report(directory: Path) -> Path:
     return directory / "ended.json"
-
-
-def seconds_since_end(directory: Path) -> float | None:
-    """Return the time since the platform before ended, as `Session.since_before_s` has it."""
-    if not session_file(directory).exists():
-        return None
-    try:
-        return max(0.0, time.time() - _exit_report(directory).stat().st_mtime)
-    except OSError:
-        return 0.0
 
 
 def remove_exit_report(directory: Path) -> None:

@@ -43,7 +43,6 @@ from rtcp.ipc.session import (
     read_processes,
     read_session,
     remove_exit_report,
-    seconds_since_end,
 )
 from rtcp.launch.platform import Platform, Report, clear, defer_signals, end_platform
 
@@ -262,7 +261,6 @@ def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_
     interface, segment = config.bus.interface, 0
     state = state_directory().absolute()
     platform = Platform(directory, config, Processes(), state)
-    since_before_s = seconds_since_end(directory)
     remove_exit_report(directory)
     for log in directory.glob("*.log"):
         log.replace(log.with_name(f"{log.name}.1"))  # kept until the next start
@@ -274,8 +272,7 @@ def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_
         bus = config.bus.interface
         name, cell = platform_name(), options.cell
         Session(
-            config, bus, interface, segment, began_ns, state, platform.segment_control, cell and _placed(cell), name,
-            since_before_s,
+            config, bus, interface, segment, began_ns, state, platform.segment_control, cell and _placed(cell), name
         ).write(directory)  # fmt: skip
         platform.start_loop(report)
         platform.await_gateway(platform.begin_gateway())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -171,20 +170,3 @@ def test_another_client_may_stop_the_heat_and_may_not_begin_any(heater: Heater) 
         heater.assert_off()
         thread.join()
         assert len(errors) == 1
-
-
-@pytest.mark.slow
-def test_a_rod_may_be_hot_after_a_restart_of_the_platform() -> None:
-    platform = Platform()
-    try:
-        platform.be_patient(500)
-        file = platform.directory / "config" / "heater.yaml"
-        text = file.read_text().replace("period_us: 500 ", "period_us: 2000 ")
-        file.write_text(re.sub(r"rod_cooling_s: 0\b", "rod_cooling_s: 600", text))
-        for is_hot in (False, True):
-            platform.rtcp("start", "--detach", "--config", str(file))
-            with Robot("the tests", control_socket(platform.directory)) as robot:
-                assert (robot.processes["heater"].fields["rod_hot_s"] > 500.0) is is_hot
-            platform.rtcp("stop")
-    finally:
-        platform.end()

@@ -27,7 +27,6 @@ from rtcp.ipc.session import (
     read_processes,
     read_session,
     remove_exit_report,
-    seconds_since_end,
     session_file,
     terminate,
     write_exit_report,
@@ -130,14 +129,3 @@ def test_the_exit_report_counts_for_the_loop_that_wrote_it_alone(tmp_path: Path,
     (problem,) = exit_problems(tmp_path, this, was_running)
     assert "does not end, also not by SIGKILL" in problem
     assert exit_problems(tmp_path, NO_PROCESS, was_running) == ()
-
-
-def test_the_time_since_the_platform_before_is_that_of_its_exit_report(tmp_path: Path) -> None:
-    assert seconds_since_end(tmp_path) is None
-    session_file(tmp_path).write_text("{}")
-    assert seconds_since_end(tmp_path) == 0.0
-    write_exit_report(tmp_path, 1, [])
-    os.utime(tmp_path / "ended.json", (time.time() - 90.0,) * 2)
-    assert seconds_since_end(tmp_path) == pytest.approx(90.0, abs=1.0)
-    os.utime(tmp_path / "ended.json", (time.time() + 90.0,) * 2)
-    assert seconds_since_end(tmp_path) == 0.0

@@ -152,10 +152,10 @@ class ShapeSettingConfig(ProcessConfig):
     """Interval of those pulses, s."""
     greatest_initial_uncertainty: Annotated[float, Gt(0), Le(0.1)] = 0.003
     """Greatest relative uncertainty of the initial resistance; 0.002 is worth some 10 K."""
-    rod_cooling_s: Annotated[float, Ge(0), Le(3600)] = 120.0
-    """Time after a heating before an initial resistance is measured again, s; none is needed where the rod has cooled
-    under the heater to 5 K above `initial_c`."""
-    greatest_target_c: Annotated[float, Gt(0), Le(1000)] = 600.0
+    rod_cooling_s: Annotated[float, Ge(0), Le(3600)] = 600.0
+    """Time after a heating, and after each start of the platform, before an initial resistance is measured, s: a rod of
+    1 mm is cold after 120, one of 3.2 mm after 600."""
+    greatest_target_c: Annotated[float, Gt(0), Le(600)] = 600.0
     """Greatest target in the middle of the rod, C: Nitinol loses its structure above."""
     longest_cooling_s: Positive = 600.0
     """Longest time of cooling down, s; then the relay opens."""

@@ -87,7 +87,8 @@ TABLE: Final = (
     Rule(
         Row.GATE_FEEDBACK,
         (_F, _F, _F),
-        "the gate's state, or a current with the gate off, differs from its command for `gate_cycles`",
+        "the gate's state differs from its command, or with the gate off a current exceeds `leakage_current`, for "
+        "`gate_cycles`",
     ),
     Rule(Row.FUSE, (_I, _M, _M), "the fuse is good"),
     Rule(Row.OVER_CURRENT, (_F, _F, _F), "the current exceeds `over_current`"),

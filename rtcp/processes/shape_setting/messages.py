@@ -185,8 +185,8 @@ class ResistanceNotMeasured(Refusal):
 
 
 class RodStillHot(Refusal):
-    """the rod was hot {elapsed_s:.0f} s ago and may still be: an initial resistance is measured {wait_s:.0f} s after it
-    (rod_cooling_s)"""
+    """the rod may have been hot {elapsed_s:.0f} s ago, by a heating or before this start: an initial resistance is
+    measured {wait_s:.0f} s after it (rod_cooling_s)"""
 
     elapsed_s: float
     wait_s: float
@@ -227,7 +227,7 @@ class ProfileOutOfRange(Refusal):
 
 
 class HeaterArmed(Event, number=127):
-    """the heater is armed in mode {mode}: its relay is closed"""
+    """the heater is armed in mode {mode}: its relay is commanded to close"""
 
     mode: Mode
 
@@ -311,8 +311,8 @@ class TripsReset(Event, number=136):
 
 
 class TargetNotReached(ProcessEnded, number=137):
-    """the middle of the rod has {middle_c:.5g} C after {longest_s:g} s (longest_s): gate and relay are commanded off;
-    check the battery and the profile's limits"""
+    """ramp and hold took longer than {longest_s:g} s (longest_s), the middle of the rod has {middle_c:.5g} C: gate and
+    relay are commanded off; check the battery and the profile's limits"""
 
     middle_c: float
     longest_s: float

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, inf
+from math import hypot
 from typing import Any, Final
 
 from rtcp.control.part import PartContext
@@ -64,8 +64,8 @@ _BUSY: Final = _HEAT | {HeaterState.MEASURING, HeaterState.COOLING}
 _HOT: Final = _HEAT | {HeaterState.COOLING}
 _HALF: Final = 0.5
 """Between the levels of a digital channel."""
-_COLD_K: Final = 5.0
-"""Rise over `initial_c` at which a rod counts as cold, K."""
+_BELOW_K: Final = 20.0
+"""So far below room and chucks no rod cools: a contact that has changed."""
 _DEAD: Final = 1 << Row.LOST_CYCLE | 1 << Row.STALE_INPUT
 _NO_AGE: Final = 9999.0
 """s; a record is also written as JSON, which has no infinity."""
@@ -138,9 +138,9 @@ class ShapeSetting(Process):
         self.energy = self.uncertainty_k = 0.0
         self._lease = 0
         self._elapsed_s = self._pulse_s = self._hold_s = 0.0
-        # What the platform before has heated is not known here.
-        self._since_heat_s = inf if setup.since_before_s is None else setup.since_before_s
-        """Since the rod was hot, s; infinite: it has cooled to its initial temperature under the heater."""
+        # What was heated before this start is not known here.
+        self._since_heat_s = 0.0
+        """Since the rod was, or may have been, heated, s."""
         self._pending: list[Event] = []
         """Events of commands and of `safe`; the next cycle reports them."""
 
@@ -187,6 +187,9 @@ class ShapeSetting(Process):
             value, greatest = getattr(command, key.name.lower()), min(most, greatest_of.get(key, most))
             if not least <= value <= greatest:
                 return ProfileNumberOutOfRange(key, value, least, greatest)
+        ramp_s = (command.target_c - command.initial_c) / command.ramp_k_s
+        if not command.hold_s + ramp_s <= config.longest_s:
+            return ProfileNumberOutOfRange(ProfileKey.HOLD_S, command.hold_s, 0.0, max(config.longest_s - ramp_s, 0.0))
         if not command.initial_c < command.cool_c < command.target_c:
             return CoolingOutOfRange(command.cool_c, command.initial_c, command.target_c)
         scale = RatioScale(
@@ -272,6 +275,9 @@ class ShapeSetting(Process):
             inputs, meter, self.initial.value, context, self._lease, interlocks.closed, self.gate
         )  # fmt: skip
         latched = interlocks.latched
+        if holds & 1 << Row.GATE_FEEDBACK:
+            # Whatever was commanded, a current may heat the rod.
+            self._since_heat_s = 0.0
         if interlocks.update(inputs.mode, holds):
             self._report_cause(context, interlocks.latched & ~latched)
             self._open()
@@ -383,13 +389,14 @@ class ShapeSetting(Process):
         self.gate = self.meter.age_s >= self._config.cooling_interval_s
         middle = self._scale.middle(self.ratio)
         self._hold_s += self._passed_s
-        if self.meter.fresh and middle <= self._profile.cool_c:
+        least = min(self._profile.initial_c, self._profile.chuck_c) - _BELOW_K
+        if self.meter.fresh and least <= middle <= self._profile.cool_c:
             context.report(ShapeSet(middle))
             self._open()
             # The rod is taken out now: the next one is measured anew.
             self.initial.forget()
             self.state = HeaterState.DONE
-            self._since_heat_s = inf if middle <= self._profile.initial_c + _COLD_K else 0.0
+            self._since_heat_s = self._hold_s
         elif self._hold_s > self._config.longest_cooling_s:
             context.report(CoolingTooLong(middle, self._config.longest_cooling_s))
             self._open()

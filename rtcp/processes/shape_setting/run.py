@@ -1,4 +1,4 @@
-"""Shape setting as one run: grip, measure, bend, heat, hold, cool, release. Heat is off before an arm moves, always."""
+"""Shape setting as one run: grip, measure, bend, heat, hold, cool, release. Heat is off before the run moves an arm."""
 
 from __future__ import annotations
 
@@ -40,8 +40,6 @@ _RELAY_S: Final = 2.0
 """Time for the relay to close or open, s."""
 _HEAT_FIRST_S, _STOP_S = 0.5, 4.0
 """At an early end: how long the stop of the arms waits for that of the heat, and the longest time for all of it, s."""
-_NO_CURRENT_A: Final = 0.5
-"""Below this the measured current is none, A."""
 _TOUCH_C: Final = 60.0
 """Temperature above which people are told not to touch the rod, C."""
 _RESISTANCE_SHARE: Final = 0.2
@@ -108,11 +106,16 @@ class ShapeSettingRun:
         self._member, self._name = _heater_of(cell)
         self._robot = cell.processes[self._member.name]
         self._heater = self._robot.processes[self._name]
+        config = next(one for one in self._member.config.processes if one.name == self._name)
+        assert isinstance(config, ShapeSettingConfig)
+        self._config = config
         self.outcome = Outcome()
         self.heat_is_off = False
         """Whether a run that ended early has measured that relay, gate and current are off."""
         self._lock = _lock(self._member.directory.parent / "shape-set.lock")
         self._check_heater()
+        # Before anything moves: of a profile that the loop refuses nothing begins.
+        self._set_profile()
         self._began = time.monotonic()
         self.plan: BendingPlan = plan_motion(cell.config, job.holders, job.steps(), pose_of(job.held), job.near)
         """The motion that bends the rod."""
@@ -145,6 +148,20 @@ class ShapeSettingRun:
     def _check_heater(self) -> None:
         """Raise where the heater is another's, or where arms would move with a hot rod."""
         fields = self._heater.fields
+        if fields["latched"]:
+            raise RtcpError(
+                "refused",
+                f"the heater has tripped: mend the cause, then `rtcp --name {self._member.name} process {self._name} "
+                "reset_trips`",
+                "heater_tripped",
+            )
+        if not self._is_off(fields):
+            raise RtcpError(
+                "refused",
+                "relay, gate and current of the heater are not measured as off, or its inputs do not change: look at "
+                f"`rtcp --name {self._member.name} process {self._name}`",
+                "heater_not_off",
+            )
         if fields["busy"] or fields["relay"]:
             raise RtcpError(
                 "refused",
@@ -163,8 +180,7 @@ class ShapeSettingRun:
 
     def _check_arms(self) -> None:
         """Raise where the heater does not supervise the arms that hold the rod."""
-        config = next(one for one in self._member.config.processes if one.name == self._name)
-        assert isinstance(config, ShapeSettingConfig)
+        config = self._config
         if missing := [name for name in self._job.holders if name not in config.arms]:
             raise RtcpError(
                 "refused",
@@ -193,10 +209,12 @@ class ShapeSettingRun:
         last = self.plan.steps[-1]
         self.outcome.wanted, self.outcome.s, self.outcome.strain = last.p, last.s, last.largest_strain
         self._confirm("the chucks hold nothing, nothing stands between the arms")
+        # Hours may have passed at the question.
+        self._check_heater()
         self._begin("arms are enabled and go to where the straight rod is gripped")
-        for robot in cell.arms.values():
-            if robot.state is State.READY:
-                robot.enable()
+        for name in self._job.holders:
+            if cell.arms[name].state is State.READY:
+                cell.arms[name].enable()
         now = {name: cell.arms[name].status().commanded_positions for name in self.plan.begin}
         approach = plan_approach(cell.config, self._job.holders, now, self.plan.begin, self._job.approach_speed)
         if approach is not None:
@@ -214,6 +232,7 @@ class ShapeSettingRun:
         heater.command("stop_heating")
         self._check_resistance()
         self._await_relay(closed=False)
+        self._check_heater()
         self._begin("the rod is bent")
         cell.run_trajectory(self.plan.trajectory)
         held = self._held()
@@ -367,13 +386,24 @@ class ShapeSettingRun:
         for thread in threads:
             thread.join(max(0.0, until - time.monotonic()))
 
+    def _await_off(self, heater: Process) -> bool:
+        """Wait for the relay to open; return whether relay, gate and current are off by what is measured."""
+        until = time.monotonic() + _RELAY_S
+        while not (is_off := self._is_off(heater.fields)) and time.monotonic() < until:
+            time.sleep(0.02)
+        return is_off
+
+    def _is_off(self, fields: Mapping[str, Any]) -> bool:
+        no_current = abs(fields["current"]) <= self._config.leakage_current
+        return no_current and not fields["relay_closed"] and not fields["gate_sense"] and bool(fields["inputs_alive"])
+
     def _stop_heat(self, commanded: threading.Event) -> None:
         try:
             with contextlib.suppress(Exception), Robot("shape-set: stop", self._socket()) as robot:
                 robot.command("stop_heating")
                 commanded.set()
                 heater = robot.processes[self._name]
-                self.heat_is_off = _await_off(heater)
+                self.heat_is_off = self._await_off(heater)
                 self._note_interlocks(heater)
         finally:
             commanded.set()
@@ -388,19 +418,6 @@ def _begin_thread(call: Callable[..., None], *arguments: Any) -> threading.Threa
 def _halt(member: Member) -> None:
     with contextlib.suppress(Exception), Robot("shape-set: stop", control_socket(member.directory)) as robot:
         robot.halt()
-
-
-def _await_off(heater: Process) -> bool:
-    """Wait for the relay to open; return whether relay, gate and current are off by what is measured."""
-    until = time.monotonic() + _RELAY_S
-    while not (is_off := _is_off(heater.fields)) and time.monotonic() < until:
-        time.sleep(0.02)
-    return is_off
-
-
-def _is_off(fields: Mapping[str, Any]) -> bool:
-    off = not fields["relay_closed"] and not fields["gate_sense"] and abs(fields["current"]) < _NO_CURRENT_A
-    return off and bool(fields["inputs_alive"])
 
 
 @contextlib.contextmanager

@@ -14,8 +14,8 @@ from rtcp.processes.shape_setting.resistance import ResistanceMeter
 _PLATFORM: Final = frozenset({State.HOLDING, State.MOVING})
 """Enabled: every emergency stop, that of a partner too, every fault and `rtcp disable` lead out of these."""
 
-_COOLING: Final = 0.15
-"""Greatest fall of the ratio of a rod that cools, 1/s: more than twice that of one of 0.3 mm at 500 C."""
+_COOLING: Final = 0.06
+"""Greatest fall of the ratio of a rod that cools, 1/s: twice that of the virtual one of 0.5 mm at 500 C."""
 _STEP: Final = 0.01
 """Fall of the ratio that passes at once: noise and contacts."""
 
@@ -105,7 +105,7 @@ class Supervision:
             self.limits[row] = config.discrepancy_s
         self.limits[Row.ARM_LOST] = config.arm_silence_s
         self.limits[Row.RELAY_FEEDBACK] = max(config.relay_close_s, config.relay_open_s)
-        self.limits[Row.GATE_FEEDBACK] = config.gate_cycles * period_s
+        self._gate_s = self.limits[Row.GATE_FEEDBACK] = config.gate_cycles * period_s
         self.limits[Row.OVER_CURRENT] = config.over_current
         self.limits[Row.OVER_VOLTAGE] = config.over_voltage
         self.limits[Row.OPEN_CIRCUIT], self.limits[Row.SHORT_CIRCUIT] = config.open_resistance, config.short_resistance
@@ -178,7 +178,10 @@ class Supervision:
         leaks = not abs(inputs.current) <= config.leakage_current
         if self._gate.differs(gate, inputs.gate_sense) | self._leakage.differs(gate, gate or leaks):
             holds |= 1 << Row.GATE_FEEDBACK
-        values[Row.GATE_FEEDBACK] = self._gate.waited * self._period_s
+        waited, limits = self._gate.waited * self._period_s, self.limits
+        values[Row.GATE_FEEDBACK], limits[Row.GATE_FEEDBACK] = waited, self._gate_s
+        if leaks and not gate:
+            values[Row.GATE_FEEDBACK], limits[Row.GATE_FEEDBACK] = abs(inputs.current), config.leakage_current
         is_stale = self._sample.exceeds(inputs.sample == self._last_sample)
         is_stale |= self._alive.exceeds(inputs.alive == self._last_alive)
         self._last_sample, self._last_alive = inputs.sample, inputs.alive
@@ -192,6 +195,8 @@ class Supervision:
         if not values[Row.OVER_VOLTAGE] <= config.over_voltage:
             holds |= 1 << Row.OVER_VOLTAGE
         values[Row.INSULATION] = inputs.chassis_voltage
+        is_low = inputs.chassis_voltage < config.least_chassis_voltage
+        limits[Row.INSULATION] = config.least_chassis_voltage if is_low else config.greatest_chassis_voltage
         if config.least_chassis_voltage <= inputs.chassis_voltage <= config.greatest_chassis_voltage:
             holds |= 1 << Row.INSULATION
         return self._finish(holds | self._judge_resistance(meter, initial))
@@ -222,6 +227,8 @@ class Supervision:
             return holds
         if initial:
             values[Row.IMPLAUSIBLE_RATIO] = ratio = meter.resistance / initial
+            limit = config.least_ratio if ratio < config.least_ratio else config.greatest_ratio
+            self.limits[Row.IMPLAUSIBLE_RATIO] = limit
             if not config.least_ratio <= ratio <= config.greatest_ratio:
                 holds |= 1 << Row.IMPLAUSIBLE_RATIO
         if self._anchor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 from typing import Any
 
 from rtcp.ipc.commands import Command
@@ -53,11 +54,7 @@ class Rig:
     """`cycle` lets one pass; `forced` are inputs that do not follow the hardware."""
 
     def __init__(
-        self,
-        config: ShapeSettingConfig = CONFIG,
-        resistance: float = 0.34,
-        heat_capacity: float = 0.75,
-        since_before_s: float | None = None,
+        self, config: ShapeSettingConfig = CONFIG, resistance: float = 0.34, heat_capacity: float = 0.75
     ) -> None:
         self.config = config
         names = [text for _, _, text in config.channels()]
@@ -70,10 +67,9 @@ class Rig:
         self.commands = [False] * LATENCY
         self.relay_cycles = 0
         self.arms_follow = True
-        setup = ProcessSetup(
-            PERIOD_S, {name: Signal(self.values, name) for name in names}, self.partners, since_before_s
-        )
+        setup = ProcessSetup(PERIOD_S, {name: Signal(self.values, name) for name in names}, self.partners)
         self.heater = ShapeSetting(config, setup)
+        self.heater._since_heat_s = inf  # the rod is cold, however long the platform has to wait for that
         self.set(battery_voltage=12.5, fuse_ok=1, chassis_voltage=5.0)
         for arm in self.partners.values():
             arm.state, arm.motion_allowed = State.HOLDING, True

@@ -142,25 +142,56 @@ def test_a_record_has_what_is_measured_beside_what_is_commanded() -> None:
     assert not record(rig)["inputs_alive"]
 
 
-@pytest.mark.parametrize(("cool_c", "is_hot"), [(300.0, True), (24.0, False)])
-def test_a_rod_that_was_not_cooled_to_its_initial_temperature_is_not_measured_after_its_heating(
-    cool_c: float, is_hot: bool
-) -> None:
-    rig = Rig()
+@pytest.mark.parametrize("cool_c", [300.0, 24.0])
+def test_a_rod_is_not_measured_before_its_time_to_cool_since_the_heat_is_over(cool_c: float) -> None:
+    rig = Rig(replace(CONFIG, rod_cooling_s=10.0))
     rig.loss = 1.0
-    rig.heat(state=HeaterState.DONE, target_c=350.0, cool_c=cool_c)
-    assert bool(record(rig)["rod_hot_s"]) is is_hot
+    rig.heat(state=HeaterState.COOLING, target_c=350.0, cool_c=cool_c)
+    began = rig.context.cycle
+    rig.until(HeaterState.DONE)
+    cooled_s = (rig.context.cycle - began) * PERIOD_S
+    assert record(rig)["rod_hot_s"] == pytest.approx(10.0 - cooled_s, abs=0.01)
     rig.cycle(20)
     rig.arm()
-    assert isinstance(rig.send(CONFIRMED), RodStillHot) is is_hot
+    assert isinstance(rig.send(CONFIRMED), RodStillHot)
+    rig.cycle(round((10.0 - cooled_s) / PERIOD_S))
+    assert rig.send(CONFIRMED) is None
 
 
-@pytest.mark.parametrize(("since_before_s", "is_hot"), [(0.0, True), (90.0, True), (121.0, False), (None, False)])
-def test_after_a_restart_a_rod_is_not_measured_before_it_is_cold(since_before_s: float | None, is_hot: bool) -> None:
-    rig = Rig(since_before_s=since_before_s)
+def test_after_a_start_a_rod_is_not_measured_before_its_time_to_cool() -> None:
+    rig = Rig(replace(CONFIG, rod_cooling_s=1.0))
+    rig.heater._since_heat_s = 0.0
     rig.arm()
-    assert bool(record(rig)["rod_hot_s"]) is is_hot
-    assert isinstance(rig.send(CONFIRMED), RodStillHot) is is_hot
+    assert isinstance(rig.send(CONFIRMED), RodStillHot)
+    rig.cycle(2000)
+    assert rig.send(CONFIRMED) is None
+
+
+def test_a_current_that_nobody_commands_keeps_the_rod_hot() -> None:
+    rig = Rig(replace(CONFIG, rod_cooling_s=1.0))
+    rig.permit(Mode.AUTO)
+    rig.forced["current"] = 30.0
+    rig.cycle(4000)
+    assert record(rig)["rod_hot_s"] == pytest.approx(1.0, abs=0.01)
+    rig.forced["current"] = 0.0
+    rig.cycle(4000)
+    assert record(rig)["rod_hot_s"] == 0.0
+
+
+def test_a_contact_that_shows_a_rod_colder_than_the_room_does_not_end_the_cooling() -> None:
+    rig = Rig()
+    rig.heat(state=HeaterState.COOLING)
+    rig.initial *= 0.86
+    rig.cycle(400)
+    assert rig.heater.state is not HeaterState.DONE
+
+
+def test_a_hold_that_does_not_fit_beside_its_ramp_is_refused() -> None:
+    rig = Rig(replace(CONFIG, longest_s=10.0))
+    assert rig.send(replace(PROFILE, hold_s=7.0)) is None
+    refusal = rig.send(replace(PROFILE, hold_s=7.7))
+    assert isinstance(refusal, ProfileNumberOutOfRange)
+    assert (refusal.value, refusal.greatest) == pytest.approx((7.7, 7.6))
 
 
 def test_the_limits_of_current_and_power_hold_the_target() -> None:
@@ -175,7 +206,7 @@ def test_the_limits_of_current_and_power_hold_the_target() -> None:
 
 
 def test_a_rod_that_does_not_get_hot_ends_the_heating_after_its_longest_time() -> None:
-    rig = Rig(replace(CONFIG, longest_s=0.5))
+    rig = Rig(replace(CONFIG, longest_s=3.0))
     rig.heat(max_power=10.0)
     rig.until(HeaterState.READY)
     assert events(rig, TargetNotReached)

@@ -61,6 +61,7 @@ def make_run(tmp_path: Path) -> ShapeSettingRun:
     run._cell = SimpleNamespace(config=SimpleNamespace(members=members))  # type: ignore[assignment]
     run._name, run.outcome, run.heat_is_off = "heater", Outcome(), False
     run._lock = module._lock(tmp_path / "shape-set.lock")
+    run._config = ShapeSettingConfig("shape_setting", "heater", arms=("left", "right"))
     return run
 
 
@@ -147,7 +148,7 @@ def with_heater(run: ShapeSettingRun, *events: tuple[str, dict[str, float]], **f
     def command(name: str, **_: float) -> None:
         commands.append(name)
 
-    shown = {"busy": 0, "relay": 0, "rod_hot_s": 0.0, "mode": Mode.AUTO, "relay_closed": 1, **fields}
+    shown = {**OFF, "latched": 0, "busy": 0, "rod_hot_s": 0.0, "mode": Mode.AUTO, **fields}
     run._heater = SimpleNamespace(fields=shown, state="armed", command=command)  # type: ignore[assignment]
     run._robot = SimpleNamespace(  # type: ignore[assignment]
         state=State.HOLDING, events=lambda since: [SimpleNamespace(name=name, fields=known) for name, known in events]
@@ -170,7 +171,16 @@ def test_a_second_run_is_refused_while_the_first_one_works(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     ("fields", "reason"),
-    [({"busy": 1}, "heater_in_use"), ({"relay": 1}, "heater_in_use"), ({"rod_hot_s": 90.0}, "rod_hot"), ({}, "")],
+    [
+        ({"busy": 1}, "heater_in_use"),
+        ({"relay": 1}, "heater_in_use"),
+        ({"rod_hot_s": 90.0}, "rod_hot"),
+        ({"latched": 1 << 12}, "heater_tripped"),
+        ({"current": 30.0}, "heater_not_off"),
+        ({"relay_closed": 1}, "heater_not_off"),
+        ({"inputs_alive": 0}, "heater_not_off"),
+        ({}, ""),
+    ],
 )
 def test_nothing_begins_while_another_uses_the_heater_or_the_rod_may_be_hot(
     tmp_path: Path, fields: dict[str, float], reason: str
@@ -188,8 +198,8 @@ def test_nothing_begins_while_another_uses_the_heater_or_the_rod_may_be_hot(
 
 def test_the_heater_has_to_supervise_both_arms(tmp_path: Path) -> None:
     run = make_run(tmp_path)
-    config = ShapeSettingConfig("shape_setting", "heater", arms=("left",))
-    run._member.config = SimpleNamespace(processes=[config], source="heater.yaml")  # type: ignore[misc, assignment]
+    run._config = ShapeSettingConfig("shape_setting", "heater", arms=("left",))
+    run._member.config = SimpleNamespace(source="heater.yaml")  # type: ignore[misc, assignment]
     run._job = SimpleNamespace(holders={"left": None})  # type: ignore[assignment]
     run._check_arms()
     run._job.holders["right"] = None  # type: ignore[assignment]
@@ -200,7 +210,7 @@ def test_the_heater_has_to_supervise_both_arms(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", Mode)
 def test_the_heater_is_armed_with_the_key_at_auto_only(tmp_path: Path, mode: Mode) -> None:
     run = make_run(tmp_path)
-    commands = with_heater(run, mode=mode)
+    commands = with_heater(run, mode=mode, relay_closed=1)
     if mode is Mode.AUTO:
         run._arm()
         assert commands == ["arm_heater"]

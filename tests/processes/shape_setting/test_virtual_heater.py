@@ -53,7 +53,7 @@ class Platform(Simulation):
         (heater,) = config.processes
         assert isinstance(heater, ShapeSettingConfig)
         # With the tolerances of a robot: none for a busy host.
-        process = ShapeSettingConfig(heater.kind, heater.name, arms=("left",), **keys)
+        process = ShapeSettingConfig(heater.kind, heater.name, arms=("left",), **({"rod_cooling_s": 0.0} | keys))
         super().__init__(replace(config, processes=(process,)))
         self.control = next(s.device for s in self.bus.slaves if isinstance(s.device, ShapeSetterBox))
         part = next(part for part in self.loop.parts if isinstance(part, ProcessPart))
