@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 _PLANNED_TIMES: Final = 2
 """So often a part is planned at most: its first time begins elsewhere, all others where it ends."""
 _MOST_PLANNED: Final = 10_000
+_SAME_RAD: Final = 1e-3
+_HALTED: Final = "halted_at_rest"
 _THERE: Final = "AlreadyThere"
 """Reason of a motion that is refused because the arm is where it leads."""
 Where = tuple[str | int, ...]
@@ -88,11 +90,11 @@ class Program:
         places = self._places(robot)
         q: Sequence[float] = robot.status().commanded_positions
         found: list[PlannedMotion] = []
-        for one in self._units(places, _PLANNED_TIMES):
+        for number, one in enumerate(self._units(places, _PLANNED_TIMES)):
+            if number == _MOST_PLANNED:
+                raise RtcpError("refused", f"{self.file}: it has more than {_MOST_PLANNED} steps", "program")
             if isinstance(one, Action):
                 continue
-            if len(found) == _MOST_PLANNED:
-                raise RtcpError("refused", f"{self.file}: it has more than {_MOST_PLANNED} motions", "program")
             line = self.line_of(one.steps[0])
             try:
                 plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed)
@@ -118,19 +120,32 @@ class Program:
             Refused: as `check`; or a step is refused.
             RtcpError: what ended it.
         """
+        here = robot.status().commanded_positions
+        since = max((event.number for event in robot.events()), default=0)
         if check:
             self.check(robot)
         for one in self._units(self._places(robot), None):
+            line = self.line_of(one.steps[0] if isinstance(one, Motion) else one.where)
+            self._check_undisturbed(robot, line, here, since)
             if isinstance(one, Motion):
-                line = self.line_of(one.steps[0])
                 say(line, f"{len(one.stops)} motions in one" if len(one.stops) > 1 else "motion")
                 try:
                     robot.run_path(one.stops, self._motion.speed)
                 except RtcpError as error:
                     if error.reason != _THERE:
                         raise
+                here = robot.status().commanded_positions
             else:
                 self._act(robot, one, say)
+
+    def _check_undisturbed(self, robot: Robot, line: int, here: Sequence[float], since: int) -> None:
+        """Raise where the arm was halted, or moved by somebody else, since the last step."""
+        now = robot.status().commanded_positions
+        if max((abs(a - b) for a, b in zip(now, here, strict=True)), default=0.0) > _SAME_RAD:
+            text = f"{self.file}:{line}: the arm was moved by somebody else meanwhile: the program ends"
+            raise RtcpError("refused", text, "moved_meanwhile")
+        if any(event.name == _HALTED for event in robot.events(since)):
+            raise RtcpError("refused", f"{self.file}:{line}: the arm was halted: the program ends", "halted")
 
     def _act(self, robot: Robot, action: Action, say: Callable[[int, str], None]) -> None:
         step, line = action.step, self.line_of(action.where)
@@ -162,19 +177,21 @@ class Program:
         steps: list[Where] = []
         stops: list[dict[str, Any]] = []
         for where, step in self._steps((("program",), self._motion.program), most):
-            stop = self._stop(step, places)
+            # A part that runs again begins a motion of its own: what is planned for twice holds for any number.
+            stop = None if step is None else self._stop(step, places)
             if stop is not None:
                 steps.append(where)
                 stops.append(stop)
-            if steps and (stop is None or not step.blend):
+            if steps and (stop is None or not stop["blend"]):
                 yield Motion(tuple(steps), tuple(stops))
                 steps, stops = [], []
-            if stop is None:
+            if stop is None and step is not None:
                 yield Action(where, step)
         if steps:
             yield Motion(tuple(steps), tuple(stops))
 
-    def _steps(self, body: tuple[Where, tuple[Step, ...]], most: int | None) -> Iterator[tuple[Where, Step]]:
+    def _steps(self, body: tuple[Where, tuple[Step, ...]], most: int | None) -> Iterator[tuple[Where, Step | None]]:
+        """Yield steps; None behind each run of a part that runs several times."""
         above, steps = body
         for at, step in enumerate(steps):
             if step.run is None:
@@ -185,6 +202,8 @@ class Program:
             while (not step.times or done < step.times) and (most is None or done < most):
                 yield from self._steps((("parts", number, "steps"), inner), most)
                 done += 1
+                if step.times != 1:
+                    yield (*above, at), None
 
     def _stop(self, step: Step, places: dict[str, list[float]]) -> dict[str, Any] | None:
         """Return the stop of a motion; None: the step is none."""

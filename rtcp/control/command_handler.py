@@ -40,6 +40,7 @@ from rtcp.ipc.events import (
     ControlModeChanged,
     GripperCloses,
     GripperOpens,
+    HaltedAtRest,
     LimitsChanged,
     SpeedOverrideChanged,
     ZeroSet,
@@ -56,6 +57,7 @@ from rtcp.ipc.refusals import (
     HomingUnsupported,
     JointOutsideRange,
     Malformed,
+    MovedByAnother,
     NoArm,
     NoGeometry,
     NoGripper,
@@ -237,6 +239,9 @@ class CommandHandler:
         if self._machine.state is State.HOMING:
             self._context.homing.stop()
         else:
+            if self._machine.state is State.HOLDING:
+                # A program that waits ends by it.
+                self._blackboard.event(HaltedAtRest())
             self._machine.change(command)
         return None
 
@@ -342,8 +347,12 @@ class CommandHandler:
         override, wanted = self._arm.speed_override, command.fraction
         if not LOWEST <= wanted <= 1.0:
             return SpeedOverrideOutOfRange(wanted, LOWEST)
-        if wanted > override.fraction and not (lease and self._context.lease_held(lease)):
+        context = self._context
+        if wanted > override.fraction and not (lease and context.lease_held(lease)):
             return NoLease()
+        if wanted > override.fraction and context.state is State.MOVING and context.lease != lease:
+            # The joystick, which holds no lease.
+            return MovedByAnother()
         if wanted != override.fraction:
             override.fraction = wanted
             self._blackboard.event(SpeedOverrideChanged(wanted))

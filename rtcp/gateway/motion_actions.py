@@ -266,6 +266,12 @@ class MotionActions:
         if frame is JogFrame.JOINTS:
             return await self.move_joints(caller, [a + b for a, b in zip(here, offset, strict=True)], speed, True)
         _require_pose(offset, "offset")
+        for name, angle in zip(_COORDINATES[3:], offset[3:], strict=True):
+            if not abs(angle) < math.pi:
+                text = (
+                    f"offset.{name}: found {angle:g} rad, allowed is less than half a turn: a line takes the short way"
+                )
+                raise RtcpError("invalid", text)
         goal = self._planner.moved_by(here, offset, frame)
         return await self.run_path(caller, [Stop((*goal.position, *goal.rpy))], speed, False)
 

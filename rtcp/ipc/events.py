@@ -97,6 +97,10 @@ class LimitsChanged(Event, number=31):
     """the limits were changed"""
 
 
+class HaltedAtRest(Event, number=54):
+    """halted: nothing moved"""
+
+
 class SpeedOverrideChanged(Event, number=53):
     """the speed override is {fraction:.0%}"""
 

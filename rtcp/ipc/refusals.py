@@ -259,6 +259,10 @@ class SpeedOverrideOutOfRange(Refusal):
     lowest: float
 
 
+class MovedByAnother(Refusal):
+    """the joystick or another client moves the arm: the speed override is only lowered meanwhile"""
+
+
 class SpeedOverridden(Refusal):
     """the speed override of this arm is {fraction:.0%}: a motion in step runs at 100 % only (`rtcp speed 100`)"""
 

@@ -263,7 +263,8 @@ class JointMotion:
         """Return the setpoints of the next cycle at the speed override: the same way, whose time passes more slowly."""
         target, plan, scale, dt = self._target, self._plan, self._time_scale, self._period_s
         if not self._is_scaled:
-            scale.begin()
+            from_rest = self.elapsed_s == 0.0 and not any(state.commanded_velocity)
+            scale.begin(self._speed_override.fraction if from_rest else 1.0)
             self._is_scaled, self.duration_s = True, plan.duration
         before, goal = scale.speed, self._speed_override.fraction
         speed = 1.0

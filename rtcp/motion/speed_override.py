@@ -48,9 +48,9 @@ class TimeScale:
         self.speed = 1.0
         self.rate = 0.0
 
-    def begin(self) -> None:
-        """Start at full speed."""
-        self.speed, self.rate = 1.0, 0.0
+    def begin(self, speed: float = 1.0) -> None:
+        """Start at a speed: at full speed, or, from rest, at that of the override."""
+        self.speed, self.rate = speed, 0.0
 
     def step(
         self,
@@ -101,6 +101,9 @@ class TimeScale:
             rate = rate if rate > last - change else last - change
             rate = rate if rate < last + change else last + change
             near = change * dt
+        if low > high and goal > 0.0:
+            # What one joint needs is too much for another: at a steady u no joint accelerates more than its path does.
+            rate, low, high = 0.0, now, now
         rate = rate if rate > -_MOST_RATE else -_MOST_RATE
         rate = rate if rate < _MOST_RATE else _MOST_RATE
         speed = now + rate * dt

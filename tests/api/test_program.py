@@ -46,9 +46,14 @@ class NotingRobot:
         self.planned: list[Any] = []
         self._refused, self._reason = refused, reason
         self.io = self
+        self.positions = (0.5,) * 6
+        self.happened: list[Any] = []
+
+    def events(self, since: int = 0) -> list[Any]:
+        return [event for event in self.happened if event.number > since]
 
     def status(self) -> Any:
-        return SimpleNamespace(commanded_positions=(0.5,) * 6)
+        return SimpleNamespace(commanded_positions=self.positions)
 
     def fk(self, q: Sequence[float]) -> list[float]:
         return [9.0, 8.0, 7.0, *q[:3]]
@@ -138,6 +143,34 @@ def test_a_program_for_ever_is_planned_and_goes_on(program: Callable[..., Progra
     with pytest.raises(KeyboardInterrupt):
         made.run(robot, stop)
     assert robot.done[1:] == [[0.1, 0.2, 0]] * 49
+
+
+@pytest.mark.parametrize("what", ["halted", "moved_meanwhile"])
+def test_a_halt_and_a_motion_of_others_end_it_before_the_next_step(program: Callable[..., Program], what: str) -> None:
+    robot: Any = NotingRobot()
+    robot.happened.append(SimpleNamespace(number=3, name="halted_at_rest"))
+
+    def disturb(line: int, text: str) -> None:
+        if "lamp" in text:
+            if what == "halted":
+                robot.happened.append(SimpleNamespace(number=4, name="halted_at_rest"))
+            else:
+                robot.positions = (0.6,) * 6
+
+    with pytest.raises(RtcpError, match=r"program\.yaml:12: the arm was") as ended:
+        program().run(robot, disturb)
+    assert ended.value.reason == what
+    assert robot.done[-1] == "lamp False"
+
+
+def test_a_part_that_runs_again_is_a_motion_of_its_own_also_where_its_last_step_is_blended(
+    program: Callable[..., Program],
+) -> None:
+    robot: Any = NotingRobot()
+    made = program(TEXT.replace("- {line: home}", "- {line: home, blend: 0.01}").replace("times: 3", "times: 500"))
+    assert len(made.check(robot)) == 3
+    made.run(robot)
+    assert robot.done[1:501] == [[0.1, 0.2, 0]] * 500
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,28 @@ def test_a_corner_is_rounded_within_its_radius_and_without_a_rest(radius: float)
     assert on_the_way < 1e-4
 
 
+@pytest.mark.parametrize(("radius", "turns"), [(0.05, 2.0), (0.003, 5.0), (0.02, 1.9)])
+def test_a_blend_takes_no_turn_of_an_arc_away_and_small_turns_are_round(radius: float, turns: float) -> None:
+    way = planned(
+        at(y=radius, z=-radius, via=place(y=0.7071 * radius, z=-0.2929 * radius), angle=2 * pi * turns, blend=0.01),
+        at(y=-0.1),
+    )
+    travelled = np.linalg.norm(np.diff(way.places, axis=0), axis=1).sum()
+    assert travelled == pytest.approx(way.plan.length_m, rel=0.05, abs=0.012)
+    centre = place(z=-radius)
+    whole = way.places[: len(way.places) // 3]
+    assert np.abs(np.linalg.norm(whole - centre, axis=1) - radius).max() < 0.02 * radius
+
+
+def test_narrow_limits_of_jerk_are_kept_up_to_some_tenths() -> None:
+    narrow = Limits(CONFIG)
+    for jerk in (2.0, 0.2):
+        narrow.jerk[:] = [jerk] * 6
+        way = way_of(plan_path(ARM, narrow, CARTESIAN, HERE, [at(y=0.1, blend=0.02), at(y=0.1, z=-0.1)]))
+        change = np.diff(way.v, n=2, axis=0)[20:-20] / STEP_S**2
+        assert np.abs(change).max() < 1.7 * jerk
+
+
 def test_lines_in_one_direction_with_a_blend_are_one_line() -> None:
     way = planned(at(y=0.05, blend=0.01), at(y=0.1))
     assert np.abs(way.speeds[400:-400] - 0.1).max() < 1e-4
@@ -186,6 +208,13 @@ def test_a_stop_where_the_arm_is_already_is_passed_over() -> None:
     [
         (at(y=0.1, via=place(y=0.05)), "on one line"),
         (at(via=place(y=0.1)), "on one line or not three places"),
+        (at(y=1e-6, via=place(y=0.1, z=-0.1), angle=2 * pi), "not three places at least 1 mm apart"),
+        (at(y=0.1, z=-0.1, via=place(y=1e-4, z=1e-4)), "not three places at least 1 mm apart"),
+        (at(y=0.1, speed=1e-9, blend=0.01), "at most 86400 s are allowed"),
+        (at(y=0.1, speed=1e-300, blend=0.01), "at most 86400 s are allowed"),
+        (Stop(q=(0.1, *HERE[1:]), by_joints=True, speed=1e-300), "at most 86400 s are allowed"),
+        (at(y=0.1, blend=1e-9), "a blend of 1e-09 m, allowed is 0 or at least 0.0001 m"),
+        (at(y=0.4, via=place(y=0.2, z=-0.2), angle=600.0), "too long to be planned whole"),
         (at(y=0.1, via=place(z=-0.1), angle=0.0), "an angle of 0 rad"),
         (at(y=0.1, via=place(z=-0.1), angle=1e9), "an angle of 1e\\+09 rad"),
         (at(y=0.1, via=(float("nan"), 0.0, 0.0)), "on one line or not three places"),

@@ -25,6 +25,7 @@ from rtcp.motion.controllers.trajectory import TrajectoryController
 from rtcp.motion.controllers.velocity import VelocityController
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.trajectories import plan_trajectory
+from rtcp.motion.speed_override import TimeScale
 from tests.samples import examples
 
 PERIOD = 0.0005
@@ -307,3 +308,26 @@ def test_a_motion_in_step_is_refused_below_1(drive: Any) -> None:
     command = RunInStep(0, 1, 1, 0, drive.state.now_ns + 10**9, 1, 0.1)
     override(mode, 0.5)
     assert mode.accept(command, drive.state, continues=False) == SpeedOverridden(0.5)
+
+
+def test_joints_that_want_opposite_changes_keep_the_rate() -> None:
+    scale = TimeScale()
+    scale.begin(0.8)
+    # The first joint cannot become slower so fast, the second cannot become faster: after a motion was replaced.
+    bounds = ([1.0, 1.0], [1.0, 0.5], [2.0, 2.0], [1000.0, 1000.0])
+    assert scale.step(0.5, *bounds, 0.001) == 0.8
+    assert scale.rate == 0.0
+
+
+def test_from_rest_a_trajectory_begins_at_the_override(new_drive: Any, memory: Any) -> None:
+    drive = new_drive()
+    made: TrajectoryController = drive.controller(TrajectoryController)
+    override(made, 0.01)
+    points = [Point(0.0, ZERO, ZERO), Point(2.0, (0.3, *ZERO[1:]), ZERO)]
+    plan = plan_trajectory(points, drive.limits, ZERO)
+    assert drive.execute(made, memory(plan.rows), len(plan.rows)) is None
+    fastest = 0.0
+    for _ in range(400):
+        drive.cycle(made)
+        fastest = max(fastest, abs(drive.state.commanded_velocity[0]))
+    assert 0.0 < fastest <= 0.01 * 1.5 * 0.3 / 2.0 + 1e-9

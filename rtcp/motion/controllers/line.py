@@ -222,7 +222,7 @@ class LineController(Controller):
             # Without a plan, which is a matter of rounding, it is tried again in the next cycle.
             if not self._is_scaled and find_way(self._otg, self._way, [self._piece[16]], self._plan):
                 self._is_scaled, self._done_s, self._plan_s = True, self.elapsed_s, 0.0
-                self._time_scale.begin()
+                self._time_scale.begin(1.0 if any(self._way.current_velocity) else self.speed_override.fraction)
             if self._is_scaled:
                 return self._follow_plan()
         output = self._output

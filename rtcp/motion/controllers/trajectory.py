@@ -164,7 +164,7 @@ class TrajectoryController(Controller):
         if refusal is not None:
             return refusal
         self.begin()
-        self._time_scale.begin()
+        self._time_scale.begin(1.0 if any(state.commanded_velocity) else self.speed_override.fraction)
         self._fade_s = self._approach_s = 0.0
         if first[0] == 0.0:
             self._fade_out(state, first, last[0])

@@ -16,7 +16,7 @@ from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.config.model import MOST_POINTS, CartesianConfig, Stop
 from rtcp.motion.planning.interpolation import Quaternion, quaternion, rotation, turn_between, turned_by
-from rtcp.motion.planning.plan import KIND, LINE, AlreadyThere, Plan, PlanRefused, ZoneAt
+from rtcp.motion.planning.plan import KIND, LINE, LONGEST_S, AlreadyThere, Plan, PlanRefused, ZoneAt
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
@@ -102,6 +102,8 @@ def plan_lines(
     duration = 0.0
     for at in range(len(rows) - 1, -1, -1):
         duration += rows[at][18]
+        if not duration <= LONGEST_S:
+            raise PlanRefused(f"the path would take {duration:g} s, at most {LONGEST_S:g} s are allowed: move faster")
         rows[at] = (*rows[at][:18], duration, *rows[at][19:])
     return Plan(tuple(rows), duration, length, slowed, q)
 
@@ -153,6 +155,7 @@ def follow(
     q: tuple[float, ...],
     where: str,
     zone_at: ZoneAt | None,
+    least: int = 0,
 ) -> list[tuple[float, ...]]:
     """Return the joints along a line or an arc, at even fractions of it, each looked at.
 
@@ -165,12 +168,13 @@ def follow(
         q: where it begins, rad.
         where: names it in what is raised.
         zone_at: looked at in every sample.
+        least: count of samples.
 
     Raises:
         PlanRefused: with the place on it, what was found and what is allowed.
     """
     length, angle = extent
-    count = max(8, ceil(length / SAMPLE_M), ceil(angle / SAMPLE_RAD))
+    count = max(8, least, ceil(length / SAMPLE_M), ceil(angle / SAMPLE_RAD))
     found: list[tuple[float, ...]] = []
     names = inverse.model.joint_names
     for k in range(count + 1):

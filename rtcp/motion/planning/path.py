@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import atan2, ceil, dist, inf, tau
+from math import atan2, ceil, dist, inf, pi, tau
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -28,6 +28,8 @@ from rtcp.motion.planning.lines import (
     NO_WAY_M,
     NO_WAY_RAD,
     OF_LIMIT,
+    SAMPLE_M,
+    SAMPLE_RAD,
     PoseAt,
     check_branch,
     check_singular,
@@ -36,8 +38,8 @@ from rtcp.motion.planning.lines import (
     speed_of,
     straight,
 )
-from rtcp.motion.planning.plan import AlreadyThere, Plan, PlanRefused, PlanTooFast, ZoneAt
-from rtcp.motion.planning.time_law import Array, Bounds, TimeLaw
+from rtcp.motion.planning.plan import LONGEST_S, AlreadyThere, Plan, PlanRefused, PlanTooFast, ZoneAt
+from rtcp.motion.planning.time_law import LONGEST_WINDOW_S, Array, Bounds, TimeLaw
 from rtcp.motion.planning.trajectories import plan_trajectory
 
 if TYPE_CHECKING:
@@ -46,6 +48,14 @@ if TYPE_CHECKING:
 _FLAT: Final = 1e-4
 """Sine below which three points of an arc are on a line."""
 _LONGEST_TURN: Final = 100.0 * tau
+_NEAR_M, _NEAR_SHARE = 0.001, 0.05
+"""The three places of an arc are so far apart at least, in m and by the largest distance: of nearer ones a rounding
+chooses the circle."""
+_ARC_SAMPLE_RAD: Final = 0.1
+_LEAST_BLEND_M: Final = 1e-4
+_MOST_SAMPLES_OF_LEGS: Final = 50_000
+_MOST_STOPS: Final = 1000
+_FIRST_ROWS: Final = 1000
 _SHRINK, _SHRINKS = 0.7, 8
 _IN_BALL: Final = 1.02
 _BLEND_SAMPLES: Final = 17
@@ -54,6 +64,9 @@ _FITS, _SHORTEST = 5, 0.3
 _PITCH_M, _PITCH_RAD = 0.001, 0.005
 """The bounds along a path are looked at whenever the tool has moved, or a joint has turned, so far."""
 _LEAST_SAMPLES, _MOST_SAMPLES = 24, 200_000
+_OF_JERK: Final = 0.6
+"""Share of a joint's jerk for the change of the rate; the rest is for the path's own bends. What both do together,
+where the rate changes in a bend, is not bounded: some tenths of the limit more."""
 _MOST_RATE, _MOST_ACCELERATION, _MOST_JERK = 1.5, 1e3, 1e5
 """Of the parameter, where nothing bounds it."""
 _ROW_S, _LEAST_ROW_S = 0.1, 0.002
@@ -76,6 +89,9 @@ class _Leg:
     length_m: float
     end: tuple[float, ...]
     blend: float
+    reach_s: float
+    """How far from an end a blend may go, s of nominal time: on an arc the tool comes back to its corner."""
+    samples: int = 0
 
 
 @dataclass(frozen=True)
@@ -118,8 +134,15 @@ def plan_path(
     """
     if not stops:
         raise PlanRefused("the path has no stops, at least one is needed")
-    if len(stops) > MOST_POINTS:
-        raise PlanRefused(f"the path has {len(stops)} stops, at most {MOST_POINTS} are allowed")
+    if len(stops) > _MOST_STOPS:
+        raise PlanRefused(
+            f"the path has {len(stops)} stops, with arcs, blends or joint moves at most {_MOST_STOPS} are allowed"
+        )
+    for number, stop in enumerate(stops, 1):
+        if 0.0 < stop.blend < _LEAST_BLEND_M:
+            raise PlanRefused(
+                f"stop {number}: found a blend of {stop.blend:g} m, allowed is 0 or at least {_LEAST_BLEND_M:g} m"
+            )
     legs = _legs(model, limits, cartesian, q_now, stops, speed, zone_at)
     if not legs:
         raise AlreadyThere("the arm is already where the path leads, there is nothing to move")
@@ -158,6 +181,7 @@ def _legs(
 ) -> list[_Leg]:
     inverse = InverseKinematics(model)
     legs: list[_Leg] = []
+    samples = 0
     q, here = tuple(q_now), forward(model, q_now)
     for number, stop in enumerate(stops, 1):
         what = "the move" if stop.by_joints else "the line" if stop.via is None else "the arc"
@@ -166,17 +190,22 @@ def _legs(
         if stop.by_joints:
             leg = _by_joints(inverse, limits, q, stop, goal, where)
         else:
-            pose_at, extent = (straight(here, goal), _extent(here, goal)) if stop.via is None else (
-                _arc(here, stop.via, goal, stop.angle, where)
-            )  # fmt: skip
-            leg = _of_tool(inverse, limits, cartesian, q, pose_at, extent, stop, speed, where, zone_at)
+            pose_at, extent, turn = (
+                (straight(here, goal), _extent(here, goal), 0.0)
+                if stop.via is None
+                else _arc(here, stop.via, goal, stop.angle, where)
+            )
+            leg = _of_tool(inverse, limits, cartesian, q, pose_at, extent, turn, stop, speed, where, zone_at)
         if leg is not None:
             legs.append(leg)
             q, here = leg.end, forward(model, leg.end)
         elif legs and legs[-1].blend != stop.blend:
             legs[-1] = replace(legs[-1], blend=stop.blend)
-        if not stop.by_joints and stop.via is None:
+        if not stop.by_joints and stop.angle is None:
             check_branch(stop, q, where, model)
+        samples += 0 if leg is None else leg.samples
+        if samples > _MOST_SAMPLES_OF_LEGS:
+            raise PlanRefused(f"{where}: the path is too long to be planned whole: run it in several parts")
     return legs
 
 
@@ -209,26 +238,28 @@ def _by_joints(
     )
     if duration <= 1e-6:
         return None
+    _check_duration(duration, where)
     curve = PPoly(np.array([[[way / duration for way in ways]], [list(q)]]), [0.0, duration])
     length = dist(forward(inverse.model, q).position, forward(inverse.model, end).position)
-    return _Leg(where, curve, duration, None, length, end, stop.blend)
+    return _Leg(where, curve, duration, None, length, end, stop.blend, 0.5 * duration)
 
 
 def _arc(
     start: Pose, via: Sequence[float], end: Pose, angle: float | None, where: str
-) -> tuple[PoseAt, tuple[float, float]]:
-    """Return the poses of the arc from a pose through a point to a pose, and how far the tool moves and turns.
+) -> tuple[PoseAt, tuple[float, float], float]:
+    """Return the poses of the arc from a pose through a point to a pose, how far the tool moves and turns, its angle.
 
     With an angle it is travelled on the circle through the three places, and the tool keeps its orientation.
     """
     a, b, c = (np.array(one, dtype=np.float64) for one in (start.position, via, end.position))
     u, w = b - a, c - a
     normal = np.cross(u, w)
-    size = float(np.linalg.norm(u) * np.linalg.norm(w))
+    sides = [float(np.linalg.norm(one)) for one in (u, w, c - b)]
     across = float(np.linalg.norm(normal))
-    if not across > _FLAT * size or size < NO_WAY_M**2 or float(np.linalg.norm(c - b)) < NO_WAY_M:
+    if not (min(sides) >= max(_NEAR_M, _NEAR_SHARE * max(sides)) and across > _FLAT * sides[0] * sides[1]):
         raise PlanRefused(
-            f"{where}: its start, its via and its end are on one line or not three places: give a via beside the line"
+            f"{where}: its start, its via and its end are on one line or not three places at least 1 mm apart: give a "
+            "via beside the line, and as the end of a circle a place far from its start"
         )
     # the centre of the circle through three points
     to_centre = (np.cross(normal, u) * float(w @ w) + np.cross(w, normal) * float(u @ u)) / (2.0 * across * across)
@@ -250,7 +281,7 @@ def _arc(
         at: Vector = (float(place[0]), float(place[1]), float(place[2]))
         return Pose(at, turned_by(turned, axis, x * tool_turn) if tool_turn else turned)
 
-    return pose_at, (radius * abs(turn), tool_turn)
+    return pose_at, (radius * abs(turn), tool_turn), abs(turn)
 
 
 def _of_tool(
@@ -260,6 +291,7 @@ def _of_tool(
     q: tuple[float, ...],
     pose_at: PoseAt,
     extent: tuple[float, float],
+    turn: float,
     stop: Stop,
     speed: float | None,
     where: str,
@@ -269,10 +301,20 @@ def _of_tool(
     length, angle = extent
     if length <= NO_WAY_M and angle <= NO_WAY_RAD:
         return None
-    joints = follow(inverse, limits, cartesian, pose_at, extent, q, where, zone_at)
     duration = max(length / fast, angle / cartesian.angular_speed)
+    _check_duration(duration, where)
+    least = ceil(turn / _ARC_SAMPLE_RAD)
+    if length / SAMPLE_M + angle / SAMPLE_RAD + least > _MOST_SAMPLES_OF_LEGS:
+        raise PlanRefused(f"{where}: it is too long to be planned whole: run it in several parts")
+    joints = follow(inverse, limits, cartesian, pose_at, extent, q, where, zone_at, least)
     curve = CubicSpline(np.linspace(0.0, duration, len(joints)), np.array(joints))
-    return _Leg(where, curve, duration, fast, length, joints[-1], stop.blend)
+    reach = 0.5 * duration * min(1.0, pi / turn if turn else 1.0)
+    return _Leg(where, curve, duration, fast, length, joints[-1], stop.blend, reach, len(joints))
+
+
+def _check_duration(duration: float, where: str) -> None:
+    if not duration <= LONGEST_S:
+        raise PlanRefused(f"{where}: it would take {duration:g} s, at most {LONGEST_S:g} s are allowed: move faster")
 
 
 def _sections(model: ArmModel, cartesian: CartesianConfig, legs: Sequence[_Leg]) -> list[list[_Piece]]:
@@ -341,7 +383,7 @@ def _within(model: ArmModel, leg: _Leg, corner: Vector, radius: float, end: floa
     def far(x: float) -> float:
         return dist(forward(model, leg.curve(x).tolist()).position, corner)
 
-    out, near = 0.5 * leg.duration_s, end
+    out, near = end + (leg.reach_s if end == 0.0 else -leg.reach_s), end
     if far(out) <= radius:
         return out
     for _ in range(50):
@@ -399,16 +441,18 @@ class _Path:
         with np.errstate(divide="ignore"):
             rate = np.minimum(wanted, (OF_LIMIT * fastest / first).min(axis=1))
             rate = np.minimum(rate, np.sqrt((0.5 * OF_LIMIT * strongest / second).min(axis=1)))
-            rate = np.minimum(rate, np.cbrt((OF_LIMIT * jerkiest / third).min(axis=1)))
+            rate = np.minimum(rate, np.cbrt(((1.0 - _OF_JERK) * jerkiest / third).min(axis=1)))
             rate = np.where(of_tool, np.minimum(rate, np.sqrt(cartesian.acceleration / bow)), rate)
             left = np.maximum(OF_LIMIT * strongest - second * (rate * rate)[:, None], 0.0)
-            acceleration, jerk = (left / first).min(axis=1), (jerkiest / first).min(axis=1)
+            acceleration, jerk = (left / first).min(axis=1), (_OF_JERK * jerkiest / first).min(axis=1)
             for bound, linear, angular in (
                 (acceleration, cartesian.acceleration, cartesian.angular_acceleration),
                 (jerk, cartesian.jerk, cartesian.angular_jerk),
             ):
                 of_both = np.minimum(linear / speed, angular / spin)
                 np.minimum(bound, np.where(of_tool, of_both, inf), out=bound)
+        # The longest window that a jerk is spread over.
+        acceleration = np.minimum(acceleration, jerk * LONGEST_WINDOW_S)
         part = float((rate / wanted)[of_tool].min(initial=1.0))
         return Bounds(
             pitch,
@@ -458,7 +502,7 @@ def _slower(point: Point) -> Point:
 
 def _rows(path: _Path, law: TimeLaw, begin_s: float) -> list[Point]:
     """Return the points of a section behind its first, dense enough for quintics between them."""
-    times = np.linspace(0.0, law.duration_s, max(ceil(law.duration_s / _ROW_S), 2) + 1)
+    times = np.linspace(0.0, law.duration_s, min(max(ceil(law.duration_s / _ROW_S), 2), _FIRST_ROWS) + 1)
 
     def at(when: Array) -> tuple[Array, Array, Array]:
         x, rate, change = law.at(when)

@@ -19,7 +19,7 @@ from scipy.interpolate import PPoly
 
 Array = npt.NDArray[np.float64]
 _LEAST_WINDOW_S: Final = 0.004
-_LONGEST_WINDOW_S: Final = 1.0
+LONGEST_WINDOW_S: Final = 1.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class TimeLaw:
     """
 
     def __init__(self, bounds: Bounds) -> None:
-        window = float(np.clip((bounds.acceleration / bounds.jerk).max(), _LEAST_WINDOW_S, _LONGEST_WINDOW_S))
+        window = float(np.clip((bounds.acceleration / bounds.jerk).max(), _LEAST_WINDOW_S, LONGEST_WINDOW_S))
         # The mean over the window at one place has the rates of all places that are passed within half of it: the
         # bounds of those hold there too. The law without them is faster, so it passes no fewer places.
         near = _times(_passes(bounds.rate, bounds.acceleration, bounds.pitch), bounds.pitch)

@@ -331,9 +331,12 @@ class ShapeSettingRun:
         thread.start()
         try:
             yield
-        finally:
+        except BaseException:
             # Not waited for: what ended the heat early has to turn it off first.
             ended.set()
+            raise
+        ended.set()
+        thread.join(_RELAY_S)
 
     def _held(self) -> Equilibrium:
         """Return the rod as the arms hold it by their measured positions."""
@@ -355,6 +358,9 @@ class ShapeSettingRun:
             at, fraction, highest = virtual.read()
             outcome.fraction, outcome.highest = np.interp(held.s, at, fraction), np.interp(held.s, at, highest)
             virtual.release()
+        elif len(outcome.times) < 2:
+            # The connection over which they come was lost: nothing is known of the heat.
+            return
         else:
             grid = temperatures_along(self._profile, held.s, outcome.samples["middle_temperature"])
             outcome.fraction, outcome.highest = set_fraction(outcome.times, grid), grid.max(axis=1)
