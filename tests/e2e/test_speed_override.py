@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import rtcp
-from rtcp.api import Robot
+from rtcp.api import Robot, State
 from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import Platform
 
@@ -52,7 +52,11 @@ def test_a_motion_under_way_slows_down_and_speeds_up_again(
     feed = rtcp.Feed(shared.directory)
     with rtcp.connect("who slows", control_socket(shared.directory)) as other, ThreadPoolExecutor(1) as pool:
         going = pool.submit(motion, robot)
-        time.sleep(1.2)
+        # The first path that a gateway plans loads scipy.
+        end = time.monotonic() + 20.0
+        while other.state is not State.MOVING:
+            assert time.monotonic() < end
+        time.sleep(1.0)
         other.set_speed_override(0.1)
         time.sleep(1.5)
         assert not going.done()
