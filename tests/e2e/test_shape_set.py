@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -12,20 +13,23 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 
-from rtcp.api import Robot, State
+from rtcp.api import Robot, RtcpError, State
 from rtcp.api.cell import Cell
 from rtcp.cli.__main__ import main
 from rtcp.config.find import default_config
 from rtcp.ipc.runtime_directory import control_socket, irc5_control, segment_control
 from rtcp.ipc.session import read_processes
+from rtcp.processes.shape_setting.job import read_job
+from rtcp.processes.shape_setting.profile import heat_command
 from rtcp.virtual.faults.control import SegmentClient
-from rtcp.virtual.request_socket import RequestClient
+from rtcp.virtual.request_socket import RequestClient, RequestRefused
 from tests.cell.running import put_in_order
 from tests.e2e.conftest import Platform, kill, lives
 
@@ -372,3 +376,62 @@ def test_a_run_after_all_that_is_complete(cell: HeaterCell) -> None:
     folder = cell.directory / "last"
     cell.platform.rtcp("shape-set", str(cell.job), "--yes", "--out", str(folder))
     assert json.loads((folder / "report.json").read_text())["facts"]["result"] == "the profile is complete"
+
+
+def put_in_order_once_it_stands(panel: RequestClient, first: dict[str, str]) -> None:
+    """Do what an operator does once the robot stands, which a controller refuses before."""
+    end = time.monotonic() + 10.0
+    while True:
+        try:
+            panel.ask(first)
+            put_in_order(panel)
+            return
+        except RequestRefused:
+            assert time.monotonic() < end
+            panel.ask({"do": "enabling", "position": "released"})
+            time.sleep(0.2)
+
+
+def test_by_hand_in_auto_with_each_arm_in_its_hand_mode_a_released_enabling_device_ends_the_heat(
+    cell: HeaterCell,
+) -> None:
+    names = ("left", "right")
+    with contextlib.ExitStack() as open_sockets:
+        panels = {
+            name: open_sockets.enter_context(RequestClient(irc5_control(cell.directory / name), server="virtual IRC5"))
+            for name in names
+        }
+        try:
+            for panel in panels.values():
+                panel.ask({"do": "mode", "mode": "hand"})
+                put_in_order_once_it_stands(panel, {"do": "enabling", "position": "middle"})
+            with cell.connect() as arms, cell.heater() as robot:
+                end = time.monotonic() + 20.0
+                while any(status.state in (State.STOPPING, State.DISABLING) for status in arms.status().values()):
+                    assert time.monotonic() < end
+                arms.reset()
+                for name in names:
+                    if arms.arms[name].state is State.READY:
+                        arms.arms[name].enable()
+                if robot.state is State.READY:
+                    robot.enable()
+                heater = robot.processes["heater"]
+                profile = read_job(cell.job)[1]
+                heater.command("arm_heater")
+                cell.until(lambda truth: truth["relay_closed"], "relay closed")
+                time.sleep(0.1)
+                heater.command("set_heat_profile", **asdict(heat_command(profile)))
+                heater.command("measure_resistance", straight_and_unloaded=True, phase="austenite")
+                with ThreadPoolExecutor(1) as pool:
+                    heating = pool.submit(heater.command, "start_heating")
+                    before = cell.truth()["middle_temperature"]
+                    cell.until(lambda truth: truth["middle_temperature"] > before + 20.0, "heat")
+                    panels["left"].ask({"do": "enabling", "position": "released"})
+                    cell.assert_cold(3.0)
+                    with pytest.raises(RtcpError) as ended:
+                        heating.result()
+                assert ended.value.fields["row"] in ("arms_permitted", "arms_engaged")
+        finally:
+            for panel in panels.values():
+                panel.ask({"do": "enabling", "position": "released"})
+                put_in_order_once_it_stands(panel, {"do": "mode", "mode": "auto"})
