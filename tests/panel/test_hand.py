@@ -260,7 +260,7 @@ def begin(page: Page, platform: Platform, motion: str) -> None:
     show(page, "/targets")
     expect(page.get_by_label("joint1, rad")).to_have_value("0")
     page.get_by_label("joint1, rad").fill("1.5")
-    page.get_by_label("Speed").fill("0.1")
+    page.get_by_role("spinbutton", name="Speed").fill("0.1")
     page.get_by_role("button", name="Plan").click()
     page.get_by_role("button", name="Send", exact=True).click()
     platform.until_moving()
