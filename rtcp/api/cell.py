@@ -374,13 +374,13 @@ class Cell:
             except BaseException as error:
                 futures[name].set_exception(error)
 
-        threads = [_begin_thread(work, name) for name in chosen]
+        threads = [begin_thread(work, name) for name in chosen]
         try:
             errors = {name: future.exception() for name, future in futures.items()}
         except BaseException:
             # Not for longer: a gateway that is frozen does not keep an interrupt from its end.
             until = time.monotonic() + _INTERRUPT_S
-            for thread in (_begin_thread(self._halt_quietly), *threads):
+            for thread in (begin_thread(self._halt_quietly), *threads):
                 thread.join(max(0.0, until - time.monotonic()))
             raise
         failed = {name: error for name, error in errors.items() if error is not None}
@@ -389,7 +389,8 @@ class Cell:
         raise most_telling(failed)
 
 
-def _begin_thread(call: Callable[..., None], *arguments: Any) -> Thread:
+def begin_thread(call: Callable[..., None], *arguments: Any) -> Thread:
+    """Start a thread that does not keep the process from its end."""
     thread = Thread(target=call, args=arguments, daemon=True)
     thread.start()
     return thread

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rtcp.config.model import NamedPose, Step
 
 _PLANNED_TIMES: Final = 2
-"""So often a part is planned at most: its first time begins elsewhere, all others where it ends."""
+"""Largest number of runs of a part that are planned: the first begins elsewhere, all others where the part ends."""
 _MOST_PLANNED: Final = 10_000
 _SAME_RAD: Final = 1e-3
 _HALTED: Final = "halted_at_rest"

@@ -49,8 +49,8 @@ _FLAT: Final = 1e-4
 """Sine below which three points of an arc are on a line."""
 _LONGEST_TURN: Final = 100.0 * tau
 _NEAR_M, _NEAR_SHARE = 0.001, 0.05
-"""The three places of an arc are so far apart at least, in m and by the largest distance: of nearer ones a rounding
-chooses the circle."""
+"""Smallest distance between the three places of an arc, m and as a share of the largest: below it rounding errors
+decide the circle."""
 _ARC_SAMPLE_RAD: Final = 0.1
 _LEAST_BLEND_M: Final = 1e-4
 _MOST_SAMPLES_OF_LEGS: Final = 50_000
@@ -62,7 +62,7 @@ _BLEND_SAMPLES: Final = 17
 _FITS, _SHORTEST = 5, 0.3
 """How often the nominal time of a blend is adapted, and its least share of that of the corner."""
 _PITCH_M, _PITCH_RAD = 0.001, 0.005
-"""The bounds along a path are looked at whenever the tool has moved, or a joint has turned, so far."""
+"""Largest motion of the tool, and of a joint, between two places at which the bounds are evaluated."""
 _LEAST_SAMPLES, _MOST_SAMPLES = 24, 200_000
 _OF_JERK: Final = 0.6
 """Share of a joint's jerk for the change of the rate; the rest is for the path's own bends. What both do together,
@@ -199,7 +199,7 @@ def _legs(
         if leg is not None:
             legs.append(leg)
             q, here = leg.end, forward(model, leg.end)
-        elif legs and legs[-1].blend != stop.blend:
+        elif legs:
             legs[-1] = replace(legs[-1], blend=stop.blend)
         if not stop.by_joints and stop.angle is None:
             check_branch(stop, q, where, model)

@@ -65,7 +65,7 @@ _HOT: Final = _HEAT | {HeaterState.COOLING}
 _HALF: Final = 0.5
 """Between the levels of a digital channel."""
 _BELOW_K: Final = 20.0
-"""So far below room and chucks no rod cools: a contact that has changed."""
+"""A rod that seems colder than room and chucks by more than this has a changed contact."""
 _DEAD: Final = 1 << Row.LOST_CYCLE | 1 << Row.STALE_INPUT
 _NO_AGE: Final = 9999.0
 """s; a record is also written as JSON, which has no infinity."""

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from kinematics import Pose, forward
 from rtcp.api import Robot, RtcpError, State
-from rtcp.api.cell import Cell, rod_file
+from rtcp.api.cell import Cell, begin_thread, rod_file
 from rtcp.api.robot import Process
 from rtcp.config.cell import Member
 from rtcp.config.model import VIRTUAL
@@ -41,7 +41,7 @@ _RELAY_S: Final = 2.0
 _HEAT_FIRST_S, _STOP_S = 0.5, 4.0
 """At an early end: how long the stop of the arms waits for that of the heat, and the longest time for all of it, s."""
 _TOUCH_C: Final = 60.0
-"""Temperature above which people are told not to touch the rod, C."""
+"""Temperature above which the rod must not be touched, C."""
 _RESISTANCE_SHARE: Final = 0.2
 """Largest relative deviation of the initial resistance from that by alloy and dimensions; another phase: 7 to 20 %."""
 _GHOSTS, _GHOST_STRIDE = 4, 4
@@ -180,11 +180,11 @@ class ShapeSettingRun:
 
     def _check_arms(self) -> None:
         """Raise where the heater does not supervise the arms that hold the rod."""
-        config = self._config
-        if missing := [name for name in self._job.holders if name not in config.arms]:
+        supervised = self._config.arms
+        if missing := [name for name in self._job.holders if name not in supervised]:
             raise RtcpError(
                 "refused",
-                f"the arm {missing[0]} is to hold the rod, the heater supervises {', '.join(config.arms) or 'none'}: "
+                f"the arm {missing[0]} is to hold the rod, the heater supervises {', '.join(supervised) or 'none'}: "
                 f"name it in `arms` of the process {self._name}, {self._member.config.source}",
                 "arm_not_supervised",
             )
@@ -327,15 +327,12 @@ class ShapeSettingRun:
                     for name, values in outcome.samples.items():
                         values.append(float(fields[name] or 0.0))
 
-        thread = threading.Thread(target=sample, daemon=True)
-        thread.start()
+        thread = begin_thread(sample)
         try:
             yield
-        except BaseException:
-            # Not waited for: what ended the heat early has to turn it off first.
+        finally:
             ended.set()
-            raise
-        ended.set()
+        # Only after a whole heating: what ends one early has to turn the heat off first.
         thread.join(_RELAY_S)
 
     def _held(self) -> Equilibrium:
@@ -386,9 +383,9 @@ class ShapeSettingRun:
         # that nobody has to wait for: a frozen gateway answers after its timeout, or never.
         until = time.monotonic() + _STOP_S
         commanded = threading.Event()
-        threads = [_begin_thread(self._stop_heat, commanded)]
+        threads = [begin_thread(self._stop_heat, commanded)]
         commanded.wait(_HEAT_FIRST_S)
-        threads += [_begin_thread(_halt, member) for member in self._cell.config.members]
+        threads += [begin_thread(_halt, member) for member in self._cell.config.members]
         for thread in threads:
             thread.join(max(0.0, until - time.monotonic()))
 
@@ -413,12 +410,6 @@ class ShapeSettingRun:
                 self._note_interlocks(heater)
         finally:
             commanded.set()
-
-
-def _begin_thread(call: Callable[..., None], *arguments: Any) -> threading.Thread:
-    thread = threading.Thread(target=call, args=arguments, daemon=True)
-    thread.start()
-    return thread
 
 
 def _halt(member: Member) -> None:
