@@ -81,6 +81,22 @@ def _halt() -> None:
     report("halted: the arm holds where it stopped")
 
 
+@commands.command("pause")
+def _pause() -> None:
+    """Bring the motion under way, whoever began it, to rest on its path; `rtcp resume` continues it."""
+    with connect("pause") as robot:
+        robot.pause()
+    report("paused: `rtcp resume` continues the motion, `rtcp halt` ends it")
+
+
+@commands.command("resume")
+def _resume() -> None:
+    """Continue the motion that is paused."""
+    with connect("resume") as robot:
+        robot.resume()
+    report("the motion goes on")
+
+
 @commands.command("mode")
 def _mode(
     name: Annotated[
@@ -162,9 +178,10 @@ def _home(joint: Joint) -> None:
 @commands.command("move", context_settings=NUMBERS_AS_WRITTEN)
 def _move(
     numbers: Annotated[
-        list[str],
+        list[str] | None,
         as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool; see --pose."),
-    ],
+    ] = None,
+    home: Annotated[bool, option("--home", "Instead of numbers: to `home` of the arm's file.")] = False,
     pose: Annotated[bool, option("--pose", "The numbers are a tool pose, X Y Z RX RY RZ: m, and rad of Rx Ry Rz.")] = (
         False
     ),
@@ -183,9 +200,13 @@ def _move(
         raise CommandError("--line is for a pose: give --pose X Y Z RX RY RZ --line")
     if unsynchronized and pose:
         raise CommandError("--unsynchronized is for joint positions, not for --pose")
-    target = pose_values(numbers) if pose else joint_values(numbers)
+    if home == bool(numbers) or (home and (pose or unsynchronized)):
+        raise CommandError("give joint positions, or --pose X Y Z RX RY RZ, or --home alone")
+    target = pose_values(numbers or ()) if pose else joint_values(numbers or ())
     with stoppable("move") as robot, progress() as shown:
-        if pose:
+        if home:
+            arrived = robot.move_home(speed, shown)
+        elif pose:
             arrived = robot.move_pose(target, speed, line, shown)
         else:
             arrived = robot.move_joints(target, speed, not unsynchronized, shown)
