@@ -29,7 +29,20 @@ from rtcp.panel.arm_view import ArmView
 from rtcp.panel.live import Live
 from rtcp.panel.metrics import exposition
 from rtcp.panel.page import View, no_geometry, shown, speed_override, text
-from rtcp.panel.pages import arm, cell, health, jog, limits, processes, recorder, scope, segment, start, targets
+from rtcp.panel.pages import (
+    arm,
+    cell,
+    health,
+    jog,
+    limits,
+    processes,
+    program,
+    recorder,
+    scope,
+    segment,
+    start,
+    targets,
+)
 
 _STATIC = Path(__file__).parent / "static"
 PAGES: dict[str, tuple[str, Callable[[View], Any], bool]] = {
@@ -37,6 +50,7 @@ PAGES: dict[str, tuple[str, Callable[[View], Any], bool]] = {
     "/arm": ("Arm", arm.build, True),
     "/cell": ("Cell", cell.build, True),
     "/processes": ("Processes", processes.build, False),
+    "/program": ("Program", program.build, True),
     "/targets": ("Targets", targets.build, True),
     "/jog": ("Jog", jog.build, True),
     "/limits": ("Limits", limits.build, False),
