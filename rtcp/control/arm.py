@@ -18,6 +18,7 @@ from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import Phase
 from rtcp.motion.step_group import StepGroup
+from rtcp.motion.tool_in_use import ToolInUse
 
 
 class Arm(JointGroup):
@@ -43,9 +44,17 @@ class Arm(JointGroup):
         super().__init__("arm", arm_fields(len(joints)), config, drives)
         self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
         self.speed_override = SpeedOverride()
+        self.tool = ToolInUse()
         self.controllers: dict[type[Command], Controller] = load_controllers(
             ControllerSetup(
-                config, self.limits, self.trajectory_guard, self.period_s, plan, self.group, self.speed_override
+                config,
+                self.limits,
+                self.trajectory_guard,
+                self.period_s,
+                plan,
+                self.group,
+                self.speed_override,
+                self.tool,
             )
         )
         """By the commands that they accept."""
@@ -80,6 +89,13 @@ class Arm(JointGroup):
         self._writer.start(self.drives)
         for drive in self.drives:
             drive.mode = mode
+
+    def use_tool(self, number: int) -> None:
+        """Use another tool, which holds nothing yet; only at rest."""
+        self.tool.number, self.tool.payload = number, None
+        self.trajectory_guard.use_tool(number)
+        for controller in self.controllers.values():
+            controller.use_tool(number)
 
     def publish(self, values: list[Any]) -> None:
         """Write modes, progress and what the joints measure and are sent."""
