@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from kinematics.model import LinkMass
 from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
 from rtcp.devices.drive import Drive
@@ -18,7 +19,9 @@ from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import Phase
 from rtcp.motion.step_group import StepGroup
-from rtcp.motion.tool_in_use import ToolInUse
+from rtcp.motion.tool_in_use import Gravity, ToolInUse
+
+_NOTHING = LinkMass(0.0, (0.0, 0.0, 0.0))
 
 
 class Arm(JointGroup):
@@ -45,6 +48,8 @@ class Arm(JointGroup):
         self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
         self.speed_override = SpeedOverride()
         self.tool = ToolInUse()
+        self._publishes_load = False
+        self.gravity = Gravity(config, self.tool)
         self.controllers: dict[type[Command], Controller] = load_controllers(
             ControllerSetup(
                 config,
@@ -96,6 +101,12 @@ class Arm(JointGroup):
         self.trajectory_guard.use_tool(number)
         for controller in self.controllers.values():
             controller.use_tool(number)
+        self._publishes_load = True
+
+    def carry(self, payload: LinkMass) -> None:
+        """Carry the weight of what the tool holds; only at rest."""
+        self.tool.payload = payload if payload.mass else None
+        self._publishes_load = True
 
     def publish(self, values: list[Any]) -> None:
         """Write modes, progress and what the joints measure and are sent."""
@@ -117,6 +128,11 @@ class Arm(JointGroup):
                 drive.target_position, drive.target_velocity, drive.target_torque, drive.state, drive.statusword,
             )  # fmt: skip
             at += 1
+        if self._publishes_load:
+            # The list is the same in every cycle: what is written once stays in it.
+            payload, at = self.tool.payload or _NOTHING, self.at + len(ARM_MODES) + 9 * n
+            values[at : at + 5] = (self.tool.number, payload.mass, *payload.centre)
+            self._publishes_load = False
 
     def stop(self) -> None:
         """Let the active controller come to rest."""

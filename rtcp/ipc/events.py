@@ -107,6 +107,18 @@ class SpeedOverrideChanged(Event, number=53):
     fraction: float
 
 
+class ToolChanged(Event, number=58):
+    """the tool is {tool_name}"""
+
+    tool: int
+
+
+class PayloadChanged(Event, number=59):
+    """the payload is {mass:.6g} kg"""
+
+    mass: float
+
+
 class ControlModeChanged(Event, number=30):
     """control mode {mode}"""
 

@@ -12,7 +12,7 @@ from rtcp.config.model import ArmConfig
 class ToolInUse:
     """`number`: of the tool, an index into `ArmConfig.models`. `payload`: what it holds, in the tool's frame, or None.
 
-    One for all controllers and guards; only `rtcp.control.arm.Arm` writes it, at rest. A motion never changes tool.
+    One for all controllers; only `rtcp.control.arm.Arm` writes it, at rest: no tool changes during a motion.
     """
 
     __slots__ = ("number", "payload")

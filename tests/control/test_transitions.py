@@ -30,7 +30,9 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetPayload,
     SetSpeedOverride,
+    SetTool,
     SetZero,
     Shutdown,
     StreamPosition,
@@ -49,6 +51,7 @@ from rtcp.ipc.events import (
 from rtcp.ipc.refusals import (
     DamagedRow,
     EmergencyStopPressed,
+    MassesUnknown,
     NoGeometry,
     NotOpen,
     PlanStartsElsewhere,
@@ -94,6 +97,8 @@ set_output       .     =     =     =     =     =     =     =     .     =     .  
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
 set_limits       .     =     .     =     =     .     =     .     .     =     =     .     .
 set_speed_override = = =     =     =     =     =     =     =     =     =     =     =
+set_tool         .     =     .     =     .     .     .     .     .     .     .     .     .
+set_payload      .     =     .     =     .     .     .     .     .     .     .     .     .
 set_zero         .     =     .     .     .     .     .     .     .     .     .     .     .
 home             .     .     .     home  .     .     .     .     .     .     .     .     .
 shutdown         close close close close close close close close close close close close =
@@ -120,8 +125,8 @@ COMMANDS: dict[str, Command] = {
         RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
         Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
         MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
-        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), SetZero(0, 0.0), Home(0),
-        Shutdown(),
+        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), SetTool(0), SetPayload(0.1),
+        SetZero(0, 0.0), Home(0), Shutdown(),
     )
 }  # fmt: skip
 """One of each kind, with fields that nobody could refuse."""
@@ -133,6 +138,7 @@ FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
     MoveAtVelocity: (WrongControlMode,),
     ApplyTorque: (WrongControlMode,),
     SetLimits: (WrongRowCount,),
+    SetPayload: (MassesUnknown,),
     Reset: (EmergencyStopPressed,),
 }
 """Commands that cannot be carried out as they are above, wherever they are accepted; tested elsewhere."""
