@@ -23,6 +23,11 @@ kinematics:
 def two_tools(directory: Path) -> Path:
     """Write the configuration into a directory; return the arm's file."""
     shutil.copytree(default_config().parent, directory, dirs_exist_ok=True)
+    return add_tools(directory)
+
+
+def add_tools(directory: Path) -> Path:
+    """Give the arm of a directory its tools; return its file."""
     arm = directory / "assistive_arm.yaml"
     before, after = arm.read_text().split("\nkinematics:\n")
     arm.write_text(before + _TOOLS + after)

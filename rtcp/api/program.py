@@ -89,15 +89,17 @@ class Program:
         """
         places = self._places(robot)
         q: Sequence[float] = robot.status().commanded_positions
+        tool: str | None = None
         found: list[PlannedMotion] = []
         for number, one in enumerate(self._units(places, _PLANNED_TIMES)):
             if number == _MOST_PLANNED:
                 raise RtcpError("refused", f"{self.file}: it has more than {_MOST_PLANNED} steps", "program")
             if isinstance(one, Action):
+                tool = one.step.tool or tool
                 continue
             line = self.line_of(one.steps[0])
             try:
-                plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed)
+                plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed, tool=tool)
             except RtcpError as error:
                 if error.reason == _THERE:
                     continue
@@ -161,6 +163,9 @@ class Program:
         elif step.wait_s is not None:
             say(line, f"wait {step.wait_s:g} s")
             time.sleep(step.wait_s)
+        elif step.tool is not None:
+            say(line, f"tool: {step.tool}")
+            robot.set_tool(step.tool)
 
     def _places(self, robot: Robot) -> dict[str, list[float]]:
         """Return x, y, z of the poses through which arcs lead."""

@@ -139,6 +139,9 @@ def _headline(status: Json) -> Panel:
     line.append(f"   {status['control_mode']}, {status['drive_mode']} on {status['bus']}{kind}")
     if (override := status["speed_override"]) < 1.0:
         line.append(f"   speed {100.0 * override:.3g} %", "yellow")
+    line.append(f"   tool {status['tool_name']}")
+    if mass := status["payload"]["mass"]:
+        line.append(f" with {mass:.3g} kg")
     line.append(f"   every {status['cycle_ns'] / 1000:g} us   {status['cycles']:,} cycles, ".replace(",", " ", 1))
     line.append(f"{status['missed']:,} missed".replace(",", " "), "yellow" if status["missed"] else "")
     if status["message"]:

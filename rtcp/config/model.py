@@ -843,6 +843,10 @@ class ArmConfig(ArmSettings):
         """Names of the tools, by their numbers; at least one."""
         return tuple(model.tool_name for model in self.models) or (ArmModel.tool_name,)
 
+    def model_of(self, tool: str) -> ArmModel | None:
+        """Return the geometry with a tool by its name; None: there is none."""
+        return next((model for model in self.models if model.tool_name == tool), None)
+
     @property
     def ethercat(self) -> EthercatBus:
         """The keys of an EtherCAT bus; on another kind their defaults."""
@@ -930,7 +934,7 @@ class NamedPose:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of a program: one of `move`, `line`, `arc`, `gripper`, `output`, `wait_for`, `wait_s` and `run`."""
+    """A step of a program: one of `move`, `line`, `arc`, `gripper`, `output`, `wait_for`, `wait_s`, `tool`, `run`."""
 
     move: Name | None = None
     """Move to this pose by the joints."""
@@ -958,6 +962,8 @@ class Step:
     """Longest wait for an input, s; None: for ever."""
     wait_s: Positive | None = None
     """Time to wait, s."""
+    tool: Name | None = None
+    """Use this tool from here on."""
     run: Name | None = None
     """Run this part."""
     times: Annotated[int, Ge(0), Le(1_000_000)] = 1

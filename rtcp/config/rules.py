@@ -611,7 +611,7 @@ def _named_pose(pose: NamedPose) -> Iterator[Finding]:
         yield (), f"found {'neither' if pose.pose is None else 'both'} of pose and q; one of them is needed"
 
 
-_VERBS = ("move", "line", "arc", "gripper", "output", "wait_for", "wait_s", "run")
+_VERBS = ("move", "line", "arc", "gripper", "output", "wait_for", "wait_s", "tool", "run")
 _OF_VERBS = {
     "via": ("arc",),
     "angle": ("arc",),
@@ -653,6 +653,13 @@ def _program(motion: MotionFile) -> Iterator[Finding]:
                 name, allowed = getattr(step, key), parts if key == "run" else poses
                 if name is not None and name not in allowed:
                     yield (*where, at, key), f'found "{name}", allowed is one of {", ".join(allowed) or "none"}'
+    if any(step.tool is not None for _, steps in lists for step in steps):
+        places = {one.name for one in motion.poses if one.pose is None}
+        for where, steps in lists:
+            for at, step in enumerate(steps):
+                if step.via in places:
+                    text = f'found "{step.via}", which has q; with several tools allowed is one with pose'
+                    yield (*where, at, "via"), text
     calls = {part.name: {step.run for step in part.steps if step.run is not None} for part in motion.parts}
     for at, name in enumerate(parts):
         reached, ahead = set[str](), set(calls[name])
