@@ -89,17 +89,18 @@ class Program:
         """
         places = self._places(robot)
         q: Sequence[float] = robot.status().commanded_positions
-        tool: str | None = None
+        with_tool: dict[str, Any] = {}
         found: list[PlannedMotion] = []
         for number, one in enumerate(self._units(places, _PLANNED_TIMES)):
             if number == _MOST_PLANNED:
                 raise RtcpError("refused", f"{self.file}: it has more than {_MOST_PLANNED} steps", "program")
             if isinstance(one, Action):
-                tool = one.step.tool or tool
+                if one.step.tool is not None:
+                    with_tool["tool"] = one.step.tool
                 continue
             line = self.line_of(one.steps[0])
             try:
-                plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed, tool=tool)
+                plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed, **with_tool)
             except RtcpError as error:
                 if error.reason == _THERE:
                     continue

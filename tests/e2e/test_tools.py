@@ -130,5 +130,5 @@ def test_the_command_line_lists_and_chooses_tools_and_says_what_is_held(enabled:
     assert "the tool is probe" in enabled.rtcp("tool", "probe").stdout
     assert "0.4 kg" in enabled.rtcp("payload", "0.4", "--centre", "0", "0", "0.05").stdout
     shown = enabled.rtcp("status").stdout
-    assert "tool probe with 0.4 kg" in shown
+    assert "probe with 0.4 kg: " in shown
     assert "2 kg is not allowed" in enabled.rtcp("payload", "2", check=None).stderr
