@@ -10,7 +10,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
 from rtcp.devices.drive import Drive
 from rtcp.ipc.commands import Command, Jog, MoveJoints
-from rtcp.ipc.schema import ARM_MODES, arm_fields
+from rtcp.ipc.schema import ARM_MODES, LOAD_FIELDS, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
 from rtcp.motion.controllers.jog import JogController
@@ -131,7 +131,7 @@ class Arm(JointGroup):
         if self._publishes_load:
             # The list is the same in every cycle: what is written once stays in it.
             payload, at = self.tool.payload or _NOTHING, self.at + len(ARM_MODES) + 9 * n
-            values[at : at + 5] = (self.tool.number, payload.mass, *payload.centre)
+            values[at : at + len(LOAD_FIELDS)] = (self.tool.number, payload.mass, *payload.centre)
             self._publishes_load = False
 
     def stop(self) -> None:

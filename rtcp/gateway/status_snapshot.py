@@ -324,7 +324,10 @@ class StatusSnapshot:
             "control_mode": _name(ControlMode, control_mode),
             "speed_override": float(record["speed_override"]),
             "tool_name": self.names.tool(int(record["tool"])),
-            "payload": {"mass": float(record["payload_mass"]), "centre": record["payload_centre"].tolist()},
+            "payload": {
+                "mass": float(record["payload_mass"]),
+                "centre": [float(record[f"payload_{axis}"]) for axis in "xyz"],
+            },
             "joystick": {
                 "mode": JOYSTICK_MODES[int(record["joystick_mode"]) % len(JOYSTICK_MODES)],
                 "controls_arm": bool(flags & FLAG_ARM_HAS_JOYSTICK),

@@ -221,7 +221,7 @@ ARM_MODES = (
 LOAD_FIELDS = (
     Field("tool", "uint8", "", "Number of the tool in use, from 0, in the order of the arm's file.", part="arm"),
     Field("payload_mass", "float64", "kg", "Mass of what the tool holds.", part="arm"),
-    Field("payload_centre", "float64", "m", "Its centre x, y, z in the frame of the tool.", (3,), part="arm"),
+    *(Field(f"payload_{axis}", "float64", "m", "Its centre in the frame of the tool.", part="arm") for axis in "xyz"),
 )
 _VECTORS = {
     "actual_position": ("float64", "rad", "Measured position."),

@@ -179,6 +179,11 @@ def test_a_part_that_runs_again_is_a_motion_of_its_own_also_where_its_last_step_
         ("line: home", "line: hoem", '22: parts[1].steps[0].line: found "hoem", allowed is one of home, right, below'),
         ("run: twice", "run: round", 'parts[0].steps: the part "round" runs itself'),
         ("line: home", "run: round", "runs itself"),
+        (
+            "{wait_s: 0.001}",
+            "{tool: probe}",
+            '18: parts[0].steps[1].via: found "home", which has q; with several tools',
+        ),
         ("via: home, ", "", "18: parts[0].steps[1].arc: an arc needs via beside it"),
         ("{gripper: open}", "{gripper: open, speed: 1}", "10: program[2].speed: found beside gripper"),
         ("{gripper: open}", "{gripper: open, wait_s: 1}", "10: program[2]: found gripper and wait_s"),

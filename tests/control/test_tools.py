@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from math import inf, nan
+from math import dist, inf, nan
 from pathlib import Path
 
 import pytest
@@ -13,11 +13,13 @@ from kinematics.forward import forward, frames
 from kinematics.gravity import gravity_torques
 from kinematics.model import LinkMass
 from rtcp.config import load
+from rtcp.config.cell import Base, Member
 from rtcp.config.model import Point, Stop
 from rtcp.ipc.commands import (
     ApplyTorque,
     Command,
     Enable,
+    Jog,
     RunLines,
     RunTrajectory,
     SetControlMode,
@@ -26,8 +28,9 @@ from rtcp.ipc.commands import (
 )
 from rtcp.ipc.events import BoxReached, PayloadChanged, ToolChanged
 from rtcp.ipc.names import Names
-from rtcp.ipc.states import ControlMode, State
+from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.launch.simulation import Simulation
+from rtcp.motion.guards.neighbours import body_of
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.trajectories import plan_trajectory
@@ -134,6 +137,27 @@ def test_a_plan_for_another_tool_is_refused_and_one_for_this_tool_runs(
     assert forward(model, bent.q).position == pytest.approx(goal[:3], abs=1e-6)
 
 
+def test_a_jog_turns_about_the_point_of_the_tool_in_use(arm: Callable[[tuple[float, ...]], Tooled]) -> None:
+    bent = arm(BENT)
+    bent.do(SetTool(PROBE))
+    flange, probe = ([forward(model, bent.q).position] for model in bent.config.models)
+    for _ in range(10):
+        bent.do(Jog((0.0, 0.0, 0.0, 0.0, 0.3, 0.0), JogFrame.TOOL, 0.2))
+        bent.run(0.1)
+        for places, model in zip((flange, probe), bent.config.models, strict=True):
+            places.append(forward(model, bent.q).position)
+    assert max(dist(place, probe[0]) for place in probe) < 1e-4
+    assert dist(flange[-1], flange[0]) > 0.05
+
+
+def test_partners_in_a_cell_keep_away_from_the_bodies_of_all_tools(tmp_path: Path) -> None:
+    config = load(two_tools(tmp_path))
+    body, bare = (body_of(Member("left", one, Base())) for one in (config, replace(config, other_tools=())))
+    assert body is not None
+    assert bare is not None
+    assert body.placed.bodies == (*bare.placed.bodies, *(config.models[PROBE].tool_bodies or ()))
+
+
 def test_the_weight_of_the_tool_and_of_the_payload_is_carried(arm: Callable[[tuple[float, ...]], Tooled]) -> None:
     bent = arm(BENT)
     gravity, models = bent.loop.arm.gravity, bent.config.models
@@ -145,7 +169,8 @@ def test_the_weight_of_the_tool_and_of_the_payload_is_carried(arm: Callable[[tup
     assert gravity.torques(BENT) == held
     assert abs(held[2] - gravity_torques(models[PROBE], BENT)[2]) > 3.0
     record = bent.observer.latest()[0]
-    assert (record["tool"], record["payload_mass"], record["payload_centre"].tolist()) == (PROBE, 0.5, [0.0, 0.1, 0.2])
+    shown = [record[name] for name in ("tool", "payload_mass", "payload_x", "payload_y", "payload_z")]
+    assert shown == [PROBE, 0.5, 0.0, 0.1, 0.2]
     assert [record.event for record in bent.events][-2:] == [ToolChanged(PROBE), PayloadChanged(0.5)]
     # The tool in use stays so, and what it holds too; another one holds nothing.
     bent.do(SetTool(PROBE))
