@@ -30,6 +30,7 @@ from rtcp.ipc.events import BoxReached, PayloadChanged, ToolChanged
 from rtcp.ipc.names import Names
 from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.launch.simulation import Simulation
+from rtcp.motion.controllers.jog_bounds import STANDOFF_M
 from rtcp.motion.guards.neighbours import body_of
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.planning.lines import plan_lines
@@ -148,6 +149,17 @@ def test_a_jog_turns_about_the_point_of_the_tool_in_use(arm: Callable[[tuple[flo
             places.append(forward(model, bent.q).position)
     assert max(dist(place, probe[0]) for place in probe) < 1e-4
     assert dist(flange[-1], flange[0]) > 0.05
+
+
+def test_a_jog_slides_along_the_boxes_of_the_tool_in_use(arm: Callable[[tuple[float, ...]], Tooled]) -> None:
+    near_user = arm((1.4, -0.4, -1.2, 0.0, 1.2, 0.0))
+    near_user.do(SetTool(PROBE))
+    assert near_user.clearance(PROBE) > 0.016
+    for _ in range(40):
+        near_user.do(Jog((0.1, 0.0, 0.0, 0.0, 0.0, 0.0), JogFrame.BASE, 0.2))
+        near_user.run(0.1)
+    assert near_user.state is State.MOVING  # no guard has stopped it
+    assert near_user.clearance(PROBE) == pytest.approx(STANDOFF_M, abs=1e-4)
 
 
 def test_partners_in_a_cell_keep_away_from_the_bodies_of_all_tools(tmp_path: Path) -> None:
