@@ -26,6 +26,8 @@ from rtcp.cli.arguments import (
 from rtcp.cli.output import CommandError, emit_json, progress, report, show, table
 from rtcp.cli.platform import connect, stoppable
 from rtcp.config.model import UNLIMITED_TORQUE, ConfigError
+from rtcp.ipc.runtime_directory import runtime_directory
+from rtcp.ipc.session import read_session
 
 Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Configured name, as joint2, or number from 1.")]
 COLUMNS = (
@@ -120,6 +122,40 @@ def _speed(
         if percent is not None:
             robot.set_speed_override(percent / 100.0)
         report(f"the speed override is {100.0 * robot.speed_override:.3g} %")
+
+
+@commands.command("tool")
+def _tool(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="One of the arm's file; without it: list them.")
+    ] = None,
+) -> None:
+    """Choose the tool, at rest: poses, boxes, collisions and gravity are those of it from then on."""
+    with connect("tool") as robot:
+        if name is not None:
+            robot.set_tool(name)
+            report(f"the tool is {name}; its payload is {robot.status().payload.mass:g} kg")
+            return
+        in_use = robot.status().tool
+    listed = table(("", "tool", "x y z, m", "rx ry rz, rad"), ("", "tool"))
+    for model in read_session(runtime_directory()).config.models:
+        numbers = (" ".join(f"{one:g}" for one in three) for three in (model.tool.position, model.tool.rpy))
+        listed.add_row("*" if model.tool_name == in_use else "", model.tool_name, *numbers)
+    show(listed)
+
+
+@commands.command("payload")
+def _payload(
+    mass: Annotated[float, typer.Argument(metavar="MASS", help="Of what the tool holds, kg; 0: nothing.")],
+    centre: Annotated[
+        tuple[float, float, float],
+        typer.Option("--centre", metavar="X Y Z", help="Its centre of mass in the frame of the tool, m."),
+    ] = (0.0, 0.0, 0.0),
+) -> None:
+    """Say what the tool holds, at rest: in control mode torque its weight is carried."""
+    with connect("payload") as robot:
+        robot.set_payload(mass, centre)
+        report(f"the payload of {robot.status().tool} is {mass:g} kg")
 
 
 @commands.command("output")
@@ -313,6 +349,7 @@ def _run(
 def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None, start: int) -> None:
     """Plan a file and show what would be done."""
     with connect("run --dry") as robot:
+        tool = robot.status().tool
         if is_program:
             from rtcp.api.program import Program
 
@@ -327,10 +364,8 @@ def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None, sta
     report(f"{len(planned)} motions in {sum(plan.duration_s for _, plan in planned):.1f} s; nothing has moved")
     if picture is not None:
         from rtcp.cli.arm_plot import draw
-        from rtcp.ipc.runtime_directory import runtime_directory
-        from rtcp.ipc.session import read_session
 
-        model = read_session(runtime_directory()).config.arm
+        model = read_session(runtime_directory()).config.model_of(tool)
         if model is None:
             raise CommandError(
                 "--picture: the geometry of the arm is unknown: the key kinematics is missing in its file"

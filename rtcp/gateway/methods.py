@@ -123,7 +123,9 @@ class Methods:
         self._streaming = StreamingCommands(channel)
         self.recordings = Recordings(directory)
         self._limits = LimitSettings(channel, limits, directory)
-        self._motion = MotionActions(channel, Planner(config, limits))
+        self._motion = MotionActions(
+            channel, [Planner(config, limits, number) for number in range(len(config.tool_names))]
+        )
         self._processes = ProcessActions(channel, config)
         self._terminals = Terminals(channel)
         self._cell = CellActions(session, self._motion, limits)
@@ -223,6 +225,25 @@ class Methods:
         """
         lease = self._streaming.lease_of(caller.connection)
         return await self.machine.set_speed_override(caller, fraction, lease)
+
+    @method()
+    async def set_tool(self, caller: Caller, name: str) -> Json:
+        """Use another tool of the arm's file, which holds nothing yet; at rest, in state ready or holding.
+
+        Refused where its bodies would be in a box or too near to the arm itself (reason `tool_in_box`).
+        """
+        return await self.machine.set_tool(caller, name)
+
+    @method()
+    async def set_payload(
+        self, caller: Caller, mass: Annotated[float, Ge(0)], centre: Numbers = (0.0, 0.0, 0.0)
+    ) -> Json:
+        """Carry the weight of what the tool holds: `mass`, kg, `centre` of mass in the frame of the tool, m; at rest.
+
+        At most `payload.max_mass` of the arm's file; until another tool is chosen.
+        """
+        self._check_count("centre", centre, 3)
+        return await self.machine.set_payload(caller, mass, centre)
 
     @method()
     async def move_gripper(self, caller: Caller, open: bool) -> Json:
@@ -388,10 +409,12 @@ class Methods:
         approach: bool = False,
         stops: tuple[Stop, ...] = (),
         start: Numbers | None = None,
+        tool: str | None = None,
     ) -> Json:
         """Plan a motion as `move_joints`, `move_pose`, `run` or `run_path` would, and move nothing.
 
-        It begins where the arm is commanded, or, of a path, at the joint positions `start`, rad.
+        It begins where the arm is commanded, or, of a path, at the joint positions `start`, rad; with `tool` it is
+        planned as if that tool were in use.
         Returns `path`, configurations along it, rad, `duration_s`, and of lines `length_m` and `slowed`; refused with
         what would refuse it, or where its way leads through a box.
         """
@@ -399,13 +422,14 @@ class Methods:
             raise RtcpError("invalid", "found none or several of q, pose, file and stops, allowed is one of them")
         if start is not None:
             self._check_count("start", start, len(self._config.joints))
+        number = None if tool is None else self.machine.tool_number(tool, "tool")
         if stops:
-            return await self._motion.preview(None, stops, (), speed, synchronized, start)
+            return await self._motion.preview(None, stops, (), speed, synchronized, start, number)
         if file is not None:
-            return await self._motion.preview_file(file, approach)
+            return await self._motion.preview_file(file, approach, number)
         if pose is not None:
-            return await self._motion.preview_pose(pose, speed, line)
-        return await self._motion.preview(q, (), (), speed, synchronized)
+            return await self._motion.preview_pose(pose, speed, line, number)
+        return await self._motion.preview(q, (), (), speed, synchronized, tool=number)
 
     @method(at_once=True)
     async def fk(self, caller: Caller, q: Numbers) -> Json:

@@ -115,6 +115,18 @@ class Resumed(Event, number=57):
     """the motion goes on"""
 
 
+class ToolChanged(Event, number=58):
+    """the tool is {tool_name}"""
+
+    tool: int
+
+
+class PayloadChanged(Event, number=59):
+    """the payload is {mass:.6g} kg"""
+
+    mass: float
+
+
 class ControlModeChanged(Event, number=30):
     """control mode {mode}"""
 

@@ -31,7 +31,9 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetPayload,
     SetSpeedOverride,
+    SetTool,
     SetZero,
     Shutdown,
     StreamPosition,
@@ -67,7 +69,7 @@ HEARTBEAT = 0x0004
 ANYONE = {"disable", "halt", "pause", "resume", "set_speed_override", "shutdown"}
 """Commands that need no lease: they make the arm safer."""
 READY = [SetOutput(5, True), SetZero(0, 0.0), Enable(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT),
-         MoveGripper(False), SetLimits(0, 1)]  # fmt: skip
+         MoveGripper(False), SetLimits(0, 1), SetTool(0), SetPayload(0.1)]  # fmt: skip
 HOLDING = [
     move_to(0.1, 0.1), RunTrajectory(0, 1), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
     RunInStep(0, 1, 1, 0, 0, 1, 0.1),

@@ -32,7 +32,9 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetPayload,
     SetSpeedOverride,
+    SetTool,
     SetZero,
     Shutdown,
     StreamPosition,
@@ -51,6 +53,7 @@ from rtcp.ipc.events import (
 from rtcp.ipc.refusals import (
     DamagedRow,
     EmergencyStopPressed,
+    MassesUnknown,
     NoGeometry,
     NotOpen,
     NotPaused,
@@ -99,6 +102,8 @@ set_limits       .     =     .     =     =     .     =     .     .     =     =  
 set_speed_override = = =     =     =     =     =     =     =     =     =     =     =
 pause            .     .     .     .     =     .     .     .     .     .     .     .     .
 resume           .     .     .     .     =     .     .     .     .     .     .     .     .
+set_tool         .     =     .     =     .     .     .     .     .     .     .     .     .
+set_payload      .     =     .     =     .     .     .     .     .     .     .     .     .
 set_zero         .     =     .     .     .     .     .     .     .     .     .     .     .
 home             .     .     .     home  .     .     .     .     .     .     .     .     .
 shutdown         close close close close close close close close close close close close =
@@ -125,8 +130,8 @@ COMMANDS: dict[str, Command] = {
         RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
         Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
         MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
-        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), Pause(), Resume(), SetZero(0, 0.0), Home(0),
-        Shutdown(),
+        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), Pause(), Resume(), SetTool(0), SetPayload(0.1),
+        SetZero(0, 0.0), Home(0), Shutdown(),
     )
 }  # fmt: skip
 """One of each kind, with fields that nobody could refuse."""
@@ -139,6 +144,7 @@ FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
     ApplyTorque: (WrongControlMode,),
     Resume: (NotPaused,),
     SetLimits: (WrongRowCount,),
+    SetPayload: (MassesUnknown,),
     Reset: (EmergencyStopPressed,),
 }
 """Commands that cannot be carried out as they are above, wherever they are accepted; tested elsewhere."""

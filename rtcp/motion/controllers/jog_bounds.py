@@ -13,8 +13,7 @@ from typing import Final
 from kinematics.pose import Pose
 from rtcp.ipc.schema import HELD_BOX_AT, HELD_ITSELF, HELD_RANGE_AT, HELD_SHOULDER
 from rtcp.motion.controllers.jog_inverse import JogInverse, Row
-from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
-from rtcp.motion.guards.zones import INNER_BOX, Clearance
+from rtcp.motion.guards.zones import INNER_BOX, Clearance, Zones
 from rtcp.motion.limits import Limits
 
 STANDOFF_M: Final = 0.008
@@ -34,7 +33,7 @@ class JogBounds:
 
     Args:
         limits: of the joints and where the boxes are; read every cycle.
-        trajectory_guard: its zones tell the clearances.
+        zones: tell the clearances; None: there are none.
         inverse: what the joints do at this configuration.
         braking: deceleration before a box, m/s^2.
         singularity: nearest distances, m, rad, rad; 0: none.
@@ -44,14 +43,14 @@ class JogBounds:
     def __init__(
         self,
         limits: Limits,
-        trajectory_guard: TrajectoryGuard,
+        zones: Zones | None,
         inverse: JogInverse,
         braking: float,
         singularity: Sequence[float],
         dt: float,
     ) -> None:
         self._limits, self._inverse, self._dt = limits, inverse, dt
-        self._zones = trajectory_guard.zones
+        self._zones = zones
         self._braking = braking
         self._nearest = tuple(singularity)
         self.near: Sequence[Clearance] = ()
