@@ -7,6 +7,7 @@ from math import sqrt
 from typing import Final
 
 from kinematics.gravity import gravity_torques
+from kinematics.model import ArmModel
 from rtcp.ipc.commands import ApplyTorque, Command
 from rtcp.ipc.events import CommandExpired
 from rtcp.ipc.refusals import FractionOutOfRange, Refusal, TorqueOutOfRange
@@ -137,12 +138,17 @@ class TorqueController(Controller):
             whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag + self._stiffness[i] * wall
             torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
             position[i] = q
-            speeds[i] = speed = _chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
+            speeds[i] = speed = chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
             follows[i] = state.commanded[i] + speed * dt
         return target
 
     def _carried(self, position: Sequence[float]) -> Sequence[float]:
-        return self._zero if self._model is None else gravity_torques(self._model, position)
+        return self._zero if self._model is None else weight(self._model, position)
+
+
+def weight(model: ArmModel, position: Sequence[float]) -> Sequence[float]:
+    """Return the torques, Nm, that carry the arm at `position` (rad)."""
+    return gravity_torques(model, position)
 
 
 def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
@@ -151,7 +157,7 @@ def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
     return bound if bound < fastest else fastest
 
 
-def _chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
+def chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
     """The setpoint's next speed: it catches up with the arm, `lag` rad away at `speed`, and has its speed there."""
     far = lag if lag >= 0.0 else -lag
     closing = sqrt(acceleration * far)
