@@ -522,7 +522,7 @@ class CommandExpired(MotionEnded, number=109):
     by_limit = False
 
 
-class GuidedTooFast(MotionEnded, number=127):
+class GuidedTooFast(MotionEnded):
     """the hand moved the tool at {speed:.6g} m/s, the bound is {limit:.6g} m/s (guiding.speed in {file}): controlled
     stop; push less hard"""
 

@@ -16,6 +16,7 @@ from rtcp.ipc.commands import (
     Disable,
     Enable,
     ExtendTrajectory,
+    Guide,
     Halt,
     Home,
     Jog,
@@ -119,7 +120,7 @@ COMMANDS: dict[str, Command] = {
         Enable(), Disable(), Reset(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1),
         RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
         Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
-        MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
+        MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Guide(), Halt(), SetOutput(5, True),
         MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), SetZero(0, 0.0), Home(0),
         Shutdown(),
     )
@@ -132,6 +133,7 @@ FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
     RunLines: (NoGeometry,),
     MoveAtVelocity: (WrongControlMode,),
     ApplyTorque: (WrongControlMode,),
+    Guide: (NoGeometry,),
     SetLimits: (WrongRowCount,),
     Reset: (EmergencyStopPressed,),
 }
