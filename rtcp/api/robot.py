@@ -570,6 +570,19 @@ class Methods:
         return Call("apply_torque", params, _streamed)
 
     @Method
+    def guide(self, duration_s: float = 0.0, progress: OnProgress | None = None) -> Call[str]:
+        """Let the arm be guided by hand, in control mode `torque`; the mode before comes back.
+
+        Args:
+            duration_s: how long, s; 0: until a halt, the release of the enabling switch, or 3600 s.
+            progress: called with what is under way.
+
+        Returns:
+            Why it ended: `done`, `halted` or `released` (the enabling switch).
+        """
+        return Call("guide", {"duration_s": duration_s}, lambda found: str(found["ended"]), progress)
+
+    @Method
     def stream(self, q: Sequence[float], t: float) -> Call[Streamed]:
         """Send the next position of a stream, rad, with the sender's time stamp, s; it ends when no more come."""
         return Call("stream_position", {"q": list(q), "stamp_s": t}, _streamed)

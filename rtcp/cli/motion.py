@@ -37,6 +37,8 @@ COLUMNS = (
 UNITS = {"speed": "m/s", "acceleration": "m/s^2", "jerk": "m/s^3", "angular_speed": "rad/s",
          "angular_acceleration": "rad/s^2", "angular_jerk": "rad/s^3"}  # fmt: skip
 
+_HOLDS = ": the arm holds"
+
 commands = typer.Typer()
 limits = typer.Typer(name="limits", help="Show and narrow the limits while the platform runs.", no_args_is_help=True)
 commands.add_typer(limits)
@@ -282,6 +284,20 @@ def _amount(text: str, unit: str) -> float:
         if text.endswith(ending):
             return factor * number(text.removesuffix(ending), "AMOUNT", ending)
     raise CommandError(f"{text!r} is not an amount for this axis: a number with {' or '.join(factors)}, as 1{unit}")
+
+
+@commands.command("guide")
+def _guide(
+    seconds: Annotated[float | None, option("--seconds", "S", "How long, s, at most 3600. Default: until Ctrl-C.")] = (
+        None
+    ),
+) -> None:
+    """Let the arm be guided by hand: it carries its weight and follows. Ctrl-C ends it, and the arm holds."""
+    positive("--seconds", seconds, "s", 3600.0)
+    with stoppable("guide") as robot:
+        report("the arm follows the hand; Ctrl-C ends it")
+        ended = robot.guide(seconds or 0.0)
+    report({"done": "the time is over", "halted": "halted"}.get(ended, "the enabling switch was released") + _HOLDS)
 
 
 @commands.command("arc", context_settings=NUMBERS_AS_WRITTEN)

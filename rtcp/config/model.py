@@ -418,6 +418,24 @@ class JogConfig:
 
 
 @dataclass(frozen=True)
+class GuidingConfig:
+    """Hand guiding: [what it does, and what to check first](guiding.md)."""
+
+    speed: Annotated[float, Gt(0), Le(0.25)] = 0.25
+    """Largest speed of the tool, m/s."""
+    joint_speed: Annotated[float, Gt(0), Le(2)] = 0.5
+    """Largest speed of each joint, rad/s; at most its `velocity`."""
+    hold: Annotated[float, Gt(0), Le(0.5)] = 0.06
+    """Torque that moves no joint yet, fraction of its `torque`: greater errors of the weight make the arm drift."""
+    damping: Annotated[float, Ge(0), Le(1)] = 0.1
+    """Damping that the hand feels, fraction of each joint's `cst_damping`."""
+    weight_error: Annotated[float, Gt(0), Le(1)] = 0.1
+    """Largest difference of a joint's torque at rest from its weight, fraction of its `torque`; more is refused."""
+    enabling_switch: bool = True
+    """Whether it is refused on a real bus where `inputs.enabling_switch` is left out."""
+
+
+@dataclass(frozen=True)
 class SupervisionConfig:
     """Limits on measured values; the emergency stop follows when one is exceeded for `cycles` in a row."""
 
@@ -793,6 +811,7 @@ class ArmSettings:
     """Joint positions to which `rtcp move --home` and the panel lead, rad."""
     cartesian: CartesianConfig = field(default_factory=CartesianConfig)
     jog: JogConfig = field(default_factory=JogConfig)
+    guiding: GuidingConfig = field(default_factory=GuidingConfig)
     supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
     stops: StopsConfig = field(default_factory=StopsConfig)
     inputs: InputsConfig = field(default_factory=InputsConfig)

@@ -39,7 +39,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.message import Joints
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.session import Session, SessionError, read_json, read_processes
-from rtcp.ipc.states import ControlMode, JogFrame
+from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.motion.limits import Limits
 from rtcp.motion.speed_override import LOWEST
 
@@ -430,6 +430,24 @@ class Methods:
         if pose is not None:
             return await self._motion.preview_pose(pose, speed, line, number)
         return await self._motion.preview(q, (), (), speed, synchronized, tool=number)
+
+    @method()
+    async def guide(self, caller: Caller, duration_s: Annotated[float, Ge(0), Le(3600)] = 0.0) -> Json:
+        """Let the arm be guided by hand (`docs/guiding.md`), in control mode torque, and go back to the mode before.
+
+        Returns when the arm holds: `ended` is `done` after `duration_s`, `halted` by a halt, `released` by the enabling
+        switch. 0: it has no end but these, and an hour.
+        """
+        before = self.channel.control_mode
+        if before in (None, ControlMode.TORQUE):
+            return await self._motion.guide(caller, duration_s)
+        async with self.channel.lease(caller):
+            await self.machine.mode(caller, "torque")
+            try:
+                return await self._motion.guide(caller, duration_s)
+            finally:
+                if self.channel.state is State.HOLDING:
+                    await self.machine.mode(caller, before.name.lower())
 
     @method(at_once=True)
     async def fk(self, caller: Caller, q: Numbers) -> Json:

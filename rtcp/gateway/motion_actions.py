@@ -22,6 +22,7 @@ from rtcp.gateway.tolerances import Tolerances, Tracking, Violation
 from rtcp.ipc.commands import (
     Command,
     ExtendTrajectory,
+    Guide,
     Halt,
     MotionCommand,
     MoveJoints,
@@ -30,6 +31,7 @@ from rtcp.ipc.commands import (
     RunTrajectory,
 )
 from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.events import Arrived, PermissionWithdrawn
 from rtcp.ipc.layout import PLAN_ROWS, PlanTooLong
 from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import (
@@ -67,6 +69,8 @@ _GONE = (NotOpen.name, NoLease.name, WrongState.name)
 """What the loop refuses more points with once the trajectory has ended."""
 _KEPT_ROWS = 3
 """Rows of the plan area beside those ahead: the one that the arm comes from, one for a point that waits, one more."""
+_GUIDED_S = 3700.0
+"""Longer than an arm may be guided."""
 _UNPLANNED_S = 600.0
 """Longest motion of a package's own command."""
 
@@ -587,6 +591,23 @@ class MotionActions:
 
         async with self._channel.lease(caller) as lease:
             return await self._run(lease, command, _UNPLANNED_S, command.name, position)
+
+    async def guide(self, caller: Caller, duration_s: float) -> Json:
+        """Let the arm be guided by hand; return when it holds again, and why: `done`, `halted`, or `released`."""
+        channel = self._channel
+        since = channel.observer.last_event
+
+        def ended() -> Json:
+            done = any(isinstance(record.event, Arrived) for record in channel.events(since))
+            return {"ended": "done" if done else "halted", "positions": channel.joints("actual_position")}
+
+        async with channel.lease(caller) as lease:
+            try:
+                return await self._run(lease, Guide(duration_s), _GUIDED_S, "guiding", ended)
+            except RtcpError as error:
+                if error.reason != PermissionWithdrawn.name:
+                    raise
+                return {"ended": "released", "positions": channel.joints("actual_position")}
 
     async def fk(self, q: Sequence[float]) -> Json:
         """Return the pose of the tool at joint positions, rad."""

@@ -300,3 +300,11 @@ class ApplyTorque(MotionCommand):
     damping: float
     """Fraction, 0 to 1, of each joint's `cst_damping`."""
     hold_s: float
+
+
+class Guide(MotionCommand):
+    """Let the arm be guided by hand: it carries its weight, and follows within its limits."""
+
+    states = frozenset({State.HOLDING})
+    duration_s: float = 0.0
+    """s, at most 3600; 0: until it is halted, or 3600 s."""

@@ -542,6 +542,15 @@ class CommandExpired(MotionEnded, number=109):
     by_limit = False
 
 
+class GuidedTooFast(MotionEnded):
+    """the hand moved the tool at {speed:.6g} m/s, the bound is {limit:.6g} m/s (guiding.speed in {file}): controlled
+    stop; push less hard"""
+
+    by_limit = False
+    speed: float
+    limit: float
+
+
 class OutOfReach(MotionEnded, number=102):
     """the motion would have left the reach of the arm by {distance:.6g} m; the arm holds, then `rtcp reset`"""
 

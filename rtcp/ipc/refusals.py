@@ -303,7 +303,7 @@ class PlannedForAnotherTool(Refusal):
 
 
 class MassesUnknown(Refusal):
-    """the masses of the links are unknown (kinematics.links in {file}): no weight is carried, and no payload's"""
+    """the masses of the links are unknown (kinematics.links in {file}): the arm's weight cannot be carried"""
 
 
 class PayloadTooHeavy(Refusal):
@@ -511,3 +511,25 @@ class NoRoomForPoints(Refusal):
 
     rows: int
     most: int
+
+
+class NoEnablingSwitch(Refusal):
+    """no enabling switch is configured (inputs.enabling_switch in {file}): a person guides the arm only while one is
+    held; guiding.enabling_switch: false allows it without"""
+
+
+class WeightDiffers(Refusal):
+    """{joint} holds {held:.6g} Nm, its weight by the masses is {expected:.6g} Nm: at most {limit:.6g} Nm apart are
+    allowed (guiding.weight_error in {file}); set kinematics.links, or take off the load"""
+
+    axis: int
+    held: float
+    expected: float
+    limit: float
+
+
+class DurationOutOfRange(Refusal):
+    """duration {value:.6g} s is not allowed: at most {limit:.6g} s, or 0: until it is halted"""
+
+    value: float
+    limit: float

@@ -72,7 +72,7 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      'drive_mode: found the text "cps", allowed is one of csp, csv, cst'),
     (ARM, [("lease_s:", "leese_s:")],
      "leese_s: this key does not exist; did you mean lease_s? allowed are name, joints, cycle, bus, drive_mode, "
-     "control_mode, enable_timeout_s, lease_s, home, cartesian, jog, supervision, stops, inputs, outputs, gripper, "
+     "control_mode, enable_timeout_s, lease_s, home, cartesian, jog, guiding, supervision, stops, inputs, outputs, gripper, "
      "payload, "
      "recording, ros, processes, slaves, kinematics"),
     (ARM, [("home: [0, 0.3, pi/2, 0, 0.5, 0]", "home: [0, 0.3, pi/2, 0, 0.5]")],
@@ -83,7 +83,7 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      "cycle.zzz: this key does not exist; allowed are period_us, priority, cpu, spin_us"),
     (ARM, [("lease_s: 0.5", "source: here")],
      "source: this key does not exist; allowed are name, joints, cycle, bus, drive_mode, control_mode, "
-     "enable_timeout_s, lease_s, home, cartesian, jog, supervision, stops, inputs, outputs, gripper, payload, "
+     "enable_timeout_s, lease_s, home, cartesian, jog, guiding, supervision, stops, inputs, outputs, gripper, payload, "
      "recording, ros, processes, slaves, kinematics"),
     (ARM, [("    jerk: 20.0\n", "")],
      "joints[0]: the key jerk is missing; it must be a number of at least 0.001"),

@@ -173,7 +173,7 @@ class JogBounds:
         px, py, pz = clearance.place
         total = [0.0] * 6
         for i in range(clearance.other, clearance.link):
-            k = _lever(poses[i], px, py, pz, x, y, z)
+            k = lever(poses[i], px, py, pz, x, y, z)
             row = self._inverse.rows[i]
             for j in range(6):
                 total[j] += k * row[j]
@@ -218,7 +218,7 @@ class JogBounds:
             travel = 0.0
             for i in range(clearance.other, clearance.link):
                 v = speeds[i]
-                towards = -_lever(poses[i], px, py, pz, x, y, z) * v
+                towards = -lever(poses[i], px, py, pz, x, y, z) * v
                 if towards > 0.0:
                     travel += towards * (v if v > 0.0 else -v) / acceleration[i]
             travel *= 0.5
@@ -238,7 +238,7 @@ def stopping(stopping_distance: float, rate: float, dt: float) -> float:
     return sqrt(half * half + 2.0 * rate * stopping_distance) - half
 
 
-def _lever(pose: Pose, px: float, py: float, pz: float, x: float, y: float, z: float) -> float:
+def lever(pose: Pose, px: float, py: float, pz: float, x: float, y: float, z: float) -> float:
     """Return the speed along (x, y, z) of a point for 1 rad/s about the axis of a frame."""
     (ox, oy, oz), (_, _, ax, _, _, ay, _, _, az) = pose
     rx, ry, rz = px - ox, py - oy, pz - oz

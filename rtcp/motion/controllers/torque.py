@@ -136,7 +136,7 @@ class TorqueController(Controller):
             whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag + self._stiffness[i] * wall
             torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
             position[i] = q
-            speeds[i] = speed = _chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
+            speeds[i] = speed = chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
             follows[i] = state.commanded[i] + speed * dt
         return target
 
@@ -147,7 +147,7 @@ def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
     return bound if bound < fastest else fastest
 
 
-def _chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
+def chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
     """The setpoint's next speed: it catches up with the arm, `lag` rad away at `speed`, and has its speed there."""
     far = lag if lag >= 0.0 else -lag
     closing = sqrt(acceleration * far)
