@@ -90,6 +90,7 @@ open_stream      .     .     .     move  .     .     .     .     .     .     .  
 jog              .     .     .     move  =     .     .     .     .     .     .     .     .
 move_at_velocity .     .     .     =     =     .     .     .     .     .     .     .     .
 apply_torque     .     .     .     =     =     .     .     .     .     .     .     .     .
+guide            .     .     .     =     .     .     .     .     .     .     .     .     .
 halt             .     =     .     =     stop  =     =     =     .     .     .     .     .
 set_output       .     =     =     =     =     =     =     =     .     =     .     .     .
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
