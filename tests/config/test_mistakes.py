@@ -72,8 +72,8 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      'drive_mode: found the text "cps", allowed is one of csp, csv, cst'),
     (ARM, [("lease_s:", "leese_s:")],
      "leese_s: this key does not exist; did you mean lease_s? allowed are name, joints, cycle, bus, drive_mode, "
-     "control_mode, enable_timeout_s, lease_s, home, cartesian, jog, guiding, supervision, stops, inputs, outputs, gripper, "
-     "payload, "
+     "control_mode, enable_timeout_s, lease_s, home, cartesian, jog, guiding, supervision, stops, inputs, outputs, "
+     "gripper, payload, "
      "recording, ros, processes, slaves, kinematics"),
     (ARM, [("home: [0, 0.3, pi/2, 0, 0.5, 0]", "home: [0, 0.3, pi/2, 0, 0.5]")],
      "home: found 5 numbers, allowed are 6, one a joint"),
