@@ -10,6 +10,7 @@ from rtcp.ipc.commands import (
     Command,
     Disable,
     Enable,
+    Guide,
     Halt,
     Jog,
     MoveAtVelocity,
@@ -134,8 +135,13 @@ class RandomActions:
         self.leave()
 
     def torque(self) -> None:
-        """Joint torques, with or without an impedance about where the arm was."""
+        """Joint torques, with or without an impedance about where the arm was; or an arm that is guided by hand."""
         random = self.random
+        if random.random() < 0.3:
+            if self._goes_on(self.send(Guide(self.or_nonsense(random.choice((0.0, 0.3, 1.0)))))):
+                self.seconds(0.0, 1.0)
+            self.leave()
+            return
         for _ in range(random.randrange(1, 6)):
             size = random.choice((1.0, 5.0, 20.0))
             torque = self.some([random.uniform(-size, size) for _ in range(6)])
