@@ -294,14 +294,14 @@ def pictures(playwright: Playwright, directory: Path) -> None:
     with panel() as (_, url):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         for width in (400, 1600):
-            for path, (name, _, _) in PAGES.items():
-                if path == "/cell":
+            for path in PAGES:
+                if path in ("/cell", "/processes", "/program"):
                     continue
                 page = opened(browser, url, path, width)
                 with moved_by_another() if path == "/arm" else contextlib.nullcontext():
                     time.sleep(2.5)
                     page.evaluate(_WITHOUT_PATHS, [str(Path(__file__).parents[1]), str(Path.home())])
-                    page.screenshot(path=directory / f"panel-{name.lower()}-{width}.png", full_page=True)
+                    page.screenshot(path=directory / f"panel-{path[1:] or 'start'}-{width}.png")
                 page.context.close()
         browser.close()
 
