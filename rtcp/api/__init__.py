@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rtcp.api.feed import Feed
     from rtcp.api.program import Program
     from rtcp.api.stream import Stream
+    from rtcp.config.program_file import ProgramFile
 
 __all__ = [
     "Arrival",
@@ -51,6 +52,7 @@ __all__ = [
     "NotRunning",
     "Preview",
     "Program",
+    "ProgramFile",
     "Progress",
     "RecordSchema",
     "RecorderStatus",
@@ -90,6 +92,10 @@ def __getattr__(name: str) -> Any:
         from rtcp.api.program import Program
 
         return Program
+    if name == "ProgramFile":
+        from rtcp.config.program_file import ProgramFile
+
+        return ProgramFile
     if name == "Stream":
         from rtcp.api.stream import Stream
 

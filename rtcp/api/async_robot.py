@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError, Future
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
 from rtcp.api.results import Pose, Positions, Progress, result
-from rtcp.api.robot import Call, Methods
+from rtcp.api.robot import Call, Methods, Robot
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.client import ANSWER_TIMEOUT_S, client_name, connection_error
 from rtcp.ipc.errors import RtcpError
@@ -97,6 +98,20 @@ class AsyncRobot(Methods):
         """Return the fraction of its speed at which the arm moves."""
         return (await self.status()).speed_override
 
+    async def in_thread(self, function: Callable[[Robot], T]) -> T:
+        """Call a function of a `Robot` in a thread, over this connection, and return what it returns.
+
+        Cancelled, it ends the call that is under way, and with that its motion; the next one raises ConnectionLost.
+
+        Args:
+            function: as `lambda robot: rtcp.Program(file).run(robot)`.
+        """
+        robot = _InThread(self, asyncio.get_running_loop())
+        try:
+            return await asyncio.to_thread(function, robot)
+        finally:
+            robot.close()
+
     async def _carry_out(self, call: Call[T]) -> T:
         writer, number = self._writer, next(self._numbers)
         if writer is None or writer.is_closing():
@@ -128,6 +143,31 @@ class AsyncRobot(Methods):
                 pending.lose()
             if self._writer is not None:
                 self._writer.close()
+
+
+class _InThread(Robot):
+    """The connection of an `AsyncRobot`, for calls from another thread."""
+
+    def __init__(self, robot: AsyncRobot, loop: asyncio.AbstractEventLoop) -> None:
+        self._robot = robot
+        self._loop = loop
+        self._ended = False
+        self._under_way: Future[Any] | None = None
+
+    def close(self) -> None:
+        self._ended = True
+        if self._under_way is not None:
+            self._under_way.cancel()
+
+    def _carry_out(self, call: Call[T]) -> T:
+        # The loop's thread closes: it sees the call, or the call sees that.
+        self._under_way = pending = asyncio.run_coroutine_threadsafe(self._robot._carry_out(call), self._loop)
+        if self._ended:
+            pending.cancel()
+        try:
+            return pending.result()
+        except CancelledError:
+            raise RtcpError("lost", f"{call.method!r} was cancelled") from None
 
 
 class _Pending:

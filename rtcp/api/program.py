@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ _PLANNED_TIMES: Final = 2
 """Largest number of runs of a part that are planned: the first begins elsewhere, all others where the part ends."""
 _MOST_PLANNED: Final = 10_000
 _SAME_RAD: Final = 1e-3
+_WAIT_S: Final = 0.05
+"""Between two calls of `between` while a step waits."""
 _HALTED: Final = "halted_at_rest"
 _THERE: Final = "AlreadyThere"
 """Reason of a motion that is refused because the arm is where it leads."""
@@ -30,10 +33,11 @@ Where = tuple[str | int, ...]
 class Motion:
     """Motions of one or more steps that go over into each other: what `Robot.run_path` takes.
 
-    steps: where each stop comes from. stops: of the path.
+    number: of the first step in the program. where: that step. stops: of the path.
     """
 
-    steps: tuple[Where, ...]
+    number: int
+    where: Where
     stops: tuple[dict[str, Any], ...]
 
 
@@ -41,8 +45,21 @@ class Motion:
 class Action:
     """A step that is no motion."""
 
+    number: int
     where: Where
     step: Step
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What a program begins to do: `text`, of the step that stands in this line of the file.
+
+    number: of the step in the program, from 0; of a part that runs, the step that runs it.
+    """
+
+    number: int
+    line: int
+    text: str
 
 
 @dataclass(frozen=True)
@@ -75,14 +92,24 @@ class Program:
         self._poses: dict[str, NamedPose] = {pose.name: pose for pose in self._motion.poses}
         self._parts = {part.name: (at, part.steps) for at, part in enumerate(self._motion.parts)}
 
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """The steps of the program, without those of its parts."""
+        return self._motion.program
+
     def line_of(self, where: Where) -> int:
         """Return the line of a step in the file."""
         return self._document.line(where)
 
-    def check(self, robot: Robot) -> list[PlannedMotion]:
+    def check(self, robot: Robot, start: int = 0, end: int | None = None) -> list[PlannedMotion]:
         """Plan all motions one after the other from where the arm is commanded; nothing moves.
 
         A part that runs several times is planned twice.
+
+        Args:
+            robot: that plans.
+            start: step to begin with, from 0.
+            end: step before which to end; None: behind the last.
 
         Raises:
             Refused: a motion cannot be carried out; the sentence begins with the line of its first step.
@@ -90,12 +117,12 @@ class Program:
         places = self._places(robot)
         q: Sequence[float] = robot.status().commanded_positions
         found: list[PlannedMotion] = []
-        for number, one in enumerate(self._units(places, _PLANNED_TIMES)):
+        for number, one in enumerate(self._units(places, _PLANNED_TIMES, start, end)):
             if number == _MOST_PLANNED:
                 raise RtcpError("refused", f"{self.file}: it has more than {_MOST_PLANNED} steps", "program")
             if isinstance(one, Action):
                 continue
-            line = self.line_of(one.steps[0])
+            line = self.line_of(one.where)
             try:
                 plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed)
             except RtcpError as error:
@@ -108,13 +135,25 @@ class Program:
             q = plan.path[-1]
         return found
 
-    def run(self, robot: Robot, say: Callable[[int, str], None] = lambda line, text: None, check: bool = True) -> None:
+    def run(
+        self,
+        robot: Robot,
+        say: Callable[[Begun], None] = lambda begun: None,
+        check: bool = True,
+        start: int = 0,
+        end: int | None = None,
+        between: Callable[[], None] = lambda: None,
+    ) -> None:
         """Carry out the program; what ends it early stops the arm.
 
         Args:
             robot: enabled, in control mode `joint` or `cartesian`.
-            say: called with the line in the file and what begins there.
+            say: called with what begins.
             check: plan all of it first.
+            start: step to begin with, from 0, from wherever the arm is.
+            end: step before which to end; None: behind the last.
+            between: called before each step, and again and again while one waits for a time: the program goes on when
+                it returns, and ends by what it raises.
 
         Raises:
             Refused: as `check`; or a step is refused.
@@ -123,20 +162,48 @@ class Program:
         here = robot.status().commanded_positions
         since = max((event.number for event in robot.events()), default=0)
         if check:
-            self.check(robot)
-        for one in self._units(self._places(robot), None):
-            line = self.line_of(one.steps[0] if isinstance(one, Motion) else one.where)
+            self.check(robot, start, end)
+        for one in self._units(self._places(robot), None, start, end):
+            between()
+            line = self.line_of(one.where)
             self._check_undisturbed(robot, line, here, since)
             if isinstance(one, Motion):
-                say(line, f"{len(one.stops)} motions in one" if len(one.stops) > 1 else "motion")
-                try:
-                    robot.run_path(one.stops, self._motion.speed)
-                except RtcpError as error:
-                    if error.reason != _THERE:
-                        raise
+                text = f"{len(one.stops)} motions in one" if len(one.stops) > 1 else "motion"
+                say(Begun(one.number, line, text))
+                _carry_out(robot, one.stops, self._motion.speed)
                 here = robot.status().commanded_positions
             else:
-                self._act(robot, one, say)
+                say(Begun(one.number, line, _described(one.step)))
+                _act(robot, one.step, between)
+
+    def step_back(self, robot: Robot, number: int) -> None:
+        """Move back to where step `number`, from 0, began: over a line or an arc on it, else by the joints.
+
+        A step that is no motion is not undone.
+
+        Raises:
+            Refused: reason `no_way_back`: no motion stands before it, or it is, or follows, an arc with an angle.
+        """
+        step, line = self._motion.program[number], self.line_of(("program", number))
+        if step.run is None and _target(step) is None:
+            return
+        before = [one for _, _, one in self._steps(0, number, 1) if one is not None and _target(one) is not None]
+        if not before or step.angle is not None or before[-1].angle is not None:
+            why = "it is, or follows, an arc with an angle" if before else "no motion stands before it"
+            raise RtcpError("refused", f"{self.file}:{line}: no way back over this step: {why}", "no_way_back")
+        name = _target(before[-1])
+        back = dataclasses.replace(
+            step,
+            move=name if step.line is None and step.arc is None else None,
+            line=name if step.line is not None else None,
+            arc=name if step.arc is not None else None,
+            blend=0.0,
+            run=None,
+            times=1,
+        )
+        stop = self._stop(back, self._places(robot))
+        assert stop is not None
+        _carry_out(robot, [stop], self._motion.speed)
 
     def _check_undisturbed(self, robot: Robot, line: int, here: Sequence[float], since: int) -> None:
         """Raise where the arm was halted, or moved by somebody else, since the last step."""
@@ -146,21 +213,6 @@ class Program:
             raise RtcpError("refused", text, "moved_meanwhile")
         if any(event.name == _HALTED for event in robot.events(since)):
             raise RtcpError("refused", f"{self.file}:{line}: the arm was halted: the program ends", "halted")
-
-    def _act(self, robot: Robot, action: Action, say: Callable[[int, str], None]) -> None:
-        step, line = action.step, self.line_of(action.where)
-        if step.gripper is not None:
-            say(line, f"gripper: {step.gripper}")
-            robot.gripper(step.gripper == "open")
-        elif step.output is not None:
-            say(line, f"output {step.output}: {'on' if step.value else 'off'}")
-            robot.io[step.output] = step.value
-        elif step.wait_for is not None:
-            say(line, f"wait until the input {step.wait_for} is {'on' if step.value else 'off'}")
-            robot.io.wait(step.wait_for, step.value, step.timeout_s)
-        elif step.wait_s is not None:
-            say(line, f"wait {step.wait_s:g} s")
-            time.sleep(step.wait_s)
 
     def _places(self, robot: Robot) -> dict[str, list[float]]:
         """Return x, y, z of the poses through which arcs lead."""
@@ -172,42 +224,49 @@ class Program:
             found[name] = list(whole[:3])
         return found
 
-    def _units(self, places: dict[str, list[float]], most: int | None) -> Iterator[Motion | Action]:
+    def _units(
+        self, places: dict[str, list[float]], most: int | None, start: int, end: int | None
+    ) -> Iterator[Motion | Action]:
         """Yield motions, joined where they are blended, and actions; parts run at most `most` times."""
-        steps: list[Where] = []
+        first: tuple[int, Where] | None = None
         stops: list[dict[str, Any]] = []
-        for where, step in self._steps((("program",), self._motion.program), most):
+        for number, where, step in self._steps(start, end, most):
             # A part that runs again begins a motion of its own: what is planned for twice holds for any number.
             stop = None if step is None else self._stop(step, places)
             if stop is not None:
-                steps.append(where)
+                first = first or (number, where)
                 stops.append(stop)
-            if steps and (stop is None or not stop["blend"]):
-                yield Motion(tuple(steps), tuple(stops))
-                steps, stops = [], []
+            if first and (stop is None or not stop["blend"]):
+                yield Motion(*first, tuple(stops))
+                first, stops = None, []
             if stop is None and step is not None:
-                yield Action(where, step)
-        if steps:
-            yield Motion(tuple(steps), tuple(stops))
+                yield Action(number, where, step)
+        if first:
+            yield Motion(*first, tuple(stops))
 
-    def _steps(self, body: tuple[Where, tuple[Step, ...]], most: int | None) -> Iterator[tuple[Where, Step | None]]:
-        """Yield steps; None behind each run of a part that runs several times."""
-        above, steps = body
-        for at, step in enumerate(steps):
-            if step.run is None:
-                yield (*above, at), step
-                continue
-            number, inner = self._parts[step.run]
-            done = 0
-            while (not step.times or done < step.times) and (most is None or done < most):
-                yield from self._steps((("parts", number, "steps"), inner), most)
-                done += 1
-                if step.times != 1:
-                    yield (*above, at), None
+    def _steps(self, start: int, end: int | None, most: int | None) -> Iterator[tuple[int, Where, Step | None]]:
+        """Yield number in the program, place and step; None behind each run of a part that runs several times."""
+        for number, step in list(enumerate(self._motion.program))[start:end]:
+            for where, inner in self._inner((("program", number)), step, most):
+                yield number, where, inner
+
+    def _inner(self, where: Where, step: Step, most: int | None) -> Iterator[tuple[Where, Step | None]]:
+        """Yield a step, or those of the part that it runs."""
+        if step.run is None:
+            yield where, step
+            return
+        number, steps = self._parts[step.run]
+        done = 0
+        while (not step.times or done < step.times) and (most is None or done < most):
+            for at, inner in enumerate(steps):
+                yield from self._inner(("parts", number, "steps", at), inner, most)
+            done += 1
+            if step.times != 1:
+                yield where, None
 
     def _stop(self, step: Step, places: dict[str, list[float]]) -> dict[str, Any] | None:
         """Return the stop of a motion; None: the step is none."""
-        name = step.move or step.line or step.arc
+        name = _target(step)
         if name is None:
             return None
         pose = self._poses[name]
@@ -218,3 +277,40 @@ class Program:
         if step.via is not None:
             made |= {"via": places[step.via], "angle": step.angle}
         return made
+
+
+def _target(step: Step) -> str | None:
+    """Return the name of the pose to which a step moves."""
+    return step.move or step.line or step.arc
+
+
+def _carry_out(robot: Robot, stops: Sequence[dict[str, Any]], speed: float | None) -> None:
+    try:
+        robot.run_path(stops, speed)
+    except RtcpError as error:
+        if error.reason != _THERE:
+            raise
+
+
+def _described(step: Step) -> str:
+    if step.gripper is not None:
+        return f"gripper: {step.gripper}"
+    if step.output is not None:
+        return f"output {step.output}: {'on' if step.value else 'off'}"
+    if step.wait_for is not None:
+        return f"wait until the input {step.wait_for} is {'on' if step.value else 'off'}"
+    return f"wait {step.wait_s:g} s"
+
+
+def _act(robot: Robot, step: Step, between: Callable[[], None]) -> None:
+    if step.gripper is not None:
+        robot.gripper(step.gripper == "open")
+    elif step.output is not None:
+        robot.io[step.output] = step.value
+    elif step.wait_for is not None:
+        robot.io.wait(step.wait_for, step.value, step.timeout_s)
+    elif step.wait_s is not None:
+        end = time.monotonic() + step.wait_s
+        while (left := end - time.monotonic()) > 0.0:
+            time.sleep(min(left, _WAIT_S))
+            between()

@@ -64,7 +64,7 @@ class Status:
     holder: str
     """Who commands the arm; empty: nobody."""
     speed_override: float
-    """Fraction of its speed at which the arm moves, 0.01 to 1."""
+    """Fraction of its speed at which the arm moves, 0.01 to 1; 0 while its motion is paused."""
     raw: Mapping[str, Any]
     """Everything that `rtcp status --json` prints."""
 

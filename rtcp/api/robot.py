@@ -204,6 +204,26 @@ class Methods:
         return Call("set_speed_override", {"fraction": fraction}, _nothing)
 
     @Method
+    def pause(self) -> Call[None]:
+        """Bring the motion under way, whoever began it, to rest on its path; `resume` continues it. Needs no lease.
+
+        Its call goes on waiting. A halt, or the end of its commander, ends it also while it is paused.
+
+        Raises:
+            Refused: nothing moves, or what moves cannot be paused (jog, stream, torque, a motion in step).
+        """
+        return Call("pause", {}, _nothing)
+
+    @Method
+    def resume(self) -> Call[None]:
+        """Continue the motion that is paused. Needs no lease.
+
+        Raises:
+            Refused: none is paused.
+        """
+        return Call("resume", {}, _nothing)
+
+    @Method
     def stop(self) -> Call[tuple[str, ...]]:
         """End the platform: stop the arm, disable the drives, leave the bus.
 
@@ -240,6 +260,19 @@ class Methods:
         """
         params = {"q": list(q), "speed": speed, "synchronized": synchronized, "replace": replace}
         return Call("move_joints", params, _arrival, progress)
+
+    @Method
+    def move_home(self, speed: float | None = None, progress: OnProgress | None = None) -> Call[Arrival]:
+        """Move the joints to `home` of the arm's file.
+
+        Args:
+            speed: of the fastest joint, rad/s; None: its limit.
+            progress: called about ten times a second meanwhile.
+
+        Raises:
+            Refused: as `move_joints`; reason `no_home`: the file has none.
+        """
+        return Call("move_home", {"speed": speed}, _arrival, progress)
 
     @Method
     def move_pose(

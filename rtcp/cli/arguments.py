@@ -51,7 +51,7 @@ def _refuse_options(context: typer.Context, values: Any) -> Any:
     """
     options = [name for parameter in context.command.params for name in parameter.opts if name.startswith("-")]
     known = [*options, *context.help_option_names]
-    for value in [values] if isinstance(values, str) else values:
+    for value in [values] if isinstance(values, str) else values or ():
         if not value.startswith("-") or _NUMBER.match(value):
             continue
         option = value.split("=", 1)[0]

@@ -25,7 +25,7 @@ from rtcp.cli.arguments import (
 )
 from rtcp.cli.output import CommandError, emit_json, progress, report, show, table
 from rtcp.cli.platform import connect, stoppable
-from rtcp.config.model import UNLIMITED_TORQUE
+from rtcp.config.model import UNLIMITED_TORQUE, ConfigError
 
 Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Configured name, as joint2, or number from 1.")]
 COLUMNS = (
@@ -79,6 +79,22 @@ def _halt() -> None:
     with connect("halt") as robot:
         robot.halt()
     report("halted: the arm holds where it stopped")
+
+
+@commands.command("pause")
+def _pause() -> None:
+    """Bring the motion under way, whoever began it, to rest on its path; `rtcp resume` continues it."""
+    with connect("pause") as robot:
+        robot.pause()
+    report("paused: `rtcp resume` continues the motion, `rtcp halt` ends it")
+
+
+@commands.command("resume")
+def _resume() -> None:
+    """Continue the motion that is paused."""
+    with connect("resume") as robot:
+        robot.resume()
+    report("the motion goes on")
 
 
 @commands.command("mode")
@@ -162,9 +178,10 @@ def _home(joint: Joint) -> None:
 @commands.command("move", context_settings=NUMBERS_AS_WRITTEN)
 def _move(
     numbers: Annotated[
-        list[str],
+        list[str] | None,
         as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool; see --pose."),
-    ],
+    ] = None,
+    home: Annotated[bool, option("--home", "Instead of numbers: to `home` of the arm's file.")] = False,
     pose: Annotated[bool, option("--pose", "The numbers are a tool pose, X Y Z RX RY RZ: m, and rad of Rx Ry Rz.")] = (
         False
     ),
@@ -183,9 +200,13 @@ def _move(
         raise CommandError("--line is for a pose: give --pose X Y Z RX RY RZ --line")
     if unsynchronized and pose:
         raise CommandError("--unsynchronized is for joint positions, not for --pose")
-    target = pose_values(numbers) if pose else joint_values(numbers)
+    if home == bool(numbers) or (home and (pose or unsynchronized)):
+        raise CommandError("give joint positions, or --pose X Y Z RX RY RZ, or --home alone")
+    target = pose_values(numbers or ()) if pose else joint_values(numbers or ())
     with stoppable("move") as robot, progress() as shown:
-        if pose:
+        if home:
+            arrived = robot.move_home(speed, shown)
+        elif pose:
             arrived = robot.move_pose(target, speed, line, shown)
         else:
             arrived = robot.move_joints(target, speed, not unsynchronized, shown)
@@ -252,6 +273,7 @@ def _run(
     approach: Annotated[bool, option("--approach", "First move to the start of the motion, by the joints.")] = False,
     dry: Annotated[bool, option("--dry", "Plan it from where the arm is, and move nothing.")] = False,
     picture: Annotated[Path | None, option("--picture", "FILE", "With --dry: draw the way of the tool.")] = None,
+    first: Annotated[int, option("--from", "N", "First step of a program, from 1; the arm begins where it is.")] = 1,
     schema: Annotated[bool, option("--schema", "Print the JSON schema of motion files, for editors.")] = False,
 ) -> None:
     """Execute a motion file, checked as a whole first; returns when it is done. Ctrl-C stops it."""
@@ -269,14 +291,18 @@ def _run(
             raise CommandError("--picture is for a plan: give --dry too")
     if motion.program and approach:
         raise CommandError("--approach is for trajectories and paths: a program begins where the arm is")
+    if first != 1 and not 1 <= first <= len(motion.program):
+        raise CommandError(
+            f"--from {first} is not allowed: 1 to {len(motion.program)}, the steps of the program in {file}"
+        )
     if dry:
-        _dry(file, bool(motion.program), approach, picture)
+        _dry(file, bool(motion.program), approach, picture, first - 1)
     elif motion.program:
         from rtcp.api.program import Program
 
         program = Program(file)
         with stoppable("run") as robot:
-            program.run(robot, lambda line, text: report(f"{file}:{line}: {text}"))
+            program.run(robot, lambda begun: report(f"{file}:{begun.line}: {begun.text}"), start=first - 1)
         report("the program is complete")
     else:
         with stoppable("run") as robot, progress() as shown:
@@ -284,13 +310,13 @@ def _run(
         report(arrival(arrived))
 
 
-def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None) -> None:
+def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None, start: int) -> None:
     """Plan a file and show what would be done."""
     with connect("run --dry") as robot:
         if is_program:
             from rtcp.api.program import Program
 
-            planned = [(one.line, one.plan) for one in Program(file).check(robot)]
+            planned = [(one.line, one.plan) for one in Program(file).check(robot, start)]
         else:
             planned = [(1, robot.preview(file=str(file.absolute()), approach=approach))]
     listed = table(("line", "duration, s", "length, m", "part of the speed"))
@@ -311,6 +337,41 @@ def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None) -> 
             )
         draw(model, planned[0][1].path[0], picture, [plan.path for _, plan in planned])
         report(f"picture: {picture}")
+
+
+@commands.command("teach")
+def _teach(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A motion file with a program, new or not.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="By which steps name the pose.")],
+    pose: Annotated[bool, option("--pose", "Keep the pose of the tool. Default: the joint positions.")] = False,
+    step: Annotated[str | None, option("--step", "move|line", "Also append a step that leads there.")] = None,
+    speed: Annotated[float | None, option("--speed", help="Of that step: rad/s, of a line m/s.")] = None,
+    blend: Annotated[float | None, option("--blend", "M", "Of that step: radius of the corner behind it, m.")] = None,
+) -> None:
+    """Keep where the arm is under a name, in a motion file; nothing moves."""
+    from rtcp.config.program_file import ProgramFile
+
+    if step not in (None, "move", "line"):
+        raise CommandError(f"--step {step!r} is not allowed: move or line")
+    if step is None and (speed, blend) != (None, None):
+        raise CommandError("--speed and --blend are of a step: give --step move or --step line too")
+    taught = ProgramFile(file)
+    with connect("teach") as robot:
+        status = robot.status()
+    if pose and status.commanded_pose is None:
+        raise CommandError("--pose: the geometry of the arm is unknown: the key kinematics is missing in its file")
+    if pose:
+        taught.keep(name, pose=status.commanded_pose)
+    else:
+        taught.keep(name, q=status.commanded_positions)
+    if step is not None:
+        keys = {step: name, "speed": speed, "blend": blend}
+        try:
+            taught.insert(len(taught.motion.program), {key: value for key, value in keys.items() if value is not None})
+        except ConfigError:
+            taught.undo()
+            raise
+    report(f"{file}: {name} is kept{'' if step is None else f', and step {len(taught.motion.program)} leads there'}")
 
 
 def arrival(arrived: Arrival) -> str:

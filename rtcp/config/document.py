@@ -106,10 +106,17 @@ def read(path: Path) -> Document:
     """Read a YAML file whose top level is a mapping.
 
     Raises:
-        ConfigError: the file is missing, unreadable, no regular file, no text, no YAML, empty, no mapping, larger than
-            any configuration, or repeats keys.
+        ConfigError: the file is missing, unreadable, no regular file, or no text; or as `parse`.
     """
-    text = text_of(path)
+    return parse(text_of(path), path)
+
+
+def parse(text: str, path: Path) -> Document:
+    """Return the document of a YAML text; `path` stands in the sentences.
+
+    Raises:
+        ConfigError: it is no YAML, empty, no mapping, larger than any configuration, or repeats keys.
+    """
     document = Document(path)
     builder = _Builder(text, document.lines)
     try:

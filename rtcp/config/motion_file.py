@@ -54,10 +54,19 @@ def read_document(path: Path) -> tuple[Document, MotionFile]:
     if ending not in (".csv", ".yaml", ".yml"):
         raise ConfigError([f'{path}: the ending "{path.suffix}" selects no form; allowed are .yaml, .yml and .csv'])
     document, problems = _read_csv(path) if ending == ".csv" else (read(path), [])
+    return document, check(document, problems)
+
+
+def check(document: Document, problems: Sequence[str] = ()) -> MotionFile:
+    """Return the motion of a document.
+
+    Raises:
+        ConfigError: `problems`, and one sentence per mistake in the document, with its line.
+    """
     motion, findings = _FILE.check(document.data)
     if motion is None or problems:
-        raise ConfigError(problems + document.sentences(findings))
-    return document, motion
+        raise ConfigError([*problems, *document.sentences(findings)])
+    return motion
 
 
 def _read_csv(path: Path) -> tuple[Document, list[str]]:

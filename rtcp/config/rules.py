@@ -418,6 +418,17 @@ def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> 
             yield (*axis, *where), f"found {found}, allowed is {low:g} to {high:g}: {why}"
 
 
+@rule(ArmFile, "home", "joints")
+def _home(arm: ArmFile) -> Iterator[Finding]:
+    home, joints = arm.home or (), arm.joints
+    if home and len(home) != len(joints):
+        yield ("home",), f"found {len(home)} numbers, allowed are {len(joints)}, one a joint"
+    for i, (q, joint) in enumerate(zip(home, joints)):  # noqa: B905 the count is checked above
+        low, high = joint.position.min, joint.position.max
+        if not low <= q <= high:
+            yield ("home", i), f"found {q:g}, allowed is {low:g} to {high:g}, the position of {joint.name}"
+
+
 # -- geometry and boxes ------------------------------------------------------------------------------------------------
 
 
@@ -648,13 +659,14 @@ def _program(motion: MotionFile) -> Iterator[Finding]:
 @rule(MotionFile, EVERY_KEY)
 def _one_form(motion: MotionFile) -> Iterator[Finding]:
     found = [key for key in ("trajectory", "path", "program") if getattr(motion, key)]
-    if not found:
-        yield (), "none of trajectory, path and program has entries; one of them is needed"
+    if not (found or motion.poses):
+        yield (), "none of trajectory, path, program and poses has entries; one of them is needed"
     if len(found) > 1:
         yield (found[1],), f"a file holds one of trajectory, path and program, found {' and '.join(found)}"
-    for key in ("poses", "parts"):
-        if getattr(motion, key) and not motion.program:
-            yield (key,), "found without program, allowed beside it"
+    if motion.parts and not motion.program:
+        yield ("parts",), "found without program, allowed beside it"
+    if motion.poses and (motion.trajectory or motion.path):
+        yield ("poses",), "found beside a trajectory or a path, allowed is a program"
     if motion.trajectory and motion.speed is not None:
         yield ("speed",), "a speed is for a path; a trajectory's follows from its times"
 

@@ -19,12 +19,15 @@ from rtcp.ipc.commands import (
     Command,
     Disable,
     Enable,
+    ExtendTrajectory,
     Halt,
     Home,
     MotionCommand,
     MoveGripper,
     OpenStream,
+    Pause,
     Reset,
+    Resume,
     RunInStep,
     RunLines,
     RunTrajectory,
@@ -42,6 +45,8 @@ from rtcp.ipc.events import (
     GripperOpens,
     HaltedAtRest,
     LimitsChanged,
+    Paused,
+    Resumed,
     SpeedOverrideChanged,
     ZeroSet,
 )
@@ -57,6 +62,7 @@ from rtcp.ipc.refusals import (
     HomingUnsupported,
     JointOutsideRange,
     Malformed,
+    MotionPaused,
     MovedByAnother,
     NoArm,
     NoGeometry,
@@ -66,6 +72,8 @@ from rtcp.ipc.refusals import (
     NotAtStandstill,
     NotInCsp,
     NotInOp,
+    NotPausable,
+    NotPaused,
     NotPermitted,
     OffsetOutOfRange,
     PartnerOfAnotherCell,
@@ -86,6 +94,7 @@ from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.controllers.stream import StreamController
 from rtcp.motion.limits import read
 from rtcp.motion.speed_override import LOWEST
+from rtcp.motion.state import Phase
 
 MOST_LIMIT_ROWS: Final = 64
 """`MOST_AXES` joints and more boxes than an arm is configured with: all are checked in one cycle."""
@@ -124,6 +133,8 @@ class CommandHandler:
             MoveGripper: self._move_gripper,
             SetLimits: self._set_limits,
             SetSpeedOverride: self._set_speed_override,
+            Pause: self._pause,
+            Resume: self._resume,
             SetZero: self._set_zero,
             Home: self._home,
             Shutdown: self._shut_down,
@@ -205,6 +216,8 @@ class CommandHandler:
         if arm.group.under_way:
             # Nothing takes the place of a motion in step: its partners would go on.
             return WrongState(command.number, State.MOVING)
+        if arm.speed_override.paused and not isinstance(command, ExtendTrajectory):
+            return MotionPaused()
         continues = machine.state is State.MOVING and arm.active is controller
         refusal = controller.accept(command, arm.state, continues)
         if refusal is not None:
@@ -348,14 +361,30 @@ class CommandHandler:
         if not LOWEST <= wanted <= 1.0:
             return SpeedOverrideOutOfRange(wanted, LOWEST)
         context = self._context
-        if wanted > override.fraction and not (lease and context.lease_held(lease)):
+        if wanted > override.chosen and not (lease and context.lease_held(lease)):
             return NoLease()
-        if wanted > override.fraction and context.state is State.MOVING and context.lease != lease:
+        if wanted > override.chosen and context.state is State.MOVING and context.lease != lease:
             # The joystick, which holds no lease.
             return MovedByAnother()
-        if wanted != override.fraction:
-            override.fraction = wanted
+        if wanted != override.chosen:
+            override.choose(wanted)
             self._blackboard.event(SpeedOverrideChanged(wanted))
+        return None
+
+    def _pause(self, command: Pause, lease: int) -> Refusal | None:
+        arm = self._arm
+        if not arm.active.pausable or arm.active.phase is not Phase.MOVE:
+            return NotPausable()
+        if not arm.speed_override.paused:
+            arm.speed_override.pause()
+            self._blackboard.event(Paused())
+        return None
+
+    def _resume(self, command: Resume, lease: int) -> Refusal | None:
+        if not self._arm.speed_override.paused:
+            return NotPaused()
+        self._arm.speed_override.resume()
+        self._blackboard.event(Resumed())
         return None
 
     def _set_output(self, command: SetOutput, lease: int) -> Refusal | None:

@@ -170,6 +170,8 @@ class StateMachine:
             ctx.lease = lease
         self._count(cause, target)
         ctx.state, ctx.entered = target, ctx.cycle
+        if target is not State.MOVING:
+            ctx.arm.speed_override.resume()
         if target in _SAFE:
             ctx.make_safe()
         if target is not State.OFF:

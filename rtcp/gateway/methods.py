@@ -329,6 +329,13 @@ class Methods:
         return await self._motion.move_joints(caller, q, speed, synchronized)
 
     @method()
+    async def move_home(self, caller: Caller, speed: float | None = None) -> Json:
+        """Move the joints to `home` of the arm's file; `speed` and result as of `move_joints`."""
+        if self._config.home is None:
+            raise RtcpError("refused", f"the key home is missing in {self._config.source}", "no_home")
+        return await self._motion.move_joints(caller, self._config.home, speed, True)
+
+    @method()
     async def move_pose(self, caller: Caller, pose: Numbers, speed: float | None = None, line: bool = False) -> Json:
         """Move the tool to x y z, m, rx ry rz, rad, by the joints or on a `line`; `speed` in rad/s or m/s."""
         return await self._motion.move_pose(caller, pose, speed, line)
@@ -613,7 +620,14 @@ class Methods:
             return {}
 
         documentation = inspect.cleandoc(kind.__doc__ or "")
-        return Method(kind.name, _parameters_of_command(kind), call, documentation, streams=streams)  # type: ignore[arg-type]
+        return Method(
+            kind.name,
+            _parameters_of_command(kind),  # type: ignore[arg-type]
+            call,
+            documentation,
+            at_once=not kind.needs_lease,
+            streams=streams,
+        )
 
     @staticmethod
     def _check_count(name: str, numbers: Numbers, count: int) -> None:

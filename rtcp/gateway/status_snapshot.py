@@ -223,10 +223,12 @@ class StatusSnapshot:
             found["box"] = f"the arm is {distance:.3f} m from {names.box(box)}"
         return found
 
-    def _headline(self, state: State, limits: dict[str, str]) -> str:
+    def _headline(self, state: State, limits: dict[str, str], paused: bool) -> str:
         """Return why the machine is in fault, else the last message; while a motion lasts none of an earlier one."""
         if self.fault or int(state) not in _UNDER_WAY:
             return self.fault or self.message
+        if paused:
+            return "paused: `rtcp resume` continues the motion"
         began_ns = self._began_ns + time.time_ns() - time.monotonic_ns()
         if self._message_ns > began_ns:
             return self.message
@@ -318,7 +320,7 @@ class StatusSnapshot:
         limits = self._limited_by(record) if state is State.MOVING else {}
         return {
             "state": "fault" if problem else state.name.lower(),
-            "message": problem or self._headline(state, limits),
+            "message": problem or self._headline(state, limits, not record["speed_override"]),
             "limited_by": limits,
             "drive_mode": _name(DriveMode, int(record["drive_mode"])),
             "control_mode": _name(ControlMode, control_mode),

@@ -140,6 +140,20 @@ class SetSpeedOverride(Command):
     fraction: float
 
 
+class Pause(Command):
+    """Bring the motion under way to rest on its path; it ends, and is no more paused, by all that ends a motion."""
+
+    states = frozenset({State.MOVING})
+    needs_lease = False
+
+
+class Resume(Command):
+    """Continue the motion that is paused."""
+
+    states = frozenset({State.MOVING})
+    needs_lease = False
+
+
 class SetZero(Command):
     """Set what a drive shows where its axis is at 0."""
 

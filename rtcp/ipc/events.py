@@ -111,6 +111,14 @@ class SpeedOverrideChanged(Event, number=53):
     fraction: float
 
 
+class Paused(Event, number=56):
+    """paused: the motion rests on its path until `rtcp resume`"""
+
+
+class Resumed(Event, number=57):
+    """the motion goes on"""
+
+
 class ControlModeChanged(Event, number=30):
     """control mode {mode}"""
 

@@ -263,6 +263,18 @@ class MovedByAnother(Refusal):
     """the joystick or another client moves the arm: the speed override is only lowered meanwhile"""
 
 
+class NotPausable(Refusal):
+    """this motion cannot be paused: `rtcp halt` stops it. Moves, lines and trajectories can"""
+
+
+class NotPaused(Refusal):
+    """no motion is paused"""
+
+
+class MotionPaused(Refusal):
+    """the motion is paused: `rtcp resume` continues it, `rtcp halt` ends it"""
+
+
 class SpeedOverridden(Refusal):
     """the speed override of this arm is {fraction:.0%}: a motion in step runs at 100 % only (`rtcp speed 100`)"""
 

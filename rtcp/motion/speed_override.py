@@ -11,13 +11,13 @@ from math import sqrt
 from typing import Final
 
 LOWEST: Final = 0.01
-"""Lowest speed override: at 0 a motion would never end, and `rtcp halt` is the stop."""
+"""Lowest speed override that can be chosen; 0 is a pause, which ends with its motion."""
 _MOST_RATE: Final = 50.0
 _MOST_JERK: Final = 2000.0
 """1/s and 1/s^2: bounds of how fast the path's time slows down where no joint moves."""
 _STILL: Final = 1e-9
-_SLOWEST: Final = 0.5 * LOWEST
-"""Least u of a motion that is to go on."""
+STOP: Final = -1.0
+"""Goal of a path that ends where it comes to rest."""
 _OF_LIMIT: Final = 0.99
 """Share of a joint's acceleration that a change of speed uses, so that what is between two cycles keeps to it too."""
 _OF_JERK: Final = 0.5
@@ -29,12 +29,32 @@ _LEAST_JERK: Final = 4.0
 
 
 class SpeedOverride:
-    """`fraction`: `LOWEST` to 1.0. One for all controllers; only the loop's command handler writes it."""
+    """One for all controllers; only the state machine and the loop's command handler write it.
 
-    __slots__ = ("fraction",)
+    `fraction`: what motions follow, `LOWEST` to 1.0, or 0 while a motion is paused. `chosen`: what it is without pause.
+    """
+
+    __slots__ = ("chosen", "fraction")
 
     def __init__(self) -> None:
-        self.fraction = 1.0
+        self.fraction = self.chosen = 1.0
+
+    @property
+    def paused(self) -> bool:
+        """Whether a motion rests on its path until `resume`."""
+        return self.fraction == 0.0
+
+    def choose(self, fraction: float) -> None:
+        """Set the fraction, which a pause outlasts."""
+        self.fraction, self.chosen = 0.0 if self.paused else fraction, fraction
+
+    def pause(self) -> None:
+        """Bring the motion under way to rest on its path."""
+        self.fraction = 0.0
+
+    def resume(self) -> None:
+        """Let motions follow the chosen fraction."""
+        self.fraction = self.chosen
 
 
 class TimeScale:
@@ -64,7 +84,7 @@ class TimeScale:
         """Return u at the end of the next cycle.
 
         Args:
-            goal: what u is led to, 0 to 1; 0: to rest.
+            goal: what u is led to, 0 to 1; `STOP`: to rest, as fast as the joints can.
             along: p'(s), rad/s, at the point that the cycle ends at.
             velocity: what was commanded last, rad/s.
             acceleration, jerk: bounds of each joint, rad/s^2, rad/s^3.
@@ -72,7 +92,7 @@ class TimeScale:
         """
         now, last, low, high, most = self.speed, self.rate, 0.0, 1.0, _MOST_JERK
         # What the joints accelerate with along the path changes with u too: a part of their jerk, 3 p''(s) u du/dt.
-        bent = 3.0 * abs(last) / (now * dt) if goal > 0.0 else 0.0
+        bent = 3.0 * abs(last) / (now * dt) if goal >= 0.0 and now > 0.0 else 0.0
         for at_full, before, bound, jerks in zip(along, velocity, acceleration, jerk, strict=True):
             steep = at_full if at_full >= 0.0 else -at_full
             if steep > 1e-6:
@@ -85,14 +105,13 @@ class TimeScale:
                 bend = steep * now - signed
                 allowed = (jerks - bent * (bend if bend >= 0.0 else -bend)) / steep
                 most = allowed if allowed < most else most
-        if goal == 0.0:
+        if goal < 0.0:
             rate = last - most * dt
             # So steep that the rate comes back to 0 together with the speed.
             landing = -sqrt(2.0 * most * now)
             rate = rate if rate > landing else landing
             near = most * dt * dt
         else:
-            low = low if low > _SLOWEST else _SLOWEST
             change = (_OF_JERK * most if most > _LEAST_JERK else _OF_JERK * _LEAST_JERK) * dt
             # The same in both directions, for cycles; the goal may move meanwhile, so the rate never changes by more.
             half, away = 0.5 * _LANDING * change, goal - now if goal > now else now - goal
@@ -101,7 +120,7 @@ class TimeScale:
             rate = rate if rate > last - change else last - change
             rate = rate if rate < last + change else last + change
             near = change * dt
-        if low > high and goal > 0.0:
+        if low > high and goal >= 0.0:
             # What one joint needs is too much for another: at a steady u no joint accelerates more than its path does.
             rate, low, high = 0.0, now, now
         rate = rate if rate > -_MOST_RATE else -_MOST_RATE
@@ -111,7 +130,7 @@ class TimeScale:
         speed = speed if speed < high else high
         speed = speed if speed > low else low
         speed = speed if speed < ceiling else ceiling
-        if goal == 0.0:
+        if goal < 0.0:
             if speed < _STILL or (low == 0.0 and speed < near):
                 speed = 0.0
         elif low <= goal <= high and -near <= goal - now <= near and -2.0 * near <= last * dt <= 2.0 * near:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rtcp.api import Preview, RtcpError
-from rtcp.api.program import Program
+from rtcp.api.program import Begun, Program
 from rtcp.config.model import ConfigError
 
 TEXT = """
@@ -35,6 +35,26 @@ parts:
   - name: twice
     steps:
       - {line: home}
+"""
+
+
+BACK = """
+speed: 0.1
+poses:
+  - {name: home, q: [0, 0, 0, 0, 0, 0]}
+  - {name: right, pose: [0.1, 0, 0, 0, 0, 0]}
+  - {name: below, pose: [0.2, 0, 0, 0, 0, 0]}
+program:
+  - {move: home}
+  - {run: there}
+  - {line: below, speed: 0.2, blend: 0.01}
+  - {arc: right, via: home}
+  - {gripper: open}
+  - {move: below, speed: 0.4}
+  - {arc: right, via: home, angle: pi}
+  - {line: home}
+parts:
+  - {name: there, steps: [{line: right}]}
 """
 
 
@@ -90,7 +110,7 @@ def program(tmp_path: Path) -> Callable[..., Program]:
 def test_steps_are_carried_out_in_order_and_blended_ones_are_one_motion(program: Callable[..., Program]) -> None:
     robot: Any = NotingRobot()
     said: list[tuple[int, str]] = []
-    program().run(robot, lambda line, text: said.append((line, text)))
+    program().run(robot, lambda begun: said.append((begun.line, begun.text)))
     rounds = [[0.1, 0.2, 0]] * 3
     assert robot.done == [[0], *rounds, "gripper True", "lamp False", "wait start True 2"]
     assert [line for line, _ in said] == [8, 17, 17, 17, 10, 11, 12, 13]
@@ -136,7 +156,7 @@ def test_a_program_for_ever_is_planned_and_goes_on(program: Callable[..., Progra
     made = program(TEXT.replace("times: 3", "times: 0"))
     assert len(made.check(robot)) == 3
 
-    def stop(line: int, text: str) -> None:
+    def stop(begun: Begun) -> None:
         if len(robot.done) == 50:
             raise KeyboardInterrupt
 
@@ -145,13 +165,73 @@ def test_a_program_for_ever_is_planned_and_goes_on(program: Callable[..., Progra
     assert robot.done[1:] == [[0.1, 0.2, 0]] * 49
 
 
+# -- a part of a program ----------------------------------------------------------------------------------------------
+
+
+def test_it_runs_from_a_step_to_another_and_plans_only_these(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+    numbers: list[int] = []
+    program().run(robot, lambda begun: numbers.append(begun.number), start=1, end=3)
+    assert robot.done == [[0.1, 0.2, 0]] * 3 + ["gripper True"]
+    assert numbers == [1, 1, 1, 2]
+    assert len(robot.planned) == 2
+
+
+def test_it_waits_before_each_step_and_ends_in_a_wait_by_what_is_raised(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+    asked: list[int] = []
+
+    def between() -> None:
+        asked.append(len(robot.done))
+        if len(asked) == 8:
+            raise TimeoutError
+
+    made = program(TEXT.replace("wait_s: 0.001", "wait_s: 60"))
+    with pytest.raises(TimeoutError):
+        made.run(robot, between=between)
+    assert asked == [0, 1, 2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize(
+    ("number", "stop"),
+    [
+        (1, {"q": [0.0] * 6, "blend": 0.0, "by_joints": True}),
+        (2, {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], "blend": 0.0, "by_joints": False, "speed": 0.2}),
+        (3, {"pose": [0.2, *[0.0] * 5], "blend": 0.0, "by_joints": False, "via": [9.0, 8.0, 7.0], "angle": None}),
+        (5, {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], "blend": 0.0, "by_joints": True, "speed": 0.4}),
+    ],
+)  # fmt: skip
+def test_a_step_back_takes_the_way_of_the_step_to_where_it_began(
+    program: Callable[..., Program], number: int, stop: dict[str, Any]
+) -> None:
+    robot: Any = NotingRobot()
+    robot.run_path = lambda stops, speed: robot.done.append((list(stops), speed))
+    program(BACK).step_back(robot, number)
+    assert robot.done == [([stop], 0.1)]
+
+
+@pytest.mark.parametrize(("number", "moves"), [(0, False), (4, None), (6, False), (7, False)])
+def test_there_is_no_way_back_before_the_first_motion_and_over_arcs_with_an_angle(
+    program: Callable[..., Program], number: int, moves: bool | None
+) -> None:
+    robot: Any = NotingRobot()
+    made = program(BACK)
+    if moves is None:
+        made.step_back(robot, number)  # no motion: nothing is undone
+    else:
+        with pytest.raises(RtcpError, match="no way back over this step") as refused:
+            made.step_back(robot, number)
+        assert refused.value.reason == "no_way_back"
+    assert not robot.done
+
+
 @pytest.mark.parametrize("what", ["halted", "moved_meanwhile"])
 def test_a_halt_and_a_motion_of_others_end_it_before_the_next_step(program: Callable[..., Program], what: str) -> None:
     robot: Any = NotingRobot()
     robot.happened.append(SimpleNamespace(number=3, name="halted_at_rest"))
 
-    def disturb(line: int, text: str) -> None:
-        if "lamp" in text:
+    def disturb(begun: Begun) -> None:
+        if "lamp" in begun.text:
             if what == "halted":
                 robot.happened.append(SimpleNamespace(number=4, name="halted_at_rest"))
             else:

@@ -72,13 +72,17 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      'drive_mode: found the text "cps", allowed is one of csp, csv, cst'),
     (ARM, [("lease_s:", "leese_s:")],
      "leese_s: this key does not exist; did you mean lease_s? allowed are name, joints, cycle, bus, drive_mode, "
-     "control_mode, enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, "
+     "control_mode, enable_timeout_s, lease_s, home, cartesian, jog, supervision, stops, inputs, outputs, gripper, "
      "recording, ros, processes, slaves, kinematics"),
+    (ARM, [("home: [0, 0.3, pi/2, 0, 0.5, 0]", "home: [0, 0.3, pi/2, 0, 0.5]")],
+     "home: found 5 numbers, allowed are 6, one a joint"),
+    (ARM, [("home: [0, 0.3, pi/2,", "home: [0, 0.3, pi,")],
+     "home[2]: found 3.14159, allowed is -2.4 to 2.4, the position of joint3"),
     (ARM, [("priority: 80", "zzz: 1")],
      "cycle.zzz: this key does not exist; allowed are period_us, priority, cpu, spin_us"),
     (ARM, [("lease_s: 0.5", "source: here")],
      "source: this key does not exist; allowed are name, joints, cycle, bus, drive_mode, control_mode, "
-     "enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, recording, ros, "
+     "enable_timeout_s, lease_s, home, cartesian, jog, supervision, stops, inputs, outputs, gripper, recording, ros, "
      "processes, slaves, kinematics"),
     (ARM, [("    jerk: 20.0\n", "")],
      "joints[0]: the key jerk is missing; it must be a number of at least 0.001"),
@@ -384,7 +388,7 @@ def test_there_is_room_for_ten_axes(directory: Path, problems_after: Callable[..
     )
     text = Path(ARM).read_text().replace(GEOMETRY, "\n").replace(SIXTH, SIXTH + slaves)
     text = text.replace("    cst_integral: 250\n", f"    cst_integral: 250{more}\n")
-    Path(ARM).write_text(text.split("\ncartesian:\n")[0] + "\njog:" + text.split("\njog:")[1])
+    Path(ARM).write_text(text.split("\nhome:")[0] + "\njog:" + text.split("\njog:")[1])
     assert len(load(Path(ARM)).axes) == 10
     (problem,) = problems_after(ARM, (ON_AN_OUTPUT, DRIVEN))
     assert problem.endswith("gripper.joint: found beside 10 joints, allowed are 10 in all")
@@ -392,9 +396,12 @@ def test_there_is_room_for_ten_axes(directory: Path, problems_after: Callable[..
     assert problem.endswith("joints: found a list of 11, allowed is a list of 0 to 10 entries")
 
 
+HOME = "home: [0, 0.3, pi/2, 0, 0.5, 0]"
+
+
 def test_an_arm_of_another_number_of_joints_has_no_kinematics(problems_after: Callable[..., list[str]]) -> None:
     sixth = "  - name: joint6\n" + Path(ARM).read_text().split("  - name: joint6\n")[1].split("\n\n")[0]
-    (problem,) = problems_after(ARM, (sixth, ""), reader=load_kinematics)
+    (problem,) = problems_after(ARM, (sixth, ""), (HOME, ""), reader=load_kinematics)
     assert problem.endswith("kinematics: found beside 5 joints, allowed are 6; leave it out for such an arm")
 
 

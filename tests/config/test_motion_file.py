@@ -61,7 +61,7 @@ def test_a_path_in_csv(write: Write) -> None:
 
 POINT = "  - {t: 0, q: [0, 0]}\n"
 YAML = [
-    ("{}", "none of trajectory, path and program has entries; one of them is needed"),
+    ("{}", "none of trajectory, path, program and poses has entries; one of them is needed"),
     (
         "trajectory:\n" + POINT + "path:\n  - {q: [0, 0, 0, 0, 0, 0]}\n",
         "a file holds one of trajectory, path and program, found trajectory and path",

@@ -21,7 +21,9 @@ from rtcp.ipc.commands import (
     MoveGripper,
     MoveJoints,
     OpenStream,
+    Pause,
     Reset,
+    Resume,
     RunInStep,
     RunLines,
     RunTrajectory,
@@ -34,17 +36,20 @@ from rtcp.ipc.commands import (
     Shutdown,
     StreamPosition,
 )
-from rtcp.ipc.events import SpeedOverrideChanged
+from rtcp.ipc.events import Paused, Resumed, SpeedOverrideChanged
 from rtcp.ipc.refusals import (
     ClockNotLocked,
     DriveModeChanging,
     JointOutsideRange,
     Malformed,
+    MotionPaused,
     NoLease,
     NoOutputs,
     NotAtStandstill,
     NotFinite,
     NotInOp,
+    NotPausable,
+    NotPaused,
     NoTrajectory,
     PositionOutOfRange,
     Refusal,
@@ -59,7 +64,7 @@ from .rig import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, LoopRig, Step, 
 
 HEARTBEAT = 0x0004
 """Output 3, which is toggled each cycle."""
-ANYONE = {"disable", "halt", "set_speed_override", "shutdown"}
+ANYONE = {"disable", "halt", "pause", "resume", "set_speed_override", "shutdown"}
 """Commands that need no lease: they make the arm safer."""
 READY = [SetOutput(5, True), SetZero(0, 0.0), Enable(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT),
          MoveGripper(False), SetLimits(0, 1)]  # fmt: skip
@@ -165,6 +170,50 @@ def test_a_speed_override_outlasts_a_halt_and_disabling(rig: LoopRig) -> None:
     rig.do(Disable())
     rig.until(State.READY)
     assert rig.arm.speed_override.fraction == 0.3
+
+
+# -- pause ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_paused_motion_rests_on_its_path_and_ends_where_it_was_to(rig: LoopRig) -> None:
+    rig.hold()
+    rig.do(move_to(0.4, 0.1))
+    rig.run(0.3)
+    assert rig.send(Pause(), lease=0).refusal is None
+    rig.run(1.0)
+    rest = list(rig.arm.state.commanded)
+    rig.run(1.0)
+    assert rig.arm.state.commanded == rest
+    assert rig.state is State.MOVING
+    assert rig.observer.latest()[0]["speed_override"] == 0.0
+    assert rig.send(Pause(), lease=0).refusal is None
+    assert rig.send(move_to(0.0, 0.0)).refusal == MotionPaused()
+    rig.do(SetSpeedOverride(0.5))
+    assert rig.observer.latest()[0]["speed_override"] == 0.0
+    assert rig.send(Resume(), lease=0).refusal is None
+    assert rig.observer.latest()[0]["speed_override"] == 0.5
+    rig.until(State.HOLDING, 20.0)
+    assert rig.arm.state.commanded == pytest.approx([0.4, 0.1])
+    kinds = [type(record.event) for record in rig.events]
+    assert (kinds.count(Paused), kinds.count(Resumed)) == (1, 1)
+
+
+@pytest.mark.parametrize("end", [Halt(), Disable()], ids=name_of)
+def test_what_ends_a_paused_motion_ends_its_pause(rig: LoopRig, end: Command) -> None:
+    rig.bring_to(State.MOVING)
+    rig.do(Pause())
+    rig.run(0.5)
+    rig.do(end)
+    rig.run(0.5)
+    assert rig.state is not State.MOVING
+    assert rig.arm.speed_override.fraction == 1.0
+
+
+def test_a_jog_cannot_be_paused(rig: LoopRig) -> None:
+    rig.hold()
+    rig.do(Jog((0.1, 0.0), JogFrame.JOINTS, 1.0))
+    assert rig.send(Pause()).refusal == NotPausable()
+    assert rig.send(Resume()).refusal == NotPaused()
 
 
 # -- moves ----------------------------------------------------------------------------------------------------------

@@ -22,7 +22,9 @@ from rtcp.ipc.commands import (
     MoveAtVelocity,
     MoveGripper,
     OpenStream,
+    Pause,
     Reset,
+    Resume,
     RunInStep,
     RunLines,
     RunTrajectory,
@@ -51,6 +53,7 @@ from rtcp.ipc.refusals import (
     EmergencyStopPressed,
     NoGeometry,
     NotOpen,
+    NotPaused,
     PlanStartsElsewhere,
     Refusal,
     StartOutOfReach,
@@ -94,6 +97,8 @@ set_output       .     =     =     =     =     =     =     =     .     =     .  
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
 set_limits       .     =     .     =     =     .     =     .     .     =     =     .     .
 set_speed_override = = =     =     =     =     =     =     =     =     =     =     =
+pause            .     .     .     .     =     .     .     .     .     .     .     .     .
+resume           .     .     .     .     =     .     .     .     .     .     .     .     .
 set_zero         .     =     .     .     .     .     .     .     .     .     .     .     .
 home             .     .     .     home  .     .     .     .     .     .     .     .     .
 shutdown         close close close close close close close close close close close close =
@@ -120,7 +125,7 @@ COMMANDS: dict[str, Command] = {
         RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
         Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
         MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
-        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), SetZero(0, 0.0), Home(0),
+        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), Pause(), Resume(), SetZero(0, 0.0), Home(0),
         Shutdown(),
     )
 }  # fmt: skip
@@ -132,6 +137,7 @@ FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
     RunLines: (NoGeometry,),
     MoveAtVelocity: (WrongControlMode,),
     ApplyTorque: (WrongControlMode,),
+    Resume: (NotPaused,),
     SetLimits: (WrongRowCount,),
     Reset: (EmergencyStopPressed,),
 }

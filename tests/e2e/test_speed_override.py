@@ -103,3 +103,32 @@ def test_the_command_line_shows_and_sets_it(enabled: Platform, robot: Robot) -> 
         assert robot.speed_override == pytest.approx(0.3)
     with pytest.raises(rtcp.Invalid, match=r"from 0\.01 to 1"):
         robot.set_speed_override(0.0)
+
+
+def test_a_circle_is_paused_by_another_client_and_goes_on(shared: Platform, robot: Robot) -> None:
+    with rtcp.connect("who pauses", control_socket(shared.directory)) as other, ThreadPoolExecutor(1) as pool:
+        with pytest.raises(rtcp.Refused):
+            other.pause()
+        going = pool.submit(circle, robot)
+        end = time.monotonic() + 20.0
+        while other.state is not State.MOVING:
+            assert time.monotonic() < end
+        time.sleep(1.0)
+        other.pause()
+        time.sleep(1.0)
+        paused = other.status()
+        time.sleep(1.0)
+        later = other.status()
+        assert later.sent_positions == paused.sent_positions
+        assert (later.state, later.speed_override) == (State.MOVING, 0.0)
+        assert later.message == "paused: `rtcp resume` continues the motion"
+        other.resume()
+        going.result()
+        status = other.status()
+    assert status.speed_override == 1.0
+    assert status.positions == pytest.approx(HERE, abs=2e-3)
+
+
+def test_the_arm_moves_home(robot: Robot) -> None:
+    robot.move_home()
+    assert robot.positions == pytest.approx([0.0, 0.3, 1.5708, 0.0, 0.5, 0.0], abs=2e-3)

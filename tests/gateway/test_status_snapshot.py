@@ -42,6 +42,7 @@ class Written:
 
     def publish(self, state: State, moves: int = 0, wkc: int = 21, held: int = 0, **joints: Any) -> None:
         told = {"state": state, "moves": moves, "wkc": wkc, "wkc_expected": 21, "flags": FLAG_DC_LOCKED, "held": held}
+        joints.setdefault("speed_override", 1.0)
         self.board.publish(numbers(self.board.schema, **told, time_ns=time.monotonic_ns(), **joints))
 
     @property
@@ -99,6 +100,8 @@ def test_while_the_arm_moves_the_message_is_not_the_end_of_the_last_motion(writt
     # The next motion begins without a cycle of rest between.
     written.publish(State.MOVING, moves=3)
     assert written.headline == "moving"
+    written.publish(State.MOVING, moves=3, speed_override=0.0)
+    assert written.headline == "paused: `rtcp resume` continues the motion"
     written.publish(State.STOPPING, moves=3)
     assert written.headline == "stopping"
     written.board.event(Arrived())

@@ -41,9 +41,11 @@ def override(controller: Controller, fraction: float) -> None:
 
 
 def change(controller: Controller, chance: random.Random, share: float) -> None:
-    """Change the override by chance: to a bound of it, or to anything between."""
+    """Change the override by chance: to a bound of it, to anything between, or to rest and back."""
     if chance.random() < share:
-        override(controller, chance.choice([0.01, 1.0, chance.uniform(0.01, 1.0)]))
+        # 0: a pause.
+        stops = [0.0] if controller.pausable and controller.speed_override.fraction > 0.0 else []
+        override(controller, chance.choice([*stops, 0.01, 1.0, chance.uniform(0.01, 1.0)]))
 
 
 def trajectory(drive: Any, memory: Any, points: list[Point], q: Any = ZERO) -> TrajectoryController:
@@ -221,7 +223,7 @@ def test_trajectories_keep_acceleration_and_jerk_and_their_path(
     for at in range(3000):
         change(mode, chance, share)
         drive.cycle(mode)
-        assert 0.0 < mode._time_scale.speed <= 1.0
+        assert 0.0 <= mode._time_scale.speed <= 1.0
         if at % 100 == 0:
             undisturbed._go_to(mode.elapsed_s)
             assert drive.state.commanded == pytest.approx(undisturbed._position, abs=1e-9)

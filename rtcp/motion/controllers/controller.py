@@ -66,6 +66,8 @@ class Controller:
     """Control modes in which it accepts them."""
     tolerates_saturation: ClassVar[bool] = False
     """True where a setpoint that a guard cuts is normal (jog, velocity); False where the motion cannot continue."""
+    pausable: ClassVar[bool] = False
+    """Whether it rests on its path at a speed override of 0, and continues from there."""
     needs_geometry: ClassVar[bool] = False
     """Whether it is left out where the geometry of the arm is unknown."""
 

@@ -50,6 +50,7 @@ class InStepController(TrajectoryController):
     """Accepts `RunInStep`."""
 
     name = "in_step"
+    pausable = False
     commands = (RunInStep,)
 
     def __init__(self, setup: ControllerSetup) -> None:

@@ -15,6 +15,7 @@ class JointMoveController(Controller):
     """Accepts `MoveJoints`."""
 
     name = "joint_move"
+    pausable = True
     commands = (MoveJoints,)
 
     def __init__(self, setup: ControllerSetup) -> None:

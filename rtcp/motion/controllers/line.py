@@ -49,6 +49,7 @@ class LineController(Controller):
     """Accepts `RunLines`: one inverse solution a cycle, on one branch."""
 
     name = "line"
+    pausable = True
     commands = (RunLines,)
     needs_geometry = True
 

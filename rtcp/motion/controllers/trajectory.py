@@ -38,7 +38,7 @@ from rtcp.motion.planning.plan import (
     first_not_finite,
     read_row,
 )
-from rtcp.motion.speed_override import TimeScale
+from rtcp.motion.speed_override import STOP, TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 AT_START_RAD: Final = 1e-3
@@ -118,6 +118,7 @@ class TrajectoryController(Controller):
     """Accepts `RunTrajectory`, and `ExtendTrajectory` while an open one is under way."""
 
     name = "trajectory"
+    pausable = True
     commands: ClassVar[tuple[type[Command], ...]] = (RunTrajectory, ExtendTrajectory)
 
     def __init__(self, setup: ControllerSetup) -> None:
@@ -240,7 +241,7 @@ class TrajectoryController(Controller):
         """Return the setpoints of the next cycle."""
         target, dt = self.setpoint, self.period_s
         scale, moves = self._time_scale, self.phase is Phase.MOVE
-        goal = self.speed_override.fraction if moves else 0.0
+        goal = self.speed_override.fraction if moves else STOP
         before = scale.speed
         if goal == before == 1.0:
             if (damaged := self._go_to(self.elapsed_s + dt)) is not None:

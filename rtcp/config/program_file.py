@@ -1,0 +1,229 @@
+"""Motion files with a program, as they are taught: each change is checked whole, written at once, and can be undone.
+
+What a person wrote into the file, comments and layout, stays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+
+from rtcp.config.document import parse, text_of
+from rtcp.config.model import ConfigError, MotionFile
+from rtcp.config.motion_file import check
+
+_DIGITS: Final = 6
+"""Decimals of a kept position: 1 um, 1 urad."""
+_LONGEST_LINE: Final = 1 << 16
+_MOST_UNDONE: Final = 100
+
+
+class ProgramFile:
+    """A motion file that is taught; there need not be a file yet.
+
+    Every method that changes something raises ConfigError, and changes nothing, where the whole would have a mistake,
+    the file cannot be written, or something else has changed it meanwhile (`reload` reads that).
+
+    Args:
+        path: of the file, in YAML.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if self.path.suffix.lower() not in (".yaml", ".yml"):
+            raise ConfigError([f"{self.path}: a program is kept in a file that ends in .yaml or .yml"])
+        self._undo: list[str] = []
+        self.motion = MotionFile()
+        """What the file holds."""
+        self._text = ""
+        self.reload()
+
+    def reload(self) -> None:
+        """Read the file again; raises ConfigError where it has mistakes or holds a trajectory or a path."""
+        text = self._on_disk()
+        self.motion = self._checked(text)
+        self._text = text
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether `undo` has a change to take back."""
+        return bool(self._undo)
+
+    def undo(self) -> None:
+        """Take the last change back."""
+        if self._undo:
+            self._check_unchanged()
+            self._write(self._undo[-1])
+            self._undo.pop()
+
+    def keep(self, name: str, q: Sequence[float] | None = None, pose: Sequence[float] | None = None) -> None:
+        """Keep joint positions, rad, or a pose of the tool, m and rad, under a name; what had it is replaced."""
+        data = self._data()
+        poses = _list_in(data, "poses")
+        made: dict[str, Any] = {"name": name}
+        made |= {
+            key: [round(float(one), _DIGITS) + 0.0 for one in value]
+            for key, value in (("q", q), ("pose", pose))
+            if value is not None
+        }
+        at = next((at for at, one in enumerate(poses) if one.get("name") == name), None)
+        if at is None:
+            poses.append(_on_one_line(made))
+        else:
+            poses[at] = _on_one_line(made)
+        self._change(data)
+
+    def remove_pose(self, name: str) -> None:
+        """Forget a pose that no step names."""
+        data = self._data()
+        poses = _list_in(data, "poses")
+        del poses[_index(self.path, [one.get("name") for one in poses], name, "poses")]
+        self._change(data)
+
+    def set_speed(self, speed: float | None) -> None:
+        """Set the speed of the tool, m/s; None: that of the arm's file."""
+        data = self._data()
+        data.pop("speed", None)
+        if speed is not None:
+            data.insert(0, "speed", speed)
+        self._change(data)
+
+    def insert(self, at: int, step: Mapping[str, Any], part: str = "") -> None:
+        """Insert a step (`docs/motion.md`) before the one at `at`, from 0, of the program or of a part."""
+        data = self._data()
+        steps = self._steps(data, part)
+        if at == len(steps):
+            steps.append(_on_one_line(step))
+        else:
+            steps.insert(self._at(steps, at), _on_one_line(step))
+        self._change(data)
+
+    def replace(self, at: int, step: Mapping[str, Any], part: str = "") -> None:
+        """Replace a step."""
+        data = self._data()
+        steps = self._steps(data, part)
+        steps[self._at(steps, at)] = _on_one_line(step)
+        self._change(data)
+
+    def remove(self, at: int, part: str = "") -> None:
+        """Delete a step."""
+        data = self._data()
+        steps = self._steps(data, part)
+        del steps[self._at(steps, at)]
+        self._change(data)
+
+    def move(self, at: int, to: int, part: str = "") -> None:
+        """Move a step to where another one is; that and what is between make room."""
+        data = self._data()
+        steps = self._steps(data, part)
+        step, comment = steps[self._at(steps, at)], steps.ca.items.get(at)
+        self._at(steps, to)
+        del steps[at]
+        steps.insert(to, step)
+        if comment is not None:
+            steps.ca.items[to] = comment
+        self._change(data)
+
+    def _steps(self, data: CommentedMap, part: str) -> CommentedSeq:
+        if not part:
+            return _list_in(data, "program")
+        parts = _list_in(data, "parts")
+        return _list_in(parts[_index(self.path, [one.get("name") for one in parts], part, "parts")], "steps")
+
+    def _at(self, steps: CommentedSeq, at: int) -> int:
+        if not 0 <= at < len(steps):
+            raise ConfigError([f"{self.path}: found step {at + 1}, allowed is 1 to {len(steps)}"])
+        return at
+
+    def _on_disk(self) -> str:
+        return text_of(self.path) if self.path.exists() else ""
+
+    def _checked(self, text: str) -> MotionFile:
+        if not text.strip():
+            return MotionFile()
+        motion = check(parse(text, self.path))
+        if motion.trajectory or motion.path:
+            kind = "trajectory" if motion.trajectory else "path"
+            raise ConfigError([f"{self.path}: it holds a {kind}, allowed is a program"])
+        return motion
+
+    def _check_unchanged(self) -> None:
+        if self._on_disk() != self._text:
+            raise ConfigError([f"{self.path}: something else has changed the file meanwhile: read it again"])
+
+    def _data(self) -> CommentedMap:
+        self._check_unchanged()
+        data = _yaml().load(self._text) if self._text.strip() else None
+        return CommentedMap() if data is None else data
+
+    def _change(self, data: CommentedMap) -> None:
+        written = io.StringIO()
+        _yaml().dump(data, written)
+        before = self._text
+        self._write(written.getvalue() if data else "")
+        self._undo = [*self._undo, before][-_MOST_UNDONE:]
+
+    def _write(self, text: str) -> None:
+        """Replace the file as a whole, or not at all."""
+        motion = self._checked(text)
+        temporary = None
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            mode = self.path.stat().st_mode & 0o777 if self.path.exists() else 0o644
+            handle, temporary = tempfile.mkstemp(prefix=f".{self.path.name}.", dir=self.path.parent)
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            Path(temporary).chmod(mode)
+            os.replace(temporary, self.path)
+        except OSError as error:
+            if temporary is not None:
+                with contextlib.suppress(OSError):
+                    os.unlink(temporary)
+            raise ConfigError([f"{self.path}: the file cannot be written: {error.strerror}"]) from error
+        self.motion, self._text = motion, text
+
+
+def _yaml() -> YAML:
+    """Return a reader and writer that keeps comments, with lists set in as in `docs/motion.md`."""
+    made = YAML()
+    made.preserve_quotes = True
+    made.width = _LONGEST_LINE
+    made.indent(mapping=2, sequence=4, offset=2)
+    return made
+
+
+def _list_in(data: CommentedMap, key: str) -> CommentedSeq:
+    """Return the list of a key, made where it is missing."""
+    if data.get(key) is None:
+        data[key] = CommentedSeq()
+    found: CommentedSeq = data[key]
+    if not len(found):
+        found.fa.set_block_style()
+    return found
+
+
+def _on_one_line(entry: Mapping[str, Any]) -> CommentedMap:
+    made = CommentedMap()
+    for key, value in entry.items():
+        if isinstance(value, list | tuple):
+            value = CommentedSeq(value)  # noqa: PLW2901
+            value.fa.set_flow_style()
+        made[key] = value
+    made.fa.set_flow_style()
+    return made
+
+
+def _index(path: Path, names: Sequence[str], name: str, key: str) -> int:
+    if name not in names:
+        raise ConfigError([f'{path}: {key}: found the text "{name}", allowed is one of {", ".join(names) or "none"}'])
+    return names.index(name)

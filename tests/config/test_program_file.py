@@ -1,0 +1,145 @@
+"""Programs that are taught: what a change writes, what it keeps, and what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.config.model import ConfigError
+from rtcp.config.motion_file import read_motion
+from rtcp.config.program_file import ProgramFile
+
+TEXT = """# what it is for
+speed: 0.1   # slow
+poses:
+  # where it rests
+  - {name: home, q: [0, -0.2, 2, 0, pi/2, 0]}   # upright
+  - {name: right, pose: [-0.66, 0.1, 0.33, 0, -0.77, 0]}
+program:
+  - {move: home}                        # by the joints
+  - {run: round, times: 3}              # thrice
+  - gripper: close
+  - {wait_s: 0.2}
+# the parts
+parts:
+  - name: round
+    steps:
+      - {line: right, blend: 0.02}
+      - {line: home}
+"""
+
+
+@pytest.fixture
+def taught(tmp_path: Path) -> ProgramFile:
+    file = tmp_path / "program.yaml"
+    file.write_text(TEXT)
+    return ProgramFile(file)
+
+
+def test_a_program_is_made_of_nothing(tmp_path: Path) -> None:
+    taught = ProgramFile(tmp_path / "new" / "program.yaml")
+    assert not taught.path.exists()
+    taught.keep("home", q=[0.0, 0.1234567, 1.0, -0.0, 0.5, 0.0])
+    taught.keep("right", pose=(0.1, 0.2, 0.3, 0.0, 0.0, 0.0))
+    taught.insert(0, {"line": "right", "blend": 0.02})
+    taught.insert(0, {"move": "home"})
+    taught.set_speed(0.1)
+    assert taught.path.read_text() == (
+        "speed: 0.1\n"
+        "poses:\n"
+        "  - {name: home, q: [0.0, 0.123457, 1.0, 0.0, 0.5, 0.0]}\n"
+        "  - {name: right, pose: [0.1, 0.2, 0.3, 0.0, 0.0, 0.0]}\n"
+        "program:\n"
+        "  - {move: home}\n"
+        "  - {line: right, blend: 0.02}\n"
+    )
+    assert read_motion(taught.path) == taught.motion
+
+
+def test_what_a_person_wrote_stays_and_a_comment_goes_with_its_step(taught: ProgramFile) -> None:
+    taught.move(0, 2)
+    taught.replace(1, {"gripper": "open"})
+    taught.insert(1, {"line": "home"}, "round")
+    taught.keep("right", q=[0.1] * 6)
+    assert taught.path.read_text().split("program:\n")[1] == (
+        "  - {run: round, times: 3}              # thrice\n"
+        "  - {gripper: open}\n"
+        "  - {move: home}                        # by the joints\n"
+        "  - {wait_s: 0.2}\n"
+        "# the parts\n"
+        "parts:\n"
+        "  - name: round\n"
+        "    steps:\n"
+        "      - {line: right, blend: 0.02}\n"
+        "      - {line: home}\n"
+        "      - {line: home}\n"
+    )
+    assert taught.path.read_text().startswith(TEXT[: TEXT.index("  - {name: right")])
+
+
+def test_every_change_is_taken_back_in_turn(taught: ProgramFile) -> None:
+    texts = [TEXT]
+    for change in (
+        lambda: taught.remove(1),
+        lambda: taught.set_speed(None),
+        lambda: taught.keep("left", q=[0.0] * 6),
+        lambda: taught.remove_pose("left"),
+    ):
+        change()
+        texts.append(taught.path.read_text())
+    for text in reversed(texts[:-1]):
+        assert taught.can_undo
+        taught.undo()
+        assert taught.path.read_text() == text
+    assert not taught.can_undo
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda taught: taught.remove_pose("right"), 'found "right", allowed is one of home'),
+        (lambda taught: taught.remove_pose("left"), 'found the text "left", allowed is one of home, right'),
+        (lambda taught: taught.insert(0, {"line": "left"}), 'found "left"'),
+        (lambda taught: taught.insert(0, {"line": "right", "speed": -1.0}), "speed"),
+        (lambda taught: taught.insert(9, {"line": "right"}), "found step 10, allowed is 1 to 4"),
+        (lambda taught: taught.remove(-1), "found step 0, allowed is 1 to 4"),
+        (lambda taught: taught.move(0, 4), "found step 5"),
+        (lambda taught: taught.insert(0, {"run": "round"}, "round"), "runs itself"),
+        (lambda taught: taught.insert(0, {"line": "right"}, "square"), 'found the text "square", allowed is one of'),
+        (lambda taught: taught.keep("", q=[0.0] * 6), "name"),
+        (lambda taught: taught.keep("home", q=[float("nan")] * 6), "found nan"),
+        (lambda taught: taught.set_speed(0.0), "speed"),
+    ],
+)  # fmt: skip
+def test_a_change_that_would_be_a_mistake_changes_nothing(
+    taught: ProgramFile, change: Callable[[ProgramFile], Any], sentence: str
+) -> None:
+    before = taught.motion
+    with pytest.raises(ConfigError, match=sentence):
+        change(taught)
+    assert taught.path.read_text() == TEXT
+    assert taught.motion is before
+    assert not taught.can_undo
+    assert [one.name for one in taught.path.parent.iterdir()] == ["program.yaml"]
+
+
+def test_a_change_of_something_else_is_not_overwritten(taught: ProgramFile) -> None:
+    taught.remove(3)
+    taught.path.write_text(TEXT)
+    for change in (lambda: taught.remove(0), taught.undo):
+        with pytest.raises(ConfigError, match="read it again"):
+            change()
+    assert taught.path.read_text() == TEXT
+    taught.reload()
+    taught.remove(0)
+    assert len(taught.motion.program) == 3
+
+
+def test_a_trajectory_is_not_taught(tmp_path: Path) -> None:
+    file = tmp_path / "path.yaml"
+    file.write_text("path:\n  - {q: [0, 0, 0, 0, 0, 0]}\n")
+    with pytest.raises(ConfigError, match="it holds a path, allowed is a program"):
+        ProgramFile(file)
