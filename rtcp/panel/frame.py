@@ -129,7 +129,7 @@ def _commands(view: View) -> None:
     async def home() -> None:
         async def move() -> None:
             dialog.close()
-            await view.act(lambda robot: robot.move_home(), "The arm is at home")  # type: ignore[attr-defined]
+            await view.act(lambda robot: robot.move_home(), "The arm is at home")
 
         with view.question("Move the arm home?", "All joints move there at once, from where they are.") as dialog:
             button("Move home", move, when="holding")

@@ -170,7 +170,7 @@ window.rtcp = (() => {
     }
     const override = document.querySelector("[data-override]");
     if (override) {
-      override.disabled = !(connected && state.speed_override);
+      override.disabled = !connected || state.speed_override === undefined;
       if (document.activeElement !== override || performance.now() - overridden > 1000) override.value = state.speed_override ?? 100;
     }
     lead();
