@@ -187,7 +187,7 @@ def moving(page: Page) -> None:
     page.goto("/targets")
     page.wait_for_selector(HOLDING)
     page.get_by_label("joint1, rad").fill("1.5")
-    page.get_by_label("Speed").fill("0.15")
+    page.get_by_role("spinbutton", name="Speed").fill("0.15")
     page.get_by_role("button", name="Plan").click()
     page.get_by_role("button", name="Send", exact=True).click()
 
@@ -320,7 +320,7 @@ def cell_picture(playwright: Playwright, directory: Path) -> None:
             page = opened(browser, url, "/cell")
             for name, q in {"left": "0.6, 0.3, 0.1, 0, 0.5, 0", "right": "-0.6, 0.3, 0.1, 0, 0.5, 0"}.items():
                 page.get_by_label(f"Joints of {name}, rad").fill(q)
-            page.get_by_label("Speed, rad/s").fill("0.1")
+            page.get_by_label("Speed (empty: the limit), rad/s").fill("0.1")
             page.get_by_role("button", name="Move in step").click()
             time.sleep(4.0)
             page.screenshot(path=directory / "cell.png")

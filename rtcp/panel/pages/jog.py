@@ -61,6 +61,8 @@ class Jog:
 
     def __init__(self, view: View, config: ArmConfig) -> None:
         self._view, self._config = view, config
+        self._kept: dict[str, str] = view.kept.setdefault("jog", {})
+        """What `panel.js` jogs with."""
         with ui.element("div").classes("page jog-area").props("tabindex=0 role=group") as self._area:
             self._area.props["aria-label"] = (
                 "Jog by keys: arrows X and Y, page up and down Z, q and e yaw, a and d roll, w and s pitch, "
@@ -72,14 +74,16 @@ class Jog:
                 _gripper(view)
             self._make_pads()
             with ui.element("div").classes("fields"):
-                self._movement = choice("Movement", _MOVEMENTS, "")
+                self._movement = choice("Movement", _MOVEMENTS, self._kept.get("data-jog-step", ""))
                 frames = FRAMES if config.arm is not None else {"joints": FRAMES["joints"]}
-                self._frame = choice("Frame", frames, config.jog.frame if config.arm is not None else "joints")
+                first = config.jog.frame if config.arm is not None else "joints"
+                kept = self._kept.get("data-jog-frame", first)
+                self._frame = choice("Frame", frames, kept if kept in frames else first)
                 with ui.element("div").style("display: contents") as of_the_tool:
-                    self._speed = self._limited("Speed", "m/s", config.jog.speed)
-                    self._turn = self._limited("Turning", "rad/s", config.jog.angular_speed)
+                    self._speed = self._limited("Speed", "m/s", config.jog.speed, "data-jog-speed")
+                    self._turn = self._limited("Turning", "rad/s", config.jog.angular_speed, "data-jog-turn")
                 of_the_tool.set_visibility(config.arm is not None)
-                self._joint = number("Joints", "0.1", "rad/s", min="0", step="0.01")
+                self._joint = number("Joints", self._kept.get("data-jog-joint", "0.1"), "rad/s", min="0", step="0.01")
             for one in (self._movement, self._frame, self._speed, self._turn, self._joint):
                 one.on_change(self._settle)
             self._settle()
@@ -92,9 +96,8 @@ class Jog:
         if config.arm is not None:
             tool_pose()
 
-    @staticmethod
-    def _limited(label: str, unit: str, most: float) -> Field:
-        return number(label, str(most / 2), unit, min="0", max=str(most), step=str(most / 20))
+    def _limited(self, label: str, unit: str, most: float, key: str) -> Field:
+        return number(label, self._kept.get(key, str(most / 2)), unit, min="0", max=str(most), step=str(most / 20))
 
     def _make_pads(self) -> None:
         with self._cartesian:
@@ -129,7 +132,7 @@ class Jog:
 
     def _settle(self) -> None:
         # Numbers that are none, or beyond what is configured, move nothing: the platform refuses them.
-        self._area.props.update(
+        self._kept.update(
             {
                 "data-jog-frame": self._frame.value,
                 "data-jog-speed": self._speed.value,
@@ -138,6 +141,7 @@ class Jog:
                 "data-jog-step": self._movement.value,
             }
         )
+        self._area.props.update(self._kept)
         self._cartesian.set_visibility(self._frame.value != "joints")
         self._single.set_visibility(self._frame.value == "joints")
 
