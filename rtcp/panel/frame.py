@@ -44,6 +44,8 @@ class Frame:
         self._feed: Feed | None = None
         """Of the platform for which the tab was built."""
         self._path = "/"
+        self._drawn: object = None
+        """What the picture shows."""
         self._header()
         with ui.element("div").props("id=frame"):
             with ui.element("section").props('id=side aria-label="The arm and its commands"'):
@@ -114,8 +116,9 @@ class Frame:
         """Draw the arm that runs; it stays when tabs change."""
         view, live = self._view, self._live
         config, own, partners = shows = (live.config, live.partners.own, live.partners.members)
-        if config is None or (view.arm is not None and view.arm.shows == shows):
+        if config is None or self._drawn == shows:
             return
+        self._drawn = shows
         self._space.clear()
         view.arm = None
         with self._space:

@@ -222,10 +222,10 @@ class View:
         self.live = live
         self.page = page
         self.arm: ArmView | None = None
-        self.kept: dict[str, Any] = {}
-        """What pages keep, by their name, while others are shown."""
         self.leaving: list[Callable[[], None]] = []
         """Called by `leave`."""
+        self.kept: dict[str, Any] = {}
+        """What a tab keeps while another one is shown, by its name."""
         self._visit = 0
         """Number of the page of the panel that is shown."""
         self._client = client
@@ -271,18 +271,25 @@ class View:
 
     async def _act(self, command: Awaitable[T], done: str) -> T | None:
         with self._visited():
-            try:
-                found = await command
-            except HeldByAnother as held:
-                self._offer_to_take_over(held.holder)
-            except EndedOnPurpose:
-                pass  # the header says that the arm has stopped
-            except (RtcpError, OSError) as error:
-                self.warn(str(error))
-            else:
-                if done:
-                    self.say(done)
-                return found
+            return await self._show_outcome(command, done)
+
+    async def act_beyond_visit(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T | None:
+        """Carry out a command as `act`; its handler goes on when its tab is left, and draws nothing of its own."""
+        return await self._show_outcome(self.live.command(self.page, command, False), "")
+
+    async def _show_outcome(self, command: Awaitable[T], done: str) -> T | None:
+        try:
+            found = await command
+        except HeldByAnother as held:
+            self._offer_to_take_over(held.holder)
+        except EndedOnPurpose:
+            pass  # the header says that the arm has stopped
+        except (RtcpError, OSError) as error:
+            self.warn(str(error))
+        else:
+            if done:
+                self.say(done)
+            return found
         return None
 
     async def set_speed_override(self, fraction: float) -> None:

@@ -1,16 +1,466 @@
-"""Program: a stub until `rtcp.Program` is edited and run here."""
+"""Program: poses kept by name, steps made of them by clicks; run, stepped forwards and back, paused. Saved at once."""
 
 from __future__ import annotations
 
+import asyncio
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
 from nicegui import ui
 
-from rtcp.panel.page import View, text
+from rtcp.api import Program, ProgramFile, Robot, RtcpError, State
+from rtcp.api.program import Begun
+from rtcp.config.model import ConfigError, NamedPose, Step
+from rtcp.config.zero import state_directory
+from rtcp.panel.page import View, button, choice, field, no_platform, number, row, table, text
+
+_KINDS: Final = {
+    "move": "Move by the joints",
+    "line": "Move on a line",
+    "arc": "Move on an arc",
+    "gripper": "Gripper",
+    "output": "Set an output",
+    "wait_for": "Wait for an input",
+    "wait_s": "Wait for a time",
+    "run": "Run a part",
+}
+_MOTIONS: Final = ("move", "line", "arc")
+_PAUSED_S: Final = 0.1
+
+
+def programs_directory() -> Path:
+    """Return where the panel keeps programs."""
+    return state_directory() / "programs"
 
 
 def build(view: View) -> None:
-    """Build the page; what it edits stands in `view.kept` while other tabs are shown."""
+    """Build the page."""
     text("h1", "Program")
-    with ui.element("p"):
-        text("span", "Motion files are checked and run on the tab ")
-        ui.link("Recorder", "/recorder")
-        text("span", ".")
+    if view.live.config is None or view.live.status is None:
+        no_platform()
+        return
+    kept = view.kept.setdefault("program", Kept())
+    assert isinstance(kept, Kept)
+    ProgramPage(view, kept)
+
+
+class Kept:
+    """What outlives a change of the tab: the file that is open, the step that is next, and the run."""
+
+    def __init__(self) -> None:
+        self.file: ProgramFile | None = None
+        self.at = 0
+        """Step that is next, from 0."""
+        self.running = False
+        self.said = ""
+        self.changed: Callable[[], None] = lambda: None
+        """Shows it anew, where the page is shown."""
+        self._go = threading.Event()
+        self._ended = False
+
+    def begin(self) -> None:
+        """A run begins."""
+        self.running, self._ended = True, False
+        self._go.set()
+
+    def end(self) -> None:
+        """The run has ended, or has to."""
+        self.running, self._ended = False, True
+
+    @property
+    def paused(self) -> bool:
+        """Whether the next step waits for `resume`."""
+        return self.running and not self._go.is_set()
+
+    def pause(self) -> None:
+        """Begin no further step."""
+        self._go.clear()
+
+    def resume(self) -> None:
+        """Go on with the steps."""
+        self._go.set()
+
+    def between(self) -> None:
+        """Wait in the thread of the run while it is paused; raises Refused where it has ended meanwhile."""
+        while not self._go.wait(_PAUSED_S) and not self._ended:
+            pass
+        if self._ended:
+            raise RtcpError("refused", "the program was ended")
+
+
+class ProgramPage:
+    """The page: each click changes the file at once, and `Undo` takes it back."""
+
+    def __init__(self, view: View, kept: Kept) -> None:
+        self._view, self._kept = view, kept
+        with ui.element("div").classes("fields"):
+            self._name = field("Program", kept.file.path.stem if kept.file else "", list="programs", maxlength="60")
+            with ui.element("datalist").props("id=programs"):
+                for path in sorted(programs_directory().glob("*.yaml")):
+                    ui.element("option").props["value"] = path.stem
+        with ui.element("div").classes("buttons"):
+            button("Open", self._open)
+            self._undo = button("Undo", partial(self._change, lambda file: file.undo()), plain=True)
+        self._said = text("p", "", role="status", **{"aria-live": "polite"})
+        self._place = ui.element("div").classes("page")
+        kept.changed = self._show
+        view.leaving.append(self._left)
+        self._show()
+
+    def _left(self) -> None:
+        self._kept.changed = lambda: None
+
+    def _say(self, said: str) -> None:
+        self._kept.said = said
+        self._kept.changed()
+
+    # -- the file -----------------------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        name = self._name.value.strip().removesuffix(".yaml")
+        if not name or name != Path(name).name or name.startswith("."):
+            self._view.warn(f'Program: found the text "{name}", allowed is a name for its file')
+            return
+        if self._kept.running:
+            self._view.warn("The program runs: stop it first")
+            return
+        try:
+            self._kept.file = ProgramFile(programs_directory() / f"{name}.yaml")
+        except ConfigError as error:
+            self._view.warn(str(error))
+            return
+        self._kept.at = 0
+        self._say(f"Saved as {self._kept.file.path}")
+
+    def _change(self, change: Callable[[ProgramFile], object]) -> bool:
+        """Change the file; return whether it was changed."""
+        file = self._kept.file
+        if file is None or not self._view.may_command():
+            return False
+        if self._kept.running:
+            self._view.warn("The program runs: it is changed when it has ended")
+            return False
+        try:
+            change(file)
+        except ConfigError as error:
+            self._view.warn("\n".join(error.problems))
+            return False
+        self._kept.at = min(self._kept.at, len(file.motion.program))
+        self._kept.changed()
+        return True
+
+    # -- what is shown ------------------------------------------------------------------------------------------------
+
+    def _show(self) -> None:
+        kept, file = self._kept, self._kept.file
+        self._said.text = kept.said
+        self._undo.props["disabled"] = file is None or not file.can_undo or kept.running
+        self._place.clear()
+        if file is None:
+            return
+        with self._place:
+            self._show_run(file)
+            self._show_steps(file)
+            self._show_new_step(file)
+            self._show_poses(file)
+            self._show_speed(file)
+
+    def _show_run(self, file: ProgramFile) -> None:
+        kept = self._kept
+        is_empty = not file.motion.program
+        with ui.element("div").classes("buttons").props('role=group aria-label="Run"'):
+            for label, handler, blocked in (
+                ("Check", self._check, is_empty or kept.running),
+                ("Run", partial(self._run, 0, None), is_empty or kept.running),
+                ("Step back", self._step_back, kept.running or kept.at == 0),
+                ("Step", self._step, kept.running or kept.at >= len(file.motion.program)),
+                ("Go on" if kept.paused else "Pause", self._pause_or_resume, not kept.running),
+            ):
+                made = button(label, handler, plain=label != "Run")
+                made.props["disabled"] = blocked
+
+    def _show_speed(self, file: ProgramFile) -> None:
+        now = file.motion.speed
+        with ui.element("div").classes("fields"):
+            speed = number("Speed of the tool (empty: the arm's)", "" if now is None else f"{now:g}", "m/s", min="0")
+
+        def set_speed() -> None:
+            try:
+                value = speed.number() if speed.value.strip() else None
+            except RtcpError as error:
+                self._view.warn(error.message)
+                return
+            self._change(lambda changed: changed.set_speed(value))
+
+        with ui.element("div").classes("buttons"):
+            button("Set the speed", set_speed, plain=True)
+
+    def _show_steps(self, file: ProgramFile) -> None:
+        steps = file.motion.program
+        with ui.element("div"):
+            text("h2", "Steps")
+            if not steps:
+                text("p", "None yet: keep a pose, then add a step that leads there.")
+                return
+            body = table(("#", "Step", "", "", "", ""), "Steps of the program")
+        for at, step in enumerate(steps):
+            shown = row(body, f"▶ {at + 1}" if at == self._kept.at else str(at + 1), described(step))
+            if at == self._kept.at:
+                shown.props["aria-current"] = "step"
+            with shown:
+                for label, spoken, handler in (
+                    ("Up", f"Move step {at + 1} up", partial(self._move, at, at - 1)),
+                    ("Down", f"Move step {at + 1} down", partial(self._move, at, at + 1)),
+                    ("Delete", f"Delete step {at + 1}", partial(self._delete, at)),
+                    ("Run from here", f"Run from step {at + 1}", partial(self._run, at, None)),
+                ):
+                    with ui.element("td"):
+                        made = button(label, handler, plain=True)
+                        made.props["aria-label"] = spoken
+
+    def _show_new_step(self, file: ProgramFile) -> None:
+        poses, parts = [one.name for one in file.motion.poses], [one.name for one in file.motion.parts]
+        kinds = {
+            key: name for key, name in _KINDS.items() if (poses or key not in _MOTIONS) and (parts or key != "run")
+        }
+        text("h2", "New step")
+        with ui.element("div").classes("fields"):
+            kind = choice("Kind", kinds, next(iter(kinds)))
+            places = {str(at): f"before step {at + 1}" for at in range(len(file.motion.program))}
+            where = choice("Where", {"": "at the end", **places}, "")
+        fields = ui.element("div").classes("fields")
+        entered: dict[str, Any] = {}
+
+        def show() -> None:
+            fields.clear()
+            entered.clear()
+            with fields:
+                entered.update(_fields_of(kind.value, poses, parts))
+
+        def add() -> None:
+            try:
+                step = {kind.value: None} | {key: read() for key, read in entered.items()}
+            except RtcpError as error:
+                self._view.warn(error.message)
+                return
+            step = {key: value for key, value in step.items() if value is not None}
+            at = int(where.value) if where.value else len(file.motion.program)
+            self._change(lambda changed: changed.insert(at, step))
+
+        kind.on_change(show)
+        show()
+        with ui.element("div").classes("buttons"):
+            button("Add the step", add)
+
+    def _show_poses(self, file: ProgramFile) -> None:
+        text("h2", "Poses")
+        with ui.element("div").classes("fields"):
+            name = field("Name of the pose", f"pose {len(file.motion.poses) + 1}", maxlength="64")
+            kinds = {"q": "joint positions"} | (
+                {"pose": "pose of the tool"}
+                if self._view.live.config is not None and self._view.live.config.arm is not None
+                else {}
+            )
+            what = choice("Kept as", kinds, "q")
+        with ui.element("div").classes("buttons"):
+            button("Keep where the arm is", lambda: self._keep(name.value.strip(), what.value))
+        if not file.motion.poses:
+            return
+        body = table(("Pose", "Kept as", "", "", ""), "Poses of the program")
+        for pose in file.motion.poses:
+            with row(body, pose.name, "joints" if pose.q is not None else "pose"):
+                for label, spoken, handler in (
+                    ("Move there", f"Move to {pose.name}", partial(self._move_to, pose)),
+                    ("Keep anew", f"Keep {pose.name} anew", partial(self._keep, pose.name, "q" if pose.q else "pose")),
+                    ("Delete", f"Delete {pose.name}", partial(self._forget, pose.name)),
+                ):
+                    with ui.element("td"):
+                        made = button(label, handler, plain=True)
+                        made.props["aria-label"] = spoken
+
+    # -- what is done -------------------------------------------------------------------------------------------------
+
+    def _keep(self, name: str, what: str) -> None:
+        status = self._view.live.status
+        if status is None:
+            self._view.warn("No platform runs: nothing is kept")
+            return
+        values = status.commanded_positions if what == "q" else status.commanded_pose
+        if values is None:
+            self._view.warn("The pose of the tool is not known: nothing is kept")
+            return
+        if self._change(lambda file: file.keep(name, **{what: values})):
+            self._view.say(f"{name} is kept")
+
+    def _forget(self, name: str) -> None:
+        self._change(lambda file: file.remove_pose(name))
+
+    def _delete(self, at: int) -> None:
+        self._change(lambda file: file.remove(at))
+
+    def _move(self, at: int, to: int) -> None:
+        file = self._kept.file
+        if file is not None and 0 <= to < len(file.motion.program):
+            self._change(lambda changed: changed.move(at, to))
+
+    async def _move_to(self, pose: NamedPose) -> None:
+        await self._view.act(
+            lambda robot: robot.move_joints(pose.q) if pose.q is not None else robot.move_pose(pose.pose or ()),
+            f"The arm is at {pose.name}",
+        )
+
+    def _program(self) -> Program | None:
+        assert self._kept.file is not None
+        try:
+            return Program(self._kept.file.path)
+        except ConfigError as error:
+            self._view.warn("\n".join(error.problems))
+            return None
+
+    async def _check(self) -> None:
+        program = self._program()
+        if program is None:
+            return
+        found = await self._view.ask(lambda robot: robot.in_thread(program.check))
+        if found is None:
+            return
+        plans = [one.plan for one in found]
+        duration_s = sum(plan.duration_s for plan in plans)
+        if self._view.arm is not None:
+            self._view.arm.preview([list(q) for plan in plans for q in plan.path], duration_s)
+        self._say(f"It can be run: {len(plans)} motions, {duration_s:.1f} s")
+
+    async def _run(self, start: int, end: int | None) -> None:
+        """Run from a step on, and show what begins."""
+        program, kept = self._program(), self._kept
+        if program is None or kept.running:
+            return
+        loop = asyncio.get_running_loop()
+
+        def begun(one: Begun) -> None:
+            kept.at = one.number
+            self._say(f"Step {one.number + 1}: {one.text}")
+
+        def say(one: Begun) -> None:
+            loop.call_soon_threadsafe(begun, one)
+
+        def run(robot: Robot) -> bool:
+            program.run(robot, say, start=start, end=end, between=kept.between)
+            return True
+
+        kept.begin()
+        self._say("It is planned")
+        done = None
+        try:
+            done = await self._view.act_beyond_visit(lambda robot: robot.in_thread(run))
+        finally:
+            kept.end()
+            last = len(program.steps) if end is None else end
+            if done:
+                kept.at = last if last < len(program.steps) else 0
+            self._say(("Done" if end is None else f"Step {start + 1} is done") if done else "It has ended early")
+
+    async def _step(self) -> None:
+        await self._run(self._kept.at, self._kept.at + 1)
+
+    async def _step_back(self) -> None:
+        program, kept = self._program(), self._kept
+        if program is None or kept.running:
+            return
+        number = kept.at - 1
+
+        def step_back(robot: Robot) -> bool:
+            program.step_back(robot, number)
+            return True
+
+        kept.begin()
+        self._say(f"Back over step {number + 1}")
+        done = None
+        try:
+            done = await self._view.act_beyond_visit(lambda robot: robot.in_thread(step_back))
+        finally:
+            kept.end()
+            if done:
+                kept.at = number
+            self._say(f"Step {number + 1} is next" if done else "It has ended early")
+
+    async def _pause_or_resume(self) -> None:
+        kept, view = self._kept, self._view
+        if not view.may_command():
+            return
+        status = view.live.status
+        moves = status is not None and status.state is State.MOVING
+        if kept.paused:
+            if moves:
+                await view.ask(lambda robot: robot.resume())
+            kept.resume()
+            self._say("It goes on")
+        else:
+            kept.pause()
+            if moves:
+                await view.ask(lambda robot: robot.pause())
+            self._say("Paused")
+
+
+def _fields_of(kind: str, poses: list[str], parts: list[str]) -> Mapping[str, Callable[[], Any]]:
+    """Make the fields of a kind of step; return what reads each key."""
+    found: dict[str, Callable[[], Any]] = {}
+
+    def optional(key: str, label: str, unit: str) -> None:
+        made = number(label, unit=unit, min="0")
+        found[key] = lambda: made.number() if made.value.strip() else None
+
+    if kind in _MOTIONS:
+        pose = choice("Pose", poses, poses[-1])
+        found[kind] = lambda: pose.value
+        if kind == "arc":
+            via = choice("Through", poses, poses[0])
+            found["via"] = lambda: via.value
+        if kind == "move":
+            optional("speed", "Speed (empty: the limit)", "rad/s")
+        else:
+            optional("speed", "Speed (empty: the program's)", "m/s")
+        optional("blend", "Blend (empty: it rests)", "m")
+    elif kind == "gripper":
+        grip = choice("Gripper", ("open", "close"), "close")
+        found[kind] = lambda: grip.value
+    elif kind in ("output", "wait_for"):
+        name = field("Output" if kind == "output" else "Input")
+        level = choice("Level", {"true": "on", "": "off"}, "true")
+        found[kind] = lambda: str(name.value).strip()
+        found["value"] = lambda: bool(level.value)
+        if kind == "wait_for":
+            optional("timeout_s", "At most (empty: for ever)", "s")
+    elif kind == "wait_s":
+        seconds = number("Time, s", "1", min="0")
+        found[kind] = seconds.number
+    else:
+        part = choice("Part", parts, parts[0])
+        times = number("Times (0: for ever)", "1", min="0", step="1")
+        found[kind] = lambda: part.value
+        found["times"] = lambda: int(times.number())
+    return found
+
+
+def described(step: Step) -> str:
+    """Return a step in words."""
+    if (name := step.move or step.line or step.arc) is not None:
+        way = "move" if step.move else "line" if step.line else f"arc through {step.via}"
+        unit = "rad/s" if step.move else "m/s"
+        speed = "" if step.speed is None else f" at {step.speed:g} {unit}"
+        angle = "" if step.angle is None else f", {step.angle:.4g} rad of the circle"
+        return f"{way} to {name}{speed}{angle}" + (f", blend {step.blend:g} m" if step.blend else "")
+    if step.gripper is not None:
+        return f"gripper: {step.gripper}"
+    level = "on" if step.value else "off"
+    if step.output is not None:
+        return f"output {step.output}: {level}"
+    if step.wait_for is not None:
+        limit = "" if step.timeout_s is None else f", at most {step.timeout_s:g} s"
+        return f"wait until {step.wait_for} is {level}{limit}"
+    if step.wait_s is not None:
+        return f"wait {step.wait_s:g} s"
+    return f"run {step.run}" + (f", {step.times} times" if step.times > 1 else ", for ever" if not step.times else "")

@@ -1,0 +1,137 @@
+"""A program taught, run, stepped and paused by clicks; what came of it is judged by the file and the API."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from rtcp.config.motion_file import read_motion
+from tests.e2e.conftest import Platform
+from tests.panel.conftest import BENT, barriers, show, until
+
+pytestmark = [pytest.mark.alone, pytest.mark.browser]
+
+
+def file_of(platform: Platform, name: str) -> Path:
+    (found,) = platform.directory.rglob(f"programs/{name}.yaml")
+    return found
+
+
+def click(page: Page, name: str) -> None:
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def opened(page: Page, platform: Platform, name: str) -> None:
+    for file in platform.directory.rglob(f"programs/{name}.yaml"):
+        file.unlink()  # of a test that is repeated
+    show(page, "/program")
+    page.get_by_label("Program", exact=True).fill(name)
+    click(page, "Open")
+    expect(page.get_by_text(re.compile("^Saved as"))).to_be_visible()
+
+
+def said(page: Page, text: str) -> None:
+    """Wait until the page says so; a motion may lie before it."""
+    expect(page.get_by_text(text, exact=True)).to_be_visible(timeout=40_000)
+
+
+def kind(page: Page, name: str, its_field: str) -> None:
+    """Choose the kind of the new step; its fields follow."""
+    page.get_by_label("Kind").select_option(name)
+    expect(page.get_by_label(its_field)).to_be_visible(timeout=20_000)
+
+
+def keep(page: Page, name: str, what: str = "q") -> None:
+    page.get_by_label("Name of the pose").fill(name)
+    page.get_by_label("Kept as").select_option(what)
+    click(page, "Keep where the arm is")
+    expect(page.get_by_role("row", name=re.compile(f"^{name} "))).to_be_visible()
+
+
+def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_command_line(
+    page: Page, holding: Platform
+) -> None:
+    there = [0.5, *BENT[1:]]
+    opened(page, holding, "clicks")
+    keep(page, "here")
+    holding.call("move_joints", q=there)
+    until(lambda: holding.status()["joints"]["commanded_position"][0] == pytest.approx(0.5), "there")
+    keep(page, "there")
+    page.get_by_label("Pose", exact=True).select_option("here")
+    click(page, "Add the step")
+    expect(page.get_by_role("row", name=re.compile("move to here"))).to_be_visible()
+    kind(page, "wait_s", "Time, s")
+    page.get_by_label("Time, s").fill("0.2")
+    click(page, "Add the step")
+    expect(page.get_by_role("row", name=re.compile("wait 0.2 s"))).to_be_visible(timeout=20_000)
+    page.get_by_label("Pose", exact=True).select_option("there")
+    page.get_by_label(re.compile("^Speed .*, rad/s$")).fill("0.2")
+    page.get_by_label("Where").select_option("before step 2")
+    click(page, "Add the step")
+    expect(page.get_by_role("row", name=re.compile("^2 move to there at 0.2 rad"))).to_be_visible()
+    # The wait between both, and back, and once too much taken back.
+    click(page, "Move step 3 up")
+    expect(page.get_by_role("row", name=re.compile("^2 wait 0.2 s"))).to_be_visible()
+    click(page, "Delete step 2")
+    expect(page.get_by_role("row", name=re.compile("^2 move to there"))).to_be_visible()
+    click(page, "Undo")
+    expect(page.get_by_role("row", name=re.compile("^2 wait 0.2 s"))).to_be_visible()
+    assert barriers(page) == {}
+    steps = read_motion(file_of(holding, "clicks")).program
+    assert [(step.move, step.wait_s, step.speed) for step in steps] == [
+        ("here", None, None),
+        (None, 0.2, None),
+        ("there", None, 0.2),
+    ]
+
+    click(page, "Check")
+    expect(page.get_by_text(re.compile(r"^It can be run: 2 motions"))).to_be_visible()
+    for number in (1, 2):
+        click(page, "Step")
+        said(page, f"Step {number} is done")
+    assert holding.status()["joints"]["actual_position"] == pytest.approx(BENT, abs=2e-3)
+    click(page, "Step")
+    holding.until_moving()
+    click(page, "Pause")
+    until(lambda: holding.status()["speed_override"] == 0.0, "paused")
+    # Another tab keeps the run.
+    page.get_by_role("link", name="Jog", exact=True).click()
+    page.get_by_role("link", name="Program", exact=True).click()
+    click(page, "Go on")
+    said(page, "Step 3 is done")
+    assert holding.status()["joints"]["actual_position"] == pytest.approx(there, abs=2e-3)
+    click(page, "Run from step 1")
+    said(page, "Done")
+    click(page, "Run from step 3")
+    said(page, "Done")
+    holding.call("move_joints", q=BENT)
+    holding.rtcp("run", str(file_of(holding, "clicks")))
+    assert holding.status()["joints"]["actual_position"] == pytest.approx(there, abs=2e-3)
+
+
+def test_a_step_back_returns_and_a_stop_ends_the_program(page: Page, holding: Platform) -> None:
+    opened(page, holding, "stepped")
+    keep(page, "here")
+    holding.call("move_joints", q=[0.4, *BENT[1:]])
+    keep(page, "there", "pose")
+    page.get_by_label("Pose", exact=True).select_option("here")
+    click(page, "Add the step")
+    expect(page.get_by_role("row", name=re.compile("move to here"))).to_be_visible(timeout=20_000)
+    kind(page, "line", "Speed (empty: the program's), m/s")
+    click(page, "Add the step")
+    expect(page.get_by_role("row", name=re.compile("line to there"))).to_be_visible(timeout=20_000)
+    click(page, "Step")
+    said(page, "Step 1 is done")
+    click(page, "Step")
+    said(page, "Step 2 is done")
+    click(page, "Step back")
+    said(page, "Step 2 is next")
+    assert holding.status()["joints"]["actual_position"] == pytest.approx(BENT, abs=2e-3)
+    click(page, "Step")
+    holding.until_moving()
+    page.get_by_role("button", name="STOP").click()
+    said(page, "It has ended early")
+    until(lambda: holding.status()["state"] == "holding", "held")
