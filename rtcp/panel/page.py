@@ -399,4 +399,5 @@ class View:
             text("p", note)
             with ui.element("div").classes("buttons"):
                 yield dialog
+        dialog.on("hide", dialog.delete)
         dialog.open()

@@ -90,13 +90,15 @@ window.rtcp = (() => {
     if (dataset.in) dataset.si = si;
     return si;
   }
-  function showUnits() {
-    for (const element of document.querySelectorAll("[data-unit]")) put(element, unit(element.dataset.unit)[0]);
-    for (const element of document.querySelectorAll("[data-si]:not(input)")) put(element, figure(+element.dataset.si, element.dataset));
-    for (const element of document.querySelectorAll("input[data-in]")) measure(element);
-    for (const element of document.querySelectorAll("[data-units]")) {
-      const name = chosen[element.dataset.units];
-      if (element.value !== name) element.value = name;
+  function showUnits(which = ":not([data-measured])") { // of what has been added since
+    const found = ["[data-unit]", "[data-si]", "input[data-in]", "[data-units]"].map((kind) => kind + which);
+    for (const element of document.querySelectorAll(found.join())) {
+      const { unit: of, units, si } = element.dataset;
+      if (of) put(element, unit(of)[0]);
+      else if (units) element.value = chosen[units];
+      else if (element.tagName === "INPUT") measure(element);
+      else put(element, figure(+si, element.dataset));
+      element.dataset.measured = "";
     }
   }
   document.addEventListener("change", (event) => {
@@ -104,6 +106,7 @@ window.rtcp = (() => {
     if (!of) return;
     chosen[of] = event.target.value;
     localStorage.setItem("rtcp-units", JSON.stringify(chosen));
+    showUnits("");
     show();
   });
 
