@@ -27,7 +27,7 @@ _PART = re.compile(r"(<!-- generated: ([^\n]+) -->\n).*?(<!-- end -->)", re.DOTA
 _FILES: dict[str, tuple[type, str]] = {
     "arm": (model.ArmFile, ""),
     "device": (model.DeviceDescription, ""),
-    "segment": (segment.SegmentSlave, "slaves[]."),
+    "segment": (segment.SegmentFile, ""),
     "motion": (model.MotionFile, ""),
     "shape_setting": (ShapeSettingConfig, "processes[]."),
 }

@@ -7,6 +7,7 @@ that are apart, negative where they overlap.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import combinations, product
 from math import hypot, inf, sqrt
 from typing import Final
@@ -46,12 +47,24 @@ def rods(model: ArmModel) -> tuple[tuple[int, Vector, Vector], ...]:
 def capsules(model: ArmModel) -> tuple[Capsule, ...]:
     """The bodies of an arm: those that it names, else one around each rod, which hold all that `to_urdf` draws.
 
-    A joint's cylinder sits where a rod ends; its circumscribed sphere is the end of that rod's capsule.
+    A joint's cylinder sits where a rod ends; its circumscribed sphere is the end of that rod's capsule. Those that the
+    tool names come last, in the place of the rod from the flange to the tool.
     """
+    tool = model.tool_bodies
     if model.bodies:
-        return model.bodies
+        return (*model.bodies, *(tool or ()))
     radius = THICK * extent(model) * hypot(1.0, 0.5 * JOINT_LENGTH)
-    return tuple(Capsule(link, start, end, radius) for link, start, end in rods(model))
+    pieces = [piece for piece in rods(model) if tool is None or piece[0] != JOINTS]
+    return (*(Capsule(link, start, end, radius) for link, start, end in pieces), *(tool or ()))
+
+
+def with_every_tool(models: Sequence[ArmModel]) -> ArmModel:
+    """The first of the models of one arm, with the bodies of the tools of all: what others must keep away from."""
+    first = models[0]
+    if len(models) == 1:
+        return first
+    count = len(capsules(replace(first, tool_bodies=())))
+    return replace(first, tool_bodies=tuple(body for model in models for body in capsules(model)[count:]))
 
 
 def self_pairs(model: ArmModel) -> tuple[tuple[int, int], ...]:
@@ -62,6 +75,7 @@ def self_pairs(model: ArmModel) -> tuple[tuple[int, int], ...]:
     bodies are too thick for this arm, and only named ones can guard that pair.
     """
     bodies = capsules(model)
+    derived = 0 if model.bodies else len(bodies) - len(model.tool_bodies or ())
     home = Placed(bodies)
     home.place(frames(model, [min(max(0.0, limit.lower), limit.upper) for limit in model.limits]))
     pairs = []
@@ -69,7 +83,7 @@ def self_pairs(model: ArmModel) -> tuple[tuple[int, int], ...]:
         a, b = (bodies[i], bodies[j]) if bodies[i].link <= bodies[j].link else (bodies[j], bodies[i])
         if b.link - a.link < 2 or _meet(model, a, b):
             continue
-        if model.bodies or distance(home, home, ((i, j),))[0] > 0.0:
+        if min(i, j) >= derived or distance(home, home, ((i, j),))[0] > 0.0:
             pairs.append((i, j))
     return tuple(pairs)
 

@@ -96,7 +96,8 @@ class ArmModel:
     """A six-joint arm, base to tool.
 
     `rows` and `limits` have six entries; `links` has six, or none when the masses are unknown; `tool` is the transform
-    from frame 6 (the flange) to the tool; `bodies` are its shape, none when it is unknown (`kinematics.capsules`).
+    from frame 6 (the flange) to the tool, whose mass the last of `links` includes; `bodies` are its shape, none when it
+    is unknown, and `tool_bodies` that of the tool, None when it is unknown or among `bodies` (`kinematics.capsules`).
     Raises ValueError for a wrong count, a value that is not finite, a tool without a proper rotation, and joint names
     that are empty or repeated.
     """
@@ -108,6 +109,8 @@ class ArmModel:
     tool: Pose = IDENTITY
     joint_names: tuple[str, ...] = tuple(f"joint{number}" for number in range(1, JOINTS + 1))
     bodies: tuple[Capsule, ...] = ()
+    tool_name: str = "tool"
+    tool_bodies: tuple[Capsule, ...] | None = None
 
     def __post_init__(self) -> None:
         for what in ("rows", "limits", "joint_names"):

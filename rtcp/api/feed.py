@@ -54,7 +54,7 @@ class Feed:
         except (BlackboardError, SessionError) as error:
             raise _not_running(directory, str(error)) from error
         self.period_ns = self._observer.period_ns
-        self._tool = ToolMotion(self.config.arm, self._observer.schema)
+        self._tool = ToolMotion(self.config.models, self._observer.schema)
         self.schema = self._tool.schema
         self._loop = select.poll()
         try:

@@ -114,17 +114,21 @@ class Program:
         Raises:
             Refused: a motion cannot be carried out; the sentence begins with the line of its first step.
         """
+        self._check_tool(robot, start)
         places = self._places(robot)
         q: Sequence[float] = robot.status().commanded_positions
+        with_tool: dict[str, Any] = {}
         found: list[PlannedMotion] = []
         for number, one in enumerate(self._units(places, _PLANNED_TIMES, start, end)):
             if number == _MOST_PLANNED:
                 raise RtcpError("refused", f"{self.file}: it has more than {_MOST_PLANNED} steps", "program")
             if isinstance(one, Action):
+                if one.step.tool is not None:
+                    with_tool["tool"] = one.step.tool
                 continue
             line = self.line_of(one.where)
             try:
-                plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed)
+                plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed, **with_tool)
             except RtcpError as error:
                 if error.reason == _THERE:
                     continue
@@ -163,6 +167,8 @@ class Program:
         since = max((event.number for event in robot.events()), default=0)
         if check:
             self.check(robot, start, end)
+        else:
+            self._check_tool(robot, start)
         for one in self._units(self._places(robot), None, start, end):
             between()
             line = self.line_of(one.where)
@@ -201,9 +207,17 @@ class Program:
             run=None,
             times=1,
         )
+        self._check_tool(robot, number)
         stop = self._stop(back, self._places(robot))
         assert stop is not None
         _carry_out(robot, [stop], self._motion.speed)
+
+    def _check_tool(self, robot: Robot, number: int) -> None:
+        """Raise where the steps before have chosen another tool than the one in use: poses are those of a tool."""
+        chosen = [one.tool for _, _, one in self._steps(0, number, 1) if one is not None and one.tool is not None]
+        if chosen and (in_use := robot.status().tool) != chosen[-1]:
+            text = f"the program uses the tool {chosen[-1]} there, in use is {in_use}: choose it first"
+            raise RtcpError("refused", f"{self.file}:{self.line_of(('program', number))}: {text}", "another_tool")
 
     def _check_undisturbed(self, robot: Robot, line: int, here: Sequence[float], since: int) -> None:
         """Raise where the arm was halted, or moved by somebody else, since the last step."""
@@ -299,6 +313,8 @@ def _described(step: Step) -> str:
         return f"output {step.output}: {'on' if step.value else 'off'}"
     if step.wait_for is not None:
         return f"wait until the input {step.wait_for} is {'on' if step.value else 'off'}"
+    if step.tool is not None:
+        return f"tool: {step.tool}"
     return f"wait {step.wait_s:g} s"
 
 
@@ -309,6 +325,8 @@ def _act(robot: Robot, step: Step, between: Callable[[], None]) -> None:
         robot.io[step.output] = step.value
     elif step.wait_for is not None:
         robot.io.wait(step.wait_for, step.value, step.timeout_s)
+    elif step.tool is not None:
+        robot.set_tool(step.tool)
     elif step.wait_s is not None:
         end = time.monotonic() + step.wait_s
         while (left := end - time.monotonic()) > 0.0:

@@ -29,6 +29,16 @@ def result(kind: type[T], found: Mapping[str, Any]) -> T:
 
 
 @dataclass(frozen=True)
+class Payload:
+    """What the tool holds."""
+
+    mass: float = 0.0
+    """kg"""
+    centre: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Of mass, x y z in the frame of the tool, m."""
+
+
+@dataclass(frozen=True)
 class Status:
     """The platform at one instant."""
 
@@ -65,6 +75,10 @@ class Status:
     """Who commands the arm; empty: nobody."""
     speed_override: float
     """Fraction of its speed at which the arm moves, 0.01 to 1; 0 while its motion is paused."""
+    tool: str
+    """Name of the tool in use."""
+    payload: Payload
+    """What it holds."""
     raw: Mapping[str, Any]
     """Everything that `rtcp status --json` prints."""
 
@@ -90,6 +104,8 @@ class Status:
             robot=RobotStatus(**found["robot"]),
             holder=found["lease"]["holder"],
             speed_override=found["speed_override"],
+            tool=found["tool_name"],
+            payload=result(Payload, found["payload"]),
             raw=found,
         )
 

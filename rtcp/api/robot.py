@@ -224,6 +224,33 @@ class Methods:
         return Call("resume", {}, _nothing)
 
     @Method
+    def set_tool(self, name: str) -> Call[None]:
+        """Use another tool of the arm's file (`kinematics.tools`); at rest, in state ready or holding.
+
+        Poses, lines, jogs, boxes, collisions and gravity are those of this tool from then on. It holds nothing yet:
+        see `set_payload`. After each start of the loop the first tool of the file is in use.
+
+        Raises:
+            Refused: the arm moves, another commander, or its bodies would be in a box or too near to the arm itself
+                (reason `tool_in_box`).
+            Invalid: no tool has this name.
+        """
+        return Call("set_tool", {"name": name}, _nothing)
+
+    @Method
+    def set_payload(self, mass: float, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Call[None]:
+        """Carry the weight of what the tool holds, in control mode torque; at rest. Choosing another tool sets it to 0.
+
+        Args:
+            mass: kg, at most `payload.max_mass` of the arm's file.
+            centre: of mass, x y z in the frame of the tool, m.
+
+        Raises:
+            Refused: the arm moves, another commander, too heavy or too far, or the masses of the links are unknown.
+        """
+        return Call("set_payload", {"mass": mass, "centre": list(centre)}, _nothing)
+
+    @Method
     def stop(self) -> Call[tuple[str, ...]]:
         """End the platform: stop the arm, disable the drives, leave the bus.
 
@@ -465,10 +492,12 @@ class Methods:
         approach: bool = False,
         stops: Sequence[Mapping[str, Any]] = (),
         start: Sequence[float] | None = None,
+        tool: str | None = None,
     ) -> Call[Preview]:
         """Plan what `move_joints(q)`, `move_pose(pose)`, `run(file)` or `run_path(stops)` would do now; nothing moves.
 
-        No lease is needed. A path may also begin at the joint positions `start`, rad.
+        No lease is needed. A path may also begin at the joint positions `start`, rad; `tool`: plan as if this one were
+        in use.
 
         Raises:
             Refused: what the motion would be refused with, or that its way leads through a box.
@@ -482,6 +511,7 @@ class Methods:
             "line": line,
             "synchronized": synchronized,
             "approach": approach,
+            "tool": tool,
         }
         if stops:
             params |= {"stops": [dict(stop) for stop in stops], "start": None if start is None else list(start)}
@@ -538,6 +568,19 @@ class Methods:
         """
         params = {"torque": list(torque), "stiffness": stiffness, "damping": damping, **_held(hold_s, sent_s)}
         return Call("apply_torque", params, _streamed)
+
+    @Method
+    def guide(self, duration_s: float = 0.0, progress: OnProgress | None = None) -> Call[str]:
+        """Let the arm be guided by hand, in control mode `torque`; the mode before comes back.
+
+        Args:
+            duration_s: how long, s; 0: until a halt, the release of the enabling switch, or 3600 s.
+            progress: called with what is under way.
+
+        Returns:
+            Why it ended: `done`, `halted` or `released` (the enabling switch).
+        """
+        return Call("guide", {"duration_s": duration_s}, lambda found: str(found["ended"]), progress)
 
     @Method
     def stream(self, q: Sequence[float], t: float) -> Call[Streamed]:

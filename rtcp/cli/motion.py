@@ -26,6 +26,8 @@ from rtcp.cli.arguments import (
 from rtcp.cli.output import CommandError, emit_json, progress, report, show, table
 from rtcp.cli.platform import connect, stoppable
 from rtcp.config.model import UNLIMITED_TORQUE, ConfigError
+from rtcp.ipc.runtime_directory import runtime_directory
+from rtcp.ipc.session import read_session
 
 Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Configured name, as joint2, or number from 1.")]
 COLUMNS = (
@@ -34,6 +36,8 @@ COLUMNS = (
 )  # fmt: skip
 UNITS = {"speed": "m/s", "acceleration": "m/s^2", "jerk": "m/s^3", "angular_speed": "rad/s",
          "angular_acceleration": "rad/s^2", "angular_jerk": "rad/s^3"}  # fmt: skip
+
+_HOLDS = ": the arm holds"
 
 commands = typer.Typer()
 limits = typer.Typer(name="limits", help="Show and narrow the limits while the platform runs.", no_args_is_help=True)
@@ -120,6 +124,40 @@ def _speed(
         if percent is not None:
             robot.set_speed_override(percent / 100.0)
         report(f"the speed override is {100.0 * robot.speed_override:.3g} %")
+
+
+@commands.command("tool")
+def _tool(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="One of the arm's file; without it: list them.")
+    ] = None,
+) -> None:
+    """Choose the tool, at rest: poses, boxes, collisions and gravity are those of it from then on."""
+    with connect("tool") as robot:
+        if name is not None:
+            robot.set_tool(name)
+            report(f"the tool is {name}; its payload is {robot.status().payload.mass:g} kg")
+            return
+        in_use = robot.status().tool
+    listed = table(("", "tool", "x y z, m", "rx ry rz, rad"), ("", "tool"))
+    for model in read_session(runtime_directory()).config.models:
+        numbers = (" ".join(f"{one:g}" for one in three) for three in (model.tool.position, model.tool.rpy))
+        listed.add_row("*" if model.tool_name == in_use else "", model.tool_name, *numbers)
+    show(listed)
+
+
+@commands.command("payload")
+def _payload(
+    mass: Annotated[float, typer.Argument(metavar="MASS", help="Of what the tool holds, kg; 0: nothing.")],
+    centre: Annotated[
+        tuple[float, float, float],
+        typer.Option("--centre", metavar="X Y Z", help="Its centre of mass in the frame of the tool, m."),
+    ] = (0.0, 0.0, 0.0),
+) -> None:
+    """Say what the tool holds, at rest: in control mode torque its weight is carried."""
+    with connect("payload") as robot:
+        robot.set_payload(mass, centre)
+        report(f"the payload of {robot.status().tool} is {mass:g} kg")
 
 
 @commands.command("output")
@@ -248,6 +286,20 @@ def _amount(text: str, unit: str) -> float:
     raise CommandError(f"{text!r} is not an amount for this axis: a number with {' or '.join(factors)}, as 1{unit}")
 
 
+@commands.command("guide")
+def _guide(
+    seconds: Annotated[float | None, option("--seconds", "S", "How long, s, at most 3600. Default: until Ctrl-C.")] = (
+        None
+    ),
+) -> None:
+    """Let the arm be guided by hand: it carries its weight and follows. Ctrl-C ends it, and the arm holds."""
+    positive("--seconds", seconds, "s", 3600.0)
+    with stoppable("guide") as robot:
+        report("the arm follows the hand; Ctrl-C ends it")
+        ended = robot.guide(seconds or 0.0)
+    report({"done": "the time is over", "halted": "halted"}.get(ended, "the enabling switch was released") + _HOLDS)
+
+
 @commands.command("arc", context_settings=NUMBERS_AS_WRITTEN)
 def _arc(
     pose: Annotated[list[str], as_written("X Y Z RX RY RZ", "Its end: m, and rad of Rx Ry Rz.")],
@@ -313,6 +365,7 @@ def _run(
 def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None, start: int) -> None:
     """Plan a file and show what would be done."""
     with connect("run --dry") as robot:
+        tool = robot.status().tool
         if is_program:
             from rtcp.api.program import Program
 
@@ -327,10 +380,8 @@ def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None, sta
     report(f"{len(planned)} motions in {sum(plan.duration_s for _, plan in planned):.1f} s; nothing has moved")
     if picture is not None:
         from rtcp.cli.arm_plot import draw
-        from rtcp.ipc.runtime_directory import runtime_directory
-        from rtcp.ipc.session import read_session
 
-        model = read_session(runtime_directory()).config.arm
+        model = read_session(runtime_directory()).config.model_of(tool)
         if model is None:
             raise CommandError(
                 "--picture: the geometry of the arm is unknown: the key kinematics is missing in its file"

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from rtcp.telemetry.reading import Reader
 
 FORMATS = ("csv", "mcap", "npz")
+_SLOWEST = 0.1
+"""Of its recorded speed a smoothed motion is replayed at least."""
 File = Annotated[Path, typer.Argument(metavar="FILE", help="A recording: .mcap or .csv; a fault of the black box.")]
 Signals = Annotated[str, option("--signals", "NAMES", "Fields of a record or patterns (*_position), by commas.")]
 Start = Annotated[float | None, typer.Option("--start", help="Begin, s from the first record.")]
@@ -88,17 +90,26 @@ def _replay(
     start: Start = None,
     end: End = None,
     speed: Annotated[float, option("--speed", "SCALE", "Scale of the recorded speed.")] = 1.0,
+    smooth: Annotated[
+        float | None,
+        option("--smooth", "HZ", "Cutoff, 0.2 to 20: smooth a hand-guided motion; slower where limits need it."),
+    ] = None,
+    rest: Annotated[float | None, option("--rest", "S", "Shorten longer rests in it to S, s.")] = None,
 ) -> None:
     """Move the arm along a recorded joint motion, checked as a whole first. Ctrl-C stops it."""
     positive("--speed", speed, "its recorded speed", 10.0)
+    positive("--rest", rest, "s")
+    if smooth is not None and not 0.2 <= smooth <= 20.0:
+        raise CommandError(f"--smooth {smooth:g} is not allowed: 0.2 to 20 Hz")
     with _readable(start, end):
         from rtcp.telemetry.reading import read
-        from rtcp.telemetry.replay import trajectory
+        from rtcp.telemetry.replay import deviation, trajectory
 
         # A CSV has no flags.
         signals = ["*_position"] if file.suffix.lower() == ".csv" else ["*_position", "flag*"]
         recorded = read(file, signals, start, end)
-        points = trajectory(recorded, speed)
+        points = trajectory(recorded, speed, smooth, rest)
+        apart = None if smooth is None else deviation(recorded, smooth)
     if recorded.truncated or recorded.missing:
         complain(f"{file}: {recorded.missing} records are missing{', and its end' if recorded.truncated else ''}")
     with stoppable("replay") as robot, progress() as shown:
@@ -106,14 +117,23 @@ def _replay(
         if (count := len(points[0]["q"])) != len(wanted) or joints not in ((), wanted):
             has = f"{count} joints {', '.join(joints)}".rstrip()
             raise CommandError(f"{file}: it has {has}; the arm has {len(wanted)}: {', '.join(wanted)}")
-        report(f"{len(points)} points, {points[-1]['t']:.1f} s, after a move to the first")
-        try:
-            arrived = robot.run_trajectory(points, True, shown)
-        except RtcpError as error:
-            if error.reason != "PlanTooFast":
-                raise
-            hint = f"nothing has moved; a motion recorded at its limits passes with --speed {0.9 * speed:.2g}"
-            raise CommandError(f"{error.message}; {hint}", ExitCode.REFUSED) from error
+        if apart is not None:
+            report(f"smoothed: at most {apart:.4f} rad from the recorded positions")
+        while True:
+            report(f"{len(points)} points, {points[-1]['t']:.1f} s, after a move to the first")
+            try:
+                arrived = robot.run_trajectory(points, True, shown)
+                break
+            except RtcpError as error:
+                if error.reason != "PlanTooFast":
+                    raise
+                slower = 0.9 * speed
+                if smooth is None or slower < _SLOWEST:
+                    hint = f"nothing has moved; a motion recorded at its limits passes with --speed {slower:.2g}"
+                    raise CommandError(f"{error.message}; {hint}", ExitCode.REFUSED) from error
+                speed = slower
+                report(f"too fast for a joint: at {speed:.0%} of its speed")
+                points = trajectory(recorded, speed, smooth, rest)
     report(arrival(arrived))
 
 

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from rtcp.cli.arguments import AsJson, Poll, option, refuse_old_name
+from rtcp.cli.arguments import (
+    NUMBERS_AS_WRITTEN,
+    AsJson,
+    Poll,
+    as_written,
+    number,
+    option,
+    positive,
+    refuse_old_name,
+)
 from rtcp.cli.control_socket import connected, free_path, settle
 from rtcp.cli.output import CommandError, emit, emit_json, report
 from rtcp.ipc.runtime_directory import runtime_directory, segment_control
@@ -24,6 +33,7 @@ ControlPath = Annotated[
     option("--segment", "PATH", "Control socket of the segment. Default: in the runtime directory."),
 ]
 _IN_HEX = ("code", "index")
+_WRENCH = (("X", "N"), ("Y", "N"), ("Z", "N"), ("RX", "Nm"), ("RY", "Nm"), ("RZ", "Nm"))
 
 commands = typer.Typer(name="segment", invoke_without_command=True)
 refuse_old_name(commands, "mend", "rtcp segment clear")
@@ -121,6 +131,24 @@ def _fault(
         until = "until its burst is over"
     where = "" if segment is None else f" --segment {segment}"
     report(f"{fault}, {until}; to clear it: rtcp segment clear {number}{where}")
+
+
+@commands.command("push", context_settings=NUMBERS_AS_WRITTEN)
+def _push(
+    wrench: Annotated[
+        list[str],
+        as_written("X Y Z [RX RY RZ]", "Force, N, and torque, Nm, along and about the axes of the base."),
+    ],
+    seconds: Annotated[float, option("--seconds", "S", "How long, s.")] = 1.0,
+    segment: ControlPath = None,
+) -> None:
+    """Push the arm at its tool, as a hand does; more pushes add up, and `rtcp segment clear` ends them."""
+    positive("--seconds", seconds, "s")
+    if len(wrench) not in (3, 6):
+        raise CommandError(f"{len(wrench)} numbers are no push: 3 (X Y Z, N) or 6 (and RX RY RZ, Nm)")
+    values = [number(text, name, unit) for text, (name, unit) in zip(wrench, _WRENCH, strict=False)]
+    pairs = [f"{name.lower()}={value!r}" for value, (name, _) in zip(values, _WRENCH, strict=False)]
+    _fault("push", pairs, seconds, segment)
 
 
 @commands.command("clear")

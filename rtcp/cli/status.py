@@ -216,7 +216,7 @@ def _facts(status: Json) -> Table:
         rows.add_row("joystick", f"{joystick['mode']}, controls the {'arm' if joystick['controls_arm'] else 'chair'}")
     rows.add_row("drives", _drives(status))
     if status["tool"] is not None:
-        rows.add_row("tool", _tool(status["tool"]))
+        rows.add_row("tool", Text(_tool(status)))
     rows.add_row("frames", _frames(status))
     if status["dc"] is not None:
         rows.add_row("clocks", _clocks(status))
@@ -242,11 +242,13 @@ def _drives(status: Json) -> str:
     return ", ".join(f"{name} {state}" for name, state in zip(status["joint_names"], states, strict=True))
 
 
-def _tool(tool: Json) -> str:
-    """Return the measured pose of the tool and how fast it moves."""
+def _tool(status: Json) -> str:
+    """Return the name of the tool, what it holds, its measured pose and how fast it moves."""
+    tool, mass = status["tool"], status["payload"]["mass"]
+    name = f"{status['tool_name']} with {mass:.3g} kg" if mass else status["tool_name"]
     position, angles = (" ".join(f"{one:+.4f}" for one in tool["pose"][at : at + 3]) for at in (0, 3))
     speed, turn = (math.hypot(*tool["velocity"][at : at + 3]) for at in (0, 3))
-    return f"{position} m, {angles} rad, {speed:.3f} m/s, {turn:.3f} rad/s"
+    return f"{name}: {position} m, {angles} rad, {speed:.3f} m/s, {turn:.3f} rad/s"
 
 
 def _value(name: str, value: Any, unit: str) -> str:

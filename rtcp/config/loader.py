@@ -32,6 +32,7 @@ from rtcp.config.model import (
     Joint,
     Kinematics,
     MechanicalLimit,
+    NamedTool,
     PluginError,
     ProcessConfig,
     SlaveConfig,
@@ -142,6 +143,7 @@ def load(path: Path) -> ArmConfig:
         findings += _shared_channels(processes)
     if findings or in_devices or arm is None:
         raise ConfigError(document.sentences(findings) + in_devices)
+    models = () if arm.kinematics is None else _arm_models(document, arm.name, arm.kinematics, arm.joints)
     return ArmConfig(
         **{entry.name: getattr(arm, entry.name) for entry in fields(ArmSettings) if entry.name != "processes"},
         slaves=nodes
@@ -149,7 +151,8 @@ def load(path: Path) -> ArmConfig:
             SlaveConfig(slave.name, devices[slave.device], str(device_path(path, slave.device))) for slave in arm.slaves
         ),
         processes=processes,
-        arm=None if arm.kinematics is None else _arm_model(document, arm.name, arm.kinematics, arm.joints),
+        arm=models[0] if models else None,
+        other_tools=models[1:],
         source=path,
         warnings=tuple(document.sentences(rules.implausible(arm))),
     )
@@ -257,7 +260,7 @@ def load_device(path: Path, period_us: float | None = None) -> DeviceDescription
 
 
 def load_kinematics(path: Path) -> ArmModel:
-    """Read an arm's file and return its kinematics.
+    """Read an arm's file and return its kinematics, with the first tool.
 
     A file with any key of a whole arm is checked as one, with its device files; its joints' `position` and `velocity`
     are then the limits of the model, and `kinematics.limits` are the mechanical ones that they must lie within.
@@ -273,7 +276,7 @@ def load_kinematics(path: Path) -> ArmModel:
             raise ConfigError(document.sentences([((), finding)]))
         return arm
     file = _KINEMATICS.read(document)
-    return _arm_model(document, file.name, file.kinematics, ())
+    return _arm_models(document, file.name, file.kinematics, ())[0]
 
 
 def load_mechanics(path: Path) -> ArmModel:
@@ -385,24 +388,44 @@ def _devices_named(data: Any) -> Iterator[tuple[str, KeyPath]]:
             yield key, ("slaves", i, "device")
 
 
-def _arm_model(document: Document, name: str, part: Kinematics, joints: Sequence[Joint]) -> ArmModel:
-    """Return the model of an arm; where it has `joints`, their names, ranges and speeds are the model's."""
+def _arm_models(document: Document, name: str, part: Kinematics, joints: Sequence[Joint]) -> tuple[ArmModel, ...]:
+    """Return the model of an arm with each tool; where it has `joints`, their names, ranges and speeds are its own."""
     try:
         limits = tuple(JointLimit(one.position.min, one.position.max, one.velocity) for one in joints)
-        x, y, z, rx, ry, rz = *part.tool.position, *part.tool.rpy
-        return ArmModel(
+        bare = ArmModel(
             name=name,
             rows=tuple(DhRow(row.alpha, row.a, row.d, row.offset) for row in part.dh),
             limits=limits or _mechanical(part.limits or ()),
             links=tuple(LinkMass(link.mass, _point(link.centre)) for link in part.links or ()),
-            tool=Pose.from_xyzrpy(x, y, z, rx, ry, rz),
             joint_names=tuple(joint.name for joint in joints) or ArmModel.joint_names,
             bodies=tuple(
                 Capsule(body.link, _point(body.start), _point(body.end), body.radius) for body in part.bodies or ()
             ),
         )
+        return tuple(_with_tool(bare, tool) for tool in part.every_tool)
     except ValueError as error:
         raise ConfigError(document.sentences([(("kinematics",), str(error))])) from error
+
+
+def _with_tool(bare: ArmModel, tool: NamedTool) -> ArmModel:
+    """Return the model of an arm with a tool at its flange, whose weight the last link carries."""
+    x, y, z, rx, ry, rz = *tool.position, *tool.rpy
+    links = bare.links
+    if links and tool.mass:
+        mass = links[-1].mass + tool.mass
+        moments = zip(links[-1].centre, tool.centre, strict=True)
+        centre = tuple((links[-1].mass * a + tool.mass * b) / mass for a, b in moments)
+        links = (*links[:-1], LinkMass(mass, _point(centre)))
+    bodies = tool.bodies
+    return replace(
+        bare,
+        links=links,
+        tool=Pose.from_xyzrpy(x, y, z, rx, ry, rz),
+        tool_name=tool.name,
+        tool_bodies=None
+        if bodies is None
+        else tuple(Capsule(JOINTS, _point(body.start), _point(body.end), body.radius) for body in bodies),
+    )
 
 
 def _point(vector: Sequence[float]) -> tuple[float, float, float]:

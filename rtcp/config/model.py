@@ -55,6 +55,8 @@ MOST_AXES = 10
 """Joints, a gripper's among them: as many as commands, plans and recordings have room for."""
 UNLIMITED_TORQUE = 1e9
 """Nm; the limit of joints whose torque nobody measures."""
+MOST_TOOLS = 16
+"""Tools of an arm."""
 MOST_POINTS = 4096
 """Points or poses of a motion file."""
 
@@ -416,6 +418,24 @@ class JogConfig:
 
 
 @dataclass(frozen=True)
+class GuidingConfig:
+    """Hand guiding: [what it does, and what to check first](guiding.md)."""
+
+    speed: Annotated[float, Gt(0), Le(0.25)] = 0.25
+    """Largest speed of the tool, m/s."""
+    joint_speed: Annotated[float, Gt(0), Le(2)] = 0.5
+    """Largest speed of each joint, rad/s; at most its `velocity`."""
+    hold: Annotated[float, Gt(0), Le(0.5)] = 0.06
+    """Torque that moves no joint yet, fraction of its `torque`: greater errors of the weight make the arm drift."""
+    damping: Annotated[float, Ge(0), Le(1)] = 0.1
+    """Damping that the hand feels, fraction of each joint's `cst_damping`."""
+    weight_error: Annotated[float, Gt(0), Le(1)] = 0.1
+    """Largest difference of a joint's torque at rest from its weight, fraction of its `torque`; more is refused."""
+    enabling_switch: bool = True
+    """Whether it is refused on a real bus where `inputs.enabling_switch` is left out."""
+
+
+@dataclass(frozen=True)
 class SupervisionConfig:
     """Limits on measured values; the emergency stop follows when one is exceeded for `cycles` in a row."""
 
@@ -648,6 +668,43 @@ class Body:
 
 
 @dataclass(frozen=True)
+class ToolBody:
+    """A body of a tool: a cylinder with a ball at each end."""
+
+    start: Vector
+    """Start x, y, z of the axis from the flange, m; `bodies` left out: one from the flange to the tool point."""
+    end: Vector
+    """End of the axis, m; the same point: a ball."""
+    radius: Positive
+    """Radius, m."""
+
+
+@dataclass(frozen=True)
+class NamedTool:
+    """A tool that `rtcp tool` chooses; the first is in use after the start."""
+
+    name: Name
+    """Name of the tool; unique."""
+    position: Vector = (0.0, 0.0, 0.0)
+    """Tool position x, y, z from the flange, m; `tools` left out: the one of `tool`."""
+    rpy: Annotated[tuple[Turn, ...], MinLen(3), MaxLen(3)] = (0.0, 0.0, 0.0)
+    """Tool rotation rx, ry, rz, rad: R = Rx(rx) Ry(ry) Rz(rz)."""
+    mass: NotNegative = 0.0
+    """Mass of the tool, kg."""
+    centre: Vector = (0.0, 0.0, 0.0)
+    """Center of mass x, y, z from the flange, m."""
+    bodies: tuple[ToolBody, ...] | None = None
+
+
+@dataclass(frozen=True)
+class PayloadConfig:
+    """What the tool may hold."""
+
+    max_mass: NotNegative = 0.0
+    """Largest mass that `rtcp payload` accepts, kg; 0: none."""
+
+
+@dataclass(frozen=True)
 class Kinematics:
     """The arm's geometry; `limits` may be left out beside `joints`, `links` where masses are not known."""
 
@@ -655,7 +712,13 @@ class Kinematics:
     limits: Annotated[tuple[MechanicalLimit, ...], MinLen(JOINTS), MaxLen(JOINTS)] | None = None
     links: Annotated[tuple[Link, ...], MinLen(JOINTS), MaxLen(JOINTS)] | None = None
     tool: Tool = field(default_factory=Tool)
+    tools: Annotated[tuple[NamedTool, ...], MaxLen(MOST_TOOLS)] = ()
     bodies: Annotated[tuple[Body, ...], MinLen(1)] | None = None
+
+    @property
+    def every_tool(self) -> tuple[NamedTool, ...]:
+        """The tools; where none is named, the only one."""
+        return self.tools or (NamedTool(ArmModel.tool_name, self.tool.position, self.tool.rpy),)
 
 
 InputChannel = Annotated[str, "tpdo"]
@@ -748,11 +811,13 @@ class ArmSettings:
     """Joint positions to which `rtcp move --home` and the panel lead, rad."""
     cartesian: CartesianConfig = field(default_factory=CartesianConfig)
     jog: JogConfig = field(default_factory=JogConfig)
+    guiding: GuidingConfig = field(default_factory=GuidingConfig)
     supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
     stops: StopsConfig = field(default_factory=StopsConfig)
     inputs: InputsConfig = field(default_factory=InputsConfig)
     outputs: OutputsConfig = field(default_factory=OutputsConfig)
     gripper: GripperConfig | None = None
+    payload: PayloadConfig = field(default_factory=PayloadConfig)
     recording: RecordingConfig | None = None
     ros: RosConfig | None = None
     processes: tuple[ProcessConfig, ...] = ()
@@ -779,13 +844,29 @@ class ArmConfig(ArmSettings):
 
     slaves: tuple[SlaveConfig, ...] = field(kw_only=True)
     arm: ArmModel | None = None
-    """The geometry; None: only joint motion is possible, and no Cartesian guard."""
+    """The geometry with the first tool; None: only joint motion is possible, and no Cartesian guard."""
+    other_tools: tuple[ArmModel, ...] = ()
+    """The geometry with each of the other tools."""
     zero_offsets: tuple[float, ...] = ()
     """rad, what each axis' drive shows at the axis' zero, in the order of `axes`; empty: all 0."""
     source: Path = Path()
     """The file it was read from."""
     warnings: tuple[str, ...] = ()
     """Values that are allowed and implausible: file, line, key, value and the likely mistake."""
+
+    @property
+    def models(self) -> tuple[ArmModel, ...]:
+        """The geometry with each tool, by the tools' numbers; empty where it is unknown."""
+        return () if self.arm is None else (self.arm, *self.other_tools)
+
+    @property
+    def tool_names(self) -> tuple[str, ...]:
+        """Names of the tools, by their numbers; at least one."""
+        return tuple(model.tool_name for model in self.models) or (ArmModel.tool_name,)
+
+    def model_of(self, tool: str) -> ArmModel | None:
+        """Return the geometry with a tool by its name; None: there is none."""
+        return next((model for model in self.models if model.tool_name == tool), None)
 
     @property
     def ethercat(self) -> EthercatBus:
@@ -874,7 +955,7 @@ class NamedPose:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of a program: one of `move`, `line`, `arc`, `gripper`, `output`, `wait_for`, `wait_s` and `run`."""
+    """A step of a program: one of `move`, `line`, `arc`, `gripper`, `output`, `wait_for`, `wait_s`, `tool`, `run`."""
 
     move: Name | None = None
     """Move to this pose by the joints."""
@@ -902,6 +983,8 @@ class Step:
     """Longest wait for an input, s; None: for ever."""
     wait_s: Positive | None = None
     """Time to wait, s."""
+    tool: Name | None = None
+    """Use this tool from here on."""
     run: Name | None = None
     """Run this part."""
     times: Annotated[int, Ge(0), Le(1_000_000)] = 1

@@ -41,6 +41,7 @@ from rtcp.config.model import (
     StartupSdo,
     Step,
     Stop,
+    Tool,
     integer_range,
 )
 from rtcp.config.validation import EVERY_KEY, rule
@@ -454,6 +455,20 @@ def _joints_of_kinematics(arm: ArmFile) -> Iterator[Finding]:
             yield ("joints", i, "velocity"), text
 
 
+@rule(Kinematics)
+def _tools(part: Kinematics) -> Iterator[Finding]:
+    tools = part.tools
+    if tools and part.tool != Tool():
+        yield ("tool",), "found beside tools: move it into the list, as its first"
+    yield from _repeated(((("tools", i, "name"), tool.name) for i, tool in enumerate(tools)), "name")
+    for i, tool in enumerate(tools):
+        if tool.mass and part.links is None:
+            yield ("tools", i, "mass"), f"found {tool.mass:g} beside links of unknown mass: it needs the key links"
+        if part.bodies is not None and tool.bodies is None:
+            text = "the key bodies is missing; where the arm's are named, so are the tool's: a list, [] for none"
+            yield ("tools", i), text
+
+
 @rule(ArmFile, "cartesian", "kinematics")
 def _boxes(arm: ArmFile) -> Iterator[Finding]:
     tool, part = arm.cartesian.box, arm.kinematics
@@ -488,7 +503,8 @@ def shoulder_and_reach(part: Kinematics) -> tuple[Position, float]:
     """Return a point that no joint moves, the origin of frame 1 (m), and how far from it the tool can be at most, m."""
     row = part.dh[0]
     shoulder = (row.a, 0.0 - math.sin(row.alpha) * row.d, math.cos(row.alpha) * row.d)
-    return shoulder, sum(math.hypot(row.a, row.d) for row in part.dh[1:]) + math.hypot(*part.tool.position)
+    longest = max(math.hypot(*tool.position) for tool in part.every_tool)
+    return shoulder, sum(math.hypot(row.a, row.d) for row in part.dh[1:]) + longest
 
 
 def _misplaced(box: Box | KeepOut, part: Kinematics) -> str:
@@ -571,6 +587,10 @@ def _magnitudes(arm: ArmFile) -> Iterator[Magnitude]:
         yield ("kinematics", "links", i, "mass"), link.mass, 200.0, "kg", _GRAMS
         yield ("kinematics", "links", i, "centre"), max(map(abs, link.centre)), 5.0, "m", _MILLIMETRES
     yield ("kinematics", "tool", "position"), max(map(abs, arm.kinematics.tool.position)), 5.0, "m", _MILLIMETRES
+    for i, tool in enumerate(arm.kinematics.tools):
+        yield ("kinematics", "tools", i, "mass"), tool.mass, 200.0, "kg", _GRAMS
+        for key in ("position", "centre"):
+            yield ("kinematics", "tools", i, key), max(map(abs, getattr(tool, key))), 5.0, "m", _MILLIMETRES
     for i, body in enumerate(arm.kinematics.bodies or ()):
         for key in ("start", "end"):
             yield ("kinematics", "bodies", i, key), max(map(abs, getattr(body, key))), 5.0, "m", _MILLIMETRES
@@ -602,7 +622,7 @@ def _named_pose(pose: NamedPose) -> Iterator[Finding]:
         yield (), f"found {'neither' if pose.pose is None else 'both'} of pose and q; one of them is needed"
 
 
-_VERBS = ("move", "line", "arc", "gripper", "output", "wait_for", "wait_s", "run")
+_VERBS = ("move", "line", "arc", "gripper", "output", "wait_for", "wait_s", "tool", "run")
 _OF_VERBS = {
     "via": ("arc",),
     "angle": ("arc",),
@@ -644,6 +664,13 @@ def _program(motion: MotionFile) -> Iterator[Finding]:
                 name, allowed = getattr(step, key), parts if key == "run" else poses
                 if name is not None and name not in allowed:
                     yield (*where, at, key), f'found "{name}", allowed is one of {", ".join(allowed) or "none"}'
+    if any(step.tool is not None for _, steps in lists for step in steps):
+        places = {one.name for one in motion.poses if one.pose is None}
+        for where, steps in lists:
+            for at, step in enumerate(steps):
+                if step.via in places:
+                    text = f'found "{step.via}", which has q; with several tools allowed is one with pose'
+                    yield (*where, at, "via"), text
     calls = {part.name: {step.run for step in part.steps if step.run is not None} for part in motion.parts}
     for at, name in enumerate(parts):
         reached, ahead = set[str](), set(calls[name])

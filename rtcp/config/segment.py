@@ -11,6 +11,7 @@ from typing import Annotated
 from annotated_types import Ge, Le, MinLen
 
 from rtcp.config.document import Finding, read, shown
+from rtcp.config.model import ConfigError
 from rtcp.config.numbers import U16, Name
 from rtcp.config.validation import Checker, rule
 
@@ -33,15 +34,22 @@ class SegmentSlave:
 
 @dataclass(frozen=True)
 class SegmentConfig:
-    """The virtual slaves in the order of the cable, and the file that lists them."""
+    """The virtual slaves in the order of the cable, the file that lists them, and that of the arm that they turn."""
 
     slaves: tuple[SegmentSlave, ...]
     source: Path
+    arm: Path | None = None
 
 
 @dataclass(frozen=True)
-class _SegmentFile:
+class SegmentFile:
+    """The file of a segment."""
+
     slaves: Annotated[tuple[SegmentSlave, ...], MinLen(1)]
+    """The slaves in the order of the cable."""
+    arm: Name | None = None
+    """File of the arm, beside this one, that the first six drives turn: its `kinematics` give the weights of the links
+    and what a push at the tool does; left out: each drive has its own load alone."""
 
 
 @rule(SegmentSlave)
@@ -51,8 +59,8 @@ def _options(slave: SegmentSlave) -> Iterator[Finding]:
             yield ("options", name), f"found {shown(value)}, allowed is a text, a number, true or false"
 
 
-@rule(_SegmentFile, "slaves")
-def _aliases(segment: _SegmentFile) -> Iterator[Finding]:
+@rule(SegmentFile, "slaves")
+def _aliases(segment: SegmentFile) -> Iterator[Finding]:
     first: dict[int, int] = {}
     for i, slave in enumerate(segment.slaves):
         if slave.alias and first.setdefault(slave.alias, i) != i:
@@ -60,7 +68,7 @@ def _aliases(segment: _SegmentFile) -> Iterator[Finding]:
             yield ("slaves", i, "alias"), text
 
 
-_SEGMENT = Checker(_SegmentFile)
+_SEGMENT = Checker(SegmentFile)
 
 
 def load_segment(path: Path) -> SegmentConfig:
@@ -69,4 +77,9 @@ def load_segment(path: Path) -> SegmentConfig:
     Raises:
         ConfigError: with one sentence for every mistake.
     """
-    return SegmentConfig(_SEGMENT.read(read(path)).slaves, path)
+    document = read(path)
+    found = _SEGMENT.read(document)
+    arm = None if found.arm is None else path.parent / found.arm
+    if arm is not None and not arm.is_file():
+        raise ConfigError(document.sentences([(("arm",), f"found {shown(found.arm)}, but there is no file {arm}")]))
+    return SegmentConfig(found.slaves, path, arm)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from kinematics.model import LinkMass
 from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
 from rtcp.devices.drive import Drive
 from rtcp.ipc.commands import Command, Jog, MoveJoints
-from rtcp.ipc.schema import ARM_MODES, arm_fields
+from rtcp.ipc.schema import ARM_MODES, LOAD_FIELDS, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
 from rtcp.motion.controllers.jog import JogController
@@ -18,6 +19,9 @@ from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import Phase
 from rtcp.motion.step_group import StepGroup
+from rtcp.motion.tool_in_use import Gravity, ToolInUse
+
+_NOTHING = LinkMass(0.0, (0.0, 0.0, 0.0))
 
 
 class Arm(JointGroup):
@@ -43,9 +47,19 @@ class Arm(JointGroup):
         super().__init__("arm", arm_fields(len(joints)), config, drives)
         self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
         self.speed_override = SpeedOverride()
+        self.tool = ToolInUse()
+        self._publishes_load = False
+        self.gravity = Gravity(config, self.tool)
         self.controllers: dict[type[Command], Controller] = load_controllers(
             ControllerSetup(
-                config, self.limits, self.trajectory_guard, self.period_s, plan, self.group, self.speed_override
+                config,
+                self.limits,
+                self.trajectory_guard,
+                self.period_s,
+                plan,
+                self.group,
+                self.speed_override,
+                self.tool,
             )
         )
         """By the commands that they accept."""
@@ -81,6 +95,19 @@ class Arm(JointGroup):
         for drive in self.drives:
             drive.mode = mode
 
+    def use_tool(self, number: int) -> None:
+        """Use another tool, which holds nothing yet; only at rest."""
+        self.tool.number, self.tool.payload = number, None
+        self.trajectory_guard.use_tool(number)
+        for controller in self.controllers.values():
+            controller.use_tool(number)
+        self._publishes_load = True
+
+    def carry(self, payload: LinkMass) -> None:
+        """Carry the weight of what the tool holds; only at rest."""
+        self.tool.payload = payload if payload.mass else None
+        self._publishes_load = True
+
     def publish(self, values: list[Any]) -> None:
         """Write modes, progress and what the joints measure and are sent."""
         state, controller, at = self.state, self.active, self.at
@@ -101,6 +128,11 @@ class Arm(JointGroup):
                 drive.target_position, drive.target_velocity, drive.target_torque, drive.state, drive.statusword,
             )  # fmt: skip
             at += 1
+        if self._publishes_load:
+            # The list is the same in every cycle: what is written once stays in it.
+            payload, at = self.tool.payload or _NOTHING, self.at + len(ARM_MODES) + 9 * n
+            values[at : at + len(LOAD_FIELDS)] = (self.tool.number, payload.mass, *payload.centre)
+            self._publishes_load = False
 
     def stop(self) -> None:
         """Let the active controller come to rest."""

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from math import hypot
 from typing import Any, Final
 
+from kinematics.model import LinkMass
 from rtcp.config.model import ConfigError
 from rtcp.control.machine import StateMachine
 from rtcp.control.processes import ProcessPart
@@ -35,7 +37,9 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetPayload,
     SetSpeedOverride,
+    SetTool,
     SetZero,
     Shutdown,
 )
@@ -46,8 +50,10 @@ from rtcp.ipc.events import (
     HaltedAtRest,
     LimitsChanged,
     Paused,
+    PayloadChanged,
     Resumed,
     SpeedOverrideChanged,
+    ToolChanged,
     ZeroSet,
 )
 from rtcp.ipc.layout import PLANS
@@ -62,6 +68,7 @@ from rtcp.ipc.refusals import (
     HomingUnsupported,
     JointOutsideRange,
     Malformed,
+    MassesUnknown,
     MotionPaused,
     MovedByAnother,
     NoArm,
@@ -78,14 +85,19 @@ from rtcp.ipc.refusals import (
     OffsetOutOfRange,
     PartnerOfAnotherCell,
     PartnerStopPressed,
+    PayloadTooFar,
+    PayloadTooHeavy,
+    PlannedForAnotherTool,
     Refusal,
     ReservedOutput,
     SpeedOverrideOutOfRange,
+    ToolInBox,
     TorqueLimitTooLow,
     TorquePresent,
     UnknownAxis,
     UnknownBox,
     UnknownOutput,
+    UnknownTool,
     WrongControlMode,
     WrongRowCount,
     WrongState,
@@ -99,7 +111,9 @@ from rtcp.motion.state import Phase
 MOST_LIMIT_ROWS: Final = 64
 """`MOST_AXES` joints and more boxes than an arm is configured with: all are checked in one cycle."""
 _LARGEST_OFFSET: Final = 100.0
+_FARTHEST_PAYLOAD_M: Final = 1.0
 _FIXED_DRIVE_MODE = frozenset({ControlMode.VELOCITY, ControlMode.TORQUE})
+_PLANNED = (RunTrajectory, RunInStep, RunLines)
 _AUTOMATIC = frozenset({ControlMode.JOINT, ControlMode.CARTESIAN})
 
 
@@ -135,6 +149,8 @@ class CommandHandler:
             SetSpeedOverride: self._set_speed_override,
             Pause: self._pause,
             Resume: self._resume,
+            SetTool: self._set_tool,
+            SetPayload: self._set_payload,
             SetZero: self._set_zero,
             Home: self._home,
             Shutdown: self._shut_down,
@@ -218,11 +234,13 @@ class CommandHandler:
             return WrongState(command.number, State.MOVING)
         if arm.speed_override.paused and not isinstance(command, ExtendTrajectory):
             return MotionPaused()
+        if isinstance(command, _PLANNED) and command.tool != arm.tool.number:
+            return PlannedForAnotherTool(command.tool, arm.tool.number)
         continues = machine.state is State.MOVING and arm.active is controller
         refusal = controller.accept(command, arm.state, continues)
         if refusal is not None:
             return refusal
-        if isinstance(command, (RunTrajectory, RunInStep, RunLines)):
+        if isinstance(command, _PLANNED):
             self._blackboard.use_plan(command.slot)
         elif isinstance(command, OpenStream):
             # Before the answer: whoever opened it may send at once.
@@ -385,6 +403,35 @@ class CommandHandler:
             return NotPaused()
         self._arm.speed_override.resume()
         self._blackboard.event(Resumed())
+        return None
+
+    def _set_tool(self, command: SetTool, lease: int) -> Refusal | None:
+        arm, tool = self._arm, command.tool
+        if not arm.at_rest:
+            return WrongState(command.number, State.MOVING)
+        if not 0 <= tool < len(self._context.config.tool_names):
+            return UnknownTool(tool, len(self._context.config.tool_names) - 1)
+        if tool == arm.tool.number:
+            return None
+        if (box := arm.trajectory_guard.zone_with(tool, arm.state.commanded)) is not None:
+            return ToolInBox(tool, box)
+        arm.use_tool(tool)
+        self._blackboard.event(ToolChanged(tool))
+        return None
+
+    def _set_payload(self, command: SetPayload, lease: int) -> Refusal | None:
+        arm, mass, centre = self._arm, command.mass, (command.x, command.y, command.z)
+        if not arm.at_rest:
+            return WrongState(command.number, State.MOVING)
+        if not arm.gravity.is_known:
+            return MassesUnknown()
+        most, away = self._context.config.payload.max_mass, hypot(*centre)
+        if not 0.0 <= mass <= most:
+            return PayloadTooHeavy(mass, most)
+        if not away <= _FARTHEST_PAYLOAD_M:
+            return PayloadTooFar(away, _FARTHEST_PAYLOAD_M)
+        arm.carry(LinkMass(mass, centre))
+        self._blackboard.event(PayloadChanged(mass))
         return None
 
     def _set_output(self, command: SetOutput, lease: int) -> Refusal | None:

@@ -308,7 +308,7 @@ class BlackBox:
             notes=(*_lacking(records, at, silent_s), *notes),
             timeline=timeline,
         )
-        tool = ToolMotion(config.arm, self._observer.schema)
+        tool = ToolMotion(config.models, self._observer.schema)
         records = tool.add(records)
         return FaultRecording(about, {name: records[name] for name in tool.schema.names}, tool.schema)
 

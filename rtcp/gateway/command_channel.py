@@ -138,6 +138,10 @@ class CommandChannel:
         """Return the speed override in the latest record."""
         return float(self.record()["speed_override"])
 
+    def tool(self) -> int:
+        """Return the number of the tool in the latest record."""
+        return int(self.record()["tool"])
+
     def joints(self, name: str) -> list[float]:
         """Return a field of the latest record, one number a joint."""
         return [float(value) for value in self.record()[name][: len(self.config.joints)]]

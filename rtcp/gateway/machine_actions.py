@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,7 +21,9 @@ from rtcp.ipc.commands import (
     Reset,
     SetControlMode,
     SetDriveMode,
+    SetPayload,
     SetSpeedOverride,
+    SetTool,
     SetZero,
     Shutdown,
 )
@@ -146,6 +149,26 @@ class MachineActions:
         else:
             async with channel.lease(caller) as acquired:
                 await channel.send(acquired, SetSpeedOverride(fraction))
+        return {}
+
+    async def set_tool(self, caller: Caller, name: str) -> Json:
+        """Use another tool; the next record says so when this returns."""
+        number = self.tool_number(name, "name")
+        async with self._channel.lease(caller) as lease:
+            await self._channel.send(lease, SetTool(number))
+        return {}
+
+    def tool_number(self, name: str, key: str) -> int:
+        """Return the number of a tool by its name."""
+        names = self._config.tool_names
+        if name not in names:
+            raise RtcpError("invalid", f'{key}: found the text "{name}", allowed is one of {", ".join(names)}')
+        return names.index(name)
+
+    async def set_payload(self, caller: Caller, mass: float, centre: Sequence[float]) -> Json:
+        """Carry the weight of what the tool holds."""
+        async with self._channel.lease(caller) as lease:
+            await self._channel.send(lease, SetPayload(mass, *centre))
         return {}
 
     # -- gripper, zero, homing ----------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.message import Joints
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.session import Session, SessionError, read_json, read_processes
-from rtcp.ipc.states import ControlMode, JogFrame
+from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.motion.limits import Limits
 from rtcp.motion.speed_override import LOWEST
 
@@ -123,7 +123,9 @@ class Methods:
         self._streaming = StreamingCommands(channel)
         self.recordings = Recordings(directory)
         self._limits = LimitSettings(channel, limits, directory)
-        self._motion = MotionActions(channel, Planner(config, limits))
+        self._motion = MotionActions(
+            channel, [Planner(config, limits, number) for number in range(len(config.tool_names))]
+        )
         self._processes = ProcessActions(channel, config)
         self._terminals = Terminals(channel)
         self._cell = CellActions(session, self._motion, limits)
@@ -226,6 +228,25 @@ class Methods:
         """
         lease = self._streaming.lease_of(caller.connection)
         return await self.machine.set_speed_override(caller, fraction, lease)
+
+    @method()
+    async def set_tool(self, caller: Caller, name: str) -> Json:
+        """Use another tool of the arm's file, which holds nothing yet; at rest, in state ready or holding.
+
+        Refused where its bodies would be in a box or too near to the arm itself (reason `tool_in_box`).
+        """
+        return await self.machine.set_tool(caller, name)
+
+    @method()
+    async def set_payload(
+        self, caller: Caller, mass: Annotated[float, Ge(0)], centre: Numbers = (0.0, 0.0, 0.0)
+    ) -> Json:
+        """Carry the weight of what the tool holds: `mass`, kg, `centre` of mass in the frame of the tool, m; at rest.
+
+        At most `payload.max_mass` of the arm's file; until another tool is chosen.
+        """
+        self._check_count("centre", centre, 3)
+        return await self.machine.set_payload(caller, mass, centre)
 
     @method()
     async def move_gripper(self, caller: Caller, open: bool) -> Json:
@@ -391,10 +412,12 @@ class Methods:
         approach: bool = False,
         stops: tuple[Stop, ...] = (),
         start: Numbers | None = None,
+        tool: str | None = None,
     ) -> Json:
         """Plan a motion as `move_joints`, `move_pose`, `run` or `run_path` would, and move nothing.
 
-        It begins where the arm is commanded, or, of a path, at the joint positions `start`, rad.
+        It begins where the arm is commanded, or, of a path, at the joint positions `start`, rad; with `tool` it is
+        planned as if that tool were in use.
         Returns `path`, configurations along it, rad, `duration_s`, and of lines `length_m` and `slowed`; refused with
         what would refuse it, or where its way leads through a box.
         """
@@ -402,13 +425,32 @@ class Methods:
             raise RtcpError("invalid", "found none or several of q, pose, file and stops, allowed is one of them")
         if start is not None:
             self._check_count("start", start, len(self._config.joints))
+        number = None if tool is None else self.machine.tool_number(tool, "tool")
         if stops:
-            return await self._motion.preview(None, stops, (), speed, synchronized, start)
+            return await self._motion.preview(None, stops, (), speed, synchronized, start, number)
         if file is not None:
-            return await self._motion.preview_file(file, approach)
+            return await self._motion.preview_file(file, approach, number)
         if pose is not None:
-            return await self._motion.preview_pose(pose, speed, line)
-        return await self._motion.preview(q, (), (), speed, synchronized)
+            return await self._motion.preview_pose(pose, speed, line, number)
+        return await self._motion.preview(q, (), (), speed, synchronized, tool=number)
+
+    @method()
+    async def guide(self, caller: Caller, duration_s: Annotated[float, Ge(0), Le(3600)] = 0.0) -> Json:
+        """Let the arm be guided by hand (`docs/guiding.md`), in control mode torque, and go back to the mode before.
+
+        Returns when the arm holds: `ended` is `done` after `duration_s`, `halted` by a halt, `released` by the enabling
+        switch. 0: it has no end but these, and an hour.
+        """
+        before = self.channel.control_mode
+        if before in (None, ControlMode.TORQUE):
+            return await self._motion.guide(caller, duration_s)
+        async with self.channel.lease(caller):
+            await self.machine.mode(caller, "torque")
+            try:
+                return await self._motion.guide(caller, duration_s)
+            finally:
+                if self.channel.state is State.HOLDING:
+                    await self.machine.mode(caller, before.name.lower())
 
     @method(at_once=True)
     async def fk(self, caller: Caller, q: Numbers) -> Json:

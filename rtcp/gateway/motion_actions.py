@@ -22,6 +22,7 @@ from rtcp.gateway.tolerances import Tolerances, Tracking, Violation
 from rtcp.ipc.commands import (
     Command,
     ExtendTrajectory,
+    Guide,
     Halt,
     MotionCommand,
     MoveJoints,
@@ -30,6 +31,7 @@ from rtcp.ipc.commands import (
     RunTrajectory,
 )
 from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.events import Arrived, PermissionWithdrawn
 from rtcp.ipc.layout import PLAN_ROWS, PlanTooLong
 from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import (
@@ -67,28 +69,33 @@ _GONE = (NotOpen.name, NoLease.name, WrongState.name)
 """What the loop refuses more points with once the trajectory has ended."""
 _KEPT_ROWS = 3
 """Rows of the plan area beside those ahead: the one that the arm comes from, one for a point that waits, one more."""
+_GUIDED_S = 3700.0
+"""Longer than an arm may be guided."""
 _UNPLANNED_S = 600.0
 """Longest motion of a package's own command."""
 
 
 class Planner:
-    """Makes plans for one arm under the limits in force.
+    """Makes plans for one arm with one tool under the limits in force.
 
     Every method raises RtcpError: `refused` for what this arm cannot do, `invalid` for what no arm could.
 
     Args:
         config: the arm.
         limits: in force now; changed elsewhere.
+        tool: number of the tool.
     """
 
-    def __init__(self, config: ArmConfig, limits: Limits) -> None:
+    def __init__(self, config: ArmConfig, limits: Limits, tool: int = 0) -> None:
         self._config = config
         self.limits = limits
-        self._zones = None if config.arm is None else Zones(config.arm, limits, config.cartesian.clearance)
+        self.tool = tool
+        self._arm = config.models[tool] if config.models else None
+        self._zones = None if self._arm is None else Zones(self._arm, limits, config.cartesian.clearance)
 
     def _model(self) -> ArmModel:
         """Return the geometry with the limits in force."""
-        arm = self._config.arm
+        arm = self._arm
         if arm is None:
             file = self._config.source
             message = f"the geometry of the arm is unknown: the key kinematics is missing in {file}"
@@ -97,9 +104,9 @@ class Planner:
         return dataclasses.replace(arm, limits=tuple(JointLimit(*three) for three in limits))
 
     def _zone_at(self, q: Sequence[float]) -> str | None:
-        if self._zones is None or self._config.arm is None:
+        if self._zones is None or self._arm is None:
             return None
-        distance, box = self._zones.distance(frames(self._config.arm, q))
+        distance, box = self._zones.distance(frames(self._arm, q))
         if distance >= 0.0:
             return None
         if box >= ITSELF:
@@ -148,10 +155,12 @@ class Planner:
         plain = all(stop.via is None and not stop.by_joints and not stop.blend for stop in stops)
         try:
             if plain:
-                return plan_lines(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
-            from rtcp.motion.planning.path import plan_path  # here: scipy loads slowly, and few need it
+                plan = plan_lines(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
+            else:
+                from rtcp.motion.planning.path import plan_path  # here: scipy loads slowly, and few need it
 
-            return plan_path(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
+                plan = plan_path(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
+            return dataclasses.replace(plan, tool=self.tool)
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused), type(refused).__name__) from None
 
@@ -159,7 +168,8 @@ class Planner:
         """Return the plan of a trajectory that begins at `q_now`; or, `moving`, on the way there."""
         names = [joint.name for joint in self._config.joints]
         try:
-            return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at, moving=moving)
+            plan = plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at, moving=moving)
+            return dataclasses.replace(plan, tool=self.tool)
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused), type(refused).__name__) from None
 
@@ -193,7 +203,7 @@ class Planner:
 
     def way(self, plan: Plan, q_now: Sequence[float]) -> preview.JointPath:
         """Return the joints along a plan."""
-        return preview.planned(plan, q_now, self._config.arm)
+        return preview.planned(plan, q_now, self._arm)
 
     @staticmethod
     def read(path: str) -> tuple[tuple[Point, ...], tuple[Stop, ...], float | None]:
@@ -224,12 +234,12 @@ class MotionActions:
 
     Args:
         channel: the way to the loop.
-        planner: makes the plans.
+        planners: make the plans, one with each tool.
     """
 
-    def __init__(self, channel: CommandChannel, planner: Planner) -> None:
+    def __init__(self, channel: CommandChannel, planners: Sequence[Planner]) -> None:
         self._channel = channel
-        self._planner = planner
+        self._planners = planners
         self._count = len(channel.config.joints)
         self.goal: Sequence[float] | None = None
         """Joint positions to which the call under way moves, rad, until it returns; None: none, or a package's own."""
@@ -237,6 +247,11 @@ class MotionActions:
         """The motion that the loop accepted last."""
         self._open: dict[int, _Open] = {}
         """Open trajectories by connection; one that has ended stays until its connection is told."""
+
+    @property
+    def _planner(self) -> Planner:
+        """Makes plans with the tool in use."""
+        return self._planners[self._channel.tool()]
 
     async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
         """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
@@ -272,8 +287,9 @@ class MotionActions:
                     f"offset.{name}: found {angle:g} rad, allowed is less than half a turn: a line takes the short way"
                 )
                 raise RtcpError("invalid", text)
-        goal = self._planner.moved_by(here, offset, frame)
-        return await self.run_path(caller, [Stop((*goal.position, *goal.rpy))], speed, False)
+        planner = self._planner
+        goal = planner.moved_by(here, offset, frame)
+        return await self.run_path(caller, [Stop((*goal.position, *goal.rpy))], speed, False, planner)
 
     async def run_file(self, caller: Caller, file: str, approach: bool) -> Json:
         """Run a motion file."""
@@ -331,7 +347,7 @@ class MotionActions:
             plan = await asyncio.to_thread(self._planner.trajectory, points, self.plan_start())
             table = tuple(tuple(brakes[at : at + COLUMNS]) for at in range(0, len(brakes), COLUMNS))
             slot = self._write(dataclasses.replace(plan, rows=plan.rows + table))
-            command = RunInStep(slot, len(plan.rows), motion, partners, start_ns, len(brakes), brake_step_s)
+            command = RunInStep(slot, len(plan.rows), motion, partners, start_ns, len(brakes), brake_step_s, plan.tool)
             what = "the motion in step"
             arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what)
             timeout_s = _TIMEOUT_S + 2 * plan.duration_s
@@ -369,7 +385,8 @@ class MotionActions:
         channel = self._channel
         async with channel.lease(dataclasses.replace(caller, report=lambda progress: None)) as lease:
             moving = channel.state is State.MOVING
-            plan = self._planner.open_plan(self.plan_start(), moving)
+            planner = self._planner
+            plan = planner.open_plan(self.plan_start(), moving)
             rows = await asyncio.to_thread(_append, plan, points)
             if plan.waits and plan.times[-1] < _AHEAD_S:
                 # No point after the second could come in time to give it a velocity.
@@ -390,7 +407,7 @@ class MotionActions:
                 accepted.set_result(opened)
                 resting = asyncio.create_task(self._rest_in_time(opened))
 
-            command = RunTrajectory(opened.slot, len(rows), open=True)
+            command = RunTrajectory(opened.slot, len(rows), open=True, tool=planner.tool)
             try:
                 return await self._run(lease, command, LONGEST_OPEN_S, "the trajectory", arrived, begun=begun)
             finally:
@@ -468,23 +485,37 @@ class MotionActions:
         passed = bisect.bisect_left(plan.times, plan.times[-1] - self._channel.ahead_s())
         return PLAN_ROWS - _KEPT_ROWS - len(plan.times) + passed
 
-    async def run_path(self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool) -> Json:
-        """Run a path to each stop in turn; with `approach` the joints first move to the first one."""
+    async def run_path(
+        self,
+        caller: Caller,
+        stops: Sequence[Stop],
+        speed: float | None,
+        approach: bool,
+        planner: Planner | None = None,
+    ) -> Json:
+        """Run a path to each stop in turn; with `approach` the joints first move to the first one.
+
+        Its poses are those of the tool of `planner`; None: of the tool in use.
+        """
         async with self._channel.lease(caller) as lease:
+            planner = planner or self._planner
             if approach and stops:
                 first = stops[0]
                 q = (
                     self._joints(first.q)
                     if first.q is not None
-                    else await asyncio.to_thread(self._planner.joints_at, first.pose or (), self.plan_start())
+                    else await asyncio.to_thread(planner.joints_at, first.pose or (), self.plan_start())
                 )
                 arrival = await self._move(lease, q, None, True)
                 stops = stops[1:]
                 if not stops:
                     return arrival
-            plan = await asyncio.to_thread(self._planner.path, stops, self.plan_start(), speed)
+            plan = await asyncio.to_thread(planner.path, stops, self.plan_start(), speed)
             kind = RunLines if plan.rows[0][KIND] == LINE else RunTrajectory
             return await self._run_plan(lease, kind, plan, self._write(plan), "the path")
+
+    def _planner_of(self, tool: int | None) -> Planner:
+        return self._planner if tool is None else self._planners[tool]
 
     async def preview(
         self,
@@ -494,49 +525,57 @@ class MotionActions:
         speed: float | None,
         synchronized: bool,
         start: Sequence[float] | None = None,
+        tool: int | None = None,
     ) -> Json:
-        """Return the way of a motion to `q`, of a path, or of a trajectory, from now on, or from `start`, rad."""
+        """Return the way of a motion to `q`, of a path, or of a trajectory, from now on, or from `start`, rad.
+
+        It is planned with the tool of this number; None: with the one in use.
+        """
+        planner = self._planner_of(tool)
         here = self.plan_start() if start is None else list(start)
         if q is not None:
             self._require_joints(q, "q")
-            found = await asyncio.to_thread(self._planner.joint_move, q, here, speed, synchronized)
+            found = await asyncio.to_thread(planner.joint_move, q, here, speed, synchronized)
             if isinstance(found, Refusal):
                 raise self._channel.error("refused", found)
             path, duration_s = found
             return {"path": path, "duration_s": duration_s, "length_m": None, "slowed": None}
 
         def plan() -> tuple[Plan, preview.JointPath]:
-            made = self._planner.path(stops, here, speed) if stops else self._planner.trajectory(points, here)
-            return made, self._planner.way(made, here)
+            made = planner.path(stops, here, speed) if stops else planner.trajectory(points, here)
+            return made, planner.way(made, here)
 
         made, path = await asyncio.to_thread(plan)
         return {"path": path, "duration_s": made.duration_s, "length_m": made.length_m, "slowed": made.slowed}
 
-    async def preview_pose(self, pose: Sequence[float], speed: float | None, line: bool) -> Json:
+    async def preview_pose(
+        self, pose: Sequence[float], speed: float | None, line: bool, tool: int | None = None
+    ) -> Json:
         """Return the way of the tool to a pose: on a straight line, or by the joints."""
         if line or self._channel.control_mode is ControlMode.CARTESIAN:
-            return await self.preview(None, [Stop(tuple(pose))], (), speed, True)
-        q = await asyncio.to_thread(self._planner.joints_at, pose, self.plan_start())
-        return await self.preview(q, (), (), speed, True)
+            return await self.preview(None, [Stop(tuple(pose))], (), speed, True, tool=tool)
+        q = await asyncio.to_thread(self._planner_of(tool).joints_at, pose, self.plan_start())
+        return await self.preview(q, (), (), speed, True, tool=tool)
 
-    async def preview_file(self, file: str, approach: bool) -> Json:
+    async def preview_file(self, file: str, approach: bool, tool: int | None = None) -> Json:
         """Return the way of a motion file; with `approach` it begins at its first point."""
-        points, stops, speed = await asyncio.to_thread(self._planner.read, file)
+        planner = self._planner_of(tool)
+        points, stops, speed = await asyncio.to_thread(planner.read, file)
         if not (stops or points):
             raise RtcpError("refused", f"{file} holds a program: `rtcp run --dry` plans it", "program")
         if not approach:
-            return await self.preview(None, stops, points, speed, True)
+            return await self.preview(None, stops, points, speed, True, tool=tool)
         first = points[0].q if points else stops[0].q
         if first is None:
-            first = tuple(await asyncio.to_thread(self._planner.joints_at, stops[0].pose or (), self.plan_start()))
-        way = await self.preview(first, (), (), None, True)
+            first = tuple(await asyncio.to_thread(planner.joints_at, stops[0].pose or (), self.plan_start()))
+        way = await self.preview(first, (), (), None, True, tool=tool)
         rest = stops[1:]
 
         def plan() -> tuple[Plan | None, preview.JointPath]:
             if not (points or rest):
                 return None, []
-            made = self._planner.path(rest, first, speed) if stops else self._planner.trajectory(points, first)
-            return made, self._planner.way(made, first)
+            made = planner.path(rest, first, speed) if stops else planner.trajectory(points, first)
+            return made, planner.way(made, first)
 
         made, path = await asyncio.to_thread(plan)
         if made is None:
@@ -552,6 +591,23 @@ class MotionActions:
 
         async with self._channel.lease(caller) as lease:
             return await self._run(lease, command, _UNPLANNED_S, command.name, position)
+
+    async def guide(self, caller: Caller, duration_s: float) -> Json:
+        """Let the arm be guided by hand; return when it holds again, and why: `done`, `halted`, or `released`."""
+        channel = self._channel
+        since = channel.observer.last_event
+
+        def ended() -> Json:
+            done = any(isinstance(record.event, Arrived) for record in channel.events(since))
+            return {"ended": "done" if done else "halted", "positions": channel.joints("actual_position")}
+
+        async with channel.lease(caller) as lease:
+            try:
+                return await self._run(lease, Guide(duration_s), _GUIDED_S, "guiding", ended)
+            except RtcpError as error:
+                if error.reason != PermissionWithdrawn.name:
+                    raise
+                return {"ended": "released", "positions": channel.joints("actual_position")}
 
     async def fk(self, q: Sequence[float]) -> Json:
         """Return the pose of the tool at joint positions, rad."""
@@ -620,7 +676,7 @@ class MotionActions:
         arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what, tracking)
         timeout_s = _TIMEOUT_S + 2 * plan.duration_s
         watch = None if tracking is None else tracking.look
-        sent = command(slot, len(plan.rows))
+        sent = command(slot, len(plan.rows), tool=plan.tool)
         found = await self._run(lease, sent, timeout_s, what, arrival, plan.end, begun, watch)
         return found | {"duration_s": plan.duration_s, "length_m": plan.length_m, "slowed": plan.slowed}
 

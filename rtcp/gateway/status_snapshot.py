@@ -76,7 +76,7 @@ class StatusSnapshot:
         self.names = Names(session.config, session.partners)
         self.limits = Limits(session.config)
         """In force."""
-        self._tool = None if session.config.arm is None else ToolMotion(session.config.arm, observer.schema)
+        self._tool = None if session.config.arm is None else ToolMotion(session.config.models, observer.schema)
         self._at = max(observer.head - 1, 0)
         self._event = 0
         self._text = 0
@@ -190,7 +190,7 @@ class StatusSnapshot:
     def _limited_by(self, record: npt.NDArray[np.void]) -> dict[str, str]:
         """Return what keeps the motion below the commanded velocity: a sentence under the name of each limit."""
         held, q = int(record["held"]), [float(value) for value in record["commanded_position"]]
-        names, model, found = self.names, self._session.config.arm, {}
+        names, models, found = self.names, self._session.config.models, {}
         low, high = self.limits.low, self.limits.high
         for axis in (axis for axis in range(len(q)) if held >> axis & 1):
             name = names.joint(axis)
@@ -206,8 +206,9 @@ class StatusSnapshot:
                 f"{name} is {abs(end - q[axis]):.4f} rad from the end of its range, {end:g} rad "
                 f"({names.key(axis)}.position in {names.file})"
             )
-        if model is None:
+        if not models:
             return found
+        model = models[int(record["tool"])]
         distances = singularity_distances(model, q)
         for which, (name, unit) in enumerate(SINGULARITIES):
             if held & HELD_SHOULDER << which:
@@ -268,7 +269,7 @@ class StatusSnapshot:
         if self._tool is None:
             return None
         q = np.stack([record["actual_position"], record["commanded_position"]])
-        poses, velocities = self._tool.of(q, np.stack([record["actual_velocity"]] * 2))
+        poses, velocities = self._tool.of(q, np.stack([record["actual_velocity"]] * 2), np.stack([record["tool"]] * 2))
         found = {"pose": poses[0], "velocity": velocities[0], "commanded_pose": poses[1]}
         return {name: [round(one, 7) for one in values.tolist()] for name, values in found.items()}
 
@@ -325,6 +326,11 @@ class StatusSnapshot:
             "drive_mode": _name(DriveMode, int(record["drive_mode"])),
             "control_mode": _name(ControlMode, control_mode),
             "speed_override": float(record["speed_override"]),
+            "tool_name": self.names.tool(int(record["tool"])),
+            "payload": {
+                "mass": float(record["payload_mass"]),
+                "centre": [float(record[f"payload_{axis}"]) for axis in "xyz"],
+            },
             "joystick": {
                 "mode": JOYSTICK_MODES[int(record["joystick_mode"]) % len(JOYSTICK_MODES)],
                 "controls_arm": bool(flags & FLAG_ARM_HAS_JOYSTICK),

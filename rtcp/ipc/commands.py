@@ -154,6 +154,26 @@ class Resume(Command):
     needs_lease = False
 
 
+class SetTool(Command):
+    """Use another tool; it holds nothing yet."""
+
+    states = AT_REST
+    waits_for_drive_mode = True
+    tool: int
+    """Its number, from 0, in the order of `kinematics.tools`."""
+
+
+class SetPayload(Command):
+    """Carry the weight of what the tool holds: its mass, kg, and its centre in the frame of the tool, m."""
+
+    states = AT_REST
+    waits_for_drive_mode = True
+    mass: float
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
 class SetZero(Command):
     """Set what a drive shows where its axis is at 0."""
 
@@ -190,6 +210,8 @@ class RunTrajectory(MotionCommand):
     rows: int
     open: bool = False
     """Whether more rows follow (`ExtendTrajectory`): each replaces one that has been passed."""
+    tool: int = 0
+    """Number of the tool for which it was planned: refused with another one in use."""
 
 
 class ExtendTrajectory(MotionCommand):
@@ -214,6 +236,8 @@ class RunInStep(MotionCommand):
     brakes: int
     """Numbers behind the rows: how long the whole group takes to brake, s, at every `brake_step_s` of the path."""
     brake_step_s: float
+    tool: int = 0
+    """As of `RunTrajectory`."""
 
 
 class RunLines(MotionCommand):
@@ -221,6 +245,8 @@ class RunLines(MotionCommand):
 
     slot: int
     rows: int
+    tool: int = 0
+    """As of `RunTrajectory`."""
 
 
 class StreamPosition(MotionCommand):
@@ -274,3 +300,11 @@ class ApplyTorque(MotionCommand):
     damping: float
     """Fraction, 0 to 1, of each joint's `cst_damping`."""
     hold_s: float
+
+
+class Guide(MotionCommand):
+    """Let the arm be guided by hand: it carries its weight, and follows within its limits."""
+
+    states = frozenset({State.HOLDING})
+    duration_s: float = 0.0
+    """s, at most 3600; 0: until it is halted, or 3600 s."""

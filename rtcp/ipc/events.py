@@ -119,6 +119,18 @@ class Resumed(Event, number=57):
     """the motion goes on"""
 
 
+class ToolChanged(Event, number=58):
+    """the tool is {tool_name}"""
+
+    tool: int
+
+
+class PayloadChanged(Event, number=59):
+    """the payload is {mass:.6g} kg"""
+
+    mass: float
+
+
 class ControlModeChanged(Event, number=30):
     """control mode {mode}"""
 
@@ -551,6 +563,15 @@ class CommandExpired(MotionEnded, number=109):
     """the command was not renewed in time: controlled stop"""
 
     by_limit = False
+
+
+class GuidedTooFast(MotionEnded):
+    """the hand moved the tool at {speed:.6g} m/s, the bound is {limit:.6g} m/s (guiding.speed in {file}): controlled
+    stop; push less hard"""
+
+    by_limit = False
+    speed: float
+    limit: float
 
 
 class OutOfReach(MotionEnded, number=102):

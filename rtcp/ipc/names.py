@@ -96,6 +96,11 @@ class Names:
             return f"the clearance of the arm's own bodies (cartesian.clearance in {self.file})"
         return f"the box that the tool stays in (cartesian.box in {self.file})"
 
+    def tool(self, number: int) -> str:
+        """Return the name of a tool."""
+        names = self.config.tool_names
+        return names[number] if 0 <= number < len(names) else f"number {number}"
+
     def partner(self, which: int) -> str:
         """Return the name of a partner in the cell."""
         return self._partners[which] if 0 <= which < len(self._partners) else f"partner {which + 1}"
@@ -145,6 +150,8 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "low": lambda names, about: names.config.axes[about.axis].position.min,
     "high": lambda names, about: names.config.axes[about.axis].position.max,
     "box_name": lambda names, about: names.box(about.box),
+    "tool_name": lambda names, about: names.tool(about.tool),
+    "planned_tool": lambda names, about: names.tool(about.planned),
     "partner_name": lambda names, about: names.partner(about.partner),
     "first_link": lambda names, about: names.link(about.first),
     "second_link": lambda names, about: names.link(about.second),

@@ -281,6 +281,45 @@ class SpeedOverridden(Refusal):
     fraction: float
 
 
+class UnknownTool(Refusal):
+    """tool {tool} does not exist: 0 to {highest}, in the order of kinematics.tools in {file}"""
+
+    tool: int
+    highest: int
+
+
+class ToolInBox(Refusal):
+    """with the tool {tool_name} the arm would be beyond the bounds of {box_name}: move it away first"""
+
+    tool: int
+    box: int
+
+
+class PlannedForAnotherTool(Refusal):
+    """the motion was planned for the tool {planned_tool}, and {tool_name} is in use: plan it again"""
+
+    planned: int
+    tool: int
+
+
+class MassesUnknown(Refusal):
+    """the masses of the links are unknown (kinematics.links in {file}): the arm's weight cannot be carried"""
+
+
+class PayloadTooHeavy(Refusal):
+    """a payload of {mass:.6g} kg is not allowed: 0 to {limit:g} kg (payload.max_mass in {file})"""
+
+    mass: float
+    limit: float
+
+
+class PayloadTooFar(Refusal):
+    """the payload's centre is {distance:.6g} m from the tool point: at most {limit:g} m is allowed"""
+
+    distance: float
+    limit: float
+
+
 class StreamPointDropped(Refusal):
     """the target came {late_s:.6g} s late or out of order: it was dropped"""
 
@@ -472,3 +511,25 @@ class NoRoomForPoints(Refusal):
 
     rows: int
     most: int
+
+
+class NoEnablingSwitch(Refusal):
+    """no enabling switch is configured (inputs.enabling_switch in {file}): a person guides the arm only while one is
+    held; guiding.enabling_switch: false allows it without"""
+
+
+class WeightDiffers(Refusal):
+    """{joint} holds {held:.6g} Nm, its weight by the masses is {expected:.6g} Nm: at most {limit:.6g} Nm apart are
+    allowed (guiding.weight_error in {file}); set kinematics.links, or take off the load"""
+
+    axis: int
+    held: float
+    expected: float
+    limit: float
+
+
+class DurationOutOfRange(Refusal):
+    """duration {value:.6g} s is not allowed: at most {limit:.6g} s, or 0: until it is halted"""
+
+    value: float
+    limit: float

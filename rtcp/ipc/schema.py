@@ -218,6 +218,11 @@ ARM_MODES = (
     Field("duration_s", "float32", "s", "Duration of the motion, where it is known.", part="arm"),
     Field("speed_override", "float64", "", "Fraction of its speed at which the arm moves, 0.01 to 1.", part="arm"),
 )
+LOAD_FIELDS = (
+    Field("tool", "uint8", "", "Number of the tool in use, from 0, in the order of the arm's file.", part="arm"),
+    Field("payload_mass", "float64", "kg", "Mass of what the tool holds.", part="arm"),
+    *(Field(f"payload_{axis}", "float64", "m", "Its centre in the frame of the tool.", part="arm") for axis in "xyz"),
+)
 _VECTORS = {
     "actual_position": ("float64", "rad", "Measured position."),
     "actual_velocity": ("float64", "rad/s", "Measured velocity."),
@@ -236,7 +241,7 @@ PER_JOINT = tuple(_VECTORS)
 def arm_fields(joints: int) -> tuple[Field, ...]:
     """Return the fields of an arm."""
     vectors = [Field(name, *about, shape=(joints,), part="arm") for name, about in _VECTORS.items()]
-    return (*ARM_MODES, *vectors)
+    return (*ARM_MODES, *vectors, *LOAD_FIELDS)
 
 
 GRIPPER_FIELDS = _fields_of(

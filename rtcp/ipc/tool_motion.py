@@ -6,6 +6,9 @@ In the loop this would add 164 to the 232 thousand instructions of a cycle that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -24,50 +27,51 @@ FIELDS = tuple(
     for at, (unit, description) in enumerate(zip(("m", "rad", "m/s", "rad/s"), _DESCRIPTIONS, strict=True))
     for name in (*POSE, *VELOCITY)[3 * at : 3 * at + 3]
 )
-_SOURCES = {"actual_position", "actual_velocity"}
+_SOURCES = {"actual_position", "actual_velocity", "tool"}
 
 
 class ToolMotion:
-    """Adds the fields of the tool to cycle records; of an arm without geometry it adds none.
+    """Adds the fields of the tool in use to cycle records; of an arm without geometry it adds none.
 
     Args:
-        model: the arm; None: its geometry is unknown.
+        models: of the arm, one a tool; none: its geometry is unknown.
         schema: of the records.
 
     Attributes:
         schema: of the records with these fields.
     """
 
-    def __init__(self, model: ArmModel | None, schema: RecordSchema) -> None:
-        self._model = model if set(schema.names) >= _SOURCES else None
-        self.schema = schema if self._model is None else RecordSchema((*schema.fields, *FIELDS))
+    def __init__(self, models: Sequence[ArmModel], schema: RecordSchema) -> None:
+        self._models = models if set(schema.names) >= _SOURCES else ()
+        self.schema = RecordSchema((*schema.fields, *FIELDS)) if self._models else schema
         self._kind = np.dtype([*record_type(schema).descr, *numpy_fields(RecordSchema(FIELDS))])
 
     def add(self, records: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
         """Return records of the ring, shape (n,), with the fields of the tool."""
-        if self._model is None:
+        if not self._models:
             return records
         before = records.dtype.itemsize
         found = np.empty(len(records), self._kind)
         if len(records):
             rows = found.view(np.uint8).reshape(len(records), -1)
             rows[:, :before] = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), -1)
-            motion = np.hstack(self.of(records["actual_position"], records["actual_velocity"]))
+            motion = np.hstack(self.of(records["actual_position"], records["actual_velocity"], records["tool"]))
             rows[:, before:] = np.ascontiguousarray(motion, "<f8").view(np.uint8)
         return found
 
     def of(
-        self, q: npt.NDArray[np.float64], velocity: npt.NDArray[np.float64]
+        self, q: npt.NDArray[np.float64], velocity: npt.NDArray[np.float64], tool: npt.NDArray[np.integer[Any]]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Return poses and velocities of the tool, both (n, 6), at joint positions, rad, and velocities, rad/s, (n, 6).
 
-        NaN where a joint's value is not finite.
+        NaN where a joint's value is not finite, or the arm has no tool of the number.
         """
-        assert self._model is not None
-        known = np.flatnonzero(np.isfinite(np.hstack([q, velocity])).all(axis=1))
-        if len(known) < len(q):
-            poses, twists = np.full((2, len(q), 6), np.nan)
-            poses[known], twists[known] = self.of(q[known], velocity[known])
-            return poses, twists
-        positions, rotations = forward_batch(self._model, q)
-        return np.hstack([positions, rpy_batch(rotations)]), twist_batch(self._model, q, velocity)
+        poses, twists = np.full((2, len(q), 6), np.nan)
+        known = np.isfinite(np.hstack([q, velocity])).all(axis=1)
+        for number, model in enumerate(self._models):
+            rows = np.flatnonzero(known & (tool == number))
+            if len(rows):
+                positions, rotations = forward_batch(model, q[rows])
+                poses[rows] = np.hstack([positions, rpy_batch(rotations)])
+                twists[rows] = twist_batch(model, q[rows], velocity[rows])
+        return poses, twists

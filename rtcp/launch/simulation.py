@@ -29,6 +29,7 @@ from rtcp.ipc.layout import LEASE_DURATION_AT, LEASE_ID_AT, LEASE_RENEWED_AT
 from rtcp.ipc.observer import Answer, EventRecord, Observer
 from rtcp.ipc.states import State
 from rtcp.launch.inprocess import InProcessBus
+from rtcp.virtual.arm import make_arm
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 
 NAME = "inprocess"
@@ -82,7 +83,10 @@ class Simulation:
     ) -> None:
         self.config = config = replace(config, bus=replace(config.bus, interface=NAME))
         self.period_ns = round(config.cycle.period_us * 1000)
-        self.bus = InProcessBus(_devices(config, segment, positions), seed, _BEGIN_NS)
+        segment = load_segment(config.source.parent / config.bus.segment) if segment is None else segment
+        devices = _devices(config, segment, positions)
+        self.bus = InProcessBus(devices, seed, _BEGIN_NS)
+        self.bus.segment.arm = make_arm(segment, devices)
         self.data = self.bus.configure(config.slaves, self.period_ns)
         self.models = [device for device in map(self._model, config.joints) if isinstance(device, CubemarsDrive)]
         self.box = next((s.device for s in self.bus.slaves if isinstance(s.device, DiewuIoBox)), None)
@@ -209,13 +213,12 @@ class Simulation:
         return answer
 
 
-def _devices(config: ArmConfig, segment: SegmentConfig | None, positions: Sequence[float] | None) -> list[Any]:
-    slaves = (load_segment(config.source.parent / config.bus.segment) if segment is None else segment).slaves
-    options = [dict(slave.options) for slave in slaves]
+def _devices(config: ArmConfig, segment: SegmentConfig, positions: Sequence[float] | None) -> list[Any]:
+    options = [dict(slave.options) for slave in segment.slaves]
     slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
     for joint, position in zip(config.joints, positions or (), strict=False):
         options[slots[joint.slave]]["initial_position"] = position
-    return [create(slave.model, **chosen) for slave, chosen in zip(slaves, options, strict=True)]
+    return [create(slave.model, **chosen) for slave, chosen in zip(segment.slaves, options, strict=True)]
 
 
 _WATCH_TURNS = 10

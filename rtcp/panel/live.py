@@ -675,6 +675,7 @@ class Live:
             "drive_mode": raw["drive_mode"],
             "control_mode": raw["control_mode"],
             "speed_override": round(100.0 * raw["speed_override"], 1),
+            "tool_name": raw["tool_name"],
             "holder": raw["lease"]["holder"],
             "age_s": round(raw["lost_s"] + max(0, time.monotonic_ns() - raw["time_ns"]) * 1e-9, 1),
             "bus": raw["bus"],
@@ -691,9 +692,10 @@ class Live:
             shown["processes"] = {name: self._process(name, raw) for name in raw["processes"]}
         shown["temperature"] = self._temperatures(raw)
         q = joints["actual_position"]
-        if self.config is not None and self.config.arm is not None and all(map(math.isfinite, q)):
-            pose = forward(self.config.arm, q)
-            distances = singularity_distances(self.config.arm, q)
+        model = None if self.config is None else self.config.model_of(raw["tool_name"])
+        if model is not None and all(map(math.isfinite, q)):
+            pose = forward(model, q)
+            distances = singularity_distances(model, q)
             shown["tool"] = [round(one, 5) for one in (*pose.position, *pose.rpy)]
             shown["singular"] = [None if one is None else round(one, 4) for one in distances]
         return shown

@@ -143,7 +143,7 @@ class Publications:
 
     def __init__(self, commands: Commands, has_link_frames: bool) -> None:
         self._commands, self._has_link_frames = commands, has_link_frames
-        self._arm: ArmModel | None = None
+        self._models: Sequence[ArmModel] = ()
         # A queue each: no subscriber that reads slowly holds the node.
         self._joint_states = rospy.Publisher("joint_states", JointState, queue_size=100, tcp_nodelay=True)
         self._feedback = rospy.Publisher(
@@ -157,7 +157,7 @@ class Publications:
     def connected(self, config: ArmConfig) -> None:
         """Set robot_description, where the geometry is known and nobody has set it."""
         rospy.loginfo("connected to %s", config.name)
-        self._arm = config.arm
+        self._models = config.models
         if config.arm is not None:
             self.describe(to_urdf(config.arm, [joint.torque for joint in config.joints]))
 
@@ -184,10 +184,10 @@ class Publications:
         self._joint_states.publish(states)
         self._feedback.publish(feedback)
         self._commands.publish_feedback(feedback)
-        if self._arm is None:
+        if not self._models:
             return
-        message = TFMessage()
-        for name, (position, (w, x, y, z)) in transforms_of(self._arm, sample.position, self._has_link_frames).items():
+        message, model = TFMessage(), self._models[sample.tool]
+        for name, (position, (w, x, y, z)) in transforms_of(model, sample.position, self._has_link_frames).items():
             one = TransformStamped(child_frame_id=name)
             one.header.stamp, one.header.frame_id = states.header.stamp, "base_link"
             one.transform.translation, one.transform.rotation = Vector3(*position), Quaternion(x, y, z, w)

@@ -234,12 +234,12 @@ class Publications:
     def __init__(self, wire: Wire, name: str, note_stop: Callable[[], None]) -> None:
         self._wire, self._make = wire, wire.make
         self._name, self._note_stop = name, note_stop
-        self._arm: ArmModel | None = None
+        self._models: Sequence[ArmModel] = ()
 
     def connected(self, config: ArmConfig) -> None:
         """Publish robot_description, where the geometry is known."""
         _LOG.info("connected to %s", config.name)
-        self._arm = config.arm
+        self._models = config.models
         if config.arm is not None:
             self.describe(to_urdf(config.arm, [joint.torque for joint in config.joints]))
 
@@ -258,8 +258,8 @@ class Publications:
             velocity=sample.velocity,
             effort=sample.effort,
         )
-        if self._arm is not None:
-            self._publish("tf", transforms=self._transforms(self._arm, sample))
+        if self._models:
+            self._publish("tf", transforms=self._transforms(self._models[sample.tool], sample))
         if "feedback_states" not in self._wire.topics:
             return
         error = [want - have for want, have in zip(sample.commanded, sample.position, strict=True)]

@@ -55,6 +55,8 @@ class JointSample:
     """Actual, Nm."""
     commanded: Numbers
     """Commanded position, rad."""
+    tool: int = 0
+    """Number of the tool in use."""
 
 
 @dataclass(frozen=True)
@@ -281,6 +283,7 @@ def _sample(record: Any, stamp_ns: int) -> JointSample:
         numbers("actual_velocity"),
         numbers("actual_torque"),
         numbers("commanded_position"),
+        int(record["tool"]),
     )
 
 

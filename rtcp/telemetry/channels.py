@@ -128,7 +128,7 @@ class Channels:
             )
             for topic, sources in _JOINTS.items()
         }
-        self._frames = None if config.arm is None else Frames(config.arm)
+        self._frames = Frames(config.models) if config.models else None
         self._tf = self._ros_channel("/tf", "tf2_msgs/msg/TFMessage", _TF)
         self._tf_ns = 0
         self._machine = self._json_channel("/machine", {"type": "object", "title": "rtcp.Machine"})
@@ -204,8 +204,8 @@ class Channels:
                 self._tf_ns = max(self._tf_ns + round(TF_S * 1e9), instant - round(TF_S * 1e9))
                 chosen.append(at)
         if chosen:
-            _send(self._tf, time_ns[chosen].tolist(),
-                  self._frames.messages(records["actual_position"][chosen], time_ns[chosen]))  # fmt: skip
+            some, instants = records[chosen], time_ns[chosen]
+            _send(self._tf, instants.tolist(), self._frames.messages(some["actual_position"], some["tool"], instants))
 
     def _publish_changes(self, records: Records, instants: Sequence[int]) -> None:
         columns = [
@@ -293,9 +293,11 @@ def _joint_template(names: Sequence[str], sources: Sequence[str | None]) -> CdrT
 class Frames:
     """The transforms from link to link, base_link to tool0, by the names of the arm's URDF."""
 
-    def __init__(self, model: ArmModel) -> None:
-        self._model = model
-        count = len(model.rows)
+    def __init__(self, models: Sequence[ArmModel]) -> None:
+        self._rows = models[0].rows
+        self._places = np.array([model.tool.position for model in models])
+        self._turns = np.array([(x, y, z, w) for w, x, y, z in (quaternion(model.tool.rotation) for model in models)])
+        count = len(self._rows)
         links = ["base_link", *(f"link{number}" for number in range(1, count + 1)), "tool0"]
         self._suffixes = [str(at) for at in range(count + 1)]
         self._template = CdrTemplate().count(count + 1)
@@ -303,10 +305,10 @@ class Frames:
             self._template.stamp(parent, str(at)).string(child).numbers(f"place{at}", "<f8", 3)
             self._template.numbers(f"turn{at}", "<f8", 4)
 
-    def messages(self, q: npt.NDArray[Any], time_ns: npt.NDArray[Any]) -> list[bytes]:
-        """Return the messages for joint positions, shape (N, joints), rad, at instants, shape (N,), ns."""
+    def messages(self, q: npt.NDArray[Any], tools: npt.NDArray[Any], time_ns: npt.NDArray[Any]) -> list[bytes]:
+        """Return the messages for joint positions, shape (N, joints), rad, and tools at instants, shape (N,), ns."""
         values = dict(stamps(time_ns, self._suffixes))
-        for at, row in enumerate(self._model.rows):
+        for at, row in enumerate(self._rows):
             # Modified DH: Rx(alpha) Tx(a) Rz(theta) Tz(d).
             half, theta = row.alpha / 2, (q[:, at] + row.offset) / 2
             sine, cosine = np.sin(half), np.cos(half)
@@ -314,8 +316,6 @@ class Frames:
             values[f"turn{at}"] = np.column_stack(
                 (sine * np.cos(theta), -sine * np.sin(theta), cosine * np.sin(theta), cosine * np.cos(theta))
             )
-        last, tool = len(self._model.rows), self._model.tool
-        w, x, y, z = quaternion(tool.rotation)
-        values[f"place{last}"] = np.tile(tool.position, (len(q), 1))
-        values[f"turn{last}"] = np.tile((x, y, z, w), (len(q), 1))
+        last = len(self._rows)
+        values[f"place{last}"], values[f"turn{last}"] = self._places[tools], self._turns[tools]
         return self._template.fill(len(q), values)

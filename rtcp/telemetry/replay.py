@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, log, pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -21,16 +21,23 @@ TOLERANCES_RAD = (1e-4, 3e-4, 9e-4)
 _ROUNDING = 1e-10
 _SLOPE_S, _SHORTEST_S = 5e-3, 2e-3
 """Time before and after a sample over which its velocity is taken; shortest time between two points."""
+_RESTING_RAD = 1e-3
+"""A hand-guided arm that turns by less rests."""
+_SIGMAS = 4.0
 _AT_REST = 5e-3
 """Below this velocity, rad/s, the motion counts as at rest where it begins and ends."""
 
 
-def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
+def trajectory(
+    recorded: Recorded, scale: float = 1.0, smooth_hz: float | None = None, rest_s: float | None = None
+) -> list[dict[str, Any]]:
     """Return the points `{"t": s, "q": [rad], "v": [rad/s]}` of what moves in a recording; rest around it is left out.
 
     Args:
         recorded: at least one of `POSITIONS`.
         scale: of the speed; 0.5 takes twice the time.
+        smooth_hz: cutoff of `smoothed`; None: as it was recorded.
+        rest_s: rests in the motion that last longer last so long, s; None: as they were.
 
     Raises:
         RecordingError: nothing moves in it, cycles of the motion are missing, the drives were not enabled in all of it,
@@ -57,6 +64,11 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
     kept = np.append(True, cycles > 0.0)
     t = np.append(0.0, np.cumsum(cycles))[kept] * (recorded.period_s / scale)
     q = q[whole][kept]
+    if rest_s is not None:
+        kept = _shortened(q, max(1, round(rest_s / recorded.period_s)))
+        t, q = t[: kept.sum()], q[kept]
+    if smooth_hz is not None:
+        t, q = smoothed(t, q, smooth_hz, scale)
     v = _velocities(t, q, max(1, round(_SLOPE_S / recorded.period_s)))
     low, high = q.min(axis=0), q.max(axis=0)
     rounded = np.clip(np.round(q, 6), low, high)
@@ -73,6 +85,48 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
             return points
     defect = f"its motion of {t[-1] - t[0]:.1f} s needs {len(points)} points, at most {MOST_POINTS} are allowed"
     raise RecordingError("long", recorded.path, f"{defect}: choose a part by --start and --end", found=len(points))
+
+
+def smoothed(t: Array, q: Array, cutoff_hz: float, scale: float = 1.0) -> tuple[Array, Array]:
+    """Return times and positions without what is faster than a cutoff: a Gaussian of no delay, at half power there.
+
+    Its weights are positive: no joint goes beyond what was recorded of it. The motion begins and ends at rest, and
+    takes a little more time for it.
+
+    Args:
+        t: s, at equal steps, the recorded ones over `scale`.
+        q: rad, shape (len(t), n).
+        cutoff_hz: of the recorded motion.
+        scale: of the speed.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    step = (t[-1] - t[0]) / (len(t) - 1)
+    sigma = sqrt(log(2.0)) / (2.0 * pi * cutoff_hz * scale * step)
+    rest = ceil(_SIGMAS * sigma)
+    held = np.pad(q, ((rest, rest), (0, 0)), mode="edge")
+    return t[0] + step * np.arange(len(held)), gaussian_filter1d(held, sigma, axis=0, mode="nearest", truncate=_SIGMAS)
+
+
+def deviation(recorded: Recorded, smooth_hz: float) -> float:
+    """Return by how much `smoothed` differs from what was recorded, at most, rad."""
+    q = recorded.column(next(name for name in POSITIONS if name in (recorded.records.dtype.names or ())))
+    t = recorded.period_s * np.arange(len(q), dtype=np.float64)
+    whole = smoothed(t, q, smooth_hz)[1]
+    rest = (len(whole) - len(q)) // 2
+    return float(np.abs(whole[rest : rest + len(q)] - q).max())
+
+
+def _shortened(q: Array, longest: int) -> npt.NDArray[np.bool_]:
+    """Return which samples are kept: a rest begins where no joint leaves `_RESTING_RAD` for `longest` samples."""
+    kept = np.ones(len(q), bool)
+    begin = 0
+    for at in range(1, len(q)):
+        if np.abs(q[at] - q[begin]).max() > _RESTING_RAD:
+            begin = at
+        elif at - begin >= longest:
+            kept[at] = False
+    return kept
 
 
 def _sent_again(speeds: Array) -> npt.NDArray[np.int64]:

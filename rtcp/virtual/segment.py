@@ -11,6 +11,7 @@ from typing import NamedTuple
 from rtcp.config.document import Finding, read
 from rtcp.config.model import ConfigError
 from rtcp.config.segment import SegmentConfig, load_segment
+from rtcp.virtual.arm import VirtualArm, make_arm
 from rtcp.virtual.device import DeviceModel, OptionError, create
 from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
@@ -137,6 +138,8 @@ class Segment:
         self.chain = Chain(self.slaves)
         self.miscounts: list[Miscount] = []
         self.damages: list[Damage] = []
+        self.arm: VirtualArm | None = None
+        """What the drives turn; None: each has its own load alone."""
         self._attention: list[Slave] = []
         self._waiting: deque[Slave] = deque()
         self._next_tick = t + IDLE_TICK
@@ -254,6 +257,8 @@ class Segment:
                     application.latch()
                     self._queue(slave, now)
         if idle:
+            if self.arm is not None:
+                self.arm.update(now)
             self._next_tick = now + IDLE_TICK
         self.next_event = min(earliest, self._next_tick)
 
@@ -334,7 +339,9 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
         raise ConfigError(read(config.source).sentences(findings))
     drifts = [entry.drift_ppm for entry in config.slaves]
     aliases = [entry.alias for entry in config.slaves]
-    return Segment(make_slaves(devices, drifts, delays, aliases, t), t)
+    segment = Segment(make_slaves(devices, drifts, delays, aliases, t), t)
+    segment.arm = make_arm(config, devices)
+    return segment
 
 
 def check_segment(path: Path) -> None:

@@ -66,6 +66,7 @@ class NotingRobot:
         self.planned: list[Any] = []
         self._refused, self._reason = refused, reason
         self.io = self
+        self.tool = "short"
         self.positions = (0.5,) * 6
         self.happened: list[Any] = []
 
@@ -73,7 +74,7 @@ class NotingRobot:
         return [event for event in self.happened if event.number > since]
 
     def status(self) -> Any:
-        return SimpleNamespace(commanded_positions=self.positions)
+        return SimpleNamespace(commanded_positions=self.positions, tool=self.tool)
 
     def fk(self, q: Sequence[float]) -> list[float]:
         return [9.0, 8.0, 7.0, *q[:3]]
@@ -225,6 +226,19 @@ def test_there_is_no_way_back_before_the_first_motion_and_over_arcs_with_an_angl
     assert not robot.done
 
 
+def test_a_program_that_begins_behind_the_choice_of_a_tool_needs_that_tool(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+    made = program(TEXT.replace("{gripper: open}", "{tool: long}").replace("via: home", "via: right"))
+    for run in (made.run, made.check):
+        with pytest.raises(RtcpError, match=r"program\.yaml:11: the program uses the tool long there") as refused:
+            run(robot, start=3)
+        assert refused.value.reason == "another_tool"
+    assert not robot.done
+    robot.tool = "long"
+    made.run(robot, start=3)
+    assert robot.done[0] == "lamp False"
+
+
 @pytest.mark.parametrize("what", ["halted", "moved_meanwhile"])
 def test_a_halt_and_a_motion_of_others_end_it_before_the_next_step(program: Callable[..., Program], what: str) -> None:
     robot: Any = NotingRobot()
@@ -259,6 +273,11 @@ def test_a_part_that_runs_again_is_a_motion_of_its_own_also_where_its_last_step_
         ("line: home", "line: hoem", '22: parts[1].steps[0].line: found "hoem", allowed is one of home, right, below'),
         ("run: twice", "run: round", 'parts[0].steps: the part "round" runs itself'),
         ("line: home", "run: round", "runs itself"),
+        (
+            "{wait_s: 0.001}",
+            "{tool: probe}",
+            '18: parts[0].steps[1].via: found "home", which has q; with several tools',
+        ),
         ("via: home, ", "", "18: parts[0].steps[1].arc: an arc needs via beside it"),
         ("{gripper: open}", "{gripper: open, speed: 1}", "10: program[2].speed: found beside gripper"),
         ("{gripper: open}", "{gripper: open, wait_s: 1}", "10: program[2]: found gripper and wait_s"),

@@ -72,6 +72,8 @@ def status() -> dict[str, Any]:
         "limited_by": {},
         "control_mode": "joint",
         "speed_override": 1.0,
+        "tool_name": "tool",
+        "payload": {"mass": 0.0, "centre": [0.0, 0.0, 0.0]},
         "drive_mode": "csp",
         "joystick": {"mode": "X-Y", "controls_arm": True},
         "robot": {"mode": "auto", "e_stopped": False, "drives_powered": True, "motion_possible": True,

@@ -7,10 +7,12 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
+from kinematics.capsules import capsules, with_every_tool
 from kinematics.forward import forward, frames
 from kinematics.model import Capsule, DhRow, JointLimit
 from kinematics.pose import IDENTITY, Pose
@@ -122,6 +124,29 @@ def test_the_bodies_of_a_file_are_those_of_its_model(directory: Path) -> None:
     assert load_kinematics(ARM).bodies == ()
 
 
+def test_each_tool_is_a_model_of_its_own_whose_last_link_carries_it(directory: Path) -> None:
+    body = {"start": [0, 0, 0], "end": [0, 0, 0.3], "radius": 0.02}
+    probe = {"name": "probe", "position": [0, 0, 0.3], "mass": 0.21, "centre": [0, 0, 0.145], "bodies": [body]}
+    arm = load(rewritten(ARM, lambda data: data["kinematics"].update(tools=[{"name": "flange"}, probe])))  # type: ignore[attr-defined]
+    bare, with_probe = arm.models
+    assert arm.tool_names == ("flange", "probe")
+    assert (bare.tool, bare.links) == (IDENTITY, load_kinematics(default_config()).links)
+    assert with_probe.tool.position == (0.0, 0.0, 0.3)
+    assert with_probe.links[5].mass == pytest.approx(0.070 + 0.21)
+    assert with_probe.links[5].centre == pytest.approx((0.0, 0.0, (0.070 * -0.035 + 0.21 * 0.145) / 0.28))
+    assert capsules(with_probe) == (*capsules(bare), Capsule(6, (0.0, 0.0, 0.0), (0.0, 0.0, 0.3), 0.02))
+    assert capsules(with_every_tool(arm.models)) == capsules(with_probe)
+
+
+def test_a_tool_has_a_mass_only_where_the_links_have(directory: Path) -> None:
+    def change(data: dict[str, Any]) -> None:
+        del data["kinematics"]["links"]
+        data["kinematics"]["tools"] = [{"name": "probe", "mass": 0.2}]
+
+    with pytest.raises(ConfigError, match=r"kinematics.tools\[0\].mass: found 0.2 beside links of unknown mass"):
+        load_kinematics(rewritten(IRB, change))
+
+
 def test_a_file_of_kinematics_alone_is_no_arm_to_start(directory: Path) -> None:
     with pytest.raises(ConfigError, match="the key joints is missing"):
         load(IRB)
@@ -191,7 +216,7 @@ def test_limits_are_needed_where_no_joints_have_them(directory: Path) -> None:
 def test_an_arm_without_kinematics_says_so_when_it_is_asked_for_them(directory: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_kinematics(rewritten(ARM, without_kinematics))
-    wanted = "it must be a mapping with the keys dh, limits, links, tool, bodies"
+    wanted = "it must be a mapping with the keys dh, limits, links, tool, tools, bodies"
     assert caught.value.problems == [f"{ARM}:1: the key kinematics is missing; {wanted}"]
 
 

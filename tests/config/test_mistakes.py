@@ -72,7 +72,8 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      'drive_mode: found the text "cps", allowed is one of csp, csv, cst'),
     (ARM, [("lease_s:", "leese_s:")],
      "leese_s: this key does not exist; did you mean lease_s? allowed are name, joints, cycle, bus, drive_mode, "
-     "control_mode, enable_timeout_s, lease_s, home, cartesian, jog, supervision, stops, inputs, outputs, gripper, "
+     "control_mode, enable_timeout_s, lease_s, home, cartesian, jog, guiding, supervision, stops, inputs, outputs, gripper, "
+     "payload, "
      "recording, ros, processes, slaves, kinematics"),
     (ARM, [("home: [0, 0.3, pi/2, 0, 0.5, 0]", "home: [0, 0.3, pi/2, 0, 0.5]")],
      "home: found 5 numbers, allowed are 6, one a joint"),
@@ -82,8 +83,8 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      "cycle.zzz: this key does not exist; allowed are period_us, priority, cpu, spin_us"),
     (ARM, [("lease_s: 0.5", "source: here")],
      "source: this key does not exist; allowed are name, joints, cycle, bus, drive_mode, control_mode, "
-     "enable_timeout_s, lease_s, home, cartesian, jog, supervision, stops, inputs, outputs, gripper, recording, ros, "
-     "processes, slaves, kinematics"),
+     "enable_timeout_s, lease_s, home, cartesian, jog, guiding, supervision, stops, inputs, outputs, gripper, payload, "
+     "recording, ros, processes, slaves, kinematics"),
     (ARM, [("    jerk: 20.0\n", "")],
      "joints[0]: the key jerk is missing; it must be a number of at least 0.001"),
     (ARM, [("{min: -3.1, max: 3.1}", "[-3.1, 3.1]")],
@@ -308,10 +309,17 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      "kinematics.bodies[0].radius: found 0, allowed is a number greater than 0"),
     (IRB, [("kinematics:\n", "kinematics:\n  bodies: []\n")],
      "kinematics.bodies: found an empty list, allowed is a list with at least one entry"),
+    (IRB, [("kinematics:\n", "kinematics:\n  tool: {position: [0, 0, 1]}\n  tools: [{name: a}]\n")],
+     "kinematics.tool: found beside tools: move it into the list, as its first"),
+    (IRB, [("kinematics:\n", "kinematics:\n  tools: [{name: a}, {name: a}]\n")],
+     'kinematics.tools[1].name: found the text "a", the name of tools[0].name; each needs its own'),
+    (IRB, [("kinematics:\n", BODIES + "  tools: [{name: a, bodies: []}, {name: b}]\n")],
+     "kinematics.tools[1]: the key bodies is missing; where the arm's are named, so are the tool's: a list, [] for "
+     "none"),
     (IRB, [("kinematics:\n", "kinematics: []\nother:\n")],
-     "kinematics: found an empty list, allowed is a mapping with the keys dh, limits, links, tool, bodies"),
-    (IRB, [("name: abb-irb120", "name: abb-irb120\npayload: 3")],
-     "payload: this key does not exist; allowed are name, kinematics"),
+     "kinematics: found an empty list, allowed is a mapping with the keys dh, limits, links, tool, tools, bodies"),
+    (IRB, [("name: abb-irb120", "name: abb-irb120\ncolor: 3")],
+     "color: this key does not exist; allowed are name, kinematics"),
     (ARM, [("kinematics:\n", MECHANICAL.replace("max: pi", "max: 3.0", 1))],
      "joints[0].position.max: found 3.1, allowed is at most 3, the joint's mechanical end in kinematics.limits[0]"),
     (ARM, [("kinematics:\n", MECHANICAL.replace("min: -pi", "min: -pi/2", 1))],

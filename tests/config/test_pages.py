@@ -9,7 +9,7 @@ import pytest
 
 from docs.generate import FOLDER, generated, keys_of
 from rtcp.config.model import ArmFile, DeviceDescription, MotionFile
-from rtcp.config.segment import SegmentSlave
+from rtcp.config.segment import SegmentFile
 
 PAGES = sorted(FOLDER.glob("*.md"))
 OWN = [
@@ -20,11 +20,12 @@ OWN = [
     "simple_message.md",
     "devices.md",
     "segment.md",
+    "guiding.md",
 ]
 KEYS = {
     "arm": list(keys_of(ArmFile)),
     "device": list(keys_of(DeviceDescription)),
-    "segment": list(keys_of(SegmentSlave, "slaves[].")),
+    "segment": list(keys_of(SegmentFile)),
     "motion": list(keys_of(MotionFile)),
 }
 UNITS = r"\b(m|rad)(/s[²³]?)?\b|\bNm\b|\bkg\b|\b1/s\b|, (s|ms|us|ns)\b|parts per million"
@@ -39,7 +40,7 @@ def test_the_generated_parts_of_a_page_are_up_to_date(page: Path) -> None:
 
 @pytest.mark.parametrize("file", KEYS)
 def test_every_key_of_a_file_is_on_exactly_one_page(file: str) -> None:
-    arm = "".join((FOLDER / name).read_text() for name in (*OWN[:5], "kinematics.md", "processes.md"))
+    arm = "".join((FOLDER / name).read_text() for name in (*OWN[:5], "guiding.md", "kinematics.md", "processes.md"))
     text = {"arm": arm} | {
         kind: (FOLDER / page).read_text()
         for kind, page in (("device", "devices.md"), ("segment", "segment.md"), ("motion", "motion.md"))

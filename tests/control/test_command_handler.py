@@ -14,6 +14,7 @@ from rtcp.ipc.commands import (
     Disable,
     Enable,
     ExtendTrajectory,
+    Guide,
     Halt,
     Home,
     Jog,
@@ -31,7 +32,9 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetPayload,
     SetSpeedOverride,
+    SetTool,
     SetZero,
     Shutdown,
     StreamPosition,
@@ -67,12 +70,12 @@ HEARTBEAT = 0x0004
 ANYONE = {"disable", "halt", "pause", "resume", "set_speed_override", "shutdown"}
 """Commands that need no lease: they make the arm safer."""
 READY = [SetOutput(5, True), SetZero(0, 0.0), Enable(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT),
-         MoveGripper(False), SetLimits(0, 1)]  # fmt: skip
+         MoveGripper(False), SetLimits(0, 1), SetTool(0), SetPayload(0.1)]  # fmt: skip
 HOLDING = [
     move_to(0.1, 0.1), RunTrajectory(0, 1), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
     RunInStep(0, 1, 1, 0, 0, 1, 0.1),
     Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2),
-    Home(0), *READY[3:],
+    Guide(), Home(0), *READY[3:],
 ]  # fmt: skip
 WITH_LEASE = {State.READY: READY, State.HOLDING: HOLDING, State.FAULT: [Reset()]}
 """Commands that need the lease, in a state that accepts them."""

@@ -144,7 +144,7 @@ def lose_the_box(simulation: Simulation) -> None:
 def brakes(simulation: Simulation) -> list[float]:
     """What each joint's closed brake slows it down by at least, rad/s2, with the load pulling the other way."""
     joints = [model.mechanics for model in simulation.models]
-    return [(one.holding_torque + one.coulomb - one.gravity_torque) / one.inertia for one in joints]
+    return [(one.holding_torque + one.coulomb - abs(one.external_torque)) / one.inertia for one in joints]
 
 
 # -- hold -----------------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from rtcp.ipc.commands import (
     Disable,
     Enable,
     ExtendTrajectory,
+    Guide,
     Halt,
     Home,
     Jog,
@@ -32,7 +33,9 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
     SetOutput,
+    SetPayload,
     SetSpeedOverride,
+    SetTool,
     SetZero,
     Shutdown,
     StreamPosition,
@@ -51,6 +54,7 @@ from rtcp.ipc.events import (
 from rtcp.ipc.refusals import (
     DamagedRow,
     EmergencyStopPressed,
+    MassesUnknown,
     NoGeometry,
     NotOpen,
     NotPaused,
@@ -92,6 +96,7 @@ open_stream      .     .     .     move  .     .     .     .     .     .     .  
 jog              .     .     .     move  =     .     .     .     .     .     .     .     .
 move_at_velocity .     .     .     =     =     .     .     .     .     .     .     .     .
 apply_torque     .     .     .     =     =     .     .     .     .     .     .     .     .
+guide            .     .     .     =     .     .     .     .     .     .     .     .     .
 halt             .     =     .     =     stop  =     =     =     .     .     .     .     .
 set_output       .     =     =     =     =     =     =     =     .     =     .     .     .
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
@@ -99,6 +104,8 @@ set_limits       .     =     .     =     =     .     =     .     .     =     =  
 set_speed_override = = =     =     =     =     =     =     =     =     =     =     =
 pause            .     .     .     .     =     .     .     .     .     .     .     .     .
 resume           .     .     .     .     =     .     .     .     .     .     .     .     .
+set_tool         .     =     .     =     .     .     .     .     .     .     .     .     .
+set_payload      .     =     .     =     .     .     .     .     .     .     .     .     .
 set_zero         .     =     .     .     .     .     .     .     .     .     .     .     .
 home             .     .     .     home  .     .     .     .     .     .     .     .     .
 shutdown         close close close close close close close close close close close close =
@@ -124,9 +131,9 @@ COMMANDS: dict[str, Command] = {
         Enable(), Disable(), Reset(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1),
         RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
         Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
-        MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
-        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), Pause(), Resume(), SetZero(0, 0.0), Home(0),
-        Shutdown(),
+        MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Guide(), Halt(), SetOutput(5, True),
+        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), Pause(), Resume(), SetTool(0), SetPayload(0.1),
+        SetZero(0, 0.0), Home(0), Shutdown(),
     )
 }  # fmt: skip
 """One of each kind, with fields that nobody could refuse."""
@@ -138,7 +145,9 @@ FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
     MoveAtVelocity: (WrongControlMode,),
     ApplyTorque: (WrongControlMode,),
     Resume: (NotPaused,),
+    Guide: (NoGeometry,),
     SetLimits: (WrongRowCount,),
+    SetPayload: (MassesUnknown,),
     Reset: (EmergencyStopPressed,),
 }
 """Commands that cannot be carried out as they are above, wherever they are accepted; tested elsewhere."""

@@ -156,5 +156,6 @@ CASES: tuple[Case, ...] = (
         workloads=(JOYSTICK,),
         watch_s=1.0,
     ),
+    Case("a push of 10 N at the tool", [_fault("push", y=10)], (CONTINUES,), watch_s=1.0),
     Case("noise of other protocols", [_fault("noise", rate_hz=500)], (CONTINUES,), watch_s=1.5),
 )

@@ -140,6 +140,7 @@ class Driver:
         box = self.simulation.box
         if box is not None:
             box.inputs = 0x033F
+        self._pushes: dict[int, float] = {}
         self.simulation.acquire()
         self.simulation.until(lambda: self.state is State.READY, START_S)
 
@@ -246,7 +247,9 @@ class Driver:
     def push(self, axis: int, torque: float) -> None:
         """Somebody pushes a joint, Nm."""
         self.happen("push", f"{axis} {torque:.1f}")
-        self.simulation.models[axis].mechanics.external_torque = torque
+        # Beside the weight of the arm, which the segment puts there.
+        self.simulation.models[axis].mechanics.external_torque += torque - self._pushes.get(axis, 0.0)
+        self._pushes[axis] = torque
 
     def joystick(self, byte: int) -> None:
         """Show a byte at the joystick's inputs."""

@@ -15,8 +15,10 @@ from rtcp.ipc.recording import RecordingError
 from rtcp.ipc.schema import FLAG_ENABLED
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import cubic, value
+from rtcp.motion.planning.plan import PlanTooFast
 from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.telemetry.reading import Recorded, read
+from rtcp.telemetry.replay import deviation as smoothing_deviation
 from rtcp.telemetry.replay import trajectory
 
 from .test_reading import CONFIG, PERIOD_NS, csv, cycles, mcap
@@ -133,3 +135,43 @@ def test_a_motion_with_a_gap_or_without_torque_is_not_replayed(tmp_path: Path) -
     with pytest.raises(RecordingError, match="the drives were not enabled") as raised:
         trajectory(read(mcap(tmp_path / "disabled.mcap", records), ["*_position", "flags"]))
     assert raised.value.kind == "disabled"
+
+
+def guided() -> Any:
+    """Cycle records of a hand: a slow motion with a tremor of 8 Hz, a rest of 3 s, and on."""
+    t = np.arange(0.0, 4.0, PERIOD_NS * 1e-9)
+    way = 0.5 * (1.0 - np.cos(np.pi * t / 4.0))
+    tremor = 0.004 * np.sin(2 * np.pi * 8.0 * t) * np.sin(np.pi * t / 4.0)
+    there = np.outer(way + tremor, [0.4, -0.2, 0.3, 0.1, 0.0, 0.2])
+    rest = np.tile(there[-1], (round(3.0 / (PERIOD_NS * 1e-9)), 1))
+    q = np.concatenate([there, rest, there[-1] + there, np.tile(2 * there[-1], (200, 1))])
+    records = cycles(len(q))
+    records["sent_position"] = q
+    return records
+
+
+def plan(points: list[dict[str, Any]]) -> None:
+    plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
+
+
+def test_a_tremor_too_fast_for_the_joints_is_smoothed_away_near_the_recorded_motion(tmp_path: Path) -> None:
+    recorded = read(mcap(tmp_path / "a.mcap", guided()), ["*_position"])
+    q = recorded.column("sent_position")
+    with pytest.raises(PlanTooFast):
+        plan(trajectory(recorded))
+    smooth = trajectory(recorded, smooth_hz=1.5)
+    plan(smooth)
+    assert 0.001 < smoothing_deviation(recorded, 1.5) < 0.01
+    found = np.array([point["q"] for point in smooth])
+    assert (found >= q.min(axis=0) - 1e-6).all()
+    assert (found <= q.max(axis=0) + 1e-6).all()
+    assert smooth[0]["v"] == smooth[-1]["v"] == [0.0] * 6
+    assert smooth[-1]["q"] == pytest.approx(q[-1], abs=1e-3)
+
+
+def test_a_rest_in_the_motion_is_shortened(tmp_path: Path) -> None:
+    recorded = read(mcap(tmp_path / "a.mcap", guided()), ["*_position"])
+    whole, short = (trajectory(recorded, smooth_hz=1.5, rest_s=rest) for rest in (None, 0.5))
+    # The slow begin and end of each half count to the rest.
+    assert 2.5 < whole[-1]["t"] - short[-1]["t"] < 4.0
+    assert short[-1]["q"] == pytest.approx(whole[-1]["q"], abs=1e-3)

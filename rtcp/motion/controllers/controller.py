@@ -27,6 +27,7 @@ from rtcp.motion.limits import Limits
 from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import ArmState, Phase, Setpoint
 from rtcp.motion.step_group import StepGroup
+from rtcp.motion.tool_in_use import ToolInUse
 
 ENTRY_POINTS = "rtcp.controllers"
 LONGEST_HOLD_S: Final = 1.0
@@ -49,6 +50,7 @@ class ControllerSetup:
     group: StepGroup = field(default_factory=StepGroup)
     """Partners in a cell, and the motion in step."""
     speed_override: SpeedOverride = field(default_factory=SpeedOverride)
+    tool: ToolInUse = field(default_factory=ToolInUse)
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -103,6 +105,9 @@ class Controller:
             continues: whether this controller is moving the arm for the same commander: it is not started anew.
         """
         raise NotImplementedError
+
+    def use_tool(self, number: int) -> None:
+        """Use another tool from now on, `ArmConfig.models[number]`; called at rest. Nothing is computed here."""
 
     def advance(self, state: ArmState) -> Setpoint:
         """Return the setpoints of the next cycle, in the phases MOVE and STOP; they are valid until the next call.

@@ -57,19 +57,23 @@ class JogController(Controller):
 
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
-        cartesian, model, limits = setup.config.cartesian, setup.config.arm, setup.limits
+        cartesian, limits = setup.config.cartesian, setup.limits
         self._velocity = VelocityController(setup)
         self._by_joints = False
-        self.has_geometry = model is not None
-        if model is None:
+        self._models = setup.config.models
+        self.has_geometry = bool(self._models)
+        if not self.has_geometry:
             return
         singularity = cartesian.singularity
-        self._model = model
         self._trajectory_guard = setup.trajectory_guard
-        self._inverse = JogInverse(model)
         nearest = (singularity.shoulder, singularity.elbow, singularity.wrist)
         braking = _BRAKING * cartesian.acceleration
-        self._bounds = JogBounds(limits, setup.trajectory_guard, self._inverse, braking, nearest, setup.period_s)
+        self._inverses = [JogInverse(model) for model in self._models]
+        self._bounds_of = [
+            JogBounds(limits, setup.trajectory_guard.zones_of(number), inverse, braking, nearest, setup.period_s)
+            for number, inverse in enumerate(self._inverses)
+        ]
+        self.use_tool(setup.tool.number)
         self._ramp = TwistRamp(cartesian)
         self._speed, self._angular_speed = cartesian.speed, cartesian.angular_speed
         self._asked = [0.0] * 6
@@ -82,6 +86,12 @@ class JogController(Controller):
         self._last = [0.0] * 6
         self._posed = False
         self._wrist = singularity.wrist
+
+    def use_tool(self, number: int) -> None:
+        """Use another tool from now on."""
+        if self.has_geometry:
+            self._model, self._inverse = self._models[number], self._inverses[number]
+            self._bounds = self._bounds_of[number]
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Move the tool, or the joints, at the velocities until they expire."""

@@ -13,8 +13,7 @@ from typing import Final
 from kinematics.pose import Pose
 from rtcp.ipc.schema import HELD_BOX_AT, HELD_ITSELF, HELD_RANGE_AT, HELD_SHOULDER
 from rtcp.motion.controllers.jog_inverse import JogInverse, Row
-from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
-from rtcp.motion.guards.zones import INNER_BOX, Clearance
+from rtcp.motion.guards.zones import INNER_BOX, Clearance, Zones
 from rtcp.motion.limits import Limits
 
 STANDOFF_M: Final = 0.008
@@ -34,7 +33,7 @@ class JogBounds:
 
     Args:
         limits: of the joints and where the boxes are; read every cycle.
-        trajectory_guard: its zones tell the clearances.
+        zones: tell the clearances; None: there are none.
         inverse: what the joints do at this configuration.
         braking: deceleration before a box, m/s^2.
         singularity: nearest distances, m, rad, rad; 0: none.
@@ -44,14 +43,14 @@ class JogBounds:
     def __init__(
         self,
         limits: Limits,
-        trajectory_guard: TrajectoryGuard,
+        zones: Zones | None,
         inverse: JogInverse,
         braking: float,
         singularity: Sequence[float],
         dt: float,
     ) -> None:
         self._limits, self._inverse, self._dt = limits, inverse, dt
-        self._zones = trajectory_guard.zones
+        self._zones = zones
         self._braking = braking
         self._nearest = tuple(singularity)
         self.near: Sequence[Clearance] = ()
@@ -174,7 +173,7 @@ class JogBounds:
         px, py, pz = clearance.place
         total = [0.0] * 6
         for i in range(clearance.other, clearance.link):
-            k = _lever(poses[i], px, py, pz, x, y, z)
+            k = lever(poses[i], px, py, pz, x, y, z)
             row = self._inverse.rows[i]
             for j in range(6):
                 total[j] += k * row[j]
@@ -219,7 +218,7 @@ class JogBounds:
             travel = 0.0
             for i in range(clearance.other, clearance.link):
                 v = speeds[i]
-                towards = -_lever(poses[i], px, py, pz, x, y, z) * v
+                towards = -lever(poses[i], px, py, pz, x, y, z) * v
                 if towards > 0.0:
                     travel += towards * (v if v > 0.0 else -v) / acceleration[i]
             travel *= 0.5
@@ -239,7 +238,7 @@ def stopping(stopping_distance: float, rate: float, dt: float) -> float:
     return sqrt(half * half + 2.0 * rate * stopping_distance) - half
 
 
-def _lever(pose: Pose, px: float, py: float, pz: float, x: float, y: float, z: float) -> float:
+def lever(pose: Pose, px: float, py: float, pz: float, x: float, y: float, z: float) -> float:
     """Return the speed along (x, y, z) of a point for 1 rad/s about the axis of a frame."""
     (ox, oy, oz), (_, _, ax, _, _, ay, _, _, az) = pose
     rx, ry, rz = px - ox, py - oy, pz - oz

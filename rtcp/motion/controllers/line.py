@@ -55,14 +55,14 @@ class LineController(Controller):
 
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
-        model, singularity, n = setup.config.arm, setup.config.cartesian.singularity, len(self._zero)
-        assert model is not None
-        self._singularities = Singularities(model)
+        singularity, n = setup.config.cartesian.singularity, len(self._zero)
+        self._models = setup.config.models
+        self._inverses = [InverseKinematics(model) for model in self._models]
+        self.use_tool(setup.tool.number)
+        self._singularities = Singularities(self._model)
         self._nearest = (singularity.shoulder, singularity.elbow, singularity.wrist)
         self._every = max(round(_LOOK_S / setup.period_s), 1)
         self._wait = 0
-        self._model = model
-        self._inverse = InverseKinematics(model)
         self._otg = Ruckig(1, setup.period_s)
         self._way, self._halt = InputParameter(1), InputParameter(1)
         self._halt.control_interface = ControlInterface.Velocity
@@ -89,6 +89,10 @@ class LineController(Controller):
         self._axis: Vector = (0.0, 0.0, 1.0)
         self._angle = 0.0
         self._rotation = rotation((1.0, 0.0, 0.0, 0.0))
+
+    def use_tool(self, number: int) -> None:
+        """Use another tool from now on."""
+        self._model, self._inverse = self._models[number], self._inverses[number]
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Run a plan of straight pieces (`rtcp.motion.planning.plan`) from `state`, at rest where the first begins."""

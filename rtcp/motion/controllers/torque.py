@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import sqrt
 from typing import Final
 
-from kinematics.gravity import gravity_torques
 from rtcp.ipc.commands import ApplyTorque, Command
 from rtcp.ipc.events import CommandExpired
 from rtcp.ipc.refusals import FractionOutOfRange, Refusal, TorqueOutOfRange
 from rtcp.ipc.states import ControlMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.state import ArmState, Phase, Setpoint
+from rtcp.motion.tool_in_use import Gravity
 
 _RATE_S: Final = 0.1
 """A torque goes from 0 to the joint's largest in no less."""
@@ -45,8 +44,8 @@ class TorqueController(Controller):
 
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
-        joints, model, n = setup.config.joints, setup.config.arm, len(self._zero)
-        self._model = model if model is not None and model.links and n == 6 else None
+        joints, n = setup.config.joints, len(self._zero)
+        self._gravity = Gravity(setup.config, setup.tool)
         self._stiffness = [joint.cst_stiffness for joint in joints]
         self._damping = [joint.cst_damping for joint in joints]
         self._direct = Setpoint(n)
@@ -82,7 +81,7 @@ class TorqueController(Controller):
 
     def _start(self, state: ArmState) -> None:
         """Begin with the torques that hold the arm now, so that it does not sag."""
-        carried = self._carried(state.actual)
+        carried = self._gravity.torques(state.actual)
         # In motion a torque holds nothing: what held the arm before is kept.
         rests = not any(abs(v) > _STILL_RAD_S for v in state.actual_velocity)
         for i in self._joints:
@@ -104,7 +103,7 @@ class TorqueController(Controller):
         target, dt = self._direct, self.period_s
         limits = self.limits
         low, high, fastest, slowing, most = limits.low, limits.high, limits.velocity, limits.acceleration, limits.torque
-        carried = self._carried(state.actual)
+        carried = self._gravity.torques(state.actual)
         position, given = self._position, self._given
         torque, follows, speeds = target.torque, target.position, target.velocity
         for i in self._joints:
@@ -137,12 +136,9 @@ class TorqueController(Controller):
             whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag + self._stiffness[i] * wall
             torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
             position[i] = q
-            speeds[i] = speed = _chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
+            speeds[i] = speed = chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
             follows[i] = state.commanded[i] + speed * dt
         return target
-
-    def _carried(self, position: Sequence[float]) -> Sequence[float]:
-        return self._zero if self._model is None else gravity_torques(self._model, position)
 
 
 def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
@@ -151,7 +147,7 @@ def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
     return bound if bound < fastest else fastest
 
 
-def _chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
+def chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
     """The setpoint's next speed: it catches up with the arm, `lag` rad away at `speed`, and has its speed there."""
     far = lag if lag >= 0.0 else -lag
     closing = sqrt(acceleration * far)

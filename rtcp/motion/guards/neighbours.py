@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from math import hypot
 from typing import Final
 
-from kinematics.capsules import Placed, capsules, distance
+from kinematics.capsules import Placed, capsules, distance, with_every_tool
 from kinematics.forward import frames
 from kinematics.model import JOINTS, ArmModel
 from kinematics.pose import Pose
@@ -77,12 +77,15 @@ class Body:
 
 
 def body_of(member: Member, acceleration: Sequence[float] | None = None) -> Body | None:
-    """Return an arm of a cell, with its configured accelerations or others; None: its geometry is not known."""
-    model, base = member.config.arm, member.base
-    if model is None:
+    """Return an arm of a cell, with its configured accelerations or others; None: its geometry is not known.
+
+    It has the bodies of all its tools: whichever it uses, partners keep away from them, and it from partners.
+    """
+    models, base = member.config.models, member.base
+    if not models:
         return None
     bounds = [joint.acceleration for joint in member.config.joints] if acceleration is None else acceleration
-    return Body(model, Pose.from_xyzrpy(*base.position, *base.rpy), bounds)
+    return Body(with_every_tool(models), Pose.from_xyzrpy(*base.position, *base.rpy), bounds)
 
 
 def certain(

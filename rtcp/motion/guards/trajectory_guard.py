@@ -15,6 +15,7 @@ from math import inf, isfinite
 from typing import Final
 
 from kinematics.forward import frames
+from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.events import BoxReached, CollisionAhead, JointLimitReached, MotionEnded, NotLeavingBox
@@ -59,9 +60,11 @@ class TrajectoryGuard:
         n = len(config.joints)
         self._limits = limits
         self._dt = dt
-        self._model = config.arm
+        self._models = config.models
         self._clearance = config.cartesian.clearance
-        self.zones = None if config.arm is None else Zones(config.arm, limits, self._clearance)
+        self._zones = [Zones(model, limits, self._clearance) for model in self._models]
+        self._model: ArmModel | None = None
+        self.zones: Zones | None = None
         self._joints = range(n)
         self._mean = [0.0] * n
         """Mean speed of each joint in the last cycle: what its acceleration is counted from."""
@@ -81,6 +84,25 @@ class TrajectoryGuard:
         self.held = 0
         self.ended: MotionEnded | None = None
         """What the last stop of the guard was for."""
+
+        self.use_tool(0)
+
+    def use_tool(self, number: int) -> None:
+        """Guard the arm with another tool from now on; at rest."""
+        if self._models:
+            self._model, self.zones = self._models[number], self._zones[number]
+            self._poses, self._room = None, 0.0
+
+    def zones_of(self, number: int) -> Zones | None:
+        """Return what is guarded with a tool."""
+        return self._zones[number] if self._models else None
+
+    def zone_with(self, number: int, q: Sequence[float]) -> int | None:
+        """Return the number of the box or pair whose bounds the arm at `q` (rad) would pass with a tool, or None."""
+        if not self._models:
+            return None
+        distance, which = self._zones[number].distance(frames(self._models[number], q))
+        return which if distance < 0.0 else None
 
     @property
     def poses(self) -> Sequence[Pose]:

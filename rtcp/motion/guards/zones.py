@@ -17,6 +17,7 @@ from kinematics.capsules import Placed, between_axes, capsules, distance, from_b
 from kinematics.forward import frames
 from kinematics.model import JOINTS, ArmModel, Capsule
 from kinematics.pose import Pose, Vector
+from rtcp.config.model import MOST_TOOLS
 from rtcp.motion.limits import Corners
 
 TOOL: Final = 6
@@ -300,7 +301,7 @@ class _Geometry(NamedTuple):
     fixed: list[list[Vector]]
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=2 * MOST_TOOLS)
 def _geometry(model: ArmModel) -> _Geometry:
     bodies = capsules(model)
     pairs = tuple((i, j) if bodies[i].link < bodies[j].link else (j, i) for i, j in self_pairs(model))

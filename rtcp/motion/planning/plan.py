@@ -63,7 +63,7 @@ class Plan:
 
     rows: of `COLUMNS` doubles each, `len(rows)` is the count of the command. duration_s: from the start to rest.
     length_m: of the lines, 0 for a trajectory. slowed: 1 where the lines keep the speed asked for, less where a joint's
-    limits made them slower. end: the joints' position at the end, rad.
+    limits made them slower. end: the joints' position at the end, rad. tool: number of the tool for which it was made.
     """
 
     rows: tuple[tuple[float, ...], ...]
@@ -71,6 +71,7 @@ class Plan:
     length_m: float
     slowed: float
     end: tuple[float, ...]
+    tool: int = 0
 
 
 def read_row(rows: memoryview[float], index: int) -> list[float]:

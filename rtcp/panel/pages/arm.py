@@ -22,6 +22,8 @@ def build(view: View) -> None:
         shown("drive_mode", tag="b")
         text("span", ", bus ")
         shown("bus", tag="b")
+        text("span", ", tool ")
+        shown("tool_name", tag="b")
     _joints(config)
     if config.arm is None:
         return

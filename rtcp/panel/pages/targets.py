@@ -184,11 +184,10 @@ class Targets:
         """Show every configuration that reaches the pose, under the limits in force."""
         self._found.clear()
         try:
-            assert self._config.arm is not None
-            pose = Pose.from_xyzrpy(*(one.number() for one in self._pose))
-            found = InverseKinematics(self._config.arm).solve(
-                pose, self._view.live.state()["joints"]["actual_position"]
-            )
+            pose, state = Pose.from_xyzrpy(*(one.number() for one in self._pose)), self._view.live.state()
+            model = self._config.model_of(state["tool_name"])
+            assert model is not None
+            found = InverseKinematics(model).solve(pose, state["joints"]["actual_position"])
             in_force = (await self._view.query(lambda robot: robot.limits()))["limits"]
         except (Invalid, ValueError, LookupError) as error:
             self._said.text = f"No: {error}"

@@ -328,6 +328,28 @@ def _device_at(devices: Sequence[DeviceModel], number: int, kind: type[_D], word
     return device
 
 
+Newton = Annotated[float, Ge(-500), Le(500)]
+
+
+@dataclass(frozen=True)
+class Push(Fault):
+    """A force (N) and a torque (Nm) act at the tool, along and about the axes of the base."""
+
+    name = "push"
+    x: Newton = 0.0
+    y: Newton = 0.0
+    z: Newton = 0.0
+    rx: Newton = 0.0
+    ry: Newton = 0.0
+    rz: Newton = 0.0
+
+    def start(self, segment: Segment, frames: Frames, t: int) -> End:
+        """Push from now on."""
+        if segment.arm is None:
+            raise FaultRefused("no arm to push: the segment's file names none with geometry, or has no six drives")
+        return segment.arm.push((self.x, self.y, self.z, self.rx, self.ry, self.rz))
+
+
 class TerminalsFault(DeviceFault):
     """Base of the faults of the first IO box's input terminals."""
 

@@ -42,6 +42,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "input": {"number": 3, "how": "bounce"},
     "input_frozen": {"slave": 1},
     "joystick_code": {"value": 9},
+    "push": {"y": 10},
     "noise": {"rate_hz": 2000},
 }
 BY_RATE = [name for name, keys in KINDS.items() if "rate" in keys]
