@@ -157,7 +157,7 @@ def on_click(element: Element, handler: Handler) -> None:
 
     async def clicked(event: Any) -> None:
         remember_click(event.args)
-        if inspect.isawaitable(found := handler()):
+        if inspect.iscoroutine(found := handler()):  # not a dialog that has closed, whose await opens it again
             await found
 
     element.on("click", clicked, js_handler="() => emit(rtcp.token)")
