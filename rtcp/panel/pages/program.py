@@ -360,7 +360,7 @@ class ProgramPage:
             kept.end()
             last = len(program.steps) if end is None else end
             if done:
-                kept.at = last if last < len(program.steps) else 0
+                kept.at = last if end is not None or last < len(program.steps) else 0
             self._say(("Done" if end is None else f"Step {start + 1} is done") if done else "It has ended early")
 
     async def _step(self) -> None:
