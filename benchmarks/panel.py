@@ -295,15 +295,29 @@ def pictures(playwright: Playwright, directory: Path) -> None:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         for width in (400, 1600):
             for path in PAGES:
-                if path in ("/cell", "/processes", "/program"):
+                if path in ("/cell", "/processes"):
                     continue
                 page = opened(browser, url, path, width)
+                if path == "/program":
+                    teach(page)
                 with moved_by_another() if path == "/arm" else contextlib.nullcontext():
                     time.sleep(2.5)
                     page.evaluate(_WITHOUT_PATHS, [str(Path(__file__).parents[1]), str(Path.home())])
                     page.screenshot(path=directory / f"panel-{path[1:] or 'start'}-{width}.png")
                 page.context.close()
         browser.close()
+
+
+def teach(page: Page) -> None:
+    """Make a program of one step."""
+    page.get_by_label("Program", exact=True).fill("cup")
+    page.get_by_role("button", name="Open").click()
+    page.get_by_label("Name of the pose").fill("above the cup")
+    page.get_by_role("button", name="Keep where the arm is").click()
+    page.get_by_role("button", name="Move to above the cup").wait_for()
+    page.get_by_role("button", name="Add the step").click()
+    page.get_by_text("above the cup is kept").wait_for(state="detached")
+    page.evaluate("scrollTo(0, 0)")
 
 
 def cell_picture(playwright: Playwright, directory: Path) -> None:

@@ -205,7 +205,7 @@ class ProgramPage:
             if not steps:
                 text("p", "None yet: keep a pose, then add a step that leads there.")
                 return
-            body = table(("#", "Step", "", "", "", ""), "Steps of the program")
+            body = table(("#", "Step", "", "", "", ""), "Steps of the program", "stack")
         for at, step in enumerate(steps):
             shown = row(body, f"▶ {at + 1}" if at == self._kept.at else str(at + 1), described(step))
             if at == self._kept.at:
@@ -269,7 +269,7 @@ class ProgramPage:
             button("Keep where the arm is", lambda: self._keep(name.value.strip(), what.value))
         if not file.motion.poses:
             return
-        body = table(("Pose", "Kept as", "", "", ""), "Poses of the program")
+        body = table(("Pose", "Kept as", "", "", ""), "Poses of the program", "stack")
         for pose in file.motion.poses:
             with row(body, pose.name, "joints" if pose.q is not None else "pose"):
                 for label, spoken, handler in (
