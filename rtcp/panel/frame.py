@@ -90,7 +90,7 @@ class Frame:
             view.leave()
             if view.arm is not None:
                 view.arm.preview([], 0.0)  # planned on the tab that is left
-            self._feed, self._path = self._live.feed, path
+            self._feed, self._path = self._known_feed(), path
             tab = self._tabs[path]
             ui.page_title(f"{tab.name} - rtcp panel")
             ui.run_javascript(f"rtcp.tab('{path}')")
@@ -103,10 +103,14 @@ class Frame:
 
         return made
 
+    def _known_feed(self) -> Feed | None:
+        """Return that of the platform once its status is known too: a tab needs both."""
+        return None if self._live.status is None else self._live.feed
+
     def _follow(self) -> None:
         """Draw the arm and build the tab anew for a platform that has begun to run."""
         self._draw()
-        feed = self._live.feed
+        feed = self._known_feed()
         if feed is not None and feed is not self._feed:
             self._feed = feed
             if self._path != "/":  # Start tells about the start itself
