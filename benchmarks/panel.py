@@ -187,7 +187,7 @@ def moving(page: Page) -> None:
     page.goto("/targets")
     page.wait_for_selector(HOLDING)
     page.get_by_label("joint1, rad").fill("1.5")
-    page.get_by_label("Speed").fill("0.15")
+    page.get_by_role("spinbutton", name="Speed").fill("0.15")
     page.get_by_role("button", name="Plan").click()
     page.get_by_role("button", name="Send", exact=True).click()
 
@@ -294,16 +294,30 @@ def pictures(playwright: Playwright, directory: Path) -> None:
     with panel() as (_, url):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         for width in (400, 1600):
-            for path, (name, _, _) in PAGES.items():
-                if path == "/cell":
+            for path in PAGES:
+                if path in ("/cell", "/processes"):
                     continue
                 page = opened(browser, url, path, width)
+                if path == "/program":
+                    teach(page)
                 with moved_by_another() if path == "/arm" else contextlib.nullcontext():
                     time.sleep(2.5)
                     page.evaluate(_WITHOUT_PATHS, [str(Path(__file__).parents[1]), str(Path.home())])
-                    page.screenshot(path=directory / f"panel-{name.lower()}-{width}.png", full_page=True)
+                    page.screenshot(path=directory / f"panel-{path[1:] or 'start'}-{width}.png")
                 page.context.close()
         browser.close()
+
+
+def teach(page: Page) -> None:
+    """Make a program of one step."""
+    page.get_by_label("Program", exact=True).fill("cup")
+    page.get_by_role("button", name="Open").click()
+    page.get_by_label("Name of the pose").fill("above the cup")
+    page.get_by_role("button", name="Keep where the arm is").click()
+    page.get_by_role("button", name="Move to above the cup").wait_for()
+    page.get_by_role("button", name="Add the step").click()
+    page.get_by_text("above the cup is kept").wait_for(state="detached")
+    page.evaluate("scrollTo(0, 0)")
 
 
 def cell_picture(playwright: Playwright, directory: Path) -> None:
@@ -320,7 +334,7 @@ def cell_picture(playwright: Playwright, directory: Path) -> None:
             page = opened(browser, url, "/cell")
             for name, q in {"left": "0.6, 0.3, 0.1, 0, 0.5, 0", "right": "-0.6, 0.3, 0.1, 0, 0.5, 0"}.items():
                 page.get_by_label(f"Joints of {name}, rad").fill(q)
-            page.get_by_label("Speed, rad/s").fill("0.1")
+            page.get_by_label("Speed (empty: the limit), rad/s").fill("0.1")
             page.get_by_role("button", name="Move in step").click()
             time.sleep(4.0)
             page.screenshot(path=directory / "cell.png")

@@ -210,6 +210,11 @@ class Levels(Mapping[str, bool]):
     def __len__(self) -> int:
         return len(self._levels)
 
+    @property
+    def places(self) -> dict[str, str]:
+        """The terminal of each name, as `box.number`."""
+        return {name: place for place, name in self._names.items()}
+
     def __repr__(self) -> str:
         return repr(self._levels)
 
@@ -279,3 +284,5 @@ class EventRecord:
     name: str
     fields: Mapping[str, Any]
     message: str
+    severity: str = "note"
+    """What it asks of a person: `emergency_stop`, `fault`, `limit` (reset, and move away), `warning`, `note`."""

@@ -165,7 +165,10 @@ class Methods:
 
     @method(at_once=True)
     async def events(self, caller: Caller, since: Annotated[int, Ge(0)] = 0) -> Json:
-        """Return `events` after the number `since`, oldest first: number, time, name, fields, message."""
+        """Return `events` after the number `since`, oldest first: number, time, name, fields, message, severity.
+
+        `severity`: emergency_stop, fault, limit (reset, and move away), warning, note.
+        """
         return {"events": [self._snapshot.event(record) for record in self._observer.events_since(since)]}
 
     @method(at_once=True)

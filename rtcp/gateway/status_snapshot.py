@@ -16,7 +16,7 @@ import numpy.typing as npt
 from kinematics.forward import frames
 from kinematics.jacobian import singularity_distances
 from rtcp.config.model import PLATFORM_PARTS
-from rtcp.ipc.events import JOYSTICK_MODES, ResetDone
+from rtcp.ipc.events import JOYSTICK_MODES, ResetDone, severity
 from rtcp.ipc.names import SINGULARITIES, Names
 from rtcp.ipc.observer import EventRecord, Observer
 from rtcp.ipc.robot_status import RobotStatus
@@ -184,6 +184,7 @@ class StatusSnapshot:
             "name": record.event.name,
             "fields": record.event.as_json(),
             "message": self.names.message(record.event),
+            "severity": severity(type(record.event)),
         }
 
     def _limited_by(self, record: npt.NDArray[np.void]) -> dict[str, str]:

@@ -23,6 +23,8 @@ class Event(Message, abstract=True):
     """Whether it begins a fault or an emergency stop."""
     is_emergency: ClassVar[bool] = False
     """Whether it begins the emergency stop, also out of a fault."""
+    is_warning: ClassVar[bool] = False
+    """Whether a person has to know of it, though it is no fault."""
     stop_key: ClassVar[str] = ""
     """Key under `stops` that sets its stop reaction (`rtcp.ipc.stop_reactions`); empty: a fault takes a quick stop."""
 
@@ -83,6 +85,8 @@ class ClockLocked(Event, number=16):
 
 class ClockUnlocked(Event, number=17):
     """the cycle has lost the phase of the reference clock"""
+
+    is_warning = True
 
 
 class TorqueRemoved(Event, number=21):
@@ -145,6 +149,7 @@ class ReturningToRange(Event, number=44):
 class EnabledInBox(Event, number=41):
     """the arm stands {depth:.6g} m beyond the bounds of {box_name}: only motion that leads out is accepted; jog out"""
 
+    is_warning = True
     box: int
     depth: float
 
@@ -153,6 +158,7 @@ class MovedSinceFault(Event, number=45):
     """{joint} stands at {position:.6g} rad, at the fault it stood at {before:.6g} rad: if nobody moved it and it did
     not sag, its drive lost its zero; check that before `rtcp enable`"""
 
+    is_warning = True
     axis: int
     position: float
     before: float
@@ -178,6 +184,7 @@ class JoystickModeChanged(Event, number=37):
 class UnknownJoystickCode(Event, number=38):
     """the joystick reads {code}, which is no code: the arm stops until it is neutral"""
 
+    is_warning = True
     code: int
 
 
@@ -216,6 +223,7 @@ class Homed(Event, number=35):
 class HomingFailed(Event, number=36):
     """{joint}: homing failed (statusword 0x{statusword:04X}); the arm holds"""
 
+    is_warning = True
     axis: int
     statusword: int
 
@@ -223,6 +231,7 @@ class HomingFailed(Event, number=36):
 class HomingInBox(Event, number=42):
     """homing was stopped: by the old zero the arm is in {box_name}"""
 
+    is_warning = True
     box: int
 
 
@@ -377,12 +386,14 @@ class HomingStillMoving(FaultEvent, number=39):
 class LeaseExpired(Event, number=9):
     """the commander fell silent or released its lease: {reaction}"""
 
+    is_warning = True
     stop_key = "lease_ended"
 
 
 class PermissionWithdrawn(Event, number=28):
     """the enabling switch was released: {reaction}"""
 
+    is_warning = True
     stop_key = "enabling_switch"
 
 
@@ -390,6 +401,7 @@ class EstopUnobservable(Event, number=46):
     """the IO box has been out of OP for {after_s:g} s: the emergency stop (inputs.emergency_stop in {file}) cannot be
     read and counts as pressed"""
 
+    is_warning = True
     after_s: float
 
 
@@ -448,6 +460,17 @@ class MotionEnded(Event, abstract=True):
 
 class ProcessEnded(Event, abstract=True):
     """Base of what ends a command of a process before it was carried out, without a fault of the machine."""
+
+    is_warning = True
+
+
+def severity(kind: type[Event]) -> str:
+    """Return what a kind asks of a person: emergency_stop, fault, limit (reset, and move away), warning or note."""
+    if kind.is_fault:
+        return "emergency_stop" if kind.is_emergency else "fault"
+    if issubclass(kind, MotionEnded) and kind.by_limit:
+        return "limit"
+    return "warning" if kind.is_warning else "note"
 
 
 class StreamEnded(MotionEnded, number=101):

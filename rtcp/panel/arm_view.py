@@ -31,7 +31,6 @@ class ArmView(Element, component="static/arm_view.js", esm={"nicegui-scene": str
     def __init__(self, config: ArmConfig, own: Member | None, partners: Sequence[Member]) -> None:
         super().__init__()
         assert config.arm is not None
-        self.shows = (config, own, partners)
         self._props["links"] = links(to_urdf(config.arm))
         self._props["partners"] = [] if own is None else [
             {"name": one.name, **_between(own.base, one.base), "links": links(to_urdf(one.config.arm))}

@@ -26,13 +26,14 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from kinematics.forward import forward
 from kinematics.jacobian import singularity_distances
-from rtcp.api import AsyncRobot, Feed, RtcpError, Status
+from rtcp.api import AsyncRobot, EventRecord, Feed, NotRunning, RtcpError, Status
 from rtcp.api.async_cell import AsyncCell
 from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
 from rtcp.panel.access import Bucket, Visitor
 from rtcp.panel.partners import Partners, arm_state
 from rtcp.panel.scope import Scope
+from rtcp.panel.trends import Trends
 
 T = TypeVar("T")
 Json = dict[str, Any]
@@ -60,9 +61,29 @@ _LIMIT_TURNS = 10
 """The limits in every tenth."""
 _PARTNER_TURNS = 20
 """Partners that have begun to run are looked for in every twentieth."""
+_EVENT_TURNS = 10
+"""New events are asked for in every tenth."""
+_MOST_EVENTS = 1000
 _MOST_HALTS = 16
 """STOPs of the pages' sockets that wait for an answer; `/stop` takes them too."""
 _STOP = "panel: stop"
+NEXT = {
+    "off": "Start a platform on the tab Start",
+    "starting": "Wait until it runs",
+    "ready": "Press Enable: the drives then hold the arm",
+    "enabling": "Wait until the drives hold the arm",
+    "holding": "Jog, send a target or run a program",
+    "moving": "Halt or STOP ends the motion",
+    "stopping": "Wait until the arm stands",
+    "disabling": "Wait until the drives are without torque",
+    "homing": "Halt or STOP ends the homing",
+    "fault": "Remove the cause, then press Reset",
+    "emergency_stop": "Release the emergency stop, then press Reset",
+    "stopped_by_limit": "Press Reset, then move away from the limit",
+    "resetting": "Wait until the fault is cleared",
+    "closing": "Wait until the platform has ended",
+}
+"""What a person does next, by the state of the machine."""
 _JOINTS = ("actual_position", "actual_velocity", "actual_torque", "commanded_position")
 log = logging.getLogger("rtcp.panel")
 
@@ -126,6 +147,11 @@ class Page:
 
     def __str__(self) -> str:
         return f"{self.visitor} (page {self.number})"
+
+    def check_may_command(self) -> None:
+        """Raise Refused where its visitor may only look."""
+        if self.visitor.role != "operator":
+            raise RtcpError("refused", f"{self.visitor.name} may look, and not command: log in as an operator")
 
     def age_s(self, now_ns: int) -> float:
         """Return for how long nothing is known of whoever looks at it, s."""
@@ -248,6 +274,11 @@ class Live:
         self.limits: Json | None = None
         """In force, as `Robot.limits` has them."""
         self.feed: Feed | None = None
+        self.events: list[EventRecord] = []
+        """Of the platform that runs, or ran last; oldest first."""
+        self._acknowledged: dict[tuple[int, str], str] = {}
+        """Who has seen an alarm, by its number and time: numbers begin anew with each platform."""
+        self.trends = Trends()
         self.partners = Partners()
         self.pages: dict[str, Page] = {}
         self.operator: Operator | None = None
@@ -255,6 +286,7 @@ class Live:
         self._retry_at = 0.0
         self._turn = 0
         self._scoped = False
+        self._last_event = 0
         self._halting: set[asyncio.Task[str]] = set()
         self._halted_ns = 0
         """When STOP was pressed last."""
@@ -360,8 +392,7 @@ class Live:
             HeldByAnother: another page has the arm.
             Refused: the visitor may only look.
         """
-        if page.visitor.role != "operator":
-            raise RtcpError("refused", f"{page.visitor.name} may look, and not command: log in as an operator")
+        page.check_may_command()
         if page.age_s(time.monotonic_ns()) > PRESENCE_S:
             raise RtcpError("refused", f"nothing is heard of this page: {page}")
         if self.operator is None:
@@ -456,6 +487,20 @@ class Live:
                 await ending
         return ""
 
+    async def set_speed_override(self, page: Page, fraction: float) -> None:
+        """Set it, also while this page moves the arm; anyone who may command lowers it.
+
+        Raises:
+            HeldByAnother: another page has the arm, and it would be raised.
+            RtcpError: as the command.
+        """
+        self.check_click(page)
+        page.check_may_command()
+        if self.status is not None and fraction <= self.status.speed_override:
+            await self.view(lambda robot: robot.set_speed_override(fraction))
+        else:
+            await (await self.claim(page).robot()).set_speed_override(fraction)
+
     async def view(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
         """Ask something that commands nothing.
 
@@ -512,12 +557,43 @@ class Live:
             self.status = await asyncio.wait_for(self._viewing.status(), 2.0)
             if self.limits is None or self._turn % _LIMIT_TURNS == 0:
                 self.limits = (await asyncio.wait_for(self._viewing.limits(), 2.0))["limits"]
+            if self._turn % _EVENT_TURNS == 0:
+                await self._read_events(self._viewing)
+            raw = self.status.raw
+            self.trends.read(raw, self.limits["torque"], self._temperatures(raw))
         except (RtcpError, OSError, asyncio.TimeoutError) as error:
-            self.problem = str(error) or "the platform does not answer"
+            self.problem = "no platform runs" if isinstance(error, NotRunning) else str(error) or "it does not answer"
             await self._lost()
+
+    async def _read_events(self, robot: AsyncRobot) -> None:
+        found = await asyncio.wait_for(robot.events(self._last_event), 2.0)
+        if found and not self._last_event:
+            self.events = []  # of the platform before
+        self._last_event = found[-1].number if found else self._last_event
+        self.events = [*self.events, *found][-_MOST_EVENTS:]
+
+    def _temperatures(self, raw: Mapping[str, Any]) -> list[float | None]:
+        """Return those of the drives, C, one a joint; None: its drive maps none."""
+        found = {slave["name"]: slave["temperature"] for slave in raw["slaves"]}
+        return [] if self.config is None else [found.get(joint.slave) for joint in self.config.joints]
+
+    @property
+    def alarms(self) -> list[EventRecord]:
+        """What has happened that a person has to know of, oldest first."""
+        return [one for one in self.events if one.severity != "note"]
+
+    def acknowledged_by(self, alarm: EventRecord) -> str:
+        """Return who has acknowledged an alarm; empty: nobody."""
+        return self._acknowledged.get((alarm.number, alarm.time), "")
+
+    def acknowledge(self, alarms: Sequence[EventRecord], by: str) -> None:
+        """Note for all pages that somebody has seen alarms."""
+        for one in alarms:
+            self._acknowledged.setdefault((one.number, one.time), by)
 
     async def _lost(self) -> None:
         self.status = self.limits = None
+        self._last_event = 0
         robot, self._viewing = self._viewing, None
         feed, self.feed = self.feed, None
         self.config = None
@@ -581,23 +657,24 @@ class Live:
 
     def state(self) -> Json:
         """Return what every page shows, SI units."""
-        cell: Json = {}
+        everywhere: Json = {"alarms": sum(not self.acknowledged_by(one) for one in self.alarms)}
         if self.partners.cell is not None:
-            cell = {
+            everywhere |= {
                 "partners": self.partners.state(),
                 "step": arm_state(self.feed).get("step"),
                 "rod": self.partners.rod,
             }
         if self.status is None:
-            return {"state": "off", "message": self.problem, **cell}
+            return {"state": "off", "message": self.problem, "next": NEXT["off"], **everywhere}
         raw = self.status.raw
         joints = raw["joints"]
         shown: Json = {
             "state": raw["state"],
             "message": raw["message"],
+            "next": NEXT[raw["state"]],
             "drive_mode": raw["drive_mode"],
             "control_mode": raw["control_mode"],
-            "speed_override": f"{100.0 * raw['speed_override']:.3g} %",
+            "speed_override": round(100.0 * raw["speed_override"], 1),
             "tool_name": raw["tool_name"],
             "holder": raw["lease"]["holder"],
             "age_s": round(raw["lost_s"] + max(0, time.monotonic_ns() - raw["time_ns"]) * 1e-9, 1),
@@ -609,13 +686,11 @@ class Live:
             "missed": raw["missed"],
             "cycles": raw["cycles"],
             "limits": self.limits,
-            **cell,
+            **everywhere,
         }
         if raw["processes"]:
             shown["processes"] = {name: self._process(name, raw) for name in raw["processes"]}
-        if self.config is not None:
-            temperatures = {slave["name"]: slave["temperature"] for slave in raw["slaves"]}
-            shown["temperature"] = [temperatures.get(joint.slave) for joint in self.config.joints]
+        shown["temperature"] = self._temperatures(raw)
         q = joints["actual_position"]
         model = None if self.config is None else self.config.model_of(raw["tool_name"])
         if model is not None and all(map(math.isfinite, q)):

@@ -27,22 +27,29 @@ _BESIDE = "seamless position=bottom"
 _COMMANDS = asyncio.Semaphore(2)
 """Of `rtcp` at once."""
 _LONGEST_LINE = 1 << 22
+Heading = str | tuple[str, str]
+"""Of a column: its name, or name and unit."""
+POSE = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 ENABLED = "holding moving stopping"
 """States with torque, as `data-when` of a control has them."""
 
 
 class Field:
-    """A control with a label; `value` is what it shows."""
+    """A control with a label; `value` is what it says, SI: the browser shows and reads it in the units chosen there."""
 
-    def __init__(self, tag: str, label: str, value: str, **attributes: str) -> None:
-        with ui.element("div").classes("field"):
-            self._label = text("label", label)
+    def __init__(self, tag: str, label: str, value: str, unit: str = "", **attributes: str) -> None:
+        self._name = label
+        with ui.element("div").classes("field") as self.place:
+            with ui.element("label") as heading:
+                with_unit(label, unit, ", ")
             self.control = ui.element(tag)
-        self._label.props["for"] = self.control.html_id
+        heading.props["for"] = self.control.html_id
         self.control.props.update(attributes)
+        if unit:
+            self.control.props["data-in"] = unit
         # An attribute: a property would be written again, over what was typed, when something near is drawn anew.
         self.control.props["^value"] = value
-        self.control.on("input", self._changed, js_handler="(event) => emit(event.target.value)")
+        self.control.on("input", self._changed, js_handler="(event) => emit(rtcp.typed(event.target))")
         self._value = value
         self._on_change: list[Callable[[], object]] = []
 
@@ -75,8 +82,7 @@ class Field:
         try:
             return float(self._value)
         except ValueError:
-            name = self._label.text
-            raise RtcpError("invalid", f'{name}: found the text "{self._value}", allowed is a number') from None
+            raise RtcpError("invalid", f'{self._name}: found the text "{self._value}", allowed is a number') from None
 
 
 def field(label: str, value: str = "", **attributes: str) -> Field:
@@ -84,9 +90,10 @@ def field(label: str, value: str = "", **attributes: str) -> Field:
     return Field("input", label, value, type="text", autocomplete="off", spellcheck="false", **attributes)
 
 
-def number(label: str, value: str = "", **attributes: str) -> Field:
+def number(label: str, value: str = "", unit: str = "", **attributes: str) -> Field:
     """Return a field for a number; `step` any."""
-    return Field("input", label, value, **{"type": "number", "step": "any", "inputmode": "decimal", **attributes})
+    given = {"type": "number", "step": "any", "inputmode": "decimal", **attributes}
+    return Field("input", label, value, unit, **given)
 
 
 def choice(label: str, options: Iterable[str] | Mapping[str, str], value: str) -> Field:
@@ -109,10 +116,27 @@ def text(tag: str, content: str, classes: str = "", **attributes: str) -> TextEl
     return made.classes(classes) if classes else made
 
 
-def shown(name: str, digits: int | None = None, tag: str = "td") -> Element:
+def with_unit(label: str, unit: str, between: str = " ") -> None:
+    """Write a label and the unit that the browser shows for a unit of the interfaces."""
+    text("span", label + (between if unit else ""))
+    if unit:
+        text("span", unit, **{"data-unit": unit})
+
+
+def shown(name: str, digits: int | None = None, tag: str = "td", unit: str = "") -> Element:
     """Return a place for a value of the live state (`Live.state`): `message`, `actual_position.2`."""
     made = ui.element(tag)
     made.props["data-live"] = name
+    if digits is not None:
+        made.props["data-digits"] = str(digits)
+    if unit:
+        made.props["data-in"] = unit
+    return made
+
+
+def quantity(value: float, unit: str, digits: int | None = None) -> Element:
+    """Return a value that stands, in the unit that the browser shows."""
+    made = text("span", f"{value:g}", **{"data-si": repr(value), "data-in": unit})
     if digits is not None:
         made.props["data-digits"] = str(digits)
     return made
@@ -128,64 +152,62 @@ def button(label: str, handler: Handler | None = None, *, when: str = "", plain:
     return made
 
 
-def speed_override(view: View) -> None:
-    """Show the speed override, and buttons that set it."""
-
-    def set_to(percent: int) -> Handler:
-        done = f"The speed override is {percent} %"
-        return lambda: view.act(lambda robot: robot.set_speed_override(percent / 100.0), done)
-
-    with ui.element("div").classes("buttons").props('role=group aria-label="Speed override"'):
-        text("span", "Speed override ")
-        shown("speed_override", tag="b")
-        for percent in (5, 25, 50, 100):
-            button(f"{percent} %", set_to(percent), plain=True)
-
-
 def on_click(element: Element, handler: Handler) -> None:
     """Call `handler` for a click; what it commands is judged by when the person has clicked."""
 
     async def clicked(event: Any) -> None:
-        CLICK.set(Click(event.args if type(event.args) is int else 0, time.monotonic_ns()))
-        if inspect.isawaitable(found := handler()):
+        remember_click(event.args)
+        if inspect.iscoroutine(found := handler()):  # not a dialog that has closed, whose await opens it again
             await found
 
     element.on("click", clicked, js_handler="() => emit(rtcp.token)")
 
 
-def table(headings: Sequence[str], caption: str, numbers: bool = False) -> Element:
-    """Return the body of a new table, which the caller fills with rows; columns of numbers align to the right."""
+def remember_click(token_ns: object) -> None:
+    """Judge what the running code commands by the token that its page had at the click."""
+    CLICK.set(Click(token_ns if type(token_ns) is int else 0, time.monotonic_ns()))
+
+
+def table(headings: Sequence[Heading], caption: str, kind: str = "") -> Element:
+    """Return the body of a new table, which the caller fills with rows.
+
+    `kind`: `numbers`, columns align to the right; `stack`, on a narrow screen each row is a block.
+    """
     with ui.element("div").classes("wide").props("tabindex=0 role=region") as region:
         region.props["aria-label"] = caption
-        with ui.element("table").classes("figures numbers" if numbers else "figures"):
+        with ui.element("table").classes(f"figures {kind}"):
             text("caption", caption, "visually-hidden")
             with ui.element("thead"), ui.element("tr"):
                 for heading in headings:
-                    text("th", heading, scope="col")
+                    with ui.element("th").props("scope=col"):
+                        with_unit(*((heading, "") if isinstance(heading, str) else heading))
             return ui.element("tbody")
 
 
-def row(body: Element, first: str, *cells: str) -> Element:
-    """Add a row of text and return it; its first cell is its heading."""
+def row(body: Element, first: str, *cells: str | tuple[float, str, int]) -> Element:
+    """Add a row of text, or of values with unit and digits, and return it; its first cell is its heading."""
     with body, ui.element("tr") as made:
         text("th", first, scope="row")
         for cell in cells:
-            text("td", cell)
+            if isinstance(cell, str):
+                text("td", cell)
+            else:
+                with ui.element("td"):
+                    quantity(*cell)
     return made
 
 
 def tool_pose() -> None:
     """Show the pose of the tool, live."""
-    headings = ("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad")
-    with table(headings, "Pose of the tool", numbers=True), ui.element("tr"):
+    with table(("", *POSE), "Pose of the tool", "numbers"), ui.element("tr"):
         text("th", "pose", scope="row")
-        for at in range(6):
-            shown(f"tool.{at}", 4)
+        for at, (_, unit) in enumerate(POSE):
+            shown(f"tool.{at}", 4, unit=unit)
 
 
 def no_platform() -> None:
     """Say on a page that needs a platform that none runs."""
-    text("p", "No platform runs: start one on the page Start.")
+    text("p", "No platform runs: start one on the tab Start.")
 
 
 def no_geometry() -> None:
@@ -202,7 +224,7 @@ class View:
         self.arm: ArmView | None = None
         self.leaving: list[Callable[[], None]] = []
         """Called by `leave`."""
-        self.kept: dict[str, object] = {}
+        self.kept: dict[str, Any] = {}
         """What a tab keeps while another one is shown, by its name."""
         self._visit = 0
         """Number of the page of the panel that is shown."""
@@ -270,6 +292,10 @@ class View:
             return found
         return None
 
+    async def set_speed_override(self, fraction: float) -> None:
+        """Set the fraction of its speed at which the arm moves, also while this page moves it."""
+        await self._act(self.live.set_speed_override(self.page, fraction), "")
+
     async def query(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
         """Ask the platform something that commands nothing; raises RtcpError."""
         with self._visited():
@@ -292,9 +318,12 @@ class View:
 
     def may_command(self) -> bool:
         """Return whether this person is an operator; else say that they are not."""
-        if self.page.visitor.role != "operator":
-            self.warn(f"{self.page.visitor.name} may look, and not command: log in as an operator")
-        return self.page.visitor.role == "operator"
+        try:
+            self.page.check_may_command()
+        except RtcpError as error:
+            self.warn(error.message)
+            return False
+        return True
 
     def claim(self) -> bool:
         """Make this page the operator's; return False where it says why not."""
@@ -345,7 +374,7 @@ class View:
             else:
                 self.warn(f"{holder} keeps the arm")
 
-        with self._question(f"{holder} operates the arm", "Whoever takes over stops what moves.") as dialog:
+        with self.question(f"{holder} operates the arm", "Whoever takes over stops what moves.") as dialog:
             button("Ask to take over", take)
             button("Leave it", dialog.close, plain=True)
 
@@ -356,13 +385,13 @@ class View:
                 answer.set_result(value)
 
         note = f"Without an answer it changes hands in {TAKE_OVER_S:g} s. What moves is stopped first."
-        with self._question(f"{who} asks for the arm", note) as dialog:
+        with self.question(f"{who} asks for the arm", note) as dialog:
             button("Give it", lambda: give(True))
             button("Keep it", lambda: give(False), plain=True)
         answer.add_done_callback(lambda _: dialog.close())
 
     @contextlib.contextmanager
-    def _question(self, title: str, note: str) -> Iterator[ui.dialog]:
+    def question(self, title: str, note: str) -> Iterator[ui.dialog]:
         """Ask the person, with the buttons that are made inside."""
         with self._client, ui.dialog().props(_BESIDE) as dialog, ui.card():
             dialog.props["aria-label"] = title
@@ -370,4 +399,5 @@ class View:
             text("p", note)
             with ui.element("div").classes("buttons"):
                 yield dialog
+        dialog.on("hide", dialog.delete)
         dialog.open()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import inspect
 import logging
 import secrets
 import socket
@@ -13,26 +12,26 @@ import webbrowser
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response, WebSocket
 from nicegui import Client, app, ui
-from nicegui.element import Element
 from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
 
 from rtcp.api import RtcpError
 from rtcp.config.zero import state_directory
 from rtcp.panel.access import Access, Sessions, Visitor, password_file, passwords_for
-from rtcp.panel.arm_view import ArmView
+from rtcp.panel.frame import Frame, Tab
 from rtcp.panel.live import Live
 from rtcp.panel.metrics import exposition
-from rtcp.panel.page import View, no_geometry, shown, speed_override, text
+from rtcp.panel.page import View
 from rtcp.panel.pages import (
+    alarms,
     arm,
     cell,
     health,
+    io,
     jog,
     limits,
     processes,
@@ -45,23 +44,23 @@ from rtcp.panel.pages import (
 )
 
 _STATIC = Path(__file__).parent / "static"
-PAGES: dict[str, tuple[str, Callable[[View], Any], bool]] = {
-    "/": ("Start", start.build, False),
-    "/arm": ("Arm", arm.build, True),
-    "/cell": ("Cell", cell.build, True),
-    "/processes": ("Processes", processes.build, False),
-    "/program": ("Program", program.build, True),
-    "/targets": ("Targets", targets.build, True),
-    "/jog": ("Jog", jog.build, True),
-    "/limits": ("Limits", limits.build, False),
-    "/recorder": ("Recorder", recorder.build, True),
-    "/scope": ("Scope", scope.build, False),
-    "/segment": ("Segment", segment.build, False),
-    "/health": ("Health", health.build, False),
+PAGES: dict[str, Tab] = {
+    "/": Tab("Start", start.build),
+    "/jog": Tab("Jog", jog.build),
+    "/program": Tab("Program", program.build),
+    "/targets": Tab("Targets", targets.build),
+    "/arm": Tab("Arm", arm.build),
+    "/io": Tab("I/O", io.build),
+    "/scope": Tab("Scope", scope.build),
+    "/recorder": Tab("Recorder", recorder.build),
+    "/segment": Tab("Segment", segment.build),
+    "/limits": Tab("Limits", limits.build),
+    "/health": Tab("Health", health.build),
+    "/alarms": Tab("Alarms", alarms.build),
+    "/cell": Tab("Cell", cell.build),
+    "/processes": Tab("Processes", processes.build),
 }
-"""Path -> name, function that builds it, whether the arm in space stands beside it.
-
-The menu shows Cell where the arm is in one, and Processes where the platform has one."""
+"""Path -> tab. Cell is shown where the arm is in one, and Processes where the platform has one."""
 _COLOURS = {"primary": "#1864ab", "positive": "#237032", "negative": "#c92a2a", "warning": "#9c4a00", "info": "#0b7285"}
 
 
@@ -165,8 +164,6 @@ class Panel:
         async def fault(path: str) -> Response:
             return _file(state_directory() / "faults", path, ("png",))
 
-    # -- what every page has ------------------------------------------------------------------------------------------
-
     def _page(self, request: Request, client: Client) -> None:
         visitor: Visitor = request.scope["visitor"]
         try:
@@ -177,76 +174,11 @@ class Panel:
         client.on_delete(lambda: self._close(view))
         ui.colors(**_COLOURS)
         ui.add_head_html('<link rel="stylesheet" href="/static/panel.css"><script src="/static/panel.js"></script>')
-        with ui.element("header").props("id=head") as head:
-            head.props["data-page"] = page.key
-            shown("state", tag="span").props("role=status aria-live=polite")
-            shown("message", tag="span").classes("message")
-            text("span", "", id="operator")
-            with text("button", "STOP", "stop", type="button", **{"data-stop": ""}):
-                text("small", "not the emergency stop")
-            if self._sessions.asks:
-                with ui.element("form").props("method=post action=/logout"):
-                    text("button", "Log out", "act plain")
-        text(
-            "div",
-            "No connection to the panel: what this page moved has been stopped.",
-            id="lost",
-            role="alert",
-            hidden="",
-        )
-        text("div", "", id="old", role="status", hidden="")
-        with ui.element("nav").props("id=menu").props('aria-label="Pages"'):
-            for path, (name, _, _) in PAGES.items():
-                ui.link(name, path).props["data-path"] = path
-        with ui.element("main").props("id=main") as main:
-            space = ui.element("div").props("id=space")
-            place = ui.sub_pages({path: self._builder(view, main, space, path) for path in PAGES}, show_404=False)
-            place.classes("page")
-        text("div", "", id="notes", role="status", **{"aria-live": "polite"})
+        Frame(view, PAGES, self._sessions.asks)
 
     async def _close(self, view: View) -> None:
         view.leave()
         await self._live.close(view.page)
-
-    def _builder(self, view: View, main: Element, space: Element, path: str) -> Callable[[], Any]:
-        name, build, beside_arm = PAGES[path]
-
-        async def made() -> None:
-            view.page.scope = None
-            view.leave()
-            if view.arm is not None:
-                view.arm.preview([], 0.0)  # planned on the page that is left
-            if beside_arm:
-                self._draw(view, space)
-            main.classes(remove="alone") if beside_arm else main.classes("alone")
-            ui.page_title(f"{name} - rtcp panel")
-            ui.run_javascript(
-                "document.querySelectorAll('#menu a').forEach((one) => one.toggleAttribute('aria-current', false));"
-                f"document.querySelector('#menu a[data-path=\"{path}\"]')?.setAttribute('aria-current', 'page')"
-            )
-            with ui.element("section").classes("page"):
-                if beside_arm and self._live.config is not None:
-                    speed_override(view)
-                try:
-                    if inspect.isawaitable(found := build(view)):
-                        await found
-                except RtcpError as error:
-                    text("p", error.message, "bad")
-
-        return made
-
-    def _draw(self, view: View, space: Element) -> None:
-        """Draw the arm that runs; it stays over all pages."""
-        config, own, partners = shows = (self._live.config, self._live.partners.own, self._live.partners.members)
-        if config is None or (view.arm is not None and view.arm.shows == shows):
-            return
-        space.clear()
-        view.arm = None
-        with space:
-            if config.arm is None:
-                no_geometry()
-            else:
-                view.arm = ArmView(config, own, partners)
 
 
 def _file(directory: Path, path: str, endings: tuple[str, ...]) -> Response:

@@ -93,7 +93,7 @@ def begin(page: Page, running: RunningCell) -> dict[str, Feed]:
     show(page, "/cell")
     for name, q in FAR.items():
         page.get_by_label(f"Joints of {name}, rad").fill(q)
-    page.get_by_label("Speed, rad/s").fill("0.15")
+    page.get_by_label("Speed (empty: the limit), rad/s").fill("0.15")
     page.get_by_role("button", name="Move in step").click()
     feeds = {name: Feed(running.of(name)) for name in FAR}
     for feed in feeds.values():
@@ -215,7 +215,7 @@ def test_all_arms_are_enabled_moved_in_step_and_disabled(page: Page, running: Ru
     expect(page.get_by_label("Joints of right, rad")).to_have_value(re.compile(r"^-?[\d.e-]+(, -?[\d.e-]+){5}$"))
     page.get_by_label("Joints of left, rad").fill("0.2, 0, 0, 0, 0.5, 0")
     page.get_by_label("Joints of right, rad").fill("-pi/12, 0, 0, 0, 0.5, 0")
-    page.get_by_label("Speed, rad/s").fill("0.15")
+    page.get_by_label("Speed (empty: the limit), rad/s").fill("0.15")
     page.get_by_role("button", name="Move in step").click()
     until(lambda: [shown(name, "step") for name in cell.arms] == ["moves"] * 2, "in step")
     assert all(shown(name, "holder").startswith("panel: ") for name in cell.arms)

@@ -22,37 +22,46 @@ def build(view: View) -> None:
         shown("drive_mode", tag="b")
         text("span", ", bus ")
         shown("bus", tag="b")
+        text("span", ", tool ")
+        shown("tool_name", tag="b")
     _joints(config)
     if config.arm is None:
         return
     text("h2", "Tool")
     tool_pose()
     text("h2", "Distance from the singularities")
-    with (
-        table(
-            ("", "shoulder m", "elbow rad", "wrist rad", "smallest singular value"), "Distances from the singularities"
-        ),
-        ui.element("tr"),
-    ):
+    distances = (("shoulder", "m"), ("elbow", "rad"), ("wrist", "rad"), ("smallest singular value", ""))
+    with table(("", *distances), "Distances from the singularities", "numbers"), ui.element("tr"):
         text("th", "distance", scope="row")
-        for at in range(4):
-            shown(f"singular.{at}", 3)
+        for at, (_, unit) in enumerate(distances):
+            shown(f"singular.{at}", 3, unit=unit)
 
 
 def _joints(config: ArmConfig) -> None:
-    headings = ("Joint", "Drive", "rad", "Position", "rad/s", "Velocity", "Nm", "Torque", "Following error rad", "°C")
-    with table(headings, "Joints", numbers=True):
+    headings = (
+        "Joint",
+        "Drive",
+        ("", "rad"),
+        "Position",
+        ("", "rad/s"),
+        "Velocity",
+        "Nm",
+        "Torque",
+        ("Following error", "rad"),
+        "°C",
+    )
+    with table(headings, "Joints", "numbers"):
         for at, joint in enumerate(config.joints):
             with ui.element("tr"):
                 text("th", joint.name, scope="row")
                 shown(f"drive.{at}").classes("text")
-                shown(f"actual_position.{at}", 4)
+                shown(f"actual_position.{at}", 4, unit="rad")
                 _bar(f"actual_position.{at}", "min max", "rad")
-                shown(f"actual_velocity.{at}", 3)
+                shown(f"actual_velocity.{at}", 3, unit="rad/s")
                 _bar(f"actual_velocity.{at}", "velocity", "rad/s")
                 shown(f"actual_torque.{at}", 2)
                 _bar(f"actual_torque.{at}", "torque", "Nm")
-                shown(f"error.{at}", 5)
+                shown(f"error.{at}", 5, unit="rad")
                 shown(f"temperature.{at}", 1)
 
 
@@ -60,4 +69,4 @@ def _bar(name: str, limits: str, unit: str) -> None:
     """Show a value between the limits in force: two by their names, or one for both ways."""
     with ui.element("td"):
         bar = ui.element("div").classes("bar")
-        bar.props.update({"data-bar": name, "data-limits": limits, "data-unit": unit})
+        bar.props.update({"data-bar": name, "data-limits": limits, "data-in": unit})

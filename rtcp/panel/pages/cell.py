@@ -56,7 +56,7 @@ class InStep:
         with ui.element("div").classes("page"):
             self._joints = {one.name: field(f"Joints of {one.name}, rad (empty: it stays)") for one in cell.arms}
         with ui.element("div").classes("fields"):
-            self._speed = number("Speed, rad/s (empty: the limit)", min="0")
+            self._speed = number("Speed (empty: the limit)", unit="rad/s", min="0")
         with ui.element("div").classes("buttons"):
             button("Here", self._here, plain=True)
             button("Move in step", self._move)

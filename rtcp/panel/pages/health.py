@@ -1,16 +1,18 @@
-"""Health: how well the cycle holds, what has happened, and the faults of the black box."""
+"""Health: how well the cycle holds, and the last hour of temperatures, torques and times."""
 
 from __future__ import annotations
 
-import json
-from functools import partial
-from pathlib import Path
+import time
 
 import numpy as np
+import numpy.typing as npt
 from nicegui import ui
+from nicegui.element import Element
+from nicegui.elements.mixins.text_element import TextElement
 
 from rtcp.api import Feed, RtcpError
-from rtcp.panel.page import View, button, row, table, text
+from rtcp.panel.page import View, row, table, text
+from rtcp.panel.trends import SAMPLE_S
 
 _FIGURES = {"wakeup_ns": "Wake-up, us", "exchange_ns": "Exchange, us", "compute_ns": "Compute, us"}
 _BINS = 40
@@ -25,9 +27,9 @@ def build(view: View) -> None:
         pass
     skipped = text("p", "", role="status")
     charts = {}
-    with ui.element("div").classes("fields").style("grid-template-columns: repeat(auto-fit, minmax(16rem, 1fr))"):
+    with ui.element("div").classes("columns"):
         for key, name in _FIGURES.items():
-            charts[key] = _chart(name)
+            charts[key] = _histogram(name)
     recent: dict[str, np.ndarray] = {key: np.zeros(0) for key in _FIGURES}
     reader: list[Feed | None] = [None]
 
@@ -54,15 +56,14 @@ def build(view: View) -> None:
         except RtcpError:
             close()
             return
-        for key, chart in charts.items():
+        for key, (path, told) in charts.items():
             recent[key] = np.concatenate([recent[key], records[key] / 1e3])[-_MOST:]
             if not len(recent[key]):
                 continue
             high = max(1.0, float(np.percentile(recent[key], 99.9)))
-            counts, edges = np.histogram(recent[key], bins=_BINS, range=(0.0, high))
-            chart.options["xAxis"]["data"] = [f"{edge:.0f}" for edge in edges[:-1]]
-            chart.options["series"][0]["data"] = [int(one) or None for one in counts]
-            chart.update()
+            counts, _ = np.histogram(recent[key], bins=_BINS, range=(0.0, high))
+            path.props["d"] = _bars(counts)
+            told.text = f" 0 to {high:.0f} us, {len(recent[key])} cycles, logarithmic"
 
     def close() -> None:
         if reader[0] is not None:
@@ -73,84 +74,51 @@ def build(view: View) -> None:
     ui.timer(1.0, refresh)
     ui.timer(1.0, draw)
     view.leaving.append(close)
-    _events(view)
-    _faults(view)
+    _trends(view)
 
 
-def _chart(name: str) -> ui.echart:
-    chart = ui.echart(
-        {
-            "title": {"text": name, "textStyle": {"fontSize": 14}},
-            "grid": {"left": 50, "right": 10, "top": 35, "bottom": 25},
-            "animation": False,
-            "xAxis": {"type": "category", "data": []},
-            "yAxis": {"type": "log", "min": 1},
-            "series": [{"type": "bar", "data": [], "itemStyle": {"color": "#1864ab"}, "barWidth": "95%"}],
-        }
-    ).style("height: 14rem; width: 100%")
-    chart.props.update({"role": "img", "aria-label": f"Histogram: {name}"})
-    return chart
+def _histogram(name: str) -> tuple[Element, TextElement]:
+    """Show a histogram; return its path, and where its range is told."""
+    with ui.element("figure"):
+        with ui.element("svg").classes("histogram") as picture:
+            picture.props.update({"viewBox": f"0 0 {_BINS} 1", "preserveAspectRatio": "none", "role": "img"})
+            picture.props["aria-label"] = f"Histogram: {name}"
+            path = ui.element("path")
+        with ui.element("figcaption"):
+            text("b", name)
+            return path, text("small", "")
 
 
-def _events(view: View) -> None:
-    text("h2", "Events")
+def _bars(counts: npt.NDArray[np.int64]) -> str:
+    """Return the outline of bars, their heights by the logarithm of the counts: rare late cycles are seen."""
+    heights = np.log10(counts + 1.0) / max(1.0, np.log10(counts.max() + 1.0))
+    return " ".join(f"M{at} 1V{1.0 - height:.3f}h0.9V1Z" for at, height in enumerate(heights) if height)
+
+
+def _trends(view: View) -> None:
+    """Show each figure of the last hour as a small line, with its numbers."""
+    text("h2", "The last hour")
+    text("p", f"Sampled every {SAMPLE_S:g} s while the panel runs; each point is the largest value of its time.")
     place = ui.element("div").classes("page")
-    last = [-1]
 
-    async def refresh() -> None:
-        try:
-            events = await view.query(lambda robot: robot.events())
-        except RtcpError:
-            return
-        if events and events[-1].number != last[0]:
-            last[0] = events[-1].number
-            place.clear()
-            with place:
-                body = table(("#", "Time", "Event", "Message"), "Events")
-            for one in reversed(events[-25:]):
-                row(body, str(one.number), one.time[11:23], one.name, one.message)
-
-    ui.timer(1.0, refresh)
-
-
-def _faults(view: View) -> None:
-    text("h2", "Recorded faults")
-    place = ui.element("div").classes("page")
-    picture = ui.element("div").classes("page")
-
-    async def show() -> None:
-        code, out = await view.rtcp("faults", "--json")
+    def refresh() -> None:
         place.clear()
-        if code:
-            view.warn(out)
-            return
-        found = json.loads(out)["faults"]
         with place:
-            if not found:
-                text("p", "None has been recorded.")
-                return
-            body = table(("#", "Time", "What", ""), "Recorded faults")
-        for one in reversed(found[-20:]):
-            what = str(one.get("what") or one.get("error"))
-            with row(body, str(one["number"]), str(one.get("time", "-"))[:19], what), ui.element("td"):
-                button(f"Picture of fault {one['number']}", partial(draw, one["number"]), plain=True)
+            body = table(("", "least", "largest", "now", "", "60 min ago to now"), "Trends", "numbers")
+        now = time.monotonic()
+        for one in view.live.trends.all.values():
+            values = [value for _, value in one.samples]
+            least, largest = min(values), max(values)
+            figures = (f"{value:.4g}" for value in (least, largest, values[-1]))
+            with row(body, one.name, *figures, one.unit), ui.element("td"):
+                _line(one.line(now), least, largest)
 
-    async def draw(number: int) -> None:
-        code, out = await view.rtcp("faults", "show", str(number), "--json")
-        if code:
-            view.warn(out)
-            return
-        file = Path(json.loads(out)["file"])
-        code, out = await view.rtcp("faults", "show", str(number), "--plot", str(file.with_suffix(".png")))
-        picture.clear()
-        with picture:
-            if code:
-                text("pre", out, "text")
-                return
-            image = ui.element("img").style("max-width: 100%; background: #fff")
-            image.props.update(
-                {"src": f"/faults/{file.with_suffix('.png').name}", "alt": f"What happened around fault {number}"}
-            )
-            text("pre", out, "text")
+    refresh()
+    ui.timer(SAMPLE_S, refresh)
 
-    button("Show the recorded faults", show, plain=True)
+
+def _line(points: list[tuple[float, float]], least: float, largest: float) -> None:
+    height = (largest - least) or 1.0
+    steps = (f"{180.0 * (1.0 - age):.0f},{22.0 - 20.0 * (value - least) / height:.1f}" for age, value in points)
+    with ui.element("svg").classes("trend").props('viewBox="0 0 180 24" preserveAspectRatio=none aria-hidden=true'):
+        ui.element("polyline").props["points"] = " ".join(steps)

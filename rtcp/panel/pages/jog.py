@@ -1,18 +1,38 @@
-"""Jog: pads, keys and a gamepad, held to move."""
+"""Jog: pads, keys and a gamepad, held to move; or a step for each click."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 from nicegui import ui
+from nicegui.element import Element
 
-from rtcp.panel.page import ENABLED, View, button, choice, no_platform, number, text, tool_pose
+from rtcp.api import RtcpError
+from rtcp.config.model import ArmConfig
+from rtcp.panel.page import (
+    ENABLED,
+    POSE,
+    Field,
+    View,
+    button,
+    choice,
+    no_platform,
+    number,
+    remember_click,
+    text,
+    tool_pose,
+)
 
 FRAMES = {"base": "Base frame", "tool": "Tool frame", "joints": "Joints"}
+_STEPS = {"fine": (1e-3, math.radians(1.0)), "coarse": (1e-2, math.radians(5.0))}
+"""Of the tool, m, and about an axis or of a joint, rad."""
+_MOVEMENTS = {"": "while held", "fine": "step 1 mm or 1 deg", "coarse": "step 10 mm or 5 deg"}
 _PADS = {
-    "X and Y": ("x+ Forward, +X", "y+ Left, +Y", "y- Right, -Y", "x- Back, -X"),
-    "Z and yaw": ("z+ Up, +Z", "rz+ Yaw +", "rz- Yaw -", "z- Down, -Z"),
-    "Roll and pitch": ("ry+ Pitch +", "rx+ Roll +", "rx- Roll -", "ry- Pitch -"),
+    "X and Y": ("x+ Forward, +X", "y+ Left, +Y", "y- Right, \N{MINUS SIGN}Y", "x- Back, \N{MINUS SIGN}X"),
+    "Z and yaw": ("z+ Up, +Z", "rz+ Yaw +", "rz- Yaw \N{MINUS SIGN}", "z- Down, \N{MINUS SIGN}Z"),
+    "Roll and pitch": ("ry+ Pitch +", "rx+ Roll +", "rx- Roll \N{MINUS SIGN}", "ry- Pitch \N{MINUS SIGN}"),
 }
 """Name -> part of the speed and label of the upper, left, right and lower button, as on the source's stick."""
 _PLACES = ("1 / 2", "2 / 1", "2 / 3", "3 / 2")
@@ -30,71 +50,119 @@ _KEYS = (
 def build(view: View) -> None:
     """Build the page."""
     text("h1", "Jog")
-    config = view.live.config
-    if config is None:
+    if view.live.config is None:
         no_platform()
-        return
-    text("p", "Hold to move. Letting go, leaving the page or losing the connection stops the arm.")
-    with ui.element("div").classes("page jog-area").props("tabindex=0") as area:
-        area.props["aria-label"] = (
-            "Jog by keys: arrows X and Y, page up and down Z, q and e yaw, a and d roll, w and s pitch, o and c gripper"
-        )
-        area.props["role"] = "group"
+    else:
+        Jog(view, view.live.config)
 
-        def settings() -> None:
-            # Numbers that are none, or beyond what is configured, move nothing: the platform refuses them.
-            area.props.update(
-                {
-                    "data-jog-frame": frame.value,
-                    "data-jog-speed": speed.value,
-                    "data-jog-turn": turn.value,
-                    "data-jog-joint": joint.value,
-                }
+
+class Jog:
+    """The pads of one arm; what they do while they are held stands in `panel.js`."""
+
+    def __init__(self, view: View, config: ArmConfig) -> None:
+        self._view, self._config = view, config
+        self._kept: dict[str, str] = view.kept.setdefault("jog", {})
+        """What `panel.js` jogs with."""
+        with ui.element("div").classes("page jog-area").props("tabindex=0 role=group") as self._area:
+            self._area.props["aria-label"] = (
+                "Jog by keys: arrows X and Y, page up and down Z, q and e yaw, a and d roll, w and s pitch, "
+                "o and c gripper"
             )
-            cartesian.set_visibility(frame.value != "joints")
-            single.set_visibility(frame.value == "joints")
+            with ui.element("div").classes("pads"):
+                self._cartesian = ui.element("div").classes("pads")
+                self._single = ui.element("div").classes("joints")
+                _gripper(view)
+            self._make_pads()
+            with ui.element("div").classes("fields"):
+                self._movement = choice("Movement", _MOVEMENTS, self._kept.get("data-jog-step", ""))
+                frames = FRAMES if config.arm is not None else {"joints": FRAMES["joints"]}
+                first = config.jog.frame if config.arm is not None else "joints"
+                kept = self._kept.get("data-jog-frame", first)
+                self._frame = choice("Frame", frames, kept if kept in frames else first)
+                with ui.element("div").style("display: contents") as of_the_tool:
+                    self._speed = self._limited("Speed", "m/s", config.jog.speed, "data-jog-speed")
+                    self._turn = self._limited("Turning", "rad/s", config.jog.angular_speed, "data-jog-turn")
+                of_the_tool.set_visibility(config.arm is not None)
+                self._joint = number("Joints", self._kept.get("data-jog-joint", "0.1"), "rad/s", min="0", step="0.01")
+            for one in (self._movement, self._frame, self._speed, self._turn, self._joint):
+                one.on_change(self._settle)
+            self._settle()
+        text(
+            "p",
+            "Letting go, leaving the page or losing the connection stops the arm. Keys, while the pads have the focus: "
+            "arrows, page up, page down, q e, a d, w s; o opens and c closes the gripper. Gamepad: hold the left "
+            "shoulder button; A closes and B opens.",
+        )
+        if config.arm is not None:
+            tool_pose()
 
-        with ui.element("div").classes("fields"):
-            if config.arm is None:
-                frame = choice("Frame", {"joints": FRAMES["joints"]}, "joints")
-            else:
-                frame = choice("Frame", FRAMES, config.jog.frame)
-            with ui.element("div").style("display: contents") as of_the_tool:
-                most = config.jog.speed
-                speed = number("Speed, m/s", str(most / 2), min="0", max=str(most), step="0.005")
-                most = config.jog.angular_speed
-                turn = number("Turning, rad/s", str(most / 2), min="0", max=str(most), step="0.01")
-            of_the_tool.set_visibility(config.arm is not None)
-            joint = number("Joints, rad/s", "0.1", min="0", step="0.01")
-        with ui.element("div").classes("pads"):
-            cartesian = ui.element("div").classes("pads")
-            single = ui.element("div")
-            _gripper(view)
-        with cartesian:
-            for name, buttons in _PADS.items() if config.arm else ():
+    def _limited(self, label: str, unit: str, most: float, key: str) -> Field:
+        return number(label, self._kept.get(key, str(most / 2)), unit, min="0", max=str(most), step=str(most / 20))
+
+    def _make_pads(self) -> None:
+        with self._cartesian:
+            for name, buttons in _PADS.items() if self._config.arm else ():
                 with ui.element("div"):
                     text("h2", name)
                     with ui.element("div").classes("pad"):
                         for place, one in zip(_PLACES, buttons, strict=True):
                             part, _, label = one.partition(" ")
-                            _hold(label, part).style(f"grid-area: {place}")
-        with single:
-            for at, motor in enumerate(config.joints):
-                with ui.element("div").classes("buttons"):
-                    text("span", motor.name).style("min-width: 5rem")
-                    _hold(f"{motor.name} -", f"{at}-")
-                    _hold(f"{motor.name} +", f"{at}+")
+                            self._pad(label, part).style(f"grid-area: {place}")
+        with self._single:
+            for at, motor in enumerate(self._config.joints):
+                with ui.element("div").classes("joint"):
+                    text("span", motor.name)
+                    self._pad(f"{motor.name} \N{MINUS SIGN}", f"{at}-")
+                    self._pad(f"{motor.name} +", f"{at}+")
                     text("small", _KEYS[at] if at < len(_KEYS) else "")
-        for one_field in (frame, speed, turn, joint):
-            one_field.on_change(settings)
-        settings()
-    text(
-        "p",
-        "Keys, while the pads have the focus: arrows, page up, page down, q e, a d, w s; o opens and c closes the "
-        "gripper. Gamepad: hold the left shoulder button; A closes and B opens.",
-    )
-    if config.arm is not None:
-        tool_pose()
+
+    def _pad(self, label: str, part: str) -> Element:
+        """Return a button that jogs while it is held, or steps where its page shows that it does."""
+        made = button(label, when="holding moving")
+        made.props["data-jog"] = part
+
+        async def clicked(event: Any) -> None:
+            token_ns, movement = event.args
+            remember_click(token_ns)
+            if movement == self._movement.value:
+                await self._step(part)
+
+        made.on("click", clicked, js_handler="() => rtcp.stepping && emit([rtcp.token, rtcp.stepping])")
+        return made
+
+    def _settle(self) -> None:
+        # Numbers that are none, or beyond what is configured, move nothing: the platform refuses them.
+        self._kept.update(
+            {
+                "data-jog-frame": self._frame.value,
+                "data-jog-speed": self._speed.value,
+                "data-jog-turn": self._turn.value,
+                "data-jog-joint": self._joint.value,
+                "data-jog-step": self._movement.value,
+            }
+        )
+        self._area.props.update(self._kept)
+        self._cartesian.set_visibility(self._frame.value != "joints")
+        self._single.set_visibility(self._frame.value == "joints")
+
+    async def _step(self, part: str) -> None:
+        """Move by one step; a click while the last one moves does nothing."""
+        operator, view = self._view.live.operator, self._view
+        if operator is not None and operator.page is view.page and operator.moves:
+            return
+        length, turn = _STEPS[self._movement.value]
+        axes = [name for name, _ in POSE]
+        by_joint = part[:-1] not in axes
+        axis = int(part[:-1]) if by_joint else axes.index(part[:-1])
+        offset = [0.0] * (len(self._config.joints) if by_joint else len(axes))
+        offset[axis] = math.copysign(turn if by_joint or axis > 2 else length, 1.0 if part[-1] == "+" else -1.0)
+        try:
+            # A line has no speed of turning: that of the configuration holds.
+            speed = self._joint.number() if by_joint else self._speed.number() if axis <= 2 else None
+        except RtcpError as error:
+            view.warn(error.message)
+            return
+        await view.act(lambda robot: robot.move_by(offset, "joints" if by_joint else self._frame.value, speed))
 
 
 def _gripper(view: View) -> None:
@@ -112,9 +180,3 @@ def _gripper(view: View) -> None:
             ):
                 made = button(label, move(opens, done), when=ENABLED).style(f"grid-area: {place}")
                 made.props.update({"data-gripper": label.lower(), "aria-label": f"{label} gripper"})
-
-
-def _hold(label: str, part: str) -> ui.element:
-    made = button(label, when="holding moving")
-    made.props["data-jog"] = part
-    return made

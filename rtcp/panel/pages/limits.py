@@ -8,9 +8,10 @@ from typing import Any
 from nicegui import ui
 
 from rtcp.api import RtcpError
-from rtcp.panel.page import ENABLED, Field, View, button, no_platform, number, table, text
+from rtcp.panel.page import ENABLED, POSE, Field, View, button, no_platform, number, quantity, table, text
 
 _JOINT = {"min": "rad", "max": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "jerk": "rad/s³", "torque": "Nm"}
+"""Limit of a joint -> its unit."""
 
 
 async def build(view: View) -> None:
@@ -42,17 +43,16 @@ async def build(view: View) -> None:
             for key, value in changes.items():
                 fields[key].value = kept[key] = f"{value:g}"
 
-    headings = ("Joint", *(f"{name} {unit}" for name, unit in _JOINT.items()))
-    with table(headings, "Limits of the joints", numbers=True):
+    with table(("Joint", *_JOINT.items()), "Limits of the joints", "numbers"):
         for at, name in enumerate(found["joint_names"]):
             with ui.element("tr"):
                 text("th", name, scope="row")
-                for key in _JOINT:
+                for key, unit in _JOINT.items():
                     with ui.element("td"):
                         fields[f"{name}.{key}"] = _field(
-                            f"{name} {key}", found["limits"][key][at], found["configured"][key][at]
+                            f"{name} {key}", found["limits"][key][at], found["configured"][key][at], unit
                         )
-    with table(("Space", "Corner", "x m", "y m", "z m"), "Limits of the space", numbers=True):
+    with table(("Space", "Corner", *POSE[:3]), "Limits of the space", "numbers"):
         for box in _boxes(found["limits"]):
             for side in ("min", "max"):
                 with ui.element("tr"):
@@ -61,7 +61,7 @@ async def build(view: View) -> None:
                     for axis, letter in enumerate("xyz"):
                         now, allowed = (_boxes(found[which])[box][side][axis] for which in ("limits", "configured"))
                         with ui.element("td"):
-                            fields[f"{box}.{side}.{letter}"] = _field(f"{box} {side} {letter}", now, allowed)
+                            fields[f"{box}.{side}.{letter}"] = _field(f"{box} {side} {letter}", now, allowed, "m")
     kept = {key: one.value for key, one in fields.items()}
     when = f"ready {ENABLED} stopped_by_limit fault"
     with ui.element("div").classes("buttons"):
@@ -69,9 +69,11 @@ async def build(view: View) -> None:
         button("As the file allows", widest, when=when, plain=True)
 
 
-def _field(name: str, now: float, allowed: float) -> Field:
-    made = number(name, f"{now:g}")
-    text("small", f"file: {allowed:g}")
+def _field(name: str, now: float, allowed: float, unit: str) -> Field:
+    made = number(name, f"{now:g}", unit)
+    with ui.element("small"):
+        text("span", "file: ")
+        quantity(allowed, unit)
     return made
 
 

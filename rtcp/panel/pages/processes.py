@@ -74,7 +74,7 @@ def _limits(process: ProcessConfig) -> None:
     if not numbers:
         return
     text("h2", f"Limits and settings of {process.name}")
-    with table(("Key", "Value"), f"Limits and settings of {process.name}", numbers=True):
+    with table(("Key", "Value"), f"Limits and settings of {process.name}", "numbers"):
         for name, value in numbers.items():
             with ui.element("tr"):
                 text("th", name, scope="row")

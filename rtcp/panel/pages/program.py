@@ -185,7 +185,7 @@ class ProgramPage:
     def _show_speed(self, file: ProgramFile) -> None:
         now = file.motion.speed
         with ui.element("div").classes("fields"):
-            speed = number("Speed of the tool, m/s (empty: the arm's)", "" if now is None else f"{now:g}", min="0")
+            speed = number("Speed of the tool (empty: the arm's)", "" if now is None else f"{now:g}", "m/s", min="0")
 
         def set_speed() -> None:
             try:
@@ -205,7 +205,7 @@ class ProgramPage:
             if not steps:
                 text("p", "None yet: keep a pose, then add a step that leads there.")
                 return
-            body = table(("#", "Step", "", "", "", ""), "Steps of the program")
+            body = table(("#", "Step", "", "", "", ""), "Steps of the program", "stack")
         for at, step in enumerate(steps):
             shown = row(body, f"▶ {at + 1}" if at == self._kept.at else str(at + 1), described(step))
             if at == self._kept.at:
@@ -269,7 +269,7 @@ class ProgramPage:
             button("Keep where the arm is", lambda: self._keep(name.value.strip(), what.value))
         if not file.motion.poses:
             return
-        body = table(("Pose", "Kept as", "", "", ""), "Poses of the program")
+        body = table(("Pose", "Kept as", "", "", ""), "Poses of the program", "stack")
         for pose in file.motion.poses:
             with row(body, pose.name, "joints" if pose.q is not None else "pose"):
                 for label, spoken, handler in (
@@ -360,7 +360,7 @@ class ProgramPage:
             kept.end()
             last = len(program.steps) if end is None else end
             if done:
-                kept.at = last if last < len(program.steps) else 0
+                kept.at = last if end is not None or last < len(program.steps) else 0
             self._say(("Done" if end is None else f"Step {start + 1} is done") if done else "It has ended early")
 
     async def _step(self) -> None:
@@ -409,8 +409,8 @@ def _fields_of(kind: str, poses: list[str], parts: list[str]) -> Mapping[str, Ca
     """Make the fields of a kind of step; return what reads each key."""
     found: dict[str, Callable[[], Any]] = {}
 
-    def optional(key: str, label: str) -> None:
-        made = number(label, min="0")
+    def optional(key: str, label: str, unit: str) -> None:
+        made = number(label, unit=unit, min="0")
         found[key] = lambda: made.number() if made.value.strip() else None
 
     if kind in _MOTIONS:
@@ -419,8 +419,11 @@ def _fields_of(kind: str, poses: list[str], parts: list[str]) -> Mapping[str, Ca
         if kind == "arc":
             via = choice("Through", poses, poses[0])
             found["via"] = lambda: via.value
-        optional("speed", "Speed, rad/s (empty: the limit)" if kind == "move" else "Speed, m/s (empty: the program's)")
-        optional("blend", "Blend, m (empty: it rests)")
+        if kind == "move":
+            optional("speed", "Speed (empty: the limit)", "rad/s")
+        else:
+            optional("speed", "Speed (empty: the program's)", "m/s")
+        optional("blend", "Blend (empty: it rests)", "m")
     elif kind == "gripper":
         grip = choice("Gripper", ("open", "close"), "close")
         found[kind] = lambda: grip.value
@@ -430,7 +433,7 @@ def _fields_of(kind: str, poses: list[str], parts: list[str]) -> Mapping[str, Ca
         found[kind] = lambda: str(name.value).strip()
         found["value"] = lambda: bool(level.value)
         if kind == "wait_for":
-            optional("timeout_s", "At most, s (empty: for ever)")
+            optional("timeout_s", "At most (empty: for ever)", "s")
     elif kind == "wait_s":
         seconds = number("Time, s", "1", min="0")
         found[kind] = seconds.number

@@ -41,7 +41,7 @@ async def build(view: View) -> None:
             shown[0] = found
             slaves.clear()
             with slaves:
-                body = table(_COUNTERS, "Slaves in the order of the cable")
+                body = table(_COUNTERS, "Slaves in the order of the cable", "lines")
             for cells in found:
                 row(body, *cells)
         if status is not None:

@@ -1,15 +1,15 @@
-"""Start: bus, configuration, modes, cycle; start and stop; what stands in the way of real time."""
+"""Start: bus, configuration, modes, cycle; start and stop; what stands in the way of real time, with remedies."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
 from nicegui import ui
 
-from rtcp.api import AsyncRobot
 from rtcp.config.find import default_config, find_config
 from rtcp.config.model import VIRTUAL, ConfigError, ControlModeName, DriveModeName
 from rtcp.panel.page import ENABLED, View, button, choice, field, number, on_click, row, table, text
@@ -52,8 +52,6 @@ def build(view: View) -> None:
         said.text = f"{said.text}\n{line}".strip()[-8000:]
 
     async def start() -> None:
-        if not view.claim():
-            return
         said.text = ""
         cell = view.live.partners.cell
         arguments = where() if cell is None else ["--bus", bus.value, "--cell", str(cell.source)]
@@ -61,15 +59,26 @@ def build(view: View) -> None:
             arguments += ["--mode", mode.value]
         if cycle.value.strip():
             arguments += ["--cycle-us", cycle.value]
-        code, _ = await view.rtcp("start", "--detach", *arguments, show=show)
-        if code:
+        if not await _start(view, arguments, show):
             view.warn("The platform was not started: the reason stands below the buttons")
-        else:
-            view.say("The platform runs")
 
     async def doctor() -> None:
         said.text = "..."
-        _, said.text = await view.rtcp("doctor", *where())
+        _, out = await view.rtcp("doctor", "--json", *where())
+        found.clear()
+        try:
+            findings = json.loads(out[out.index("{") :])["findings"]
+        except (ValueError, LookupError):
+            said.text = out
+            return
+        said.text = ""
+        with found:
+            body = table(("Check", "", "Found", "Why it matters", "To fix it, as root"), "This host", "stack")
+            for one in findings:
+                with row(body, one["key"].replace("_", " "), one["severity"], one["found"], one["why"]) as made:
+                    made.props["data-severity"] = one["severity"]
+                    with ui.element("td"):
+                        text("pre", "\n".join(one["remedy"]), "text remedy")
 
     async def scan_bus() -> None:
         if not view.claim():
@@ -90,22 +99,7 @@ def build(view: View) -> None:
     for control, handler in ((begin, start), (check, doctor), (scan, scan_bus)):
         on_click(control, handler)
 
-    text("h2", "Machine")
-    with ui.element("div").classes("buttons"):
-        button("Enable", lambda: view.act(lambda robot: robot.enable(), "The drives hold the arm"), when="ready")
-        button(
-            "Disable",
-            lambda: view.act(_disable, "The drives are without torque", instead=True),
-            when=ENABLED + " stopped_by_limit",
-            plain=True,
-        )
-        button(
-            "Reset",
-            lambda: view.act(lambda robot: robot.reset(), "Reset"),
-            when="fault emergency_stop stopped_by_limit",
-            plain=True,
-        )
-        button("Halt", view.halt, when="moving homing", plain=True)
+    text("h2", "Modes")
     with ui.element("div").classes("fields"):
         control_mode = choice("Control mode", MODES, "joint")
         drive_mode = choice("Drive mode", DRIVE_MODES, "csp")
@@ -124,8 +118,24 @@ def build(view: View) -> None:
         )
 
 
-async def _disable(robot: AsyncRobot) -> None:
-    await robot.disable()
+async def start_virtual(view: View) -> None:
+    """Start the virtual arm as it is configured; show what keeps it from that."""
+    lines: list[str] = []
+    view.say("The virtual arm starts")
+    cell = view.live.partners.cell
+    arguments = ["--bus", VIRTUAL, *([] if cell is None else ["--cell", str(cell.source)])]
+    if not await _start(view, arguments, lines.append):
+        view.warn("The virtual arm was not started: " + " ".join(lines[-3:]))
+
+
+async def _start(view: View, arguments: list[str], show: Callable[[str], None]) -> bool:
+    """Start a platform and return whether it runs; `show` gets each line of the command."""
+    if not view.claim():
+        return True  # the person has been told
+    code, _ = await view.rtcp("start", "--detach", *arguments, show=show)
+    if not code:
+        view.say("The platform runs")
+    return not code
 
 
 async def _end(view: View) -> None:

@@ -18,10 +18,9 @@ from kinematics.pose import Pose
 from rtcp.api import Arrival, AsyncRobot, Invalid, Preview, RtcpError
 from rtcp.config.model import ArmConfig
 from rtcp.config.zero import state_directory
-from rtcp.panel.page import Field, View, button, choice, field, no_platform, number, row, table, text
+from rtcp.panel.page import POSE, Field, View, button, choice, field, no_platform, number, quantity, row, table, text
 
 _WAYS = {"joints": "Joint positions", "pose": "Pose, by the joints", "line": "Pose, on a straight line"}
-_POSE = ("x m", "y m", "z m", "rx rad", "ry rad", "rz rad")
 _LONGEST_NAME = 40
 _SAME_RAD = 1e-3
 
@@ -68,7 +67,7 @@ class Targets:
         """Where what was shown begins, rad."""
         with ui.element("div").classes("fields"):
             self._way = choice("Target", _WAYS if config.arm else {"joints": _WAYS["joints"]}, "joints")
-            self._speed = number("Speed, rad/s or m/s (empty: the limit)", min="0")
+            self._speeds = {unit: number("Speed (empty: the limit)", unit=unit, min="0") for unit in ("rad/s", "m/s")}
         self._joints_part = ui.element("div").classes("fields")
         with self._joints_part:
             self._joints = [
@@ -76,7 +75,7 @@ class Targets:
             ]
         self._pose_part = ui.element("div").classes("fields")
         with self._pose_part:
-            self._pose = [number(name) for name in _POSE]
+            self._pose = [number(name, unit=unit) for name, unit in POSE]
         with ui.element("div").classes("buttons"):
             button("Here", self._here, plain=True)
             button("Plan", self._plan, when="ready holding")
@@ -90,14 +89,14 @@ class Targets:
             button("Keep these joint positions", self._keep, plain=True)
         self._named = ui.element("div").classes("page")
         self._show_named()
-        for one in (self._way, self._speed, *self._pose):
+        for one in (self._way, *self._speeds.values(), *self._pose):
             one.on_change(self._changed)
         self._here()
         self._changed()
 
     def _with_slider(self, name: str, low: float, high: float) -> Field:
         with ui.element("div"):
-            made = number(f"{name}, rad")
+            made = number(name, unit="rad")
             slider = ui.element("input")
             slider.props.update(
                 {
@@ -112,8 +111,15 @@ class Targets:
         made.on_change(self._changed)
         return made
 
+    @property
+    def _speed(self) -> Field:
+        """That of the joints, or of the tool on a line."""
+        return self._speeds["m/s" if self._way.value == "line" else "rad/s"]
+
     def _changed(self) -> None:
         """What was planned is not what the fields say any more."""
+        for one in self._speeds.values():
+            one.place.set_visibility(one is self._speed)
         self._planned = None
         self._send_button.props["disabled"] = True
         self._joints_part.set_visibility(self._way.value == "joints")
@@ -191,15 +197,15 @@ class Targets:
             return
         with self._found:
             names = [joint.name for joint in self._config.joints]
-            body = table(("#", "Branch", *names, "Limits", ""), "Solutions of the pose")
+            body = table(("#", "Branch", *((name, "rad") for name in names), "Limits", ""), "Solutions of the pose")
         for count, one in enumerate(found.solutions, 1):
             outside = [
                 name for name, q, low, high in zip(names, one.q, in_force["min"], in_force["max"], strict=True)
                 if not low <= q <= high
             ]  # fmt: skip
             limits = f"outside: {', '.join(outside)}" if outside else "inside"
-            cells = (str(one.branch or "-"), *(f"{q:.4f}" for q in one.q), limits)
-            with row(body, str(count), *cells), ui.element("td"):
+            angles: list[tuple[float, str, int]] = [(q, "rad", 4) for q in one.q]
+            with row(body, str(count), str(one.branch or "-"), *angles, limits), ui.element("td"):
                 button(f"Use solution {count}", partial(self._use, one.q), plain=True)
 
     def _use(self, q: Sequence[float]) -> None:
@@ -243,7 +249,9 @@ class Targets:
             for name, q in named.items():
                 with ui.element("div").classes("buttons"):
                     button(name, partial(self._use, q), plain=True)
-                    text("span", ", ".join(f"{one:.3f}" for one in q))
+                    with ui.element("span").classes("values"):
+                        for one in q:
+                            quantity(one, "rad", 3)
                     button(f"Remove {name}", partial(self._forget, name), plain=True)
 
 

@@ -115,6 +115,7 @@ export default {
     scene.children[1].position.set(3, -4, 6);
     const grid = new THREE.GridHelper(2, 20, "#868e96", "#adb5bd");
     grid.rotateX(Math.PI / 2);
+    Object.assign(grid.material, { transparent: true, opacity: 0.5 });
     scene.add(grid, new THREE.AxesHelper(0.2));
     this.arm = new Chain(scene, this.links);
     this.ghost = new Chain(scene, this.links, GHOST);
@@ -255,6 +256,7 @@ export default {
       this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
       this.renderer.setSize(clientWidth, clientHeight, false);
       this.camera.aspect = clientWidth / clientHeight;
+      this.camera.fov = this.camera.aspect > 2 ? 30 : 45; // a low picture shows the arm, and not all around it
       this.camera.updateProjectionMatrix();
       this.draw();
     },

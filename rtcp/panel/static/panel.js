@@ -56,6 +56,60 @@ window.rtcp = (() => {
     0x27: "operation enabled", 0x07: "quick stop", 0x0f: "fault reaction", 0x08: "fault" };
   function drive(word) { return STATES[(word & 0x4f) in STATES && (word & 0x4f) !== 0x07 ? word & 0x4f : word & 0x6f] ?? "?"; }
   function put(element, text) { if (element.textContent !== text) element.textContent = text; }
+
+  // Values are SI everywhere; what a person reads and types is in the units that this browser keeps.
+  const UNITS = { rad: { rad: 1, deg: 180 / Math.PI }, m: { m: 1, mm: 1000 } };
+  const chosen = { rad: "rad", m: "m", ...JSON.parse(localStorage.getItem("rtcp-units") ?? "{}") };
+  function unit(si) { // the name of what is shown for a unit of the interfaces, and how many of it make one
+    const [base, ...rest] = si.split("/"), name = Object.hasOwn(chosen, base) ? chosen[base] : "";
+    return name ? [[name, ...rest].join("/"), UNITS[base][name] ?? 1] : [si, 1];
+  }
+  function figure(value, { in: si = "", digits }) {
+    const factor = unit(si)[1], fewer = Math.round(Math.log10(factor));
+    return digits ? (value * factor).toFixed(Math.max(0, digits - fewer)) : String(factor === 1 ? value : +(value * factor).toPrecision(5));
+  }
+  function isNumber(text) { return text.trim() !== "" && Number.isFinite(+text); }
+  function measure(field) { // show what a field says in the chosen unit
+    const factor = unit(field.dataset.in)[1], before = +(field.dataset.factor ?? 1);
+    if (field.dataset.factor === String(factor)) return;
+    field.dataset.factor = factor;
+    for (const key of ["min", "max", "step"]) {
+      const bound = parseFloat(field.getAttribute(key));
+      if (Number.isFinite(bound)) field.setAttribute(key, +((bound * factor) / before).toPrecision(9));
+    }
+    write(field, field.dataset.si ?? field.value);
+  }
+  function write(field, si) {
+    if (!field.dataset.in) { field.value = si; return; }
+    field.dataset.si = si;
+    field.value = isNumber(si) && unit(field.dataset.in)[1] !== 1 ? figure(+si, { in: field.dataset.in }) : si;
+  }
+  function typed(field) { // what somebody has typed, SI
+    const { value, dataset } = field, factor = dataset.in ? unit(dataset.in)[1] : 1;
+    const si = factor !== 1 && isNumber(value) ? String(+value / factor) : value;
+    if (dataset.in) dataset.si = si;
+    return si;
+  }
+  function showUnits(which = ":not([data-measured])") { // of what has been added since
+    const found = ["[data-unit]", "[data-si]", "input[data-in]", "[data-units]"].map((kind) => kind + which);
+    for (const element of document.querySelectorAll(found.join())) {
+      const { unit: of, units, si } = element.dataset;
+      if (of) put(element, unit(of)[0]);
+      else if (units) element.value = chosen[units];
+      else if (element.tagName === "INPUT") measure(element);
+      else put(element, figure(+si, element.dataset));
+      element.dataset.measured = "";
+    }
+  }
+  document.addEventListener("change", (event) => {
+    const of = event.target.dataset?.units;
+    if (!of) return;
+    chosen[of] = event.target.value;
+    localStorage.setItem("rtcp-units", JSON.stringify(chosen));
+    showUnits("");
+    show();
+  });
+
   function show() {
     const connectedNow = performance.now() - heard < STALE_MS;
     if (connectedNow !== connected) {
@@ -72,16 +126,19 @@ window.rtcp = (() => {
       else for (const key of path) value = value?.[key];
       const isState = element.dataset.live.endsWith("state");
       if (!connected) value = isState ? "no connection" : undefined;
-      const digits = element.dataset.digits;
-      put(element, value === undefined || value === null || value === "" ? "–" : digits ? value.toFixed(digits) : String(value));
+      const empty = value === undefined || value === null || value === "";
+      const said = empty ? "–" : typeof value === "number" ? figure(value, element.dataset) : String(value);
+      put(element, (isState ? said.replaceAll("_", " ") : said) + (empty ? "" : element.dataset.suffix ?? ""));
       if (isState) element.dataset.state = String(value);
     }
+    showUnits();
     for (const element of document.querySelectorAll("[data-bar]")) {
       const [name, index] = element.dataset.bar.split(".");
       const value = connected && joints ? joints[name][index] : NaN;
       const ends = element.dataset.limits.split(" ").map((limit) => state.limits?.[limit]?.[index] ?? NaN);
       const [low, high] = ends.length > 1 ? ends : [-ends[0], ends[0]];
-      const title = Number.isFinite(low + high) ? `${+low.toPrecision(4)} to ${+high.toPrecision(4)} ${element.dataset.unit}` : "";
+      const [unitName, factor] = unit(element.dataset.in), bound = (value) => +(value * factor).toPrecision(4);
+      const title = Number.isFinite(low + high) ? `${bound(low)} to ${bound(high)} ${unitName}` : "";
       if (element.title !== title) element.title = title;
       const part = Math.min(1, Math.max(0, (value - low) / (high - low)));
       element.style.setProperty("--at", Number.isNaN(part) ? "50%" : `${100 * part}%`);
@@ -91,10 +148,11 @@ window.rtcp = (() => {
       const fits = connected && element.dataset.when.split(" ").includes(state.state);
       if (element.disabled === fits) { element.disabled = !fits; element.ariaDisabled = String(!fits); }
     }
-    const toCell = document.querySelector('#menu [data-path="/cell"]');
-    if (toCell) toCell.hidden = !state.partners;
-    const toProcesses = document.querySelector('#menu [data-path="/processes"]');
-    if (toProcesses) toProcesses.hidden = !state.processes;
+    for (const [path, isThere] of [["/cell", state.partners], ["/processes", state.processes]]) {
+      const link = document.querySelector(`#menu [data-path="${path}"]`);
+      if (link && link.hidden === Boolean(isThere)) { link.hidden = !isThere; tab(); }
+    }
+    showFrame();
     const note = document.getElementById("operator");
     if (note) put(note, state.mine ? "You operate the arm" : state.operator ? `${state.operator} operates the arm` : "Nobody operates the arm");
     const lost = document.getElementById("lost"), old = document.getElementById("old");
@@ -106,6 +164,62 @@ window.rtcp = (() => {
       if (isOld) put(old, `Joint values are ${state.age_s.toFixed(1)} s old: since then not every slave has answered.`);
     }
   }
+  function showFrame() {
+    document.body.dataset.machine = connected ? state.state : "";
+    const alarmed = document.getElementById("alarmed");
+    if (alarmed) {
+      alarmed.hidden = !(connected && state.alarms);
+      put(alarmed, `${state.alarms} ${state.alarms === 1 ? "alarm" : "alarms"}`);
+    }
+    const override = document.querySelector("[data-override]");
+    if (override) {
+      override.disabled = !connected || state.speed_override === undefined;
+      if (document.activeElement !== override || performance.now() - overridden > 1000) override.value = state.speed_override ?? 100;
+    }
+    lead();
+  }
+  let overridden = 0; // when somebody moved the slider of the override
+  document.addEventListener("input", (event) => { if (event.target.dataset?.override === "") overridden = performance.now(); });
+
+  // The first steps of somebody for whom no platform runs: start, enable, move.
+  const LED = "rtcp-led";
+  let done = null;
+  function lead() {
+    const box = document.getElementById("lead");
+    if (!box || !connected || (box.hidden && localStorage.getItem(LED))) return;
+    if (state.state === "off") done = new Set();
+    if (!done) return;
+    if (!["off", "starting"].includes(state.state)) done.add("start");
+    if (["holding", "moving"].includes(state.state)) done.add("enable");
+    if (state.state === "moving") done.add("move");
+    const steps = [...box.querySelectorAll("[data-step]")], next = steps.find((one) => !done.has(one.dataset.step));
+    for (const one of steps) {
+      one.dataset.done = done.has(one.dataset.step);
+      one.toggleAttribute("aria-current", one === next);
+    }
+    box.hidden = false;
+    if (!next) setTimeout(endLead, 4000);
+  }
+  function endLead() {
+    localStorage.setItem(LED, "1");
+    done = null;
+    document.getElementById("lead").hidden = true;
+  }
+  document.addEventListener("click", (event) => { if (event.target.closest?.("[data-lead-end]")) endLead(); });
+
+  let path = "/";
+  function tab(opened = path) { // mark a tab and bring it into view
+    path = opened;
+    for (const link of document.querySelectorAll("#menu a")) {
+      const isOpen = link.dataset.path === path;
+      link.toggleAttribute("aria-current", false);
+      if (isOpen) {
+        link.setAttribute("aria-current", "page");
+        const menu = link.parentElement;
+        menu.scrollTo({ left: link.offsetLeft - (menu.clientWidth - link.clientWidth) / 2 });
+      }
+    }
+  }
   setInterval(() => { if (performance.now() - heard > STALE_MS) { release(); show(); } }, 250);
 
   // -- the operator's hand -----------------------------------------------------------------------------------------------
@@ -113,7 +227,9 @@ window.rtcp = (() => {
   const pressed = new Map(); // what holds -> the six parts of the speed that it asks for
   let press = 0, pad = null, padEnded = false;
   const AXES = ["x", "y", "z", "rx", "ry", "rz"];
+  function stepping() { return document.querySelector("[data-jog-frame]")?.dataset.jogStep ?? ""; }
   function begin(holder, axis, sign) {
+    if (stepping()) return;
     if (!pressed.size && !pad) press += 1;
     pressed.set(holder, [axis, sign]);
     send(jogMessage());
@@ -161,7 +277,7 @@ window.rtcp = (() => {
   }
   document.addEventListener("pointerdown", (event) => {
     const found = jogOf(event.target);
-    if (!found || event.button > 0) return;
+    if (!found || event.button > 0 || stepping()) return;
     event.preventDefault();
     found[0].focus();
     found[0].setPointerCapture?.(event.pointerId);
@@ -184,7 +300,7 @@ window.rtcp = (() => {
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape") { stop(); return; }
     const button = jogOf(event.target);
-    if (button && (event.key === " " || event.key === "Enter")) {
+    if (button && !stepping() && (event.key === " " || event.key === "Enter")) {
       event.preventDefault();
       if (!event.repeat) begin(...button);
       return;
@@ -196,8 +312,14 @@ window.rtcp = (() => {
     const found = KEYS[event.code];
     if (!found) return;
     event.preventDefault();
-    if (!event.repeat) begin(event.code, ...found);
+    if (event.repeat) return;
+    if (stepping()) step(...found);
+    else begin(event.code, ...found);
   });
+  function step(axis, sign) {
+    const names = [AXES[axis], axis].map((name) => `[data-jog="${name}${sign > 0 ? "+" : "-"}"]`);
+    [...document.querySelectorAll(names.join())].find((one) => one.checkVisibility())?.click();
+  }
   document.addEventListener("keyup", (event) => {
     if (event.key === " " || event.key === "Enter") end(padOf(event.target));
     end(event.code);
@@ -213,7 +335,7 @@ window.rtcp = (() => {
   function gamepad() {
     const area = document.querySelector("[data-jog-frame]");
     const found = area && !document.hidden && document.hasFocus() && [...navigator.getGamepads()].find((one) => one?.connected);
-    const held = found && found.buttons[4]?.pressed;
+    const held = found && !stepping() && found.buttons[4]?.pressed;
     const wanted = !found ? "" : found.buttons[0]?.pressed ? "close" : found.buttons[1]?.pressed ? "open" : "";
     const begins = wanted && wanted !== lastGripper;
     lastGripper = wanted;
@@ -242,25 +364,25 @@ window.rtcp = (() => {
   function fill(id, value) {
     const field = document.getElementById(id);
     if (!field) return;
-    field.value = value;
+    write(field, value);
     const slider = sliderOf(field);
     if (slider) slider.value = value;
   }
   document.addEventListener("input", (event) => {
     const field = document.getElementById(event.target.dataset?.slider);
     if (field) {
-      field.value = event.target.value;
+      write(field, event.target.value);
       field.dispatchEvent(new Event("input"));
     } else if (event.target.id) {
       const slider = sliderOf(event.target);
-      if (slider) slider.value = event.target.value;
+      if (slider) slider.value = typed(event.target);
     }
   });
 
   window.addEventListener("load", () => {
     const wait = setInterval(() => { if (pageKey()) { clearInterval(wait); connect(); } }, 50);
   });
-  return { fill, stop, get token() { return token; }, get state() { return state; },
+  return { fill, stop, tab, typed, unit, get stepping() { return stepping(); }, get token() { return token; }, get state() { return state; },
     listen: (listener) => { listeners.add(listener); return () => listeners.delete(listener); },
     scope: (picture) => { pictures.add(picture); return () => pictures.delete(picture); } };
 })();

@@ -1,0 +1,75 @@
+"""I/O: every input and output of the boxes with its name and terminal; outputs set by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from nicegui import ui
+from nicegui.elements.mixins.text_element import TextElement
+
+from rtcp.api import Levels, RtcpError
+from rtcp.panel.page import View, no_platform, on_click, text
+
+_INTERVAL_S = 0.2
+
+
+async def build(view: View) -> None:
+    """Build the page."""
+    text("h1", "I/O")
+    if view.live.config is None:
+        no_platform()
+        return
+    found = await view.query(lambda robot: robot.read_io())
+    if not (found.inputs or found.outputs):
+        text("p", "This platform has no box with inputs or outputs.")
+        return
+    with ui.element("div").classes("columns"):
+        inputs = _terminals("Inputs", found.inputs, lambda name: text("span", "", "level"))
+        outputs = _terminals("Outputs", found.outputs, lambda name: _switch(view, name))
+    text("p", "An output that the gripper, a lamp or a process drives is set again by it.")
+
+    def show(places: dict[str, TextElement], levels: Levels) -> None:
+        for name, place in places.items():
+            word = "high" if levels[name] else "low"
+            if place.text != word:
+                place.text = word
+                place.props["data-level"] = word
+                if place.tag == "button":
+                    place.props["aria-checked"] = str(levels[name]).lower()
+
+    async def refresh() -> None:
+        try:
+            now = await view.query(lambda robot: robot.read_io())
+        except RtcpError:
+            return  # the header says why
+        show(inputs, now.inputs)
+        show(outputs, now.outputs)
+
+    show(inputs, found.inputs)
+    show(outputs, found.outputs)
+    ui.timer(_INTERVAL_S, refresh)
+
+
+def _terminals(title: str, levels: Levels, control: Callable[[str], TextElement]) -> dict[str, TextElement]:
+    """Show terminals, those with a meaning first; return where each one's level stands."""
+    made = {}
+    with ui.element("section").classes("page"):
+        text("h2", title)
+        with ui.element("ul").classes("terminals"):
+            for name, place in sorted(levels.places.items(), key=lambda one: one[0] == one[1]):
+                with ui.element("li"):
+                    text("span", name.replace("_", " "))
+                    text("small", place if name != place else "")
+                    made[name] = control(name)
+    return made
+
+
+def _switch(view: View, name: str) -> TextElement:
+    made = text("button", "", "act plain level", type="button", role="switch", **{"aria-label": name})
+
+    async def turn() -> None:
+        value = made.props.get("aria-checked") != "true"
+        await view.act(lambda robot: robot.set_output(name, value))
+
+    on_click(made, turn)
+    return made
