@@ -589,3 +589,24 @@ def test_no_page_has_a_serious_barrier(
                 found[f"{path} is wider than the screen"] = page.evaluate("document.documentElement.scrollWidth")
             expect(page.get_by_role("button", name="STOP not the emergency stop")).to_be_in_viewport()
     assert found == {}
+
+
+def test_the_arm_is_guided_by_hand_and_carries_a_payload(page: Page, holding: Platform) -> None:
+    show(page, "/jog")
+    page.get_by_label("Payload, at the tool's point").fill("0.2")
+    page.get_by_role("button", name="Set the payload").click()
+    until(lambda: holding.status()["payload"]["mass"] == pytest.approx(0.2), "the payload")
+    page.get_by_role("button", name="Use this tool").click()
+    expect(page.get_by_text("The tool is tool; it holds nothing")).to_be_visible()
+    page.get_by_label("Payload, at the tool's point").fill("0")
+    page.get_by_role("button", name="Set the payload").click()
+    until(lambda: holding.status()["payload"]["mass"] == 0.0, "no payload")
+    before = holding.status()["joints"]["actual_position"][0]
+    page.get_by_role("button", name="Guide by hand").click()
+    holding.until_moving()
+    holding.rtcp("segment", "push", "0", "25", "0", "--seconds", "20")
+    until(lambda: abs(holding.status()["joints"]["actual_position"][0] - before) > 0.05, "it follows")
+    page.get_by_role("button", name="Halt").click()
+    expect(page.get_by_text("Hand guiding has ended: halted")).to_be_visible()
+    until(lambda: holding.status()["control_mode"] == "joint", "the mode before")
+    holding.rtcp("segment", "clear")

@@ -99,7 +99,9 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     until(lambda: holding.status()["speed_override"] == 0.0, "paused")
     # Another tab keeps the run.
     page.get_by_role("link", name="Jog", exact=True).click()
+    expect(page.get_by_label("Movement")).to_be_visible(timeout=20_000)
     page.get_by_role("link", name="Program", exact=True).click()
+    expect(page.get_by_label("Movement")).to_have_count(0, timeout=20_000)
     click(page, "Go on")
     said(page, "Step 3 is done")
     assert holding.status()["joints"]["actual_position"] == pytest.approx(there, abs=2e-3)

@@ -95,6 +95,7 @@ class Jog:
         )
         if config.arm is not None:
             tool_pose()
+            _tool_and_hand(view, config)
 
     def _limited(self, label: str, unit: str, most: float, key: str) -> Field:
         return number(label, self._kept.get(key, str(most / 2)), unit, min="0", max=str(most), step=str(most / 20))
@@ -180,3 +181,32 @@ def _gripper(view: View) -> None:
             ):
                 made = button(label, move(opens, done), when=ENABLED).style(f"grid-area: {place}")
                 made.props.update({"data-gripper": label.lower(), "aria-label": f"{label} gripper"})
+
+
+def _tool_and_hand(view: View, config: ArmConfig) -> None:
+    """Choose the tool and what it holds; let the arm be guided by hand."""
+    state = view.live.state()
+    with ui.element("div").classes("fields"):
+        tool = choice("Tool", config.tool_names, state.get("tool_name", config.tool_names[0]))
+        mass = number("Payload, at the tool's point", "0", "kg", min="0", step="0.1")
+
+    def use() -> Awaitable[object]:
+        name = tool.value
+        return view.act(lambda robot: robot.set_tool(name), f"The tool is {name}; it holds nothing")
+
+    async def carry() -> None:
+        try:
+            value = mass.number()
+        except RtcpError as error:
+            view.warn(error.message)
+            return
+        await view.act(lambda robot: robot.set_payload(value), f"The payload is {value:g} kg")
+
+    async def guide() -> None:
+        if ended := await view.act(lambda robot: robot.guide()):
+            view.say(f"Hand guiding has ended: {ended}")
+
+    with ui.element("div").classes("buttons"):
+        button("Use this tool", use, when="ready holding", plain=True)
+        button("Set the payload", carry, when="ready holding", plain=True)
+        button("Guide by hand", guide, when="holding", plain=True)

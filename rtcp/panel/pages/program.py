@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +25,7 @@ _KINDS: Final = {
     "output": "Set an output",
     "wait_for": "Wait for an input",
     "wait_s": "Wait for a time",
+    "tool": "Use a tool",
     "run": "Run a part",
 }
 _MOTIONS: Final = ("move", "line", "arc")
@@ -222,6 +223,8 @@ class ProgramPage:
                         made.props["aria-label"] = spoken
 
     def _show_new_step(self, file: ProgramFile) -> None:
+        config = self._view.live.config
+        assert config is not None
         poses, parts = [one.name for one in file.motion.poses], [one.name for one in file.motion.parts]
         kinds = {
             key: name for key, name in _KINDS.items() if (poses or key not in _MOTIONS) and (parts or key != "run")
@@ -229,7 +232,8 @@ class ProgramPage:
         text("h2", "New step")
         with ui.element("div").classes("fields"):
             kind = choice("Kind", kinds, next(iter(kinds)))
-            places = {str(at): f"before step {at + 1}" for at in range(len(file.motion.program))}
+            places = {f"{at}": f"before step {at + 1}" for at in range(len(file.motion.program))}
+            places |= {f"={at}": f"in place of step {at + 1}" for at in range(len(file.motion.program))}
             where = choice("Where", {"": "at the end", **places}, "")
         fields = ui.element("div").classes("fields")
         entered: dict[str, Any] = {}
@@ -238,7 +242,7 @@ class ProgramPage:
             fields.clear()
             entered.clear()
             with fields:
-                entered.update(_fields_of(kind.value, poses, parts))
+                entered.update(_fields_of(kind.value, poses, parts, config.tool_names))
 
         def add() -> None:
             try:
@@ -247,8 +251,11 @@ class ProgramPage:
                 self._view.warn(error.message)
                 return
             step = {key: value for key, value in step.items() if value is not None}
-            at = int(where.value) if where.value else len(file.motion.program)
-            self._change(lambda changed: changed.insert(at, step))
+            if where.value.startswith("="):
+                self._change(lambda changed: changed.replace(int(where.value[1:]), step))
+            else:
+                at = int(where.value) if where.value else len(file.motion.program)
+                self._change(lambda changed: changed.insert(at, step))
 
         kind.on_change(show)
         show()
@@ -405,7 +412,9 @@ class ProgramPage:
             self._say("Paused")
 
 
-def _fields_of(kind: str, poses: list[str], parts: list[str]) -> Mapping[str, Callable[[], Any]]:
+def _fields_of(
+    kind: str, poses: Sequence[str], parts: Sequence[str], tools: Sequence[str]
+) -> Mapping[str, Callable[[], Any]]:
     """Make the fields of a kind of step; return what reads each key."""
     found: dict[str, Callable[[], Any]] = {}
 
@@ -419,6 +428,7 @@ def _fields_of(kind: str, poses: list[str], parts: list[str]) -> Mapping[str, Ca
         if kind == "arc":
             via = choice("Through", poses, poses[0])
             found["via"] = lambda: via.value
+            optional("angle", "Angle of the circle (empty: up to the pose)", "rad")
         if kind == "move":
             optional("speed", "Speed (empty: the limit)", "rad/s")
         else:
@@ -437,6 +447,9 @@ def _fields_of(kind: str, poses: list[str], parts: list[str]) -> Mapping[str, Ca
     elif kind == "wait_s":
         seconds = number("Time, s", "1", min="0")
         found[kind] = seconds.number
+    elif kind == "tool":
+        tool = choice("Tool", tools, tools[0])
+        found[kind] = lambda: tool.value
     else:
         part = choice("Part", parts, parts[0])
         times = number("Times (0: for ever)", "1", min="0", step="1")
@@ -455,6 +468,8 @@ def described(step: Step) -> str:
         return f"{way} to {name}{speed}{angle}" + (f", blend {step.blend:g} m" if step.blend else "")
     if step.gripper is not None:
         return f"gripper: {step.gripper}"
+    if step.tool is not None:
+        return f"tool: {step.tool}"
     level = "on" if step.value else "off"
     if step.output is not None:
         return f"output {step.output}: {level}"
