@@ -6,6 +6,8 @@ its own name by itself.
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -45,6 +47,8 @@ from rtcp.motion.speed_override import LOWEST
 
 HOLD_S = 0.25
 """Hold time of a command that gives none."""
+_RESTORE_S, _LOOK_S = 5.0, 0.05
+_OWN_CONNECTION = -1
 _INTERNAL = (commands.Shutdown, commands.SetZero, commands.RunLines, commands.ExtendTrajectory)
 """Commands that no client sends by themselves."""
 GOAL_TIME_S = 3.0
@@ -129,6 +133,7 @@ class Methods:
         self._processes = ProcessActions(channel, config)
         self._terminals = Terminals(channel)
         self._cell = CellActions(session, self._motion, limits)
+        self._restoring: asyncio.Task[None] | None = None
         self.table = self._table()
 
     def _table(self) -> dict[str, Method]:
@@ -444,13 +449,27 @@ class Methods:
         before = self.channel.control_mode
         if before in (None, ControlMode.TORQUE):
             return await self._motion.guide(caller, duration_s)
-        async with self.channel.lease(caller):
-            await self.machine.mode(caller, "torque")
-            try:
-                return await self._motion.guide(caller, duration_s)
-            finally:
-                if self.channel.state is State.HOLDING:
-                    await self.machine.mode(caller, before.name.lower())
+        try:
+            async with self.channel.lease(caller):
+                await self.machine.mode(caller, "torque")
+                try:
+                    return await self._motion.guide(caller, duration_s)
+                finally:
+                    if self.channel.state is State.HOLDING:
+                        await self.machine.mode(caller, before.name.lower())
+        except asyncio.CancelledError:
+            # Its connection is lost: the arm comes to rest, and is left as it was before.
+            self._restoring = asyncio.create_task(self._restore_mode(before.name.lower()))
+            raise
+
+    async def _restore_mode(self, name: str) -> None:
+        """Change the control mode once the arm holds, where nobody else commands it."""
+        end = time.monotonic() + _RESTORE_S
+        while self.channel.state is not State.HOLDING and time.monotonic() < end:
+            await asyncio.sleep(_LOOK_S)
+        # Whoever has the arm meanwhile finds it in mode torque, and is told so where that matters.
+        with contextlib.suppress(RtcpError):
+            await self.machine.mode(Caller("the end of hand guiding", _OWN_CONNECTION), name)
 
     @method(at_once=True)
     async def fk(self, caller: Caller, q: Numbers) -> Json:

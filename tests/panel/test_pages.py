@@ -604,10 +604,9 @@ def test_the_arm_is_guided_by_hand_and_carries_a_payload(page: Page, holding: Pl
     until(lambda: holding.status()["payload"]["mass"] == 0.0, "no payload")
     before = holding.status()["joints"]["actual_position"][0]
     page.get_by_role("button", name="Guide by hand").click()
-    holding.until_moving()
+    until(lambda: holding.status()["state"] == "moving", "guiding")
     holding.rtcp("segment", "push", "0", "25", "0", "--seconds", "20")
     until(lambda: abs(holding.status()["joints"]["actual_position"][0] - before) > 0.05, "it follows")
     page.get_by_role("button", name="Halt").click()
-    expect(page.get_by_text("Hand guiding has ended: halted")).to_be_visible()
     until(lambda: holding.status()["control_mode"] == "joint", "the mode before")
     holding.rtcp("segment", "clear")
