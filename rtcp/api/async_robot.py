@@ -160,10 +160,12 @@ class _InThread(Robot):
             self._under_way.cancel()
 
     def _carry_out(self, call: Call[T]) -> T:
-        # The loop's thread closes: it sees the call, or the call sees that.
-        self._under_way = pending = asyncio.run_coroutine_threadsafe(self._robot._carry_out(call), self._loop)
-        if self._ended:
-            pending.cancel()
+        async def carry_out() -> T:
+            if self._ended:  # by the same thread, which this runs in
+                raise CancelledError
+            return await self._robot._carry_out(call)
+
+        self._under_way = pending = asyncio.run_coroutine_threadsafe(carry_out(), self._loop)
         try:
             return pending.result()
         except CancelledError:

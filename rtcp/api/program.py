@@ -6,6 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,8 +21,8 @@ _PLANNED_TIMES: Final = 2
 """Largest number of runs of a part that are planned: the first begins elsewhere, all others where the part ends."""
 _MOST_PLANNED: Final = 10_000
 _SAME_RAD: Final = 1e-3
-_WAIT_S: Final = 0.05
-"""Between two calls of `between` while a step waits."""
+_WAIT_S: Final = 0.1
+"""Between two looks at what ends a program while a step waits for a time."""
 _HALTED: Final = "halted_at_rest"
 _THERE: Final = "AlreadyThere"
 """Reason of a motion that is refused because the arm is where it leads."""
@@ -157,13 +158,14 @@ class Program:
             start: step to begin with, from 0, from wherever the arm is.
             end: step before which to end; None: behind the last.
             between: called before each step, and again and again while one waits for a time: the program goes on when
-                it returns, and ends by what it raises.
+                it returns, and ends by what it raises; a wait also ends as a step does.
 
         Raises:
             Refused: as `check`; or a step is refused.
             RtcpError: what ended it.
         """
-        here = robot.status().commanded_positions
+        status = robot.status()
+        here, tool = status.commanded_positions, status.tool
         since = max((event.number for event in robot.events()), default=0)
         if check:
             self.check(robot, start, end)
@@ -172,7 +174,7 @@ class Program:
         for one in self._units(self._places(robot), None, start, end):
             between()
             line = self.line_of(one.where)
-            self._check_undisturbed(robot, line, here, since)
+            self._check_undisturbed(robot, line, here, tool, since)
             if isinstance(one, Motion):
                 text = f"{len(one.stops)} motions in one" if len(one.stops) > 1 else "motion"
                 say(Begun(one.number, line, text))
@@ -180,7 +182,12 @@ class Program:
                 here = robot.status().commanded_positions
             else:
                 say(Begun(one.number, line, _described(one.step)))
-                _act(robot, one.step, between)
+                if one.step.wait_s is not None:
+                    self._wait(
+                        one.step.wait_s, between, partial(self._check_undisturbed, robot, line, here, tool, since)
+                    )
+                _act(robot, one.step)
+                tool = one.step.tool or tool
 
     def step_back(self, robot: Robot, number: int) -> None:
         """Move back to where step `number`, from 0, began: over a line or an arc on it, else by the joints.
@@ -193,11 +200,18 @@ class Program:
         step, line = self._motion.program[number], self.line_of(("program", number))
         if step.run is None and _target(step) is None:
             return
-        before = [one for _, _, one in self._steps(0, number, 1) if one is not None and _target(one) is not None]
-        if not before or step.angle is not None or before[-1].angle is not None:
-            why = "it is, or follows, an arc with an angle" if before else "no motion stands before it"
+        done = [one for _, _, one in self._steps(0, number, 1) if one is not None]
+        before = [at for at, one in enumerate(done) if _target(one) is not None]
+        why = ""
+        if not before:
+            why = "no motion stands before it"
+        elif step.angle is not None or done[before[-1]].angle is not None:
+            why = "it is, or follows, an arc with an angle"
+        elif any(one.tool is not None for one in done[before[-1] :]):
+            why = "another tool was chosen before it"
+        if why:
             raise RtcpError("refused", f"{self.file}:{line}: no way back over this step: {why}", "no_way_back")
-        name = _target(before[-1])
+        name = _target(done[before[-1]])
         back = dataclasses.replace(
             step,
             move=name if step.line is None and step.arc is None else None,
@@ -219,9 +233,22 @@ class Program:
             text = f"the program uses the tool {chosen[-1]} there, in use is {in_use}: choose it first"
             raise RtcpError("refused", f"{self.file}:{self.line_of(('program', number))}: {text}", "another_tool")
 
-    def _check_undisturbed(self, robot: Robot, line: int, here: Sequence[float], since: int) -> None:
-        """Raise where the arm was halted, or moved by somebody else, since the last step."""
-        now = robot.status().commanded_positions
+    @staticmethod
+    def _wait(seconds: float, between: Callable[[], None], check: Callable[[], None]) -> None:
+        """Wait, and end by what disturbs the program meanwhile."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            time.sleep(min(left, _WAIT_S))
+            between()
+            check()
+
+    def _check_undisturbed(self, robot: Robot, line: int, here: Sequence[float], tool: str, since: int) -> None:
+        """Raise where the arm was halted, moved or given another tool by somebody else since the last step."""
+        status = robot.status()
+        now = status.commanded_positions
+        if status.tool != tool:
+            text = f"{self.file}:{line}: somebody else has chosen the tool {status.tool} meanwhile: the program ends"
+            raise RtcpError("refused", text, "another_tool")
         if max((abs(a - b) for a, b in zip(now, here, strict=True)), default=0.0) > _SAME_RAD:
             text = f"{self.file}:{line}: the arm was moved by somebody else meanwhile: the program ends"
             raise RtcpError("refused", text, "moved_meanwhile")
@@ -318,7 +345,7 @@ def _described(step: Step) -> str:
     return f"wait {step.wait_s:g} s"
 
 
-def _act(robot: Robot, step: Step, between: Callable[[], None]) -> None:
+def _act(robot: Robot, step: Step) -> None:
     if step.gripper is not None:
         robot.gripper(step.gripper == "open")
     elif step.output is not None:
@@ -327,8 +354,3 @@ def _act(robot: Robot, step: Step, between: Callable[[], None]) -> None:
         robot.io.wait(step.wait_for, step.value, step.timeout_s)
     elif step.tool is not None:
         robot.set_tool(step.tool)
-    elif step.wait_s is not None:
-        end = time.monotonic() + step.wait_s
-        while (left := end - time.monotonic()) > 0.0:
-            time.sleep(min(left, _WAIT_S))
-            between()

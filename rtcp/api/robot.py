@@ -216,10 +216,10 @@ class Methods:
 
     @Method
     def resume(self) -> Call[None]:
-        """Continue the motion that is paused. Needs no lease.
+        """Continue the motion that is paused: for the connection that paused it or commands it.
 
         Raises:
-            Refused: none is paused.
+            Refused: none is paused; or reason `paused_by_another`.
         """
         return Call("resume", {}, _nothing)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -87,16 +88,12 @@ def _halt() -> None:
 
 @commands.command("pause")
 def _pause() -> None:
-    """Bring the motion under way, whoever began it, to rest on its path; `rtcp resume` continues it."""
+    """Bring the motion under way, whoever began it, to rest on its path; Enter continues it."""
     with connect("pause") as robot:
         robot.pause()
-    report("paused: `rtcp resume` continues the motion, `rtcp halt` ends it")
-
-
-@commands.command("resume")
-def _resume() -> None:
-    """Continue the motion that is paused."""
-    with connect("resume") as robot:
+        report("paused: Enter continues the motion; Ctrl-C leaves it to who commands it; `rtcp halt` ends it")
+        if not sys.stdin.readline():
+            return
         robot.resume()
     report("the motion goes on")
 

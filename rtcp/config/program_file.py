@@ -41,6 +41,7 @@ class ProgramFile:
         if self.path.suffix.lower() not in (".yaml", ".yml"):
             raise ConfigError([f"{self.path}: a program is kept in a file that ends in .yaml or .yml"])
         self._undo: list[str] = []
+        """Texts before the last changes; none from before `reload`."""
         self.motion = MotionFile()
         """What the file holds."""
         self._text = ""
@@ -51,6 +52,7 @@ class ProgramFile:
         text = self._on_disk()
         self.motion = self._checked(text)
         self._text = text
+        self._undo.clear()
 
     @property
     def can_undo(self) -> bool:
@@ -175,16 +177,18 @@ class ProgramFile:
         """Replace the file as a whole, or not at all."""
         motion = self._checked(text)
         temporary = None
+        # A link stays one: the file that it leads to is replaced.
+        path = self.path.resolve()
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            mode = self.path.stat().st_mode & 0o777 if self.path.exists() else 0o644
-            handle, temporary = tempfile.mkstemp(prefix=f".{self.path.name}.", dir=self.path.parent)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            mode = path.stat().st_mode & 0o777 if path.exists() else 0o644
+            handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
             with os.fdopen(handle, "w", encoding="utf-8") as file:
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
             Path(temporary).chmod(mode)
-            os.replace(temporary, self.path)
+            os.replace(temporary, path)
         except OSError as error:
             if temporary is not None:
                 with contextlib.suppress(OSError):

@@ -24,6 +24,7 @@ from rtcp.config.model import (
     DeviceDescription,
     EthercatBus,
     GripperConfig,
+    GuidingConfig,
     HasBox,
     InputsConfig,
     Joint,
@@ -419,6 +420,13 @@ def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> 
             yield (*axis, *where), f"found {found}, allowed is {low:g} to {high:g}: {why}"
 
 
+@rule(GuidingConfig)
+def _guiding(guiding: GuidingConfig) -> Iterator[Finding]:
+    if guiding.weight_error > guiding.hold:
+        text = f"found {guiding.weight_error:g}, allowed is at most hold, {guiding.hold:g}: what is accepted is held"
+        yield ("weight_error",), text
+
+
 @rule(ArmFile, "home", "joints")
 def _home(arm: ArmFile) -> Iterator[Finding]:
     home, joints = arm.home or (), arm.joints
@@ -671,6 +679,12 @@ def _program(motion: MotionFile) -> Iterator[Finding]:
                 if step.via in places:
                     text = f'found "{step.via}", which has q; with several tools allowed is one with pose'
                     yield (*where, at, "via"), text
+    by_name = {part.name: part.steps for part in motion.parts}
+    if any(step.tool is not None for _, steps in lists for step in steps):
+        first = next(_tools_and_motions(motion.program, by_name, len(parts)), None)
+        if first is not None and first.tool is None:
+            text = "a step chooses a tool, found a motion before the first choice; allowed is a tool before all motions"
+            yield ("program",), text
     calls = {part.name: {step.run for step in part.steps if step.run is not None} for part in motion.parts}
     for at, name in enumerate(parts):
         reached, ahead = set[str](), set(calls[name])
@@ -681,6 +695,15 @@ def _program(motion: MotionFile) -> Iterator[Finding]:
                 ahead |= calls.get(one, set())
         if name in reached:
             yield ("parts", at, "steps"), f'the part "{name}" runs itself; parts may only run others'
+
+
+def _tools_and_motions(steps: Sequence[Step], parts: Mapping[str, tuple[Step, ...]], depth: int) -> Iterator[Step]:
+    """Yield in their order the steps that move or choose a tool, also of parts; `depth`: of parts in parts, at most."""
+    for step in steps:
+        if step.run is not None and depth > 0:
+            yield from _tools_and_motions(parts.get(step.run, ()), parts, depth - 1)
+        elif step.tool is not None or step.move or step.line or step.arc:
+            yield step
 
 
 @rule(MotionFile, EVERY_KEY)

@@ -194,6 +194,14 @@ class CommandChannel:
             else:
                 self.observer.release(lease)
 
+    def lease_of(self, connection: int) -> int:
+        """Return the lease that requests of a connection hold; 0: none."""
+        return self._shared.get(connection, (0, 0))[0]
+
+    def lease_in_use(self) -> int:
+        """Return the lease that a request holds; 0: none."""
+        return next((lease for lease, _ in self._shared.values()), 0)
+
     def is_shared(self, lease: int) -> bool:
         """Whether another request of the connection holds this lease too, so that its end does not stop the arm."""
         return any(held == lease and users > 1 for held, users in self._shared.values())

@@ -29,6 +29,7 @@ from rtcp.ipc.commands import (
 )
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, GripperOpens, Homed, HomingFailed, ZeroSet
+from rtcp.ipc.refusals import NoLease
 from rtcp.ipc.states import WITH_TORQUE, ControlMode, DriveMode, DriveState, State
 from rtcp.ipc.stop_reactions import longest_s
 
@@ -144,9 +145,12 @@ class MachineActions:
         """Change the speed override; `lease`: one that the caller holds already, 0: none."""
         channel = self._channel
         channel.check_loop()
-        if lease or fraction <= channel.speed_override():
+        try:
             await channel.send(lease, SetSpeedOverride(fraction))
-        else:
+        except RtcpError as error:
+            # It is raised: while a motion is paused the record does not say from what.
+            if lease or error.reason != NoLease.name:
+                raise
             async with channel.lease(caller) as acquired:
                 await channel.send(acquired, SetSpeedOverride(fraction))
         return {}

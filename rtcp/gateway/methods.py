@@ -7,7 +7,6 @@ its own name by itself.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -40,6 +39,7 @@ from rtcp.ipc.commands import COMMANDS, Command, MotionCommand, ProcessCommand
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.message import Joints
 from rtcp.ipc.observer import Observer
+from rtcp.ipc.refusals import DriveModeChanging
 from rtcp.ipc.session import Session, SessionError, read_json, read_processes
 from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.motion.limits import Limits
@@ -48,6 +48,7 @@ from rtcp.motion.speed_override import LOWEST
 HOLD_S = 0.25
 """Hold time of a command that gives none."""
 _RESTORE_S, _LOOK_S = 5.0, 0.05
+_STANDS_RAD = 2e-3
 _OWN_CONNECTION = -1
 _INTERNAL = (commands.Shutdown, commands.SetZero, commands.RunLines, commands.ExtendTrajectory)
 """Commands that no client sends by themselves."""
@@ -133,6 +134,8 @@ class Methods:
         self._processes = ProcessActions(channel, config)
         self._terminals = Terminals(channel)
         self._cell = CellActions(session, self._motion, limits)
+        self._paused_by: set[int] = set()
+        """Connections that have paused a motion."""
         self._restoring: asyncio.Task[None] | None = None
         self.table = self._table()
 
@@ -156,6 +159,7 @@ class Methods:
 
     async def end_connection(self, connection: int) -> None:
         """End what a connection that has closed was moving or holding."""
+        self._paused_by.discard(connection)
         self._streaming.end(connection)
         await self._motion.end_connection(connection)
         await self.joystick_override.end(connection)
@@ -219,6 +223,26 @@ class Methods:
     async def halt(self, caller: Caller) -> Json:
         """Stop every motion; returns when the arm holds. Needs no lease."""
         return await self.machine.halt()
+
+    @method(at_once=True)
+    async def pause(self, caller: Caller) -> Json:
+        """Bring the motion under way to rest on its path. Needs no lease."""
+        await self.channel.send(0, commands.Pause())
+        self._paused_by.add(caller.connection)
+        return {}
+
+    @method(at_once=True)
+    async def resume(self, caller: Caller) -> Json:
+        """Continue the motion that is paused: for who paused it, and for who commands it."""
+        lease = self.channel.lease_of(caller.connection)
+        if not lease and caller.connection in self._paused_by:
+            lease = self.channel.lease_in_use()
+        if not lease and self.channel.state is State.MOVING:
+            text = "not resumed: who paused the motion, or commands it, resumes it; `rtcp halt` ends it"
+            raise RtcpError("refused", text, "paused_by_another")
+        await self.channel.send(lease, commands.Resume())
+        self._paused_by.clear()
+        return {}
 
     @method()
     async def mode(self, caller: Caller, name: str) -> Json:
@@ -449,27 +473,34 @@ class Methods:
         before = self.channel.control_mode
         if before in (None, ControlMode.TORQUE):
             return await self._motion.guide(caller, duration_s)
+        name = before.name.lower()
         try:
             async with self.channel.lease(caller):
                 await self.machine.mode(caller, "torque")
-                try:
-                    return await self._motion.guide(caller, duration_s)
-                finally:
-                    if self.channel.state is State.HOLDING:
-                        await self.machine.mode(caller, before.name.lower())
-        except asyncio.CancelledError:
-            # Its connection is lost: the arm comes to rest, and is left as it was before.
-            self._restoring = asyncio.create_task(self._restore_mode(before.name.lower()))
+                ended = await self._motion.guide(caller, duration_s)
+                await self._restore_mode(caller, name)
+                return ended
+        except BaseException:
+            # Also where its connection is lost: the arm comes to rest, and is left as it was before.
+            own = Caller("the end of hand guiding", _OWN_CONNECTION)
+            self._restoring = asyncio.create_task(self._restore_mode(own, name))
             raise
 
-    async def _restore_mode(self, name: str) -> None:
-        """Change the control mode once the arm holds, where nobody else commands it."""
-        end = time.monotonic() + _RESTORE_S
-        while self.channel.state is not State.HOLDING and time.monotonic() < end:
+    async def _restore_mode(self, caller: Caller, name: str) -> None:
+        """Change the control mode once the arm stands where it is commanded: no position loop snaps a hand away."""
+        channel, end = self.channel, time.monotonic() + _RESTORE_S
+        while time.monotonic() < end:
+            pairs = zip(channel.joints("actual_position"), channel.joints("commanded_position"), strict=True)
+            stands = channel.state is State.READY or all(abs(a - b) < _STANDS_RAD for a, b in pairs)
+            if stands and channel.state in (State.READY, State.HOLDING):
+                try:
+                    await self.machine.mode(caller, name)
+                    return
+                except RtcpError as error:
+                    if error.reason != DriveModeChanging.name:
+                        break
             await asyncio.sleep(_LOOK_S)
-        # Whoever has the arm meanwhile finds it in mode torque, and is told so where that matters.
-        with contextlib.suppress(RtcpError):
-            await self.machine.mode(Caller("the end of hand guiding", _OWN_CONNECTION), name)
+        self._snapshot.note(f"after hand guiding the control mode stays torque: `rtcp mode {name}` changes it")
 
     @method(at_once=True)
     async def fk(self, caller: Caller, q: Numbers) -> Json:

@@ -229,7 +229,7 @@ class StatusSnapshot:
         if self.fault or int(state) not in _UNDER_WAY:
             return self.fault or self.message
         if paused:
-            return "paused: `rtcp resume` continues the motion"
+            return "paused: the motion rests on its path"
         began_ns = self._began_ns + time.time_ns() - time.monotonic_ns()
         if self._message_ns > began_ns:
             return self.message

@@ -148,10 +148,9 @@ class Pause(Command):
 
 
 class Resume(Command):
-    """Continue the motion that is paused."""
+    """Continue the motion that is paused, by its lease."""
 
     states = frozenset({State.MOVING})
-    needs_lease = False
 
 
 class SetTool(Command):

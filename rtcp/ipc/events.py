@@ -112,7 +112,7 @@ class SpeedOverrideChanged(Event, number=53):
 
 
 class Paused(Event, number=56):
-    """paused: the motion rests on its path until `rtcp resume`"""
+    """paused: the motion rests on its path"""
 
 
 class Resumed(Event, number=57):

@@ -268,11 +268,11 @@ class NotPausable(Refusal):
 
 
 class NotPaused(Refusal):
-    """no motion is paused"""
+    """nothing is resumed: the motion under way is not paused"""
 
 
 class MotionPaused(Refusal):
-    """the motion is paused: `rtcp resume` continues it, `rtcp halt` ends it"""
+    """the motion under way is paused: who paused it or commands it resumes it, `rtcp halt` ends it"""
 
 
 class SpeedOverridden(Refusal):

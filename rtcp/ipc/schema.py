@@ -216,7 +216,13 @@ ARM_MODES = (
     Field("held", "uint32", "", "What holds or slows the motion; bits HELD_... of rtcp.ipc.schema.", part="arm"),
     Field("elapsed_s", "float32", "s", "Time since the motion began.", part="arm"),
     Field("duration_s", "float32", "s", "Duration of the motion, where it is known.", part="arm"),
-    Field("speed_override", "float64", "", "Fraction of its speed at which the arm moves, 0.01 to 1.", part="arm"),
+    Field(
+        "speed_override",
+        "float64",
+        "",
+        "Fraction of its speed at which the arm moves; 0: paused.",
+        part="arm",
+    ),
 )
 LOAD_FIELDS = (
     Field("tool", "uint8", "", "Number of the tool in use, from 0, in the order of the arm's file.", part="arm"),

@@ -45,14 +45,17 @@ poses:
   - {name: right, pose: [0.1, 0, 0, 0, 0, 0]}
   - {name: below, pose: [0.2, 0, 0, 0, 0, 0]}
 program:
+  - {tool: short}
   - {move: home}
   - {run: there}
   - {line: below, speed: 0.2, blend: 0.01}
-  - {arc: right, via: home}
+  - {arc: right, via: below}
   - {gripper: open}
   - {move: below, speed: 0.4}
-  - {arc: right, via: home, angle: pi}
+  - {arc: right, via: below, angle: pi}
   - {line: home}
+  - {tool: long}
+  - {line: right}
 parts:
   - {name: there, steps: [{line: right}]}
 """
@@ -196,10 +199,10 @@ def test_it_waits_before_each_step_and_ends_in_a_wait_by_what_is_raised(program:
 @pytest.mark.parametrize(
     ("number", "stop"),
     [
-        (1, {"q": [0.0] * 6, "blend": 0.0, "by_joints": True}),
-        (2, {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], "blend": 0.0, "by_joints": False, "speed": 0.2}),
-        (3, {"pose": [0.2, *[0.0] * 5], "blend": 0.0, "by_joints": False, "via": [9.0, 8.0, 7.0], "angle": None}),
-        (5, {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], "blend": 0.0, "by_joints": True, "speed": 0.4}),
+        (2, {"q": [0.0] * 6, "blend": 0.0, "by_joints": True}),
+        (3, {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], "blend": 0.0, "by_joints": False, "speed": 0.2}),
+        (4, {"pose": [0.2, *[0.0] * 5], "blend": 0.0, "by_joints": False, "via": [0.2, 0.0, 0.0], "angle": None}),
+        (6, {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], "blend": 0.0, "by_joints": True, "speed": 0.4}),
     ],
 )  # fmt: skip
 def test_a_step_back_takes_the_way_of_the_step_to_where_it_began(
@@ -211,7 +214,7 @@ def test_a_step_back_takes_the_way_of_the_step_to_where_it_began(
     assert robot.done == [([stop], 0.1)]
 
 
-@pytest.mark.parametrize(("number", "moves"), [(0, False), (4, None), (6, False), (7, False)])
+@pytest.mark.parametrize(("number", "moves"), [(1, False), (5, None), (7, False), (8, False), (10, False)])
 def test_there_is_no_way_back_before_the_first_motion_and_over_arcs_with_an_angle(
     program: Callable[..., Program], number: int, moves: bool | None
 ) -> None:
@@ -228,15 +231,39 @@ def test_there_is_no_way_back_before_the_first_motion_and_over_arcs_with_an_angl
 
 def test_a_program_that_begins_behind_the_choice_of_a_tool_needs_that_tool(program: Callable[..., Program]) -> None:
     robot: Any = NotingRobot()
-    made = program(TEXT.replace("{gripper: open}", "{tool: long}").replace("via: home", "via: right"))
+    text = TEXT.replace("{gripper: open}", "{tool: long}").replace("via: home", "via: right")
+    made = program(text.replace("program:\n", "program:\n  - {tool: short}\n"))
     for run in (made.run, made.check):
-        with pytest.raises(RtcpError, match=r"program\.yaml:11: the program uses the tool long there") as refused:
-            run(robot, start=3)
+        with pytest.raises(RtcpError, match=r"program\.yaml:12: the program uses the tool long there") as refused:
+            run(robot, start=4)
         assert refused.value.reason == "another_tool"
     assert not robot.done
     robot.tool = "long"
-    made.run(robot, start=3)
+    made.run(robot, start=4)
     assert robot.done[0] == "lamp False"
+
+
+def test_a_tool_that_somebody_else_chooses_ends_the_program(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+
+    def disturb(begun: Begun) -> None:
+        if "lamp" in begun.text:
+            robot.tool = "long"
+
+    with pytest.raises(RtcpError, match="chosen the tool long meanwhile") as ended:
+        program().run(robot, disturb)
+    assert ended.value.reason == "another_tool"
+
+
+def test_a_halt_ends_a_program_that_waits_for_a_time_at_once(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+
+    def halt() -> None:
+        if "wait start True 2" in robot.done:
+            robot.happened.append(SimpleNamespace(number=4, name="halted_at_rest"))
+
+    with pytest.raises(RtcpError, match="the arm was halted"):
+        program(TEXT.replace("wait_s: 0.001", "wait_s: 60")).run(robot, between=halt)
 
 
 @pytest.mark.parametrize("what", ["halted", "moved_meanwhile"])

@@ -134,8 +134,17 @@ def test_a_change_of_something_else_is_not_overwritten(taught: ProgramFile) -> N
             change()
     assert taught.path.read_text() == TEXT
     taught.reload()
+    assert not taught.can_undo
     taught.remove(0)
     assert len(taught.motion.program) == 3
+
+
+def test_a_link_stays_one_and_its_file_is_changed(taught: ProgramFile) -> None:
+    link = taught.path.parent / "link.yaml"
+    link.symlink_to(taught.path)
+    ProgramFile(link).remove(0)
+    assert link.is_symlink()
+    assert len(read_motion(taught.path).program) == 3
 
 
 def test_a_trajectory_is_not_taught(tmp_path: Path) -> None:

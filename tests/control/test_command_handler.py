@@ -67,7 +67,7 @@ from .rig import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, LoopRig, Step, 
 
 HEARTBEAT = 0x0004
 """Output 3, which is toggled each cycle."""
-ANYONE = {"disable", "halt", "pause", "resume", "set_speed_override", "shutdown"}
+ANYONE = {"disable", "halt", "pause", "set_speed_override", "shutdown"}
 """Commands that need no lease: they make the arm safer."""
 READY = [SetOutput(5, True), SetZero(0, 0.0), Enable(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT),
          MoveGripper(False), SetLimits(0, 1), SetTool(0), SetPayload(0.1)]  # fmt: skip
@@ -92,8 +92,8 @@ def test_only_what_makes_the_arm_safer_needs_no_lease() -> None:
     own = {kind for kind in Command.kinds if kind.__module__ == "rtcp.ipc.commands"}
     assert {kind.name for kind in own if not kind.needs_lease} == ANYONE
     tried = {type(command) for commands in WITH_LEASE.values() for command in commands}
-    # While it moves an arm without its lease stops: `ExtendTrajectory` comes too late for another answer.
-    assert {kind for kind in own if kind.needs_lease} == tried | {ExtendTrajectory}
+    # While it moves an arm without its lease stops: `ExtendTrajectory` and `Resume` come too late for another answer.
+    assert {kind for kind in own if kind.needs_lease} == tried | {ExtendTrajectory, Resume}
 
 
 @pytest.mark.parametrize("stream", [0, -1, -(1 << 63)])
@@ -193,7 +193,9 @@ def test_a_paused_motion_rests_on_its_path_and_ends_where_it_was_to(rig: LoopRig
     assert rig.send(move_to(0.0, 0.0)).refusal == MotionPaused()
     rig.do(SetSpeedOverride(0.5))
     assert rig.observer.latest()[0]["speed_override"] == 0.0
-    assert rig.send(Resume(), lease=0).refusal is None
+    assert rig.send(Resume(), lease=0).refusal == NoLease()
+    assert rig.send(Resume(), lease=12345).refusal == NoLease()
+    rig.do(Resume())
     assert rig.observer.latest()[0]["speed_override"] == 0.5
     rig.until(State.HOLDING, 20.0)
     assert rig.arm.state.commanded == pytest.approx([0.4, 0.1])

@@ -121,7 +121,12 @@ def test_a_circle_is_paused_by_another_client_and_goes_on(shared: Platform, robo
         later = other.status()
         assert later.sent_positions == paused.sent_positions
         assert (later.state, later.speed_override) == (State.MOVING, 0.0)
-        assert later.message == "paused: `rtcp resume` continues the motion"
+        assert later.message == "paused: the motion rests on its path"
+        with rtcp.connect("who looks on", control_socket(shared.directory)) as third:
+            with pytest.raises(rtcp.Refused, match="who paused the motion") as refused:
+                third.resume()
+            assert refused.value.reason == "paused_by_another"
+        assert other.status().sent_positions == paused.sent_positions
         other.resume()
         going.result()
         status = other.status()

@@ -101,7 +101,7 @@ def test_while_the_arm_moves_the_message_is_not_the_end_of_the_last_motion(writt
     written.publish(State.MOVING, moves=3)
     assert written.headline == "moving"
     written.publish(State.MOVING, moves=3, speed_override=0.0)
-    assert written.headline == "paused: `rtcp resume` continues the motion"
+    assert written.headline == "paused: the motion rests on its path"
     written.publish(State.STOPPING, moves=3)
     assert written.headline == "stopping"
     written.board.event(Arrived())
