@@ -26,7 +26,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from kinematics.forward import forward
 from kinematics.jacobian import singularity_distances
-from rtcp.api import AsyncRobot, EventRecord, Feed, NotRunning, RtcpError, Status
+from rtcp.api import AsyncRobot, EventRecord, Feed, NotRunning, RtcpError, State, Status
 from rtcp.api.async_cell import AsyncCell
 from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
@@ -500,6 +500,34 @@ class Live:
             await self.view(lambda robot: robot.set_speed_override(fraction))
         else:
             await (await self.claim(page).robot()).set_speed_override(fraction)
+
+    @property
+    def moves_unpaused(self) -> bool:
+        """Whether the arm is on its way and not paused, by the newest status."""
+        return self.status is not None and self.status.state is State.MOVING and self.status.speed_override > 0.0
+
+    async def pause(self, page: Page) -> None:
+        """Pause the motion under way, by whoever it is; raises RtcpError.
+
+        By the connection of the operator, who may resume it then, or, where that is another page, by nobody's.
+        """
+        page.check_may_command()
+        try:
+            operator = self.claim(page)
+        except HeldByAnother:
+            await self.view(lambda robot: robot.pause())
+        else:
+            await (await operator.robot()).pause()
+
+    async def resume(self, page: Page) -> None:
+        """Continue the motion that is paused.
+
+        Raises:
+            HeldByAnother: another page has the arm.
+            RtcpError: as the command.
+        """
+        self.check_click(page)
+        await (await self.claim(page).robot()).resume()
 
     async def view(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
         """Ask something that commands nothing.

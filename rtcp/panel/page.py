@@ -7,6 +7,7 @@ import contextlib
 import inspect
 import json
 import sys
+import threading
 import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
@@ -15,7 +16,7 @@ from nicegui import Client, ui
 from nicegui.element import Element
 from nicegui.elements.mixins.text_element import TextElement
 
-from rtcp.api import AsyncRobot, RtcpError
+from rtcp.api import AsyncRobot, ProgramFile, RtcpError, State
 from rtcp.api.async_cell import AsyncCell
 from rtcp.panel.arm_view import ArmView
 from rtcp.panel.live import CLICK, TAKE_OVER_S, Click, EndedOnPurpose, HeldByAnother, Live, Page
@@ -24,6 +25,8 @@ T = TypeVar("T")
 Handler = Callable[[], Awaitable[object] | object]
 _BESIDE = "seamless position=bottom"
 """A dialog that covers nothing: STOP stays in reach."""
+_PAUSE_S = 0.05
+"""Between two looks at what a pause has to hold."""
 _COMMANDS = asyncio.Semaphore(2)
 """Of `rtcp` at once."""
 _LONGEST_LINE = 1 << 22
@@ -215,6 +218,50 @@ def no_geometry() -> None:
     text("p", "The arm has no geometry (the key kinematics is missing): joints alone move, no pose is known.")
 
 
+class ProgramSession:
+    """A program on a page: the file that is open, the step that is next, its run. It outlives a change of the tab."""
+
+    def __init__(self) -> None:
+        self.file: ProgramFile | None = None
+        self.at = 0
+        """Step that is next, from 0."""
+        self.running = False
+        self.said = ""
+        self.changed: Callable[[], None] = lambda: None
+        """Shows it anew, where its tab is shown."""
+        self._go = threading.Event()
+        self._ended = False
+
+    def begin(self) -> None:
+        """A run begins."""
+        self.running, self._ended = True, False
+        self._go.set()
+
+    def end(self) -> None:
+        """The run has ended, or has to."""
+        self.running, self._ended = False, True
+
+    @property
+    def paused(self) -> bool:
+        """Whether the next step waits for `resume`."""
+        return self.running and not self._go.is_set()
+
+    def pause(self) -> None:
+        """Begin no further step."""
+        self._go.clear()
+
+    def resume(self) -> None:
+        """Go on with the steps."""
+        self._go.set()
+
+    def between(self) -> None:
+        """Wait in the thread of the run while it is paused; raises Refused where it has ended meanwhile."""
+        while not self._go.wait(_PAUSE_S) and not self._ended:
+            pass
+        if self._ended:
+            raise RtcpError("refused", "the program was ended: its page or STOP has ended the command")
+
+
 class View:
     """One open page of the panel, to the functions that build it."""
 
@@ -295,6 +342,40 @@ class View:
     async def set_speed_override(self, fraction: float) -> None:
         """Set the fraction of its speed at which the arm moves, also while this page moves it."""
         await self._act(self.live.set_speed_override(self.page, fraction), "")
+
+    async def pause(self) -> None:
+        """Pause the motion under way, and the program of this page before its next step."""
+        session = self.kept.get("program")
+        if isinstance(session, ProgramSession) and session.running:
+            session.pause()
+            # What is planned just now begins to move later.
+            while session.paused:
+                if self.live.moves_unpaused:
+                    await self._pause_motion()
+                await asyncio.sleep(_PAUSE_S)
+        else:
+            await self._pause_motion()
+
+    async def _pause_motion(self) -> None:
+        try:
+            await self.live.pause(self.page)
+        except RtcpError as error:
+            self.warn(error.message)
+
+    async def go_on(self) -> None:
+        """Continue the motion, and the program of this page."""
+        session = self.kept.get("program")
+        if not isinstance(session, ProgramSession) or not session.paused:
+            await self._act(self._resume(), "")
+        elif self.live.status is None or self.live.status.state is not State.MOVING:
+            if self.claim():
+                session.resume()
+        elif await self._act(self._resume(), ""):
+            session.resume()
+
+    async def _resume(self) -> bool:
+        await self.live.resume(self.page)
+        return True
 
     async def query(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
         """Ask the platform something that commands nothing; raises RtcpError."""

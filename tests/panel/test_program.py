@@ -88,7 +88,7 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     ]
 
     click(page, "Check")
-    expect(page.get_by_text(re.compile(r"^It can be run: 2 motions"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^It can be run: 2 motions"))).to_be_visible(timeout=40_000)
     for number in (1, 2):
         click(page, "Step")
         said(page, f"Step {number} is done")
@@ -97,6 +97,9 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     holding.until_moving()
     click(page, "Pause")
     until(lambda: holding.status()["speed_override"] == 0.0, "paused")
+    click(page, "Pause")  # a second press starts nothing
+    expect(page.get_by_text("paused: the motion rests on its path")).to_be_visible()
+    assert holding.status()["speed_override"] == 0.0
     # Another tab keeps the run.
     page.get_by_role("link", name="Jog", exact=True).click()
     expect(page.get_by_label("Movement")).to_be_visible(timeout=20_000)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import Any, Final
 
 from nicegui import ui
 
-from rtcp.api import Program, ProgramFile, Robot, RtcpError, State
+from rtcp.api import Program, ProgramFile, Robot, RtcpError
 from rtcp.api.program import Begun
 from rtcp.config.model import ConfigError, NamedPose, Step
 from rtcp.config.zero import state_directory
-from rtcp.panel.page import View, button, choice, field, no_platform, number, row, table, text
+from rtcp.panel.page import ProgramSession, View, button, choice, field, no_platform, number, row, table, text
 
 _KINDS: Final = {
     "move": "Move by the joints",
@@ -29,7 +28,6 @@ _KINDS: Final = {
     "run": "Run a part",
 }
 _MOTIONS: Final = ("move", "line", "arc")
-_PAUSED_S: Final = 0.1
 
 
 def programs_directory() -> Path:
@@ -43,59 +41,15 @@ def build(view: View) -> None:
     if view.live.config is None or view.live.status is None:
         no_platform()
         return
-    kept = view.kept.setdefault("program", Kept())
-    assert isinstance(kept, Kept)
+    kept = view.kept.setdefault("program", ProgramSession())
+    assert isinstance(kept, ProgramSession)
     ProgramPage(view, kept)
-
-
-class Kept:
-    """What outlives a change of the tab: the file that is open, the step that is next, and the run."""
-
-    def __init__(self) -> None:
-        self.file: ProgramFile | None = None
-        self.at = 0
-        """Step that is next, from 0."""
-        self.running = False
-        self.said = ""
-        self.changed: Callable[[], None] = lambda: None
-        """Shows it anew, where the page is shown."""
-        self._go = threading.Event()
-        self._ended = False
-
-    def begin(self) -> None:
-        """A run begins."""
-        self.running, self._ended = True, False
-        self._go.set()
-
-    def end(self) -> None:
-        """The run has ended, or has to."""
-        self.running, self._ended = False, True
-
-    @property
-    def paused(self) -> bool:
-        """Whether the next step waits for `resume`."""
-        return self.running and not self._go.is_set()
-
-    def pause(self) -> None:
-        """Begin no further step."""
-        self._go.clear()
-
-    def resume(self) -> None:
-        """Go on with the steps."""
-        self._go.set()
-
-    def between(self) -> None:
-        """Wait in the thread of the run while it is paused; raises Refused where it has ended meanwhile."""
-        while not self._go.wait(_PAUSED_S) and not self._ended:
-            pass
-        if self._ended:
-            raise RtcpError("refused", "the program was ended")
 
 
 class ProgramPage:
     """The page: each click changes the file at once, and `Undo` takes it back."""
 
-    def __init__(self, view: View, kept: Kept) -> None:
+    def __init__(self, view: View, kept: ProgramSession) -> None:
         self._view, self._kept = view, kept
         with ui.element("div").classes("fields"):
             self._name = field("Program", kept.file.path.stem if kept.file else "", list="programs", maxlength="60")
@@ -178,7 +132,6 @@ class ProgramPage:
                 ("Run", partial(self._run, 0, None), is_empty or kept.running),
                 ("Step back", self._step_back, kept.running or kept.at == 0),
                 ("Step", self._step, kept.running or kept.at >= len(file.motion.program)),
-                ("Go on" if kept.paused else "Pause", self._pause_or_resume, not kept.running),
             ):
                 made = button(label, handler, plain=label != "Run")
                 made.props["disabled"] = blocked
@@ -393,23 +346,6 @@ class ProgramPage:
             if done:
                 kept.at = number
             self._say(f"Step {number + 1} is next" if done else "It has ended early")
-
-    async def _pause_or_resume(self) -> None:
-        kept, view = self._kept, self._view
-        if not view.may_command():
-            return
-        status = view.live.status
-        moves = status is not None and status.state is State.MOVING
-        if kept.paused:
-            if moves:
-                await view.ask(lambda robot: robot.resume())
-            kept.resume()
-            self._say("It goes on")
-        else:
-            kept.pause()
-            if moves:
-                await view.ask(lambda robot: robot.pause())
-            self._say("Paused")
 
 
 def _fields_of(
