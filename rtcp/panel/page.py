@@ -9,7 +9,7 @@ import json
 import sys
 import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from nicegui import Client, ui
 from nicegui.element import Element
@@ -24,6 +24,8 @@ T = TypeVar("T")
 Handler = Callable[[], Awaitable[object] | object]
 _BESIDE = "seamless position=bottom"
 """A dialog that covers nothing: STOP stays in reach."""
+_ABOVE: Final = "top-right"
+"""Of what is told: pads and buttons of a tab are further down."""
 _COMMANDS = asyncio.Semaphore(2)
 """Of `rtcp` at once."""
 _LONGEST_LINE = 1 << 22
@@ -250,12 +252,12 @@ class View:
     def say(self, message: str) -> None:
         """Show that something went well."""
         with self._client:
-            ui.notify(message, type="positive", timeout=3000)
+            ui.notify(message, type="positive", position=_ABOVE, timeout=3000)
 
     def warn(self, message: str) -> None:
         """Show that something did not."""
         with self._client:
-            ui.notify(message, type="negative", timeout=10_000, close_button="Close", multi_line=True)
+            ui.notify(message, type="negative", position=_ABOVE, timeout=10_000, close_button="Close", multi_line=True)
 
     async def act(
         self, command: Callable[[AsyncRobot], Awaitable[T]], done: str = "", *, instead: bool = False

@@ -108,17 +108,17 @@ def test_the_override_slows_what_the_page_moves_and_others_may_only_lower_it(
     page.get_by_role("button", name="Plan").click()
     page.get_by_role("button", name="Send", exact=True).click()
     holding.until_moving()
-    slider = page.get_by_role("slider", name="Speed", exact=True)
+    slider = page.get_by_role("slider", name="Override", exact=True)
     for _ in range(3):
         slider.press("PageDown")
     holding.until(lambda found: found["speed_override"] < 0.9, "slower")
     assert holding.status()["state"] == "moving"
     with visitor(browser, panel) as other:
         show(other, "/health")
-        other.get_by_role("slider", name="Speed", exact=True).press("Home")
+        other.get_by_role("slider", name="Override", exact=True).press("Home")
         holding.until(lambda found: found["speed_override"] == pytest.approx(0.01), "as slow as can be")
         expect(page.locator("output")).to_have_text("1 %")
-        other.get_by_role("slider", name="Speed", exact=True).press("End")
+        other.get_by_role("slider", name="Override", exact=True).press("End")
         expect(other.get_by_role("button", name="Ask to take over")).to_be_visible()
     assert holding.status()["speed_override"] == pytest.approx(0.01)
     slider.press("End")

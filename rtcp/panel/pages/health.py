@@ -44,7 +44,7 @@ def build(view: View) -> None:
             row(body, name, *(f"{figures[one]:.1f}" for one in ("p50", "p99", "p999", "max")))
         why = status.raw["skipped_ticks"]
         skipped.text = f"{status.raw['missed']} of {status.raw['cycles']} cycles skipped" + (
-            f": {why['message']}; {why['remedy']}" if why else ""
+            f": {why['message']}; {why['remedy']}".replace("`", "") if why else ""
         )
 
     def draw() -> None:

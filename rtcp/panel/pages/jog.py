@@ -34,7 +34,7 @@ _PADS = {
     "Z and yaw": ("z+ Up, +Z", "rz+ Yaw +", "rz- Yaw \N{MINUS SIGN}", "z- Down, \N{MINUS SIGN}Z"),
     "Roll and pitch": ("ry+ Pitch +", "rx+ Roll +", "rx- Roll \N{MINUS SIGN}", "ry- Pitch \N{MINUS SIGN}"),
 }
-"""Name -> part of the speed and label of the upper, left, right and lower button, as on the source's stick."""
+"""Name -> part of the speed and label of the upper, left, right and lower button, as on the joystick."""
 _PLACES = ("1 / 2", "2 / 1", "2 / 3", "3 / 2")
 _KEYS = (
     "up and down, left stick",
@@ -167,7 +167,7 @@ class Jog:
 
 
 def _gripper(view: View) -> None:
-    """Show the gripper as on the source's stick: forward opens, backward closes."""
+    """Show the gripper as on the joystick: forward opens, backward closes."""
 
     def move(opens: bool, done: str) -> Callable[[], Awaitable[object]]:
         return lambda: view.act(lambda robot: robot.gripper(opens), done, instead=True)

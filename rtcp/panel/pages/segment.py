@@ -67,7 +67,7 @@ async def build(view: View) -> None:
         status = view.live.status
         if status is not None:
             lines = zip(status.raw["message_times"], status.raw["messages"], strict=True)
-            messages.text = "\n".join(f"{when[11:23]}  {what}" for when, what in lines)
+            messages.text = "\n".join(f"{when[11:23]}  {what}" for when, what in lines).replace("`", "")
 
     read_messages()
     ui.timer(0.5, read_messages)
