@@ -30,7 +30,7 @@ def opened(page: Page, platform: Platform, name: str) -> None:
     show(page, "/program")
     page.get_by_label("Program", exact=True).fill(name)
     click(page, "Open")
-    expect(page.get_by_text(re.compile("^Saved as"))).to_be_visible()
+    expect(page.get_by_text(re.compile("^New; saved as"))).to_be_visible()
 
 
 def said(page: Page, text: str) -> None:

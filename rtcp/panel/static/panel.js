@@ -389,7 +389,8 @@ window.rtcp = (() => {
       new ResizeObserver(() => document.body.style.setProperty("--head", `${head.offsetHeight}px`)).observe(head);
     }, 50);
   });
-  return { fill, stop, tab, typed, unit, get stepping() { return stepping(); }, get token() { return token; }, get state() { return state; },
+  function showArm() { document.getElementById("space").scrollIntoView({ block: "nearest" }); }
+  return { fill, stop, tab, showArm, typed, unit, get stepping() { return stepping(); }, get token() { return token; }, get state() { return state; },
     listen: (listener) => { listeners.add(listener); return () => listeners.delete(listener); },
     scope: (picture) => { pictures.add(picture); return () => pictures.delete(picture); } };
 })();
