@@ -201,7 +201,7 @@ def row(body: Element, first: str, *cells: str | tuple[float, str, int]) -> Elem
 
 def tool_pose() -> None:
     """Show the pose of the tool, live."""
-    with table(("", *POSE), "Pose of the tool", "numbers"), ui.element("tr"):
+    with table(("", *POSE), "Pose of the tool", "numbers pose"), ui.element("tr"):
         text("th", "pose", scope="row")
         for at, (_, unit) in enumerate(POSE):
             shown(f"tool.{at}", 4, unit=unit)

@@ -11,10 +11,10 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from kinematics.forward import forward
-from rtcp.api import State
+from rtcp.api import EventRecord, State
 from rtcp.config.loader import load
 from rtcp.panel import trends
-from rtcp.panel.live import NEXT
+from rtcp.panel.live import NEXT, Live, sentence
 from rtcp.panel.server import PAGES
 from rtcp.panel.trends import KEPT_S, SAMPLE_S, Trends
 from tests.e2e.conftest import Platform
@@ -212,6 +212,39 @@ def test_an_alarm_says_what_to_do_until_somebody_acknowledges_it(
     expect(page.locator("#alarmed")).to_be_hidden()
     page.get_by_role("button", name="Reset").click()
     holding.until(lambda found: found["state"] == "ready", "reset")
+
+
+def test_alarms_that_nobody_has_acknowledged_are_kept_longest() -> None:
+    live = Live(lambda secret: True)
+    events = [
+        EventRecord(number, f"2026-11-26T00:{number:04}", "drive_fault", {}, "", "fault") for number in range(1, 252)
+    ]
+    live._keep_alarms(events[:200])
+    live.acknowledge(events[100:150], "Ada")
+    live._keep_alarms(events[200:250])
+    assert live.alarms == [*events[:100], *events[150:250]]
+    assert live._acknowledged == {}
+    live._keep_alarms(events[250:])
+    assert live.alarms == [*events[1:100], *events[150:]]
+
+
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        ("paused: `rtcp resume` continues the motion", "Paused."),
+        (
+            "the emergency stop is pressed (inputs.emergency_stop in arm.yaml): release it, then `rtcp reset`",
+            "The emergency stop is pressed: release it.",
+        ),
+        (
+            "slave 3 (drive2) does not answer: torque off; `rtcp reset` when it is back",
+            "Slave 3 (drive2) does not answer: torque off.",
+        ),
+        ("", ""),
+    ],
+)
+def test_the_header_says_in_sentences_what_needs_no_terminal(message: str, shown: str) -> None:
+    assert sentence(message) == shown
 
 
 def test_health_draws_the_last_hour(page: Page, holding: Platform) -> None:

@@ -43,7 +43,7 @@ async def build(view: View) -> None:
             with slaves:
                 body = table(_COUNTERS, "Slaves in the order of the cable", "lines")
             for cells in found:
-                row(body, *cells)
+                row(body, *cells).classes("bad" if cells[2] == "no answer" else "")
         if status is not None:
             dc, wkc = status.raw["dc"], status.raw["wkc"]
             clocks = ""

@@ -258,9 +258,9 @@ export default {
       this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
       this.renderer.setSize(clientWidth, clientHeight, false);
       this.camera.aspect = clientWidth / clientHeight;
-      // 48 degrees of the smaller side, so that the boxes fit; a low picture shows the arm, and not all around it.
+      // 54 degrees of the smaller side, so that the boxes fit; a low picture shows the arm, and not all around it.
       const { aspect } = this.camera;
-      this.camera.fov = aspect > 2 ? 34 : 2 * THREE.MathUtils.radToDeg(Math.atan(Math.tan(THREE.MathUtils.degToRad(24)) / Math.min(1, aspect)));
+      this.camera.fov = aspect > 2 ? 40 : 2 * THREE.MathUtils.radToDeg(Math.atan(Math.tan(THREE.MathUtils.degToRad(27)) / Math.min(1, aspect)));
       this.camera.updateProjectionMatrix();
       this.draw();
     },

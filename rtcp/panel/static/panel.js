@@ -131,6 +131,7 @@ window.rtcp = (() => {
       const said = empty ? "–" : typeof value === "number" ? figure(value, element.dataset) : String(value);
       put(element, (isState ? said.replaceAll("_", " ") : said) + (empty ? "" : element.dataset.suffix ?? ""));
       if (isState) element.dataset.state = String(value);
+      else if (name === "drive") element.dataset.value = said;
     }
     showUnits();
     for (const element of document.querySelectorAll("[data-bar]")) {
@@ -221,6 +222,11 @@ window.rtcp = (() => {
       }
     }
   }
+  function more() { // whether tabs are beyond the right edge
+    const menu = document.getElementById("menu");
+    menu?.toggleAttribute("data-more", menu.scrollLeft + menu.clientWidth < menu.scrollWidth - 4);
+  }
+  setInterval(more, 250);
   setInterval(() => { if (performance.now() - heard > STALE_MS) { release(); show(); } }, 250);
 
   // -- the operator's hand -----------------------------------------------------------------------------------------------
