@@ -425,12 +425,12 @@ class GuidingConfig:
     """Largest speed of the tool, m/s."""
     joint_speed: Annotated[float, Gt(0), Le(2)] = 0.5
     """Largest speed of each joint, rad/s; at most its `velocity`."""
-    hold: Annotated[float, Gt(0), Le(0.5)] = 0.08
+    hold: Annotated[float, Gt(0), Le(0.5)] = 0.06
     """Torque that moves no joint yet, fraction of its `torque`: greater errors of the weight make the arm drift."""
     damping: Annotated[float, Ge(0), Le(1)] = 0.1
     """Damping that the hand feels, fraction of each joint's `cst_damping`."""
-    weight_error: Annotated[float, Gt(0), Le(0.5)] = 0.08
-    """Largest error of a joint's weight at rest, fraction of its `torque`; at most `hold`; more is refused."""
+    weight_error: Annotated[float, Gt(0), Le(1)] = 0.1
+    """Largest difference of a joint's torque at rest from its weight, fraction of its `torque`; friction counts too."""
     enabling_switch: bool = True
     """Whether it is refused on a real bus where `inputs.enabling_switch` is left out."""
 

@@ -24,7 +24,6 @@ from rtcp.config.model import (
     DeviceDescription,
     EthercatBus,
     GripperConfig,
-    GuidingConfig,
     HasBox,
     InputsConfig,
     Joint,
@@ -418,13 +417,6 @@ def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> 
             why = f"{name} of {device.name} is {entry.type} with factor {entry.factor:g}"
             found = f"{'+-' if len(ends) == 2 else ''}{ends[-1]:g}"
             yield (*axis, *where), f"found {found}, allowed is {low:g} to {high:g}: {why}"
-
-
-@rule(GuidingConfig)
-def _guiding(guiding: GuidingConfig) -> Iterator[Finding]:
-    if guiding.weight_error > guiding.hold:
-        text = f"found {guiding.weight_error:g}, allowed is at most hold, {guiding.hold:g}: what is accepted is held"
-        yield ("weight_error",), text
 
 
 @rule(ArmFile, "home", "joints")

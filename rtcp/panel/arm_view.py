@@ -24,14 +24,16 @@ class ArmView(Element, component="static/arm_view.js", esm={"nicegui-scene": str
 
     Args:
         config: the arm; its geometry must be known.
+        tool: the tool in use.
         own: the arm in its cell; None: it is in none.
         partners: the others; one whose geometry is not known is not drawn.
     """
 
-    def __init__(self, config: ArmConfig, own: Member | None, partners: Sequence[Member]) -> None:
+    def __init__(self, config: ArmConfig, tool: str, own: Member | None, partners: Sequence[Member]) -> None:
         super().__init__()
-        assert config.arm is not None
-        self._props["links"] = links(to_urdf(config.arm))
+        model = config.model_of(tool)
+        assert model is not None
+        self._props["links"] = links(to_urdf(model))
         self._props["partners"] = [] if own is None else [
             {"name": one.name, **_between(own.base, one.base), "links": links(to_urdf(one.config.arm))}
             for one in partners

@@ -120,16 +120,17 @@ class Frame:
         """Draw the arm that runs; it stays when tabs change."""
         view, live = self._view, self._live
         config, own, partners = shows = (live.config, live.partners.own, live.partners.members)
-        if config is None or self._drawn == shows:
+        tool = "" if live.status is None else str(live.status.raw["tool_name"])
+        if config is None or not tool or self._drawn == (shows, tool):
             return
-        self._drawn = shows
+        self._drawn = shows, tool
         self._space.clear()
         view.arm = None
         with self._space:
             if config.arm is None:
                 no_geometry()
             else:
-                view.arm = ArmView(config, own, partners)
+                view.arm = ArmView(config, tool, own, partners)
 
 
 def _commands(view: View) -> None:
@@ -171,7 +172,7 @@ def _override(view: View) -> None:
 
     with ui.element("div").props("id=override"):
         slider = ui.element("input")
-        heading = text("label", "Speed", **{"for": slider.html_id})
+        heading = text("label", "Override", **{"for": slider.html_id})
         heading.move(target_index=0)
         slider.props.update({"type": "range", "min": "1", "max": "100", "step": "1", "data-override": ""})
         slider.on("change", changed, js_handler="(event) => emit([rtcp.token, +event.target.value])")
@@ -189,11 +190,13 @@ def _first_steps(view: View) -> None:
                 text("span", "Start the virtual arm: software drives on a virtual cable, no hardware.")
                 button("Start the virtual arm", lambda: start_virtual(view), when="off")
             with ui.element("li").props("data-step=enable"):
-                text("span", "Press Enable beside the arm: its drives hold it.")
+                text("span", "Press Enable, above or beside the picture: the drives then hold the arm.")
             with ui.element("li").props("data-step=move"):
-                text("span", "Move it: hold a pad on the tab ")
-                text("a", "Jog", href="/jog").props["aria-label"] = "Pads that move the arm"
-        text("button", "Leave these steps out", "act plain", type="button", **{"data-lead-end": ""})
+                text("span", "Move it: hold a pad")
+                with ui.element("span").classes("elsewhere"):
+                    text("span", " on the tab ")
+                    text("a", "Jog", href="/jog").props["aria-label"] = "Pads that move the arm"
+        text("button", "Hide these steps", "act plain", type="button", **{"data-lead-end": ""})
 
 
 def _footer(asks: bool) -> None:

@@ -16,6 +16,7 @@ import contextlib
 import itertools
 import logging
 import math
+import re
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextvars import ContextVar
@@ -64,6 +65,7 @@ _PARTNER_TURNS = 20
 _EVENT_TURNS = 10
 """New events are asked for in every tenth."""
 _MOST_EVENTS = 1000
+_MOST_ALARMS = 200
 _MOST_HALTS = 16
 """STOPs of the pages' sockets that wait for an answer; `/stop` takes them too."""
 _STOP = "panel: stop"
@@ -84,6 +86,11 @@ NEXT = {
     "closing": "Wait until the platform has ended",
 }
 """What a person does next, by the state of the machine."""
+_ASIDE = re.compile(
+    r"[;,:][^;,:`()]*`rtcp [^`]*`[^;,.]*"  # what to type
+    r"| \((?:[\w.\[\]]+ in \S+|\w+\.[\w.]+)\)"  # the key that sets a limit
+)
+"""What the header leaves out of a message: the whole one is on the tab Alarms."""
 _JOINTS = ("actual_position", "actual_velocity", "actual_torque", "commanded_position")
 log = logging.getLogger("rtcp.panel")
 
@@ -276,6 +283,10 @@ class Live:
         self.feed: Feed | None = None
         self.events: list[EventRecord] = []
         """Of the platform that runs, or ran last; oldest first."""
+        self.alarms: list[EventRecord] = []
+        """What has happened that a person has to know of, oldest first."""
+        self.starting = 0
+        """Commands under way that start a platform."""
         self._acknowledged: dict[tuple[int, str], str] = {}
         """Who has seen an alarm, by its number and time: numbers begin anew with each platform."""
         self.trends = Trends()
@@ -596,19 +607,24 @@ class Live:
     async def _read_events(self, robot: AsyncRobot) -> None:
         found = await asyncio.wait_for(robot.events(self._last_event), 2.0)
         if found and not self._last_event:
-            self.events = []  # of the platform before
+            self.events, self.alarms = [], []  # of the platform before
         self._last_event = found[-1].number if found else self._last_event
         self.events = [*self.events, *found][-_MOST_EVENTS:]
+        if found:
+            self._keep_alarms([one for one in found if one.severity != "note"])
+
+    def _keep_alarms(self, found: Sequence[EventRecord]) -> None:
+        """Add alarms; those that somebody has acknowledged are dropped first."""
+        alarms = [*self.alarms, *found]
+        dropped = sorted(alarms, key=lambda one: not self.acknowledged_by(one))[: max(0, len(alarms) - _MOST_ALARMS)]
+        self.alarms = [one for one in alarms if one not in dropped]
+        kept = {(one.number, one.time) for one in self.alarms}
+        self._acknowledged = {key: by for key, by in self._acknowledged.items() if key in kept}
 
     def _temperatures(self, raw: Mapping[str, Any]) -> list[float | None]:
         """Return those of the drives, C, one a joint; None: its drive maps none."""
         found = {slave["name"]: slave["temperature"] for slave in raw["slaves"]}
         return [] if self.config is None else [found.get(joint.slave) for joint in self.config.joints]
-
-    @property
-    def alarms(self) -> list[EventRecord]:
-        """What has happened that a person has to know of, oldest first."""
-        return [one for one in self.events if one.severity != "note"]
 
     def acknowledged_by(self, alarm: EventRecord) -> str:
         """Return who has acknowledged an alarm; empty: nobody."""
@@ -693,12 +709,13 @@ class Live:
                 "rod": self.partners.rod,
             }
         if self.status is None:
-            return {"state": "off", "message": self.problem, "next": NEXT["off"], **everywhere}
+            state, message = ("starting", "the platform starts") if self.starting else ("off", self.problem)
+            return {"state": state, "message": sentence(message), "next": NEXT[state], **everywhere}
         raw = self.status.raw
         joints = raw["joints"]
         shown: Json = {
             "state": raw["state"],
-            "message": raw["message"],
+            "message": sentence(raw["message"]),
             "next": NEXT[raw["state"]],
             "drive_mode": raw["drive_mode"],
             "control_mode": raw["control_mode"],
@@ -743,6 +760,12 @@ class Live:
             if not isinstance(one["value"], list)
         }
         return {"state": raw["processes"][name]["state"] or "", "fields": fields, "lamps": lamps}
+
+
+def sentence(message: str) -> str:
+    """Return a message as a sentence for somebody who has no terminal and no files at hand."""
+    short = _ASIDE.sub("", message).replace("`", "").rstrip(".")
+    return short and f"{short[0].upper()}{short[1:]}."
 
 
 def _number(value: float, digits: int) -> float | None:

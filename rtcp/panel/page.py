@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from nicegui import Client, ui
 from nicegui.element import Element
@@ -27,6 +27,8 @@ _BESIDE = "seamless position=bottom"
 """A dialog that covers nothing: STOP stays in reach."""
 _PAUSE_S = 0.05
 """Between two looks at what a pause has to hold."""
+_ABOVE: Final = "top-right"
+"""Of what is told: pads and buttons of a tab are further down."""
 _COMMANDS = asyncio.Semaphore(2)
 """Of `rtcp` at once."""
 _LONGEST_LINE = 1 << 22
@@ -202,7 +204,7 @@ def row(body: Element, first: str, *cells: str | tuple[float, str, int]) -> Elem
 
 def tool_pose() -> None:
     """Show the pose of the tool, live."""
-    with table(("", *POSE), "Pose of the tool", "numbers"), ui.element("tr"):
+    with table(("", *POSE), "Pose of the tool", "numbers pose"), ui.element("tr"):
         text("th", "pose", scope="row")
         for at, (_, unit) in enumerate(POSE):
             shown(f"tool.{at}", 4, unit=unit)
@@ -297,12 +299,12 @@ class View:
     def say(self, message: str) -> None:
         """Show that something went well."""
         with self._client:
-            ui.notify(message, type="positive", timeout=3000)
+            ui.notify(message, type="positive", position=_ABOVE, timeout=3000)
 
     def warn(self, message: str) -> None:
         """Show that something did not."""
         with self._client:
-            ui.notify(message, type="negative", timeout=10_000, close_button="Close", multi_line=True)
+            ui.notify(message, type="negative", position=_ABOVE, timeout=10_000, close_button="Close", multi_line=True)
 
     async def act(
         self, command: Callable[[AsyncRobot], Awaitable[T]], done: str = "", *, instead: bool = False

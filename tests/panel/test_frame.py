@@ -11,10 +11,10 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from kinematics.forward import forward
-from rtcp.api import State
+from rtcp.api import EventRecord, State
 from rtcp.config.loader import load
 from rtcp.panel import trends
-from rtcp.panel.live import NEXT
+from rtcp.panel.live import NEXT, Live, sentence
 from rtcp.panel.server import PAGES
 from rtcp.panel.trends import KEPT_S, SAMPLE_S, Trends
 from tests.e2e.conftest import Platform
@@ -108,17 +108,17 @@ def test_the_override_slows_what_the_page_moves_and_others_may_only_lower_it(
     page.get_by_role("button", name="Plan").click()
     page.get_by_role("button", name="Send", exact=True).click()
     holding.until_moving()
-    slider = page.get_by_role("slider", name="Speed", exact=True)
+    slider = page.get_by_role("slider", name="Override", exact=True)
     for _ in range(3):
         slider.press("PageDown")
     holding.until(lambda found: found["speed_override"] < 0.9, "slower")
     assert holding.status()["state"] == "moving"
     with visitor(browser, panel) as other:
         show(other, "/health")
-        other.get_by_role("slider", name="Speed", exact=True).press("Home")
+        other.get_by_role("slider", name="Override", exact=True).press("Home")
         holding.until(lambda found: found["speed_override"] == pytest.approx(0.01), "as slow as can be")
         expect(page.locator("output")).to_have_text("1 %")
-        other.get_by_role("slider", name="Speed", exact=True).press("End")
+        other.get_by_role("slider", name="Override", exact=True).press("End")
         expect(other.get_by_role("button", name="Ask to take over")).to_be_visible()
     assert holding.status()["speed_override"] == pytest.approx(0.01)
     slider.press("End")
@@ -212,6 +212,39 @@ def test_an_alarm_says_what_to_do_until_somebody_acknowledges_it(
     expect(page.locator("#alarmed")).to_be_hidden()
     page.get_by_role("button", name="Reset").click()
     holding.until(lambda found: found["state"] == "ready", "reset")
+
+
+def test_alarms_that_nobody_has_acknowledged_are_kept_longest() -> None:
+    live = Live(lambda secret: True)
+    events = [
+        EventRecord(number, f"2026-11-26T00:{number:04}", "drive_fault", {}, "", "fault") for number in range(1, 252)
+    ]
+    live._keep_alarms(events[:200])
+    live.acknowledge(events[100:150], "Ada")
+    live._keep_alarms(events[200:250])
+    assert live.alarms == [*events[:100], *events[150:250]]
+    assert live._acknowledged == {}
+    live._keep_alarms(events[250:])
+    assert live.alarms == [*events[1:100], *events[150:]]
+
+
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        ("paused: `rtcp resume` continues the motion", "Paused."),
+        (
+            "the emergency stop is pressed (inputs.emergency_stop in arm.yaml): release it, then `rtcp reset`",
+            "The emergency stop is pressed: release it.",
+        ),
+        (
+            "slave 3 (drive2) does not answer: torque off; `rtcp reset` when it is back",
+            "Slave 3 (drive2) does not answer: torque off.",
+        ),
+        ("", ""),
+    ],
+)
+def test_the_header_says_in_sentences_what_needs_no_terminal(message: str, shown: str) -> None:
+    assert sentence(message) == shown
 
 
 def test_health_draws_the_last_hour(page: Page, holding: Platform) -> None:

@@ -109,7 +109,7 @@ def test_what_holds_a_jog_back_is_shown_while_the_pad_is_held(page: Page, holdin
     page.get_by_role("button", name="Up, +Z").hover()
     page.mouse.down()
     expect(page.locator("[data-live=message]").first).to_contain_text(
-        "moving, limited: the elbow is 0.000 rad from its singularity, limit 0.08 rad (cartesian.singularity.elbow"
+        "Moving, limited: the elbow is 0.000 rad from its singularity, limit 0.08 rad: jog away from it"
     )
     page.mouse.up()
     holding.until(lambda found: found["state"] == "holding", "standstill")

@@ -448,7 +448,7 @@ def test_faults_of_the_segment_are_made_and_objects_read(page: Page, holding: Pl
 def test_health_draws_the_cycle_and_serves_it_to_prometheus(page: Page, holding: Platform, panel: str) -> None:
     show(page, "/health")
     for name in ("Wake-up", "Exchange", "Compute"):
-        path = page.get_by_label(f"Histogram: {name}, us").locator("path")
+        path = page.get_by_label(f"Histogram: {name}").locator("path")
         expect(path).to_have_attribute("d", re.compile(r"^M\d+ 1V0\.\d+"))
     expect(page.get_by_role("row", name=re.compile("^wake-up [0-9]"))).to_contain_text(re.compile(r"\d+\.\d"))
     expect(page.get_by_text(re.compile(r"^\d+ of \d+ cycles skipped"))).to_be_visible()

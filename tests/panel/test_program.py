@@ -30,7 +30,7 @@ def opened(page: Page, platform: Platform, name: str) -> None:
     show(page, "/program")
     page.get_by_label("Program", exact=True).fill(name)
     click(page, "Open")
-    expect(page.get_by_text(re.compile("^Saved as"))).to_be_visible()
+    expect(page.get_by_text(re.compile("^New; saved as"))).to_be_visible()
 
 
 def said(page: Page, text: str) -> None:
@@ -79,6 +79,7 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     expect(page.get_by_role("row", name=re.compile("^2 move to there"))).to_be_visible()
     click(page, "Undo")
     expect(page.get_by_role("row", name=re.compile("^2 wait 0.2 s"))).to_be_visible()
+    expect(page.locator(".q-notification")).to_have_count(0)  # one that fades has no contrast
     assert barriers(page) == {}
     steps = read_motion(file_of(holding, "clicks")).program
     assert [(step.move, step.wait_s, step.speed) for step in steps] == [

@@ -42,7 +42,7 @@ def _alarms(view: View) -> None:
             refresh()
 
     def refresh() -> None:
-        alarms = view.live.alarms[-_MOST:]
+        alarms = view.live.alarms
         state = [(one, view.live.acknowledged_by(one)) for one in alarms]
         if state == drawn and place.default_slot.children:
             return
@@ -55,9 +55,9 @@ def _alarms(view: View) -> None:
             return
         with place:
             body = table(("Time", "Kind", "What happened", "What to do", "Acknowledged"), "Alarms", "stack")
-        for one, by in reversed(state):
-            kind = one.severity.replace("_", " ")
-            with row(body, _time(one), kind, one.message, _TO_DO[one.severity]) as made, ui.element("td"):
+        for one, by in reversed(state[-_MOST:]):
+            kind, message = one.severity.replace("_", " "), one.message.replace("`", "")
+            with row(body, _time(one), kind, message, _TO_DO[one.severity]) as made, ui.element("td"):
                 made.props["data-severity"] = one.severity
                 if by:
                     text("span", f"by {by}")
@@ -87,7 +87,7 @@ def _events(view: View) -> None:
         with place:
             body = table(("#", "Time", "Event", "Message"), "Events", "stack")
         for one in reversed(events):
-            row(body, str(one.number), _time(one), one.name, one.message)
+            row(body, str(one.number), _time(one), one.name.replace("_", " "), one.message.replace("`", ""))
 
     refresh()
     ui.timer(1.0, refresh)

@@ -41,16 +41,16 @@ def _joints(config: ArmConfig) -> None:
     headings = (
         "Joint",
         "Drive",
-        ("", "rad"),
-        "Position",
-        ("", "rad/s"),
-        "Velocity",
-        "Nm",
-        "Torque",
+        ("Position", "rad"),
+        "",
+        ("Velocity", "rad/s"),
+        "",
+        ("Torque", "Nm"),
+        "",
         ("Following error", "rad"),
         "°C",
     )
-    with table(headings, "Joints", "numbers"):
+    with table(headings, "Joints", "numbers joints"):
         for at, joint in enumerate(config.joints):
             with ui.element("tr"):
                 text("th", joint.name, scope="row")

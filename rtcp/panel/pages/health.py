@@ -14,7 +14,7 @@ from rtcp.api import Feed, RtcpError
 from rtcp.panel.page import View, row, table, text
 from rtcp.panel.trends import SAMPLE_S
 
-_FIGURES = {"wakeup_ns": "Wake-up, us", "exchange_ns": "Exchange, us", "compute_ns": "Compute, us"}
+_FIGURES = {"wakeup_ns": "Wake-up", "exchange_ns": "Exchange", "compute_ns": "Compute"}
 _BINS = 40
 _MOST = 100_000
 """Cycles in a histogram."""
@@ -44,7 +44,7 @@ def build(view: View) -> None:
             row(body, name, *(f"{figures[one]:.1f}" for one in ("p50", "p99", "p999", "max")))
         why = status.raw["skipped_ticks"]
         skipped.text = f"{status.raw['missed']} of {status.raw['cycles']} cycles skipped" + (
-            f": {why['message']}; {why['remedy']}" if why else ""
+            f": {why['message']}; {why['remedy']}".replace("`", "") if why else ""
         )
 
     def draw() -> None:
@@ -104,14 +104,17 @@ def _trends(view: View) -> None:
     def refresh() -> None:
         place.clear()
         with place:
-            body = table(("", "least", "largest", "now", "", "60 min ago to now"), "Trends", "numbers")
+            body = table(("", "60 min ago to now", "least", "largest", "now", ""), "Trends", "numbers trends")
         now = time.monotonic()
         for one in view.live.trends.all.values():
             values = [value for _, value in one.samples]
             least, largest = min(values), max(values)
             figures = (f"{value:.4g}" for value in (least, largest, values[-1]))
-            with row(body, one.name, *figures, one.unit), ui.element("td"):
+            with row(body, one.name) as made, ui.element("td"):
                 _line(one.line(now), least, largest)
+            with made:
+                for figure in (*figures, one.unit):
+                    text("td", figure)
 
     refresh()
     ui.timer(SAMPLE_S, refresh)

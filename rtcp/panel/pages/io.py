@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from nicegui import ui
 from nicegui.elements.mixins.text_element import TextElement
 
 from rtcp.api import Levels, RtcpError
+from rtcp.config.model import ArmConfig, Level
 from rtcp.panel.page import View, no_platform, on_click, text
 
 _INTERVAL_S = 0.2
+_JOYSTICK = ("forward", "backward", "left", "right", "mode_up", "mode_down")
+Places = dict[str, tuple[TextElement, TextElement | None, Level | None]]
+"""Name -> where its word and its level stand, and the level at which it is on."""
 
 
 async def build(view: View) -> None:
@@ -24,16 +28,19 @@ async def build(view: View) -> None:
         text("p", "This platform has no box with inputs or outputs.")
         return
     with ui.element("div").classes("columns"):
-        inputs = _terminals("Inputs", found.inputs, lambda name: text("span", "", "level"))
-        outputs = _terminals("Outputs", found.outputs, lambda name: _switch(view, name))
+        inputs = _terminals("Inputs", found.inputs, lambda name: text("span", "", "level"), _active(view.live.config))
+        outputs = _terminals("Outputs", found.outputs, lambda name: _switch(view, name), {})
     text("p", "An output that the gripper, a lamp or a process drives is set again by it.")
 
-    def show(places: dict[str, TextElement], levels: Levels) -> None:
-        for name, place in places.items():
-            word = "high" if levels[name] else "low"
+    def show(places: Places, levels: Levels) -> None:
+        for name, (place, beside, active) in places.items():
+            level = "high" if levels[name] else "low"
+            word = level if not active else "on" if level == active else "off"
             if place.text != word:
                 place.text = word
-                place.props["data-level"] = word
+                place.props["data-level"] = level
+                if beside is not None:
+                    beside.text = level
                 if place.tag == "button":
                     place.props["aria-checked"] = str(levels[name]).lower()
 
@@ -50,17 +57,29 @@ async def build(view: View) -> None:
     ui.timer(_INTERVAL_S, refresh)
 
 
-def _terminals(title: str, levels: Levels, control: Callable[[str], TextElement]) -> dict[str, TextElement]:
+def _active(config: ArmConfig) -> dict[str, Level]:
+    """Return the levels at which the inputs with a function are on."""
+    inputs = config.inputs
+    found = {one: getattr(inputs, one) for one in ("arm_toggle", "enabling_switch", "emergency_stop")}
+    joystick = dict.fromkeys(_JOYSTICK, inputs.joystick.active) if inputs.joystick is not None else {}
+    return joystick | {name: one.active for name, one in found.items() if one is not None}
+
+
+def _terminals(
+    title: str, levels: Levels, control: Callable[[str], TextElement], active: Mapping[str, Level]
+) -> Places:
     """Show terminals, those with a meaning first; return where each one's level stands."""
-    made = {}
+    made: Places = {}
     with ui.element("section").classes("page"):
         text("h2", title)
         with ui.element("ul").classes("terminals"):
             for name, place in sorted(levels.places.items(), key=lambda one: one[0] == one[1]):
                 with ui.element("li"):
                     text("span", name.replace("_", " "))
-                    text("small", place if name != place else "")
-                    made[name] = control(name)
+                    with ui.element("small"):
+                        text("span", f"{place} " if name != place else "")
+                        beside = text("span", "") if name in active else None
+                    made[name] = control(name), beside, active.get(name)
     return made
 
 

@@ -34,7 +34,7 @@ _PADS = {
     "Z and yaw": ("z+ Up, +Z", "rz+ Yaw +", "rz- Yaw \N{MINUS SIGN}", "z- Down, \N{MINUS SIGN}Z"),
     "Roll and pitch": ("ry+ Pitch +", "rx+ Roll +", "rx- Roll \N{MINUS SIGN}", "ry- Pitch \N{MINUS SIGN}"),
 }
-"""Name -> part of the speed and label of the upper, left, right and lower button, as on the source's stick."""
+"""Name -> part of the speed and label of the upper, left, right and lower button, as on the joystick."""
 _PLACES = ("1 / 2", "2 / 1", "2 / 3", "3 / 2")
 _KEYS = (
     "up and down, left stick",
@@ -79,11 +79,13 @@ class Jog:
                 first = config.jog.frame if config.arm is not None else "joints"
                 kept = self._kept.get("data-jog-frame", first)
                 self._frame = choice("Frame", frames, kept if kept in frames else first)
-                with ui.element("div").style("display: contents") as of_the_tool:
+                self._of_the_tool = ui.element("div").style("display: contents")
+                with self._of_the_tool:
                     self._speed = self._limited("Speed", "m/s", config.jog.speed, "data-jog-speed")
                     self._turn = self._limited("Turning", "rad/s", config.jog.angular_speed, "data-jog-turn")
-                of_the_tool.set_visibility(config.arm is not None)
-                self._joint = number("Joints", self._kept.get("data-jog-joint", "0.1"), "rad/s", min="0", step="0.01")
+                self._joint = number(
+                    "Speed of joints", self._kept.get("data-jog-joint", "0.1"), "rad/s", min="0", step="0.01"
+                )
             for one in (self._movement, self._frame, self._speed, self._turn, self._joint):
                 one.on_change(self._settle)
             self._settle()
@@ -145,6 +147,8 @@ class Jog:
         self._area.props.update(self._kept)
         self._cartesian.set_visibility(self._frame.value != "joints")
         self._single.set_visibility(self._frame.value == "joints")
+        self._of_the_tool.set_visibility(self._frame.value != "joints")
+        self._joint.place.set_visibility(self._frame.value == "joints")
 
     async def _step(self, part: str) -> None:
         """Move by one step; a click while the last one moves does nothing."""
@@ -167,7 +171,7 @@ class Jog:
 
 
 def _gripper(view: View) -> None:
-    """Show the gripper as on the source's stick: forward opens, backward closes."""
+    """Show the gripper as on the joystick: forward opens, backward closes."""
 
     def move(opens: bool, done: str) -> Callable[[], Awaitable[object]]:
         return lambda: view.act(lambda robot: robot.gripper(opens), done, instead=True)

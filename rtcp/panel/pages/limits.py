@@ -23,7 +23,7 @@ async def build(view: View) -> None:
     text(
         "p",
         "Narrower than the file allows, until the platform ends. A field says what is in force; below it stands what "
-        "the file allows.",
+        "the file allows. The tool stays inside the box, and out of the other spaces.",
     )
     found = await view.live.view(lambda robot: robot.limits())
     fields: dict[str, Field] = {}
@@ -56,7 +56,7 @@ async def build(view: View) -> None:
         for box in _boxes(found["limits"]):
             for side in ("min", "max"):
                 with ui.element("tr"):
-                    text("th", "box, the tool stays inside" if box == "box" else f"{box}, kept out", scope="row")
+                    text("th", box.replace("_", " "), scope="row")
                     text("td", "lower" if side == "min" else "upper", "text")
                     for axis, letter in enumerate("xyz"):
                         now, allowed = (_boxes(found[which])[box][side][axis] for which in ("limits", "configured"))

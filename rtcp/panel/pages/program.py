@@ -28,6 +28,7 @@ _KINDS: Final = {
     "run": "Run a part",
 }
 _MOTIONS: Final = ("move", "line", "arc")
+_MOST_OFFERED: Final = 24
 
 
 def programs_directory() -> Path:
@@ -88,7 +89,8 @@ class ProgramPage:
             self._view.warn(str(error))
             return
         self._kept.at = 0
-        self._say(f"Saved as {self._kept.file.path}")
+        path = self._kept.file.path
+        self._say(f"Opened {path}" if path.exists() else f"New; saved as {path} with its first pose")
 
     def _change(self, change: Callable[[ProgramFile], object]) -> bool:
         """Change the file; return whether it was changed."""
@@ -115,12 +117,17 @@ class ProgramPage:
         self._undo.props["disabled"] = file is None or not file.can_undo or kept.running
         self._place.clear()
         if file is None:
+            with self._place:
+                self._show_known()
             return
         with self._place:
             self._show_run(file)
             self._show_steps(file)
+            if not file.motion.poses:
+                self._show_poses(file)  # what comes first
             self._show_new_step(file)
-            self._show_poses(file)
+            if file.motion.poses:
+                self._show_poses(file)
             self._show_speed(file)
 
     def _show_run(self, file: ProgramFile) -> None:
@@ -135,6 +142,18 @@ class ProgramPage:
             ):
                 made = button(label, handler, plain=label != "Run")
                 made.props["disabled"] = blocked
+
+    def _show_known(self) -> None:
+        """Offer the programs that exist."""
+
+        def opens(name: str) -> None:
+            self._name.value = name
+            self._open()
+
+        text("p", "Type a name: a new program is made, a known one is opened.")
+        with ui.element("div").classes("buttons").props('role=group aria-label="Programs"'):
+            for path in sorted(programs_directory().glob("*.yaml"))[:_MOST_OFFERED]:
+                button(path.stem, partial(opens, path.stem), plain=True)
 
     def _show_speed(self, file: ProgramFile) -> None:
         now = file.motion.speed
@@ -159,21 +178,19 @@ class ProgramPage:
             if not steps:
                 text("p", "None yet: keep a pose, then add a step that leads there.")
                 return
-            body = table(("#", "Step", "", "", "", ""), "Steps of the program", "stack")
+            body = table(("#", "Step", ""), "Steps of the program", "stack steps")
         for at, step in enumerate(steps):
             shown = row(body, f"▶ {at + 1}" if at == self._kept.at else str(at + 1), described(step))
             if at == self._kept.at:
                 shown.props["aria-current"] = "step"
-            with shown:
+            with shown, ui.element("td"), ui.element("div").classes("buttons"):
                 for label, spoken, handler in (
                     ("Up", f"Move step {at + 1} up", partial(self._move, at, at - 1)),
                     ("Down", f"Move step {at + 1} down", partial(self._move, at, at + 1)),
                     ("Delete", f"Delete step {at + 1}", partial(self._delete, at)),
                     ("Run from here", f"Run from step {at + 1}", partial(self._run, at, None)),
                 ):
-                    with ui.element("td"):
-                        made = button(label, handler, plain=True)
-                        made.props["aria-label"] = spoken
+                    button(label, handler, plain=True).props["aria-label"] = spoken
 
     def _show_new_step(self, file: ProgramFile) -> None:
         config = self._view.live.config
@@ -213,7 +230,7 @@ class ProgramPage:
         kind.on_change(show)
         show()
         with ui.element("div").classes("buttons"):
-            button("Add the step", add)
+            button("Add the step", add, plain=not poses)
 
     def _show_poses(self, file: ProgramFile) -> None:
         text("h2", "Poses")
@@ -226,20 +243,26 @@ class ProgramPage:
             )
             what = choice("Kept as", kinds, "q")
         with ui.element("div").classes("buttons"):
-            button("Keep where the arm is", lambda: self._keep(name.value.strip(), what.value))
+            button(
+                "Keep where the arm is",
+                lambda: self._keep(name.value.strip(), what.value),
+                plain=bool(file.motion.poses),
+            )
         if not file.motion.poses:
             return
-        body = table(("Pose", "Kept as", "", "", ""), "Poses of the program", "stack")
+        body = table(("Pose", "Kept as", ""), "Poses of the program", "stack steps")
         for pose in file.motion.poses:
-            with row(body, pose.name, "joints" if pose.q is not None else "pose"):
+            with (
+                row(body, pose.name, "joints" if pose.q is not None else "pose"),
+                ui.element("td"),
+                ui.element("div").classes("buttons"),
+            ):
                 for label, spoken, handler in (
                     ("Move there", f"Move to {pose.name}", partial(self._move_to, pose)),
                     ("Keep anew", f"Keep {pose.name} anew", partial(self._keep, pose.name, "q" if pose.q else "pose")),
                     ("Delete", f"Delete {pose.name}", partial(self._forget, pose.name)),
                 ):
-                    with ui.element("td"):
-                        made = button(label, handler, plain=True)
-                        made.props["aria-label"] = spoken
+                    button(label, handler, plain=True).props["aria-label"] = spoken
 
     # -- what is done -------------------------------------------------------------------------------------------------
 

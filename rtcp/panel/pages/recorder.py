@@ -27,12 +27,13 @@ def build(view: View) -> None:
     """Build the page."""
     text("h1", "Recorder")
     with ui.element("div").classes("fields"):
-        name = field("File name (empty: by the time)")
+        name = field("File name", placeholder="by the time")
         formats = choice("Format", _FORMATS, "mcap")
-        signals = field("Signals (empty: all)")
+        signals = field("Signals", placeholder="all")
     with ui.element("div").classes("buttons"):
         begin = button("Record")
         end = button("Stop recording", plain=True)
+        end.props["disabled"] = True
         again = button("Show the files", plain=True)
     said = text("p", "", role="status")
     files = ui.element("div").classes("page")
@@ -71,6 +72,7 @@ def build(view: View) -> None:
                 names = ", ".join(Path(file).name for file in one.files)
                 lines.append(f"{names}: {one.records} samples, {one.missing} missing, {one.seconds:.0f} s")
             said.text = "; ".join(lines) or "Nothing is recorded"
+        end.props["disabled"] = not running
 
     def show_files() -> None:
         files.clear()
@@ -81,10 +83,10 @@ def build(view: View) -> None:
             where = str(path.relative_to(recordings_directory()))
             with row(body, where, f"{path.stat().st_size / 1e6:.1f}"):
                 with ui.element("td"):
-                    link = text("a", f"Download {where}", href=f"/recordings/{quote(where)}")
-                    link.props["download"] = path.name
+                    link = text("a", "Download", href=f"/recordings/{quote(where)}")
+                    link.props.update({"download": path.name, "aria-label": f"Download {where}"})
                 with ui.element("td"):
-                    button(f"Plot {where}", partial(plot, path), plain=True)
+                    button("Plot", partial(plot, path), plain=True).props["aria-label"] = f"Plot {where}"
 
     async def plot(path: Path) -> None:
         picture = path.with_suffix(".png")
@@ -116,9 +118,9 @@ def _files() -> list[Path]:
 
 
 def _programs(view: View) -> None:
-    text("h2", "Programs")
+    text("h2", "Run a motion file")
     with ui.element("div").classes("fields"):
-        file = field("Motion file", str(Path.home()) + "/", list="programs")
+        file = field("Motion file", list="programs", placeholder="path of a file")
         approach = choice("Start", {"approach": "move to its beginning first", "": "the arm stands there"}, "approach")
     with ui.element("datalist").props("id=programs"):
         for path in sorted(_motion_files()):

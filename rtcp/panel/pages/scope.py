@@ -34,6 +34,7 @@ def build(view: View) -> None:
     chosen = ["actual_position.0", "commanded_position.0"]
     with ui.element("div").classes("fields"):
         signal = choice("Signal", allowed, "actual_position.0")
+        signal.place.classes("long")
         span = number(f"Time base, s ({SHORTEST_S:g} to {LONGEST_S:g})", "5", min=str(SHORTEST_S), max=str(LONGEST_S))
         trigger = choice(
             "Trigger",

@@ -43,7 +43,7 @@ async def build(view: View) -> None:
             with slaves:
                 body = table(_COUNTERS, "Slaves in the order of the cable", "lines")
             for cells in found:
-                row(body, *cells)
+                row(body, *cells).classes("bad" if cells[2] == "no answer" else "")
         if status is not None:
             dc, wkc = status.raw["dc"], status.raw["wkc"]
             clocks = ""
@@ -67,7 +67,7 @@ async def build(view: View) -> None:
         status = view.live.status
         if status is not None:
             lines = zip(status.raw["message_times"], status.raw["messages"], strict=True)
-            messages.text = "\n".join(f"{when[11:23]}  {what}" for when, what in lines)
+            messages.text = "\n".join(f"{when[11:23]}  {what}" for when, what in lines).replace("`", "")
 
     read_messages()
     ui.timer(0.5, read_messages)

@@ -33,6 +33,7 @@ def build(view: View) -> None:
             ui.element("option").props["value"] = str(path)
     with ui.element("div").classes("buttons"):
         begin = button("Start", when="off")
+        begin.props["data-start"] = ""
         button(
             "Stop the platform",
             lambda: _end(view),
@@ -132,7 +133,11 @@ async def _start(view: View, arguments: list[str], show: Callable[[str], None]) 
     """Start a platform and return whether it runs; `show` gets each line of the command."""
     if not view.claim():
         return True  # the person has been told
-    code, _ = await view.rtcp("start", "--detach", *arguments, show=show)
+    view.live.starting += 1
+    try:
+        code, _ = await view.rtcp("start", "--detach", *arguments, show=show)
+    finally:
+        view.live.starting -= 1
     if not code:
         view.say("The platform runs")
     return not code

@@ -141,7 +141,7 @@ class Targets:
     @staticmethod
     def _fill(fields: Sequence[Field], values: Sequence[float]) -> None:
         for one, value in zip(fields, values, strict=False):
-            one.value = f"{value:.5g}"
+            one.value = f"{round(value, 6) + 0.0:.5g}"  # no -0
 
     def _target(self) -> Target:
         """Return what the fields say; raises Invalid."""
@@ -164,6 +164,7 @@ class Targets:
         self._said.text = f"{found.duration_s:.1f} s{length}: {look}send it"
         if self._view.arm is not None:
             self._view.arm.preview([list(q) for q in found.path], found.duration_s)
+            ui.run_javascript("rtcp.showArm()")
         self._planned, self._begin = target, found.path[0]
         self._send_button.props["disabled"] = False
 

@@ -6,6 +6,8 @@ const TRACE = 600, TRACE_S = 10, SEEN = "rtcp-camera";
 const GHOST = { color: "#2f9e44", opacity: 0.35 }, PARTNER = { color: "#adb5bd" };
 const NORMAL = new THREE.Color("#4a6da7"), NEAR = new THREE.Color("#e8590c");
 
+function stored(read) { try { return read(); } catch { return null; } } // a browser may block its storage
+
 function place(object, { xyz, rpy }) {
   object.position.set(...xyz);
   object.rotation.set(rpy[0], rpy[1], rpy[2], "ZYX"); // fixed axes roll, pitch, yaw
@@ -126,11 +128,11 @@ export default {
     this.path = line("#2f9e44", 400);
     scene.add(this.trace, this.path);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
-    const kept = JSON.parse(sessionStorage.getItem(SEEN) ?? "null") ?? { at: [-2.2, -2.4, 1.9], to: [0, 0, 0.5] };
+    const kept = stored(() => JSON.parse(sessionStorage.getItem(SEEN))) ?? { at: [-2.2, -2.4, 1.9], to: [0, 0, 0.5] };
     this.camera.position.set(...kept.at);
     this.controls.target.set(...kept.to);
     this.controls.addEventListener("change", () => {
-      sessionStorage.setItem(SEEN, JSON.stringify({ at: this.camera.position.toArray(), to: this.controls.target.toArray() }));
+      stored(() => sessionStorage.setItem(SEEN, JSON.stringify({ at: this.camera.position.toArray(), to: this.controls.target.toArray() })));
       this.draw();
     });
     this.controls.update();
@@ -256,7 +258,9 @@ export default {
       this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
       this.renderer.setSize(clientWidth, clientHeight, false);
       this.camera.aspect = clientWidth / clientHeight;
-      this.camera.fov = this.camera.aspect > 2 ? 30 : 45; // a low picture shows the arm, and not all around it
+      // 54 degrees of the smaller side, so that the boxes fit; a low picture shows the arm, and not all around it.
+      const { aspect } = this.camera;
+      this.camera.fov = aspect > 2 ? 40 : 2 * THREE.MathUtils.radToDeg(Math.atan(Math.tan(THREE.MathUtils.degToRad(27)) / Math.min(1, aspect)));
       this.camera.updateProjectionMatrix();
       this.draw();
     },

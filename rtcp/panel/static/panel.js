@@ -6,6 +6,7 @@ window.rtcp = (() => {
   const OLD_S = 0.5; // joint values older than this are marked; a bar that comes and goes would move the buttons
   let socket = null, token = 0, heard = 0, state = {}, connected = false;
   const listeners = new Set(), pictures = new Set();
+  function kept(read) { try { return read(); } catch { return null; } } // a browser may block its storage
 
   // -- the socket ------------------------------------------------------------------------------------------------------
 
@@ -59,7 +60,7 @@ window.rtcp = (() => {
 
   // Values are SI everywhere; what a person reads and types is in the units that this browser keeps.
   const UNITS = { rad: { rad: 1, deg: 180 / Math.PI }, m: { m: 1, mm: 1000 } };
-  const chosen = { rad: "rad", m: "m", ...JSON.parse(localStorage.getItem("rtcp-units") ?? "{}") };
+  const chosen = { rad: "rad", m: "m", ...kept(() => JSON.parse(localStorage.getItem("rtcp-units"))) };
   function unit(si) { // the name of what is shown for a unit of the interfaces, and how many of it make one
     const [base, ...rest] = si.split("/"), name = Object.hasOwn(chosen, base) ? chosen[base] : "";
     return name ? [[name, ...rest].join("/"), UNITS[base][name] ?? 1] : [si, 1];
@@ -105,7 +106,7 @@ window.rtcp = (() => {
     const of = event.target.dataset?.units;
     if (!of) return;
     chosen[of] = event.target.value;
-    localStorage.setItem("rtcp-units", JSON.stringify(chosen));
+    kept(() => localStorage.setItem("rtcp-units", JSON.stringify(chosen)));
     showUnits("");
     show();
   });
@@ -130,6 +131,7 @@ window.rtcp = (() => {
       const said = empty ? "–" : typeof value === "number" ? figure(value, element.dataset) : String(value);
       put(element, (isState ? said.replaceAll("_", " ") : said) + (empty ? "" : element.dataset.suffix ?? ""));
       if (isState) element.dataset.state = String(value);
+      else if (name === "drive") element.dataset.value = said;
     }
     showUnits();
     for (const element of document.querySelectorAll("[data-bar]")) {
@@ -154,7 +156,7 @@ window.rtcp = (() => {
     }
     showFrame();
     const note = document.getElementById("operator");
-    if (note) put(note, state.mine ? "You operate the arm" : state.operator ? `${state.operator} operates the arm` : "Nobody operates the arm");
+    if (note) put(note, note.title = state.mine ? "You operate the arm" : state.operator ? `${state.operator} operates the arm` : "Nobody operates the arm");
     const lost = document.getElementById("lost"), old = document.getElementById("old");
     if (lost) lost.hidden = connected;
     const isOld = connected && state.age_s > OLD_S;
@@ -186,7 +188,7 @@ window.rtcp = (() => {
   let done = null;
   function lead() {
     const box = document.getElementById("lead");
-    if (!box || !connected || (box.hidden && localStorage.getItem(LED))) return;
+    if (!box || !connected || (box.hidden && kept(() => localStorage.getItem(LED)))) return;
     if (state.state === "off") done = new Set();
     if (!done) return;
     if (!["off", "starting"].includes(state.state)) done.add("start");
@@ -201,7 +203,7 @@ window.rtcp = (() => {
     if (!next) setTimeout(endLead, 4000);
   }
   function endLead() {
-    localStorage.setItem(LED, "1");
+    kept(() => localStorage.setItem(LED, "1"));
     done = null;
     document.getElementById("lead").hidden = true;
   }
@@ -209,7 +211,7 @@ window.rtcp = (() => {
 
   let path = "/";
   function tab(opened = path) { // mark a tab and bring it into view
-    path = opened;
+    document.body.dataset.tab = path = opened;
     for (const link of document.querySelectorAll("#menu a")) {
       const isOpen = link.dataset.path === path;
       link.toggleAttribute("aria-current", false);
@@ -220,6 +222,11 @@ window.rtcp = (() => {
       }
     }
   }
+  function more() { // whether tabs are beyond the right edge
+    const menu = document.getElementById("menu");
+    menu?.toggleAttribute("data-more", menu.scrollLeft + menu.clientWidth < menu.scrollWidth - 4);
+  }
+  setInterval(more, 250);
   setInterval(() => { if (performance.now() - heard > STALE_MS) { release(); show(); } }, 250);
 
   // -- the operator's hand -----------------------------------------------------------------------------------------------
@@ -380,9 +387,16 @@ window.rtcp = (() => {
   });
 
   window.addEventListener("load", () => {
-    const wait = setInterval(() => { if (pageKey()) { clearInterval(wait); connect(); } }, 50);
+    const wait = setInterval(() => {
+      if (!pageKey()) return;
+      clearInterval(wait);
+      connect();
+      const head = document.getElementById("head"); // what is told lies below it
+      new ResizeObserver(() => document.body.style.setProperty("--head", `${head.offsetHeight}px`)).observe(head);
+    }, 50);
   });
-  return { fill, stop, tab, typed, unit, get stepping() { return stepping(); }, get token() { return token; }, get state() { return state; },
+  function showArm() { document.getElementById("space").scrollIntoView({ block: "nearest" }); }
+  return { fill, stop, tab, showArm, typed, unit, get stepping() { return stepping(); }, get token() { return token; }, get state() { return state; },
     listen: (listener) => { listeners.add(listener); return () => listeners.delete(listener); },
     scope: (picture) => { pictures.add(picture); return () => pictures.delete(picture); } };
 })();

@@ -57,18 +57,20 @@ export default {
       const block = this.block;
       if (!block) return;
       const dark = document.body.classList.contains("body--dark");
+      const [ink, rule] = dark ? ["#f1f3f5", "#3a424b"] : ["#212529", "#d3d9df"];
+      const axis = { nameTextStyle: { color: ink }, axisLine: { lineStyle: { color: ink } }, splitLine: { lineStyle: { color: rule } } };
       const lines = this.marks.map((t, at) => ({ xAxis: t, label: { formatter: "AB"[at] } }));
       this.chart.setOption({
         animation: false,
-        textStyle: { color: dark ? "#f1f3f5" : "#212529" },
-        legend: { type: "scroll", top: 0, textStyle: { color: dark ? "#f1f3f5" : "#212529" } },
+        textStyle: { color: ink },
+        legend: { type: "scroll", top: 0, textStyle: { color: ink } },
         grid: { left: 60, right: 15, top: 40, bottom: 70 },
-        xAxis: { type: "value", name: "s", min: "dataMin", max: "dataMax", axisLabel: { formatter: (t) => String(Number(t.toFixed(4))) } },
-        yAxis: { type: "value", scale: true },
+        xAxis: { ...axis, type: "value", name: "s", min: "dataMin", max: "dataMax", axisLabel: { color: ink, formatter: (t) => String(Number(t.toFixed(4))) } },
+        yAxis: { ...axis, type: "value", scale: true, axisLabel: { color: ink } },
         dataZoom: [{ type: "inside" }, { type: "slider", bottom: 10 }],
         tooltip: { trigger: "axis" },
         series: block.signals.map((name, at) => ({
-          name: this.names[name], type: "line", showSymbol: false, lineStyle: { width: 1 }, data: block.t.map((t, k) => [t, block.y[at][k]]),
+          name: this.names[name], type: "line", showSymbol: false, lineStyle: { width: 2 }, data: block.t.map((t, k) => [t, block.y[at][k]]),
           markLine: at === 0 ? { symbol: "none", data: lines, animation: false } : undefined,
         })),
       }, { replaceMerge: ["series"] });
