@@ -153,6 +153,9 @@ def _commands(view: View) -> None:
             ),
             ("Reset", lambda: view.act(lambda robot: robot.reset(), "Reset"), "fault emergency_stop stopped_by_limit"),
             ("Halt", view.halt, "moving homing"),
+            # Two buttons, each with one meaning: a second press of the first starts nothing.
+            ("Pause", view.pause, "moving holding"),
+            ("Go on", view.go_on, "moving holding"),
             ("Home", home, "holding"),
         ):
             button(label, handler, when=when, plain=True).props["data-do"] = label.lower()
@@ -177,9 +180,6 @@ def _override(view: View) -> None:
         slider.props.update({"type": "range", "min": "1", "max": "100", "step": "1", "data-override": ""})
         slider.on("change", changed, js_handler="(event) => emit([rtcp.token, +event.target.value])")
         shown("speed_override", tag="output").props["data-suffix"] = " %"
-        # Two buttons, each with one meaning: a second press of the first starts nothing.
-        button("Pause", view.pause, when="moving holding", plain=True)
-        button("Go on", view.go_on, when="moving holding", plain=True)
 
 
 def _first_steps(view: View) -> None:
