@@ -386,7 +386,7 @@ def test_the_scope_shows_and_keeps_what_moves(page: Page, holding: Platform, tmp
         ),
         "the trigger",
     )
-    page.get_by_role("button", name="Pause").click()
+    page.get_by_role("button", name="Freeze").click()
     with page.expect_download() as download:
         page.get_by_role("button", name="CSV").click()
     download.value.save_as(tmp_path / "scope.csv")

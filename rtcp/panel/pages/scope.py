@@ -74,12 +74,12 @@ def build(view: View) -> None:
     def pause() -> None:
         paused[0] = not paused[0]
         picture.run_method("pause", paused[0])
-        hold.text = "Go on" if paused[0] else "Pause"
+        hold.text = "Follow" if paused[0] else "Freeze"
 
     with ui.element("div").classes("buttons"):
         button("Add the signal", add)
         button("Remove all", clear, plain=True)
-        hold = button("Pause", pause, plain=True)
+        hold = button("Freeze", pause, plain=True)
         button("CSV of what is shown", lambda: picture.run_method("csv"), plain=True)
     for one in (span, trigger, level):
         one.on_change(apply)
