@@ -480,7 +480,7 @@ class Methods:
                 ended = await self._motion.guide(caller, duration_s)
                 await self._restore_mode(caller, name)
                 return ended
-        except BaseException:
+        except (RtcpError, asyncio.CancelledError):
             # Also where its connection is lost: the arm comes to rest, and is left as it was before.
             own = Caller("the end of hand guiding", _OWN_CONNECTION)
             self._restoring = asyncio.create_task(self._restore_mode(own, name))
@@ -712,14 +712,7 @@ class Methods:
             return {}
 
         documentation = inspect.cleandoc(kind.__doc__ or "")
-        return Method(
-            kind.name,
-            _parameters_of_command(kind),  # type: ignore[arg-type]
-            call,
-            documentation,
-            at_once=not kind.needs_lease,
-            streams=streams,
-        )
+        return Method(kind.name, _parameters_of_command(kind), call, documentation, streams=streams)  # type: ignore[arg-type]
 
     @staticmethod
     def _check_count(name: str, numbers: Numbers, count: int) -> None:

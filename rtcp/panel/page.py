@@ -28,7 +28,7 @@ _BESIDE = "seamless position=bottom"
 _PAUSE_S = 0.05
 """Between two looks at what a pause has to hold."""
 _ABOVE: Final = "top-right"
-"""Of what is told: pads and buttons of a tab are further down."""
+"""Position of notifications: away from the pads and buttons of a tab."""
 _COMMANDS = asyncio.Semaphore(2)
 """Of `rtcp` at once."""
 _LONGEST_LINE = 1 << 22

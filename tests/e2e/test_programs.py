@@ -59,7 +59,7 @@ def test_a_program_steps_back_the_way_it_came(enabled: Platform, tmp_path: Path)
         records, _ = feed.records()
         feed.close()
         assert robot.positions == pytest.approx(HERE, abs=2e-3)
-    # The arc has its centre 0.05 m beside the start: so far from it the tool was all the way.
+    # The centre of the arc is 0.05 m beside the start; the tool keeps this distance from it all the way.
     with rtcp.connect("who looks", control_socket(enabled.directory)) as robot:
         places = [robot.fk([float(q) for q in sent]) for sent in records["sent_position"][::50]]
     assert [math.hypot(one[1] - y - 0.05, one[2] - z) for one in places] == pytest.approx(

@@ -40,9 +40,9 @@ _SHARE: Final = 0.8
 """Of the speed bounds, which anchors keep to: a hand that pushes hard is faster until the spring is bent."""
 _TOO_FAST: Final = 1.5
 _FAST_CYCLES: Final = 5
-"""A tool faster than so many times its bound, for more cycles in a row, ends it: the hand is stronger than the arm."""
+"""The guiding ends when the tool exceeds `_TOO_FAST` times its speed bound for more than this many cycles in a row."""
 _MARGIN_RAD: Final = 0.05
-"""Anchors stay so far inside the range: a hand that leans on the arm bends the spring."""
+"""Distance of the anchors from the ends of the range: room for the spring that a leaning hand bends."""
 _BRAKES: Final = 0.5
 """Share of the joints' and the tool's acceleration with which anchors slow down before a range or a box."""
 _FORGET_1_RAD: Final = 10.0

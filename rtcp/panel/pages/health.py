@@ -78,7 +78,7 @@ def build(view: View) -> None:
 
 
 def _histogram(name: str) -> tuple[Element, TextElement]:
-    """Show a histogram; return its path, and where its range is told."""
+    """Show a histogram; return its path and the element with its range."""
     with ui.element("figure"):
         with ui.element("svg").classes("histogram") as picture:
             picture.props.update({"viewBox": f"0 0 {_BINS} 1", "preserveAspectRatio": "none", "role": "img"})
