@@ -207,7 +207,7 @@ class Program:
             why = "no motion stands before it"
         elif step.angle is not None or done[before[-1]].angle is not None:
             why = "it is, or follows, an arc with an angle"
-        elif any(one.tool is not None for one in done[before[-1] :]):
+        elif any(earlier.tool is not None for earlier in done[before[-1] :]):
             why = "another tool was chosen before it"
         if why:
             raise RtcpError("refused", f"{self.file}:{line}: no way back over this step: {why}", "no_way_back")

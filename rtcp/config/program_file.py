@@ -72,7 +72,7 @@ class ProgramFile:
         poses = _list_in(data, "poses")
         made: dict[str, Any] = {"name": name}
         made |= {
-            key: [round(float(one), _DIGITS) + 0.0 for one in value]
+            key: [round(float(number), _DIGITS) + 0.0 for number in value]
             for key, value in (("q", q), ("pose", pose))
             if value is not None
         }
@@ -87,7 +87,7 @@ class ProgramFile:
         """Forget a pose that no step names."""
         data = self._data()
         poses = _list_in(data, "poses")
-        del poses[_index(self.path, [one.get("name") for one in poses], name, "poses")]
+        del poses[_index(self.path, [pose.get("name") for pose in poses], name, "poses")]
         self._change(data)
 
     def set_speed(self, speed: float | None) -> None:
@@ -138,7 +138,7 @@ class ProgramFile:
         if not part:
             return _list_in(data, "program")
         parts = _list_in(data, "parts")
-        return _list_in(parts[_index(self.path, [one.get("name") for one in parts], part, "parts")], "steps")
+        return _list_in(parts[_index(self.path, [entry.get("name") for entry in parts], part, "parts")], "steps")
 
     def _at(self, steps: CommentedSeq, at: int) -> int:
         if not 0 <= at < len(steps):
