@@ -24,6 +24,7 @@ poses:
   - {name: here, q: [0, -0.2, 2, 0, 1, 0]}
   - {name: beside, pose: [X, 0.1, Z, RX, RY, RZ]}
 program:
+  - {tool: flange}
   - {move: here}
   - {tool: probe}
   - {line: beside}
@@ -93,8 +94,8 @@ def test_a_program_changes_the_tool_and_is_planned_with_each(shared: Platform, r
     assert planned[-2].plan.length_m == pytest.approx(0.1, abs=1e-4)
     robot.set_payload(0.3)
     said: list[str] = []
-    program.run(robot, lambda line, what: said.append(what))
-    assert [what for what in said if "tool" in what] == ["tool: probe", "tool: flange"]
+    program.run(robot, lambda step: said.append(step.text))
+    assert [what for what in said if "tool" in what] == ["tool: flange", "tool: probe", "tool: flange"]
     assert (robot.status().tool, robot.status().payload.mass) == ("flange", 0.0)
     assert robot.positions == pytest.approx(HERE, abs=2e-3)
 

@@ -79,5 +79,5 @@ def test_the_latency_of_each_wire_is_measured_in_the_frames(platform: Platform, 
     command = [sys.executable, "-m", "rtcp.ros.latency", wire, "5"]
     done = subprocess.run(command, env=platform.environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    # At least the cycle in which a command is taken: how much more depends on the host.
-    assert [cycles for cycles in json.loads(done.stdout) if cycles < 1.0] == []
+    # Below one cycle where the host is late: the record has the instant at which the cycle was due.
+    assert [cycles > 0.0 for cycles in json.loads(done.stdout)] == [True] * 5
