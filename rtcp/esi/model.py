@@ -1,0 +1,290 @@
+"""What a device is by its description, wherever that comes from: an ESI file, an SII image, or a scan of the bus.
+
+Terms are those of ETG.2000 (ESI) and ETG.1000.6. Lengths in bits unless a field says otherwise, times in ns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+
+class Source(Enum):
+    """Where a description comes from."""
+
+    ESI = "ESI"
+    SII = "SII"
+    BUS = "bus"
+
+
+class SyncManagerType(IntEnum):
+    """What a sync manager carries (ETG.1000.6, 5.6.7.4; the same numbers in the SII)."""
+
+    UNUSED = 0
+    MAILBOX_RECEIVE = 1
+    """The master writes, the slave receives."""
+    MAILBOX_SEND = 2
+    OUTPUTS = 3
+    INPUTS = 4
+
+
+class FmmuUse(IntEnum):
+    """What an FMMU is for (ETG.1000.6, table 23)."""
+
+    UNUSED = 0
+    OUTPUTS = 1
+    INPUTS = 2
+    MAILBOX_STATE = 3
+
+
+class ObjectCode(IntEnum):
+    """Kinds of CoE objects (ETG.1000.6, table 62)."""
+
+    VARIABLE = 7
+    ARRAY = 8
+    RECORD = 9
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Identity of a device, object 0x1018."""
+
+    vendor_id: int
+    product_code: int
+    revision: int
+    serial: int = 0
+
+
+@dataclass(frozen=True)
+class SyncManager:
+    """A sync manager's default setting (ETG.1000.4, 6.7.2)."""
+
+    start: int
+    """Start address in the ESC's memory; below 0x1000 it lies in registers (0x0F00: digital outputs)."""
+    length: int
+    """Default length, bytes; a hint where PDOs are assigned: their sum counts."""
+    control: int
+    """Mode (0: three buffers, 2: mailbox, 1: one buffer), direction (4: the master writes), 0x40: watchdog trigger."""
+    type: SyncManagerType
+    enabled: bool = True
+    virtual: bool = False
+    """It stands for registers that an FMMU maps without any sync manager."""
+    minimum: int | None = None
+    """Smallest length, bytes."""
+    maximum: int | None = None
+    """Largest length, bytes."""
+
+
+@dataclass(frozen=True)
+class PdoEntry:
+    """A mapped object; index 0 is padding."""
+
+    index: int
+    sub_index: int
+    bits: int
+    name: str = ""
+    type: str = ""
+    """Data type as the description names it (UINT, BIT2, INT24, `ARRAY [0..30] OF BYTE`); empty: not given."""
+
+
+@dataclass(frozen=True)
+class Pdo:
+    """A process data object."""
+
+    index: int
+    name: str
+    entries: tuple[PdoEntry, ...]
+    sync_manager: int | None = None
+    """Sync manager to which it is assigned by default; None: it can be assigned, and is not."""
+    fixed: bool = False
+    """Its entries cannot be changed."""
+    mandatory: bool = False
+    """Its assignment cannot be removed."""
+    virtual: bool = False
+    excludes: frozenset[int] = frozenset()
+    """PDOs that cannot be assigned together with it."""
+
+    @property
+    def bits(self) -> int:
+        """Length in bits."""
+        return sum(entry.bits for entry in self.entries)
+
+
+@dataclass(frozen=True)
+class ObjectEntry:
+    """A subindex of an object."""
+
+    sub_index: int
+    name: str
+    type: str
+    """Data type as the description names it; a base type, never an array's or a record's name."""
+    bits: int
+    readable: bool = True
+    writable: bool = False
+    """In some state; `write_states` says in which."""
+    write_states: str = ""
+    """States in which it can be written, of P (PRE-OP), S (SAFE-OP), O (OP); empty: all."""
+    rx_mappable: bool = False
+    tx_mappable: bool = False
+    default: bytes | None = None
+    """Value at power-on, little endian; None: none is given, 0 is meant."""
+    minimum: bytes | None = None
+    maximum: bytes | None = None
+    unit: int | None = None
+    """Unit in the notation of ETG.1004."""
+
+
+@dataclass(frozen=True)
+class DictionaryObject:
+    """An object of the object dictionary."""
+
+    index: int
+    name: str
+    code: ObjectCode
+    entries: tuple[ObjectEntry, ...]
+    """By rising subindex, subindex 0 among them."""
+
+
+@dataclass(frozen=True)
+class InitCommand:
+    """An SDO that the device expects at a transition."""
+
+    transitions: tuple[str, ...]
+    """`IP`, `PS`, `SO`, ..."""
+    index: int
+    sub_index: int
+    data: bytes
+    complete_access: bool = False
+    fixed: bool = False
+    """Its data cannot be changed."""
+    comment: str = ""
+
+
+@dataclass(frozen=True)
+class Coe:
+    """What a device can do over CoE (ETG.1000.6, table 21)."""
+
+    sdo_information: bool = False
+    pdo_assignment: bool = False
+    """0x1C12 and 0x1C13 can be written."""
+    pdo_configuration: bool = False
+    """0x1600.. and 0x1A00.. can be written."""
+    pdo_upload: bool = False
+    complete_access: bool = False
+    segmented: bool = False
+    ds402_channels: int = 0
+
+
+@dataclass(frozen=True)
+class Mailbox:
+    """The mailbox and the protocols that it carries; its addresses are those of the sync managers."""
+
+    coe: Coe | None = None
+    foe: bool = False
+    eoe: bool = False
+    aoe: bool = False
+    soe: bool = False
+    voe: bool = False
+
+
+@dataclass(frozen=True)
+class DcMode:
+    """An operation mode of distributed clocks (ETG.2010, table 15). A cycle of 0 with a factor follows the master's."""
+
+    name: str
+    assign_activate: int
+    """The word for registers 0x0980 and 0x0981."""
+    description: str = ""
+    sync0_cycle: int = 0
+    sync0_factor: int = 1
+    """Above 0: multiple of the master's cycle, below: its divisor."""
+    sync0_shift: int = 0
+    sync1_cycle: int = 0
+    sync1_factor: int = 0
+    """Above 0: multiple of SYNC0's cycle, below: of the master's."""
+    sync1_shift: int = 0
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A place for modules."""
+
+    name: str
+    idents: tuple[int, ...]
+    """Modules that may stand there, by ident; empty: `classes` decides."""
+    minimum: int
+    maximum: int
+    pdo_increment: int = 0
+    index_increment: int = 0
+    classes: tuple[str, ...] = ()
+    default: int | None = None
+    """Ident of the module that stands there where nothing is chosen."""
+
+
+@dataclass(frozen=True)
+class Module:
+    """A module for a slot; its indices are those of slot 0."""
+
+    ident: int
+    name: str
+    rx_pdos: tuple[Pdo, ...] = ()
+    tx_pdos: tuple[Pdo, ...] = ()
+    objects: tuple[DictionaryObject, ...] = ()
+    init_commands: tuple[InitCommand, ...] = ()
+    module_class: str = ""
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device by its description."""
+
+    identity: Identity
+    name: str
+    """In English where the description has several languages."""
+    source: Source
+    origin: str
+    """File and line, or bus and position."""
+    type: str = ""
+    """Order code."""
+    vendor_name: str = ""
+    group: str = ""
+    physics: str = ""
+    """Letters of the ports: Y MII, K E-bus, H fast hot connect, blank: none."""
+    sync_managers: tuple[SyncManager, ...] = ()
+    fmmus: tuple[FmmuUse, ...] = ()
+    rx_pdos: tuple[Pdo, ...] = ()
+    tx_pdos: tuple[Pdo, ...] = ()
+    mailbox: Mailbox | None = None
+    objects: tuple[DictionaryObject, ...] = ()
+    """The object dictionary; empty: the description has none, see `rtcp.esi.dictionary`."""
+    init_commands: tuple[InitCommand, ...] = ()
+    dc_modes: tuple[DcMode, ...] = ()
+    """The first is the default; empty: no distributed clock."""
+    slots: tuple[Slot, ...] = ()
+    eeprom_bytes: int = 0
+    """Size of its EEPROM; 0: not given."""
+    config_data: bytes = b""
+    """First bytes of the EEPROM, at most 14; empty: not given."""
+    bootstrap: bytes = b""
+    """Words 0x14 to 0x17 of the EEPROM: receive offset and size, send offset and size of the mailboxes in BOOT."""
+    profile: int | None = None
+    """Device profile number, 402 for drives."""
+    station_alias: int = 0
+    hidden: bool = False
+    """A tool offers it no more: a later revision takes its place."""
+    unread: Mapping[str, int] = field(default_factory=dict)
+    """Parts of the description that were not understood, by name, with how often; they are warned of."""
+
+
+@dataclass(frozen=True)
+class DeviceFile:
+    """The devices and modules of an ESI file."""
+
+    path: str
+    vendor_id: int
+    vendor_name: str
+    devices: tuple[Device, ...]
+    modules: tuple[Module, ...]
+    warnings: tuple[str, ...]
+    """A sentence for each deviation that was accepted, with file and line."""
