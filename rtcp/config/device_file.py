@@ -1,0 +1,363 @@
+"""A device's file (`config/devices/NAME.yaml`) made of its description, with what a person needs to know as comments."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+from rtcp.config.model import BITS
+from rtcp.config.scaling import OBJECTS_PER_AXIS
+from rtcp.esi import units
+from rtcp.esi.dictionary import assigned, complete
+from rtcp.esi.model import Device, DcMode, ObjectEntry, Pdo, PdoEntry, SyncManagerType
+from rtcp.esi.types import Kind, decode, resolve
+
+_DRIVE_PROFILE = 402
+_AXES = range(0x6000, 0x6000 + 8 * OBJECTS_PER_AXIS)
+_DRIVE_CHANNELS = {
+    (0x6040, 0): "controlword",
+    (0x6041, 0): "statusword",
+    (0x6060, 0): "modes_of_operation",
+    (0x6061, 0): "modes_of_operation_display",
+    (0x6064, 0): "position",
+    (0x606C, 0): "velocity",
+    (0x6071, 0): "target_torque",
+    (0x6077, 0): "torque",
+    (0x607A, 0): "target_position",
+    (0x60B0, 0): "position_offset",
+    (0x60B1, 0): "velocity_offset",
+    (0x60B2, 0): "torque_offset",
+    (0x60F4, 0): "following_error",
+    (0x60FF, 0): "target_velocity",
+}
+"""Channel names of a drive's objects (IEC 61800-7-201), those of the first axis."""
+_NEEDED = {
+    "rpdo": ("controlword", "target_position"),
+    "tpdo": ("statusword", "position"),
+}
+"""Channels that a drive cannot do without."""
+_MODE_OBJECT, _CSP = 0x6060, 8
+_DRIVE_WATCHDOG_MS, _WATCHDOG_MS = 20, 100
+_MODULE_BITS = 16
+"""Shortest analog value, bits."""
+_WIDTH = 118
+
+
+def file_text(device: Device, kind: str | None = None) -> str:
+    """Return the text of the device's file.
+
+    Args:
+        device: its description, with its modules in place.
+        kind: the driver; None: the one that fits its process data.
+    """
+    return "\n".join(_lines(complete(device), kind or kind_of(device))) + "\n"
+
+
+def kind_of(device: Device) -> str:
+    """Return the driver that fits a device by its profile and its default process data."""
+    rx, tx = (entries_of(assigned(device, outputs)) for outputs in (True, False))
+    if not rx and not tx:
+        return "coupler"
+    if any(entry.index in _AXES and (entry.index - 0x6000) % OBJECTS_PER_AXIS == 0x40 for entry in rx) or (
+        device.profile == _DRIVE_PROFILE
+    ):
+        return "cia402"
+    if any(re.search(r"\b(counter|encoder|position) value\b|\bcounter\b", entry.name, re.IGNORECASE) for entry in tx):
+        return "encoder"
+    values = [entry for entry in (*rx, *tx) if entry.bits >= _MODULE_BITS]
+    if values and all(resolve(entry.type, entry.bits).kind in (Kind.SIGNED, Kind.REAL) for entry in values):
+        return "analog"
+    return "generic"
+
+
+def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:
+    """Return the entries of PDOs that are not padding."""
+    return [entry for pdo in pdos for entry in pdo.entries if entry.index]
+
+
+def _lines(device: Device, kind: str) -> Iterator[str]:
+    identity = device.identity
+    yield from _comment(
+        f"{device.name}{f' ({device.type})' if device.type else ''}"
+        + (f", {device.vendor_name}" if device.vendor_name else "")
+        + f": revision 0x{identity.revision:08X}, by {device.source.value}, {device.origin}."
+    )
+    yield from _comment("Made by `rtcp device new`. Lines marked CHECK need a person.")
+    yield ""
+    yield f"name: {_quoted(device.name or f'0x{identity.product_code:08X}')}"
+    yield f"kind: {kind}"
+    yield f"vendor_id: 0x{identity.vendor_id:08X}"
+    yield f"product_id: 0x{identity.product_code:08X}"
+    yield ""
+    yield from _clock_lines(device, kind)
+    watchdog = _DRIVE_WATCHDOG_MS if kind == "cia402" else _WATCHDOG_MS
+    note = "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
+    yield f"watchdog_ms: {watchdog}             # ms; {note}"
+    coe = None if device.mailbox is None else device.mailbox.coe
+    if coe is None:
+        yield "coe: false                  # it has no object dictionary: its mapping is that of its EEPROM"
+    configurable = coe is not None and coe.pdo_assignment and coe.pdo_configuration and not _is_fixed(device)
+    said = "the entries below are written to it" if configurable else "fixed in the device: compared, never written"
+    yield f"configurable_pdos: {str(configurable).lower():10}# {said}"
+    if coe is not None and not coe.complete_access:
+        yield "complete_access: false"
+    yield ""
+    yield from _startup_lines(device, kind)
+    if kind == "cia402":
+        yield from _scaling_lines(device)
+    names: Counter[str] = Counter()
+    for key, outputs in (("rpdo", True), ("tpdo", False)):
+        yield from _pdo_lines(device, kind, key, assigned(device, outputs), outputs, names)
+        yield from _others(device, key, outputs)
+
+
+def _clock_lines(device: Device, kind: str) -> Iterator[str]:
+    modes = device.dc_modes
+    chosen = modes[0] if modes else None
+    if kind == "cia402":
+        chosen = next((mode for mode in modes if mode.assign_activate & 0x0100), chosen)
+    word = 0 if chosen is None else chosen.assign_activate
+    yield f"assign_activate: 0x{word:04X}     # " + ("it has no distributed clock" if chosen is None else _mode_text(chosen))
+    if chosen is not None:
+        if chosen.sync0_factor not in (0, 1):
+            yield f"sync0_factor: {chosen.sync0_factor}"
+        if chosen.sync0_shift:
+            yield f"sync0_shift_us: {chosen.sync0_shift / 1000:g}"
+        if chosen.assign_activate & 0x0400:
+            if chosen.sync1_factor:
+                yield f"sync1_factor: {chosen.sync1_factor}"
+            if chosen.sync1_shift:
+                yield f"sync1_shift_us: {chosen.sync1_shift / 1000:g}"
+    for mode in modes:
+        if mode is not chosen:
+            yield f"# assign_activate: 0x{mode.assign_activate:04X}   # {_mode_text(mode)}"
+
+
+def _mode_text(mode: DcMode) -> str:
+    return mode.name + (f": {mode.description}" if mode.description and mode.description != mode.name else "")
+
+
+def _is_fixed(device: Device) -> bool:
+    pdos = (*assigned(device, True), *assigned(device, False))
+    return bool(pdos) and all(pdo.fixed for pdo in pdos)
+
+
+def _startup_lines(device: Device, kind: str) -> Iterator[str]:
+    written: list[str] = []
+    mapping = {pdo.index for pdo in (*device.rx_pdos, *device.tx_pdos)}
+    for command in device.init_commands:
+        if command.index in mapping or 0x1C10 <= command.index <= 0x1C2F:
+            continue  # what the mapping below says
+        entry = _object(device, command.index, command.sub_index)
+        kept = None if entry is None else resolve(entry.type, entry.bits)
+        name = (command.comment or ("" if entry is None else entry.name)).strip()
+        if command.complete_access or len(command.data) not in (1, 2, 4, 8) or (kept and kept.kind is Kind.TEXT):
+            written.append(
+                f"  # CHECK: not written, {len(command.data)} bytes to 0x{command.index:04X}:{command.sub_index}: "
+                f"{command.data[:16].hex(' ')} {name}"
+            )
+            continue
+        signed = kept is not None and kept.kind is Kind.SIGNED
+        value = int.from_bytes(command.data, "little", signed=signed)
+        written.append(
+            f"  - {{index: 0x{command.index:04X}, sub_index: {command.sub_index}, "
+            f"type: {'int' if signed else 'uint'}{8 * len(command.data)}, value: {value}"
+            + (f", name: {_quoted(name)}" if name else "") + "}"
+        )
+    mapped = {entry.index for entry in entries_of(assigned(device, True))}
+    listed = {command.index for command in device.init_commands}
+    for axis in _axes(device) if kind == "cia402" else ():
+        index = _MODE_OBJECT + (axis - 1) * OBJECTS_PER_AXIS
+        if index not in mapped and index not in listed:
+            written.append(
+                f"  - {{index: 0x{index:04X}, sub_index: 0, type: int8, value: {_CSP}, name: modes of operation}}"
+                "   # CSP; no PDO has it"
+            )
+    if written:
+        yield "# Start-up SDOs, written in PRE-OP in this order and read back, in the device's own units."
+        yield "sdo:"
+        yield from written
+        yield ""
+
+
+def _scaling_lines(device: Device) -> Iterator[str]:
+    yield "# CHECK: what the drive counts in; compared with the drive's own objects at the start (docs/devices.md)."
+    yield "scaling:"
+    for axis in _axes(device):
+        base = (axis - 1) * OBJECTS_PER_AXIS
+
+        def default(index: int, sub: int, base: int = base) -> float | None:
+            entry = _object(device, index + base, sub)
+            if entry is None or entry.default is None:
+                return None
+            value = decode(resolve(entry.type, entry.bits), entry.default)
+            return float(value) if isinstance(value, int | float) and value else None
+
+        def ratio(index: int, fallback: float, default: object = default) -> tuple[float, str]:
+            above, below = _default(device, index + base, 1), _default(device, index + base, 2)
+            if not above:
+                return fallback, f"0x{index + base:04X} has no default: read it from the drive or its manual"
+            return above / (below or 1.0), f"0x{index + base:04X}, default"
+
+        increments, where = ratio(0x608F, 65536)
+        yield f"  - encoder_increments: {increments:.10g}     # per motor revolution; {where}"
+        gear, where = ratio(0x6091, 1)
+        yield f"    gear_ratio: {gear:.10g}     # motor revolutions per revolution of the output; {where}"
+        rated = _default(device, 0x6076 + base, 0)
+        if rated:
+            yield f"    rated_torque: {rated / 1000:.10g}     # Nm; 0x{0x6076 + base:04X}, default"
+        else:
+            yield f"    rated_torque: 1.0     # Nm, 0x{0x6076 + base:04X}, has no default: read it from the drive"
+    yield ""
+
+
+def _default(device: Device, index: int, sub: int) -> float | None:
+    entry = _object(device, index, sub)
+    if entry is None or entry.default is None:
+        return None
+    value = decode(resolve(entry.type, entry.bits), entry.default)
+    return float(value) if isinstance(value, int | float) and value else None
+
+
+def _axes(device: Device) -> tuple[int, ...]:
+    found = {
+        (entry.index - 0x6000) // OBJECTS_PER_AXIS + 1
+        for entry in entries_of((*assigned(device, True), *assigned(device, False)))
+        if entry.index in _AXES and (entry.index - 0x6000) % OBJECTS_PER_AXIS in (0x40, 0x41)
+    }
+    return tuple(sorted(found)) or (1,)
+
+
+def _pdo_lines(
+    device: Device, kind: str, key: str, pdos: Sequence[Pdo], outputs: bool, names: Counter[str]
+) -> Iterator[str]:
+    yield f"# {'Master to device' if outputs else 'Device to master'}. SI value = counts * factor."
+    filled = [pdo for pdo in pdos if pdo.entries]
+    if not filled:
+        yield f"{key}: []"
+        yield ""
+        return
+    usual = _usual_sync_manager(device, outputs)
+    yield f"{key}:"
+    channels: set[str] = set()
+    for pdo in filled:
+        marks = [word for word, holds in (("fixed", pdo.fixed), ("mandatory", pdo.mandatory)) if holds]
+        if pdo.excludes:
+            marks.append("excludes " + ", ".join(f"0x{index:04X}" for index in sorted(pdo.excludes)))
+        said = "; ".join([pdo.name, *marks] if pdo.name else marks)
+        yield f"  - index: 0x{pdo.index:04X}" + (f"     # {_clean(said)}" if said else "")
+        if pdo.sync_manager is not None and pdo.sync_manager != usual:
+            yield f"    sync_manager: {pdo.sync_manager}"
+        axis = _axis_of(pdo) if kind == "cia402" else 1
+        if axis > 1:
+            yield f"    axis: {axis}"
+        yield "    channels:"
+        for entry in pdo.entries:
+            yield from _channel_lines(device, kind, entry, axis, names, key)
+            if entry.index:
+                channels.add(_DRIVE_CHANNELS.get((entry.index - (axis - 1) * OBJECTS_PER_AXIS, entry.sub_index), ""))
+    if kind == "cia402" and (missing := [name for name in _NEEDED[key] if name not in channels]):
+        yield f"  # CHECK: the default assignment has no {', '.join(missing)}, which the kind cia402 needs: assign another PDO"
+    yield ""
+
+
+def _channel_lines(
+    device: Device, kind: str, entry: PdoEntry, axis: int, names: Counter[str], key: str
+) -> Iterator[str]:
+    if not entry.index:
+        yield f"      - {{index: 0, sub_index: 0, {_type_keys('', entry.bits)}}}"
+        return
+    known = None
+    if kind == "cia402" and entry.index in _AXES:
+        known = _DRIVE_CHANNELS.get((entry.index - (axis - 1) * OBJECTS_PER_AXIS, entry.sub_index))
+    name = known or _unique(_identifier(entry), names, f"{key}.{axis}")
+    if known:
+        names[f"{key}.{axis}.{known}"] += 1
+    keys = f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {_type_keys(entry.type, entry.bits)}, name: {name}"
+    described = _object(device, entry.index, entry.sub_index)
+    unit = None if described is None or described.unit is None or known else units.unit_of(described.unit)
+    if unit is not None and unit.si:
+        keys += f", factor: {unit.factor:.10g}, unit: {_quoted(unit.si)}"
+    said = [_clean(entry.name), entry.type if entry.type.upper() not in ("", "BOOL") else ""]
+    if described is not None:
+        said += _range_text(described)
+    yield f"      - {{{keys}}}   # {', '.join(text for text in said if text)}".rstrip(" #")
+
+
+def _range_text(entry: ObjectEntry) -> list[str]:
+    if entry.minimum is None and entry.maximum is None:
+        return []
+    data_type = resolve(entry.type, entry.bits)
+    low, high = (
+        "" if end is None else f"{decode(data_type, end)}" for end in (entry.minimum, entry.maximum)
+    )
+    return [f"{low} to {high}" if low and high else f"at least {low}" if low else f"at most {high}"]
+
+
+def _others(device: Device, key: str, outputs: bool) -> Iterator[str]:
+    """Name the PDOs that can be assigned instead."""
+    there = {pdo.index for pdo in assigned(device, outputs)}
+    others = [pdo for pdo in (device.rx_pdos if outputs else device.tx_pdos) if pdo.index not in there]
+    if others:
+        listed = "; ".join(f"0x{pdo.index:04X} {_clean(pdo.name)} ({pdo.bits} bits)" for pdo in others)
+        yield from _comment(f"Further PDOs of {key}: {listed}")
+        yield ""
+
+
+def _usual_sync_manager(device: Device, outputs: bool) -> int:
+    wanted = SyncManagerType.OUTPUTS if outputs else SyncManagerType.INPUTS
+    usual = 2 if outputs else 3
+    return next((n for n, manager in enumerate(device.sync_managers) if manager.type is wanted), usual)
+
+
+def _object(device: Device, index: int, sub: int) -> ObjectEntry | None:
+    for described in device.objects:
+        if described.index == index:
+            return next((entry for entry in described.entries if entry.sub_index == sub), None)
+    return None
+
+
+def _axis_of(pdo: Pdo) -> int:
+    found = Counter(
+        (entry.index - 0x6000) // OBJECTS_PER_AXIS + 1 for entry in pdo.entries if entry.index in _AXES
+    )
+    return found.most_common(1)[0][0] if found else 1
+
+
+def _type_keys(name: str, bits: int) -> str:
+    data_type = resolve(name, bits)
+    if data_type.kind is Kind.REAL:
+        return f"type: float{bits}"
+    if data_type.kind in (Kind.TEXT, Kind.BYTES):
+        return f"type: bytes, bits: {bits}"
+    if bits == 1:
+        return "type: bool"
+    written = f"{'int' if data_type.kind is Kind.SIGNED else 'uint'}{bits}"
+    return f"type: {written}" if written in BITS else f"type: bits, bits: {bits}"
+
+
+def _identifier(entry: PdoEntry) -> str:
+    name = re.sub(r"[^a-z0-9]+", "_", entry.name.lower()).strip("_")
+    return name[:48].rstrip("_") or f"x{entry.index:04x}_{entry.sub_index}"
+
+
+def _unique(name: str, names: Counter[str], scope: str) -> str:
+    names[f"{scope}.{name}"] += 1
+    count = names[f"{scope}.{name}"]
+    return name if count == 1 else _unique(f"{name}_{count}", names, scope)
+
+
+def _quoted(text: str) -> str:
+    """Return a YAML scalar."""
+    clean = _clean(text)[:64]
+    return clean if re.fullmatch(r"[A-Za-z][A-Za-z0-9 ._/()+-]*[A-Za-z0-9.)]|[A-Za-z]", clean) else f'"{clean}"'
+
+
+def _clean(text: str) -> str:
+    return " ".join(re.sub(r'["\\\x00-\x1f\x7f-\x9f]', " ", text).split())
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(_clean(text), _WIDTH, initial_indent="# ", subsequent_indent="#   ")
