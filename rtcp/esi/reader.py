@@ -7,8 +7,8 @@ is left out with its reason, and the others are read.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -41,6 +41,12 @@ ENGLISH = "1033"
 """LcId of English."""
 SLOT_LIMIT = 1024
 """Places for modules of one slot element."""
+DEVICE_LIMIT = 10_000
+"""Devices and modules in a file."""
+LIST_LIMIT = 4096
+"""PDOs of a direction, entries of a PDO, and the like."""
+ENTRY_LIMIT = 500_000
+"""Subindexes in all dictionaries of a file; a type that many objects share counts with each."""
 _MAX_ENTRY_BITS = 8 * 1486
 _HEXADECIMAL = re.compile(r"#?x+(?:0x)?([0-9a-f]{1,16})|#([0-9a-f]{1,16})|0x([0-9a-f]{1,16})", re.IGNORECASE)
 _DECIMAL = re.compile(r"[+-]?\d{1,20}")
@@ -84,14 +90,8 @@ def name_of(node: Node, tag: str = "Name") -> str:
     return next((name.text for name in names if name.text), "")
 
 
-@dataclass(frozen=True)
-class _Hiding:
-    """A revision that a device hides."""
-
-    by: tuple[int, int]
-    type: str
-    product: int | None
-    revision: int | None
+class _TooLarge(EsiError):
+    """No device of the file is read further."""
 
 
 class _Reader:
@@ -106,10 +106,14 @@ class _Reader:
         self.devices: list[Device] = []
         self.modules: list[Module] = []
         self.failures: list[str] = []
-        self.hidings: list[_Hiding] = []
+        self.hiding: dict[tuple[int | str, int | None], set[tuple[int, int]]] = {}
+        """Product code or type, and revision or None for all, to the devices that hide such ones."""
+        self.entries = 0
 
     def collect(self, node: Node) -> None:
         """Take a tree of the file."""
+        if len(self.devices) + len(self.modules) + len(self.failures) >= DEVICE_LIMIT:
+            raise self.error(node, f"more than {DEVICE_LIMIT} devices and modules")
         try:
             if node.tag == "Vendor":
                 self.vendor_id = self.number(node, "Id", default=0) & 0xFFFFFFFF
@@ -120,15 +124,14 @@ class _Reader:
                 self.devices.append(self.device(node))
             else:
                 self.modules.append(self.module(node))
+        except _TooLarge:
+            raise
         except EsiError as error:
             self.failures.append(str(error))
 
     def file(self) -> DeviceFile:
         """Return what has been read."""
-        devices = [
-            replace(device, hidden=True) if any(_hides(hiding, device) for hiding in self.hidings) else device
-            for device in self.devices
-        ]
+        devices = [replace(device, hidden=True) if self.is_hidden(device) else device for device in self.devices]
         return DeviceFile(
             path=self.path,
             vendor_id=self.vendor_id,
@@ -138,6 +141,12 @@ class _Reader:
             warnings=self.warnings.all(),
             failures=tuple(self.failures),
         )
+
+    def is_hidden(self, device: Device) -> bool:
+        """Return whether another device of the file hides this one."""
+        own = (device.identity.product_code, device.identity.revision)
+        keys = ((kind, revision) for kind in (own[0], device.type) for revision in (own[1], None))
+        return any(self.hiding.get(key, set()) - {own} for key in keys)
 
     # Values
 
@@ -187,8 +196,10 @@ class _Reader:
             return bytes.fromhex(match[0])[:limit]
         return b""
 
-    def each(self, nodes: Iterable[Node], build: Callable[[Node], _T | None]) -> tuple[_T, ...]:
+    def each(self, nodes: list[Node], build: Callable[[Node], _T | None]) -> tuple[_T, ...]:
         """Return what is built of each node; those of which nothing can be are left out."""
+        if len(nodes) > LIST_LIMIT:
+            raise self.error(nodes[0], f"{len(nodes)} elements {nodes[0].tag}; there can be {LIST_LIMIT}")
         return tuple(item for item in map(build, nodes) if item is not None)
 
     def within(self, node: Node, what: str, value: int, limit: int) -> int:
@@ -213,23 +224,21 @@ class _Reader:
         for hidden in node.all("HideType"):
             product, revision = (hidden.attributes.get(name) for name in ("ProductCode", "RevisionNo"))
             revision = revision or hidden.attributes.get("ProductRevision")
-            self.hidings.append(
-                _Hiding(
-                    (identity.product_code, identity.revision),
-                    hidden.text,
-                    number(product) if product else None,
-                    number(revision) if revision else None,
-                )
-            )
+            kind_hidden = number(product) if product else hidden.text or identity.product_code
+            if kind_hidden is not None:
+                key = (kind_hidden, number(revision) if revision else None)
+                self.hiding.setdefault(key, set()).add((identity.product_code, identity.revision))
         rx_pdos = self.each(node.all("RxPdo"), self.pdo)
         tx_pdos = self.each(node.all("TxPdo"), self.pdo)
         mailbox = node.first("Mailbox")
         assigned = {pdo.sync_manager: SyncManagerType.OUTPUTS for pdo in rx_pdos} | {
             pdo.sync_manager: SyncManagerType.INPUTS for pdo in tx_pdos
         }
+        if len(node.all("Sm")) > 16 or len(node.all("Fmmu")) > 16:
+            raise self.error(node, "more than 16 sync managers or FMMUs, which no slave controller has")
         sync_managers = tuple(
-            self.sync_manager(item, assigned.get(number_), mailbox is not None)
-            for number_, item in enumerate(node.all("Sm"))
+            self.sync_manager(item, assigned.get(position), mailbox is not None)
+            for position, item in enumerate(node.all("Sm"))
         )
         profiles, channels = self.profiles(node)
         slots = node.first("Slots")
@@ -264,6 +273,7 @@ class _Reader:
             channel_profiles=channels,
             ebus_current=self.ebus_current(node),
             no_lrw=self.flag(kind, "UseLrdLwr"),
+            unit_symbols=self.unit_symbols(node),
             unread=dict(node.unread or {}),
         )
 
@@ -274,6 +284,12 @@ class _Reader:
         for tag in path:
             nodes = [child for parent in nodes for child in parent.all(tag)]
         return nodes
+
+    def unit_symbols(self, node: Node) -> dict[int, str]:
+        """Return the symbols of the file's own units, by notation index."""
+        nodes = self.below(node, "Profile", "Dictionary", "UnitTypes", "UnitType")
+        found = [(number(item.value("NotationIndex")), item.value("Symbol")) for item in nodes]
+        return {index: symbol[:40] for index, symbol in found if index is not None and symbol}
 
     def ebus_current(self, node: Node) -> int:
         electrical = node.first("Info", "Electrical")
@@ -482,6 +498,9 @@ class _Reader:
                 if built.index in objects:
                     self.warnings.add(item.line, f"Object 0x{built.index:04X} occurs twice; the first is used")
                     continue
+                self.entries += len(built.entries)
+                if self.entries > ENTRY_LIMIT:
+                    raise _TooLarge(f"{self.path}:{item.line}", f"dictionaries of more than {ENTRY_LIMIT} subindexes")
                 objects[built.index] = built
         return tuple(objects[index] for index in sorted(objects))
 
@@ -508,15 +527,12 @@ class _Reader:
                 values = given.first("Info") if given is not None else part
                 entries.append(self.object_entry(part, sub_index, name, entry_type, bits, flags, values, data_types))
             entries = [item for number_, item in sorted({item.sub_index: item for item in reversed(entries)}.items())]
-            if entries[0].sub_index == 0 and not entries[0].default:
-                entries[0] = replace(entries[0], default=bytes([entries[-1].sub_index]))
         return DictionaryObject(
             index=index,
             name=name_of(node),
             code=code,
             entries=tuple(entries),
             depends_on_slot=self.flag(node.first("Index"), "DependOnSlot"),
-            overwritten_by_module=self.flag(node.first("Index"), "OverwrittenByModule"),
         )
 
     def sub_items(self, parts: list[Node], data_types: dict[str, Node]) -> list[_Part]:
@@ -538,6 +554,8 @@ class _Reader:
             else:
                 sub_index = self.within(part, "SubIdx", following if given is None else given, 255)
                 slots.append((sub_index, part, type_name, bits, False))
+            if len(slots) > LIST_LIMIT:
+                raise self.error(part, f"a type of more than {LIST_LIMIT} subindexes")
         return slots
 
     def object_entry(
@@ -608,7 +626,7 @@ class _Reader:
                 return None
         if not data:
             return data
-        if base.size and base.kind is not types.Kind.TEXT:
+        if base.size and base.kind not in (types.Kind.TEXT, types.Kind.BYTES):
             if len(data) > base.size and any(data[base.size :]):
                 self.warnings.add(
                     info.line, f"{name}: {which}Data has {len(data)} bytes, the type {base.size}; it is cut"
@@ -631,19 +649,6 @@ def _matched(infos: list[Node], slots: list[_Part]) -> list[Node | None]:
     if len(infos) < len(slots) and sum(found is not None for found in by_name) == len(infos):
         return list(by_name)
     return [infos[position] if position < len(infos) else None for position in range(len(slots))]
-
-
-def _hides(hiding: _Hiding, device: Device) -> bool:
-    identity = device.identity
-    if (identity.product_code, identity.revision) == hiding.by:
-        return False
-    if hiding.product is not None:
-        alike = identity.product_code == hiding.product
-    elif hiding.type:
-        alike = device.type == hiding.type
-    else:
-        alike = identity.product_code == hiding.by[0]
-    return alike and hiding.revision in (None, identity.revision)
 
 
 def read_esi(path: Path | str) -> DeviceFile:

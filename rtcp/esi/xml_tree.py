@@ -13,8 +13,8 @@ from rtcp.esi.model import EsiError
 
 FILE_LIMIT = 64 << 20
 """Largest file, bytes; the largest public one has 4.2 million."""
-NODE_LIMIT = 2_000_000
-"""Elements that are read in a file."""
+NODE_LIMIT = 300_000
+"""Elements that are read of a device; the largest public one has 84 thousand."""
 TEXT_LIMIT = 1 << 18
 """Characters in an element."""
 TOKEN_LIMIT = 4 << 20
@@ -41,9 +41,10 @@ READ = frozenset(
         Access AoE ArrayInfo AssignActivate BaseType BitLen BitSize BootStrap ByteSize ChannelInfo Class CoE Comment
         ConfigData CycleTimeSync0 CycleTimeSync1 Data DataType DataTypes Dc DefaultData DefaultString DefaultValue
         Desc Descriptions Device Devices Dictionary EBusCurrent Eeprom Electrical Elements Entry EoE Exclude Flags
-        Fmmu FoE Group GroupType Groups HideType Id Index Info InitCmd LBound Mailbox MaxData MaxValue MinData
-        MinValue Module ModuleClass ModuleIdent Modules Name Object Objects OpMode PdoMapping Profile ProfileNo RxPdo
-        ShiftTimeSync0 ShiftTimeSync1 Slot Slots Sm SoE SubIdx SubIndex SubItem Transition TxPdo Type Unit Vendor VoE
+        Fmmu FoE Group Groups GroupType HideType Id Index Info InitCmd LBound Mailbox MaxData MaxValue MinData
+        MinValue Module ModuleClass ModuleIdent Modules Name NotationIndex Object Objects OpMode PdoMapping Profile
+        ProfileNo RxPdo ShiftTimeSync0 ShiftTimeSync1 Slot Slots Sm SoE SubIdx SubIndex SubItem Symbol Transition
+        TxPdo Type Unit UnitType UnitTypes Vendor VoE
         """,
     )
 )
@@ -53,10 +54,10 @@ IGNORED = frozenset(
         r"\w+",
         """
         AddInfo AlternativeType Backup Category ChannelCount DataString DcOpModeName DiagFile DiagMessages
-        DictionaryFile DisplayName ESC Enum EnumInfo EtherCATController EtherCATp ExecutionUnit IdentificationAdo
+        DictionaryFile DisplayName Enum EnumInfo ESC EtherCATController EtherCATp ExecutionUnit IdentificationAdo
         IdentificationReg134 Image16x14 ImageData16x14 ImageFile16x14 InfoReference MaxSlotCount Port ProducerInfo
         Properties Property ReadAccess SafetyMapping SafetyParaMapping SdoAccess Setting SlotSelections StateMachine
-        StationAliasSupported Su SubDevice Text Timeout TreeView URL UnitTypes VendorSpecific
+        StationAliasSupported Su SubDevice Text Timeout TreeView URL VendorSpecific
         """,
     )
 )
@@ -155,14 +156,14 @@ class _Trees:
             if self._skipped > DEPTH_LIMIT:
                 raise self._error(f"elements are nested more than {DEPTH_LIMIT} deep")
             return
-        self._count += 1
-        if self._count > NODE_LIMIT:
-            raise self._error(f"more than {NODE_LIMIT} elements")
         if len(self._stack) >= DEPTH_LIMIT:
             raise self._error(f"elements are nested more than {DEPTH_LIMIT} deep")
         parent = self._stack[-1] if self._stack else ""
         if self._open or (tag in _COLLECTED and (_COLLECTED[tag] in (parent, None))):
             node = Node(tag, attributes, self._parser.CurrentLineNumber)
+            self._count = self._count + 1 if self._open else 1
+            if self._count > NODE_LIMIT:
+                raise self._error(f"{self._open[0].tag} of more than {NODE_LIMIT} elements")
             if self._open:
                 self._open[-1].children.append(node)
             self._open.append(node)
