@@ -38,6 +38,7 @@ from rtcp.config.model import (
     SlaveConfig,
 )
 from rtcp.config.numbers import Name
+from rtcp.config.scaling import QUANTITIES, DriveScaling
 from rtcp.config.validation import EVERY_KEY, Checker, FileRule, allowed, keys, rule
 
 RENAMED = {
@@ -90,7 +91,7 @@ class _NamedKind:
 
 
 _KINEMATICS, _DEVICE, _CYCLE = Checker(KinematicsFile), Checker(DeviceDescription), Checker(CycleConfig)
-_NAMED_KIND = Checker(_NamedKind)
+_NAMED_KIND, _SCALING = Checker(_NamedKind), Checker(DriveScaling)
 
 
 def load(path: Path) -> ArmConfig:
@@ -256,7 +257,46 @@ def load_device(path: Path, period_us: float | None = None) -> DeviceDescription
     document = read(path)
     timing = partial(rules.period_findings, period_us=period_us or 0.0)
     more = [FileRule(("kind", "watchdog_ms", "sync0_shift_us"), timing)] if period_us is not None else []
-    return _DEVICE.read(document, *more)
+    document.data, missing = _with_factors(document.data)
+    device, findings = _DEVICE.check(document.data, *more)
+    if device is None or missing:
+        raise ConfigError(document.sentences(findings + missing))
+    return device
+
+
+def _with_factors(data: Any) -> tuple[Any, list[Finding]]:
+    """Return a device's file with the factors that follow from its scaling, and what the scaling says too little for.
+
+    A factor that is written stays. What is no valid scaling is left to the checker.
+    """
+    written = data.get("scaling")
+    made = [_SCALING.check(entry)[0] for entry in written] if isinstance(written, list) else []
+    if not made or None in made:
+        return data, []
+    findings: list[Finding] = []
+    images: dict[str, Any] = {}
+    for image in ("rpdo", "tpdo"):
+        images[image] = []
+        for i, pdo in enumerate(data.get(image) or () if isinstance(data.get(image), list) else ()):
+            channels = pdo.get("channels") if isinstance(pdo, dict) else None
+            if not isinstance(channels, list):
+                images[image].append(pdo)
+                continue
+            images[image].append({**pdo, "channels": []})
+            for j, channel in enumerate(channels):
+                images[image][-1]["channels"].append(channel)
+                quantity = QUANTITIES.get(str(channel.get("name"))) if isinstance(channel, dict) else None
+                if quantity is None or "factor" in channel:
+                    continue
+                axis = channel.get("axis") or pdo.get("axis", 1)
+                scaling = made[0] if len(made) == 1 else made[axis - 1] if axis in range(1, len(made) + 1) else None
+                factor = None if scaling is None else scaling.factor(quantity)
+                if factor is not None:
+                    images[image][-1]["channels"][-1] = {**channel, "factor": factor}
+                elif scaling is not None:
+                    text = "the key factor is missing; without it scaling needs rated_torque, or rated_current and "
+                    findings.append(((image, i, "channels", j), f"{text}torque_constant"))
+    return {**data, **{image: pdos for image, pdos in images.items() if image in data}}, findings
 
 
 def load_kinematics(path: Path) -> ArmModel:

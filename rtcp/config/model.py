@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -35,6 +35,7 @@ from rtcp.config.numbers import (
     Turn,
     Vector,
 )
+from rtcp.config.scaling import OBJECTS_PER_AXIS, DriveScaling
 
 
 class HasBox(Protocol):
@@ -66,11 +67,13 @@ BITS: dict[str, int] = {
     "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
     "float32": 32, "float64": 64,
 }  # fmt: skip
+AxisNumber = Annotated[int, Ge(1), Le(8)]
+"""Axis of a drive, from 1: its objects stand 0x800 above those of the one before (CiA 402)."""
 DriveModeName = Literal["csp", "csv", "cst"]
 MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "csp": ((), ()),
-    "csv": (("target_velocity",), ("velocity",)),
-    "cst": (("target_torque",), ("velocity", "torque")),
+    "csv": (("target_velocity", "modes_of_operation"), ("velocity",)),
+    "cst": (("target_torque", "modes_of_operation"), ("velocity", "torque")),
 }
 """Channels of rpdo and of tpdo that a drive mode needs beside those that every CiA 402 drive needs."""
 ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
@@ -116,6 +119,8 @@ class PdoEntry:
     """SI units per count; not 0."""
     unit: str = ""
     """Unit of the value, for people and recordings; at most 32 characters, no comma, colon or line break."""
+    axis: AxisNumber | None = None
+    """Axis of a drive with several, where one PDO holds channels of more than one; left out: that of the PDO."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,12 @@ class Pdo:
     index: U16
     """PDO mapping object: 0x1600 to 0x17ff from the master, 0x1a00 to 0x1bff to it (ETG.1000.6)."""
     channels: Annotated[tuple[PdoEntry, ...], MinLen(1)]
+    axis: AxisNumber = 1
+    """Axis of a drive with several that the channels belong to."""
+
+    def axis_of(self, entry: PdoEntry) -> int:
+        """Return the axis that a channel belongs to."""
+        return self.axis if entry.axis is None else entry.axis
 
 
 @dataclass(frozen=True)
@@ -172,12 +183,37 @@ class DeviceDescription:
     """SYNC0 shift, us; less than one cycle in either direction."""
     watchdog_ms: Annotated[float, Gt(0), Le(6000)] = 100.0
     """Process-data (sync manager) watchdog, ms: without outputs for this time the device stops."""
+    scaling: tuple[DriveScaling, ...] = ()
+    """Of a CiA 402 drive: one for all its axes, or one an axis. Channels without `factor` have theirs from here."""
 
     @property
     def is_box(self) -> bool:
         """Whether inputs and outputs with a function may hang on it: it maps channels of these names."""
         mapped = [{entry.name for pdo in pdos for entry in pdo.channels} for pdos in (self.rpdo, self.tpdo)]
         return self.kind == "io" or (self.kind != "cia402" and "outputs" in mapped[0] and "inputs" in mapped[1])
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The axes that its channels belong to."""
+        found = {pdo.axis_of(entry) for pdo in (*self.rpdo, *self.tpdo) for entry in pdo.channels if entry.index}
+        return tuple(sorted(found)) or (1,)
+
+    def of_axis(self, axis: int) -> DeviceDescription:
+        """Return the description with the channels of the other axes as padding."""
+        if self.axes == (axis,):
+            return self
+        return replace(self, rpdo=_of_axis(self.rpdo, axis), tpdo=_of_axis(self.tpdo, axis))
+
+    def scaling_of(self, axis: int) -> DriveScaling | None:
+        """Return what an axis counts in; None: only the factors say it."""
+        if len(self.scaling) == 1:
+            return self.scaling[0]
+        return self.scaling[axis - 1] if axis <= len(self.scaling) else None
+
+    def startup(self, index: int, axis: int = 1) -> float | None:
+        """Return what the start-up SDOs write to an object (subindex 0) of an axis; `index`: that of the first axis."""
+        index += (axis - 1) * OBJECTS_PER_AXIS
+        return next((sdo.value for sdo in reversed(self.sdo) if (sdo.index, sdo.sub_index) == (index, 0)), None)
 
     def wire_range(self, channel: str) -> tuple[float, float]:
         """Return the range of a channel to the device, SI; infinite where it is a float or does not exist."""
@@ -186,6 +222,18 @@ class DeviceDescription:
                 low, high = sorted(end * entry.factor for end in integer_range(entry.type))
                 return low, high
         return -math.inf, math.inf
+
+
+def _of_axis(pdos: Sequence[Pdo], axis: int) -> tuple[Pdo, ...]:
+    return tuple(
+        replace(
+            pdo,
+            channels=tuple(
+                entry if pdo.axis_of(entry) == axis else PdoEntry(0, 0, entry.type) for entry in pdo.channels
+            ),
+        )
+        for pdo in pdos
+    )
 
 
 def integer_range(kind: str) -> tuple[int, int]:
@@ -234,7 +282,7 @@ class Joint:
     name: Name
     """Joint name; unique, and not `joints`."""
     slave: Name
-    """Drive that moves the joint: a name under `slaves` of kind `cia402`; unique."""
+    """Drive that moves the joint: a name under `slaves` of kind `cia402`; unique, or with another `axis`."""
     position: Range
     velocity: Rate
     """Speed limit, rad/s; in CSP also the drive's own limit."""
@@ -252,6 +300,13 @@ class Joint:
     """Joint damping in CST, Nm s/rad; follows the inertia at the drive."""
     cst_integral: NotNegative = 1200.0
     """Integral gain in CST, Nm/(rad s)."""
+    axis: AxisNumber = 1
+    """Axis of `slave`, where its drive has several."""
+
+    @property
+    def place(self) -> str:
+        """The drive that moves it, in words: slave, and axis beyond the first."""
+        return self.slave if self.axis == 1 else f"{self.slave}, axis {self.axis}"
 
 
 @dataclass(frozen=True)

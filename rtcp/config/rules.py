@@ -44,6 +44,7 @@ from rtcp.config.model import (
     Tool,
     integer_range,
 )
+from rtcp.config.scaling import OBJECTS_PER_AXIS, DriveScaling
 from rtcp.config.validation import EVERY_KEY, rule
 
 _NUMERIC = tuple(name for name in BITS if name != "bool")
@@ -70,10 +71,15 @@ CHANNELS: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {
     },
     "io": {"rpdo": {"outputs": ("uint16",)}, "tpdo": {"inputs": ("uint16",), "counter": ("int32",)}},
 }
-OPTIONAL = {"target_velocity", "target_torque", "velocity", "torque", "counter"}
-"""Channels that only some modes of a drive need (`MODE_CHANNELS`), and only some boxes have."""
+OPTIONAL = {
+    "target_velocity", "target_torque", "velocity", "torque", "modes_of_operation", "modes_of_operation_display",
+    "counter",
+}  # fmt: skip
+"""Channels that only some modes of a drive need (`MODE_CHANNELS`, `_drive_mode`), and only some boxes have."""
 PDO_RANGE = {"rpdo": (0x1600, 0x17FF), "tpdo": (0x1A00, 0x1BFF)}
 """Objects of receive and transmit PDO mappings (ETG.1000.6)."""
+MODES_OF_OPERATION, CSP = 0x6060, 8
+"""Object of the drive mode and its value for cyclic synchronous position (CiA 402-2, clause 10.1)."""
 JOYSTICK_TERMINALS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
 LONGEST_INTERFACE = 15
 """Characters of a network interface's name (IFNAMSIZ less the closing zero)."""
@@ -144,10 +150,58 @@ def _dc_word(device: DeviceDescription) -> Iterator[Finding]:
         yield ("assign_activate",), f"found {word:#06x}, allowed is {wanted}"
 
 
+@rule(DeviceDescription, "rpdo", "tpdo", "sdo", "kind")
+def _drive_mode(device: DeviceDescription) -> Iterator[Finding]:
+    """A drive whose PDOs have no mode of operation stays in the one that a start-up SDO sets."""
+    if device.kind != "cia402":
+        return
+    for axis in device.axes:
+        of = "" if device.axes == (1,) else f" of axis {axis}"
+        channels = device.of_axis(axis)
+        sent, shown = (
+            {entry.name for pdo in pdos for entry in pdo.channels if entry.index}
+            for pdos in (channels.rpdo, channels.tpdo)
+        )
+        index = MODES_OF_OPERATION + (axis - 1) * OBJECTS_PER_AXIS
+        if len(device.axes) > 1 and not (sent and shown):
+            yield ("tpdo" if sent else "rpdo",), f"found no channels{of}; an axis needs some in both directions"
+        elif "modes_of_operation" not in sent and device.startup(MODES_OF_OPERATION, axis) != CSP:
+            text = f"found no channel named modes_of_operation{of}; without it the start-up SDO "
+            yield ("rpdo",), f"{text}{{index: {index:#x}, sub_index: 0, type: int8, value: {CSP}}} (CSP) must be in sdo"
+        elif "modes_of_operation" in sent and "modes_of_operation_display" not in shown:
+            text = f"found no channel named modes_of_operation_display{of} beside modes_of_operation in rpdo; "
+            yield ("tpdo",), f"{text}allowed are both, or neither: else it is unknown in which mode the drive is"
+
+
+@rule(DeviceDescription, "rpdo", "tpdo", "scaling", "kind")
+def _scaling(device: DeviceDescription) -> Iterator[Finding]:
+    scaling, axes = device.scaling, device.axes
+    if scaling and device.kind != "cia402":
+        yield ("scaling",), f"found with kind {device.kind}, allowed is kind cia402"
+    elif len(scaling) > 1 and len(scaling) != axes[-1]:
+        text = f"found a list of {len(scaling)}, allowed is one for all axes, or one for each of {axes[-1]}"
+        yield ("scaling",), text
+    if axes != tuple(range(1, len(axes) + 1)):
+        yield (), f"found channels of axis {' and '.join(map(str, axes))}; axes are counted from 1, without a gap"
+    elif len(axes) > 1 and device.kind in CHANNELS and device.kind != "cia402":
+        yield (), f"found channels of {len(axes)} axes, allowed is kind cia402 for a device with several"
+
+
+@rule(DriveScaling)
+def _of_drive(scaling: DriveScaling) -> Iterator[Finding]:
+    if scaling.external_gear_ratio == 0:
+        yield ("external_gear_ratio",), "found 0, allowed is any number but 0"
+    if (scaling.rated_current is None) != (scaling.torque_constant is None):
+        key = "torque_constant" if scaling.torque_constant is None else "rated_current"
+        yield (), f"the key {key} is missing: rated_current and torque_constant belong together"
+    if scaling.rated_torque is not None and scaling.rated_current is not None:
+        yield ("rated_torque",), "found beside rated_current, allowed is one of them: what torques are thousandths of"
+
+
 def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
     low, high = PDO_RANGE[direction]
     first: dict[int, int] = {}
-    names: dict[str, tuple[KeyPath, PdoEntry]] = {}
+    axes: dict[int, dict[str, tuple[KeyPath, PdoEntry]]] = {}
     for i, pdo in enumerate(pdos):
         if not low <= pdo.index <= high:
             wanted = f"{low:#x} to {high:#x}, the objects of a {direction}"
@@ -157,6 +211,7 @@ def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
             yield (direction, i, "index"), text
         for j, entry in enumerate(pdo.channels):
             where = (direction, i, "channels", j)
+            names = axes.setdefault(pdo.axis_of(entry), {}) if entry.index else {}
             if entry.index and names.setdefault(entry.name, (where, entry))[1] is not entry:
                 text = f'found the text "{entry.name}" again; each channel of the {direction} needs its own'
                 yield (*where, "name"), text
@@ -165,15 +220,17 @@ def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
         wanted = "whole bytes; fill up with padding (`{index: 0, sub_index: 0, type: bool}`)"
         yield (direction,), f"found {bits} bits in all, allowed are {wanted}"
     needed = CHANNELS.get(kind, {}).get(direction, {})
-    if missing := [name for name in needed if name not in names and name not in OPTIONAL]:
-        there = f"its channels are {', '.join(names)}" if names else "it has no channels"
-        those = f"{'a channel' if len(missing) == 1 else 'channels'} named {', '.join(missing)}"
-        yield (direction,), f"kind {kind} needs {those}; {there}"
-    for name in needed.keys() & names.keys():
-        place, entry = names[name]
-        if entry.type not in needed[name]:
-            wanted = "any type but bool" if needed[name] is _NUMERIC else " or ".join(needed[name])
-            yield (*place, "type"), f"found {entry.type} for {name}, allowed is {wanted}"
+    for axis, names in (axes or {1: {}}).items():
+        if missing := [name for name in needed if name not in names and name not in OPTIONAL]:
+            there = f"its channels are {', '.join(names)}" if names else "it has no channels"
+            those = f"{'a channel' if len(missing) == 1 else 'channels'} named {', '.join(missing)}"
+            of = f" of axis {axis}" if len(axes) > 1 else ""
+            yield (direction,), f"kind {kind} needs {those}{of}; {there}"
+        for name in needed.keys() & names.keys():
+            place, entry = names[name]
+            if entry.type not in needed[name]:
+                wanted = "any type but bool" if needed[name] is _NUMERIC else " or ".join(needed[name])
+                yield (*place, "type"), f"found {entry.type} for {name}, allowed is {wanted}"
 
 
 def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Finding]:
@@ -255,7 +312,7 @@ def _slave_names(arm: ArmFile) -> Iterator[Finding]:
 def _axis_names(arm: ArmFile) -> Iterator[Finding]:
     axes = list(axes_of(arm))
     yield from _repeated((((*where, "name"), joint.name) for where, joint in axes), "name")
-    yield from _repeated((((*where, "slave"), joint.slave) for where, joint in axes), "slave")
+    yield from _repeated((((*where, "slave"), joint.place) for where, joint in axes), "slave")
     if len(axes) > MOST_AXES:
         yield ("gripper", "joint"), f"found beside {len(axes) - 1} joints, allowed are {MOST_AXES} in all"
     for where, joint in axes:
@@ -370,7 +427,11 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
         elif device is not None and device.kind == "io":
             text = f'found the text "{joint.slave}", which moves no joint: its device {slave.device} is of kind '
             yield (*where, "slave"), f"{text}{device.kind}; allowed is kind cia402"
+        elif device is not None and joint.axis not in device.axes:
+            text = f"found {joint.axis}, allowed is {' or '.join(map(str, device.axes))}, the axes of {slave.device}"
+            yield (*where, "axis"), text
         elif device is not None:
+            device = device.of_axis(joint.axis)
             missing: list[str] = []
             for needed, pdos in zip(MODE_CHANNELS[arm.drive_mode], (device.rpdo, device.tpdo), strict=True):
                 mapped = {entry.name for pdo in pdos for entry in pdo.channels}

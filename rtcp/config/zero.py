@@ -163,7 +163,7 @@ def _wrong(config: ArmConfig, axis: int, offset: object) -> str:
     if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= LARGEST:
         return f"found {shown(offset)}, allowed is a number from {-LARGEST:g} to {LARGEST:g} (rad)"
     joint = config.axes[axis]
-    device = next(slave.device for slave in config.slaves if slave.name == joint.slave)
+    device = next(slave.device for slave in config.slaves if slave.name == joint.slave).of_axis(joint.axis)
     low, high = device.wire_range("target_position")
     ends = (joint.position.min + offset, joint.position.max + offset)
     if all(low <= end <= high for end in ends):

@@ -48,7 +48,7 @@ class BusService(threading.Thread):
     Args:
         master: the bus, started.
         blackboard: where slave states and sentences go and requests come from.
-        drive_positions: position on the cable of each joint's drive.
+        drive_addresses: position on the cable and axis of each joint's drive.
         joint_names: their names.
         op_timeout_s: how long the slaves may take from SAFE-OP to OP.
         cycle_cpu: CPU of the cycle, which this thread keeps off.
@@ -60,7 +60,7 @@ class BusService(threading.Thread):
         self,
         master: Master,
         blackboard: Blackboard,
-        drive_positions: Sequence[int],
+        drive_addresses: Sequence[tuple[int, int]],
         joint_names: Sequence[str],
         op_timeout_s: float,
         cycle_cpu: int,
@@ -74,7 +74,7 @@ class BusService(threading.Thread):
         self._sdo_requests = None if bus is None else SdoRequests(bus, blackboard)
         self._waiting_for = ""
         self._watcher: SlaveWatcher | None = None
-        self._drive_positions = drive_positions
+        self._drive_addresses = drive_addresses
         self._joint_names = joint_names
         self._op_timeout_s = op_timeout_s
         self._cycle_cpu = cycle_cpu
@@ -101,7 +101,7 @@ class BusService(threading.Thread):
         self.clock_followed: Callable[[], bool] = _always
         """Whether the cycle follows the reference clock; slaves that were lost wait in SAFE-OP for it."""
         self.temperature: Callable[[int], float] = lambda position: math.nan
-        """Temperature of the drive at a position, C."""
+        """Temperature of the drive at a position, of the warmest of its axes, C."""
         self.on_op: Callable[[], None] = _nothing
         """Called once, from this thread, when all slaves are in OP for the first time."""
         self.look_around: Callable[[], None] = _nothing
@@ -265,7 +265,7 @@ class BusService(threading.Thread):
         if True in self._explain and not self._sdo_requests.explaining:
             axis = self._explain.index(True)
             self._explain[axis] = False
-            self._sdo_requests.explain(self._joint_names[axis], self._drive_positions[axis])
+            self._sdo_requests.explain(self._joint_names[axis], *self._drive_addresses[axis])
         self._sdo_requests.take_steps()
 
     def _listen(self, turn: int) -> None:

@@ -254,7 +254,8 @@ class CommandHandler:
         arm = self._arm
         if not 0 <= command.axis < len(arm.drives):
             return UnknownAxis(command.axis, len(arm.drives) - 1)
-        if not isinstance(arm.drives[command.axis], Cia402Drive):
+        drive = arm.drives[command.axis]
+        if not isinstance(drive, Cia402Drive) or not drive.changes_mode:
             return HomingUnsupported(command.axis)
         refusal = self._motion_refusal(_AUTOMATIC)
         if refusal is None and arm.mode is not DriveMode.CSP:

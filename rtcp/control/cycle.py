@@ -304,6 +304,6 @@ def make_discipline(config: ArmConfig) -> Discipline | None:
     return Discipline(period_ns, round(shifts[0] * 1000 + config.ethercat.send_phase * period_ns))
 
 
-def position_of(config: ArmConfig, joint: Joint) -> int:
-    """Return the position on the cable, from 1, of the drive that moves `joint`."""
-    return next(slot for slot, slave in enumerate(config.slaves, 1) if slave.name == joint.slave)
+def address_of(config: ArmConfig, joint: Joint) -> tuple[int, int]:
+    """Return where the drive that moves `joint` is: its position on the cable, from 1, and its axis."""
+    return next(slot for slot, slave in enumerate(config.slaves, 1) if slave.name == joint.slave), joint.axis

@@ -7,7 +7,7 @@ from typing import Final
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.part import Part
-from rtcp.devices.drive import Drive, TargetState
+from rtcp.devices.drive import Drive, TargetState, share_slaves
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.events import EmergencyStop, PositionJumped
 from rtcp.ipc.schema import Field
@@ -74,7 +74,8 @@ class JointGroup(Part):
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the drives."""
         for slot, drive in self.pairs:
-            data.set_output(slot, drive.encode())
+            own, slave = drive.encode(), drive.slave
+            data.set_output(slot, own if slave is None else slave.outputs(drive, own))
 
     def set_limits(self, new: Values) -> None:
         """Put other limits into force."""
@@ -140,6 +141,7 @@ class Joints:
         self.groups = [arm, *others]
         self.pairs = [pair for group in self.groups for pair in group.pairs]
         """Index of its slave and driver of each drive."""
+        share_slaves(self.pairs)
         self.drives = [drive for _, drive in self.pairs]
 
     def advance(self, target: TargetState) -> None:

@@ -20,9 +20,9 @@ from types import FrameType
 from typing import Any
 
 from kinematics.compiled import BUILD
-from rtcp.config.model import ArmConfig, ConfigError, DeviceDescription
+from rtcp.config.model import ArmConfig, ConfigError
 from rtcp.control.bus_service import BusService
-from rtcp.control.cycle import Cycle, make_discipline, position_of, record_schema
+from rtcp.control.cycle import Cycle, address_of, make_discipline, record_schema
 from rtcp.control.part import Device
 from rtcp.control.partners import Partners
 from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP
@@ -31,7 +31,6 @@ from rtcp.devices.driver import DeviceError, make_codec
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.master import Master, master_of
-from rtcp.fieldbus.pdo import layout
 from rtcp.ipc.blackboard import Blackboard, BlackboardTooLarge
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import SchemaError
@@ -125,7 +124,7 @@ def _work(master: Master, session: Session, directory: Path, report: Report) -> 
     service = BusService(
         master,
         blackboard,
-        [position_of(config, joint) for joint in config.axes],
+        [address_of(config, joint) for joint in config.axes],
         [joint.name for joint in config.axes],
         config.bus.op_timeout_s,
         cpu,
@@ -157,8 +156,11 @@ def _work(master: Master, session: Session, directory: Path, report: Report) -> 
         report.close()
 
     service.on_op = started
-    drives = {position_of(config, joint): drive for joint, drive in zip(config.axes, cycle.joints.drives, strict=True)}
-    service.temperature = lambda position: drives[position].temperature if position in drives else math.nan
+    service.temperature = lambda position: max(
+        (drive.temperature for slot, drive in cycle.joints.pairs if slot + 1 == position),
+        key=lambda degrees: -math.inf if math.isnan(degrees) else degrees,
+        default=math.nan,
+    )
     service.clock_followed = lambda: discipline is None or discipline.locked
     service.on_refused = cycle.shut_down
     service.start()
@@ -197,7 +199,7 @@ def stop_blindly(
         for _ in range(cycles):
             for slot, drive in drives:
                 with contextlib.suppress(Exception):
-                    data.set_output(slot, _outputs(drive, data, slot, goal, config.slaves[slot].device))
+                    data.set_output(slot, _outputs(drive, data, slot, goal))
             with contextlib.suppress(Exception):
                 data.send()
                 data.receive()
@@ -206,16 +208,17 @@ def stop_blindly(
             time.sleep(max(due - time.monotonic(), 0.0))
 
 
-def _outputs(drive: Drive, data: ProcessData, slot: int, goal: TargetState, device: DeviceDescription) -> bytes:
+def _outputs(drive: Drive, data: ProcessData, slot: int, goal: TargetState) -> bytes:
     """Return a drive's outputs one step towards `goal`; where its driver raises: a controlword, and 0 in the rest."""
     try:
         drive.decode(data.input(slot))
         drive.advance(goal)
-        return drive.encode()
+        own = drive.encode()
     except Exception:
-        image = layout(device.rpdo)
+        image = drive.rpdo
         control = image.find("controlword")  # a node of another bus has none: zeros are its command to stand
-        return make_codec(image).pack(*(_BLIND_WORDS[goal] if one is control else 0 for one in image.channels))
+        own = make_codec(image).pack(*(_BLIND_WORDS[goal] if one is control else 0 for one in image.channels))
+    return own if drive.slave is None else drive.slave.outputs(drive, own)
 
 
 if __name__ == "__main__":

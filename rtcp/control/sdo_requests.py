@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.emergency import error_words
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.registers import Steps
@@ -43,9 +44,9 @@ class SdoRequests:
         """Whether the error code of a drive is still being read."""
         return self._explaining is not None
 
-    def explain(self, name: str, position: int) -> None:
-        """Start to read the error code of the drive at `position`, and report it."""
-        self._explaining = self._explanation(name, position)
+    def explain(self, name: str, position: int, axis: int) -> None:
+        """Start to read the error code of an axis of the drive at `position`, and report it."""
+        self._explaining = self._explanation(name, position, axis)
 
     def take_steps(self) -> None:
         """Advance the pending requests and start new ones; raises BusError from an explanation that failed."""
@@ -68,10 +69,12 @@ class SdoRequests:
             if ended:
                 self._explaining = None
 
-    def _explanation(self, name: str, position: int) -> Steps[None]:
-        code = yield from self._bus.sdo(position).reading_int(_ERROR_CODE, 0)
+    def _explanation(self, name: str, position: int, axis: int) -> Steps[None]:
+        index = _ERROR_CODE + (axis - 1) * OBJECTS_PER_AXIS
+        code = yield from self._bus.sdo(position).reading_int(index, 0)
+        of = f", axis {axis}" if axis > 1 else ""
         if code:
-            self._blackboard.text(f"{name} (slave {position}): the drive's error code is {error_words(code)}")
+            self._blackboard.text(f"{name} (slave {position}{of}): the drive's error code is {error_words(code)}")
 
     def _answer(self) -> Steps[dict[str, Any]]:
         memory, words = self._blackboard.memory, self._blackboard.words

@@ -91,7 +91,8 @@ class Cia402Drive(Drive):
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 
     `encode` also takes `controlword`. A velocity that is not mapped is the mean one over 20 ms. In CSP the drive takes
-    `speed_limit` from the field of the target velocity.
+    `speed_limit` from the field of the target velocity. A drive whose PDOs have no mode of operation stays in CSP, to
+    which a start-up SDO sets it. Whatever else is mapped, as the offsets 0x60B1 and 0x60B2, is sent as 0.
 
     Args:
         slave: the slave's name and description.
@@ -104,8 +105,8 @@ class Cia402Drive(Drive):
     """
 
     HAS_STATUSWORD: ClassVar[bool] = True
-    REQUIRED_OUTPUTS = ("controlword", "target_position", "modes_of_operation")
-    REQUIRED_INPUTS = ("statusword", "position", "modes_of_operation_display")
+    REQUIRED_OUTPUTS = ("controlword", "target_position")
+    REQUIRED_INPUTS = ("statusword", "position")
 
     def __init__(self, slave: SlaveConfig, period_s: float, *, speed_limit: float = 0.0, zero: float = 0.0) -> None:
         super().__init__(slave, period_s, speed_limit=speed_limit, zero=zero)
@@ -114,7 +115,14 @@ class Cia402Drive(Drive):
         if any(channel is not None and channel.factor == 0 for channel in targets):
             raise DeviceError(f"{self.device}: a factor of 0 in `rpdo` is not allowed")
         for slot in (self._in[0], self._in[4]):
-            integer_range(self.tpdo.channels[slot])  # statusword and mode: raises where one is no integer
+            if slot >= 0:
+                integer_range(self.tpdo.channels[slot])  # statusword and mode: raises where one is no integer
+        self.changes_mode = self._out[4] >= 0
+        """Whether its mode of operation can be commanded; else it stays in CSP."""
+        if self.changes_mode and self._in[4] < 0:
+            raise DeviceError(f"{self.device}: `rpdo` maps modes_of_operation, `tpdo` no modes_of_operation_display")
+        if self._in[4] < 0:
+            self.mode_display = CSP
         self._limits = tuple((0, 0) if channel is None else integer_range(channel) for channel in targets)
         self._scales = tuple(0.0 if channel is None else 1.0 / channel.factor for channel in targets)
         self._in_factors = tuple(0.0 if slot < 0 else self.tpdo.channels[slot].factor for slot in self._in[1:4])
@@ -148,8 +156,7 @@ class Cia402Drive(Drive):
         self.velocity = values[velocity] * by_velocity if velocity >= 0 else self._measured_velocity(shown)
         if torque >= 0:
             self.torque = values[torque] * by_torque
-        display: int = values[mode]
-        if display != self.mode_display:
+        if mode >= 0 and (display := values[mode]) != self.mode_display:
             self.mode_display = display
             self._changed = True
         if self._temperature_slot >= 0:
@@ -199,14 +206,17 @@ class Cia402Drive(Drive):
         """Fill in all outputs but the position."""
         control, _, velocity, torque, mode = self._out
         _, by_velocity, by_torque = self._scales
-        fields[control], fields[mode] = word, commanded
+        fields[control] = word
+        if mode >= 0:
+            fields[mode] = commanded
         speed = effort = 0
         if word == ENABLE_OPERATION and self.state is _ENABLED:
             if commanded == CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
             elif commanded == self.mode_display and commanded in _WITH_SPEED:
-                wanted = self.speed_limit if commanded == CSP else self.target_velocity
-                speed = self._counts(wanted * by_velocity, 1, fields[velocity])
+                # A limit is no direction: positive also where the joint turns against the drive.
+                wanted = abs(self.speed_limit * by_velocity) if commanded == CSP else self.target_velocity * by_velocity
+                speed = self._counts(wanted, 1, fields[velocity])
         if velocity >= 0:
             fields[velocity] = speed
         if torque >= 0:

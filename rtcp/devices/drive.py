@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from enum import Enum
 from typing import ClassVar, Final
 
@@ -68,6 +70,8 @@ class Drive(Driver):
         """Of a quick stop that this driver ramps itself, rad/s^2."""
         self.low, self.high = -math.inf, math.inf
         """Ends of that ramp, rad."""
+        self.slave: SharedSlave | None = None
+        """Set where other axes of its slave move joints too: its outputs are a part of that slave's."""
         self._zero = zero
         self.target_position = self.target_velocity = self.target_torque = 0.0
         self._past: list[float] = []
@@ -110,6 +114,36 @@ class Drive(Driver):
         return moved / (len(past) * self.period_s)
 
 
+class SharedSlave:
+    """The outputs of a slave whose axes are several drives: each has its own bits of them.
+
+    Args:
+        drives: its axes.
+    """
+
+    def __init__(self, drives: Sequence[Drive]) -> None:
+        self._length = max(drive.output_bytes for drive in drives)
+        self._parts = dict.fromkeys(drives, 0)
+        for drive in drives:
+            drive.slave = self
+
+    def outputs(self, drive: Drive, own: bytes) -> bytes:
+        """Return the slave's outputs: `own` of one drive, and those of the others as they were encoded last."""
+        self._parts[drive] = int.from_bytes(own, "little")
+        whole = 0
+        for part in self._parts.values():
+            whole |= part
+        return whole.to_bytes(self._length, "little")
+
+
+def share_slaves(pairs: Sequence[tuple[int, Drive]]) -> None:
+    """Let drives of one slave share its outputs; `pairs`: the index of its slave and the driver of each drive."""
+    for slot in {slot for slot, _ in pairs}:
+        drives = [drive for other, drive in pairs if other == slot]
+        if len(drives) > 1:
+            SharedSlave(drives)
+
+
 def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     """Return the driver of the drive that moves `joint`, with the index of its slave; `zero` as in `Drive`.
 
@@ -118,6 +152,7 @@ def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     """
     slot = next(slot for slot, slave in enumerate(config.slaves) if slave.name == joint.slave)
     slave = config.slaves[slot]
+    slave = replace(slave, device=slave.device.of_axis(joint.axis))
     drive = make_driver(slave, config.cycle.period_us * 1e-6)
     if not isinstance(drive, Drive):
         raise DeviceError(f"slave {slave.name} (kind {slave.device.kind}) is no drive: it cannot move {joint.name}")

@@ -10,6 +10,23 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 
+class EsiError(Exception):
+    """A description that cannot be read, written or put together; `origin` is the file and line, or what it is of."""
+
+    def __init__(self, origin: str, problem: str) -> None:
+        super().__init__(f"{origin}: {problem}")
+        self.origin = origin
+        self.problem = problem
+
+
+class LookupFailure(EsiError):
+    """No device, or several, are what was asked for; `candidates` are those that there are."""
+
+    def __init__(self, origin: str, problem: str, candidates: tuple[str, ...]) -> None:
+        super().__init__(origin, problem)
+        self.candidates = candidates
+
+
 class Source(Enum):
     """Where a description comes from."""
 
@@ -74,9 +91,11 @@ class SyncManager:
     """Smallest length, bytes."""
     maximum: int | None = None
     """Largest length, bytes."""
+    op_only: bool = False
+    """It is enabled in OP only."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PdoEntry:
     """A mapped object; index 0 is padding."""
 
@@ -86,9 +105,11 @@ class PdoEntry:
     name: str = ""
     type: str = ""
     """Data type as the description names it (UINT, BIT2, INT24, `ARRAY [0..30] OF BYTE`); empty: not given."""
+    depends_on_slot: bool = False
+    """In a module: its index grows with the slot."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Pdo:
     """A process data object."""
 
@@ -104,6 +125,10 @@ class Pdo:
     virtual: bool = False
     excludes: frozenset[int] = frozenset()
     """PDOs that cannot be assigned together with it."""
+    depends_on_slot: bool = False
+    """In a module: its index grows with the slot."""
+    overwritten_by_module: bool = False
+    """A module's PDO of the same index takes its place."""
 
     @property
     def bits(self) -> int:
@@ -111,7 +136,7 @@ class Pdo:
         return sum(entry.bits for entry in self.entries)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ObjectEntry:
     """A subindex of an object."""
 
@@ -128,14 +153,14 @@ class ObjectEntry:
     rx_mappable: bool = False
     tx_mappable: bool = False
     default: bytes | None = None
-    """Value at power-on, little endian; None: none is given, 0 is meant."""
+    """Value at power-on, little endian; None: 0. Of a text or an array it may be shorter than `bits`."""
     minimum: bytes | None = None
     maximum: bytes | None = None
     unit: int | None = None
     """Unit in the notation of ETG.1004."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class DictionaryObject:
     """An object of the object dictionary."""
 
@@ -144,6 +169,8 @@ class DictionaryObject:
     code: ObjectCode
     entries: tuple[ObjectEntry, ...]
     """By rising subindex, subindex 0 among them."""
+    depends_on_slot: bool = False
+    """In a module: its index grows with the slot."""
 
 
 @dataclass(frozen=True)
@@ -159,6 +186,8 @@ class InitCommand:
     fixed: bool = False
     """Its data cannot be changed."""
     comment: str = ""
+    depends_on_slot: bool = False
+    """In a module: its index grows with the slot."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +215,8 @@ class Mailbox:
     aoe: bool = False
     soe: bool = False
     voe: bool = False
+    data_link_layer: bool = False
+    """It repeats a lost answer (ETG.1000.4, 6.7.1)."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +229,7 @@ class DcMode:
     description: str = ""
     sync0_cycle: int = 0
     sync0_factor: int = 1
-    """Above 0: multiple of the master's cycle, below: its divisor."""
+    """Above 0: multiple of the master's cycle, below: its divisor; 0: not given."""
     sync0_shift: int = 0
     sync1_cycle: int = 0
     sync1_factor: int = 0
@@ -233,6 +264,10 @@ class Module:
     objects: tuple[DictionaryObject, ...] = ()
     init_commands: tuple[InitCommand, ...] = ()
     module_class: str = ""
+    profile: int | None = None
+    """Device profile number, 402 for a drive's axis."""
+    origin: str = ""
+    """File and line."""
 
 
 @dataclass(frozen=True)
@@ -262,6 +297,8 @@ class Device:
     dc_modes: tuple[DcMode, ...] = ()
     """The first is the default; empty: no distributed clock."""
     slots: tuple[Slot, ...] = ()
+    modules: tuple[tuple[int, int], ...] = ()
+    """Place and ident of each module that has been put in, see `rtcp.esi.modules`."""
     eeprom_bytes: int = 0
     """Size of its EEPROM; 0: not given."""
     config_data: bytes = b""
@@ -271,6 +308,17 @@ class Device:
     profile: int | None = None
     """Device profile number, 402 for drives."""
     station_alias: int = 0
+    group_name: str = ""
+    channel_profiles: tuple[int, ...] = ()
+    """Profile number of each channel, for two axes (402, 402); empty: not given."""
+    download_module_idents: bool = False
+    """The master writes the idents of the modules to 0xF030 before SAFE-OP."""
+    ebus_current: int = 0
+    """Current that it takes from the E-bus, mA; below 0: that it feeds."""
+    no_lrw: bool = False
+    """It does not support the command LRW."""
+    unit_symbols: Mapping[int, str] = field(default_factory=dict)
+    """Symbols of units of its own, by their notation index, see `rtcp.esi.units`."""
     hidden: bool = False
     """A tool offers it no more: a later revision takes its place."""
     unread: Mapping[str, int] = field(default_factory=dict)
@@ -288,3 +336,5 @@ class DeviceFile:
     modules: tuple[Module, ...]
     warnings: tuple[str, ...]
     """A sentence for each deviation that was accepted, with file and line."""
+    failures: tuple[str, ...] = ()
+    """A sentence for each device or module that could not be read, with file and line."""

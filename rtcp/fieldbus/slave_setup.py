@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
+from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
@@ -21,6 +22,7 @@ from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, TYPES, compare_mapping, mapping_of, write_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
+from rtcp.fieldbus.scaling import compare_scaling
 from rtcp.fieldbus.scan import name_of
 
 _FMMUS_SIZE = 0x80
@@ -272,7 +274,10 @@ def configure_slave(
     for startup in device.sdo:
         notes += yield from write_startup(sdo, startup)
     if device.kind == "cia402":
-        notes += yield from write_interpolation_time(sdo, period_ns)
+        # Before anything that moves: a drive that counts otherwise must not come to SAFE-OP.
+        notes += yield from compare_scaling(sdo, config)
+        for axis in device.axes:
+            notes += yield from write_interpolation_time(sdo, period_ns, axis)
     set_watchdog(port, station, slave_label(sdo.position, sdo.name), device)
     return notes
 
@@ -314,23 +319,23 @@ def interpolation_time(period_ns: int) -> tuple[int, int] | None:
     return (value, exponent) if 0 < value <= 255 else None
 
 
-def write_interpolation_time(sdo: SdoClient, period_ns: int) -> Steps[list[str]]:
-    """Set 0x60C2 to the period where the drive has it; return a note where that was not possible."""
+def write_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Steps[list[str]]:
+    """Set 0x60C2 of an axis to the period where the drive has it; return a note where that was not possible."""
     where = slave_label(sdo.position, sdo.name)
     value = interpolation_time(period_ns)
+    index = _INTERPOLATION + (axis - 1) * OBJECTS_PER_AXIS
     if value is None:
-        return [
-            f"{where}: its interpolation time (0x60C2) cannot express {period_ns / 1000:g} us and was left as it is"
-        ]
+        us = period_ns / 1000
+        return [f"{where}: its interpolation time (0x{index:04X}) cannot express {us:g} us and was left as it is"]
     try:
         for sub_index, (number, packer) in enumerate(
             zip(value, (struct.Struct("B"), struct.Struct("b")), strict=True), 1
         ):
-            what = f"0x60C2:{sub_index} (interpolation time)"
-            yield from _write_and_verify(sdo, _INTERPOLATION, sub_index, packer.pack(number), what, packer)
+            what = f"0x{index:04X}:{sub_index} (interpolation time)"
+            yield from _write_and_verify(sdo, index, sub_index, packer.pack(number), what, packer)
     except SdoAborted as error:
         if error.code in ABSENT:
-            return [f"{where} has no interpolation time (0x60C2)"]
+            return [f"{where} has no interpolation time (0x{index:04X})"]
         raise
     return []
 

@@ -372,7 +372,7 @@ def _with_torque(record: np.void) -> list[tuple[int, str]]:
 
 
 def _drive(joint: Joint) -> str:
-    return f"{joint.name} ({joint.slave})"
+    return f"{joint.name} ({joint.place})"
 
 
 def _longest_s(joint: Joint) -> float:

@@ -142,6 +142,9 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "mode_reason": lambda names, about: (
         names.lacks("torque") or "it has no process data for that (rpdo and tpdo in its device file)"
     ),
+    "homing_reason": lambda names, about: (
+        names.lacks("homing") or "the PDOs of its drive have no modes_of_operation, so it stays in CSP"
+    ),
     "all_in_op": lambda names, about: "the controller sends" if names.lacks("states") else "all slaves are in OP",
     "not_in_op": lambda names, about: (
         "the robot controller sends nothing" if names.lacks("states") else "not all slaves are in OP"

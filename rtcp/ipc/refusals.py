@@ -56,7 +56,7 @@ class DriveNotReady(Refusal):
 
 
 class HomingUnsupported(Refusal):
-    """{joint} has no homing here: its robot controller knows where it is; calibrate it there"""
+    """{joint} has no homing here: {homing_reason}"""
 
     axis: int
 

@@ -19,7 +19,7 @@ _LATENCY_CYCLES = 3
 """From the cycle that finds a reason to the drive that obeys, and to the master that sees it: frame, SYNC0, frame."""
 _DRIVE_S = 0.03
 """A joint comes to rest so long after the end of its drive's ramp, or of its setpoints, at most."""
-_QUICK_STOP_DECELERATION = (0x6085, 0)
+_QUICK_STOP_DECELERATION = 0x6085
 _UNKNOWN_S = 2.0
 """A quick stop at a rate that is not known is given so long: as the emergency stop gives it."""
 
@@ -148,11 +148,14 @@ def _quick_stop_rate(config: ArmConfig, joint: Joint) -> float:
     if device.kind == "joint":
         return joint.acceleration
     # A rate counts as a speed does, by the second.
-    factors = [entry.factor for pdo in device.rpdo for entry in pdo.channels if entry.name == "target_velocity"]
-    rates = [sdo.value for sdo in device.sdo if (sdo.index, sdo.sub_index) == _QUICK_STOP_DECELERATION]
-    if not (rates and factors):
+    channels = (entry for pdo in device.of_axis(joint.axis).rpdo for entry in pdo.channels)
+    scaling = device.scaling_of(joint.axis)
+    factors = [entry.factor for entry in channels if entry.name == "target_velocity"]
+    factors += [] if scaling is None else [scaling.velocity]
+    rate = device.startup(_QUICK_STOP_DECELERATION, joint.axis)
+    if rate is None or not factors:
         raise ValueError(f"{device.name}: 0x6085 is not among its start-up SDOs: how fast it stops is not known")
-    return rates[-1] * factors[0]
+    return rate * abs(factors[0])
 
 
 def _brake(braking: Sequence[float], at: int, joint: Joint) -> float:

@@ -18,6 +18,7 @@ from rtcp.fieldbus.al_state import AlState, state_name
 from rtcp.fieldbus.bus import SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.pdo import layout as image_of
 from rtcp.fieldbus.registers import Steps, finish
 from rtcp.fieldbus.slave_setup import configure_slave, identity_faults
 from rtcp.virtual import coe
@@ -291,10 +292,12 @@ class InProcessBus:
         client = cast(Any, slave)
         notes = finish(configure_slave(client, client, 0, config, self._period_ns))
         layout = SyncManagerLayout()
-        at = sum(other.output_bytes for other in self.slaves[: position - 1])
+        # As they will be mapped: slaves after this one may still have another mapping.
+        outputs = [image_of(other.device.rpdo).bytes for other in self._configs]
+        inputs = [image_of(other.device.tpdo).bytes for other in self._configs]
+        at = sum(outputs[: position - 1])
         self._map(slave, OUTPUTS, layout.outputs.start, layout.outputs.control, at, slave.output_bytes)
-        at = sum(other.output_bytes for other in self.slaves)
-        at += sum(other.input_bytes for other in self.slaves[: position - 1])
+        at = sum(outputs) + sum(inputs[: position - 1])
         self._map(slave, INPUTS, layout.inputs.start, layout.inputs.control, at, slave.input_bytes)
         device = config.device
         clock = slave.virtual.clock

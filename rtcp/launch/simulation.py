@@ -15,9 +15,10 @@ from types import TracebackType
 from typing import Any, NamedTuple, cast
 
 from rtcp.config.model import ArmConfig
+from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.control.bus_service import BusService
-from rtcp.control.cycle import Cycle, make_discipline, position_of, record_schema
+from rtcp.control.cycle import Cycle, address_of, make_discipline, record_schema
 from rtcp.control.partners import Partners
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import ProcessData
@@ -254,13 +255,13 @@ class InlineService(BusService):
     """Does in turns of simulated time what the service thread does: the way to OP, to PRE-OP and back, the watch."""
 
     def __init__(self, bus: InProcessBus, blackboard: Blackboard, config: ArmConfig) -> None:
-        positions = [position_of(config, axis) for axis in config.axes]
+        addresses = [address_of(config, axis) for axis in config.axes]
         names = [axis.name for axis in config.axes]
         master = _InlineMaster(config, bus)
-        super().__init__(master, blackboard, positions, names, config.bus.op_timeout_s, 0, 1)
+        super().__init__(master, blackboard, addresses, names, config.bus.op_timeout_s, 0, 1)
         self._segment = bus
         self._board = blackboard
-        self._positions = positions
+        self._addresses = addresses
         self._names = names
         self._wanted: list[Callable[[], None]] = []
         self._op_asked = False
@@ -295,7 +296,9 @@ class InlineService(BusService):
             do()
         if self._axis >= 0:
             axis, self._axis = self._axis, -1
-            code = int.from_bytes(self._segment.sdo_read(self._positions[axis], _ERROR_CODE, 0), "little")
+            position, of_slave = self._addresses[axis]
+            index = _ERROR_CODE + (of_slave - 1) * OBJECTS_PER_AXIS
+            code = int.from_bytes(self._segment.sdo_read(position, index, 0), "little")
             if code:
                 self._board.text(f"{self._names[axis]}: the drive's error code is 0x{code:04X}")
         if turn % _WATCH_TURNS == 0:

@@ -235,7 +235,7 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      'rpdo[0].channels[4].type: found the text "int24", allowed is one of bool, int8, uint8, int16, uint16, int32, '
      "uint32, int64, uint64, float32, float64"),
     (BOX, [("kind: io", "kind: cia402")],
-     "rpdo: kind cia402 needs channels named controlword, target_position, modes_of_operation; "
+     "rpdo: kind cia402 needs channels named controlword, target_position; "
      "its channels are outputs"),
     (DRIVE, [("type: uint16, name: controlword", "type: uint32, name: controlword")],
      "rpdo[0].channels[0].type: found uint32 for controlword, allowed is uint16"),

@@ -28,7 +28,7 @@ KEYS = {
     "segment": list(keys_of(SegmentFile)),
     "motion": list(keys_of(MotionFile)),
 }
-UNITS = r"\b(m|rad)(/s[²³]?)?\b|\bNm\b|\bkg\b|\b1/s\b|, (s|ms|us|ns)\b|parts per million"
+UNITS = r"\b(m|rad)(/s[²³]?)?\b|\bNm\b|\bkg\b|\b1/s\b|, (s|ms|us|ns)\b|parts per million|, A\b|[Rr]evolution"
 WITHOUT_UNIT = r"[Ff]raction|[Mm]ultiple|Factor|per count|Value to write"
 
 

@@ -216,7 +216,9 @@ class LoopRig:
         self.board, self.observer = board, observer
         self.discipline = Followed(period_ns, 0)
         self.discipline.locked = True
-        self.service = BusService(master(None), board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
+        self.service = BusService(
+            master(None), board, [(2, 1), (3, 1)], [joint.name for joint in CONFIG.joints], 5.0, 0, 80
+        )
         self.slaves_come_back = True
         for position in range(1, 1 + len(config.slaves)):
             board.slave(position, AlState.OP, 0)

@@ -107,7 +107,7 @@ def test_a_cycle_that_does_not_lock_under_fifo_names_the_cpu_that_it_keeps(
 ) -> None:
     monkeypatch.setattr(bus_service, "_LOCK_S", 0.0)
     monkeypatch.setattr(os, "sched_getscheduler", lambda pid: policy)
-    waiting = BusService(rig.master(bus), board, [2, 3], ["joint1", "joint2"], 5.0, 1, 80, watch_s=0.001)
+    waiting = BusService(rig.master(bus), board, [(2, 1), (3, 1)], ["joint1", "joint2"], 5.0, 1, 80, watch_s=0.001)
     refused = threading.Event()
     waiting.on_refused = refused.set
     waiting.start()
@@ -125,7 +125,7 @@ def bus() -> Bus:
 
 @pytest.fixture
 def service(bus: Bus, board: Blackboard) -> Iterator[BusService]:
-    made = BusService(rig.master(bus), board, [2, 3], ["joint1", "joint2"], 5.0, 0, 1, watch_s=0.001)
+    made = BusService(rig.master(bus), board, [(2, 1), (3, 1)], ["joint1", "joint2"], 5.0, 0, 1, watch_s=0.001)
     made.want_op()
     made.start()
     until(lambda: made.all_op)

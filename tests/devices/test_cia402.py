@@ -8,7 +8,7 @@ import pytest
 from rtcp.devices import Cia402Drive, DeviceError, DriveState
 from rtcp.devices import TargetState as T
 
-from .conftest import RPDO, TPDO, slave
+from .conftest import FACTOR, RPDO, TPDO, slave
 
 S = DriveState
 DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x0250, 0x0231, 0x0233, 0x0237, 0x0217
@@ -221,9 +221,9 @@ def test_widths_and_order_are_those_of_the_description():
 
 
 def test_missing_channels_are_all_named_at_the_start():
-    with pytest.raises(DeviceError, match=r"`rpdo` maps no target_position, modes_of_operation"):
+    with pytest.raises(DeviceError, match=r"`rpdo` maps no target_position; kind cia402"):
         Cia402Drive(slave(rpdo=RPDO[:1]), 0.001)
-    with pytest.raises(DeviceError, match=r"`tpdo` maps no modes_of_operation_display"):
+    with pytest.raises(DeviceError, match=r"`tpdo` no modes_of_operation_display"):
         Cia402Drive(slave(tpdo=TPDO[:4]), 0.001)
 
 
@@ -238,6 +238,28 @@ def test_a_drive_with_the_entries_of_csp_alone_is_driven_in_csp():
     drive.target_position = 1.5
     assert drive.encode() == struct.pack("<Hib", 0x0F, 15000, 8)
     assert [drive.supports(mode) for mode in (8, 9, 10)] == [True, False, False]
+
+
+def test_a_drive_without_a_mode_in_its_pdos_stays_in_csp():
+    drive = Cia402Drive(slave(RPDO[:4], TPDO[:4]), 0.001, speed_limit=0.5)
+    assert [drive.supports(mode) for mode in (8, 9, 10)] == [True, False, False]
+    for status in (SWITCHED_ON, ENABLED, ENABLED):
+        drive.decode(struct.pack("<Hiii", status, 10000, 0, 0))
+        drive.advance(T.ENABLED)
+    assert (drive.changes_mode, drive.mode_display, drive.mode) == (False, 8, 8)
+    assert drive.encode() == struct.pack("<Hiii", 0x0F, 10000, 5000, 0)
+
+
+def test_the_speed_limit_is_positive_where_the_joint_turns_against_the_drive():
+    reversed_ = [(name, index, kind, -factor if factor == FACTOR else factor) for name, index, kind, factor in RPDO]
+    drive = Cia402Drive(slave(reversed_), 0.001, speed_limit=0.5)
+    drive.controlword = 0x0F
+    drive.decode(struct.pack("<Hiiib", ENABLED, 0, 0, 0, 8))
+    drive.target_position = 0.1
+    assert struct.unpack("<Hiiib", drive.encode())[1:3] == (-1000, 5000)
+    drive.mode, drive.target_velocity = 9, 0.25
+    drive.decode(struct.pack("<Hiiib", ENABLED, 0, 0, 0, 9))
+    assert struct.unpack("<Hiiib", drive.encode())[2] == -2500
 
 
 def test_a_velocity_that_is_not_mapped_is_the_mean_over_20_ms():

@@ -1,0 +1,94 @@
+"""What a CiA 402 drive counts in: from its encoder, gear and rated torque to the factors of its process data.
+
+The keys of `scaling` in a device's file are the objects in which the drive itself holds the same values; what it holds
+is compared at the start (`rtcp.fieldbus.scaling`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt
+
+OBJECTS_PER_AXIS = 0x800
+"""Distance of the objects of one axis from those of the next (IEC 61800-7-201, 0x6000 to 0x67FF is the first)."""
+
+VelocityUnit = Literal["counts/s", "rpm", "mrpm", "urpm"]
+_RPM: dict[VelocityUnit, float] = {"rpm": 1.0, "mrpm": 1e-3, "urpm": 1e-6}
+TorqueUnit = Literal["mNm", "uNm"]
+TORQUE_UNITS: dict[TorqueUnit, float] = {"mNm": 1e-3, "uNm": 1e-6}
+"""Nm per count of 0x6076."""
+PER_MILLE = 1e-3
+
+QUANTITIES: dict[str, str] = {
+    "target_position": "position",
+    "position": "position",
+    "position_offset": "position",
+    "target_velocity": "velocity",
+    "velocity": "velocity",
+    "velocity_offset": "velocity",
+    "target_torque": "torque",
+    "torque": "torque",
+    "torque_offset": "torque",
+}
+"""Channels of a CiA 402 drive whose factors follow from the scaling."""
+
+
+@dataclass(frozen=True)
+class DriveScaling:
+    """What one axis of a CiA 402 drive counts in. At the start the drive's own objects are compared with it."""
+
+    encoder_increments: Annotated[float, Gt(0)]
+    """Encoder increments per motor revolution (0x608F); of an encoder at the output: per revolution there."""
+    gear_ratio: Annotated[float, Gt(0)] = 1.0
+    """Motor revolutions per revolution of the drive's output shaft (0x6091)."""
+    feed_constant: Annotated[float, Ge(0)] | None = None
+    """Position counts per revolution of the output shaft (0x6092); left out: those of encoder and gear; 0: the drive
+    holds the object and does not count in it."""
+    external_gear_ratio: float = 1.0
+    """Revolutions of the output shaft per revolution of the joint, by a gear that the drive does not know; not 0,
+    negative: the joint turns the other way."""
+    velocity_unit: VelocityUnit = "counts/s"
+    """Unit of velocities (0x60A9): position counts per second, or (thousandth, millionth) revolutions per minute."""
+    velocity_at: Literal["motor", "output"] = "motor"
+    """Which shaft's revolutions per minute they are."""
+    rated_torque: Annotated[float, Gt(0)] | None = None
+    """Rated torque of the motor, Nm (0x6076): torques are thousandths of it."""
+    rated_torque_unit: TorqueUnit = "mNm"
+    """Unit of 0x6076 in the drive."""
+    rated_current: Annotated[float, Gt(0)] | None = None
+    """Rated current, A (0x6075): where torques are thousandths of it; with `torque_constant`."""
+    torque_constant: Annotated[float, Gt(0)] | None = None
+    """Torque of the motor by its current, Nm/A."""
+
+    @property
+    def counts_per_output_turn(self) -> float:
+        """Position counts per revolution of the drive's output shaft."""
+        return self.feed_constant or self.encoder_increments * self.gear_ratio
+
+    @property
+    def position(self) -> float:
+        """Joint angle per position count, rad."""
+        return 2.0 * math.pi / (self.counts_per_output_turn * self.external_gear_ratio)
+
+    @property
+    def velocity(self) -> float:
+        """Joint speed per count of velocity, rad/s."""
+        if self.velocity_unit == "counts/s":
+            return self.position
+        turns = self.external_gear_ratio * (self.gear_ratio if self.velocity_at == "motor" else 1.0)
+        return _RPM[self.velocity_unit] * 2.0 * math.pi / 60.0 / turns
+
+    @property
+    def torque(self) -> float | None:
+        """Joint torque per count, Nm, without losses of the gears; None: nothing is said about the torque."""
+        rated = self.rated_torque
+        if rated is None and self.rated_current is not None and self.torque_constant is not None:
+            rated = self.rated_current * self.torque_constant
+        return None if rated is None else PER_MILLE * rated * self.gear_ratio * self.external_gear_ratio
+
+    def factor(self, quantity: str) -> float | None:
+        """Return the factor of a quantity; None: the keys say nothing about it."""
+        return {"position": self.position, "velocity": self.velocity, "torque": self.torque}[quantity]

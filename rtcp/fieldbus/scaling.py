@@ -1,0 +1,124 @@
+"""What a CiA 402 drive itself says that it counts in, compared with its device's file (IEC 61800-7-201, clause 7).
+
+A drive whose encoder, gear or rated torque differ from the file would move its joint too far, or push too hard: it is
+refused. An object that the drive lacks is a note.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from rtcp.config.model import SlaveConfig
+from rtcp.config.scaling import OBJECTS_PER_AXIS, TORQUE_UNITS, DriveScaling
+from rtcp.fieldbus.bus import slave_label
+from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.mailbox import ABSENT, SdoClient
+from rtcp.fieldbus.registers import Steps
+
+_ENCODER, _GEAR, _FEED = 0x608F, 0x6091, 0x6092
+"""Ratios: subindex 1 by subindex 2."""
+_RATED_CURRENT, _RATED_TORQUE, _VELOCITY_UNIT = 0x6075, 0x6076, 0x60A9
+_TOLERANCE: Final = 1e-6
+_AMPERE_PER_COUNT: Final = 1e-3
+_UNITS: Final = {0x00B44700: "rpm", 0xFDB44700: "mrpm", 0xFAB44700: "urpm", 0x00B50300: "counts/s"}
+"""Revolutions per minute and increments per second in the notation of ETG.1004: prefix, numerator, denominator."""
+_WRITE_ONLY: Final = 0x06010001
+_UNREADABLE: Final = ABSENT | {_WRITE_ONLY}
+
+
+def compare_scaling(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
+    """Read what each axis of a drive counts in; return sentences on objects that it lacks.
+
+    Raises:
+        BusError: it counts in something else than its device's file says, or does not answer.
+    """
+    device = config.device
+    notes: list[str] = []
+    faults: list[str] = []
+    for axis in device.axes:
+        scaling = device.scaling_of(axis)
+        if scaling is None:
+            continue
+        where = slave_label(sdo.position, sdo.name) + ("" if device.axes == (1,) else f", axis {axis}")
+        lacking: list[str] = []
+        for index, key, wanted, reading, unit in _compared(scaling, (axis - 1) * OBJECTS_PER_AXIS):
+            held = yield from reading(sdo, index)
+            if held is None:
+                # A drive without a feed constant counts in what its encoder and gear say, as its file does without one.
+                if key != "feed_constant" or scaling.feed_constant is not None:
+                    lacking.append(f"0x{index:04X} ({key})")
+            elif not _equal(held, wanted):
+                faults.append(
+                    f"{where}: the drive counts otherwise than its file: 0x{index:04X} holds {_shown(held)}{unit}, the "
+                    f"file has {_shown(wanted)} (key `{key}` of `scaling` in {config.file or 'its device file'}): "
+                    "correct the one that is wrong before the arm moves"
+                )
+        if lacking:
+            notes.append(f"{where} has no {', '.join(lacking)}: whether its file is right about it is not checked")
+    if faults:
+        raise BusError(*faults)
+    return notes
+
+
+Value = float | str
+Reading = Callable[[SdoClient, int], Steps[Value | None]]
+
+
+def _compared(scaling: DriveScaling, shift: int) -> Iterator[tuple[int, str, Value, Reading, str]]:
+    """Yield object, key, the file's value, how the drive's is read, and its unit; `shift`: of the axis' objects."""
+    yield _ENCODER + shift, "encoder_increments", scaling.encoder_increments, _ratio, " increments a motor revolution"
+    yield _GEAR + shift, "gear_ratio", scaling.gear_ratio, _ratio, " motor revolutions a revolution of the output"
+    if scaling.feed_constant != 0:
+        turn = scaling.counts_per_output_turn
+        yield _FEED + shift, "feed_constant", turn, _ratio, " counts a revolution of the output"
+    for index, key, rated, unit, count in (
+        (_RATED_TORQUE, "rated_torque", scaling.rated_torque, " Nm", TORQUE_UNITS[scaling.rated_torque_unit]),
+        (_RATED_CURRENT, "rated_current", scaling.rated_current, " A", _AMPERE_PER_COUNT),
+    ):
+        if rated is not None:
+            # The drive holds whole counts: so does what it is compared with.
+            yield index + shift, key, round(rated / count) * count, _counts(count), unit
+    yield _VELOCITY_UNIT + shift, "velocity_unit", scaling.velocity_unit, _velocity_unit, ""
+
+
+def _equal(held: Value, wanted: Value) -> bool:
+    if isinstance(held, str) or isinstance(wanted, str):
+        return held == wanted
+    return math.isclose(held, wanted, rel_tol=_TOLERANCE)
+
+
+def _shown(value: Value) -> str:
+    return value if isinstance(value, str) else f"{value:.10g}"
+
+
+def _reading(sdo: SdoClient, index: int, subindex: int) -> Steps[int | None]:
+    """Return an object as an unsigned integer; None: the drive has no such object, or none that can be read."""
+    try:
+        return (yield from sdo.reading_int(index, subindex))
+    except SdoAborted as error:
+        if error.code in _UNREADABLE:
+            return None
+        raise
+
+
+def _ratio(sdo: SdoClient, index: int) -> Steps[Value | None]:
+    """Return subindex 1 by subindex 2; None: the drive lacks them, or holds 0, which is no ratio."""
+    above = yield from _reading(sdo, index, 1)
+    below = yield from _reading(sdo, index, 2)
+    return above / below if above and below else None
+
+
+def _counts(count: float) -> Reading:
+    def read(sdo: SdoClient, index: int) -> Steps[Value | None]:
+        counts = yield from _reading(sdo, index, 0)
+        return None if counts is None else counts * count
+
+    return read
+
+
+def _velocity_unit(sdo: SdoClient, index: int) -> Steps[Value | None]:
+    """Return the unit of velocities; one that is none of those of `velocity_unit` by its number."""
+    code = yield from _reading(sdo, index, 0)
+    return None if not code else _UNITS.get(code, f"the unit 0x{code:08X}")

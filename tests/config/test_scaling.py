@@ -1,0 +1,185 @@
+"""Device files of CiA 402 drives in the standard's units: factors from the scaling, axes, drives of one mode."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from rtcp.config import ConfigError, default_config, load, load_device
+from rtcp.ipc.stop_reactions import StopReaction, bounds
+
+ENTRIES = {
+    "rpdo": (("controlword", 0x6040, "uint16"), ("target_position", 0x607A, "int32"),
+             ("target_velocity", 0x60FF, "int32"), ("target_torque", 0x6071, "int16"),
+             ("modes_of_operation", 0x6060, "int8")),
+    "tpdo": (("statusword", 0x6041, "uint16"), ("position", 0x6064, "int32"), ("velocity", 0x606C, "int32"),
+             ("torque", 0x6077, "int16"), ("modes_of_operation_display", 0x6061, "int8")),
+}  # fmt: skip
+CSP = {"index": 0x6060, "sub_index": 0, "type": "int8", "value": 8}
+SCALING = {"encoder_increments": 4096, "gear_ratio": 100, "velocity_unit": "rpm", "rated_torque": 0.5}
+
+
+def pdos(image: str, axis: int = 1, without: tuple[str, ...] = (), **factors: float) -> list[dict[str, Any]]:
+    channels = [
+        {"index": index + 0x800 * (axis - 1), "sub_index": 0, "type": kind, "name": name}
+        | ({"factor": factors[name]} if name in factors else {})
+        for name, index, kind in ENTRIES[image]
+        if name not in without
+    ]
+    index = {"rpdo": 0x1600, "tpdo": 0x1A00}[image] + 0x10 * (axis - 1)
+    return [{"index": index, "channels": channels, "axis": axis}]
+
+
+def device(**changes: Any) -> dict[str, Any]:
+    made = {"name": "a drive", "kind": "cia402", "vendor_id": 1, "product_id": 2, "scaling": [SCALING],
+            "rpdo": pdos("rpdo"), "tpdo": pdos("tpdo"), **changes}  # fmt: skip
+    return {key: value for key, value in made.items() if value is not None}
+
+
+@pytest.fixture
+def written(tmp_path: Path):
+    def write(**changes: Any):
+        file = tmp_path / "drive.yaml"
+        file.write_text(yaml.safe_dump(device(**changes)))
+        return load_device(file)
+
+    return write
+
+
+@pytest.fixture
+def problems(written):
+    def found(**changes: Any) -> list[str]:
+        with pytest.raises(ConfigError) as refused:
+            written(**changes)
+        return [text.split(": ", 1)[1] for text in refused.value.problems]
+
+    return found
+
+
+TURN = 2 * math.pi
+
+
+@pytest.mark.parametrize(
+    ("scaling", "position", "velocity", "torque"),
+    [
+        (SCALING, TURN / 409600, TURN / 60 / 100, 0.5e-3 * 100),
+        (SCALING | {"feed_constant": 36000}, TURN / 36000, TURN / 60 / 100, 0.5e-3 * 100),
+        (SCALING | {"velocity_at": "output"}, TURN / 409600, TURN / 60, 0.5e-3 * 100),
+        (SCALING | {"velocity_unit": "urpm"}, TURN / 409600, 1e-6 * TURN / 60 / 100, 0.5e-3 * 100),
+        (SCALING | {"velocity_unit": "counts/s", "external_gear_ratio": -2}, *2 * (-TURN / 819200,), -1e-3 * 100),
+        ({"encoder_increments": 524288, "rated_current": 4, "torque_constant": 2}, *2 * (TURN / 524288,), 8e-3),
+    ],
+)  # fmt: skip
+def test_the_factors_follow_from_what_the_drive_counts_in(written, scaling, position, velocity, torque) -> None:
+    made = written(scaling=[scaling])
+    (_, at, speed, effort, _), (_, shown, moving, measured, _) = (pdo.channels for pdo in (made.rpdo[0], made.tpdo[0]))
+    assert [one.factor for one in (at, shown)] == [pytest.approx(position)] * 2
+    assert [one.factor for one in (speed, moving)] == [pytest.approx(velocity)] * 2
+    assert [one.factor for one in (effort, measured)] == [pytest.approx(torque)] * 2
+    assert made.wire_range("target_torque") == (
+        pytest.approx(min(-32768 * torque, 32767 * torque)), pytest.approx(max(-32768 * torque, 32767 * torque)),
+    )  # fmt: skip
+
+
+def test_a_factor_that_is_written_wins_also_where_it_is_1(written) -> None:
+    made = written(rpdo=pdos("rpdo", target_position=1.0, target_torque=0.25))
+    assert [entry.factor for entry in made.rpdo[0].channels][1:4:2] == [1.0, 0.25]
+    assert made.tpdo[0].channels[1].factor == pytest.approx(TURN / 409600)
+
+
+def test_each_axis_has_its_own_scaling_or_all_have_one(written) -> None:
+    both = {image: [*pdos(image), *pdos(image, 2)] for image in ("rpdo", "tpdo")}
+    made = written(**both, scaling=[SCALING, SCALING | {"gear_ratio": 50}])
+    assert made.axes == (1, 2)
+    ranges = [made.of_axis(axis).wire_range("target_position")[1] for axis in (1, 2)]
+    assert ranges[1] == pytest.approx(2 * ranges[0])
+    shared = written(**both)
+    assert shared.of_axis(1).wire_range("target_position") == shared.of_axis(2).wire_range("target_position")
+
+
+def test_a_drive_without_a_mode_in_its_pdos_is_set_to_csp_by_a_start_up_sdo(written, problems) -> None:
+    mode = ("modes_of_operation", "modes_of_operation_display")
+    without = {image: pdos(image, without=mode) for image in ("rpdo", "tpdo")}
+    assert written(**without, sdo=[CSP]).startup(0x6060) == 8
+    for sdo in ([], [CSP | {"value": 9}], [CSP | {"index": 0x6860}]):
+        assert problems(**without, sdo=sdo) == [
+            "rpdo: found no channel named modes_of_operation; without it the start-up SDO {index: 0x6060, "
+            "sub_index: 0, type: int8, value: 8} (CSP) must be in sdo"
+        ]
+    assert (
+        "tpdo: found no channel named modes_of_operation_display beside modes_of_operation in rpdo; "
+        in (problems(tpdo=pdos("tpdo", without=mode))[0])
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"scaling": [SCALING | {"external_gear_ratio": 0}]},
+         "scaling[0].external_gear_ratio: found 0, allowed is any number but 0"),
+        ({"scaling": [SCALING | {"rated_current": 4}]},
+         "scaling[0]: the key torque_constant is missing: rated_current and torque_constant belong together"),
+        ({"scaling": [{"encoder_increments": 4096}], "rpdo": pdos("rpdo", target_torque=1.0)},
+         "tpdo[0].channels[3]: the key factor is missing; without it scaling needs rated_torque, or rated_current and "
+         "torque_constant"),
+        ({"scaling": [SCALING, SCALING]},
+         "scaling: found a list of 2, allowed is one for all axes, or one for each of 1"),
+        ({"rpdo": [*pdos("rpdo"), *pdos("rpdo", 3)], "tpdo": [*pdos("tpdo"), *pdos("tpdo", 3)]},
+         "found channels of axis 1 and 3; axes are counted from 1, without a gap"),
+        ({"rpdo": [*pdos("rpdo"), *pdos("rpdo", 2, ("target_position",))], "tpdo": [*pdos("tpdo"), *pdos("tpdo", 2)]},
+         "rpdo: kind cia402 needs a channel named target_position of axis 2; its channels are controlword, "
+         "target_velocity, target_torque, modes_of_operation"),
+        ({"rpdo": [*pdos("rpdo"), *pdos("rpdo", 2)]},
+         "tpdo: found no channels of axis 2; an axis needs some in both directions"),
+    ],
+)  # fmt: skip
+def test_each_mistake_of_scaling_and_axes_is_named(problems, changes, sentence) -> None:
+    assert sentence in problems(**changes)
+
+
+def arm_with(tmp_path: Path, joint: dict[str, Any], **changes: Any):
+    """The shipped arm whose joints hang on three two-axis drives."""
+    arm = yaml.safe_load(default_config().read_text())
+    io = arm["slaves"][0]
+    (tmp_path / "devices").mkdir(exist_ok=True)
+    (tmp_path / "devices" / "diewu-io.yaml").write_text(
+        (default_config().parent / "devices" / "diewu-io.yaml").read_text()
+    )
+    both = {image: [*pdos(image), *pdos(image, 2)] for image in ("rpdo", "tpdo")}
+    quick = [{"index": 0x6085 + shift, "sub_index": 0, "type": "uint32", "value": 9549} for shift in (0, 0x800)]
+    more = {"watchdog_ms": 20, "sdo": quick, **changes}
+    (tmp_path / "devices" / "two-axes.yaml").write_text(yaml.safe_dump(device(**both, **more)))
+    arm["slaves"] = [io, *({"name": f"drive{i}", "device": "two-axes"} for i in (1, 2, 3))]
+    for i, entry in enumerate(arm["joints"]):
+        entry |= {"slave": f"drive{i // 2 + 1}", "axis": i % 2 + 1}
+    arm["joints"][1] |= joint
+    file = tmp_path / "arm.yaml"
+    file.write_text(yaml.safe_dump(arm))
+    return load(file)
+
+
+def test_three_drives_of_two_axes_move_six_joints(tmp_path: Path) -> None:
+    config = arm_with(tmp_path, {})
+    assert [joint.place for joint in config.joints[:3]] == ["drive1", "drive1, axis 2", "drive2"]
+    # 9549 rpm/s at the motor, 100 to 1 at the joint
+    assert bounds(config, StopReaction.QUICK_STOP)[1].time_s < 0.6
+
+
+@pytest.mark.parametrize(
+    ("joint", "sentence"),
+    [
+        ({"axis": 1}, 'joints[1].slave: found the text "drive1", the slave of joints[0].slave; each needs its own'),
+        ({"axis": 3}, "joints[1].axis: found 3, allowed is 1 or 2, the axes of two-axes"),
+        ({"torque": 2000.0},
+         "joints[1].torque: found +-2000, allowed is -1638.4 to 1638.35: target_torque of a drive is int16 with "
+         "factor 0.05"),
+    ],
+)  # fmt: skip
+def test_a_joint_that_names_a_wrong_axis_or_what_the_drive_cannot_express_is_refused(tmp_path, joint, sentence) -> None:
+    with pytest.raises(ConfigError) as refused:
+        arm_with(tmp_path, joint)
+    assert [problem.split(": ", 1)[1] for problem in refused.value.problems] == [sentence]
