@@ -17,6 +17,7 @@ from rtcp.cli import (
     bus,
     cell,
     demo,
+    device,
     doctor,
     experiment,
     faults,
@@ -72,7 +73,7 @@ def _root(
 
 
 _GROUPS = (
-    platform, status, cell, motion, process, jog, arm, bus, segment, irc5, demo, service, doctor, soak, faults, record,
+    platform, status, cell, motion, process, jog, arm, bus, device, segment, irc5, demo, service, doctor, soak, faults, record,
     recorded, live, experiment, panel, ros, shape_set,
 )  # fmt: skip
 for _group in _GROUPS:

@@ -58,8 +58,7 @@ def _list(
 
 
 def _facts(device: Device) -> dict[str, Any]:
-    from rtcp.config.device_file import kind_of
-    from rtcp.esi.dictionary import assigned
+    from rtcp.config.device_file import assigned, kind_of
 
     mailbox = device.mailbox
     protocols = () if mailbox is None else ("coe", "foe", "eoe", "aoe", "soe", "voe")
@@ -92,7 +91,9 @@ def _new(
     """Write a device's file that a person reads: process data with types and units, start-up SDOs, clocks, watchdog."""
     from rtcp.config.device_file import file_text
     from rtcp.config.loader import load_device
+    from rtcp.esi.model import EsiError
     from rtcp.esi.modules import assemble
+    from rtcp.esi.reader import find_device
 
     sources = [name for name, value in (("--esi", esi), ("--sii", sii), ("--from-bus", from_bus)) if value is not None]
     if len(sources) != 1:
@@ -102,7 +103,7 @@ def _new(
     chosen = _slots(module or ())
     if esi is not None:
         content = _read(esi)
-        found = content.device(_number("--product", product), _number("--revision", revision))
+        found = find_device(content, product=_number("--product", product), revision=_number("--revision", revision))
         made = assemble(found, content.modules, chosen) if found.slots or chosen else found
     elif chosen:
         raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
@@ -147,7 +148,10 @@ def _check(
     for slave in same:
         found = _differences(described, slave)
         differences += len(found)
-        emit(f"slave {slave['position']} ({slave['name']}): " + ("as the file says" if not found else "\n  ".join(["", *found]).strip("\n")))
+        emit(
+            f"slave {slave['position']} ({slave['name']}): "
+            + ("as the file says" if not found else "\n  ".join(["", *found]).strip("\n"))
+        )
     if differences:
         raise CommandError(f"{differences} differences", ExitCode.FAULT)
 
@@ -156,15 +160,21 @@ def _differences(described: DeviceDescription, slave: Mapping[str, Any]) -> list
     """Return a sentence for each thing in which a slave that answered a scan differs from a device's file."""
     differences = []
     if described.coe is not bool(slave["has_coe"]):
-        differences.append(f"coe: the file says {str(described.coe).lower()}, the slave has {'CoE' if slave['has_coe'] else 'none'}")
+        differences.append(
+            f"coe: the file says {str(described.coe).lower()}, the slave has {'CoE' if slave['has_coe'] else 'none'}"
+        )
     if described.assign_activate and not slave["dc"]:
-        differences.append(f"assign_activate: the file says 0x{described.assign_activate:04X}, the slave has no distributed clock")
+        differences.append(
+            f"assign_activate: the file says 0x{described.assign_activate:04X}, the slave has no distributed clock"
+        )
     for (key, pdos), direction in zip(_images(described), ("outputs", "inputs"), strict=True):
         file_entries = [(e.index, e.sub_index if e.index else 0, e.length) for pdo in pdos for e in pdo.channels]
         bus_entries = [(e["index"], e["sub_index"], e["bits"]) for pdo in slave[direction] for e in pdo["entries"]]
         if described.coe and file_entries != bus_entries:
             said = "will be written" if described.configurable_pdos else "cannot be written"
-            differences.append(f"{key}: the file has {_entries(file_entries)}; the slave has {_entries(bus_entries)}; the mapping {said}")
+            differences.append(
+                f"{key}: the file has {_entries(file_entries)}; the slave has {_entries(bus_entries)}; the mapping {said}"
+            )
     return differences
 
 

@@ -6,16 +6,23 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from rtcp.config.model import BITS
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.esi import units
-from rtcp.esi.dictionary import assigned, complete
+from rtcp.esi.dictionary import complete
 from rtcp.esi.model import Device, DcMode, ObjectEntry, Pdo, PdoEntry, SyncManagerType
 from rtcp.esi.types import Kind, decode, resolve
 
 _DRIVE_PROFILE = 402
-_AXES = range(0x6000, 0x6000 + 8 * OBJECTS_PER_AXIS)
+_MOST_AXES, _WORD = 8, 16
+_AXES = range(0x6000, 0x6000 + _MOST_AXES * OBJECTS_PER_AXIS)
+_MAPPED_OBJECTS = {
+    True: (0x6040, 0x607A, 0x60FF, 0x6071, 0x6060),
+    False: (0x6041, 0x6064, 0x606C, 0x6077, 0x6061),
+}
+"""Objects of a drive that are mapped where they can be, by whether they are outputs."""
 _DRIVE_CHANNELS = {
     (0x6040, 0): "controlword",
     (0x6041, 0): "statusword",
@@ -33,15 +40,14 @@ _DRIVE_CHANNELS = {
     (0x60FF, 0): "target_velocity",
 }
 """Channel names of a drive's objects (IEC 61800-7-201), those of the first axis."""
-_NEEDED = {
-    "rpdo": ("controlword", "target_position"),
-    "tpdo": ("statusword", "position"),
-}
-"""Channels that a drive cannot do without."""
+_NEEDED = {True: (0x6040, 0x607A), False: (0x6041, 0x6064)}
+"""Objects that the driver of a drive cannot do without, by whether they are outputs."""
 _MODE_OBJECT, _CSP = 0x6060, 8
 _DRIVE_WATCHDOG_MS, _WATCHDOG_MS = 20, 100
-_MODULE_BITS = 16
-"""Shortest analog value, bits."""
+_ANALOG_BITS = 16
+"""Shortest analog value."""
+_COUNTER = re.compile(r"counter|encoder", re.IGNORECASE)
+_CHANNEL = re.compile(r"(?:channel|ch\.?)\s*(\d+)", re.IGNORECASE)
 _WIDTH = 118
 
 
@@ -52,24 +58,70 @@ def file_text(device: Device, kind: str | None = None) -> str:
         device: its description, with its modules in place.
         kind: the driver; None: the one that fits its process data.
     """
-    return "\n".join(_lines(complete(device), kind or kind_of(device))) + "\n"
+    made = complete(for_drive(device))
+    return "\n".join(_lines(made, kind or kind_of(made))) + "\n"
 
 
 def kind_of(device: Device) -> str:
-    """Return the driver that fits a device by its profile and its default process data."""
+    """Return the driver that fits a device by its default process data."""
     rx, tx = (entries_of(assigned(device, outputs)) for outputs in (True, False))
     if not rx and not tx:
         return "coupler"
-    if any(entry.index in _AXES and (entry.index - 0x6000) % OBJECTS_PER_AXIS == 0x40 for entry in rx) or (
-        device.profile == _DRIVE_PROFILE
-    ):
+    if _axes(device):
         return "cia402"
-    if any(re.search(r"\b(counter|encoder|position) value\b|\bcounter\b", entry.name, re.IGNORECASE) for entry in tx):
+    if any(_COUNTER.search(entry.name) for entry in tx):
         return "encoder"
-    values = [entry for entry in (*rx, *tx) if entry.bits >= _MODULE_BITS]
+    values = [entry for entry in (*rx, *tx) if entry.bits >= _ANALOG_BITS]
     if values and all(resolve(entry.type, entry.bits).kind in (Kind.SIGNED, Kind.REAL) for entry in values):
         return "analog"
     return "generic"
+
+
+def for_drive(device: Device) -> Device:
+    """Return a drive with PDOs assigned that its driver can work with, where the default assignment lacks an object.
+
+    Other PDOs of the description are taken where some have the objects, else one PDO is mapped of the objects that may
+    be mapped. A device that has neither is returned as it is.
+    """
+    if _axes(device) or not _is_drive(device):
+        return device
+    rx, tx = (_chosen(device, device.rx_pdos if outputs else device.tx_pdos, outputs) for outputs in (True, False))
+    return device if rx is None or tx is None else replace(device, rx_pdos=rx, tx_pdos=tx)
+
+
+def _is_drive(device: Device) -> bool:
+    mapped = {entry.index for entry in entries_of((*device.rx_pdos, *device.tx_pdos))}
+    return device.profile == _DRIVE_PROFILE or {0x6040, 0x6041} <= mapped
+
+
+def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, ...] | None:
+    """Return `pdos` with one assigned that holds what a drive needs; None: there is none, and none can be made."""
+    needed = {*_NEEDED[outputs]}
+    if needed <= {entry.index for entry in entries_of(assigned(device, outputs))}:
+        return pdos
+    manager = _usual_sync_manager(device, outputs)
+    if fitting := [pdo for pdo in pdos if needed <= {entry.index for entry in pdo.entries} and not pdo.virtual]:
+        best = min(fitting, key=lambda pdo: (pdo.bits, pdo.index))
+        return tuple(replace(pdo, sync_manager=manager if pdo is best else None) for pdo in pdos)
+    coe = None if device.mailbox is None else device.mailbox.coe
+    if coe is None or not coe.pdo_configuration:
+        return None
+    entries = []
+    for index in _MAPPED_OBJECTS[outputs]:
+        entry = _object(device, index, 0)
+        if entry is not None and (entry.rx_mappable if outputs else entry.tx_mappable):
+            entries.append(PdoEntry(index, 0, entry.bits, entry.name, entry.type))
+    free = next((pdo for pdo in pdos if not pdo.fixed), Pdo(0x1600 if outputs else 0x1A00, "", ()))
+    if not needed <= {entry.index for entry in entries}:
+        return None
+    made = replace(free, entries=tuple(entries), sync_manager=manager)
+    return (made, *(replace(pdo, sync_manager=None) for pdo in pdos if pdo is not free))
+
+
+def assigned(device: Device, outputs: bool) -> tuple[Pdo, ...]:
+    """Return the PDOs of a direction that are assigned by default, in the order of the process image."""
+    pdos = [pdo for pdo in (device.rx_pdos if outputs else device.tx_pdos) if pdo.sync_manager is not None]
+    return tuple(sorted((pdo for pdo in pdos if not pdo.virtual), key=lambda pdo: pdo.sync_manager or 0))
 
 
 def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:
@@ -82,18 +134,25 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
     yield from _comment(
         f"{device.name}{f' ({device.type})' if device.type else ''}"
         + (f", {device.vendor_name}" if device.vendor_name else "")
-        + f": revision 0x{identity.revision:08X}, by {device.source.value}, {device.origin}."
+        + f": revision 0x{identity.revision:08X}, by {device.source.value}, {_file_name(device.origin)}."
     )
     yield from _comment("Made by `rtcp device new`. Lines marked CHECK need a person.")
     yield ""
     yield f"name: {_quoted(device.name or f'0x{identity.product_code:08X}')}"
-    yield f"kind: {kind}"
+    needed = ", ".join(f"0x{index:04X}" for outputs in (True, False) for index in _NEEDED[outputs])
+    yield f"kind: {kind}" + (
+        f"     # CHECK: a drive whose PDOs lack one of {needed}: it can move no joint"
+        if kind != "cia402" and _is_drive(device)
+        else ""
+    )
     yield f"vendor_id: 0x{identity.vendor_id:08X}"
     yield f"product_id: 0x{identity.product_code:08X}"
     yield ""
     yield from _clock_lines(device, kind)
     watchdog = _DRIVE_WATCHDOG_MS if kind == "cia402" else _WATCHDOG_MS
-    note = "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
+    note = (
+        "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
+    )
     yield f"watchdog_ms: {watchdog}             # ms; {note}"
     coe = None if device.mailbox is None else device.mailbox.coe
     if coe is None:
@@ -119,7 +178,9 @@ def _clock_lines(device: Device, kind: str) -> Iterator[str]:
     if kind == "cia402":
         chosen = next((mode for mode in modes if mode.assign_activate & 0x0100), chosen)
     word = 0 if chosen is None else chosen.assign_activate
-    yield f"assign_activate: 0x{word:04X}     # " + ("it has no distributed clock" if chosen is None else _mode_text(chosen))
+    yield f"assign_activate: 0x{word:04X}     # " + (
+        "it has no distributed clock" if chosen is None else _mode_text(chosen)
+    )
     if chosen is not None:
         if chosen.sync0_factor not in (0, 1):
             yield f"sync0_factor: {chosen.sync0_factor}"
@@ -164,11 +225,12 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
         written.append(
             f"  - {{index: 0x{command.index:04X}, sub_index: {command.sub_index}, "
             f"type: {'int' if signed else 'uint'}{8 * len(command.data)}, value: {value}"
-            + (f", name: {_quoted(name)}" if name else "") + "}"
+            + (f", name: {_quoted(name)}" if name else "")
+            + "}"
         )
     mapped = {entry.index for entry in entries_of(assigned(device, True))}
     listed = {command.index for command in device.init_commands}
-    for axis in _axes(device) if kind == "cia402" else ():
+    for axis in (_axes(device) or (1,)) if kind == "cia402" else ():
         index = _MODE_OBJECT + (axis - 1) * OBJECTS_PER_AXIS
         if index not in mapped and index not in listed:
             written.append(
@@ -185,25 +247,12 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
 def _scaling_lines(device: Device) -> Iterator[str]:
     yield "# CHECK: what the drive counts in; compared with the drive's own objects at the start (docs/devices.md)."
     yield "scaling:"
-    for axis in _axes(device):
+    for axis in _axes(device) or (1,):
         base = (axis - 1) * OBJECTS_PER_AXIS
 
-        def default(index: int, sub: int, base: int = base) -> float | None:
-            entry = _object(device, index + base, sub)
-            if entry is None or entry.default is None:
-                return None
-            value = decode(resolve(entry.type, entry.bits), entry.default)
-            return float(value) if isinstance(value, int | float) and value else None
-
-        def ratio(index: int, fallback: float, default: object = default) -> tuple[float, str]:
-            above, below = _default(device, index + base, 1), _default(device, index + base, 2)
-            if not above:
-                return fallback, f"0x{index + base:04X} has no default: read it from the drive or its manual"
-            return above / (below or 1.0), f"0x{index + base:04X}, default"
-
-        increments, where = ratio(0x608F, 65536)
+        increments, where = _ratio(device, 0x608F + base, 65536)
         yield f"  - encoder_increments: {increments:.10g}     # per motor revolution; {where}"
-        gear, where = ratio(0x6091, 1)
+        gear, where = _ratio(device, 0x6091 + base, 1)
         yield f"    gear_ratio: {gear:.10g}     # motor revolutions per revolution of the output; {where}"
         rated = _default(device, 0x6076 + base, 0)
         if rated:
@@ -211,6 +260,14 @@ def _scaling_lines(device: Device) -> Iterator[str]:
         else:
             yield f"    rated_torque: 1.0     # Nm, 0x{0x6076 + base:04X}, has no default: read it from the drive"
     yield ""
+
+
+def _ratio(device: Device, index: int, otherwise: float) -> tuple[float, str]:
+    """Return the default of a ratio, subindex 1 by 2, and where it is from; `otherwise` where there is none."""
+    above, below = _default(device, index, 1), _default(device, index, 2)
+    if not above:
+        return otherwise, f"0x{index:04X} has no default: read it from the drive or its manual"
+    return above / (below or 1.0), f"0x{index:04X}, default"
 
 
 def _default(device: Device, index: int, sub: int) -> float | None:
@@ -222,12 +279,19 @@ def _default(device: Device, index: int, sub: int) -> float | None:
 
 
 def _axes(device: Device) -> tuple[int, ...]:
-    found = {
-        (entry.index - 0x6000) // OBJECTS_PER_AXIS + 1
-        for entry in entries_of((*assigned(device, True), *assigned(device, False)))
-        if entry.index in _AXES and (entry.index - 0x6000) % OBJECTS_PER_AXIS in (0x40, 0x41)
+    """Return the axes of a drive for which all that its driver needs is assigned."""
+    there = {
+        (entry.index, outputs)
+        for outputs in (True, False)
+        for entry in entries_of(assigned(device, outputs))
+        if entry.bits >= _WORD and not entry.sub_index
     }
-    return tuple(sorted(found)) or (1,)
+    bases = range(0, _MOST_AXES * OBJECTS_PER_AXIS, OBJECTS_PER_AXIS)
+    return tuple(
+        n
+        for n, base in enumerate(bases, 1)
+        if all((index + base, outputs) in there for outputs in (True, False) for index in _NEEDED[outputs])
+    )
 
 
 def _pdo_lines(
@@ -241,7 +305,7 @@ def _pdo_lines(
         return
     usual = _usual_sync_manager(device, outputs)
     yield f"{key}:"
-    channels: set[str] = set()
+    repeated = Counter(name for pdo in filled for name in {entry.name for entry in pdo.entries})
     for pdo in filled:
         marks = [word for word, holds in (("fixed", pdo.fixed), ("mandatory", pdo.mandatory)) if holds]
         if pdo.excludes:
@@ -255,11 +319,8 @@ def _pdo_lines(
             yield f"    axis: {axis}"
         yield "    channels:"
         for entry in pdo.entries:
-            yield from _channel_lines(device, kind, entry, axis, names, key)
-            if entry.index:
-                channels.add(_DRIVE_CHANNELS.get((entry.index - (axis - 1) * OBJECTS_PER_AXIS, entry.sub_index), ""))
-    if kind == "cia402" and (missing := [name for name in _NEEDED[key] if name not in channels]):
-        yield f"  # CHECK: the default assignment has no {', '.join(missing)}, which the kind cia402 needs: assign another PDO"
+            where = f"{prefix_of(pdo)} " if repeated[entry.name] > 1 else ""
+            yield from _channel_lines(device, kind, replace(entry, name=where + entry.name), axis, names, key)
     yield ""
 
 
@@ -275,9 +336,11 @@ def _channel_lines(
     name = known or _unique(_identifier(entry), names, f"{key}.{axis}")
     if known:
         names[f"{key}.{axis}.{known}"] += 1
-    keys = f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {_type_keys(entry.type, entry.bits)}, name: {name}"
+    keys = (
+        f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {_type_keys(entry.type, entry.bits)}, name: {name}"
+    )
     described = _object(device, entry.index, entry.sub_index)
-    unit = None if described is None or described.unit is None or known else units.unit_of(described.unit)
+    unit = None if described is None or described.unit is None or known else units.unit(described.unit)
     if unit is not None and unit.si:
         keys += f", factor: {unit.factor:.10g}, unit: {_quoted(unit.si)}"
     said = [_clean(entry.name), entry.type if entry.type.upper() not in ("", "BOOL") else ""]
@@ -286,13 +349,17 @@ def _channel_lines(
     yield f"      - {{{keys}}}   # {', '.join(text for text in said if text)}".rstrip(" #")
 
 
+def prefix_of(pdo: Pdo) -> str:
+    """Return what tells a PDO's channels from those of another: `channel 2`, else its name."""
+    channel = _CHANNEL.search(pdo.name)
+    return f"channel {channel[1]}" if channel else pdo.name or f"x{pdo.index:04x}"
+
+
 def _range_text(entry: ObjectEntry) -> list[str]:
     if entry.minimum is None and entry.maximum is None:
         return []
     data_type = resolve(entry.type, entry.bits)
-    low, high = (
-        "" if end is None else f"{decode(data_type, end)}" for end in (entry.minimum, entry.maximum)
-    )
+    low, high = ("" if end is None else f"{decode(data_type, end)}" for end in (entry.minimum, entry.maximum))
     return [f"{low} to {high}" if low and high else f"at least {low}" if low else f"at most {high}"]
 
 
@@ -320,9 +387,7 @@ def _object(device: Device, index: int, sub: int) -> ObjectEntry | None:
 
 
 def _axis_of(pdo: Pdo) -> int:
-    found = Counter(
-        (entry.index - 0x6000) // OBJECTS_PER_AXIS + 1 for entry in pdo.entries if entry.index in _AXES
-    )
+    found = Counter((entry.index - 0x6000) // OBJECTS_PER_AXIS + 1 for entry in pdo.entries if entry.index in _AXES)
     return found.most_common(1)[0][0] if found else 1
 
 
@@ -353,6 +418,10 @@ def _quoted(text: str) -> str:
     """Return a YAML scalar."""
     clean = _clean(text)[:64]
     return clean if re.fullmatch(r"[A-Za-z][A-Za-z0-9 ._/()+-]*[A-Za-z0-9.)]|[A-Za-z]", clean) else f'"{clean}"'
+
+
+def _file_name(origin: str) -> str:
+    return origin.rpartition("/")[2]
 
 
 def _clean(text: str) -> str:
