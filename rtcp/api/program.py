@@ -23,7 +23,12 @@ _MOST_PLANNED: Final = 10_000
 _SAME_RAD: Final = 1e-3
 _WAIT_S: Final = 0.1
 """Between two looks at what ends a program while a step waits for a time."""
-_HALTED: Final = "halted_at_rest"
+_ENDS: Final = frozenset({
+    "halted_at_rest", "disabled", "torque_removed", "stopped_by_limit", "limit_stop_reset", "reset_done",
+    "control_mode_changed",
+})  # fmt: skip
+"""Events that end a program, beside faults and emergency stops: whoever enables the arm again expects no motion."""
+_FAULTS: Final = ("fault", "emergency_stop")
 _THERE: Final = "AlreadyThere"
 """Reason of a motion that is refused because the arm is where it leads."""
 Where = tuple[str | int, ...]
@@ -71,6 +76,17 @@ class PlannedMotion:
     plan: Preview
 
 
+@dataclass
+class _Expected:
+    """Where a program has left the arm."""
+
+    here: Sequence[float]
+    """Commanded joint positions, rad."""
+    tool: str
+    event: int
+    """Number of the newest event that was seen."""
+
+
 class Program:
     """A program of a motion file (`docs/motion.md`).
 
@@ -116,6 +132,7 @@ class Program:
             Refused: a motion cannot be carried out; the sentence begins with the line of its first step.
         """
         self._check_tool(robot, start)
+        self._check_terminals(robot, start, end)
         places = self._places(robot)
         q: Sequence[float] = robot.status().commanded_positions
         with_tool: dict[str, Any] = {}
@@ -165,29 +182,28 @@ class Program:
             RtcpError: what ended it.
         """
         status = robot.status()
-        here, tool = status.commanded_positions, status.tool
-        since = max((event.number for event in robot.events()), default=0)
+        newest = max((event.number for event in robot.events()), default=0)
+        expected = _Expected(status.commanded_positions, status.tool, newest)
         if check:
             self.check(robot, start, end)
         else:
             self._check_tool(robot, start)
+            self._check_terminals(robot, start, end)
         for one in self._units(self._places(robot), None, start, end):
             between()
             line = self.line_of(one.where)
-            self._check_undisturbed(robot, line, here, tool, since)
+            self._check_undisturbed(robot, line, expected)
             if isinstance(one, Motion):
                 text = f"{len(one.stops)} motions in one" if len(one.stops) > 1 else "motion"
                 say(Begun(one.number, line, text))
                 _carry_out(robot, one.stops, self._motion.speed)
-                here = robot.status().commanded_positions
+                expected.here = robot.status().commanded_positions
             else:
                 say(Begun(one.number, line, _described(one.step)))
                 if one.step.wait_s is not None:
-                    self._wait(
-                        one.step.wait_s, between, partial(self._check_undisturbed, robot, line, here, tool, since)
-                    )
+                    self._wait(one.step.wait_s, between, partial(self._check_undisturbed, robot, line, expected))
                 _act(robot, one.step)
-                tool = one.step.tool or tool
+                expected.tool = one.step.tool or expected.tool
 
     def step_back(self, robot: Robot, number: int) -> None:
         """Move back to where step `number`, from 0, began: over a line or an arc on it, else by the joints.
@@ -197,6 +213,9 @@ class Program:
         Raises:
             Refused: reason `no_way_back`: no motion stands before it, or it is, or follows, an arc with an angle.
         """
+        if not 0 <= number < len(self.steps):
+            found = f"{self.file}: found step {number + 1}, allowed is 1 to {len(self.steps)}"
+            raise RtcpError("invalid", found, "no_such_step")
         step, line = self._motion.program[number], self.line_of(("program", number))
         if step.run is None and _target(step) is None:
             return
@@ -233,6 +252,29 @@ class Program:
             text = f"the program uses the tool {chosen[-1]} there, in use is {in_use}: choose it first"
             raise RtcpError("refused", f"{self.file}:{self.line_of(('program', number))}: {text}", "another_tool")
 
+    def _check_terminals(self, robot: Robot, start: int, end: int | None) -> None:
+        """Raise where a step names an input or output that does not exist, or an output that has a function."""
+        steps = [(where, step) for _, where, step in self._steps(start, end, 1) if step is not None]
+        if not any(step.output is not None or step.wait_for is not None for _, step in steps):
+            return
+        terminals = robot.read_io()
+        inputs, outputs = terminals.inputs, terminals.outputs
+        # The names, then the places that name each terminal too.
+        settable = dict.fromkeys(
+            name for name in (*outputs, *outputs.places.values()) if not outputs.has_function(name)
+        )
+        readable = dict.fromkeys((*inputs, *outputs, *inputs.places.values(), *outputs.places.values()))
+        for where, step in steps:
+            if step.output is not None:
+                name, key, allowed = step.output, "output", settable
+            elif step.wait_for is not None:
+                name, key, allowed = step.wait_for, "wait_for", readable
+            else:
+                continue
+            if name not in allowed:
+                text = f'{key}: found the text "{name}", allowed is one of {", ".join(allowed) or "none"}'
+                raise RtcpError("refused", f"{self.file}:{self.line_of(where)}: {text}", "unknown_terminal")
+
     @staticmethod
     def _wait(seconds: float, between: Callable[[], None], check: Callable[[], None]) -> None:
         """Wait, and end by what disturbs the program meanwhile."""
@@ -242,18 +284,28 @@ class Program:
             between()
             check()
 
-    def _check_undisturbed(self, robot: Robot, line: int, here: Sequence[float], tool: str, since: int) -> None:
-        """Raise where the arm was halted, moved or given another tool by somebody else since the last step."""
+    def _check_undisturbed(self, robot: Robot, line: int, expected: _Expected) -> None:
+        """Raise where the arm was stopped, moved or given another tool by somebody else since the last step."""
         status = robot.status()
         now = status.commanded_positions
-        if status.tool != tool:
+        if status.tool != expected.tool:
             text = f"{self.file}:{line}: somebody else has chosen the tool {status.tool} meanwhile: the program ends"
             raise RtcpError("refused", text, "another_tool")
-        if max((abs(a - b) for a, b in zip(now, here, strict=True)), default=0.0) > _SAME_RAD:
+        if max((abs(a - b) for a, b in zip(now, expected.here, strict=True)), default=0.0) > _SAME_RAD:
             text = f"{self.file}:{line}: the arm was moved by somebody else meanwhile: the program ends"
             raise RtcpError("refused", text, "moved_meanwhile")
-        if any(event.name == _HALTED for event in robot.events(since)):
-            raise RtcpError("refused", f"{self.file}:{line}: the arm was halted: the program ends", "halted")
+        events = robot.events(expected.event)
+        for event in events:
+            if event.name in _ENDS or event.severity in _FAULTS:
+                text = f"{self.file}:{line}: meanwhile: {event.message}; the program ends"
+                raise RtcpError("refused", text, "halted" if event.name == "halted_at_rest" else "interrupted")
+        if events:
+            if events[0].number > expected.event + 1:
+                text = (
+                    f"{self.file}:{line}: more events than are kept came meanwhile, a stop may be one: the program ends"
+                )
+                raise RtcpError("refused", text, "interrupted")
+            expected.event = events[-1].number
 
     def _places(self, robot: Robot) -> dict[str, list[float]]:
         """Return x, y, z of the poses through which arcs lead."""

@@ -198,6 +198,7 @@ class Levels(Mapping[str, bool]):
     def __init__(self, terminals: Sequence[Mapping[str, Any]]) -> None:
         self._levels = {one["name"]: bool(one["value"]) for one in terminals}
         self._names = {f"{one['box']}.{one['number']}": one["name"] for one in terminals}
+        self._functions = {one["name"] for one in terminals if one["has_function"]}
 
     def __getitem__(self, name: str) -> bool:
         if name not in self._levels and name not in self._names:
@@ -209,6 +210,10 @@ class Levels(Mapping[str, bool]):
 
     def __len__(self) -> int:
         return len(self._levels)
+
+    def has_function(self, name: str) -> bool:
+        """Whether the platform reads or writes a terminal itself: such an output cannot be set."""
+        return self._names.get(name, name) in self._functions
 
     @property
     def places(self) -> dict[str, str]:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 PIPED_WIDTH = 80
 """Columns of a table that goes to a file or a pipe."""
 ABSENT = "-"
+_CONTROLS = {code: "?" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\r\t"}
+"""What a name in a file could do to a terminal."""
 
 
 def emit(text: str) -> None:
@@ -52,7 +54,7 @@ def report(text: str) -> None:
 def complain(text: str) -> None:
     """Print an error on standard error, `rtcp: ` before each line."""
     try:
-        for line in text.splitlines() or [""]:
+        for line in text.translate(_CONTROLS).splitlines() or [""]:
             print(f"rtcp: {line}", file=sys.stderr, flush=True)
     except OSError:
         pass  # standard error is closed; the exit code still tells

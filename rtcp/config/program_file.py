@@ -6,10 +6,11 @@ What a person wrote into the file, comments and layout, stays.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import io
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -176,11 +177,23 @@ class ProgramFile:
     def _write(self, text: str) -> None:
         """Replace the file as a whole, or not at all."""
         motion = self._checked(text)
-        temporary = None
-        # A link stays one: the file that it leads to is replaced.
-        path = self.path.resolve()
         try:
+            # A link stays one: the file that it leads to is replaced.
+            path = self.path.resolve()
             path.parent.mkdir(parents=True, exist_ok=True)
+            with _locked(path.parent):
+                # Looked at again, alone: another process may have written since the change began.
+                self._check_unchanged()
+                self._replace_by(path, text)
+        except (OSError, RuntimeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise ConfigError([f"{self.path}: the file cannot be written: {reason}"]) from error
+        self.motion, self._text = motion, text
+
+    @staticmethod
+    def _replace_by(path: Path, text: str) -> None:
+        temporary = None
+        try:
             mode = path.stat().st_mode & 0o777 if path.exists() else 0o644
             handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
             with os.fdopen(handle, "w", encoding="utf-8") as file:
@@ -189,12 +202,22 @@ class ProgramFile:
                 os.fsync(file.fileno())
             Path(temporary).chmod(mode)
             os.replace(temporary, path)
-        except OSError as error:
+        except OSError:
             if temporary is not None:
                 with contextlib.suppress(OSError):
                     os.unlink(temporary)
-            raise ConfigError([f"{self.path}: the file cannot be written: {error.strerror}"]) from error
-        self.motion, self._text = motion, text
+            raise
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes that teach in this folder waiting."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _yaml() -> YAML:

@@ -683,6 +683,10 @@ def _named_pose(pose: NamedPose) -> Iterator[Finding]:
         yield (), f"found {'neither' if pose.pose is None else 'both'} of pose and q; one of them is needed"
 
 
+MOST_PLANNED_STEPS = 10_000
+"""Steps of a program, those of its parts with them."""
+_MOST_DEPTH = 50
+"""Parts in parts."""
 _VERBS = ("move", "line", "arc", "gripper", "output", "wait_for", "wait_s", "tool", "run")
 _OF_VERBS = {
     "via": ("arc",),
@@ -732,22 +736,53 @@ def _program(motion: MotionFile) -> Iterator[Finding]:
                 if step.via in places:
                     text = f'found "{step.via}", which has q; with several tools allowed is one with pose'
                     yield (*where, at, "via"), text
+    calls = {part.name: {step.run for step in part.steps if step.run is not None} for part in motion.parts}
+    circles = [at for at, name in enumerate(parts) if name in _reached(calls, name)]
+    for at in circles:
+        yield ("parts", at, "steps"), f'the part "{parts[at]}" runs itself; parts may only run others'
+    if circles:
+        return
     by_name = {part.name: part.steps for part in motion.parts}
+    if (count := _planned_steps(motion.program, by_name)) > MOST_PLANNED_STEPS:
+        text = f"found {'endless' if count == math.inf else f'{count:g}'} steps with those of all parts, a part that"
+        yield ("program",), f"{text} repeats counted twice; allowed are {MOST_PLANNED_STEPS}"
+        return
     if any(step.tool is not None for _, steps in lists for step in steps):
         first = next(_tools_and_motions(motion.program, by_name, len(parts)), None)
         if first is not None and first.tool is None:
             text = "a step chooses a tool, found a motion before the first choice; allowed is a tool before all motions"
             yield ("program",), text
-    calls = {part.name: {step.run for step in part.steps if step.run is not None} for part in motion.parts}
-    for at, name in enumerate(parts):
-        reached, ahead = set[str](), set(calls[name])
-        while ahead:
-            one = ahead.pop()
-            if one not in reached:
-                reached.add(one)
-                ahead |= calls.get(one, set())
-        if name in reached:
-            yield ("parts", at, "steps"), f'the part "{name}" runs itself; parts may only run others'
+
+
+def _reached(calls: Mapping[str, set[str]], name: str) -> set[str]:
+    """Return the parts that a part runs, and those that they run."""
+    reached, ahead = set[str](), set(calls[name])
+    while ahead:
+        part = ahead.pop()
+        if part not in reached:
+            reached.add(part)
+            ahead |= calls.get(part, set())
+    return reached
+
+
+def _planned_steps(program: Sequence[Step], parts: Mapping[str, tuple[Step, ...]]) -> float:
+    """Return the number of steps that are planned: of a part that repeats twice; infinite: parts are too deep."""
+    counts: dict[str, float] = {}
+
+    def count(steps: Sequence[Step], depth: int) -> float:
+        if depth > _MOST_DEPTH:
+            return math.inf
+        total = 0.0
+        for step in steps:
+            if step.run is None:
+                total += 1
+                continue
+            if step.run not in counts:
+                counts[step.run] = count(parts.get(step.run, ()), depth + 1)
+            total += counts[step.run] * (1 if step.times == 1 else 2)
+        return total
+
+    return count(program, 0)
 
 
 def _tools_and_motions(steps: Sequence[Step], parts: Mapping[str, tuple[Step, ...]], depth: int) -> Iterator[Step]:

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import inspect
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass, field, make_dataclass
 from enum import IntEnum
 from math import inf
@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
 
 from annotated_types import Ge, Gt, Le
 
+import rtcp.config.rules  # noqa: F401 its rules hold for stops and points too
 from rtcp.config.find import load_messages
 from rtcp.config.model import Point, RecordingConfig, RecordingFormat, Stop
 from rtcp.config.validation import Checker
@@ -49,6 +50,8 @@ HOLD_S = 0.25
 """Hold time of a command that gives none."""
 _RESTORE_S, _LOOK_S = 5.0, 0.05
 _STANDS_RAD = 2e-3
+_REPORT_S = 0.5
+"""Interval between progress reports of a plan that takes long."""
 _OWN_CONNECTION = -1
 _INTERNAL = (commands.Shutdown, commands.SetZero, commands.RunLines, commands.ExtendTrajectory)
 """Commands that no client sends by themselves."""
@@ -227,18 +230,21 @@ class Methods:
     @method(at_once=True)
     async def pause(self, caller: Caller) -> Json:
         """Bring the motion under way to rest on its path. Needs no lease."""
+        if self.channel.speed_override() > 0.0:
+            self._paused_by.clear()  # who paused a motion that has ended
         await self.channel.send(0, commands.Pause())
         self._paused_by.add(caller.connection)
         return {}
 
     @method(at_once=True)
     async def resume(self, caller: Caller) -> Json:
-        """Continue the motion that is paused: for who paused it, and for who commands it."""
+        """Continue the motion that is paused: for who commands it, and for who paused it once all who did resume."""
         lease = self.channel.lease_of(caller.connection)
         if not lease and caller.connection in self._paused_by:
-            lease = self.channel.lease_in_use()
+            self._paused_by.discard(caller.connection)
+            lease = 0 if self._paused_by else self.channel.lease_in_use()
         if not lease and self.channel.state is State.MOVING:
-            text = "not resumed: who paused the motion, or commands it, resumes it; `rtcp halt` ends it"
+            text = "not resumed: another who paused the motion, or who commands it, resumes it; `rtcp halt` ends it"
             raise RtcpError("refused", text, "paused_by_another")
         await self.channel.send(lease, commands.Resume())
         self._paused_by.clear()
@@ -456,12 +462,23 @@ class Methods:
             self._check_count("start", start, len(self._config.joints))
         number = None if tool is None else self.machine.tool_number(tool, "tool")
         if stops:
-            return await self._motion.preview(None, stops, (), speed, synchronized, start, number)
+            plan = self._motion.preview(None, stops, (), speed, synchronized, start, number)
+            return await self._with_progress(caller, plan)
         if file is not None:
-            return await self._motion.preview_file(file, approach, number)
+            return await self._with_progress(caller, self._motion.preview_file(file, approach, number))
         if pose is not None:
             return await self._motion.preview_pose(pose, speed, line, number)
         return await self._motion.preview(q, (), (), speed, synchronized, tool=number)
+
+    async def _with_progress(self, caller: Caller, work: Coroutine[Any, Any, Json]) -> Json:
+        """Carry out what takes long and moves nothing; its caller sees that the platform lives."""
+        task = asyncio.ensure_future(work)
+        try:
+            while not (await asyncio.wait({task}, timeout=_REPORT_S))[0]:
+                caller.report(self.channel.progress())
+            return task.result()
+        finally:
+            task.cancel()
 
     @method()
     async def guide(self, caller: Caller, duration_s: Annotated[float, Ge(0), Le(3600)] = 0.0) -> Json:
@@ -663,7 +680,7 @@ class Methods:
 
     @method(at_once=True)
     async def read_io(self, caller: Caller) -> Json:
-        """Return `inputs` and `outputs`: `name`, `box`, `number` and level `value` of all terminals of the IO boxes."""
+        """Return `inputs` and `outputs` of all IO boxes: `name`, `box`, `number`, level `value`, `has_function`."""
         return self._terminals.read()
 
     @method()

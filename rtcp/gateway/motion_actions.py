@@ -50,15 +50,15 @@ from rtcp.motion.joint_motion import LONGEST_S
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning import preview
 from rtcp.motion.planning.lines import plan_lines
-from rtcp.motion.planning.plan import COLUMNS, KIND, LINE, Plan, PlanRefused
+from rtcp.motion.planning.plan import COLUMNS, KIND, LINE, MOST_LINES, Plan, PlanRefused
 from rtcp.motion.planning.trajectories import OpenPlan, plan_trajectory
 
 T = TypeVar("T")
 _COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 _LARGEST = 100.0
 """m or rad of a pose: further away is no arm, and the remainder of larger angles would be noise of the number."""
-_SAME_RAD, _SAME_PLANNED_RAD = 1e-9, 1e-4
-"""Distance of the commanded end from the goal: of a move exact, of a plan as the loop's own sums have it."""
+_SAME_RAD, _SAME_PLANNED_RAD = 1e-6, 1e-4
+"""Distance of the commanded end from the goal: of a move below what a drive counts, of a plan as the loop sums up."""
 _SETTLED_RAD, _SETTLE_S = 5e-4, 3.0
 _TIMEOUT_S = 20.0
 LONGEST_OPEN_S = 86_400.0
@@ -155,6 +155,9 @@ class Planner:
         plain = all(stop.via is None and not stop.by_joints and not stop.blend for stop in stops)
         try:
             if plain:
+                if len(stops) > MOST_LINES:
+                    found = f"the path has {len(stops)} lines with a rest after each, allowed are {MOST_LINES}"
+                    raise PlanRefused(f"{found}; with blends it is one motion")
                 plan = plan_lines(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
             else:
                 from rtcp.motion.planning.path import plan_path  # here: scipy loads slowly, and few need it

@@ -26,6 +26,8 @@ class Terminal:
     number: int
     field: str
     """Of the cycle record; bit 0 is number 1."""
+    has_function: bool
+    """The platform reads or writes it itself."""
 
     @property
     def place(self) -> str:
@@ -50,19 +52,27 @@ class Terminals:
         self._all: dict[str, list[Terminal]] = {"inputs": [], "outputs": []}
         for which, terminals in self._all.items():
             names = {place: name for name, place in functions[which].items()}
+            free = {terminal.name for terminal in getattr(config, which).named}
             for box in config.boxes:
                 field = f"{identifier(box)}_{which}"
                 bits = int(schema[field].type.lstrip("uint")) if field in schema.names else 0
                 for number in range(1, bits + 1):
                     name = names.get((box, number), f"{box}.{number}")
-                    terminals.append(Terminal(name, box, number, field))
+                    has_function = (box, number) in names and name not in free
+                    terminals.append(Terminal(name, box, number, field, has_function))
 
     def read(self) -> Json:
-        """Return name, box, number and level of every terminal, by `inputs` and `outputs`."""
+        """Return each terminal's name, box, number, level and if it has a function, by `inputs` and `outputs`."""
         record = self._channel.record()
         return {
             which: [
-                {"name": one.name, "box": one.box, "number": one.number, "value": _is_set(int(record[one.field]), one)}
+                {
+                    "name": one.name,
+                    "box": one.box,
+                    "number": one.number,
+                    "value": _is_set(int(record[one.field]), one),
+                    "has_function": one.has_function,
+                }
                 for one in terminals
             ]
             for which, terminals in self._all.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import pytest
 
 from rtcp.api import Preview, RtcpError
 from rtcp.api.program import Begun, Program
+from rtcp.api.results import Levels, Terminals
 from rtcp.config.model import ConfigError
 
 TEXT = """
@@ -72,6 +74,17 @@ class NotingRobot:
         self.tool = "short"
         self.positions = (0.5,) * 6
         self.happened: list[Any] = []
+        levels = [
+            {"name": name, "box": "box", "number": number, "value": False, "has_function": name == "state_lamp"}
+            for number, name in enumerate(("lamp", "state_lamp"), 1)
+        ]
+        self.terminals = Terminals(Levels([{**levels[0], "name": "start"}]), Levels(levels))
+
+    def happens(self, number: int, name: str, severity: str = "note") -> None:
+        self.happened.append(SimpleNamespace(number=number, name=name, severity=severity, message="it happened"))
+
+    def read_io(self) -> Terminals:
+        return self.terminals
 
     def events(self, since: int = 0) -> list[Any]:
         return [event for event in self.happened if event.number > since]
@@ -260,28 +273,74 @@ def test_a_halt_ends_a_program_that_waits_for_a_time_at_once(program: Callable[.
 
     def halt() -> None:
         if "wait start True 2" in robot.done:
-            robot.happened.append(SimpleNamespace(number=4, name="halted_at_rest"))
+            robot.happens(1, "halted_at_rest")
 
-    with pytest.raises(RtcpError, match="the arm was halted"):
+    with pytest.raises(RtcpError, match="it happened; the program ends"):
         program(TEXT.replace("wait_s: 0.001", "wait_s: 60")).run(robot, between=halt)
 
 
-@pytest.mark.parametrize("what", ["halted", "moved_meanwhile"])
-def test_a_halt_and_a_motion_of_others_end_it_before_the_next_step(program: Callable[..., Program], what: str) -> None:
+def test_a_motion_of_others_ends_it_before_the_next_step(program: Callable[..., Program]) -> None:
     robot: Any = NotingRobot()
-    robot.happened.append(SimpleNamespace(number=3, name="halted_at_rest"))
 
     def disturb(begun: Begun) -> None:
         if "lamp" in begun.text:
-            if what == "halted":
-                robot.happened.append(SimpleNamespace(number=4, name="halted_at_rest"))
-            else:
-                robot.positions = (0.6,) * 6
+            robot.positions = (0.6,) * 6
 
     with pytest.raises(RtcpError, match=r"program\.yaml:12: the arm was") as ended:
         program().run(robot, disturb)
-    assert ended.value.reason == what
+    assert ended.value.reason == "moved_meanwhile"
     assert robot.done[-1] == "lamp False"
+
+
+@pytest.mark.parametrize(
+    ("number", "name", "severity", "reason"),
+    [
+        (4, "halted_at_rest", "note", "halted"),
+        (4, "disabled", "note", "interrupted"),
+        (4, "control_mode_changed", "note", "interrupted"),
+        (4, "drive_fault", "fault", "interrupted"),
+        (4, "emergency_stop_activated", "emergency_stop", "interrupted"),
+        (300, "speed_override_changed", "note", "interrupted"),
+    ],
+)
+def test_what_stops_the_arm_ends_it_before_the_next_step_although_it_is_enabled_again(
+    program: Callable[..., Program], number: int, name: str, severity: str, reason: str
+) -> None:
+    robot: Any = NotingRobot()
+    robot.happens(3, "halted_at_rest")
+
+    def disturb(begun: Begun) -> None:
+        if "lamp" in begun.text:
+            robot.happens(number, name, severity)
+            robot.happens(number + 1, "enabled")
+
+    with pytest.raises(RtcpError, match=r"program\.yaml:12: .*meanwhile") as ended:
+        program().run(robot, disturb)
+    assert ended.value.reason == reason
+    assert robot.done[-1] == "lamp False"
+
+
+def test_events_that_stop_nothing_let_it_go_on_however_many_they_are(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+    program().run(robot, lambda begun: robot.happens(len(robot.happened) + 1, "speed_override_changed"))
+    assert robot.done[-1] == "wait start True 2"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("output: lamp", "output: lamb", '11: output: found the text "lamb", allowed is one of lamp, box.1'),
+        ("output: lamp", "output: box.2", '11: output: found the text "box.2", allowed is one of lamp, box.1'),
+        ("wait_for: start", "wait_for: box.7", '12: wait_for: found the text "box.7", allowed is one of start, lamp'),
+    ],
+)
+def test_a_terminal_that_does_not_exist_or_has_a_function_is_refused_before_the_first_motion(
+    program: Callable[..., Program], old: str, new: str, sentence: str
+) -> None:
+    robot: Any = NotingRobot()
+    with pytest.raises(RtcpError, match=re.escape(sentence)):
+        program(TEXT.replace(old, new)).run(robot, check=False)
+    assert not robot.done
 
 
 def test_a_part_that_runs_again_is_a_motion_of_its_own_also_where_its_last_step_is_blended(
@@ -322,6 +381,18 @@ def test_a_mistake_is_a_sentence_with_its_line(
     with pytest.raises(ConfigError) as wrong:
         program(TEXT.replace(old, new, 1))
     assert any(sentence in problem for problem in wrong.value.problems), wrong.value.problems
+
+
+@pytest.mark.parametrize(("calls", "depth"), [(2, 20), (1, 1500)])
+def test_a_program_of_parts_in_parts_that_is_too_long_or_too_deep_is_refused_at_once(
+    program: Callable[..., Program], calls: int, depth: int
+) -> None:
+    runs = "".join(
+        f"  - {{name: p{at}, steps: [{', '.join([f'{{run: p{at - 1}}}'] * calls)}]}}\n" for at in range(1, depth)
+    )
+    parts = f"parts:\n  - {{name: p0, steps: [{{move: home}}, {{gripper: open}}]}}\n{runs}"
+    with pytest.raises(ConfigError, match=r"found (endless|1048576|1.04858e\+06) steps .* allowed are 10000"):
+        program(f"poses: [{{name: home, q: [0, 0, 0, 0, 0, 0]}}]\nprogram: [{{run: p{depth - 1}}}]\n{parts}")
 
 
 def test_a_file_without_a_program_says_what_runs_it(program: Callable[..., Program]) -> None:

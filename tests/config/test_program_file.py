@@ -126,6 +126,21 @@ def test_a_change_that_would_be_a_mistake_changes_nothing(
     assert [one.name for one in taught.path.parent.iterdir()] == ["program.yaml"]
 
 
+def test_a_change_that_comes_while_another_one_is_checked_is_not_overwritten(
+    taught: ProgramFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, checked = ProgramFile(taught.path), taught._checked
+
+    def slow(text: str) -> Any:
+        other.keep("theirs", q=[0.0] * 6)
+        return checked(text)
+
+    monkeypatch.setattr(taught, "_checked", slow)
+    with pytest.raises(ConfigError, match="read it again"):
+        taught.keep("mine", q=[0.0] * 6)
+    assert [pose.name for pose in ProgramFile(taught.path).motion.poses][-1] == "theirs"
+
+
 def test_a_change_of_something_else_is_not_overwritten(taught: ProgramFile) -> None:
     taught.remove(3)
     taught.path.write_text(TEXT)

@@ -126,12 +126,34 @@ def test_a_circle_is_paused_by_another_client_and_goes_on(shared: Platform, robo
             with pytest.raises(rtcp.Refused, match="who paused the motion") as refused:
                 third.resume()
             assert refused.value.reason == "paused_by_another"
+            third.pause()
+            with pytest.raises(rtcp.Refused, match="another who paused the motion"):
+                third.resume()
         assert other.status().sent_positions == paused.sent_positions
         other.resume()
         going.result()
         status = other.status()
     assert status.speed_override == 1.0
     assert status.positions == pytest.approx(HERE, abs=2e-3)
+
+
+def test_who_paused_a_motion_that_has_ended_does_not_resume_the_next_one(shared: Platform, robot: Robot) -> None:
+    socket = control_socket(shared.directory)
+    with rtcp.connect("before", socket) as before, rtcp.connect("now", socket) as now, ThreadPoolExecutor(1) as pool:
+        for pauser in (before, now):
+            going = pool.submit(circle, robot)
+            shared.until_moving(0.0)
+            pauser.pause()
+            shared.until(lambda found: found["speed_override"] == 0.0, "the pause")
+            if pauser is before:
+                before.halt()
+                with pytest.raises(rtcp.RtcpError):
+                    going.result()
+                robot.move_joints(HERE)
+        with pytest.raises(rtcp.Refused, match="another who paused the motion"):
+            before.resume()
+        now.resume()
+        going.result()
 
 
 def test_the_arm_moves_home(robot: Robot) -> None:

@@ -28,12 +28,10 @@ from rtcp.ipc.refusals import DamagedRow, PathNeedsRest, PathStartsElsewhere, Re
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.joint_motion import find_way
 from rtcp.motion.planning.interpolation import quaternion, rotation, turn_between, turned_by
-from rtcp.motion.planning.plan import damaged_line, read_row
+from rtcp.motion.planning.plan import MOST_LINES, damaged_line, read_row
 from rtcp.motion.speed_override import TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
-LINES_MOST: Final = 256
-"""Straight pieces of a plan."""
 AT_START_M, AT_START_RAD = 1e-3, 2e-3
 """The first piece begins at most this far from where the tool is commanded; the difference fades out."""
 _STILL_RAD_S: Final = 1e-6
@@ -97,7 +95,7 @@ class LineController(Controller):
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Run a plan of straight pieces (`rtcp.motion.planning.plan`) from `state`, at rest where the first begins."""
         assert isinstance(command, RunLines)
-        rows, count = self.rows_of(command.slot, command.rows, LINES_MOST), command.rows
+        rows, count = self.rows_of(command.slot, command.rows, MOST_LINES), command.rows
         if isinstance(rows, Refusal):
             return rows
         first = read_row(rows, 0)

@@ -31,6 +31,8 @@ from rtcp.config.model import MOST_AXES
 from rtcp.ipc.layout import PLAN_COLUMNS
 
 COLUMNS = PLAN_COLUMNS
+MOST_LINES: Final = 256
+"""Straight pieces of a plan."""
 POSITIONS, VELOCITIES, ACCELERATIONS = 1, 1 + MOST_AXES, 1 + 2 * MOST_AXES
 KIND = COLUMNS - 1
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
