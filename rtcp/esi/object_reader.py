@@ -9,7 +9,7 @@ from rtcp.esi.model import DictionaryObject, EsiError, ObjectCode, ObjectEntry
 from rtcp.esi.values import LIST_LIMIT, Values, name_of, number
 from rtcp.esi.xml_tree import Node
 
-ENTRY_LIMIT = 500_000
+ENTRY_LIMIT = 200_000
 """Subindexes in all dictionaries of a file; a type that many objects share counts with each."""
 _MAX_BITS = 1 << 22
 _STATES = (("PREOP", "P"), ("SAFEOP", "S"), ("OP", "O"))
