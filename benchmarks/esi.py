@@ -24,7 +24,7 @@ from rtcp.esi.sii import check_sii, crc, read_sii, write_sii
 
 ESI_SUFFIXES = {".xml", ".esi"}
 IMAGE_SUFFIXES = {".bin", ".sii", ".hex", ".eeprom"}
-PARTS = ("identity", "config", "texts", "sync managers", "fmmus", "pdos", "dc", "bytes")
+PARTS = ("identity", "config", "fixed part", "texts", "sync managers", "fmmus", "pdos", "dc", "bytes")
 COLUMNS = ("files", "devices", "read", "modules", "image", "given back", "size kept", "objects", "made", "warnings")
 
 
@@ -77,6 +77,7 @@ def equal_parts(ours: bytes, theirs: bytes) -> dict[str, bool]:
     return {
         "identity": one.identity == other.identity,
         "config": ours[:15] == theirs[:15],
+        "fixed part": ours[:128] == theirs[:128],
         "texts": (one.name, one.type, one.group) == (other.name, other.type, other.group),
         "sync managers": one.sync_managers == other.sync_managers,
         "fmmus": used_fmmus(one) == used_fmmus(other),
@@ -175,7 +176,7 @@ def count_pairs(folder: Path, files: list[DeviceFile], reasons: list[str]) -> tu
         row["pairs"] += 1
         row["faultless"] += not check_sii(image)
         row.update(equal)
-        different = ", ".join(part for part in PARTS[:-1] if not equal[part])
+        different = ", ".join(part for part in PARTS if part not in ("fixed part", "bytes") and not equal[part])
         if different:
             reasons.append(f"{name}: another {different} than its description")
     return rows, alone

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.esi.dictionary import complete, default_assignment
-from rtcp.esi.model import Device, DictionaryObject, ObjectCode, ObjectEntry
+from rtcp.esi.model import Device, DictionaryObject, ObjectCode, ObjectEntry, PdoEntry
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
 
@@ -78,6 +78,22 @@ def test_objects_of_the_file_keep_their_values_and_a_count_is_filled_in(drive: D
     assert numbers(found[0x607D]) == [2, 0x80000000, 0x7FFFFFFF]
     assert found[0x1008].entries[0].default == b"SD-402"
     assert numbers(found[0x2000])[0] == 3
+
+
+def test_an_object_of_the_file_that_a_pdo_maps_is_mappable_and_gets_the_subindexes_that_it_lacks(
+    drive: Device,
+) -> None:
+    first = ObjectEntry(1, "Encoder of the file", "UDINT", 32, writable=True)
+    given = DictionaryObject(0x2010, "Encoder", ObjectCode.RECORD, (ObjectEntry(0, "Count", "USINT", 8), first))
+    pdo = replace(drive.tx_pdos[0], entries=(PdoEntry(0x2010, 1, 32), PdoEntry(0x2010, 4, 8), PdoEntry(0x2020, 3, 8)))
+    found = objects(replace(drive, objects=(given,), tx_pdos=(pdo,)))
+    assert [(entry.sub_index, entry.name, entry.tx_mappable) for entry in found[0x2010].entries] == [
+        (0, "Count", False),
+        (1, "Encoder of the file", True),
+        (4, "", True),
+    ]
+    assert found[0x2010].entries[1].writable
+    assert (numbers(found[0x2010])[0], numbers(found[0x2020])[0]) == (4, 3)
 
 
 def test_where_a_files_dictionary_contradicts_its_pdos_the_pdos_are_right(drive: Device) -> None:

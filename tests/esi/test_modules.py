@@ -31,6 +31,8 @@ def test_a_slot_allows_its_idents_and_the_modules_of_its_classes(file: DeviceFil
         [CSP, BRAKE],
     ]
     assert defaults(drive) == {0: CSP}
+    optional = replace(drive, slots=(replace(drive.slots[0], minimum=0, maximum=4),))
+    assert defaults(optional) == {0: CSP}
 
 
 def test_indices_that_depend_on_the_slot_grow_with_it_and_fixed_ones_do_not(file: DeviceFile, drive: Device) -> None:

@@ -100,6 +100,11 @@ def test_dc_modes_keep_the_whole_word_the_factors_and_the_shifts(drive: Device) 
     )
 
 
+def test_a_cycle_without_a_factor_is_that_of_the_master(tmp_path: Path) -> None:
+    file = device(tmp_path, "<Dc><OpMode><Name>A</Name><CycleTimeSync0>0</CycleTimeSync0></OpMode></Dc>")
+    assert file.devices[0].dc_modes == (DcMode("A", 0, sync0_factor=1),)
+
+
 def test_commands_for_a_transition_are_read(drive: Device) -> None:
     (command,) = drive.init_commands
     assert (command.transitions, command.index, command.data, command.fixed) == (("PS",), 0x6060, b"\x08", True)
@@ -134,6 +139,29 @@ def test_a_record_keeps_its_names_though_those_of_the_values_differ_and_its_gaps
     ]
     assert [entry.default for entry in record.entries] == [None, b"\x00\x00\xc0\x3f", b"\xfd"]
     assert (record.entries[2].minimum, record.entries[2].maximum) == (b"\xfb", b"\x05")
+
+
+def test_values_of_some_subindexes_are_found_by_name_and_an_array_shares_its_length(tmp_path: Path) -> None:
+    types = (
+        "<DataType><Name>R</Name><SubItem><SubIdx>0</SubIdx><Name>n</Name><Type>USINT</Type></SubItem>"
+        "<SubItem><SubIdx>1</SubIdx><Name>a</Name><Type>UINT</Type></SubItem>"
+        "<SubItem><Name>b</Name><Type>A</Type><BitSize>48</BitSize></SubItem></DataType>"
+        "<DataType><Name>A</Name><BaseType>T</BaseType><ArrayInfo><LBound>2</LBound><Elements>2</Elements></ArrayInfo>"
+        "</DataType>"
+    )
+    values = "<SubItem><Name>a</Name><Info><DefaultValue>7</DefaultValue></Info></SubItem>"
+    item = f"<Object><Index>#x2000</Index><Type>R</Type><Info>{values}</Info></Object>"
+    file = device(
+        tmp_path,
+        f"<Profile><Dictionary><DataTypes>{types}</DataTypes><Objects>{item}</Objects></Dictionary></Profile>",
+    )
+    entries = file.devices[0].objects[0].entries
+    assert [(entry.sub_index, entry.bits, entry.default) for entry in entries] == [
+        (0, 8, None),
+        (1, 16, b"\x07\0"),
+        (2, 24, None),
+        (3, 24, None),
+    ]
 
 
 def test_values_that_are_shorter_than_the_type_are_filled_and_texts_are_not(drive: Device) -> None:
@@ -190,6 +218,13 @@ def test_a_device_that_is_ambiguous_or_absent_is_refused_with_what_there_is() ->
     assert len(one.value.candidates) == 3
     with pytest.raises(LookupFailure, match="no devices fit product 0x00000009; there are: 2 digital outputs"):
         find_device(file, product=9)
+
+
+def test_a_device_that_hides_all_of_its_kind_does_not_hide_itself(tmp_path: Path) -> None:
+    first = "<Device><Type ProductCode='1' RevisionNo='1'>T</Type></Device>"
+    second = "<Device><Type ProductCode='1' RevisionNo='2'>T</Type><HideType/></Device>"
+    file = read(tmp_path, f"{START}{first}{second}{END}")
+    assert [item.hidden for item in file.devices] == [True, False]
 
 
 # What is accepted
