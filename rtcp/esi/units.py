@@ -52,6 +52,7 @@ _BY_SYMBOL = {
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 3: "k", 6: "M", 9: "G"}
 _UNPREFIXED = {"", "kg", "°C", "°", "'", "''", "min", "h", "d", "a", "rev", "inc", "rpm", "s²", "m/s²", "gon"}
 _QUOTIENTS = {("rev", "min"): "rpm"}
+_SI_QUOTIENTS = {"rad/s/s": "rad/s²", "rad/s²/s": "rad/s³"}
 
 
 def _single(index: int, own: Mapping[int, str]) -> Unit | None:
@@ -71,6 +72,7 @@ def unit(notation: int, own: Mapping[int, str] | None = None) -> Unit | None:
         return None
     text = _QUOTIENTS.get((above.text, below.text), f"{above.text or '1'}/{below.text}" if below.text else above.text)
     si = f"{above.si or '1'}/{below.si}" if below.si else above.si
+    si = _SI_QUOTIENTS.get(si, si)
     factor = above.factor / below.factor * 10.0**exponent
     if exponent == -2 and not text:
         text = "%"

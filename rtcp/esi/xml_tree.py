@@ -53,7 +53,7 @@ IGNORED = frozenset(
     re.findall(
         r"\w+",
         """
-        AddInfo AlternativeType Backup Category ChannelCount DataString DcOpModeName DiagFile DiagMessages
+        AddInfo AlternativeType Backup BitOffs Category ChannelCount DataString DcOpModeName DiagFile DiagMessages
         DictionaryFile DisplayName Enum EnumInfo ESC EtherCATController EtherCATp ExecutionUnit IdentificationAdo
         IdentificationReg134 Image16x14 ImageData16x14 ImageFile16x14 InfoReference MaxSlotCount Port ProducerInfo
         Properties Property ReadAccess SafetyMapping SafetyParaMapping SdoAccess Setting SlotSelections StateMachine
@@ -84,17 +84,27 @@ class Node:
         """Return the children of a name."""
         return [child for child in self.children if child.tag == tag]
 
-    def first(self, *path: str) -> Node | None:
-        """Return the first child of a name, and so on down the path; None: there is none."""
+    def first(self, path: str) -> Node | None:
+        """Return the first child of a name, and so on down a path such as `Info/Electrical`; None: there is none."""
         node: Node | None = self
-        for tag in path:
+        for tag in path.split("/"):
             node = next((child for child in node.children if child.tag == tag), None) if node is not None else None
         return node
 
-    def value(self, *path: str) -> str:
-        """Return the text of the first child of a name, and so on down the path; "": there is none."""
-        node = self.first(*path)
-        return node.text if node is not None else ""
+    def below(self, path: str) -> list[Node]:
+        """Return all elements at the end of a path."""
+        nodes = [self]
+        for tag in path.split("/"):
+            nodes = [child for node in nodes for child in node.children if child.tag == tag]
+        return nodes
+
+    def value(self, path: str) -> str | None:
+        """Return the text of the first element at a path, or an attribute of it as in `Index/@Default`; None: none."""
+        path, _, attribute = path.partition("@")
+        node = self.first(path.rstrip("/")) if path else self
+        if node is None:
+            return None
+        return node.attributes.get(attribute) if attribute else node.text
 
 
 class Warnings:

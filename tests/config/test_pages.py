@@ -19,6 +19,7 @@ OWN = [
     "recording.md",
     "simple_message.md",
     "devices.md",
+    "descriptions.md",
     "segment.md",
     "guiding.md",
 ]
