@@ -98,6 +98,8 @@ class CubemarsDrive(DeviceModel):
         )  # fmt: skip
         self.servos = (self.servo,)
         self.mechanics, self.condition, self.axis = mechanics, self.servo.condition, self.servo.axis
+        # The segment steps the axis at once.
+        self.step = self.servo.step  # type: ignore[method-assign]
         self.power_on()
 
     def define(self, objects: ObjectDictionary) -> None:

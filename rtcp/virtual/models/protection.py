@@ -130,17 +130,18 @@ class Feedback:
     def update_units(self) -> None:
         """Take over the units, which have changed."""
         units = self._units
+        self._increments_per_rad = units.increments
         self._positions, self._velocities = 1.0 / units.position, 1.0 / units.velocity
         self._torques = 1.0 / units.torque
 
     def publish(self, status: int, axis: Axis, following: float) -> None:
         """Write the statusword and what is measured; `following` is the following error in rad."""
         mechanics = axis.mechanics
-        increments = round(mechanics.position * self._units.increments)
-        positions, velocities = self._positions, self._velocities
+        per_rad, positions, velocities = self._increments_per_rad, self._positions, self._velocities
+        increments = round(mechanics.position * per_rad)
         self._statusword.value = status
         self._increments.value = increments
-        self._position.value = round((increments / self._units.increments + axis.offset) * positions)
+        self._position.value = round((increments / per_rad + axis.offset) * positions)
         self._velocity.value = round(mechanics.velocity * velocities)
         # The current loop is ideal: the torque demanded is there.
         self._torque.value = self._torque_demand.value = round(axis.torque * self._torques)
