@@ -30,7 +30,7 @@ from typing import Any, ClassVar
 from rtcp.config.find import load_class
 from rtcp.config.model import PluginError
 from rtcp.virtual.device import DeviceModel, Emergency, Option, OptionError
-from rtcp.virtual.objects import SIGNED, Entry, SdoAbort, Value
+from rtcp.virtual.objects import Entry, SdoAbort, Value, bounds
 from rtcp.virtual.protocol import AlState
 
 __all__ = ["Behaviour", "FileBusy", "FileRefused", "FoeError", "Option", "SdoAbort"]
@@ -178,13 +178,6 @@ def set_value(entry: Entry, value: Value) -> None:
     entry.value = value
 
 
-def bounds(entry: Entry) -> tuple[int, int]:
-    """Return the lowest and the highest number that the bits of an entry hold."""
-    if entry.data_type in SIGNED:
-        return -(1 << entry.bit_length - 1), (1 << entry.bit_length - 1) - 1
-    return 0, (1 << entry.bit_length) - 1
-
-
 class HookHangs(BaseException):
     """Raised inside a hook that takes too long; no `except Exception` of the hook catches it."""
 
@@ -286,7 +279,7 @@ class Runner:
             WATCH.active = True
             steps(dt)
         except BaseException as error:  # whatever a behaviour raises, and HookHangs
-            self._fail("on_outputs", error)
+            self.fail("on_outputs", error)
         finally:
             WATCH.active = False
 
@@ -356,7 +349,8 @@ class Runner:
         finally:
             WATCH.active = False
 
-    def _fail(self, hook: str, error: BaseException) -> None:
+    def fail(self, hook: str, error: BaseException) -> None:
+        """Take the slave out of OP for a failure, and report that."""
         self._broken = True
         self._device.failure = UNSPECIFIED_ERROR
         self._tell(hook, error)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 
 from rtcp.esi import types
+from rtcp.esi.dictionary import complete
 from rtcp.esi.model import Device, ObjectEntry, Pdo, PdoEntry
 from rtcp.esi.sii import crc
 from rtcp.virtual.behaviour import Behaviour, Runner
@@ -62,7 +63,8 @@ class DescribedDevice(DeviceModel):
 
     def __init__(self, device: Device, image: Callable[[int], bytes], behaviour: type[Behaviour] | None = None,
                  **options: object) -> None:  # fmt: skip
-        self.description = device
+        has_coe = device.mailbox is not None and device.mailbox.coe is not None
+        self.description = device = complete(device) if has_coe else device
         self._image = image
         mailbox = device.mailbox
         self.sync_managers = _layout(device)
@@ -235,6 +237,10 @@ class DescribedDevice(DeviceModel):
                 for entry in () if image is None else image.entries:
                     entry.value = bytes(len(entry.value)) if isinstance(entry.value, bytes) else 0
         self.runner.outputs_valid(valid)
+
+    def unpackable(self, error: Exception) -> None:
+        """An error of the behaviour, which has written to an entry past `Behaviour.__setitem__`."""
+        self.runner.fail("on_outputs", error)
 
     def open_mailbox(self, receive_size: int, send_size: int) -> None:
         """No transfer of a file is under way."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
 
 from rtcp.virtual.al_state import HELD, AlStatusCode, SyncMonitor, first_failure, judge
@@ -317,10 +318,14 @@ class Application:
             elif self.state == AlState.SAFE_OP and not self._error:
                 self._refuse(code)
         if self.state >= AlState.SAFE_OP or self._emulated:
-            for data in self._inputs:
-                data.pack()
-                if data.manager.control & CONTROL_ECAT_EVENT:
-                    data.manager.exchanged()
+            try:
+                for data in self._inputs:
+                    data.pack()
+                    if data.manager.control & CONTROL_ECAT_EVENT:
+                        data.manager.exchanged()
+            except (struct.error, ArithmeticError, TypeError, AttributeError) as error:
+                # A behaviour has put something into an object that its bits do not hold.
+                self.device.unpackable(error)
         mailbox = self._mailbox
         if mailbox is not None and mailbox.pending(t):
             mailbox.serve(self.state, t)

@@ -36,7 +36,7 @@ _POSITION_LIMIT = (1 << 31) - 1
 _SUPPORTED = {1: 0x607A, 3: 0x60FF, 6: 0x6098, 8: 0x607A, 9: 0x60FF, 10: 0x6071}
 """Modes, and the object without which a drive has not got them."""
 _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
-    "rated_torque": Option(None, 0.001, 10_000.0, "Nm at the joint; left out: 0x6076, else 28", ),
+    "rated_torque": Option(None, 0.001, 10_000.0, "Nm at the joint; left out: 0x6076, else 28"),
     "peak_torque": Option(None, 0.001, 30_000.0, "Nm; left out: twice the rated torque"),
     "max_speed": Option(10.0, 0.01, 1000.0, "speed above which the drive fails, rad/s"),
     "counts_per_turn": Option(None, 1.0, 2.0**40, "counts of a turn of the joint; left out: by 0x608F, 0x6091, 0x6092"),
@@ -47,7 +47,7 @@ _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
 def _options() -> Mapping[str, Option]:
     """Return the options: those of the axes for all of them, and with the number of one before them for it alone."""
     own = {
-        f"axis{n}_{name}": Option(None, option.low, option.high, option.meaning)
+        f"axis{n}_{name}": Option(None, option.low, option.high, option.meaning, listed=False)
         for n in range(1, MOST_AXES + 1)
         for name, option in _AXIS_OPTIONS.items()
     }
@@ -92,6 +92,23 @@ class Cia402Drive(Behaviour):
             servo.step(dt)
 
 
+class _BoundedFeedback(Feedback):
+    """Shows what is beyond an object's bits as the most that it holds."""
+
+    def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
+        super().__init__(objects, rated_torque)
+        indices = (0x6062, 0x6063, 0x6064, 0x606B, 0x606C, 0x6074, 0x6077, 0x6078, 0x60F4)
+        self._bounded = [(objects.number(n), *objects.bounds(n)) for n in indices if (n, 0) in objects]
+
+    def publish(self, status: int, axis: Axis, following: float) -> None:
+        """Write the statusword and what is measured."""
+        super().publish(status, axis, following)
+        for entry, low, high in self._bounded:
+            value = entry.value
+            if not low <= value <= high:
+                entry.value = low if value < low else high
+
+
 class _StandardAxis:
     """One axis: its units and defaults, and the servo that turns it."""
 
@@ -113,7 +130,7 @@ class _StandardAxis:
             position=self._option("initial_position"),
         )
         self._read_units()
-        self._feedback = Feedback(objects, size.rated_torque)
+        self._feedback = _BoundedFeedback(objects, size.rated_torque)
         condition = Condition(size, drive.option("temperature"), drive.option("bus_voltage"))
         errors = ErrorLog(objects, drive.device.emergencies)
         self.servo = ServoAxis(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rtcp.virtual.device import Number, number
-from rtcp.virtual.objects import ObjectDictionary
+from rtcp.virtual.objects import ObjectDictionary, bounds
 
 AXIS_STRIDE = 0x800
 """Distance of the objects of two axes of a drive: 0x6040 and 0x6840 (ETG.6010, CiA 402-2)."""
@@ -62,7 +62,13 @@ class AxisObjects:
         for at, value in defaults.items():
             entry = self.number(*at)
             if not entry.value:
-                entry.value = value
+                low, high = self.bounds(*at)
+                entry.value = min(max(value, low), high)
+
+    def bounds(self, index: int, subindex: int = 0) -> tuple[int, int]:
+        """Return the lowest and the highest number that an entry holds."""
+        key = self._key(index, subindex)
+        return bounds(self.dictionary[key]) if key in self.dictionary else (-LIMITLESS, 0xFFFF_FFFF)
 
     def _key(self, index: int, subindex: int) -> tuple[int, int]:
         return index + self._shift if index in _PROFILE else index, subindex
