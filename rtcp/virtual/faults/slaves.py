@@ -17,6 +17,7 @@ from rtcp.virtual.faults.fault import (
     Fault,
     FaultRefused,
     Frames,
+    Port,
     Position,
     SlaveFault,
     StrikingFault,
@@ -50,10 +51,11 @@ class CableFault(Fault):
 
     name = "cable"
     after: Cable
+    port: Port = 1
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
         """Cut the cable."""
-        cable = cable_of(segment, self.after)
+        cable = cable_of(segment, self.after, self.port)
 
         def join(_: int) -> None:
             segment.topology.join(cable)
@@ -96,10 +98,11 @@ class Corrupt(StrikingFault):
     counted = ("corrupted",)
     after: Cable
     way: Literal["out", "back"] = "out"
+    port: Port = 1
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
         """Damage frames from now on."""
-        damage = Damage(cable_of(segment, self.after), self.strikes, self.way == "back")
+        damage = Damage(cable_of(segment, self.after, self.port), self.strikes, self.way == "back")
         return self.listed(segment.damages, damage)
 
 
