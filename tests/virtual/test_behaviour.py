@@ -165,7 +165,7 @@ def test_a_real_master_writes_firmware_in_boot_and_reads_it(tmp_path: Path) -> N
     from tests.virtual.conftest import segment
 
     config = tmp_path / "segment.yaml"
-    config.write_text(f"slaves:\n- {{{described(DRIVE, 'behaviour: rtcp.virtual.behaviour:Behaviour')}}}\n")
+    config.write_text(f"slaves:\n- {{{described(DRIVE)}}}\n")
     with segment(config) as pid:
         command = [sys.executable, str(Path(__file__).with_name("boot_child.py")), str(pid), "ecat0"]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT)
