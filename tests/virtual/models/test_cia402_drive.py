@@ -164,12 +164,10 @@ def test_what_a_description_leaves_open_gets_defaults_and_what_an_object_cannot_
     image.pack(bytearray(image.byte_length))
     assert bench[0x6064] == pytest.approx(3.0 / (2 * pi) * (1 << 31), abs=1)
     assert bench[0x6076] == 4_000_000
-    bench[0x6076] = 1
-    bench.device.state_changed(2, 4)
-    bench.enable(10)
-    bench[0x6071] = 32767
-    bench.run(0.05)
+    bench.device.servos[0].mechanics.position = 7.0
+    bench.run(0.01)
     image.pack(bytearray(image.byte_length))
+    assert bench[0x6064] == (1 << 31) - 1
     assert not bench.sentences
 
 
