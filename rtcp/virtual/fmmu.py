@@ -41,6 +41,11 @@ class Overlap:
         """Whether it is whole bytes on both sides."""
         return not (self.at | self.physical | self.bits) & 7
 
+    @property
+    def last(self) -> int:
+        """Its last bit in the memory."""
+        return self.physical + self.bits - 1
+
 
 def active_fmmus(esc: Esc) -> list[Fmmu]:
     """The active FMMUs of a slave in the order of their numbers."""
@@ -73,21 +78,24 @@ def overlap(fmmu: Fmmu, address: int, length: int) -> Overlap | None:
 
 def copy_bits(source: bytes | bytearray, source_bit: int, target: bytearray, target_bit: int, bits: int) -> None:
     """Copy `bits` bits, least significant first within a byte; the bits around them stay."""
+    first, end = source_bit >> 3, source_bit + bits + 7 >> 3
     mask = (1 << bits) - 1
-    value = int.from_bytes(source, "little") >> source_bit & mask
-    whole = int.from_bytes(target, "little") & ~(mask << target_bit) | value << target_bit
-    target[:] = whole.to_bytes(len(target), "little")
+    value = int.from_bytes(source[first:end], "little") >> (source_bit & 7) & mask
+    first, end, shift = target_bit >> 3, target_bit + bits + 7 >> 3, target_bit & 7
+    whole = int.from_bytes(target[first:end], "little") & ~(mask << shift) | value << shift
+    target[first:end] = whole.to_bytes(end - first, "little")
 
 
-def transfer(esc: Esc, command: int, address: int, data: bytearray, t: int) -> int:
+def touched(esc: Esc, address: int, length: int) -> Parts:
+    """Return what a datagram of `length` bytes at logical `address` touches of a slave's FMMUs."""
+    return [(fmmu, part) for fmmu in active_fmmus(esc) if (part := overlap(fmmu, address, length)) is not None]
+
+
+def transfer(esc: Esc, command: int, parts: Parts, data: bytearray, t: int) -> int:
     """Let one slave handle a logical datagram's `data`; return what it adds to the working counter."""
-    length = len(data)
     incoming = bytes(data)
     read = wrote = False
-    for fmmu in active_fmmus(esc):
-        part = overlap(fmmu, address, length)
-        if part is None:
-            continue
+    for fmmu, part in parts:
         first, end = part.physical // 8, (part.physical + part.bits + 7) // 8
         if end > len(esc.memory):
             # An FMMU that reaches beyond the memory maps nothing there.
@@ -104,12 +112,30 @@ def transfer(esc: Esc, command: int, address: int, data: bytearray, t: int) -> i
     return read + (2 * wrote if command == DatagramCommand.LRW else wrote)
 
 
+Parts = list[tuple[Fmmu, Overlap]]
+"""FMMUs and the part of each that a datagram touches."""
+
+
 class Copy(NamedTuple):
     """Copy `size` bytes between `at` in the datagram's data and `image` in the segment's process image."""
 
     at: int
     image: int
     size: int
+
+
+class BitCopy(NamedTuple):
+    """Copy some bits of one byte, `at` in the datagram's data, to or from one byte, `image` in the process image."""
+
+    at: int
+    shift: int
+    """Place of the lowest bit in the datagram's byte."""
+    mask: int
+    """The bits, from bit 0 on."""
+    image: int
+    image_shift: int
+    image_others: int
+    """The bits of the image's byte that are not copied."""
 
 
 @dataclass
@@ -120,23 +146,35 @@ class Plan:
     """From the frame into the image of outputs."""
     inputs: list[Copy] = field(default_factory=list)
     """From the image of inputs into the frame, after all outputs were taken out."""
+    output_bits: list[BitCopy] = field(default_factory=list)
+    """As `outputs`, of slaves that share a byte of the datagram with their neighbours."""
+    input_bits: list[BitCopy] = field(default_factory=list)
     counter: int = 0
     """What the copies add to the working counter."""
     shares: list[tuple[Esc, int]] = field(default_factory=list)
     """What each slave has in `counter`."""
     written: list[tuple[Esc, SyncManager]] = field(default_factory=list)
     """Buffers that the copies complete."""
-    others: list[Esc] = field(default_factory=list)
+    others: list[tuple[Esc, Parts]] = field(default_factory=list)
     """Slaves, in the order of the wire, that need `transfer`."""
 
 
 def _exact_buffer(esc: Esc, part: Overlap) -> SyncManager | None:
-    """The buffered sync manager whose whole area `part` is, if it is one."""
+    """The buffered sync manager whose whole area `part` is, or some bits of its only byte, if it is one."""
     for manager in esc.sync_managers:
-        exact = part.aligned and part.physical == 8 * manager.start and part.bits == 8 * manager.length
-        if exact and manager.enabled and not manager.mailbox and not manager.ecat_event:
+        if not manager.enabled or manager.mailbox or manager.ecat_event:
+            continue
+        if part.aligned and part.physical == 8 * manager.start and part.bits == 8 * manager.length:
+            return manager
+        within_a_byte = (part.at & 7) + part.bits <= 8
+        if manager.length == 1 and within_a_byte and part.physical >> 3 == manager.start == part.last >> 3:
             return manager
     return None
+
+
+def _bit_copy(part: Overlap, image: int) -> BitCopy:
+    shift, mask = part.physical & 7, (1 << part.bits) - 1
+    return BitCopy(part.at >> 3, part.at & 7, mask, image, shift, 0xFF & ~(mask << shift))
 
 
 def _join(copies: list[Copy]) -> list[Copy]:
@@ -154,19 +192,19 @@ def compile_plan(slaves: Sequence[Esc], images: dict[SyncManager, int], command:
                  length: int) -> Plan:  # fmt: skip
     """Work out the copies of a logical datagram; `images` gives each buffer's place in the image of its direction."""
     plan = Plan()
-    used: list[tuple[Esc, list[Overlap]]] = []
+    used: list[tuple[Esc, Parts]] = []
     taken: list[tuple[int, int, int]] = []
     for position, esc in enumerate(slaves):
-        parts = [(fmmu, part) for fmmu in active_fmmus(esc) if (part := overlap(fmmu, address, length)) is not None]
+        parts = touched(esc, address, length)
         if not parts:
             continue
-        used.append((esc, [part for _, part in parts]))
+        used.append((esc, parts))
         taken += [(part.at, part.at + part.bits, position) for _, part in parts]
         if not _fast(plan, esc, parts, images, command):
-            plan.others.append(esc)
+            plan.others.append((esc, parts))
     # Where slaves share bits of the datagram their order matters: then all go the exact way, one after another.
     if _shared(taken):
-        return Plan(others=[esc for esc, _ in used])
+        return Plan(others=used)
     plan.outputs = _join(plan.outputs)
     plan.inputs = _join(plan.inputs)
     return plan
@@ -185,17 +223,18 @@ def _shared(taken: list[tuple[int, int, int]]) -> bool:
     return False
 
 
-def _fast(plan: Plan, esc: Esc, parts: list[tuple[Fmmu, Overlap]], images: dict[SyncManager, int],
+def _fast(plan: Plan, esc: Esc, parts: Parts, images: dict[SyncManager, int],
           command: int) -> bool:  # fmt: skip
     """Add one slave's part to `plan` if whole buffers are all it has; otherwise leave the plan alone."""
-    outputs: list[Copy] = []
-    inputs: list[Copy] = []
+    outputs: list[Copy | BitCopy] = []
+    inputs: list[Copy | BitCopy] = []
     written: list[tuple[Esc, SyncManager]] = []
     for fmmu, part in parts:
         manager = _exact_buffer(esc, part)
         if manager is None:
             return False
-        copy = Copy(part.at // 8, images[manager], manager.length)
+        place = images[manager]
+        copy = Copy(part.at // 8, place, manager.length) if part.aligned else _bit_copy(part, place)
         if manager.locked:
             continue
         if manager.master_writes and fmmu.writable and command in WRITES:
@@ -203,8 +242,10 @@ def _fast(plan: Plan, esc: Esc, parts: list[tuple[Fmmu, Overlap]], images: dict[
             written.append((esc, manager))
         elif not manager.master_writes and fmmu.readable and command in READS:
             inputs.append(copy)
-    plan.outputs += outputs
-    plan.inputs += inputs
+    for copy in outputs:
+        plan.outputs.append(copy) if isinstance(copy, Copy) else plan.output_bits.append(copy)
+    for copy in inputs:
+        plan.inputs.append(copy) if isinstance(copy, Copy) else plan.input_bits.append(copy)
     plan.written += written
     share = bool(inputs) + bool(outputs) * (2 if command == DatagramCommand.LRW else 1)
     plan.counter += share

@@ -21,6 +21,7 @@ OWN = [
     "devices.md",
     "descriptions.md",
     "segment.md",
+    "behaviours.md",
     "guiding.md",
 ]
 KEYS = {

@@ -42,12 +42,12 @@ MISTAKES = {
     "no slaves": ("slaves: []", "slaves: found an empty list, allowed is a list with at least one entry"),
     "no model": (
         "slaves: [{alias: 1}]",
-        "slaves[0]: the key model is missing; it must be a text of 1 to 64 characters",
+        "slaves[0]: found none of them, allowed is one of model, esi and sii",
     ),
     "an unknown key": (
         "slaves: [{model: m, drift: 3}]",
-        "slaves[0].drift: this key does not exist; did you mean drift_ppm? allowed are model, drift_ppm, delay_ns, "
-        "alias, options",
+        "slaves[0].drift: this key does not exist; did you mean drift_ppm? allowed are model, esi, sii, product, "
+        "revision, modules, behaviour, name, after, port, drift_ppm, delay_ns, alias, options",
     ),
     "a wild drift": (
         "slaves: [{model: m, drift_ppm: 5000}]",

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.config.document import shown
+from rtcp.virtual.behaviour import set_value
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.registry import FaultRegistry, installed, parse, sentence_of
-from rtcp.virtual.models.cubemars import CubemarsDrive
 from rtcp.virtual.models.diewu import CHANNELS, DiewuIoBox
+from rtcp.virtual.models.servo import ServoAxis
+from rtcp.virtual.objects import Entry
 from rtcp.virtual.request_socket import RequestClient, RequestSocket, choose
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import Slave
@@ -45,6 +47,8 @@ class Control(RequestSocket):
             "truth": ((), lambda _, now: truth.answer(now)),
             "clear_peaks": ((), lambda _, now: truth.clear_peaks(now)),
             "edges": (("slave", "output"), self._edges),
+            "get": (("slave", "index", "subindex"), self._get),
+            "set": (("slave", "index", "subindex", "value"), self._set),
         }
         """What a request can ask for: its keys, and what answers it."""
         for name in installed():
@@ -73,6 +77,25 @@ class Control(RequestSocket):
             raise FaultRefused(f"found slave {shown(slave)}, output {shown(output)}, allowed are two numbers, from 1")
         return self._truth.edges(slave, output, now)
 
+    def _get(self, request: dict[str, Any], now: int) -> list[dict[str, Any]]:
+        slave = self._truth.slave_of(request.get("slave"))
+        if "index" in request:
+            return [_shown_entry(_entry_of(slave, request))]
+        roles = slave.device.roles
+        images = [slave.device.image(index) for index in roles.outputs + roles.inputs]
+        return [_shown_entry(entry) for image in images if image is not None for entry in image.entries]
+
+    def _set(self, request: dict[str, Any], now: int) -> dict[str, Any]:
+        slave = self._truth.slave_of(request.get("slave"))
+        entry, value = _entry_of(slave, request), request.get("value")
+        try:
+            if entry.is_bytes and isinstance(value, str):
+                value = bytes.fromhex(value[2:]) if value.startswith("0x") else value.encode()
+            set_value(entry, value)  # type: ignore[arg-type]  # it says which kinds an object takes
+        except ValueError as error:
+            raise FaultRefused(f"value: {error}") from error
+        return _shown_entry(entry)
+
     def _clear(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
         number = request.get("id")
         if number is not None and type(number) is not int:
@@ -80,12 +103,26 @@ class Control(RequestSocket):
         return {"cleared": self._registry.clear(number, now)}
 
 
+def _entry_of(slave: Slave, request: dict[str, Any]) -> Entry:
+    index, subindex = request.get("index"), request.get("subindex", 0)
+    if type(index) is not int or type(subindex) is not int:
+        raise FaultRefused(f"found object {shown(index)}:{shown(subindex)}, allowed are two numbers")
+    if (index, subindex) not in slave.device.objects:
+        raise FaultRefused(f"{slave.device.identity.name} has no object 0x{index:04X}:{subindex}")
+    return slave.device.objects[index, subindex]
+
+
+def _shown_entry(entry: Entry) -> dict[str, Any]:
+    value = f"0x{entry.value.hex()}" if isinstance(entry.value, bytes) else entry.value
+    return {"index": entry.index, "subindex": entry.subindex, "name": entry.name, "value": value}
+
+
 class _Joint:
     """A drive that is watched: when it last moved, how fast it was at most."""
 
     __slots__ = ("drive", "moved", "peak")
 
-    def __init__(self, drive: CubemarsDrive) -> None:
+    def __init__(self, drive: ServoAxis) -> None:
         self.drive = drive
         self.moved = 0
         self.peak = 0.0
@@ -129,18 +166,16 @@ class GroundTruth:
         self.watching = False
         self._asked: int | None = None
         """Instant of the last request; None: nobody has ever asked for the truth."""
-        self._chain = segment.chain
         self._segment = segment
         self._models = tuple(models)
         self._joints = {
-            slave: _Joint(slave.device) for slave in segment.slaves if isinstance(slave.device, CubemarsDrive)
+            slave: [_Joint(servo) for servo in slave.device.servos] for slave in segment.slaves if slave.device.servos
         }
         self._output: tuple[int, int, _Output] | None = None
 
     def look(self, slave: Slave, now: int) -> None:
         """See whether the joint of `slave`, which was stepped, moves at instant `now`."""
-        joint = self._joints.get(slave)
-        if joint is not None:
+        for joint in self._joints.get(slave, ()):
             joint.look(now)
         if self._asked is not None and now - self._asked > PATIENCE:
             self.watching = False
@@ -158,8 +193,9 @@ class GroundTruth:
     def clear_peaks(self, now: int) -> None:
         """Forget how fast the joints were."""
         self._watch(now)
-        for joint in self._joints.values():
-            joint.peak = 0.0
+        for joints in self._joints.values():
+            for joint in joints:
+                joint.peak = 0.0
 
     def edges(self, position: int, output: int, now: int) -> list[int]:
         """Return when frames changed an output since the last question, ns of its slave's own clock.
@@ -184,6 +220,17 @@ class GroundTruth:
         watched[2].edges.clear()
         return found
 
+    def slave_of(self, wanted: object) -> Slave:
+        """Return the slave at a position from 1, or of a label; raises FaultRefused."""
+        slaves = self._segment.slaves
+        if type(wanted) is int and 1 <= wanted <= len(slaves):
+            return slaves[wanted - 1]
+        places = [place for place, label in enumerate(self._models) if label == wanted]
+        if len(places) != 1:
+            found = f"{len(places)} slaves are called {wanted}" if places else f"there is no slave {shown(wanted)}"
+            raise FaultRefused(f"slave: {found}; give a position from 1 to {len(slaves)}, or a name")
+        return slaves[places[0]]
+
     def _release_output(self) -> None:
         if self._output is not None:
             self._segment.slaves[self._output[0] - 1].application.outputs_watch = None
@@ -192,8 +239,9 @@ class GroundTruth:
     def answer(self, now: int) -> dict[str, Any]:
         """Return what is true at instant `now`, slave by slave."""
         self._watch(now)
-        for joint in self._joints.values():
-            joint.look(now)
+        for joints in self._joints.values():
+            for joint in joints:
+                joint.look(now)
         slaves = zip(self._segment.slaves, self._models, strict=True)
         return {
             "time_ns": now,
@@ -205,21 +253,27 @@ class GroundTruth:
             "position": position,
             "model": model,
             "al": slave.application.state.name.replace("_", "-"),
-            "reachable": position <= self._segment.chain.reach,
+            "reachable": slave in self._segment.topology.reached,
         }
         found |= slave.device.truth()
-        joint = self._joints.get(slave)
-        if joint is not None:
-            drive = joint.drive
-            found |= {
-                "position_rad": drive.mechanics.position,
-                "velocity_rad_s": drive.mechanics.velocity,
-                "state": drive.state.name.lower().replace("_", " "),
-                "torque_on": drive.powered,
-                "moved_ns": joint.moved,
-                "peak_rad_s": joint.peak,
-            }
+        joints = [_truth_of(joint) for joint in self._joints.get(slave, ())]
+        if joints:
+            found |= joints[0]
+        if len(joints) > 1:
+            found["axes"] = joints
         return found
+
+
+def _truth_of(joint: _Joint) -> dict[str, Any]:
+    drive = joint.drive
+    return {
+        "position_rad": drive.mechanics.position,
+        "velocity_rad_s": drive.mechanics.velocity,
+        "state": drive.state.name.lower().replace("_", " "),
+        "torque_on": drive.powered,
+        "moved_ns": joint.moved,
+        "peak_rad_s": joint.peak,
+    }
 
 
 class SegmentClient(RequestClient):
@@ -246,7 +300,8 @@ class SegmentClient(RequestClient):
 
         `time_ns` (CLOCK_MONOTONIC) and `slaves`, a list with `position`, `model`, `al` (as "SAFE-OP"), `reachable`; of
         drives `position_rad`, `velocity_rad_s`, `state` (CiA 402), `torque_on`, `moved_ns` (last instant at which it
-        was faster than 0.002 rad/s; 0: not since the first question) and `peak_rad_s` (since `clear_peaks`); of a shape
+        was faster than 0.002 rad/s; 0: not since the first question) and `peak_rad_s` (since `clear_peaks`), of drives
+        with several axes those of the first, and of each in `axes`; of a shape
         setter's box `gate`, `relay`, `relay_closed`, `current` (A) and `middle_temperature` (C). Who asks for nothing
         for 10 s misses what moves until the next request.
         """
@@ -262,3 +317,18 @@ class SegmentClient(RequestClient):
         The first question begins; each returns what came since the one before it, of which 1024 edges are kept.
         """
         return list(self.ask({"do": "edges", "slave": slave, "output": output}))
+
+    def get(self, slave: int | str, index: int | None = None, subindex: int = 0) -> list[dict[str, Any]]:
+        """Return an object of a slave, which is a position from 1 or a name; without `index` all of its process data.
+
+        Each has `index`, `subindex`, `name` and `value`; a string of bytes is `0x` and its digits.
+        """
+        request: dict[str, Any] = {"do": "get", "slave": slave}
+        if index is not None:
+            request |= {"index": index, "subindex": subindex}
+        return list(self.ask(request))
+
+    def set(self, slave: int | str, index: int, subindex: int, value: float | str) -> dict[str, Any]:
+        """Give an object of a slave a value past all rights, as its inputs; return it as `get` does."""
+        request = {"do": "set", "slave": slave, "index": index, "subindex": subindex, "value": value}
+        return dict(self.ask(request))
