@@ -46,6 +46,8 @@ class HasBox(Protocol):
         """Name of the box; None: the only one."""
 
 
+CHANNEL_KINDS = frozenset({"analog", "encoder", "coupler", "generic"})
+"""Kinds of device of which nothing is known but their channels."""
 PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator", "tool"})
 """Parts of the cycle that are no devices: their fields have names of their own."""
 VIRTUAL = "virtual"
@@ -105,7 +107,7 @@ class PluginError(ConfigError):
 
 @dataclass(frozen=True)
 class PdoEntry:
-    """One mapped object: `value in SI = counts * factor`. Index 0 is padding and needs no name."""
+    """One mapped object: `value in SI = counts * factor + offset`. Index 0 is padding and needs no name."""
 
     index: U16
     """Object index; 0: padding."""
@@ -119,8 +121,29 @@ class PdoEntry:
     """SI units per count; not 0."""
     unit: str = ""
     """Unit of the value, for people and recordings; at most 32 characters, no comma, colon or line break."""
+    offset: float = 0.0
+    """SI value at 0 counts: value = counts * factor + offset. Not of drives and IO boxes."""
+    modulo: Annotated[int, Ge(0)] = 0
+    """Of an input: counts after which it begins anew at 0, as an encoder of one turn; its value counts on. 0: never."""
+    min: float | None = None
+    """Of an output: smallest value that a command may set, in the channel's unit; left out: that of `type`."""
+    max: float | None = None
+    """Of an output: largest value that a command may set, in the channel's unit; left out: that of `type`."""
+    safe: float = 0.0
+    """Of an output: value, in the channel's unit, from the start until it is commanded, and after a fault."""
     axis: AxisNumber | None = None
     """Axis of a drive with several, where one PDO holds channels of more than one; left out: that of the PDO."""
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Smallest and largest value that a command may set, SI: of `min` and `max`, and of the type."""
+        low, high = -math.inf, math.inf
+        if not self.type.startswith("float"):
+            low, high = sorted(end * self.factor + self.offset for end in integer_range(self.type))
+        return (
+            low if self.min is None else max(low, self.min),
+            high if self.max is None else min(high, self.max),
+        )
 
 
 @dataclass(frozen=True)
@@ -163,14 +186,15 @@ class DeviceDescription:
     name: Name
     """Device name, for messages."""
     kind: Name
-    """Driver: `cia402` moves a joint, `io` is a box of inputs and outputs; further ones from installed packages."""
+    """Driver: `cia402` moves joints, `io` is a box of inputs and outputs, `analog`, `encoder` and `generic` have named
+    channels, `coupler` has none; further ones from installed packages."""
     vendor_id: U32
     """Vendor id (0x1018:01); another one on the bus is refused."""
     product_id: U32
     """Product code (0x1018:02); another one on the bus is refused."""
-    rpdo: tuple[Pdo, ...]
+    rpdo: tuple[Pdo, ...] = ()
     """Outputs of the master, assigned through 0x1C12."""
-    tpdo: tuple[Pdo, ...]
+    tpdo: tuple[Pdo, ...] = ()
     """Inputs of the master, assigned through 0x1C13."""
     configurable_pdos: bool = True
     """False: the mapping is fixed in the device; it is compared and never written."""
@@ -185,6 +209,21 @@ class DeviceDescription:
     """Process-data (sync manager) watchdog, ms: without outputs for this time the device stops."""
     scaling: tuple[DriveScaling, ...] = ()
     """Of a CiA 402 drive: one for all its axes, or one an axis. Channels without `factor` have theirs from here."""
+
+    @property
+    def has_channels(self) -> bool:
+        """Whether commands see its channels by name, and set those of `rpdo`."""
+        return self.kind in CHANNEL_KINDS and not self.is_box
+
+    @property
+    def outputs(self) -> tuple[PdoEntry, ...]:
+        """The channels of `rpdo`, without padding."""
+        return tuple(entry for pdo in self.rpdo for entry in pdo.channels if entry.index)
+
+    @property
+    def inputs(self) -> tuple[PdoEntry, ...]:
+        """The channels of `tpdo`, without padding."""
+        return tuple(entry for pdo in self.tpdo for entry in pdo.channels if entry.index)
 
     @property
     def is_box(self) -> bool:
@@ -218,9 +257,8 @@ class DeviceDescription:
     def wire_range(self, channel: str) -> tuple[float, float]:
         """Return the range of a channel to the device, SI; infinite where it is a float or does not exist."""
         for entry in (entry for pdo in self.rpdo for entry in pdo.channels):
-            if entry.name == channel and not entry.type.startswith("float"):
-                low, high = sorted(end * entry.factor for end in integer_range(entry.type))
-                return low, high
+            if entry.name == channel:
+                return entry.range
         return -math.inf, math.inf
 
 
@@ -229,7 +267,8 @@ def _of_axis(pdos: Sequence[Pdo], axis: int) -> tuple[Pdo, ...]:
         replace(
             pdo,
             channels=tuple(
-                entry if pdo.axis_of(entry) == axis else PdoEntry(0, 0, entry.type) for entry in pdo.channels
+                entry if pdo.axis_of(entry) == axis else replace(entry, index=0, sub_index=0, name=PdoEntry.name)
+                for entry in pdo.channels
             ),
         )
         for pdo in pdos
@@ -938,6 +977,14 @@ class ArmConfig(ArmSettings):
         boxes = self.boxes
         named = None if user is None else user.box
         return named if named is not None else boxes[0] if boxes else ""
+
+    @property
+    def process_outputs(self) -> frozenset[tuple[str, str]]:
+        """Slave and channel of every output that a process writes: no command sets it."""
+        written = (
+            text.partition(".") for one in self.processes for _, image, text in one.channels() if image == "rpdo"
+        )
+        return frozenset((slave, channel) for slave, _, channel in written)
 
     def terminals(self, section: InputsConfig | OutputsConfig) -> dict[str, tuple[str, int]]:
         """Return box and number of each terminal that a section names, by its name or the key of its function."""

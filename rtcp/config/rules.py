@@ -69,6 +69,7 @@ CHANNELS: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {
             "modes_of_operation_display": ("int8",),
         },
     },
+    "encoder": {"tpdo": {"position": _NUMERIC}},
     "io": {"rpdo": {"outputs": ("uint16",)}, "tpdo": {"inputs": ("uint16",), "counter": ("int32",)}},
 }
 OPTIONAL = {
@@ -78,6 +79,10 @@ OPTIONAL = {
 """Channels that only some modes of a drive need (`MODE_CHANNELS`, `_drive_mode`), and only some boxes have."""
 PDO_RANGE = {"rpdo": (0x1600, 0x17FF), "tpdo": (0x1A00, 0x1BFF)}
 """Objects of receive and transmit PDO mappings (ETG.1000.6)."""
+_OF_OUTPUTS: tuple[str, ...] = ("min", "max", "safe")
+_OF_INPUTS: tuple[str, ...] = ("modulo",)
+_ALL = (*_OF_OUTPUTS, *_OF_INPUTS, "offset")
+"""Keys of a channel that have a meaning in one direction, and all that a channel with a fixed meaning has not."""
 MODES_OF_OPERATION, CSP = 0x6060, 8
 """Object of the drive mode and its value for cyclic synchronous position (CiA 402-2, clause 10.1)."""
 JOYSTICK_TERMINALS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
@@ -111,6 +116,13 @@ def _min_below_max(low: float, high: float) -> str:
 def _entry(entry: PdoEntry) -> Iterator[Finding]:
     if entry.index and entry.factor == 0:
         yield ("factor",), "found 0, allowed is any number but 0"
+    if entry.min is not None and entry.max is not None and (text := _min_below_max(entry.min, entry.max)):
+        yield (), text
+    elif entry.factor and not entry.range[0] <= entry.safe <= entry.range[1]:
+        low, high = entry.range
+        yield ("safe",), f"found {entry.safe:g}, allowed is {low:g} to {high:g}, the range of the channel"
+    if entry.modulo and "int" not in entry.type:
+        yield ("modulo",), f"found {entry.modulo} with the type {entry.type}, allowed is an integer type"
     if entry.index and entry.name == PdoEntry.name:
         yield (), f"the key name is missing; it must be a text of 1 to 64 characters other than {PdoEntry.name}"
 
@@ -220,6 +232,19 @@ def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
         wanted = "whole bytes; fill up with padding (`{index: 0, sub_index: 0, type: bool}`)"
         yield (direction,), f"found {bits} bits in all, allowed are {wanted}"
     needed = CHANNELS.get(kind, {}).get(direction, {})
+    if kind == "coupler" and pdos:
+        yield (direction,), "found PDOs; a coupler has no process data: leave it out"
+    for i, pdo in enumerate(pdos):
+        for j, entry in enumerate(pdo.channels):
+            unused = _OF_OUTPUTS if direction == "tpdo" else _OF_INPUTS
+            if kind == "io" or (kind == "cia402" and entry.name in needed):
+                unused = (*_OF_OUTPUTS, *_OF_INPUTS, "offset")
+            for key in unused:
+                if getattr(entry, key) != getattr(PdoEntry, key):
+                    text = (
+                        f"found with {entry.name} in {direction} of kind {kind}, where it has no meaning; leave it out"
+                    )
+                    yield (direction, i, "channels", j, key), text
     for axis, names in (axes or {1: {}}).items():
         if missing := [name for name in needed if name not in names and name not in OPTIONAL]:
             there = f"its channels are {', '.join(names)}" if names else "it has no channels"

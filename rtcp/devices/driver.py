@@ -72,14 +72,23 @@ class Driver:
         self.period_s = period_s
         self.codec_in, self.codec_out = make_codec(self.tpdo), make_codec(self.rpdo)
         self.values: dict[str, float] = {channel.name: 0.0 for channel in self.tpdo.channels if channel.index}
-        self.targets: dict[str, float] = {channel.name: 0.0 for channel in self.rpdo.channels if channel.index}
+        self.safe_values = {entry.name: entry.safe for entry in device.outputs}
+        """What the outputs are at the start and after a fault, SI."""
+        self.targets: dict[str, float] = dict(self.safe_values)
+        self._in_offsets = {entry.name: entry.offset for entry in device.inputs}
+        self._out_offsets = {entry.name: entry.offset for entry in device.outputs}
+        self._counters = {entry.name: Counter(entry.modulo) for entry in device.inputs if entry.modulo}
+        self.safe_outputs = Driver.encode(self)
+        """The image of the outputs with these values, for a driver that raises."""
         self._input_names, self._output_names = tuple(self.values), tuple(self.targets)
 
     def decode(self, data: bytes) -> None:
         """Decode the inputs of the cycle (`input_bytes` long)."""
         for channel, counts in zip(self.tpdo.channels, self.codec_in.unpack(data), strict=True):
             if channel.index:
-                self.values[channel.name] = counts * channel.factor
+                counter = self._counters.get(channel.name)
+                counts = counts if counter is None else counter.follow(counts)  # noqa: PLW2901
+                self.values[channel.name] = counts * channel.factor + self._in_offsets[channel.name]
 
     def accept(self, command: Command) -> Refusal | None:
         """Carry out one of `commands`; or return why not, and change nothing."""
@@ -95,9 +104,8 @@ class Driver:
         return None
 
     def safe(self) -> None:
-        """Set the outputs to their safe state, by default 0; called on a fault, on stale inputs and at the end."""
-        for name in self.targets:
-            self.targets[name] = 0.0
+        """Set the outputs to their safe values; called on a fault, on stale inputs and at the end."""
+        self.targets.update(self.safe_values)
 
     def fields(self) -> Sequence[Field]:
         """Return what it publishes in the cycle record, without the slave's name; by default every mapped channel."""
@@ -127,13 +135,42 @@ class Driver:
         return self.codec_out.pack(*(self._counts_of(channel) for channel in self.rpdo.channels))
 
     def _counts_of(self, channel: Channel) -> Number:
-        counts = self.targets[channel.name] / channel.factor if channel.index else 0
-        if isnan(counts):
-            return 0  # what is no number is no reason to end the cycle
+        if not channel.index:
+            return 0
+        value = self.targets[channel.name]
+        if isnan(value):
+            value = self.safe_values[channel.name]  # what is no number is no reason to end the cycle
+        counts = (value - self._out_offsets[channel.name]) / channel.factor
         if channel.type.startswith("float"):
             return counts
         low, high = (0, 1) if channel.type == "bool" else integer_range(channel)
         return round(min(max(counts, low), high))
+
+
+class Counter:
+    """Counts that begin anew at 0 after `modulo` of them, counted on over that, in either direction.
+
+    Args:
+        modulo: number of different counts; a step of more than half of them is taken for one in the other direction.
+    """
+
+    __slots__ = ("_last", "_modulo", "_total")
+
+    def __init__(self, modulo: int) -> None:
+        self._modulo = modulo
+        self._last = -1
+        self._total = 0
+
+    def follow(self, counts: Number) -> int:
+        """Return the counts since 0 of the first turn; `counts`: as they came in this cycle."""
+        here, modulo = int(counts) % self._modulo, self._modulo
+        if self._last < 0:
+            self._total = here
+        else:
+            step = (here - self._last) % modulo
+            self._total += step - modulo if 2 * step > modulo else step
+        self._last = here
+        return self._total
 
 
 def make_driver(slave: SlaveConfig, period_s: float) -> Driver:

@@ -226,7 +226,7 @@ MISTAKES: list[tuple[str, Changes, str]] = [
     (ARM, driven("drive7", "drive6"),
      'gripper.joint.slave: found the text "drive6", the slave of joints[5].slave; each needs its own'),
     (DRIVE, [("kind: cia402", "kind: servo")],
-     'kind: found the text "servo", allowed is one of cia402, generic, io, joint'),
+     'kind: found the text "servo", allowed is one of analog, cia402, coupler, encoder, generic, io, joint'),
     (DRIVE, [("index: 0x6071", "index: 0x16071")],
      "rpdo[0].channels[3].index: found 90225, allowed is an integer from 0 to 65535"),
     (DRIVE, [("configurable_pdos: true", "configurable_pdos: yes")],
@@ -354,7 +354,7 @@ def test_a_mistake_is_named_with_file_and_line(
         (ARM, USER, USER.replace("-0.1", "0.9"),
          "cartesian.keep_out[0]: found min 0.9 and max 0.85 in z; min must be less than max"),
         (DRIVE, "kind: cia402", "kind: servo",
-         'kind: found the text "servo", allowed is one of cia402, generic, io, joint'),
+         'kind: found the text "servo", allowed is one of analog, cia402, coupler, encoder, generic, io, joint'),
     ],
 )  # fmt: skip
 def test_one_mistake_gives_one_sentence_with_its_line(
