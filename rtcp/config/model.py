@@ -23,6 +23,7 @@ from rtcp.config.numbers import (
     U16,
     U32,
     Angle,
+    Factor,
     Fraction,
     Length,
     Milliseconds,
@@ -60,12 +61,16 @@ MOST_TOOLS = 16
 MOST_POINTS = 4096
 """Points or poses of a motion file."""
 
-DataTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
-                       "float32", "float64"]  # fmt: skip
+NumberTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int24", "uint24", "int32", "uint32",
+                         "int40", "uint40", "int48", "uint48", "int56", "uint56", "int64", "uint64",
+                         "float32", "float64"]  # fmt: skip
+DataTypeName = Literal[NumberTypeName, "bits", "bytes"]
 BITS: dict[str, int] = {
-    "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
+    "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int24": 24, "uint24": 24, "int32": 32, "uint32": 32,
+    "int40": 40, "uint40": 40, "int48": 48, "uint48": 48, "int56": 56, "uint56": 56, "int64": 64, "uint64": 64,
     "float32": 32, "float64": 64,
 }  # fmt: skip
+"""Lengths of the types that have one; `bits` and `bytes` are as long as their entry says."""
 DriveModeName = Literal["csp", "csv", "cst"]
 MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "csp": ((), ()),
@@ -109,22 +114,33 @@ class PdoEntry:
     sub_index: U8
     """Object subindex."""
     type: DataTypeName
-    """Data type on the wire."""
+    """Data type on the wire; `bits`: unsigned, 1 to 64 bits, as BIT2; `bytes`: an array, which no record holds."""
     name: Name = "padding"
     """Channel name; the kind of device determines which names are needed."""
     factor: float = 1.0
     """SI units per count; not 0."""
     unit: str = ""
     """Unit of the value, for people and recordings; at most 32 characters, no comma, colon or line break."""
+    bits: Annotated[int, Ge(1), Le(255)] | None = None
+    """Length in bits of the types `bits` and `bytes`; of padding of type `bits` up to 255."""
+
+    @property
+    def length(self) -> int:
+        """Length in bits."""
+        return BITS.get(self.type) or self.bits or 0
 
 
 @dataclass(frozen=True)
 class Pdo:
     """A process data object and the entries mapped into it, in order."""
 
-    index: U16
-    """PDO mapping object: 0x1600 to 0x17ff from the master, 0x1a00 to 0x1bff to it (ETG.1000.6)."""
+    index: Annotated[int, Ge(1), Le(0xFFFF)]
+    """PDO mapping object; most lie in 0x1600 to 0x17ff from the master, in 0x1a00 to 0x1bff to it (ETG.1000.6)."""
     channels: Annotated[tuple[PdoEntry, ...], MinLen(1)]
+    sync_manager: Annotated[int, Ge(0), Le(7)] | None = None
+    """Sync manager, assigned through 0x1C10 + its number; none: the device's only one of that direction."""
+    fixed: bool = False
+    """True: its entries are fixed in the device; only its assignment is written."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +151,7 @@ class StartupSdo:
     """Object index."""
     sub_index: U8
     """Object subindex."""
-    type: DataTypeName
+    type: NumberTypeName
     """Data type of the object."""
     value: float
     """Value to write, in the range of `type`."""
@@ -158,11 +174,13 @@ class DeviceDescription:
     product_id: U32
     """Product code (0x1018:02); another one on the bus is refused."""
     rpdo: tuple[Pdo, ...]
-    """Outputs of the master, assigned through 0x1C12."""
+    """Outputs of the master, by sync manager; without `sync_manager` assigned through 0x1C12."""
     tpdo: tuple[Pdo, ...]
-    """Inputs of the master, assigned through 0x1C13."""
+    """Inputs of the master, by sync manager; without `sync_manager` assigned through 0x1C13."""
     configurable_pdos: bool = True
     """False: the mapping is fixed in the device; it is compared and never written."""
+    coe: bool = True
+    """False: the device has no CoE or no mailbox; its lengths are compared with its EEPROM, its mapping is fixed."""
     complete_access: bool = True
     """False: the device answers SDO complete access of its PDO assignment wrongly although its EEPROM offers it."""
     sdo: tuple[StartupSdo, ...] = ()
@@ -170,6 +188,16 @@ class DeviceDescription:
     """DC AssignActivate word of the ESI: 0x0300 for SYNC0, 0x0700 for SYNC0 and SYNC1, 0 for no distributed clock."""
     sync0_shift_us: float = 0.0
     """SYNC0 shift, us; less than one cycle in either direction."""
+    sync0_factor: Factor = 1
+    """Cycle of SYNC0: above 0 a multiple of `cycle.period_us`, below 0 its part (-10: a tenth); 0: `sync0_cycle_us`."""
+    sync0_cycle_us: NotNegative = 0.0
+    """Cycle of SYNC0 where `sync0_factor` is 0, us."""
+    sync1_factor: Factor = 0
+    """Cycle of SYNC1: above 0 a multiple of SYNC0's, below 0 of `cycle.period_us`; 0: `sync1_cycle_us`."""
+    sync1_cycle_us: NotNegative = 0.0
+    """Cycle of SYNC1 where `sync1_factor` is 0, us; 0: that of SYNC0."""
+    sync1_shift_us: NotNegative = 0.0
+    """Time from SYNC0 to SYNC1, us."""
     watchdog_ms: Annotated[float, Gt(0), Le(6000)] = 100.0
     """Process-data (sync manager) watchdog, ms: without outputs for this time the device stops."""
 
@@ -183,14 +211,14 @@ class DeviceDescription:
         """Return the range of a channel to the device, SI; infinite where it is a float or does not exist."""
         for entry in (entry for pdo in self.rpdo for entry in pdo.channels):
             if entry.name == channel and not entry.type.startswith("float"):
-                low, high = sorted(end * entry.factor for end in integer_range(entry.type))
+                low, high = sorted(end * entry.factor for end in integer_range(entry.type, entry.length))
                 return low, high
         return -math.inf, math.inf
 
 
-def integer_range(kind: str) -> tuple[int, int]:
-    """Return the smallest and the largest number of an integer type."""
-    bits = BITS[kind]
+def integer_range(kind: str, bits: int = 0) -> tuple[int, int]:
+    """Return the smallest and the largest number of an integer type; `bits`: length where the type has none."""
+    bits = BITS.get(kind, bits)
     return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if kind.startswith("int") else (0, 2**bits - 1)
 
 

@@ -35,6 +35,10 @@ class PdoInfo:
         return sum(entry.bits for entry in self.entries)
 
 
+LARGEST_MAILBOX = 1486
+"""Bytes of a mailbox that one datagram carries, and that SOEM has room for."""
+
+
 @dataclass(frozen=True)
 class MailboxInfo:
     """The mailbox according to the SII (ETG.1000.6, 5.4: words 0x18 to 0x1C)."""
@@ -47,8 +51,13 @@ class MailboxInfo:
 
     @property
     def has_coe(self) -> bool:
-        """Whether it speaks CoE."""
-        return "CoE" in self.protocols
+        """Whether it speaks CoE, and its messages fit."""
+        return "CoE" in self.protocols and self.fits
+
+    @property
+    def fits(self) -> bool:
+        """Whether a datagram carries its messages."""
+        return max(self.receive_size, self.send_size) <= LARGEST_MAILBOX
 
 
 @dataclass(frozen=True)

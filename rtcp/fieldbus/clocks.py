@@ -111,37 +111,57 @@ def _difference(register: bytes) -> int:
     return int.from_bytes(register, "little") & 0x7FFF_FFFF
 
 
+def sync_cycles(device: DeviceDescription, period_ns: int) -> tuple[int, int]:
+    """Return the cycle of SYNC0 and the time from it to SYNC1 as registers 0x09A0 and 0x09A4 hold them, ns.
+
+    Where the latter is a cycle of SYNC0 or more, SYNC1 comes after that many of them only (ETG.1000.4, 6.8.5).
+    """
+    sync0 = _cycle(device.sync0_factor, device.sync0_cycle_us, period_ns, period_ns)
+    # As ETG.2000 gives it, SYNC1's cycle counts from the SYNC0 that it comes with; the register from the one after.
+    sync1 = _cycle(device.sync1_factor, device.sync1_cycle_us, sync0, period_ns)
+    return sync0, max(sync1 - sync0, 0) + round(device.sync1_shift_us * 1000)
+
+
+def _cycle(factor: int, cycle_us: float, multiple_of_ns: int, part_of_ns: int) -> int:
+    if factor > 0:
+        return factor * multiple_of_ns
+    return part_of_ns // -factor if factor else round(cycle_us * 1000)
+
+
 def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescription, period_ns: int) -> None:
-    """Start SYNC0 of one slave on the grid of the others: multiples of the period, shifted by `sync0_shift_us`.
+    """Start SYNC0 of one slave on the grid of the others: multiples of its cycle, shifted by `sync0_shift_us`.
 
     Raises:
         BusError: its first SYNC0 lies in the past, or the slave does not keep the activation.
     """
     shift = round(device.sync0_shift_us * 1000)
-    cycles = struct.pack("<II", period_ns, 0)
-    activation = bytes((device.assign_activate >> 8,))
+    sync0, after = sync_cycles(device, period_ns)
+    grid = max(sync0, period_ns)
+    cycles = struct.pack("<II", sync0, after)
+    activation = device.assign_activate.to_bytes(2, "little")
     for _ in range(_SYNC_ATTEMPTS):
-        port.put(station, Register.DC_ACTIVATION, b"\0", label)
-        port.put(station, Register.DC_CYCLIC_UNIT, b"\0", label)
+        port.put(station, Register.DC_CYCLIC_UNIT, bytes(2), label)
         now = port.read(station, Register.DC_SYSTEM_TIME, 8)
         if now is None:
             raise BusError(f"{label} stopped answering while its SYNC0 was started")
-        begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // period_ns * period_ns + period_ns + shift
+        begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // grid * grid + grid + shift
         port.put(station, Register.DC_START, begin.to_bytes(8, "little"), label)
         port.put(station, Register.DC_SYNC0_CYCLE, cycles, label)
         if port.read(station, Register.DC_SYNC0_CYCLE, len(cycles)) != cycles:
-            raise BusError(f"{label}: it does not keep the cycle of SYNC0, {period_ns / 1000:g} us (register 0x09A0)")
-        port.put(station, Register.DC_ACTIVATION, activation, label)
+            kept = f"SYNC0, {sync0 / 1000:g} us, and SYNC1, {after / 1000:g} us after it (registers 0x09A0 and 0x09A4)"
+            raise BusError(f"{label}: it does not keep the cycle of {kept}")
+        # The whole word at once, as IgH writes it: its low byte says who latches and who controls the unit.
+        port.put(station, Register.DC_CYCLIC_UNIT, activation, label)
         # A SYNC0 whose time had passed at the activation never comes (SOEM#757): frames may have been lost meanwhile.
         if first_sync_is_ahead(port, station):
             break
     else:
         raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
-    active = port.read(station, Register.DC_ACTIVATION, 1)
+    active = port.read(station, Register.DC_CYCLIC_UNIT, 2)
     if active != activation:
-        shown = "nothing" if active is None else f"0x{active[0]:02X}"
+        found = "nothing" if active is None else f"0x{int.from_bytes(active, 'little'):04X}"
         raise BusError(
-            f"{label}: `assign_activate` 0x{device.assign_activate:04X} reads back from register 0x0981 as {shown}"
+            f"{label}: `assign_activate` 0x{device.assign_activate:04X} reads back from register 0x0980 as {found}"
         )
 
 

@@ -19,8 +19,8 @@ _DEVICE_NAME = 0x1008
 _SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
 _EEPROM_US = 500_000
 """For a word of it: a shared host may be off its CPU for longer than the 20 ms that pysoem gives it."""
-_SMALLEST_MAILBOX, _LARGEST_MAILBOX = 16, 1486
-"""Bytes: headers and an SDO (ETG.1000.6, 5.6.2); what one datagram carries."""
+_SMALLEST_MAILBOX = 16
+"""Bytes: headers and an SDO (ETG.1000.6, 5.6.2)."""
 _PROTOCOLS = ("AoE", "EoE", "CoE", "FoE", "SoE", "VoE")
 """Bits 0 to 5 of SII word 0x1C (ETG.2010, table 4)."""
 _SYNC_MANAGER = struct.Struct("<HHBBBB")
@@ -31,7 +31,7 @@ def read_mailbox(slave: Any) -> MailboxInfo | None:
     receive_start, receive_size = struct.unpack("<HH", slave.eeprom_read(_SII_RECEIVE, _EEPROM_US))
     send_start, send_size = struct.unpack("<HH", slave.eeprom_read(_SII_SEND, _EEPROM_US))
     send_size = send_size or receive_size
-    if not _SMALLEST_MAILBOX <= min(receive_size, send_size) <= max(receive_size, send_size) <= _LARGEST_MAILBOX:
+    if min(receive_size, send_size) < _SMALLEST_MAILBOX:
         return None
     bits = slave.eeprom_read(_SII_PROTOCOLS, _EEPROM_US)[0]
     protocols = tuple(name for i, name in enumerate(_PROTOCOLS) if bits >> i & 1)

@@ -13,20 +13,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
+from rtcp.config.model import BITS, DeviceDescription, SlaveConfig, StartupSdo
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
-from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, TYPES, compare_mapping, mapping_of, write_mapping
+from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, mapping_of, write_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
 from rtcp.fieldbus.scan import name_of
 
 _FMMUS_SIZE = 0x80
 _SYNC_MANAGER_SIZE, _SYNC_MANAGER_COUNT = 8, 8
-_MAILBOXES = 2
-"""Sync managers 0 and 1 are the mailboxes."""
+_MODE, _MAILBOX = 0x03, 0x02
+"""Mode of a sync manager in its control register, and that of a mailbox (ETG.1000.4, 6.7.2)."""
 _EEPROM_READ, _EEPROM_BUSY, _EEPROM_FAILED = 0x0100, 0x8000, 0x2000
 _SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
 """Word addresses in the EEPROM (ETG.2010, table 2)."""
@@ -45,6 +45,8 @@ class SlaveSetup:
     """Propagation delay from the reference clock, as register 0x0928 holds it; None: it has no clock."""
     serial: int
     """Serial number in its EEPROM; 0: it has none."""
+    mailboxes: int
+    """How many sync managers, from 0 on, are mailboxes."""
 
 
 def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SlaveSetup:
@@ -55,12 +57,13 @@ def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> Sl
     features = port.read(station, Register.FEATURES, 2)
     if fmmus is None or managers is None or features is None:
         raise BusError(f"{slave_label(position, name)} stopped answering while its set-up was read")
-    own = (managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE))
+    own = [managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE)]
     return SlaveSetup(
         fmmus,
         tuple(one[:5] + bytes((0, one[6] & 1, 0)) for one in own),
         port.read(station, Register.DC_DELAY, 4) if features[0] & FEATURE_DC else None,
         serial,
+        sum(one[4] & _MODE == _MAILBOX for one in own[:2]),
     )
 
 
@@ -120,12 +123,12 @@ class SlaveRestorer:
         yield from self._change_state(position, AlState.INIT)
         port.put(station, Register.SYNC_MANAGER, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT), label)
         port.put(station, Register.FMMU, bytes(_FMMUS_SIZE), label)
-        self._write_sync_managers(position, range(_MAILBOXES))
+        self._write_sync_managers(position, range(set_up.mailboxes))
         if not eeprom_to_device(port, station):
             raise BusError(f"{label} did not take its EEPROM back")
         yield from self._change_state(position, AlState.PREOP)
         yield from configure_slave(self._sdo(position), port, station, config, self._period_ns)
-        self._write_sync_managers(position, range(_MAILBOXES, _SYNC_MANAGER_COUNT))
+        self._write_sync_managers(position, range(set_up.mailboxes, _SYNC_MANAGER_COUNT))
         port.put(station, Register.FMMU, set_up.fmmus, label)
         if config.device.assign_activate:
             if position != self._clocks[0]:
@@ -260,10 +263,14 @@ def configure_slave(
     """
     device = config.device
     notes: list[str] = []
-    for assignment, pdos, key in ((RX_ASSIGN, device.rpdo, "rpdo"), (TX_ASSIGN, device.tpdo, "tpdo")):
+    set_watchdog(port, station, slave_label(sdo.position, sdo.name), device)
+    if not device.coe:
+        return notes
+    for key, manager, pdos in assignments(device):
+        assignment = ASSIGN + manager
         if device.configurable_pdos:
             try:
-                yield from write_mapping(sdo, assignment, mapping_of(pdos))
+                yield from write_mapping(sdo, assignment, pdos)
             except SdoAborted as error:
                 file = config.file or "the device's file"
                 sentence = f"{error.sentences[0]}; the device does not take the mapping of {file} (key `{key}`)"
@@ -273,18 +280,20 @@ def configure_slave(
         notes += yield from write_startup(sdo, startup)
     if device.kind == "cia402":
         notes += yield from write_interpolation_time(sdo, period_ns)
-    set_watchdog(port, station, slave_label(sdo.position, sdo.name), device)
     return notes
 
 
 def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     """Write a start-up SDO and read it back; return a note where the device lacks it and may."""
-    code = "B" if startup.type == "bool" else TYPES[startup.type][1]
-    packer = struct.Struct("<" + code)
-    data = packer.pack(startup.value if code in "fd" else int(startup.value))
+    if startup.type.startswith("float"):
+        packer = struct.Struct("<" + STRUCT_CODES[startup.type])
+        data = packer.pack(startup.value)
+    else:
+        length = max(BITS[startup.type] // 8, 1)
+        data = int(startup.value).to_bytes(length, "little", signed=startup.type.startswith("int"))
     what = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
     try:
-        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, packer)
+        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, startup.type)
     except SdoAborted as error:
         if startup.optional and error.code in ABSENT:
             return [f"{slave_label(sdo.position, sdo.name)} has no {what}; it is marked optional and was left out"]
@@ -292,15 +301,19 @@ def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     return []
 
 
-def _write_and_verify(
-    sdo: SdoClient, index: int, sub_index: int, data: bytes, what: str, packer: struct.Struct
-) -> Steps[None]:
+def _write_and_verify(sdo: SdoClient, index: int, sub_index: int, data: bytes, what: str, kind: str) -> Steps[None]:
     yield from sdo.writing(index, sub_index, data)
     kept = yield from sdo.reading(index, sub_index)
     if kept != data:
-        shown = f"{packer.unpack(kept)[0]}" if len(kept) == packer.size else f"bytes {kept.hex(' ')}"
+        found = _number(kept, kind) if len(kept) == len(data) else f"bytes {kept.hex(' ')}"
         where = slave_label(sdo.position, sdo.name)
-        raise BusError(f"{where}: {what} was set to {packer.unpack(data)[0]} and reads back as {shown}")
+        raise BusError(f"{where}: {what} was set to {_number(data, kind)} and reads back as {found}")
+
+
+def _number(data: bytes, kind: str) -> str:
+    if kind.startswith("float"):
+        return str(struct.unpack("<" + STRUCT_CODES[kind], data)[0])
+    return str(int.from_bytes(data, "little", signed=kind.startswith("int")))
 
 
 def interpolation_time(period_ns: int) -> tuple[int, int] | None:
@@ -323,11 +336,10 @@ def write_interpolation_time(sdo: SdoClient, period_ns: int) -> Steps[list[str]]
             f"{where}: its interpolation time (0x60C2) cannot express {period_ns / 1000:g} us and was left as it is"
         ]
     try:
-        for sub_index, (number, packer) in enumerate(
-            zip(value, (struct.Struct("B"), struct.Struct("b")), strict=True), 1
-        ):
+        for sub_index, (number, kind) in enumerate(zip(value, ("uint8", "int8"), strict=True), 1):
             what = f"0x60C2:{sub_index} (interpolation time)"
-            yield from _write_and_verify(sdo, _INTERPOLATION, sub_index, packer.pack(number), what, packer)
+            data = number.to_bytes(1, "little", signed=kind == "int8")
+            yield from _write_and_verify(sdo, _INTERPOLATION, sub_index, data, what, kind)
     except SdoAborted as error:
         if error.code in ABSENT:
             return [f"{where} has no interpolation time (0x60C2)"]

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
-from rtcp.fieldbus.pdo import layout_faults, mapping_of, mapping_text
+from rtcp.fieldbus.image import limit_faults
+from rtcp.fieldbus.pdo import layout, mapping_of, mapping_text
 from rtcp.fieldbus.scan import parents
 from rtcp.fieldbus.slave_setup import identity_faults, interpolation_time
 
@@ -59,9 +60,36 @@ def test_a_mapping_lists_index_subindex_and_bits():
     assert mapping_text(mapping_of((padding,))) == "17 bits (0x1A00: 0x6041:0/16, 0x0000:0/1)"
 
 
-@pytest.mark.parametrize(("entries", "faults"), [(("bool",) * 3, 1), (("bool",) * 8, 0), (("uint8",), 0)])
-def test_an_image_below_a_byte_is_refused(entries, faults):
-    assert len(layout_faults(slave("a", entries=entries).device)) == faults
+def with_managers(*bits_of: tuple[int, int], sent: int = 1) -> SlaveConfig:
+    """A slave that maps so many bits into each of these sync managers of its inputs, and bytes into one of outputs."""
+    tpdo = tuple(
+        Pdo(0x1A00 + n, (PdoEntry(0x6000, n, "bits", f"c{n}", bits=bits),), manager)
+        for n, (manager, bits) in enumerate(bits_of)
+    )
+    rpdo = (Pdo(0x1600, (PdoEntry(0x7000, 1, "bytes", "out", bits=8 * sent),)),)
+    return SlaveConfig("a", DeviceDescription("kind", "io", 1, 2, rpdo, tpdo))
+
+
+def test_each_sync_manager_begins_at_a_whole_byte_in_the_order_of_its_number():
+    image = layout(with_managers((5, 3), (3, 12)).device.tpdo)
+    assert [(channel.name, channel.bit_offset) for channel in image.channels] == [("c1", 0), ("c0", 16)]
+    assert image.bits == 19
+
+
+@pytest.mark.parametrize(
+    ("slaves", "said"),
+    [
+        ([with_managers((3, 8), (4, 4))], ""),
+        ([with_managers((3, 4), (4, 4))], "slave 1 (a): the sync managers of key `tpdo` carry 4 and 4 bits, which need "
+         "2 bytes; SOEM gives them 1"),
+        ([with_managers(*((n, 8) for n in range(3, 7)))], "slave 1 (a): `rpdo` and `tpdo` use 5 sync managers, each of "
+         "which needs an FMMU; SOEM has room for 4"),
+        ([with_managers(sent=21)] * 199, "the process data of all slaves have 4179 bytes; SOEM has room for 4096"),
+        ([with_managers()] * 200, "(key `slaves`) lists 200 slaves; SOEM has room for 199"),
+    ],
+)  # fmt: skip
+def test_what_soem_has_no_room_for_is_told_before_it_maps(slaves, said):
+    assert "\n".join(limit_faults(slaves)).count(said) == 1 if said else not limit_faults(slaves)
 
 
 OPEN, NONE = "open", "no link"
