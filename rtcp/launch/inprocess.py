@@ -250,7 +250,7 @@ class InProcessBus:
         shown = now_ns + self.offset_ns
         for device in devices:
             device.join(devices)
-        virtual = [Slave(device, b"", 0.0, shown, 0, None, now_ns) for device in devices]
+        virtual = [Slave(device, b"", 0.0, shown, 0, now_ns) for device in devices]
         self.segment = Segment(virtual, now_ns)
         self.slaves = [InProcessSlave(slave, self, position) for position, slave in enumerate(virtual, 1)]
         self._configs: Sequence[SlaveConfig] = ()
@@ -392,7 +392,7 @@ class InProcessBus:
 
     def restart(self, position: int) -> None:
         """Switch a slave's supply off and on again."""
-        self.segment.chain.restart(self._slave(position).virtual, self.now_ns)
+        self.segment.topology.restart(self._slave(position).virtual, self.now_ns)
         self.segment.rewire()
 
     def _slave(self, position: int) -> InProcessSlave:

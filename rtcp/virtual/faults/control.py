@@ -129,7 +129,6 @@ class GroundTruth:
         self.watching = False
         self._asked: int | None = None
         """Instant of the last request; None: nobody has ever asked for the truth."""
-        self._chain = segment.chain
         self._segment = segment
         self._models = tuple(models)
         self._joints = {
@@ -205,7 +204,7 @@ class GroundTruth:
             "position": position,
             "model": model,
             "al": slave.application.state.name.replace("_", "-"),
-            "reachable": position <= self._segment.chain.reach,
+            "reachable": slave in self._segment.topology.reached,
         }
         found |= slave.device.truth()
         joint = self._joints.get(slave)
