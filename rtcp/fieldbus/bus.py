@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from rtcp.config.model import SlaveConfig
@@ -35,8 +35,21 @@ class PdoInfo:
         return sum(entry.bits for entry in self.entries)
 
 
+PORTS = 4
 LARGEST_MAILBOX = 1486
 """Bytes of a mailbox that one datagram carries, and that SOEM has room for."""
+
+
+@dataclass(frozen=True)
+class PortErrors:
+    """What each of a slave's ports has counted."""
+
+    rx: list[int] = field(default_factory=lambda: [0] * PORTS)
+    """Damaged frames that came in over the cable of that port."""
+    forwarded: list[int] = field(default_factory=lambda: [0] * PORTS)
+    """Damaged frames that somebody before it has already counted."""
+    links: list[int] = field(default_factory=lambda: [0] * PORTS)
+    """Lost links."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +121,11 @@ class SlaveInfo:
     ports: tuple[str, ...]
     """Ports 0 to 3: `open` (a neighbour answers there), `closed`, `no link`."""
     parent: int
-    """Position of the slave before it on the cable; 0: the master."""
+    """Position of the slave before it; 0: the master."""
+    parent_port: int
+    """Port of that slave at which it hangs."""
+    port_errors: PortErrors
+    """Error counters of its ports since its power-on, each up to 255."""
 
 
 @dataclass(frozen=True)

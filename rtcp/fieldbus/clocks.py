@@ -45,13 +45,13 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
 
 
 def take_over_time(
-    port: RegisterPort, position: int, label: str, delay: bytes, others: Sequence[int], *, always: bool
+    port: RegisterPort, station: int, label: str, delay: bytes, others: Sequence[int], *, always: bool
 ) -> None:
     """Set the clock of one slave by that of another: one broadcast latches the local times of both (ETG.1000.4, 6.8).
 
     Args:
         port: the port for registers.
-        position: the slave whose clock is set; SYNC0 is off. It need not have a station address.
+        station: address of the slave whose clock is set; SYNC0 is off.
         label: how sentences name it.
         delay: its propagation delay from the reference clock, as register 0x0928 holds it.
         others: the other slaves that have a clock, the reference first; the first one that answers is believed.
@@ -61,33 +61,32 @@ def take_over_time(
         BusError: it stopped answering, or no slave took the broadcast.
     """
     if not always:
-        shown = port.read_at(position, Register.DC_DIFFERENCE, 4)
+        shown = port.read(station, Register.DC_DIFFERENCE, 4)
         if shown is not None and _difference(shown) < _SETTLED_NS:
             return
     # Without it the two registers below would hold times of two different frames.
     if port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4)) < 1:
         raise BusError(f"{label}: the local times could not be latched while its clock was set")
-    own = port.read_at(position, Register.DC_RECEIVE_TIME, 8)
+    own = port.read(station, Register.DC_RECEIVE_TIME, 8)
     if own is None:
         raise BusError(f"{label} stopped answering while its clock was set")
     # Where no other clock lives, the host's time is as good as any (SOEM starts with it): ns since 2000.
     time_then = time.time_ns() - _UNTIL_2000_NS
     for other in others:
-        station = station_of(other)
-        theirs = [port.read(station, address, 8) for address in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
-        their_delay = port.read(station, Register.DC_DELAY, 4)
+        theirs = [port.read(station_of(other), at, 8) for at in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
+        their_delay = port.read(station_of(other), Register.DC_DELAY, 4)
         if None not in theirs and their_delay is not None:
             time_then = sum(int.from_bytes(part or b"", "little") for part in theirs)
             time_then += int.from_bytes(delay, "little") - int.from_bytes(their_delay, "little")
             break
     offset = time_then - int.from_bytes(own, "little") & (1 << 64) - 1
-    port.put_at(position, Register.DC_DELAY, delay, label)
-    port.put_at(position, Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
+    port.put(station, Register.DC_DELAY, delay, label)
+    port.put(station, Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
 
 
-def forget_drift(port: RegisterPort, position: int, label: str) -> None:
+def forget_drift(port: RegisterPort, station: int, label: str) -> None:
     """Let a slave forget what drift compensation has learnt: it may have followed a reference that stood still."""
-    port.put_at(position, Register.DC_SPEED, _DC_SPEED_DEFAULT, label)
+    port.put(station, Register.DC_SPEED, _DC_SPEED_DEFAULT, label)
 
 
 def settle_clock(port: RegisterPort, station: int, label: str) -> Steps[None]:

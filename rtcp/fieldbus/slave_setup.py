@@ -11,6 +11,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rtcp.config.model import BITS, DeviceDescription, SlaveConfig, StartupSdo
@@ -67,6 +68,11 @@ def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> Sl
     )
 
 
+def provisional_of(position: int) -> int:
+    """Return the address of a slave that has lost its own, until it is known to be the right one."""
+    return 0x2000 + position
+
+
 class SlaveRestorer:
     """Sets up single slaves again, each in steps of a few frames."""
 
@@ -94,12 +100,13 @@ class SlaveRestorer:
         self._period_ns = period_ns
         self._clocks = tuple(i for i, set_up in enumerate(set_ups, 1) if set_up.delay is not None)
 
-    def restore(self, position: int, lost_address: bool) -> Steps[None]:
+    def restore(self, position: int, place: int | None) -> Steps[None]:
         """Set up the slave at `position` and bring it to SAFE-OP.
 
         Args:
             position: its position on the cable, from 1.
-            lost_address: it has no station address: it was without supply.
+            place: where in the frame's way it answers, from 1: it was without supply and has no station address. None:
+                it has one.
 
         Raises:
             ForeignSlave: another device answers there.
@@ -107,18 +114,22 @@ class SlaveRestorer:
         """
         port, station, config = self._port, station_of(position), self._slaves[position - 1]
         set_up, label = self._set_ups[position - 1], self._label(position)
-        if lost_address:
-            yield from self._identify(position)
+        found_at = station
+        if place is not None:
+            # Its place changes with whoever comes or goes before it: from here on an address of its own is used.
+            found_at = provisional_of(position)
+            self._write_address(position, found_at, partial(port.write_at, place), partial(port.read_at, place))
+            yield from self._identify(position, found_at)
         if set_up.delay is not None:
             # SYNC0 first: it must not run on while the time is set. The address last: the frames of the cycle ask the
             # reference clock by its address, and every other slave follows its time.
-            port.put_at(position, Register.DC_ACTIVATION, b"\0", label)
+            port.put(found_at, Register.DC_ACTIVATION, b"\0", label)
             others = [other for other in self._clocks if other != position]
-            take_over_time(port, position, label, set_up.delay, others, always=lost_address)
-        if lost_address:
-            self._write_address(position)
+            take_over_time(port, found_at, label, set_up.delay, others, always=place is not None)
+        if place is not None:
+            self._write_address(position, station, partial(port.write, found_at), partial(port.read, station))
         if set_up.delay is not None:
-            forget_drift(port, position, label)
+            forget_drift(port, station, label)
         yield
         yield from self._change_state(position, AlState.INIT)
         port.put(station, Register.SYNC_MANAGER, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT), label)
@@ -140,9 +151,9 @@ class SlaveRestorer:
     def _label(self, position: int) -> str:
         return slave_label(position, self._slaves[position - 1].name)
 
-    def _identify(self, position: int) -> Steps[None]:
-        vendor = yield from self._reading_eeprom(position, _SII_VENDOR)
-        product = yield from self._reading_eeprom(position, _SII_PRODUCT)
+    def _identify(self, position: int, station: int) -> Steps[None]:
+        vendor = yield from self._reading_eeprom(position, station, _SII_VENDOR)
+        product = yield from self._reading_eeprom(position, station, _SII_PRODUCT)
         device = self._slaves[position - 1].device
         if (vendor, product) != (device.vendor_id, device.product_id):
             raise ForeignSlave(
@@ -152,23 +163,23 @@ class SlaveRestorer:
             )
         # Two of a kind that were swapped move each other's joint.
         expected = self._set_ups[position - 1].serial
-        if expected and (serial := (yield from self._reading_eeprom(position, _SII_SERIAL))) != expected:
+        if expected and (serial := (yield from self._reading_eeprom(position, station, _SII_SERIAL))) != expected:
             raise ForeignSlave(
                 f"{self._label(position)}: at its place answers another {device.name} (serial number {serial}), "
                 f"expected serial number {expected}: it is left alone; put the right one there, or start anew with "
                 "this one"
             )
 
-    def _reading_eeprom(self, position: int, word: int) -> Steps[int]:
+    def _reading_eeprom(self, position: int, station: int, word: int) -> Steps[int]:
         """Return four bytes of the EEPROM from `word` on (ETG.1000.4, 6.4)."""
         port, label = self._port, self._label(position)
         # Taken back from the device by force, as it may have it after power-on.
-        port.put_at(position, Register.EEPROM_CONFIG, b"\x02", label)
-        port.put_at(position, Register.EEPROM_CONFIG, b"\x00", label)
-        port.put_at(position, Register.EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
+        port.put(station, Register.EEPROM_CONFIG, b"\x02", label)
+        port.put(station, Register.EEPROM_CONFIG, b"\x00", label)
+        port.put(station, Register.EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
         deadline = time.monotonic() + _EEPROM_S
         while True:
-            data = port.read_at(position, Register.EEPROM_CONTROL, 2)
+            data = port.read(station, Register.EEPROM_CONTROL, 2)
             if data is None:
                 raise BusError(f"{self._label(position)} stopped answering while its EEPROM was read")
             status = int.from_bytes(data, "little")
@@ -177,15 +188,20 @@ class SlaveRestorer:
             if time.monotonic() >= deadline:
                 raise BusError(f"{self._label(position)}: its EEPROM stays busy")
             yield
-        found = port.read_at(position, Register.EEPROM_DATA, 4)
+        found = port.read(station, Register.EEPROM_DATA, 4)
         if found is None or status & _EEPROM_FAILED:
             raise BusError(f"{self._label(position)}: its EEPROM cannot be read (status 0x{status:04X})")
         return int.from_bytes(found, "little")
 
-    def _write_address(self, position: int) -> None:
-        port, data = self._port, station_of(position).to_bytes(2, "little")
-        taken = port.write_at(position, Register.STATION_ADDRESS, data)
-        if not taken or port.read_at(position, Register.STATION_ADDRESS, 2) != data:
+    def _write_address(
+        self,
+        position: int,
+        station: int,
+        write: Callable[[int, bytes], bool],
+        read: Callable[[int, int], bytes | None],
+    ) -> None:
+        data = station.to_bytes(2, "little")
+        if not write(Register.STATION_ADDRESS, data) or read(Register.STATION_ADDRESS, 2) != data:
             raise BusError(f"{self._label(position)} does not keep its station address")
 
     def _write_sync_managers(self, position: int, numbers: range) -> None:

@@ -28,9 +28,10 @@ from rtcp.fieldbus.master import Master
 from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, layout
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
-from rtcp.fieldbus.scan import describe, name_of, parents, read_mailbox, read_serial
+from rtcp.fieldbus.scan import describe, name_of, read_mailbox, read_serial
 from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_device, identity_faults, read_set_up
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
+from rtcp.fieldbus.topology import Topology, port_words
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
 _BELOW_SAFEOP = 0x03
@@ -83,6 +84,7 @@ class SoemBus:
         self._serials: list[int] = []
         self._boxes: Mailboxes | None = None
         self._restorer: SlaveRestorer | None = None
+        self._topology: Topology | None = None
 
     def __enter__(self) -> SoemBus:
         self.open()
@@ -141,8 +143,10 @@ class SoemBus:
             describe(slave, self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), self._infos[i], self._serials[i])
             for i, slave in enumerate(self._master.slaves)
         ]
-        before = parents([info.ports for info in found])
-        return tuple(replace(info, parent=parent) for info, parent in zip(found, before, strict=True))
+        tree = Topology.of([info.ports for info in found])
+        return tuple(
+            replace(info, parent=tree.parent(info.position), parent_port=tree.port(info.position)) for info in found
+        )
 
     def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> SoemProcessData:
         """Bring the slaves from INIT to SAFE-OP as configured, with outputs of zero.
@@ -180,10 +184,15 @@ class SoemBus:
             read_set_up(self.port, position, config.name, serial)
             for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
         ]
+        self._topology = self._read_topology()
         self._restorer = SlaveRestorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
         # From here on a cycle runs, and slaves are watched beside it: what is lost is to be known soon.
         self.port.tries = TRIES
         return data
+
+    def _read_topology(self) -> Topology:
+        status = [self.port.read(station, Register.DL_STATUS, 2) for station in self._stations(None)]
+        return Topology.of([port_words(int.from_bytes(one or b"", "little")) for one in status])
 
     def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int, failures: Sequence[int]) -> None:
         """Bring the slaves from INIT to PRE-OP, each set up as configured; raises BusError.
@@ -363,7 +372,7 @@ class SoemBus:
     def watcher(self, report: Callable[[str], None]) -> SlaveWatcher:
         """Return the watcher of the configured slaves, all of them in OP; `report` receives its messages."""
         assert self._restorer is not None, "only a configured bus has something to restore"
-        return SlaveWatcher(self.port, self._names, self._restorer, report)
+        return SlaveWatcher(self.port, self._names, self._restorer, report, self._topology)
 
     def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
         wanted = range(1, len(self._names) + 1) if positions is None else positions

@@ -50,7 +50,7 @@ def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Dire
     port.lost = {(DatagramCommand.BWR, 0x0900)}
     before = port.read(STATION, 0x0920, 8)
     with pytest.raises(BusError, match=r"slave 3 \(drive2\): the local times could not be latched"):
-        take_over_time(port, 3, LABEL, bytes(4), (1, 2), always=True)
+        take_over_time(port, STATION, LABEL, bytes(4), (1, 2), always=True)
     assert port.read(STATION, 0x0920, 8) == before
 
 

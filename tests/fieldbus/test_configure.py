@@ -7,8 +7,8 @@ import pytest
 from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
 from rtcp.fieldbus.image import limit_faults
 from rtcp.fieldbus.pdo import layout, mapping_of, mapping_text
-from rtcp.fieldbus.scan import parents
 from rtcp.fieldbus.slave_setup import identity_faults, interpolation_time
+from rtcp.fieldbus.topology import Topology
 
 
 def slave(name: str, vendor: int = 1, product: int = 2, entries=("uint16",)) -> SlaveConfig:
@@ -93,18 +93,27 @@ def test_what_soem_has_no_room_for_is_told_before_it_maps(slaves, said):
 
 
 OPEN, NONE = "open", "no link"
+END, MIDDLE = (OPEN, NONE, NONE, NONE), (OPEN, OPEN, NONE, NONE)
 
 
 @pytest.mark.parametrize(
     ("ports", "expected"),
     [
-        ([(OPEN, OPEN, NONE, NONE)] * 3 + [(OPEN, NONE, NONE, NONE)], [0, 1, 2, 3]),
-        # A junction at 1 with a branch of two, then one more at its other port.
-        (
-            [(OPEN, OPEN, NONE, OPEN), (OPEN, OPEN, NONE, NONE), (OPEN, NONE, NONE, NONE), (OPEN, NONE, NONE, NONE)],
-            [0, 1, 2, 1],
-        ),
+        ([MIDDLE, MIDDLE, MIDDLE, END], [(0, 0), (1, 1), (2, 1), (3, 1)]),
+        # A junction with two slaves at port 3, which the frame visits first, one at port 1, two at port 2.
+        ([(OPEN,) * 4, MIDDLE, END, END, MIDDLE, END], [(0, 0), (1, 3), (2, 1), (1, 1), (1, 2), (5, 1)]),
+        # A junction behind a branch of another junction.
+        ([(OPEN, OPEN, NONE, OPEN), (OPEN, OPEN, OPEN, NONE), END, END, END], [(0, 0), (1, 3), (2, 1), (2, 2), (1, 1)]),
     ],
 )  # fmt: skip
-def test_the_parent_of_a_slave_follows_from_the_open_ports(ports, expected):
-    assert parents(ports) == expected
+def test_the_tree_of_the_slaves_follows_from_the_open_ports(ports, expected):
+    tree = Topology.of(ports)
+    assert [(tree.parent(position), tree.port(position)) for position in range(1, len(ports) + 1)] == expected
+    assert all(tree.child_at(*at) == position for position, at in enumerate(expected, 1))
+
+
+def test_the_first_of_the_slaves_that_are_lost_together_hangs_at_one_that_answers():
+    tree = Topology.of([(OPEN,) * 4, MIDDLE, END, END, MIDDLE, END])
+    lost = {2, 3, 5, 6}
+    assert [tree.first_lost(position, lost) for position in (2, 3, 5, 6)] == [2, 2, 5, 5]
+    assert [tree.depth(position) for position in range(1, 7)] == [0, 1, 2, 1, 1, 2]
