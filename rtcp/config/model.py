@@ -233,6 +233,8 @@ class SlaveEntry:
     """Slave name; unique."""
     device: Name
     """Device file: `devices/NAME.yaml` beside the arm's file, or a path that ends in .yaml."""
+    alias: U16 = 0
+    """Station alias by which the slave is found wherever it hangs; 0: by its place among those without."""
 
 
 @dataclass(frozen=True)
@@ -243,6 +245,8 @@ class SlaveConfig:
     device: DeviceDescription
     file: str = ""
     """Path of the device's file; empty: made by a program."""
+    alias: int = 0
+    """Station alias by which it is found; 0: by its place."""
 
 
 @dataclass(frozen=True)

@@ -279,6 +279,8 @@ def axes_of(arm: ArmFile | ArmConfig) -> Iterator[tuple[KeyPath, Joint]]:
 @rule(ArmFile, "slaves")
 def _slave_names(arm: ArmFile) -> Iterator[Finding]:
     yield from _repeated(((("slaves", i, "name"), slave.name) for i, slave in enumerate(arm.slaves)), "name")
+    aliases = ((("slaves", i, "alias"), slave.alias) for i, slave in enumerate(arm.slaves) if slave.alias)
+    yield from _repeated(aliases, "alias")
     for i, slave in enumerate(arm.slaves):
         if slave.name in PLATFORM_PARTS:
             yield ("slaves", i, "name"), f'found the text "{slave.name}", the name of a part of the platform'

@@ -16,7 +16,7 @@ from typing import Any
 
 from rtcp.config.model import BITS, DeviceDescription, SlaveConfig, StartupSdo
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
-from rtcp.fieldbus.bus import slave_label, station_of
+from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
@@ -230,6 +230,33 @@ class SlaveRestorer:
 _DIVIDER = 2498
 """Watchdog divider of 100 us: (2498 + 2) * 40 ns (ETG.1000.4, 6.3)."""
 _INTERPOLATION = 0x60C2
+
+
+def by_alias(slaves: Sequence[SlaveConfig], found: Sequence[SlaveInfo]) -> tuple[SlaveConfig, ...]:
+    """Return the slaves of the configuration in the order of the cable: those with an alias where it was found.
+
+    Raises:
+        BusError: nobody has an alias, or several do.
+    """
+    at = {slave.alias: [info.position for info in found if info.alias == slave.alias] for slave in slaves}
+    there = ", ".join(f"slave {info.position} ({info.name}) has {info.alias}" for info in found if info.alias)
+    faults = []
+    for slave in slaves:
+        if slave.alias and not at[slave.alias]:
+            faults.append(
+                f"{slave.name}: no slave has the station alias {slave.alias} (key `slaves`): "
+                f"{there or 'none has any'}; `rtcp alias set` writes one"
+            )
+        elif slave.alias and len(at[slave.alias]) > 1:
+            places = " and ".join(f"slave {position}" for position in at[slave.alias])
+            faults.append(f"{slave.name}: {places} have the station alias {slave.alias}; `rtcp alias set` changes one")
+    if faults:
+        raise BusError(*faults)
+    placed = {at[slave.alias][0]: slave for slave in slaves if slave.alias}
+    if not placed or len(found) != len(slaves):
+        return tuple(slaves)
+    others = iter([slave for slave in slaves if not slave.alias])
+    return tuple(placed.get(info.position) or next(others) for info in found)
 
 
 def identity_faults(found: Sequence[Any], expected: Sequence[SlaveConfig]) -> list[str]:

@@ -29,7 +29,14 @@ from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, layout
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
 from rtcp.fieldbus.scan import describe, name_of, read_mailbox, read_serial
-from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_device, identity_faults, read_set_up
+from rtcp.fieldbus.slave_setup import (
+    SlaveRestorer,
+    by_alias,
+    configure_slave,
+    eeprom_to_device,
+    identity_faults,
+    read_set_up,
+)
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
 from rtcp.fieldbus.topology import Topology, port_words
 
@@ -437,6 +444,7 @@ class SoemMaster(Master):
         found = bus.scan()
         report(f"{len(found)} slaves on {self.interface}")
         (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in found]))
+        self.config = replace(self.config, slaves=by_alias(self.config.slaves, found))
         data = bus.configure(self.config.slaves, round(self.config.cycle.period_us * 1000))
         for note in bus.notes:
             report(note)

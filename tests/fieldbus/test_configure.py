@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
 from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
+from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.image import limit_faults
 from rtcp.fieldbus.pdo import layout, mapping_of, mapping_text
-from rtcp.fieldbus.slave_setup import identity_faults, interpolation_time
+from rtcp.fieldbus.slave_setup import by_alias, identity_faults, interpolation_time
 from rtcp.fieldbus.topology import Topology
 
 
@@ -117,3 +119,23 @@ def test_the_first_of_the_slaves_that_are_lost_together_hangs_at_one_that_answer
     lost = {2, 3, 5, 6}
     assert [tree.first_lost(position, lost) for position in (2, 3, 5, 6)] == [2, 2, 5, 5]
     assert [tree.depth(position) for position in range(1, 7)] == [0, 1, 2, 1, 1, 2]
+
+
+def answering(*aliases: int) -> list[SimpleNamespace]:
+    return [SimpleNamespace(position=n, name="thing", alias=alias) for n, alias in enumerate(aliases, 1)]
+
+
+def test_slaves_with_an_alias_are_found_where_they_hang_and_the_others_in_their_order():
+    slaves = [replace(slave(name), alias=alias) for name, alias in (("a", 7), ("b", 0), ("c", 9), ("d", 0))]
+    assert [one.name for one in by_alias(slaves, answering(0, 9, 5, 7))] == ["b", "c", "d", "a"]
+
+
+def test_an_alias_that_nobody_or_that_several_have_is_told_with_those_that_there_are():
+    slaves = [replace(slave(name), alias=alias) for name, alias in (("a", 7), ("b", 8))]
+    with pytest.raises(BusError) as told:
+        by_alias(slaves, answering(8, 8, 5))
+    assert told.value.sentences == (
+        "a: no slave has the station alias 7 (key `slaves`): slave 1 (thing) has 8, slave 2 (thing) has 8, slave 3 "
+        "(thing) has 5; `rtcp alias set` writes one",
+        "b: slave 1 and slave 2 have the station alias 8; `rtcp alias set` changes one",
+    )
