@@ -429,6 +429,8 @@ class ValueInfo(IntFlag):
     MAXIMUM = 0x40
 
 
+_HIGHEST_INDEX = 0xFFFF
+"""Above it stand PDOs without an index of their own."""
 _ALWAYS_REPORTED = ValueInfo.ACCESS | ValueInfo.CATEGORY | ValueInfo.MAPPABLE
 _RECORD_TYPES = {
     **dict.fromkeys(range(0x1600, 0x1800), DataType.PDO_MAPPING),
@@ -489,7 +491,7 @@ class SdoInformation:
     def _indices(self, kind: ListType) -> list[int]:
         """Return the indices of one list; no entry can be marked for replacement or start-up: those lists are empty."""
         if kind == ListType.ALL:
-            return [found.index for found in self._objects]
+            return [found.index for found in self._objects if found.index <= _HIGHEST_INDEX]
         wanted = {ListType.RXPDO: Access.RXPDO, ListType.TXPDO: Access.TXPDO}.get(kind, Access(0))
         return [
             found.index for found in self._objects if any(entry.access & wanted for entry in found.entries.values())

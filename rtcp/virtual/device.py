@@ -168,7 +168,7 @@ class DeviceModel:
     name: ClassVar[str] = ""
     group: ClassVar[str] = ""
     order_code: ClassVar[str] = ""
-    options: ClassVar[Mapping[str, Option]] = MappingProxyType({})
+    options: Mapping[str, Option] = MappingProxyType({})
     """Options beside those that every model has (`COMMON_OPTIONS`)."""
     supports_dc: bool = True
     """Whether the slave has a distributed clock."""
@@ -193,10 +193,7 @@ class DeviceModel:
     def __init__(self, **given: object) -> None:
         self.chosen = _read_options({**COMMON_OPTIONS, **self.options}, given)
         """Value of every option."""
-        self.identity = Identity(
-            self.vendor_id, self.product_code, self.revision, int(self.option("serial")),
-            self.name, self.group, self.order_code,
-        )  # fmt: skip
+        self.identity = self.make_identity()
         self.emergencies: deque[Emergency] = deque(maxlen=LONGEST_QUEUE)
         """Emergency messages that wait to be sent; the slave's mailbox takes them from the left."""
         self.mailbox_protocols: dict[MailboxType, MailboxHandler] = {}
@@ -212,6 +209,13 @@ class DeviceModel:
 
     def join(self, devices: Sequence[DeviceModel]) -> None:
         """Get to know all devices of the segment, in the order of the cable; called once, before time passes."""
+
+    def make_identity(self) -> Identity:
+        """Return its identity: that of the class, with the serial number of the options."""
+        return Identity(
+            self.vendor_id, self.product_code, self.revision, int(self.option("serial")),
+            self.name, self.group, self.order_code,
+        )  # fmt: skip
 
     def option(self, name: str, otherwise: float = 0.0) -> float:
         """Return the value of an option, `otherwise` where it follows from the model."""
@@ -262,6 +266,9 @@ class DeviceModel:
     def eeprom(self, alias: int) -> bytes:
         """Return its EEPROM image with the station alias; empty: it is made of its objects."""
         return b""
+
+    def open_mailbox(self, receive_size: int, send_size: int) -> None:
+        """The mailbox opens: what the master writes at once, and reads, in bytes with all headers."""
 
     def state_changed(self, before: int, after: int) -> None:
         """The slave went from AL state `before` to `after`."""

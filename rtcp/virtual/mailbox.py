@@ -190,6 +190,7 @@ class MailboxService:
         self._out = out
         self._in = in_
         device.emergencies.clear()
+        device.open_mailbox(out.length, in_.length)
         protocols = device.mailbox_protocols
         if boot:
             protocols = {kind: handler for kind, handler in protocols.items() if kind == MailboxType.FOE}

@@ -53,6 +53,14 @@ class DataType(IntEnum):
     BIT6 = 0x0035
     BIT7 = 0x0036
     BIT8 = 0x0037
+    BIT9 = 0x0038
+    BIT10 = 0x0039
+    BIT11 = 0x003A
+    BIT12 = 0x003B
+    BIT13 = 0x003C
+    BIT14 = 0x003D
+    BIT15 = 0x003E
+    BIT16 = 0x003F
 
 
 class ObjectCode(IntEnum):
@@ -114,7 +122,7 @@ BITS = {DataType.BOOLEAN: 1, **{data_type: 8 * struct.calcsize(code) for data_ty
 BITS |= {
     DataType.INTEGER24: 24, DataType.INTEGER40: 40, DataType.INTEGER48: 48, DataType.INTEGER56: 56,
     DataType.UNSIGNED24: 24, DataType.UNSIGNED40: 40, DataType.UNSIGNED48: 48, DataType.UNSIGNED56: 56,
-    **{DataType(DataType.BIT1 + n): n + 1 for n in range(8)},
+    **{DataType(DataType.BIT1 + n): n + 1 for n in range(16)},
 }  # fmt: skip
 SIGNED = frozenset(data_type for data_type, code in STRUCT_CODES.items() if code in "bhiq") | {
     DataType.INTEGER24, DataType.INTEGER40, DataType.INTEGER48, DataType.INTEGER56,
@@ -199,8 +207,8 @@ class ObjectDictionary:
 
     def __init__(self) -> None:
         self._objects: dict[int, DictionaryObject] = {}
-        self.mappings: dict[int, Entry | None] = {}
-        """Mappings that hold past all checks: those that a description has, and what they stand for (None: a gap)."""
+        self.mappings: dict[int, tuple[Entry, int]] = {}
+        """Mappings that hold though they have another length than their object: that, and the bits of it."""
 
     def variable(self, index: int, name: str, data_type: DataType, value: Value = 0, access: Access = Access.RO,
                  *, minimum: int | None = None, maximum: int | None = None,

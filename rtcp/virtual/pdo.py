@@ -206,7 +206,7 @@ def _field(objects: ObjectDictionary, mapping: int, wanted: Access) -> tuple[Ent
     """Return entry (None: a gap) and bits of a mapping."""
     index, subindex, bits = split_mapping(mapping)
     if mapping in objects.mappings:
-        return objects.mappings[mapping], bits
+        return objects.mappings[mapping]
     if index == 0:
         # A gap; without bits it is an unused place of the mapping object.
         if subindex or not bits:

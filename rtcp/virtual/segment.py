@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 from rtcp.config.document import Finding, read
 from rtcp.config.model import ConfigError
-from rtcp.config.segment import SegmentConfig, load_segment
+from rtcp.config.segment import SegmentConfig, load_segment, place_of
 from rtcp.virtual.arm import VirtualArm, make_arm
-from rtcp.virtual.device import DeviceModel, OptionError, create
+from rtcp.virtual.descriptions import Descriptions
+from rtcp.virtual.device import DeviceModel, OptionError
 from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.protocol import Register
 from rtcp.virtual.slave import Slave, make_slaves
@@ -53,7 +53,7 @@ class Topology:
                 self._children[parent][port] = place
         self._cuts = [0] * len(self._slaves)
         self._outages = [0] * len(self._slaves)
-        self._times = cable_times([slave.delay for slave in slaves], connections)
+        self._times = [cable.time for cable in lay_cables([slave.delay for slave in slaves], connections)]
         self.reached: tuple[Slave, ...] = ()
         """Slaves that a frame reaches, in this order."""
         self.returns = True
@@ -162,28 +162,35 @@ class Topology:
         self.update()
 
 
-def cable_times(arrivals: Sequence[int | None], connections: Sequence[Connection]) -> list[int]:
-    """Return how long, ns, a frame takes over each cable, from when it comes to each slave.
+class Cable(NamedTuple):
+    """How long, ns, a frame takes over a cable, and when it comes to the slave at its end."""
 
-    Where no arrival is given (None) a cable takes `FURTHER_DELAY`. A negative time: it would come before it left.
+    time: int
+    arrival: int
+
+
+def lay_cables(arrivals: Sequence[int | None], connections: Sequence[Connection]) -> list[Cable]:
+    """Return the cables to slaves at which a frame arrives at these instants, ns from the master.
+
+    Where none is given (None) a cable takes `FURTHER_DELAY`, the first one none. A negative time: the frame would come
+    before it left the branches that it passes earlier.
     """
-    times: list[int] = []
-    leaves: dict[int, int] = {}
-    came: list[int] = []
+    cables: list[Cable] = []
+    leaves: list[int] = []
     for place, (parent, _) in enumerate(connections):
-        # All slaves before this one that hang behind its parent have been passed: close their branches.
         left = 0 if parent is None else leaves[parent]
+        usual = FURTHER_DELAY if place else 0
         given = arrivals[place]
-        times.append(FURTHER_DELAY if given is None else given - left)
-        came.append(left + times[place])
-        leaves[place] = came[place]
-        # The frame comes back to every slave on its way to the master, each later by its cable.
-        t, child = came[place], place
+        arrival = left + usual if given is None else given
+        cables.append(Cable(arrival - left, arrival))
+        leaves.append(arrival)
+        # From here it would go back to every slave before it, unless another one follows.
+        t, child = arrival, place
         while (above := connections[child].parent) is not None:
-            t += times[child]
+            t += cables[child].time
             leaves[above] = t
             child = above
-    return times
+    return cables
 
 
 DELAYS = (0, 820, 1660, 2500, 3320, 4160, 5020)
@@ -412,31 +419,83 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
     """
     devices: list[DeviceModel] = []
     findings: list[Finding] = []
+    descriptions = Descriptions(config.source.parent)
     for i, entry in enumerate(config.slaves):
+        key = "esi" if entry.esi is not None else "sii" if entry.sii is not None else "model"
         try:
-            device = create(entry.model, **entry.options)
+            device = descriptions.make(entry)
             for index in device.roles.outputs + device.roles.inputs:
                 device.lay_out(index)
             devices.append(device)
         except OptionError as error:
             findings += [(("slaves", i, *where), text) for where, text in error.findings]
         except (SdoAbort, ValueError) as error:
-            findings.append((("slaves", i, "model"), f"the process data of {entry.model} cannot be laid out: {error}"))
-    delays = [
-        usual if entry.delay_ns is None else entry.delay_ns
-        for entry, usual in zip(config.slaves, default_delays(len(config.slaves)), strict=True)
-    ]
-    for i, (before, delay) in enumerate(pairwise(delays), 1):
-        if delay < before:
-            text = f"found {delay} ns, allowed is at least the {before} ns of the slave before it"
+            findings.append((("slaves", i, key), f"the process data of {entry.label} cannot be laid out: {error}"))
+    connections, misplaced = _connections(config, devices if len(devices) == len(config.slaves) else None)
+    findings += misplaced
+    arrivals: list[int | None] = [entry.delay_ns for entry in config.slaves]
+    if connections == chain(len(arrivals)):
+        usual = default_delays(len(arrivals))
+        arrivals = [own if given is None else given for given, own in zip(arrivals, usual, strict=True)]
+    cables = [] if misplaced else lay_cables(arrivals, connections)
+    for i, cable in enumerate(cables):
+        if cable.time < 0:
+            before = cable.arrival - cable.time
+            text = f"found {cable.arrival} ns, allowed is at least the {before} ns of the slave before it"
             findings.append((("slaves", i, "delay_ns"), text))
     if findings:
         raise ConfigError(read(config.source).sentences(findings))
     drifts = [entry.drift_ppm for entry in config.slaves]
     aliases = [entry.alias for entry in config.slaves]
-    segment = Segment(make_slaves(devices, drifts, delays, aliases, t), t)
+    slaves = make_slaves(devices, drifts, [cable.arrival for cable in cables], aliases, t)
+    segment = Segment(slaves, t, connections)
     segment.arm = make_arm(config, devices)
     return segment
+
+
+def _connections(
+    config: SegmentConfig, devices: Sequence[DeviceModel] | None
+) -> tuple[list[Connection], list[Finding]]:
+    """Return where each slave hangs, and what is wrong with that; without `devices` ports are not looked at."""
+    connections: list[Connection] = []
+    findings: list[Finding] = []
+    taken: dict[Connection, int] = {}
+    for i, entry in enumerate(config.slaves):
+        parent = i - 1 if entry.after is None else place_of(entry.after, config.slaves[:i])
+        made = Connection(None if i == 0 else parent, entry.port if i else 1)
+        connections.append(made)
+        if parent is None or i == 0:
+            continue
+        label = f"slave {parent + 1} ({config.slaves[parent].label})"
+        ports = [] if devices is None else [n for n, kind in enumerate(devices[parent].physics) if n and kind != " "]
+        if devices is not None and made.port not in ports:
+            text = f"found {made.port}, but {label} has {_listed(ports)} to hang something at"
+            findings.append((("slaves", i, "port"), text))
+        elif taken.setdefault(made, i) != i:
+            text = f"found {made.port} of {label}, where slave {taken[made] + 1} hangs already"
+            findings.append((("slaves", i, "port"), text))
+    if not findings:
+        for expected, place in enumerate(_wire_order(connections)):
+            if place != expected:
+                text = f"frames come to this slave before slave {expected + 1} ({config.slaves[expected].label})"
+                return connections, [(("slaves", place, "after"), f"{text}: list it before that one")]
+    return connections, findings
+
+
+def _listed(ports: Sequence[int]) -> str:
+    return f"port{'s' if len(ports) > 1 else ''} {' and '.join(map(str, ports))}" if ports else "no port"
+
+
+def _wire_order(connections: Sequence[Connection]) -> list[int]:
+    """Return the places of the slaves in the order in which frames come to them."""
+    order: list[int] = []
+    waiting = [0]
+    while waiting:
+        place = waiting.pop()
+        order.append(place)
+        children = [other for other, connection in enumerate(connections) if connection.parent == place]
+        waiting += sorted(children, key=lambda other: BRANCHES.index(connections[other].port), reverse=True)
+    return order
 
 
 def check_segment(path: Path) -> None:
