@@ -178,6 +178,55 @@ def _faults(as_json: AsJson = False, segment: ControlPath = None) -> None:
         emit("no fault is active")
 
 
+@commands.command("get")
+def _get(
+    slave: Annotated[str, typer.Argument(metavar="SLAVE", help="Position from 1, or name.")],
+    target: Annotated[
+        str | None, typer.Argument(metavar="OBJECT", help="As 0x6000:1. Default: all process data.")
+    ] = None,
+    as_json: AsJson = False,
+    segment: ControlPath = None,
+) -> None:
+    """Show what an object of a software slave holds, or its process data."""
+    address = () if target is None else _object(target)
+    with _client(segment) as client:
+        entries = client.get(_slave(slave), *address)
+    if as_json:
+        emit_json(entries)
+        return
+    for entry in entries:
+        emit(f"0x{entry['index']:04X}:{entry['subindex']} {entry['name']}: {entry['value']}")
+
+
+@commands.command("set", context_settings=NUMBERS_AS_WRITTEN)
+def _set(
+    slave: Annotated[str, typer.Argument(metavar="SLAVE", help="Position from 1, or name.")],
+    target: Annotated[str, typer.Argument(metavar="OBJECT", help="As 0x6000:1.")],
+    value: Annotated[str, as_written("VALUE", "A number; of strings a text, or bytes as 0x1A2B.")],
+    segment: ControlPath = None,
+) -> None:
+    """Set an object of a software slave, as its inputs: past all rights, and until something changes it."""
+    index, subindex = _object(target)
+    with _client(segment) as client:
+        is_text = isinstance(client.get(_slave(slave), index, subindex)[0]["value"], str)
+        entry = client.set(_slave(slave), index, subindex, value if is_text else _value(value))
+    report(f"0x{index:04X}:{subindex} {entry['name']}: {entry['value']}")
+
+
+def _slave(written: str) -> int | str:
+    return int(written) if written.isdecimal() else written
+
+
+def _object(written: str) -> tuple[int, int]:
+    """Return index and subindex of an object, as 0x6000:1 or 0x6040; raises CommandError."""
+    index, _, subindex = written.partition(":")
+    try:
+        found = int(index, 0), int(subindex or "0", 0)
+    except ValueError:
+        raise CommandError(f"{written!r} is no object: write index and subindex, as 0x6000:1") from None
+    return found
+
+
 @commands.command("kinds")
 def _kinds(as_json: AsJson = False) -> None:
     """List the kinds of faults, their keys and the allowed values."""

@@ -10,6 +10,23 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 
+class EsiError(Exception):
+    """A description that cannot be read, written or put together; `origin` is the file and line, or what it is of."""
+
+    def __init__(self, origin: str, problem: str) -> None:
+        super().__init__(f"{origin}: {problem}")
+        self.origin = origin
+        self.problem = problem
+
+
+class LookupFailure(EsiError):
+    """No device, or several, are what was asked for; `candidates` are those that there are."""
+
+    def __init__(self, origin: str, problem: str, candidates: tuple[str, ...]) -> None:
+        super().__init__(origin, problem)
+        self.candidates = candidates
+
+
 class Source(Enum):
     """Where a description comes from."""
 
@@ -74,6 +91,8 @@ class SyncManager:
     """Smallest length, bytes."""
     maximum: int | None = None
     """Largest length, bytes."""
+    op_only: bool = False
+    """It is enabled in OP only."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +105,8 @@ class PdoEntry:
     name: str = ""
     type: str = ""
     """Data type as the description names it (UINT, BIT2, INT24, `ARRAY [0..30] OF BYTE`); empty: not given."""
+    depends_on_slot: bool = False
+    """In a module: its index grows with the slot."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +125,10 @@ class Pdo:
     virtual: bool = False
     excludes: frozenset[int] = frozenset()
     """PDOs that cannot be assigned together with it."""
+    depends_on_slot: bool = False
+    """In a module: its index grows with the slot."""
+    overwritten_by_module: bool = False
+    """A module's PDO of the same index takes its place."""
 
     @property
     def bits(self) -> int:
@@ -144,6 +169,9 @@ class DictionaryObject:
     code: ObjectCode
     entries: tuple[ObjectEntry, ...]
     """By rising subindex, subindex 0 among them."""
+    depends_on_slot: bool = False
+    """In a module: its index grows with the slot."""
+    overwritten_by_module: bool = False
 
 
 @dataclass(frozen=True)
@@ -159,6 +187,8 @@ class InitCommand:
     fixed: bool = False
     """Its data cannot be changed."""
     comment: str = ""
+    depends_on_slot: bool = False
+    """In a module: its index grows with the slot."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +216,8 @@ class Mailbox:
     aoe: bool = False
     soe: bool = False
     voe: bool = False
+    data_link_layer: bool = False
+    """It repeats a lost answer (ETG.1000.4, 6.7.1)."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +230,7 @@ class DcMode:
     description: str = ""
     sync0_cycle: int = 0
     sync0_factor: int = 1
-    """Above 0: multiple of the master's cycle, below: its divisor."""
+    """Above 0: multiple of the master's cycle, below: its divisor; 0: not given."""
     sync0_shift: int = 0
     sync1_cycle: int = 0
     sync1_factor: int = 0
@@ -233,6 +265,10 @@ class Module:
     objects: tuple[DictionaryObject, ...] = ()
     init_commands: tuple[InitCommand, ...] = ()
     module_class: str = ""
+    profile: int | None = None
+    """Device profile number, 402 for a drive's axis."""
+    origin: str = ""
+    """File and line."""
 
 
 @dataclass(frozen=True)
@@ -262,6 +298,8 @@ class Device:
     dc_modes: tuple[DcMode, ...] = ()
     """The first is the default; empty: no distributed clock."""
     slots: tuple[Slot, ...] = ()
+    modules: tuple[tuple[int, int], ...] = ()
+    """Place and ident of each module that has been put in, see `rtcp.esi.modules`."""
     eeprom_bytes: int = 0
     """Size of its EEPROM; 0: not given."""
     config_data: bytes = b""
@@ -271,6 +309,15 @@ class Device:
     profile: int | None = None
     """Device profile number, 402 for drives."""
     station_alias: int = 0
+    group_name: str = ""
+    channel_profiles: tuple[int, ...] = ()
+    """Profile number of each channel, for two axes (402, 402); empty: not given."""
+    download_module_idents: bool = False
+    """The master writes the idents of the modules to 0xF030 before SAFE-OP."""
+    ebus_current: int = 0
+    """Current that it takes from the E-bus, mA; below 0: that it feeds."""
+    no_lrw: bool = False
+    """It does not support the command LRW."""
     hidden: bool = False
     """A tool offers it no more: a later revision takes its place."""
     unread: Mapping[str, int] = field(default_factory=dict)
@@ -288,3 +335,5 @@ class DeviceFile:
     modules: tuple[Module, ...]
     warnings: tuple[str, ...]
     """A sentence for each deviation that was accepted, with file and line."""
+    failures: tuple[str, ...] = ()
+    """A sentence for each device or module that could not be read, with file and line."""

@@ -15,7 +15,7 @@ from typing import Any, cast
 
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.al_state import AlState, state_name
-from rtcp.fieldbus.bus import SlaveInfo, SlaveState, slave_label, station_of
+from rtcp.fieldbus.bus import PortErrors, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.pdo import layout as image_of
@@ -251,7 +251,7 @@ class InProcessBus:
         shown = now_ns + self.offset_ns
         for device in devices:
             device.join(devices)
-        virtual = [Slave(device, b"", 0.0, shown, 0, None, now_ns) for device in devices]
+        virtual = [Slave(device, b"", 0.0, shown, 0, now_ns) for device in devices]
         self.segment = Segment(virtual, now_ns)
         self.slaves = [InProcessSlave(slave, self, position) for position, slave in enumerate(virtual, 1)]
         self._configs: Sequence[SlaveConfig] = ()
@@ -395,7 +395,7 @@ class InProcessBus:
 
     def restart(self, position: int) -> None:
         """Switch a slave's supply off and on again."""
-        self.segment.chain.restart(self._slave(position).virtual, self.now_ns)
+        self.segment.topology.restart(self._slave(position).virtual, self.now_ns)
         self.segment.rewire()
 
     def _slave(self, position: int) -> InProcessSlave:
@@ -413,4 +413,5 @@ def _info(slave: InProcessSlave) -> SlaveInfo:
         slave.position, status.station, identity.name, identity.vendor_id, identity.product_code, identity.revision,
         identity.serial, 0, status.words(), status.code, "", True, None, (), (), 8 * slave.output_bytes,
         8 * slave.input_bytes, (), 0, slave.device.supports_dc, 0, (), slave.position - 1,
+        1, PortErrors(),
     )  # fmt: skip

@@ -31,7 +31,8 @@ from rtcp.ipc.observer import Answer, EventRecord, Observer
 from rtcp.ipc.states import State
 from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.arm import make_arm
-from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
+from rtcp.virtual.descriptions import Descriptions
+from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
 
 NAME = "inprocess"
 """Name of the bus."""
@@ -219,7 +220,10 @@ def _devices(config: ArmConfig, segment: SegmentConfig, positions: Sequence[floa
     slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
     for joint, position in zip(config.joints, positions or (), strict=False):
         options[slots[joint.slave]]["initial_position"] = position
-    return [create(slave.model, **chosen) for slave, chosen in zip(segment.slaves, options, strict=True)]
+    descriptions = Descriptions(segment.source.parent)
+    return [
+        descriptions.make(replace(slave, options=chosen)) for slave, chosen in zip(segment.slaves, options, strict=True)
+    ]
 
 
 _WATCH_TURNS = 10

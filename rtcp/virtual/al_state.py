@@ -10,16 +10,11 @@ from enum import IntEnum
 from itertools import pairwise
 
 from rtcp.virtual.device import DeviceModel
-from rtcp.virtual.esc import MEMORY_SIZE, Esc, SyncManager
-from rtcp.virtual.objects import SdoAbort
-from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
+from rtcp.virtual.esc import Esc, SyncManager
 from rtcp.virtual.protocol import REGISTER_SPACE, AlState, Register
 
 MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(4)
 """Sync managers of a slave with mailbox, by their use (ETG.1000.6, 5.6.7.4)."""
-MINIMUM_MAILBOX = 34
-"""Smallest mailbox of a CoE slave, in bytes: SDO information needs it (ETG.1020, 8.1)."""
-BUFFERS = 3
 MINIMUM_CYCLE = (0x1C32, 5)
 
 
@@ -30,6 +25,7 @@ class AlStatusCode(IntEnum):
     INVALID_STATE_CHANGE = 0x0011
     UNKNOWN_STATE = 0x0012
     BOOTSTRAP_NOT_SUPPORTED = 0x0013
+    INVALID_MAILBOX_BOOT = 0x0015
     INVALID_MAILBOX_PREOP = 0x0016
     INVALID_SYNC_MANAGERS = 0x0017
     SYNC_ERROR = 0x001A
@@ -45,76 +41,75 @@ class AlStatusCode(IntEnum):
     INVALID_SYNC0_CYCLE = 0x0035
 
 
-def _in_ram(manager: SyncManager, size: int) -> bool:
-    return manager.start >= REGISTER_SPACE and manager.start + size <= MEMORY_SIZE
+def _in_ram(manager: SyncManager, size: int, esc: Esc) -> bool:
+    return manager.start >= REGISTER_SPACE and manager.start + size <= len(esc.memory)
 
 
 def check_mailboxes(esc: Esc, device: DeviceModel) -> bool:
-    """SM0 and SM1 must be mailboxes, out and in, long enough and apart."""
-    out, in_ = esc.sync_managers[MAILBOX_OUT], esc.sync_managers[MAILBOX_IN]
+    """The mailboxes must be mailboxes, out and in, long enough and apart; a slave without mailbox needs none."""
+    if device.roles.mailboxes is None:
+        return True
+    out, in_ = (esc.sync_managers[index] for index in device.roles.mailboxes)
     return (
-        all(m.enabled and m.mailbox and m.length >= MINIMUM_MAILBOX and _in_ram(m, m.length) for m in (out, in_))
+        all(
+            m.enabled and m.mailbox and m.length >= device.smallest_mailbox and _in_ram(m, m.length, esc)
+            for m in (out, in_)
+        )
         and out.master_writes
         and not in_.master_writes
         and (out.end <= in_.start or in_.end <= out.start)
     )
 
 
-def mapped_image(device: DeviceModel, assignment: int) -> PdoImage | None:
-    """The process image that `assignment` (0x1C12, 0x1C13) gives; None where it maps what does not exist."""
-    try:
-        return PdoImage.from_assignment(device.objects, assignment)
-    except (SdoAbort, ValueError):
-        return None
-
-
-def _fits(manager: SyncManager, image: PdoImage | None, master_writes: bool) -> bool:
-    """Whether the sync manager is a buffer in the right direction as long as `image`; an empty one needs none."""
+def _fits(esc: Esc, device: DeviceModel, index: int, master_writes: bool) -> bool:
+    """Whether a sync manager lies where and as its device has it, as long as its PDOs; an empty one needs none."""
+    manager, own, image = esc.sync_managers[index], device.sync_managers[index], device.image(index)
     if image is None or not image.byte_length:
         return image is not None and not manager.enabled
     return (
         manager.enabled
-        and not manager.mailbox
         and manager.master_writes == master_writes
+        and manager.buffers == own.buffers
         and manager.length == image.byte_length
-        and _in_ram(manager, BUFFERS * manager.length)
+        and (_in_ram(manager, manager.buffers * manager.length, esc) or manager.start == own.start)
     )
 
 
 def check_outputs(esc: Esc, device: DeviceModel) -> bool:
-    """SM2 must be a buffer that the master writes, as long as the RxPDOs."""
-    return _fits(esc.sync_managers[OUTPUTS], mapped_image(device, RX_ASSIGN), True)
+    """Each sync manager of outputs must be a buffer that the master writes, as long as its RxPDOs."""
+    return all(_fits(esc, device, index, True) for index in device.roles.outputs)
 
 
 def check_inputs(esc: Esc, device: DeviceModel) -> bool:
-    """SM3 must be a buffer that the master reads, as long as the TxPDOs."""
-    return _fits(esc.sync_managers[INPUTS], mapped_image(device, TX_ASSIGN), False)
+    """Each sync manager of inputs must be a buffer that the master reads, as long as its TxPDOs."""
+    return all(_fits(esc, device, index, False) for index in device.roles.inputs)
 
 
 def check_areas(esc: Esc, device: DeviceModel) -> bool:
     """No two sync managers may share memory; a buffer takes its length three times."""
-    areas = sorted(
-        (m.start, m.start + m.length * (1 if m.mailbox else BUFFERS)) for m in esc.sync_managers if m.enabled
-    )
-    return all(first[1] <= second[0] for first, second in pairwise(areas))
+    areas = sorted((m.start, m.start + m.length * m.buffers) for m in esc.sync_managers if m.enabled)
+    return device.shares_memory or all(first[1] <= second[0] for first, second in pairwise(areas))
 
 
 def check_watchdog(esc: Esc, device: DeviceModel) -> bool:
-    """A watchdog that SM2 triggers and that has a time must have a divider to count it with."""
-    wanted = esc.sync_managers[OUTPUTS].watchdog_trigger and esc.get(Register.WATCHDOG_PROCESS_DATA, 2)
+    """A watchdog that outputs trigger and that has a time must have a divider to count it with."""
+    triggered = any(esc.sync_managers[index].watchdog_trigger for index in device.roles.outputs)
+    wanted = triggered and esc.get(Register.WATCHDOG_PROCESS_DATA, 2)
     return not wanted or bool(esc.get(Register.WATCHDOG_DIVIDER, 2))
 
 
 def check_sync0(esc: Esc, device: DeviceModel) -> bool:
-    """Where SYNC pulses are on there must be SYNC0."""
+    """Where SYNC pulses are on there must be SYNC0, or what the device has instead."""
     dc = esc.dc
-    return dc is None or not dc.cyclic or (dc.sync0_active and bool(dc.sync0.cycle))
+    if dc is None or not dc.cyclic or esc.memory[Register.DC_ACTIVATION] in device.sync_activations:
+        return True
+    return dc.sync0_active and bool(dc.sync0.cycle)
 
 
 def check_cycle(esc: Esc, device: DeviceModel) -> bool:
     """SYNC0 must have a cycle that the device can keep."""
     minimum = device.objects[MINIMUM_CYCLE].value if MINIMUM_CYCLE in device.objects else 0
-    return esc.dc is None or not esc.dc.cyclic or not isinstance(minimum, int) or esc.dc.sync0.cycle >= minimum
+    return esc.dc is None or not esc.dc.sync0_active or not isinstance(minimum, int) or esc.dc.sync0.cycle >= minimum
 
 
 def check_pulses(esc: Esc, device: DeviceModel) -> bool:
@@ -124,6 +119,10 @@ def check_pulses(esc: Esc, device: DeviceModel) -> bool:
     """
     dc = esc.dc
     return dc is None or not dc.cyclic or not (dc.sync0.lost and dc.sync0.pulses)
+
+
+def _mapped(device: DeviceModel, indices: tuple[int, ...]) -> bool:
+    return all(device.image(index) is not None for index in indices)
 
 
 Check = tuple[Callable[[Esc, DeviceModel], bool], AlStatusCode]
@@ -143,10 +142,11 @@ _SYNC: tuple[Check, ...] = (
 # Steps up, and what must hold for them. A step down is always allowed; any other pair is 0x0011.
 UPWARD: dict[tuple[AlState, AlState], tuple[Check, ...]] = {
     (AlState.INIT, AlState.PRE_OP): _MAILBOXES,
+    (AlState.INIT, AlState.BOOTSTRAP): ((check_mailboxes, AlStatusCode.INVALID_MAILBOX_BOOT),),
     (AlState.PRE_OP, AlState.SAFE_OP): (
         *_MAILBOXES,
-        (lambda esc, device: mapped_image(device, RX_ASSIGN) is not None, AlStatusCode.INVALID_OUTPUT_MAPPING),
-        (lambda esc, device: mapped_image(device, TX_ASSIGN) is not None, AlStatusCode.INVALID_INPUT_MAPPING),
+        (lambda esc, device: _mapped(device, device.roles.outputs), AlStatusCode.INVALID_OUTPUT_MAPPING),
+        (lambda esc, device: _mapped(device, device.roles.inputs), AlStatusCode.INVALID_INPUT_MAPPING),
         *_BUFFERS,
         (check_watchdog, AlStatusCode.INVALID_WATCHDOG),
         *_SYNC,
@@ -159,6 +159,7 @@ _PROCESS_DATA = ((_MAILBOXES, AlState.INIT), (_BUFFERS, AlState.PRE_OP))
 HELD: dict[AlState, tuple[tuple[tuple[Check, ...], AlState], ...]] = {
     AlState.INIT: (),
     AlState.PRE_OP: _PROCESS_DATA[:1],
+    AlState.BOOTSTRAP: _PROCESS_DATA[:1],
     AlState.SAFE_OP: _PROCESS_DATA,
     AlState.OP: _PROCESS_DATA,
 }
@@ -173,9 +174,9 @@ def judge(state: AlState, wanted: int, esc: Esc, device: DeviceModel) -> AlStatu
     """Whether a slave in `state` may go to `wanted`, the value of AL control's low four bits."""
     if wanted not in AlState.__members__.values():
         return AlStatusCode.UNKNOWN_STATE
-    if wanted == AlState.BOOTSTRAP:
-        return AlStatusCode.BOOTSTRAP_NOT_SUPPORTED if state == AlState.INIT else AlStatusCode.INVALID_STATE_CHANGE
-    if wanted <= state:
+    if wanted == AlState.BOOTSTRAP and state == AlState.INIT and device.bootstrap is None:
+        return AlStatusCode.BOOTSTRAP_NOT_SUPPORTED
+    if wanted == state or (wanted < state and AlState.BOOTSTRAP not in (wanted, state)) or wanted == AlState.INIT:
         return AlStatusCode.NO_ERROR
     checks = UPWARD.get((state, AlState(wanted)))
     return AlStatusCode.INVALID_STATE_CHANGE if checks is None else first_failure(checks, esc, device)

@@ -46,6 +46,8 @@ def read(objects: ObjectDictionary, index: int, subindex: int, complete: bool, s
     if not complete or found.code == ObjectCode.VARIABLE:
         entry = objects[index, subindex]
         _check_right(entry, Access.RO, _READ.get(state & _STATE, Access(0)), AbortCode.WRITE_ONLY)
+        if entry.on_read is not None:
+            entry.on_read(entry)
         return encode(entry, entry.value)
     _check_first(subindex)
     entries = [found.entries[0]] if subindex == 0 else []
@@ -57,6 +59,8 @@ def read(objects: ObjectDictionary, index: int, subindex: int, complete: bool, s
     image = offset = 0
     for entry in entries:
         if entry.access & right:
+            if entry.on_read is not None:
+                entry.on_read(entry)
             image |= to_bits(entry) << offset
         offset += entry.bit_length if entry.subindex else _COUNT_BITS
     return image.to_bytes((offset + 7) // 8, "little")
@@ -275,9 +279,11 @@ class SdoServer:
     MINIMUM_REQUEST = 10
     """Bytes of the shortest request, CoE header included."""
 
-    def __init__(self, objects: ObjectDictionary, send_size: int, faults: SlaveFaults | None = None) -> None:
+    def __init__(self, objects: ObjectDictionary, send_size: int, faults: SlaveFaults | None = None,
+                 complete_access: bool = True) -> None:  # fmt: skip
         """Serve `objects` through a send mailbox of `send_size` bytes."""
         self._objects = objects
+        self._complete_access = complete_access
         self._faults = SlaveFaults() if faults is None else faults
         self._segment_size = send_size - MAILBOX_AND_COE_HEADER - 1
         self._normal_size = send_size - MAILBOX_AND_COE_HEADER - _SDO.size
@@ -299,6 +305,8 @@ class SdoServer:
         try:
             if specifier != Request.ABORT and (code := self._faults.sdo_abort(index)):
                 raise SdoAbort(code)
+            if specifier in (Request.UPLOAD, Request.DOWNLOAD) and command & _COMPLETE and not self._complete_access:
+                raise SdoAbort(AbortCode.UNSUPPORTED_ACCESS)
             if specifier == Request.UPLOAD:
                 return self._upload(command, index, subindex, state)
             if specifier == Request.DOWNLOAD:
@@ -421,6 +429,8 @@ class ValueInfo(IntFlag):
     MAXIMUM = 0x40
 
 
+_HIGHEST_INDEX = 0xFFFF
+"""Above it stand PDOs without an index of their own."""
 _ALWAYS_REPORTED = ValueInfo.ACCESS | ValueInfo.CATEGORY | ValueInfo.MAPPABLE
 _RECORD_TYPES = {
     **dict.fromkeys(range(0x1600, 0x1800), DataType.PDO_MAPPING),
@@ -481,7 +491,7 @@ class SdoInformation:
     def _indices(self, kind: ListType) -> list[int]:
         """Return the indices of one list; no entry can be marked for replacement or start-up: those lists are empty."""
         if kind == ListType.ALL:
-            return [found.index for found in self._objects]
+            return [found.index for found in self._objects if found.index <= _HIGHEST_INDEX]
         wanted = {ListType.RXPDO: Access.RXPDO, ListType.TXPDO: Access.TXPDO}.get(kind, Access(0))
         return [
             found.index for found in self._objects if any(entry.access & wanted for entry in found.entries.values())

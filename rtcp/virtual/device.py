@@ -12,13 +12,14 @@ from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from math import isfinite
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol, cast
+from typing import Any, ClassVar, NamedTuple, Protocol, cast
 
 from rtcp.config.document import Finding, shown
 from rtcp.config.find import load_class, registered
 from rtcp.config.model import PluginError
-from rtcp.virtual.objects import DataType, Entry, ObjectDictionary
-from rtcp.virtual.protocol import MailboxType
+from rtcp.virtual.objects import DataType, Entry, ObjectDictionary, SdoAbort
+from rtcp.virtual.pdo import ASSIGN, PdoImage, SyncManager, SyncManagerLayout, SyncManagerType, room
+from rtcp.virtual.protocol import RAM_SIZE, REGISTER_SPACE, MailboxType
 
 MailboxHandler = Callable[[bytes, int], Iterable[bytes]]
 """Answers a mailbox message: it gets the message without its mailbox header, and the most bytes of an answer."""
@@ -100,6 +101,37 @@ class SlaveFaults:
         return max(self.sdo_delays, default=0)
 
 
+class Roles(NamedTuple):
+    """Numbers of the sync managers of a slave by their use; virtual ones, which stand for registers, have none."""
+
+    mailboxes: tuple[int, int] | None
+    """The one that the master writes and the one that it reads; None: no mailbox."""
+    outputs: tuple[int, ...]
+    inputs: tuple[int, ...]
+
+
+def roles_of(layout: Sequence[SyncManager]) -> Roles:
+    """Return the use of each sync manager of `layout`."""
+
+    def of(wanted: SyncManagerType) -> tuple[int, ...]:
+        return tuple(n for n, manager in enumerate(layout) if manager.type == wanted)
+
+    receive, send = of(SyncManagerType.MAILBOX_RECEIVE), of(SyncManagerType.MAILBOX_SEND)
+    mailboxes = (receive[0], send[0]) if receive and send else None
+    return Roles(mailboxes, of(SyncManagerType.OUTPUTS), of(SyncManagerType.INPUTS))
+
+
+@dataclass(frozen=True)
+class CoeFeatures:
+    """What a device's CoE can do beside single SDOs (ETG.1000.6, table 21)."""
+
+    sdo_information: bool = True
+    complete_access: bool = True
+
+
+FULL_COE = CoeFeatures()
+
+
 class Number(Protocol):
     """An entry whose value is known to be an int."""
 
@@ -136,25 +168,40 @@ class DeviceModel:
     name: ClassVar[str] = ""
     group: ClassVar[str] = ""
     order_code: ClassVar[str] = ""
-    options: ClassVar[Mapping[str, Option]] = MappingProxyType({})
+    options: Mapping[str, Option] = MappingProxyType({})
     """Options beside those that every model has (`COMMON_OPTIONS`)."""
     supports_dc: bool = True
     """Whether the slave has a distributed clock."""
     uses_sync0: ClassVar[bool] = True
     """Whether active SYNC0 steps the device and is supervised; else process data step it."""
+    sync_managers: Sequence[SyncManager] = SyncManagerLayout()
+    bootstrap: tuple[int, int, int, int] | None = None
+    """Mailboxes in BOOT: start and length of the one that the master writes, and of the other; None: no BOOT."""
+    coe: CoeFeatures | None = FULL_COE
+    """None: its mailbox, if it has one, carries other protocols alone."""
+    smallest_mailbox: int = 34
+    """Fewest bytes of a mailbox; a CoE slave needs 34 for SDO information (ETG.1020, 8.1)."""
+    physics: str = "YY"
+    """Ports 0, 1, 2, 3: Y MII, K E-bus, H MII for fast hot connect, blank none (ETG.2000)."""
+    ram_size: int = RAM_SIZE
+    """Bytes of process data RAM."""
+    shares_memory: bool = False
+    """Whether its own sync managers overlap: then nobody checks that they do not."""
+    sync_activations: frozenset[int] = frozenset()
+    """Values of the DC activation register 0x0981 that are allowed beside those with SYNC0."""
 
     def __init__(self, **given: object) -> None:
         self.chosen = _read_options({**COMMON_OPTIONS, **self.options}, given)
         """Value of every option."""
-        self.identity = Identity(
-            self.vendor_id, self.product_code, self.revision, int(self.option("serial")),
-            self.name, self.group, self.order_code,
-        )  # fmt: skip
+        self.identity = self.make_identity()
         self.emergencies: deque[Emergency] = deque(maxlen=LONGEST_QUEUE)
         """Emergency messages that wait to be sent; the slave's mailbox takes them from the left."""
         self.mailbox_protocols: dict[MailboxType, MailboxHandler] = {}
         """Mailbox protocols beside CoE, as FoE, that a subclass adds in its `__init__`; its SII lists them."""
         self.outputs_valid = False
+        self.failure = 0
+        """AL status code with which the slave is to leave OP for SAFE-OP now; 0: none."""
+        self.roles = roles_of(self.sync_managers)
         self.objects = ObjectDictionary()
         self._define_identity()
         self.define(self.objects)
@@ -162,6 +209,13 @@ class DeviceModel:
 
     def join(self, devices: Sequence[DeviceModel]) -> None:
         """Get to know all devices of the segment, in the order of the cable; called once, before time passes."""
+
+    def make_identity(self) -> Identity:
+        """Return its identity: that of the class, with the serial number of the options."""
+        return Identity(
+            self.vendor_id, self.product_code, self.revision, int(self.option("serial")),
+            self.name, self.group, self.order_code,
+        )  # fmt: skip
 
     def option(self, name: str, otherwise: float = 0.0) -> float:
         """Return the value of an option, `otherwise` where it follows from the model."""
@@ -208,6 +262,33 @@ class DeviceModel:
     def set_outputs_valid(self, valid: bool) -> None:
         """Process data outputs become valid (OP), or must be ignored (the safe state)."""
         self.outputs_valid = valid
+
+    def eeprom(self, alias: int) -> bytes:
+        """Return its EEPROM image with the station alias; empty: it is made of its objects."""
+        return b""
+
+    def open_mailbox(self, receive_size: int, send_size: int) -> None:
+        """The mailbox opens: what the master writes at once, and reads, in bytes with all headers."""
+
+    def state_changed(self, before: int, after: int) -> None:
+        """The slave went from AL state `before` to `after`."""
+
+    def image(self, index: int) -> PdoImage | None:
+        """Return the process image of sync manager `index` by its PDO assignment; None where it cannot be laid out."""
+        try:
+            return self.lay_out(index)
+        except (SdoAbort, ValueError):
+            return None
+
+    def lay_out(self, index: int) -> PdoImage:
+        """Return the process image of sync manager `index` by its PDO assignment.
+
+        Raises:
+            SdoAbort: it maps what does not exist or may not be mapped.
+            ValueError: it is longer than the memory has room for.
+        """
+        most = room(self.sync_managers, index, REGISTER_SPACE + self.ram_size)
+        return PdoImage.from_assignment(self.objects, ASSIGN + index, index in self.roles.outputs, most)
 
     @property
     def sync_error_limit(self) -> int:

@@ -193,16 +193,14 @@ NEGATIVE = 0x8000_0000
 
 
 class DistributedClockUnit:
-    """Clock, SYNC generator and their registers in `memory`.
+    """Clock, SYNC generator and their registers in `memory`."""
 
-    `turnaround` is the time in ns from a frame's arrival at port 0 to its return at port 1; None for the last slave.
-    """
-
-    def __init__(self, memory: bytearray, clock: Clock, turnaround: int | None) -> None:
+    def __init__(self, memory: bytearray, clock: Clock) -> None:
         self._memory = memory
         self.clock = clock
         self.sync0 = SyncGenerator(clock)
-        self.turnaround = turnaround
+        self.returns: dict[int, int] = {}
+        """Time, ns, from a frame's arrival at port 0 to its return at each port behind which it has been."""
 
     @property
     def cyclic(self) -> bool:
@@ -223,8 +221,9 @@ class DistributedClockUnit:
         """A write to 0x0900 passed at `t`: latch the receive times of the ports and of the processing unit."""
         local = self.clock.local(t)
         self._put(Register.DC_RECEIVE_TIME, local, 4)
-        returned = 0 if self.turnaround is None else local + self.turnaround
-        self._put(Register.DC_RECEIVE_TIME + 4, returned, 4)
+        for port in (1, 2, 3):
+            returned = self.returns.get(port)
+            self._put(Register.DC_RECEIVE_TIME + 4 * port, 0 if returned is None else local + returned, 4)
         self._put(Register.DC_RECEIVE_TIME_UNIT, local, 8)
 
     def before_read(self, t: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from rtcp.virtual.distributed_clock import Clock, DistributedClockUnit
+from rtcp.virtual.pdo import BUFFERS
 from rtcp.virtual.protocol import (
     DC_SPACE,
     DEFAULTS,
@@ -27,7 +28,11 @@ from rtcp.virtual.protocol import (
 )
 from rtcp.virtual.sii import EepromInterface
 
-MEMORY_SIZE = REGISTER_SPACE + RAM_SIZE
+IO_SPACE = 0x0F00
+"""Digital outputs, general purpose IO and user RAM lie from here on; a sync manager may cover them."""
+PORTS = range(4)
+DEVICE_EMULATION = 0x01
+"""Bit of 0x0141: the controller follows AL control without any firmware."""
 ALIAS_ENABLE = 0x01
 """Bit of 0x0103 that lets the alias serve as station address."""
 LINK = 0x0010
@@ -35,7 +40,6 @@ LINK = 0x0010
 LOOP_CLOSED = 0x0100
 COMMUNICATION = 0x0200
 """Bits of the DL status for port 0: the frame turns round there, or continues; those of port n are 2n further up."""
-PORTS_2_3_CLOSED = 0x5000
 LOOP_AUTO_CLOSE, LOOP_OPEN, LOOP_ALWAYS_CLOSED = 1, 2, 3
 """Loop settings of a port, two bits each in 0x0101 (ETG.1000.4, 6.1.3); 0: automatic."""
 PDI_RUNS = 0x0001
@@ -67,6 +71,12 @@ def _nothing() -> None:
     return
 
 
+def port_descriptor(physics: str) -> int:
+    """Return register 0x0007 for the ports that `physics` names: two bits each (ETG.1000.4, 6.1.1)."""
+    kinds = {"Y": 0b11, "H": 0b11, "K": 0b10}
+    return sum(kinds.get(kind, 0) << 2 * port for port, kind in zip(PORTS, physics.upper(), strict=False))
+
+
 class SyncManager:
     """One sync manager. `memory` is the controller's whole memory, `writable` its map of bytes open to the master.
 
@@ -76,7 +86,7 @@ class SyncManager:
 
     __slots__ = (
         "_memory", "_open", "_writable", "base", "buffer", "control", "enabled", "end", "index", "length", "locked",
-        "on_event", "start",
+        "on_event", "process_data", "start",
     )  # fmt: skip
 
     def __init__(self, index: int, memory: bytearray, writable: bytearray) -> None:
@@ -89,6 +99,8 @@ class SyncManager:
         """The last complete buffer of a buffered sync manager: what the other side sees. Set by the segment."""
         self.on_event: Callable[[], None] = _nothing
         """Called when the event of a sync manager with `ecat_event` may have changed."""
+        self.process_data = False
+        """Whether the device has process data here, with one buffer (as a mailbox) or three."""
         self.start = self.end = self.length = self.control = 0
         self.enabled = False
         self.locked = False
@@ -98,6 +110,11 @@ class SyncManager:
     def mailbox(self) -> bool:
         """Whether it works as a mailbox (full or empty) and not as a buffer."""
         return self.control & CONTROL_MODE == MODE_MAILBOX
+
+    @property
+    def buffers(self) -> int:
+        """How many times its length lies in the memory."""
+        return 1 if self.mailbox else BUFFERS
 
     @property
     def master_writes(self) -> bool:
@@ -233,27 +250,27 @@ class SyncManager:
 class Esc:
     """The memory of one slave controller, read and written by address.
 
-    `turnaround` is the time in ns that a frame takes from this slave to the end of the chain and back; None for the
-    last slave. `clock` is None for a slave without distributed clocks. Instants `t` are those of the frame's arrival at
-    this slave, in ns of the host's monotonic clock. `links` says of ports 0 and 1 whether they have a link.
+    `clock` is None for a slave without distributed clocks. `physics` names its ports, `links` says which of them have a
+    link. Instants `t` are those of the frame's arrival at this slave, in ns of the host's monotonic clock.
     """
 
-    def __init__(
-        self, eeprom: bytes, clock: Clock | None, turnaround: int | None, links: tuple[bool, bool]
-    ) -> None:  # fmt: skip
-        self.memory = bytearray(MEMORY_SIZE)
+    def __init__(self, eeprom: bytes, clock: Clock | None, links: Sequence[bool] = (False,) * 4, physics: str = "YY",
+                 ram_size: int = RAM_SIZE) -> None:  # fmt: skip
+        self.memory = bytearray(REGISTER_SPACE + ram_size)
         self.writable = bytearray(REGISTER_SPACE)
         features = FEATURE_SEPARATE_FCS
         spaces: tuple[tuple[int, int], ...] = WRITABLE
         self.dc: DistributedClockUnit | None = None
         if clock is not None:
-            self.dc = DistributedClockUnit(self.memory, clock, turnaround)
+            self.dc = DistributedClockUnit(self.memory, clock)
             features |= FEATURE_DC | FEATURE_DC_64 | FEATURE_DC_SYNC_ENHANCED
             spaces += WRITABLE_DC
         for first, last in spaces:
             self.writable[first : last + 1] = b"\x01" * (last + 1 - first)
         for register, content in DEFAULTS:
             self.memory[register : register + len(content)] = content
+        self.memory[Register.RAM] = ram_size // 1024
+        self.memory[Register.PORT_DESCRIPTOR] = port_descriptor(physics)
         self.put(Register.FEATURES, features, 2)
         self.put(Register.DL_STATUS, self._dl_status(links), 2)
         # The link comes up after power-on: the first change of the DL status (ET1100, 0x0210.2).
@@ -271,6 +288,8 @@ class Esc:
         self.mailbox_touched = False
         """A mailbox was filled or emptied; the device has not looked yet."""
         self.loops_written = False
+        self._io_managed = False
+        """Whether a sync manager covers addresses below the RAM."""
         self.reset_requested = False
         """The master completed the reset sequence (0x0040)."""
         self._reset_progress = 0
@@ -298,7 +317,7 @@ class Esc:
         return self.memory[Register.DL_CONTROL + 1] >> 2 * port & 3
 
     def closed(self, port: int, linked: bool) -> bool:
-        """Whether the loop of port 0 or 1 is closed, so that frames turn round there."""
+        """Whether the loop of a port is closed, so that frames turn round there."""
         setting = self.loop(port)
         if setting == LOOP_AUTO_CLOSE and not self.get(Register.DL_STATUS, 2) & COMMUNICATION << 2 * port:
             # It closed when the link was lost, and opens only by a write to 0x0101.
@@ -306,19 +325,19 @@ class Esc:
         return setting == LOOP_ALWAYS_CLOSED or (setting != LOOP_OPEN and not linked)
 
     def _dl_status(self, links: Sequence[bool]) -> int:
-        status = PDI_RUNS | WATCHDOG_OK | PORTS_2_3_CLOSED
+        status = PDI_RUNS | WATCHDOG_OK
         for port, linked in enumerate(links):
             status |= LINK << port if linked else 0
             status |= LOOP_CLOSED << 2 * port if self.closed(port, linked) else COMMUNICATION << 2 * port
         return status
 
-    def set_links(self, *links: bool) -> None:
-        """Show which of the ports 0 and 1 have a link now; a port that has lost it counts that."""
+    def set_links(self, links: Sequence[bool]) -> None:
+        """Show which of the four ports have a link now; a port that has lost it counts that."""
         before, after = self.get(Register.DL_STATUS, 2), self._dl_status(links)
         if before == after:
             return
         self.put(Register.DL_STATUS, after, 2)
-        for port in range(len(links)):
+        for port in PORTS:
             if before & ~after & LINK << port:
                 self.count(Register.LOST_LINKS + port)
         self.raise_event(EcatEvent.DL_STATUS)
@@ -368,9 +387,9 @@ class Esc:
     def read(self, address: int, length: int, t: int) -> bytes | None:
         """The master reads; None where the access is refused, and the working counter does not count it."""
         end = address + length
-        if not length or end > MEMORY_SIZE:
+        if not length or end > len(self.memory):
             return None
-        if address >= REGISTER_SPACE:
+        if address >= REGISTER_SPACE or (self._io_managed and address >= IO_SPACE):
             return self._read_ram(address, length)
         if end > REGISTER_SPACE:
             return None
@@ -391,9 +410,9 @@ class Esc:
     def write(self, address: int, data: bytes, t: int) -> bool:
         """The master writes; False where nothing could be written, and the working counter does not count it."""
         end = address + len(data)
-        if not data or end > MEMORY_SIZE:
+        if not data or end > len(self.memory):
             return False
-        if address >= REGISTER_SPACE:
+        if address >= REGISTER_SPACE or (self._io_managed and address >= IO_SPACE):
             return self._write_ram(address, data, t)
         if end > REGISTER_SPACE:
             return False
@@ -472,6 +491,7 @@ class Esc:
                 changed |= before != (manager.start, manager.length, manager.control, manager.enabled)
                 self.mailbox_touched |= manager.repeat_wanted
         if changed:
+            self._io_managed = any(m.enabled and IO_SPACE <= m.start < REGISTER_SPACE for m in self.sync_managers)
             self.sync_managers_written = True
             self.on_layout()
         self.on_attention()
@@ -490,7 +510,7 @@ class Esc:
                 data[first - address : last - address] = bytes(last - first)
                 continue
             data[first - address : last - address] = part[0]
-            if part[1] and manager.mailbox:
+            if part[1] and manager.mailbox and not manager.process_data:
                 self.mailbox_touched = True
                 self.on_attention()
         return None if refused >= length else bytes(data)
@@ -508,7 +528,7 @@ class Esc:
             if complete is None:
                 continue
             written = True
-            if complete and manager.mailbox:
+            if complete and manager.mailbox and not manager.process_data:
                 self.mailbox_touched = True
                 self.on_attention()
             elif complete:

@@ -41,6 +41,11 @@ class Overlap:
         """Whether it is whole bytes on both sides."""
         return not (self.at | self.physical | self.bits) & 7
 
+    @property
+    def last(self) -> int:
+        """Its last bit in the memory."""
+        return self.physical + self.bits - 1
+
 
 def active_fmmus(esc: Esc) -> list[Fmmu]:
     """The active FMMUs of a slave in the order of their numbers."""
@@ -73,10 +78,12 @@ def overlap(fmmu: Fmmu, address: int, length: int) -> Overlap | None:
 
 def copy_bits(source: bytes | bytearray, source_bit: int, target: bytearray, target_bit: int, bits: int) -> None:
     """Copy `bits` bits, least significant first within a byte; the bits around them stay."""
+    first, end = source_bit >> 3, source_bit + bits + 7 >> 3
     mask = (1 << bits) - 1
-    value = int.from_bytes(source, "little") >> source_bit & mask
-    whole = int.from_bytes(target, "little") & ~(mask << target_bit) | value << target_bit
-    target[:] = whole.to_bytes(len(target), "little")
+    value = int.from_bytes(source[first:end], "little") >> (source_bit & 7) & mask
+    first, end, shift = target_bit >> 3, target_bit + bits + 7 >> 3, target_bit & 7
+    whole = int.from_bytes(target[first:end], "little") & ~(mask << shift) | value << shift
+    target[first:end] = whole.to_bytes(end - first, "little")
 
 
 def transfer(esc: Esc, command: int, address: int, data: bytearray, t: int) -> int:
@@ -112,6 +119,20 @@ class Copy(NamedTuple):
     size: int
 
 
+class BitCopy(NamedTuple):
+    """Copy some bits of one byte, `at` in the datagram's data, to or from one byte, `image` in the process image."""
+
+    at: int
+    shift: int
+    """Place of the lowest bit in the datagram's byte."""
+    mask: int
+    """The bits, from bit 0 on."""
+    image: int
+    image_shift: int
+    image_others: int
+    """The bits of the image's byte that are not copied."""
+
+
 @dataclass
 class Plan:
     """What a logical datagram does while FMMUs, sync managers and AL states stay as they are."""
@@ -120,6 +141,9 @@ class Plan:
     """From the frame into the image of outputs."""
     inputs: list[Copy] = field(default_factory=list)
     """From the image of inputs into the frame, after all outputs were taken out."""
+    output_bits: list[BitCopy] = field(default_factory=list)
+    """As `outputs`, of slaves that share a byte of the datagram with their neighbours."""
+    input_bits: list[BitCopy] = field(default_factory=list)
     counter: int = 0
     """What the copies add to the working counter."""
     shares: list[tuple[Esc, int]] = field(default_factory=list)
@@ -131,12 +155,21 @@ class Plan:
 
 
 def _exact_buffer(esc: Esc, part: Overlap) -> SyncManager | None:
-    """The buffered sync manager whose whole area `part` is, if it is one."""
+    """The buffered sync manager whose whole area `part` is, or some bits of its only byte, if it is one."""
     for manager in esc.sync_managers:
-        exact = part.aligned and part.physical == 8 * manager.start and part.bits == 8 * manager.length
-        if exact and manager.enabled and not manager.mailbox and not manager.ecat_event:
+        if not manager.enabled or manager.mailbox or manager.ecat_event:
+            continue
+        if part.aligned and part.physical == 8 * manager.start and part.bits == 8 * manager.length:
+            return manager
+        within_a_byte = (part.at & 7) + part.bits <= 8
+        if manager.length == 1 and within_a_byte and part.physical >> 3 == manager.start == part.last >> 3:
             return manager
     return None
+
+
+def _bit_copy(part: Overlap, image: int) -> BitCopy:
+    shift, mask = part.physical & 7, (1 << part.bits) - 1
+    return BitCopy(part.at >> 3, part.at & 7, mask, image, shift, 0xFF & ~(mask << shift))
 
 
 def _join(copies: list[Copy]) -> list[Copy]:
@@ -188,14 +221,15 @@ def _shared(taken: list[tuple[int, int, int]]) -> bool:
 def _fast(plan: Plan, esc: Esc, parts: list[tuple[Fmmu, Overlap]], images: dict[SyncManager, int],
           command: int) -> bool:  # fmt: skip
     """Add one slave's part to `plan` if whole buffers are all it has; otherwise leave the plan alone."""
-    outputs: list[Copy] = []
-    inputs: list[Copy] = []
+    outputs: list[Copy | BitCopy] = []
+    inputs: list[Copy | BitCopy] = []
     written: list[tuple[Esc, SyncManager]] = []
     for fmmu, part in parts:
         manager = _exact_buffer(esc, part)
         if manager is None:
             return False
-        copy = Copy(part.at // 8, images[manager], manager.length)
+        place = images[manager]
+        copy = Copy(part.at // 8, place, manager.length) if part.aligned else _bit_copy(part, place)
         if manager.locked:
             continue
         if manager.master_writes and fmmu.writable and command in WRITES:
@@ -203,8 +237,10 @@ def _fast(plan: Plan, esc: Esc, parts: list[tuple[Fmmu, Overlap]], images: dict[
             written.append((esc, manager))
         elif not manager.master_writes and fmmu.readable and command in READS:
             inputs.append(copy)
-    plan.outputs += outputs
-    plan.inputs += inputs
+    for copy in outputs:
+        plan.outputs.append(copy) if isinstance(copy, Copy) else plan.output_bits.append(copy)
+    for copy in inputs:
+        plan.inputs.append(copy) if isinstance(copy, Copy) else plan.input_bits.append(copy)
     plan.written += written
     share = bool(inputs) + bool(outputs) * (2 if command == DatagramCommand.LRW else 1)
     plan.counter += share

@@ -9,7 +9,7 @@ from enum import IntEnum
 from types import MappingProxyType
 
 from rtcp.virtual.coe import ABORT, CoeService, SdoInformation, SdoServer, emergency_message
-from rtcp.virtual.device import DeviceModel, Emergency, MailboxHandler, SlaveFaults
+from rtcp.virtual.device import FULL_COE, CoeFeatures, DeviceModel, Emergency, MailboxHandler, SlaveFaults
 from rtcp.virtual.esc import SyncManager
 from rtcp.virtual.objects import ObjectDictionary
 from rtcp.virtual.protocol import MailboxType
@@ -52,8 +52,11 @@ class Mailbox:
         send_size: int,
         faults: SlaveFaults | None = None,
         protocols: Mapping[MailboxType, MailboxHandler] = MappingProxyType({}),
+        coe: CoeFeatures | None = FULL_COE,
     ) -> None:
         """Serve `objects` over mailboxes of `receive_size` (SM0) and `send_size` (SM1) bytes, and further `protocols`.
+
+        `coe` says what CoE can do; None: there is none.
 
         Raises:
             ValueError: a mailbox smaller than 16 bytes.
@@ -66,8 +69,9 @@ class Mailbox:
         self._room = send_size - _HEADER.size
         self._protocols = protocols
         self._faults = SlaveFaults() if faults is None else faults
-        self._sdo = SdoServer(objects, send_size, self._faults)
-        self._information = SdoInformation(objects, send_size)
+        self._sdo = SdoServer(objects, send_size, self._faults, coe is None or coe.complete_access)
+        self._information = SdoInformation(objects, send_size) if coe is not None and coe.sdo_information else None
+        self._known = frozenset(protocols) if coe is None else frozenset((*protocols, MailboxType.COE))
         self._waiting: deque[tuple[MailboxType, int, bytes, int]] = deque()
         self._master_counter = 0
         self._own_counter = 0
@@ -93,7 +97,7 @@ class Mailbox:
                 self._refuse(address, MailboxError.NO_MORE_MEMORY)
         elif length > min(len(data), self._receive_size) - _HEADER.size:
             self._refuse(address, MailboxError.INVALID_SIZE)
-        elif (protocol := kind & 0xF) != MailboxType.COE and protocol not in self._protocols:
+        elif (protocol := kind & 0xF) not in self._known:
             self._refuse(address, MailboxError.UNSUPPORTED_PROTOCOL)
         elif channel & 0x3F:
             self._refuse(address, MailboxError.INVALID_CHANNEL)
@@ -139,8 +143,8 @@ class Mailbox:
         service = content[1] >> 4
         if service == CoeService.SDO_REQUEST:
             self._sdo_request(address, content, state, t)
-        elif service == CoeService.SDO_INFORMATION:
-            self._sdo_information(address, content)
+        elif service == CoeService.SDO_INFORMATION and self._information is not None:
+            self._sdo_information(address, content, self._information)
         elif service in _SERVICES:
             self._refuse(address, MailboxError.SERVICE_NOT_SUPPORTED)
         else:
@@ -164,11 +168,11 @@ class Mailbox:
             service = CoeService.SDO_REQUEST if answer[0] == ABORT else CoeService.SDO_RESPONSE
             self._waiting.append((MailboxType.COE, address, service.header + answer, t + self._faults.sdo_delay()))
 
-    def _sdo_information(self, address: int, content: bytes) -> None:
+    def _sdo_information(self, address: int, content: bytes, information: SdoInformation) -> None:
         if len(content) < SdoInformation.MINIMUM_REQUEST:
             self._refuse(address, MailboxError.SIZE_TOO_SHORT)
             return
-        for answer in self._information.answer(content[2:]):
+        for answer in information.answer(content[2:]):
             self._waiting.append((MailboxType.COE, address, CoeService.SDO_INFORMATION.header + answer, 0))
 
 
@@ -180,14 +184,20 @@ def _error(error: MailboxError) -> bytes:
 class MailboxService:
     """Carries messages between sync managers and `Mailbox`, and repeats the last one when the master lost it."""
 
-    def __init__(self, device: DeviceModel, out: SyncManager, in_: SyncManager, faults: SlaveFaults) -> None:
-        """`out` is SM0, which the master writes, `in_` is SM1, which it reads; both configured by now."""
+    def __init__(self, device: DeviceModel, out: SyncManager, in_: SyncManager, faults: SlaveFaults,
+                 boot: bool = False) -> None:  # fmt: skip
+        """The master writes `out` and reads `in_`, both configured by now. In BOOT there is FoE alone."""
         self._out = out
         self._in = in_
         device.emergencies.clear()
+        device.open_mailbox(out.length, in_.length)
+        protocols = device.mailbox_protocols
+        if boot:
+            protocols = {kind: handler for kind, handler in protocols.items() if kind == MailboxType.FOE}
         self._mailbox = Mailbox(
-            device.objects, device.emergencies, out.length, in_.length, faults, device.mailbox_protocols
-        )
+            device.objects, device.emergencies, out.length, in_.length, faults, protocols,
+            None if boot else device.coe,
+        )  # fmt: skip
         self._outbox: deque[bytes] = deque()
         self._present: bytes | None = None
         self._last: bytes | None = None

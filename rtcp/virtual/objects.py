@@ -9,8 +9,9 @@ from enum import IntEnum, IntFlag
 
 
 class DataType(IntEnum):
-    """Data types of CoE objects (ETG.1000.6, table 64)."""
+    """Data types of CoE objects (ETG.1000.6, table 64; BYTE to BIT16: ETG.1020, table 98)."""
 
+    UNKNOWN = 0x0000
     BOOLEAN = 0x0001
     INTEGER8 = 0x0002
     INTEGER16 = 0x0003
@@ -21,11 +22,45 @@ class DataType(IntEnum):
     REAL32 = 0x0008
     VISIBLE_STRING = 0x0009
     OCTET_STRING = 0x000A
+    UNICODE_STRING = 0x000B
+    TIME_OF_DAY = 0x000C
+    TIME_DIFFERENCE = 0x000D
+    INTEGER24 = 0x0010
     REAL64 = 0x0011
+    INTEGER40 = 0x0012
+    INTEGER48 = 0x0013
+    INTEGER56 = 0x0014
     INTEGER64 = 0x0015
+    UNSIGNED24 = 0x0016
+    UNSIGNED40 = 0x0018
+    UNSIGNED48 = 0x0019
+    UNSIGNED56 = 0x001A
     UNSIGNED64 = 0x001B
+    GUID = 0x001D
+    BYTE = 0x001E
+    WORD = 0x001F
+    DWORD = 0x0020
     PDO_MAPPING = 0x0021
     IDENTITY = 0x0023
+    BITARR8 = 0x002D
+    BITARR16 = 0x002E
+    BITARR32 = 0x002F
+    BIT1 = 0x0030
+    BIT2 = 0x0031
+    BIT3 = 0x0032
+    BIT4 = 0x0033
+    BIT5 = 0x0034
+    BIT6 = 0x0035
+    BIT7 = 0x0036
+    BIT8 = 0x0037
+    BIT9 = 0x0038
+    BIT10 = 0x0039
+    BIT11 = 0x003A
+    BIT12 = 0x003B
+    BIT13 = 0x003C
+    BIT14 = 0x003D
+    BIT15 = 0x003E
+    BIT16 = 0x003F
 
 
 class ObjectCode(IntEnum):
@@ -63,7 +98,14 @@ class SdoAbort(Exception):
 
 Value = int | float | bytes
 WriteHook = Callable[["Entry", Value], None]
+ReadHook = Callable[["Entry"], None]
 STRUCT_CODES = {
+    DataType.BYTE: "B",
+    DataType.WORD: "H",
+    DataType.DWORD: "I",
+    DataType.BITARR8: "B",
+    DataType.BITARR16: "H",
+    DataType.BITARR32: "I",
     DataType.INTEGER8: "b",
     DataType.INTEGER16: "h",
     DataType.INTEGER32: "i",
@@ -77,20 +119,29 @@ STRUCT_CODES = {
 }
 """Codes of the `struct` module for the types that fill whole bytes."""
 BITS = {DataType.BOOLEAN: 1, **{data_type: 8 * struct.calcsize(code) for data_type, code in STRUCT_CODES.items()}}
-SIGNED = frozenset(data_type for data_type, code in STRUCT_CODES.items() if code in "bhiq")
+BITS |= {
+    DataType.INTEGER24: 24, DataType.INTEGER40: 40, DataType.INTEGER48: 48, DataType.INTEGER56: 56,
+    DataType.UNSIGNED24: 24, DataType.UNSIGNED40: 40, DataType.UNSIGNED48: 48, DataType.UNSIGNED56: 56,
+    **{DataType(DataType.BIT1 + n): n + 1 for n in range(16)},
+}  # fmt: skip
+SIGNED = frozenset(data_type for data_type, code in STRUCT_CODES.items() if code in "bhiq") | {
+    DataType.INTEGER24, DataType.INTEGER40, DataType.INTEGER48, DataType.INTEGER56,
+}  # fmt: skip
 _FLOATS = (DataType.REAL32, DataType.REAL64)
-_BYTES = (DataType.VISIBLE_STRING, DataType.OCTET_STRING)
+_BYTES = (DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType.UNICODE_STRING, DataType.GUID)
 
 
 class Entry:
     """One entry of the object dictionary.
 
     `value` is an int, a float or (strings) bytes, in the entry's own counts. `minimum` and `maximum` bound what an SDO
-    may write; `on_write` is called with the entry and the new value before it is stored and may raise `SdoAbort`.
+    may write; `on_write` is called with the entry and the new value before it is stored, `on_read` with the entry
+    before an SDO reads its value; both may raise `SdoAbort`.
     """
 
     __slots__ = (
-        "access", "bit_length", "data_type", "index", "maximum", "minimum", "name", "on_write", "subindex", "value",
+        "access", "bit_length", "data_type", "index", "maximum", "minimum", "name", "on_read", "on_write", "subindex",
+        "value",
     )  # fmt: skip
 
     def __init__(
@@ -103,8 +154,8 @@ class Entry:
         access: Access = Access.RO,
         *,
         bit_length: int | None = None,
-        minimum: int | None = None,
-        maximum: int | None = None,
+        minimum: float | None = None,
+        maximum: float | None = None,
         on_write: WriteHook | None = None,
     ) -> None:
         self.index = index
@@ -120,6 +171,7 @@ class Entry:
         self.minimum = minimum
         self.maximum = maximum
         self.on_write = on_write
+        self.on_read: ReadHook | None = None
 
     @property
     def is_float(self) -> bool:
@@ -155,6 +207,8 @@ class ObjectDictionary:
 
     def __init__(self) -> None:
         self._objects: dict[int, DictionaryObject] = {}
+        self.mappings: dict[int, tuple[Entry, int]] = {}
+        """Mappings that hold though they have another length than their object: that, and the bits of it."""
 
     def variable(self, index: int, name: str, data_type: DataType, value: Value = 0, access: Access = Access.RO,
                  *, minimum: int | None = None, maximum: int | None = None,
@@ -169,8 +223,12 @@ class ObjectDictionary:
         """Add a record or an array of `entries` (subindex 1 upwards); subindex 0, their number, is made here."""
         count = Entry(index, 0, "Number of entries", DataType.UNSIGNED8, len(entries), count_access, maximum=255)
         made = DictionaryObject(index, name, code, {0: count, **{entry.subindex: entry for entry in entries}})
-        self._objects[index] = made
+        self.add(made)
         return made
+
+    def add(self, made: DictionaryObject) -> None:
+        """Add an object, in place of one with its index."""
+        self._objects[made.index] = made
 
     def __getitem__(self, key: tuple[int, int]) -> Entry:
         """Return the entry.

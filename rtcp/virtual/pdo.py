@@ -23,6 +23,7 @@ from rtcp.virtual.objects import (
     struct_code,
     to_bits,
 )
+from rtcp.virtual.protocol import RAM_SIZE, REGISTER_SPACE
 
 SM_TYPES = 0x1C00
 """Sync manager communication type (ETG.1000.6, table 67)."""
@@ -30,12 +31,18 @@ RX_ASSIGN = 0x1C12
 TX_ASSIGN = 0x1C13
 RX_MAPPINGS = range(0x1600, 0x1800)
 TX_MAPPINGS = range(0x1A00, 0x1C00)
+BUFFERS = 3
+"""Buffers of a sync manager that is no mailbox (ETG.1000.4, 6.7.1)."""
 MAX_BYTES = 256
-"""Largest process image of one sync manager: three buffers of it fit between the start addresses below."""
+"""Largest process image of SM2 of `SyncManagerLayout`: three buffers of it fit before SM3."""
+MAX_INPUT_BYTES = (REGISTER_SPACE + RAM_SIZE - 0x1400) // BUFFERS
+"""The same for SM3, up to the memory's end."""
 MAX_MAPPED = 16
-"""Entries that a free mapping object has room for."""
+"""Entries that a free mapping object of a model has room for at least."""
 MAX_ASSIGNED = 4
-"""PDOs that a free assignment object has room for."""
+"""PDOs that a free assignment object of a model has room for at least."""
+ASSIGN = 0x1C10
+"""0x1C10 + n assigns the PDOs of sync manager n (ETG.1000.6, 5.6.7.4)."""
 
 Mapped = tuple[int, int, int]
 """A mapped entry: index (0: a gap), subindex, bits."""
@@ -66,6 +73,11 @@ class SyncManager:
     type: SyncManagerType
     activate: int = 0x01
 
+    @property
+    def buffers(self) -> int:
+        """How many times its length lies in the memory: once as a mailbox or in one-buffer mode."""
+        return 1 if self.control & 0x03 == 0x02 else BUFFERS
+
 
 class SyncManagerLayout(NamedTuple):
     """The four sync managers of a slave with mailbox, as its SII tells them."""
@@ -78,6 +90,13 @@ class SyncManagerLayout(NamedTuple):
     """SM2: RxPDOs, triggers the process-data watchdog."""
     inputs: SyncManager = SyncManager(0x1400, 0, 0x20, SyncManagerType.INPUTS)
     """SM3: TxPDOs."""
+
+
+def room(layout: Sequence[SyncManager], index: int, memory_end: int) -> int:
+    """Return the most bytes that sync manager `index` can have: up to the next one in the memory, or its end."""
+    own = layout[index]
+    ends = [other.start for n, other in enumerate(layout) if n != index and other.start > own.start]
+    return (min([*ends, memory_end]) - own.start) // own.buffers
 
 
 class PdoImage:
@@ -102,19 +121,27 @@ class PdoImage:
             offset += bits
 
     @classmethod
-    def from_assignment(cls, objects: ObjectDictionary, assignment: int) -> PdoImage:
-        """Return the image of the PDOs that `assignment` (0x1C12 or 0x1C13) lists.
+    def from_assignment(cls, objects: ObjectDictionary, assignment: int, outputs: bool | None = None,
+                        most: int | None = None) -> PdoImage:  # fmt: skip
+        """Return the image of the PDOs that `assignment` lists.
+
+        `outputs` tells their direction (None: 0x1C12 has outputs), `most` the bytes allowed (None: those of
+        `SyncManagerLayout`).
 
         Raises:
             SdoAbort: an object, a subindex or a mapping that does not exist or may not be mapped.
-            ValueError: the image is longer than 256 bytes.
+            ValueError: the image is longer than that.
         """
-        wanted = Access.RXPDO if assignment == RX_ASSIGN else Access.TXPDO
+        if outputs is None:
+            outputs = assignment == RX_ASSIGN
+        if most is None:
+            most = MAX_BYTES if outputs else MAX_INPUT_BYTES
+        wanted = Access.RXPDO if outputs else Access.TXPDO
         mappings = [mapping for pdo in listed(objects, assignment) for mapping in listed(objects, pdo)]
         image = cls([_field(objects, mapping, wanted) for mapping in mappings])
-        if image.byte_length > MAX_BYTES:
+        if image.byte_length > most:
             raise ValueError(
-                f"the PDOs assigned in 0x{assignment:04X} take {image.byte_length} bytes, allowed are {MAX_BYTES}"
+                f"the PDOs assigned in 0x{assignment:04X} take {image.byte_length} bytes, allowed are {most}"
             )
         return image
 
@@ -142,8 +169,8 @@ class PdoImage:
             self._struct.pack_into(target, offset, *map(_VALUE, self.entries))
             return
         image = 0
-        for entry, shift, _ in self._bits:
-            image |= to_bits(entry) << shift
+        for entry, shift, mask in self._bits:
+            image |= (to_bits(entry) & mask) << shift
         target[offset : offset + self.byte_length] = image.to_bytes(self.byte_length, "little")
 
 
@@ -151,6 +178,8 @@ def _compile(fields: Sequence[tuple[Entry | None, int]]) -> struct.Struct | None
     """Return one struct for all of `fields`, None where any of them is not made of whole bytes."""
     codes = []
     for entry, bits in fields:
+        if entry is not None and entry.bit_length != bits:
+            return None
         code = struct_code(entry) if entry is not None else (f"{bits // 8}x" if bits % 8 == 0 else None)
         if code is None:
             return None
@@ -176,6 +205,8 @@ def split_mapping(mapping: int) -> Mapped:
 def _field(objects: ObjectDictionary, mapping: int, wanted: Access) -> tuple[Entry | None, int]:
     """Return entry (None: a gap) and bits of a mapping."""
     index, subindex, bits = split_mapping(mapping)
+    if mapping in objects.mappings:
+        return objects.mappings[mapping]
     if index == 0:
         # A gap; without bits it is an unused place of the mapping object.
         if subindex or not bits:
@@ -201,21 +232,22 @@ def define_pdo_objects(
 
     Written by SDO, they keep these rules: only in PRE-OP (else 0x08000022); subindex 0 must be 0 before another one is
     written (0x06010003); a mapped entry exists (0x06020000, 0x06090011), may be mapped in this direction (0x06040041),
-    has the bits that the mapping tells and fits in 256 bytes with the others (0x06040042); an assigned PDO exists
-    (0x06020000) and has this direction (0x06040041). With `fixed` nothing can be written (0x06010002).
+    has the bits that the mapping tells and fits in the sync manager with the others (0x06040042); an assigned PDO
+    exists (0x06020000) and has this direction (0x06040041). With `fixed` nothing can be written (0x06010002).
     """
-    types = [sm.type for sm in SyncManagerLayout()]
-    objects.record(
-        SM_TYPES, "Sync manager type",
-        [Entry(SM_TYPES, n, f"Type of SM{n - 1}", DataType.UNSIGNED8, int(t)) for n, t in enumerate(types, 1)],
-        code=ObjectCode.ARRAY,
-    )  # fmt: skip
+    define_sync_manager_types(objects, SyncManagerLayout())
     for index, mapped in rx.items():
         _define_mapping(objects, index, f"RxPDO mapping {index - 0x15FF}", mapped, Access.RXPDO, fixed)
     for index, mapped in tx.items():
         _define_mapping(objects, index, f"TxPDO mapping {index - 0x19FF}", mapped, Access.TXPDO, fixed)
     _define_assignment(objects, RX_ASSIGN, "RxPDO assign", assign_rx, rx.keys(), tx.keys(), fixed)
     _define_assignment(objects, TX_ASSIGN, "TxPDO assign", assign_tx, tx.keys(), rx.keys(), fixed)
+
+
+def define_sync_manager_types(objects: ObjectDictionary, layout: Sequence[SyncManager]) -> None:
+    """Add 0x1C00: what each sync manager carries."""
+    types = [Entry(SM_TYPES, n, f"Type of SM{n - 1}", DataType.UNSIGNED8, int(m.type)) for n, m in enumerate(layout, 1)]
+    objects.record(SM_TYPES, "Sync manager type", types, code=ObjectCode.ARRAY)
 
 
 def _define_mapping(
@@ -227,7 +259,13 @@ def _define_mapping(
     values = [at << 16 | subindex << 8 | bits for at, subindex, bits in mapped]
     places = values if fixed else values + [0] * (MAX_MAPPED - len(values))
     made = objects.record(index, name, [entry_at(n, value) for n, value in enumerate(places, 1)])
-    _restrict(made, len(values), fixed, lambda value: _field(objects, value, wanted)[1])
+    most = MAX_BYTES if wanted == Access.RXPDO else MAX_INPUT_BYTES
+    restrict(made, len(values), fixed, lambda value: mapped_bits(objects, value, wanted), most)
+
+
+def mapped_bits(objects: ObjectDictionary, mapping: int, wanted: Access) -> int:
+    """Return the bits of a mapping; raises SdoAbort where it may not be mapped in the direction `wanted`."""
+    return _field(objects, mapping, wanted)[1]
 
 
 def _define_assignment(
@@ -246,13 +284,16 @@ def _define_assignment(
 
     places = [*assigned] if fixed else [*assigned] + [0] * (MAX_ASSIGNED - len(assigned))
     entries = [entry_at(n, pdo) for n, pdo in enumerate(places, 1)]
-    _restrict(objects.record(index, name, entries, code=ObjectCode.ARRAY), len(assigned), fixed, bits_of)
+    most = MAX_BYTES if index == RX_ASSIGN else MAX_INPUT_BYTES
+    restrict(objects.record(index, name, entries, code=ObjectCode.ARRAY), len(assigned), fixed, bits_of, most)
 
 
-def _restrict(made: DictionaryObject, used: int, fixed: bool, bits_of: Callable[[int], int]) -> None:
+def restrict(made: DictionaryObject, used: int, fixed: bool, bits_of: Callable[[int], int], most: int,
+             accept: Callable[[Sequence[int]], None] | None = None) -> None:  # fmt: skip
     """Let a mapping or an assignment, `used` of whose places count, be written by the rules of `define_pdo_objects`.
 
-    `bits_of` returns the bits that a place takes, or refuses what stands there.
+    `bits_of` returns the bits that a place takes, or refuses what stands there; all take at most `most` bytes. `accept`
+    refuses what the places hold together.
     """
     count, *places = made.entries.values()
 
@@ -263,9 +304,11 @@ def _restrict(made: DictionaryObject, used: int, fixed: bool, bits_of: Callable[
             bits_of(int(value))
 
     def check_count(_: Entry, value: Value) -> None:
-        bits = sum(bits_of(int(place.value)) for place in places[: int(value)])
-        if bits > 8 * MAX_BYTES:
+        wanted = [int(place.value) for place in places[: int(value)]]
+        if sum(map(bits_of, wanted)) > 8 * most:
             raise SdoAbort(AbortCode.PDO_LENGTH)
+        if accept is not None:
+            accept(wanted)
 
     count.value, count.maximum, count.on_write = used, len(places), check_count
     for place in places:

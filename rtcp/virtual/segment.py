@@ -4,36 +4,81 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 from rtcp.config.document import Finding, read
 from rtcp.config.model import ConfigError
-from rtcp.config.segment import SegmentConfig, load_segment
+from rtcp.config.segment import SegmentConfig, load_segment, place_of
 from rtcp.virtual.arm import VirtualArm, make_arm
-from rtcp.virtual.device import DeviceModel, OptionError, create
+from rtcp.virtual.descriptions import Descriptions
+from rtcp.virtual.device import DeviceModel, OptionError
 from rtcp.virtual.objects import SdoAbort
-from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 from rtcp.virtual.protocol import Register
 from rtcp.virtual.slave import Slave, make_slaves
 from rtcp.virtual.wire import Miscount, Wire
 
 
-class Chain:
-    """Cable n lies behind slave n (0: between the master and slave 1); slaves count from 1.
+class Connection(NamedTuple):
+    """Where a slave hangs: behind which slave (its place, from 0; None: the master), at which of its ports."""
 
-    What is broken twice must be joined twice.
+    parent: int | None
+    port: int = 1
+
+
+def chain(count: int) -> list[Connection]:
+    """Return the connections of slaves that hang one behind the other."""
+    return [Connection(None if place == 0 else place - 1) for place in range(count)]
+
+
+BRANCHES = (3, 1, 2)
+"""Ports behind which a frame goes after it came in at port 0 and was processed, in this order (ETG.1000.4, 4.3)."""
+
+
+class Topology:
+    """The slaves as a tree, in the order in which frames reach them.
+
+    Cable n leads to the slave at place n, from 0; in a chain it lies behind slave n, from 1. What is broken twice must
+    be joined twice.
     """
 
-    def __init__(self, slaves: Sequence[Slave]) -> None:
+    def __init__(self, slaves: Sequence[Slave], connections: Sequence[Connection]) -> None:
+        """Connect `slaves`; their `delay` is that of a frame that passes all of them."""
         self._slaves = tuple(slaves)
+        self._parents = [connection.parent for connection in connections]
+        self._ports = [connection.port for connection in connections]
+        self._children: list[dict[int, int]] = [{} for _ in slaves]
+        for place, (parent, port) in enumerate(connections):
+            if parent is not None:
+                self._children[parent][port] = place
         self._cuts = [0] * len(self._slaves)
         self._outages = [0] * len(self._slaves)
-        self.reach = len(self._slaves)
-        """Number of slaves that a frame reaches."""
+        self._times = [cable.time for cable in lay_cables([slave.delay for slave in slaves], connections)]
+        self.reached: tuple[Slave, ...] = ()
+        """Slaves that a frame reaches, in this order."""
         self.returns = True
         """Whether frames come back: False where the loop of a port without a link is open."""
+        self.update()
+
+    def cable_behind(self, place: int, port: int) -> int | None:
+        """Return the cable at a port of a slave; None: nothing hangs there."""
+        return self._children[place].get(port)
+
+    def way_to(self, cable: int) -> list[tuple[int, int]]:
+        """Return place and port of every slave between `cable` and the master, from the cable on."""
+        way: list[tuple[int, int]] = []
+        place = cable
+        while (parent := self._parents[place]) is not None:
+            way.append((parent, self._ports[place]))
+            place = parent
+        return way
+
+    def last_behind(self, cable: int) -> int:
+        """Return the place of the last slave that a frame passes before it comes back over `cable`."""
+        last = cable
+        while self._children[last]:
+            last = max(self._children[last].values())
+        return last
 
     def cut(self, cable: int) -> None:
         """Break a cable."""
@@ -59,34 +104,56 @@ class Chain:
             self._slaves[number - 1].power_on(t)
         self.update()
 
-    def _linked(self, cable: int) -> bool:
-        """Whether the cable is whole and what is at both of its ends has supply."""
-        if cable == len(self._slaves) or self._cuts[cable] or self._outages[cable]:
+    def _linked(self, cable: int | None) -> bool:
+        """Whether there is a cable, it is whole, and what is at both of its ends has supply."""
+        if cable is None:
             return False
-        return cable == 0 or not self._outages[cable - 1]
+        if self._cuts[cable] or self._outages[cable]:
+            return False
+        parent = self._parents[cable]
+        return parent is None or not self._outages[parent]
 
     def update(self) -> None:
-        """Update ports and turnaround times to the state of the chain."""
-        links = [self._linked(cable) for cable in range(len(self._slaves) + 1)]
-        self.reach, self.returns = 0, True
-        blocked = False
+        """Update ports and delays to the state of cables and supplies."""
         for place, slave in enumerate(self._slaves):
-            if self._outages[place]:
-                blocked = True
+            if not self._outages[place]:
+                children = self._children[place]
+                slave.esc.set_links([self._linked(place), *(self._linked(children.get(port)) for port in (1, 2, 3))])
+        reached: list[Slave] = []
+        self.returns = True
+        if self._slaves and self._passes(0):
+            self.returns = self._visit(0, self._times[0], reached) is not None
+        self.reached = tuple(reached)
+        for slave in self._slaves:
+            slave.esc.loops_written = False
+
+    def _passes(self, cable: int) -> bool:
+        """Whether the slave behind `cable` lets in what comes over it."""
+        return self._linked(cable) and not self._slaves[cable].esc.closed(0, True)
+
+    def _visit(self, place: int, t: int, reached: list[Slave]) -> int | None:
+        """Follow a frame that comes to a slave at `t`; return when it leaves again at port 0, None: it is lost."""
+        slave = self._slaves[place]
+        slave.delay = arrival = t
+        reached.append(slave)
+        returns: dict[int, int] = {}
+        for port in BRANCHES:
+            cable = self._children[place].get(port)
+            linked = self._linked(cable)
+            if slave.esc.closed(port, linked):
                 continue
-            esc = slave.esc
-            esc.set_links(links[place], links[place + 1])
-            blocked = blocked or not links[place] or esc.closed(0, links[place])
-            esc.loops_written = False
-            if blocked:
+            if cable is None or not linked:
+                return None
+            if not self._passes(cable):
                 continue
-            self.reach = place + 1
-            if esc.closed(1, links[place + 1]):
-                blocked = True
-            elif not links[place + 1]:
-                self.returns, blocked = False, True
-        if self.reach:
-            self._turn_round(self._slaves[: self.reach])
+            left = self._visit(cable, t + self._times[cable], reached)
+            if left is None:
+                return None
+            t = left + self._times[cable]
+            returns[port] = t - arrival
+        if slave.esc.dc is not None:
+            slave.esc.dc.returns = returns
+        return t
 
     def restart(self, slave: Slave, t: int) -> None:
         """Reset a slave's controller and device, as its supply going and coming back would."""
@@ -94,12 +161,36 @@ class Chain:
         slave.power_on(t)
         self.update()
 
-    @staticmethod
-    def _turn_round(reached: Sequence[Slave]) -> None:
-        last = reached[-1]
-        for slave in reached:
-            if slave.esc.dc is not None:
-                slave.esc.dc.turnaround = None if slave is last else 2 * (last.delay - slave.delay)
+
+class Cable(NamedTuple):
+    """How long, ns, a frame takes over a cable, and when it comes to the slave at its end."""
+
+    time: int
+    arrival: int
+
+
+def lay_cables(arrivals: Sequence[int | None], connections: Sequence[Connection]) -> list[Cable]:
+    """Return the cables to slaves at which a frame arrives at these instants, ns from the master.
+
+    Where none is given (None) a cable takes `FURTHER_DELAY`, the first one none. A negative time: the frame would come
+    before it left the branches that it passes earlier.
+    """
+    cables: list[Cable] = []
+    leaves: list[int] = []
+    for place, (parent, _) in enumerate(connections):
+        left = 0 if parent is None else leaves[parent]
+        usual = FURTHER_DELAY if place else 0
+        given = arrivals[place]
+        arrival = left + usual if given is None else given
+        cables.append(Cable(arrival - left, arrival))
+        leaves.append(arrival)
+        # From here it would go back to every slave before it, unless another one follows.
+        t, child = arrival, place
+        while (above := connections[child].parent) is not None:
+            t += cables[child].time
+            leaves[above] = t
+            child = above
+    return cables
 
 
 DELAYS = (0, 820, 1660, 2500, 3320, 4160, 5020)
@@ -117,7 +208,7 @@ BREATH = 50_000
 
 
 class Damage(NamedTuple):
-    """A cable that damages a frame when `strikes` says so; the cable's number is that of the slave before it."""
+    """A cable that damages a frame when `strikes` says so; see `Topology` for its number."""
 
     cable: int
     strikes: Callable[[], bool]
@@ -133,9 +224,10 @@ class Segment:
     that frames come in between. Instants are ns of the host's monotonic clock.
     """
 
-    def __init__(self, slaves: Sequence[Slave], t: int) -> None:
+    def __init__(self, slaves: Sequence[Slave], t: int, connections: Sequence[Connection] | None = None) -> None:
+        """Connect `slaves`; None: one behind the other."""
         self.slaves = tuple(slaves)
-        self.chain = Chain(self.slaves)
+        self.topology = Topology(self.slaves, chain(len(self.slaves)) if connections is None else connections)
         self.miscounts: list[Miscount] = []
         self.damages: list[Damage] = []
         self.arm: VirtualArm | None = None
@@ -149,7 +241,7 @@ class Segment:
 
     def rewire(self) -> None:
         """Route frames to the slaves that they reach now."""
-        self._wire = Wire(self.slaves[: self.chain.reach], self.miscounts)
+        self._wire = Wire(self.topology.reached, self.miscounts)
         for slave in self.slaves:
             slave.esc.on_attention = self._attention_of(slave)
 
@@ -162,46 +254,56 @@ class Segment:
 
     def process(self, frame: bytearray, size: int, t: int) -> bool:
         """Answer a frame in place, see `Wire.process`; False: nothing comes back of it."""
-        if self.damages or not self._wire.slaves or not self.chain.returns:
+        if self.damages or not self._wire.slaves or not self.topology.returns:
             return self._process_faulty(frame, size, t)
         return self._wire.process(frame, size, t)
 
     def _process_faulty(self, frame: bytearray, size: int, t: int) -> bool:
         """Answer a frame that may not come back, or not come far."""
-        reach = self.chain.reach
-        struck = [damage for damage in tuple(self.damages) if damage.cable < reach and damage.strikes()]
+        reached, returns = self.topology.reached, self.topology.returns
+        damages = [damage for damage in tuple(self.damages) if self.slaves[damage.cable] in reached]
+        struck = [damage for damage in damages if damage.strikes()]
         if not struck:
-            return bool(reach) and self._wire.process(frame, size, t) and self.chain.returns
+            return bool(reached) and self._wire.process(frame, size, t) and returns
         out = [damage.cable for damage in struck if not damage.back]
         if out:
-            self._damage_out(frame, size, t, min(out))
+            far = min(out)
+            self._process_until(far, frame, size, t)
+            first = self.slaves[far].esc
+            first.count(Register.RX_ERRORS)
+            first.count(Register.RX_ERRORS + 1)
+            self._forward_from(far + 1)
         else:
-            self._wire.process(frame, size, t)
-            self.settle(t)
-            # The first that it meets on its way back.
-            self._count_back(max(damage.cable for damage in struck))
+            # The first that the frame meets on its way back.
+            last, cable = min((self.topology.last_behind(damage.cable), -damage.cable) for damage in struck)
+            self._process_until(last + 1, frame, size, t)
+            self._count_back(-cable)
+            self._forward_from(last + 1)
         return False
 
-    def _damage_out(self, frame: bytearray, size: int, t: int, far: int) -> None:
-        """Let a frame be sound up to slave `far` only."""
-        whole, self._wire = self._wire, Wire(self.slaves[:far], self.miscounts, passing=True)
+    def _process_until(self, far: int, frame: bytearray, size: int, t: int) -> None:
+        """Let a frame be sound for the slaves before place `far` only."""
+        sound = [slave for slave in self.topology.reached if slave in self.slaves[:far]]
+        whole, self._wire = self._wire, Wire(sound, self.miscounts, passing=True)
         self._wire.process(frame, size, t)
         self.settle(t)
         self._wire = whole
-        first = self.slaves[far].esc
-        first.count(Register.RX_ERRORS)
-        first.count(Register.RX_ERRORS + 1)
-        for slave in self.slaves[far + 1 : self.chain.reach]:
-            slave.esc.count(Register.FORWARDED_RX_ERRORS)
+
+    def _forward_from(self, place: int) -> None:
+        """Let the slaves from `place` on count a frame that was damaged before it came to them."""
+        for slave in self.topology.reached:
+            if slave in self.slaves[place:]:
+                slave.esc.count(Register.FORWARDED_RX_ERRORS)
 
     def _count_back(self, cable: int) -> None:
-        """Let the slaves count a frame that was damaged on its way back over `cable`; they get it at port 1."""
-        if cable:
-            last = self.slaves[cable - 1].esc
-            last.count(Register.RX_ERRORS + 2)
-            last.count(Register.RX_ERRORS + 3)
-        for slave in self.slaves[: max(0, cable - 1)]:
-            slave.esc.count(Register.FORWARDED_RX_ERRORS + 1)
+        """Let the slaves count a frame that was damaged on its way back over `cable`, each at the port it comes to."""
+        for n, (place, port) in enumerate(self.topology.way_to(cable)):
+            esc = self.slaves[place].esc
+            if n:
+                esc.count(Register.FORWARDED_RX_ERRORS + port)
+            else:
+                esc.count(Register.RX_ERRORS + 2 * port)
+                esc.count(Register.RX_ERRORS + 2 * port + 1)
 
     def settle(self, t: int) -> None:
         """Do what the frames since the last call, the last of which arrived at `t`, asked of the slaves."""
@@ -227,10 +329,10 @@ class Segment:
             for slave in asking:
                 slave.application.attend(t)
                 if slave.esc.reset_requested:
-                    self.chain.restart(slave, t)
+                    self.topology.restart(slave, t)
                     self.rewire()
                 elif slave.esc.loops_written:
-                    self.chain.update()
+                    self.topology.update()
                     self.rewire()
             self.look_at(t)
 
@@ -317,31 +419,83 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
     """
     devices: list[DeviceModel] = []
     findings: list[Finding] = []
+    descriptions = Descriptions(config.source.parent)
     for i, entry in enumerate(config.slaves):
+        key = "esi" if entry.esi is not None else "sii" if entry.sii is not None else "model"
         try:
-            device = create(entry.model, **entry.options)
-            for assignment in (RX_ASSIGN, TX_ASSIGN):
-                PdoImage.from_assignment(device.objects, assignment)
+            device = descriptions.make(entry)
+            for index in device.roles.outputs + device.roles.inputs:
+                device.lay_out(index)
             devices.append(device)
         except OptionError as error:
             findings += [(("slaves", i, *where), text) for where, text in error.findings]
         except (SdoAbort, ValueError) as error:
-            findings.append((("slaves", i, "model"), f"the process data of {entry.model} cannot be laid out: {error}"))
-    delays = [
-        usual if entry.delay_ns is None else entry.delay_ns
-        for entry, usual in zip(config.slaves, default_delays(len(config.slaves)), strict=True)
-    ]
-    for i, (before, delay) in enumerate(pairwise(delays), 1):
-        if delay < before:
-            text = f"found {delay} ns, allowed is at least the {before} ns of the slave before it"
+            findings.append((("slaves", i, key), f"the process data of {entry.label} cannot be laid out: {error}"))
+    connections, misplaced = _connections(config, devices if len(devices) == len(config.slaves) else None)
+    findings += misplaced
+    arrivals: list[int | None] = [entry.delay_ns for entry in config.slaves]
+    if connections == chain(len(arrivals)):
+        usual = default_delays(len(arrivals))
+        arrivals = [own if given is None else given for given, own in zip(arrivals, usual, strict=True)]
+    cables = [] if misplaced else lay_cables(arrivals, connections)
+    for i, cable in enumerate(cables):
+        if cable.time < 0:
+            before = cable.arrival - cable.time
+            text = f"found {cable.arrival} ns, allowed is at least the {before} ns of the slave before it"
             findings.append((("slaves", i, "delay_ns"), text))
     if findings:
         raise ConfigError(read(config.source).sentences(findings))
     drifts = [entry.drift_ppm for entry in config.slaves]
     aliases = [entry.alias for entry in config.slaves]
-    segment = Segment(make_slaves(devices, drifts, delays, aliases, t), t)
+    slaves = make_slaves(devices, drifts, [cable.arrival for cable in cables], aliases, t)
+    segment = Segment(slaves, t, connections)
     segment.arm = make_arm(config, devices)
     return segment
+
+
+def _connections(
+    config: SegmentConfig, devices: Sequence[DeviceModel] | None
+) -> tuple[list[Connection], list[Finding]]:
+    """Return where each slave hangs, and what is wrong with that; without `devices` ports are not looked at."""
+    connections: list[Connection] = []
+    findings: list[Finding] = []
+    taken: dict[Connection, int] = {}
+    for i, entry in enumerate(config.slaves):
+        parent = i - 1 if entry.after is None else place_of(entry.after, config.slaves[:i])
+        made = Connection(None if i == 0 else parent, entry.port if i else 1)
+        connections.append(made)
+        if parent is None or i == 0:
+            continue
+        label = f"slave {parent + 1} ({config.slaves[parent].label})"
+        ports = [] if devices is None else [n for n, kind in enumerate(devices[parent].physics) if n and kind != " "]
+        if devices is not None and made.port not in ports:
+            text = f"found {made.port}, but {label} has {_listed(ports)} to hang something at"
+            findings.append((("slaves", i, "port"), text))
+        elif taken.setdefault(made, i) != i:
+            text = f"found {made.port} of {label}, where slave {taken[made] + 1} hangs already"
+            findings.append((("slaves", i, "port"), text))
+    if not findings:
+        for expected, place in enumerate(_wire_order(connections)):
+            if place != expected:
+                text = f"frames come to this slave before slave {expected + 1} ({config.slaves[expected].label})"
+                return connections, [(("slaves", place, "after"), f"{text}: list it before that one")]
+    return connections, findings
+
+
+def _listed(ports: Sequence[int]) -> str:
+    return f"port{'s' if len(ports) > 1 else ''} {' and '.join(map(str, ports))}" if ports else "no port"
+
+
+def _wire_order(connections: Sequence[Connection]) -> list[int]:
+    """Return the places of the slaves in the order in which frames come to them."""
+    order: list[int] = []
+    waiting = [0]
+    while waiting:
+        place = waiting.pop()
+        order.append(place)
+        children = [other for other, connection in enumerate(connections) if connection.parent == place]
+        waiting += sorted(children, key=lambda other: BRANCHES.index(connections[other].port), reverse=True)
+    return order
 
 
 def check_segment(path: Path) -> None:

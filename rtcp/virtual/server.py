@@ -268,7 +268,7 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
         listener = None if control_path is None else kept.enter_context(control_socket(control_path))
         pair = private_pair() if interface is None else public_pair(interface)
         master_end, segment_end, bring_up = kept.enter_context(pair)
-        truth = GroundTruth(segment, [slave.model for slave in config.slaves])
+        truth = GroundTruth(segment, [slave.label for slave in config.slaves])
         server = Server(segment, segment_end, truth, script)
         kept.callback(server.close)
         control = None if listener is None else Control(listener, server.registry, truth)

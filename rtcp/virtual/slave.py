@@ -4,23 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from rtcp.virtual.al_state import (
-    HELD,
-    INPUTS,
-    MAILBOX_IN,
-    MAILBOX_OUT,
-    OUTPUTS,
-    AlStatusCode,
-    SyncMonitor,
-    first_failure,
-    judge,
-    mapped_image,
-)
+from rtcp.virtual.al_state import HELD, AlStatusCode, SyncMonitor, first_failure, judge
 from rtcp.virtual.device import DeviceModel, SlaveFaults
 from rtcp.virtual.distributed_clock import Clock
-from rtcp.virtual.esc import CONTROL_ECAT_EVENT, Esc, SyncManager
+from rtcp.virtual.esc import CONTROL_ECAT_EVENT, DEVICE_EMULATION, Esc, SyncManager
 from rtcp.virtual.mailbox import MailboxService
-from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage, SyncManagerLayout
+from rtcp.virtual.pdo import PdoImage, SyncManagerLayout
 from rtcp.virtual.protocol import ERROR_FLAG, STATE_MASK, AlState, Register
 from rtcp.virtual.sii import build_sii
 
@@ -30,6 +19,43 @@ LONGEST_STEP = 2_000_000
 """Longest time in ns that a device is let pass in one step."""
 MOST_STEPS = 20
 """Steps made up for after the process was stopped; what is older than these is dropped."""
+_EMPTY = PdoImage(())
+
+
+class ProcessData:
+    """A sync manager of process data with its image and, of outputs, what the device has taken over last."""
+
+    __slots__ = ("image", "latched", "manager")
+
+    def __init__(self, manager: SyncManager) -> None:
+        self.manager = manager
+        self.image = _EMPTY
+        self.latched = b""
+
+    def latch(self) -> None:
+        """Take over the outputs that are there now; a single buffer is empty then."""
+        manager = self.manager
+        if not manager.mailbox:
+            self.latched = bytes(manager.buffer)
+        elif manager.full:
+            self.latched = manager.take()
+
+    def unpack(self) -> None:
+        """Put the outputs taken over into their objects."""
+        if len(self.latched) == self.image.byte_length:  # the master may have changed the sync manager just now
+            self.image.unpack(self.latched)
+
+    def pack(self) -> None:
+        """Put the inputs where the master reads them; into a single buffer once it was read."""
+        manager, image = self.manager, self.image
+        if manager.length != image.byte_length:
+            return
+        if not manager.mailbox:
+            image.pack(manager.buffer)
+        elif not manager.full and not manager.locked and manager.length:
+            packed = bytearray(image.byte_length)
+            image.pack(packed)
+            manager.put(bytes(packed))
 
 
 class Application:
@@ -43,10 +69,15 @@ class Application:
         self.device = device
         self._faults = faults
         self._mailbox: MailboxService | None = None
-        self._rx = self._tx = PdoImage(())
-        self._latched = b""
+        roles = device.roles
+        self._mailboxes = roles.mailboxes or ()
+        self._outputs = tuple(ProcessData(esc.sync_managers[index]) for index in roles.outputs)
+        self._inputs = tuple(ProcessData(esc.sync_managers[index]) for index in roles.inputs)
+        self._emulated = not self._mailboxes and bool(esc.memory[Register.PDI_CONTROL + 1] & DEVICE_EMULATION)
+        """Whether there is no firmware: the controller itself follows every request (ETG.1000.4, 6.1.4)."""
         self._fed: int | None = None
-        self._received = False
+        self._missing: set[int] = set()
+        """Sync managers of outputs that nothing has been written to."""
         self._op_wanted_at: int | None = None
         self._error = False
         self._stepped_at = t
@@ -55,8 +86,13 @@ class Application:
         self.sync = SyncMonitor(esc, device)
         self.state = AlState.INIT
         esc.on_outputs = self.outputs_written
-        for index in (MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS):
-            esc.sync_managers[index].lock(True)
+        for data in self._outputs + self._inputs:
+            data.manager.process_data = True
+        if self._emulated:
+            self._lay_out()
+        else:
+            for index in (*self._mailboxes, *roles.outputs, *roles.inputs):
+                esc.sync_managers[index].lock(True)
 
     @property
     def by_sync0(self) -> bool:
@@ -81,20 +117,28 @@ class Application:
 
     def outputs_written(self, manager: SyncManager, t: int) -> None:
         """A buffer of outputs was completed by a frame that arrived at `t`."""
-        if manager.index != OUTPUTS:
+        if not manager.process_data:
             return
-        self._received = True
-        self.sync.outputs_came()
-        if self.outputs_watch is not None and self.state == AlState.OP:
-            self.outputs_watch(manager.buffer, t)
+        if self._missing:
+            self._missing.discard(manager.index)
+        if self._outputs and manager is self._outputs[0].manager:
+            self.sync.outputs_came()
+            if self.outputs_watch is not None and self.state == AlState.OP:
+                self.outputs_watch(manager.buffer, t)
         if manager.watchdog_trigger:
             if self._fed is None:
                 self.esc.memory[Register.WATCHDOG_STATUS] |= 0x01
+                if self._emulated and self.state == AlState.OP:
+                    self.device.set_outputs_valid(True)
             self._fed = t
-        self._try_op(t)
+        if self._op_wanted_at is not None:
+            self._try_op(t)
 
     def _control(self, request: int, t: int) -> None:
         wanted = request & STATE_MASK
+        if self._emulated:
+            self._follow(request)
+            return
         if self._error:
             # Until it is acknowledged an error keeps the slave where it is, but for INIT (ETG.1000.6, 6.4.1.4).
             if not request & ERROR_FLAG and wanted != AlState.INIT:
@@ -116,6 +160,16 @@ class Application:
         self._enter(AlState(wanted))
         self._report(AlStatusCode.NO_ERROR)
 
+    def _follow(self, request: int) -> None:
+        """Show what is requested, acknowledgement included, as AL status: nobody checks it."""
+        if request & STATE_MASK in AlState.__members__.values():
+            before, self.state = self.state, AlState(request & STATE_MASK)
+            if AlState.OP in (before, self.state):
+                self.device.set_outputs_valid(self.state == AlState.OP)
+            self.sync.configure()
+            self.device.state_changed(before, self.state)
+        self.esc.set_al_status(request & (STATE_MASK | ERROR_FLAG), AlStatusCode.NO_ERROR)
+
     def _enter(self, wanted: AlState) -> None:
         """Start or stop what lies between the present state and `wanted`."""
         before, self.state = self.state, wanted
@@ -127,29 +181,35 @@ class Application:
         if before >= AlState.PRE_OP > wanted:
             # With it go messages, transfers and counters.
             self._mailbox = None
-            self._lock(True, MAILBOX_OUT, MAILBOX_IN)
-        if before < AlState.PRE_OP <= wanted:
-            self._lock(False, MAILBOX_OUT, MAILBOX_IN)
-            managers = self.esc.sync_managers
-            out, in_ = managers[MAILBOX_OUT], managers[MAILBOX_IN]
-            self._mailbox = MailboxService(self.device, out, in_, self._faults)
+            self._lock(True, self._mailboxes)
+        if before < AlState.PRE_OP <= wanted and self._mailboxes:
+            self._lock(False, self._mailboxes)
+            out, in_ = (self.esc.sync_managers[index] for index in self._mailboxes)
+            self._mailbox = MailboxService(self.device, out, in_, self._faults, wanted == AlState.BOOTSTRAP)
         if before < AlState.SAFE_OP <= wanted:
             self._start_process_data()
+        if before != wanted:
+            self.device.state_changed(before, wanted)
+
+    def _lay_out(self) -> None:
+        for data in self._outputs + self._inputs:
+            data.image = self.device.image(data.manager.index) or _EMPTY
+        self._missing = {data.manager.index for data in self._outputs if data.image.byte_length}
 
     def _start_process_data(self) -> None:
-        self._rx = mapped_image(self.device, RX_ASSIGN) or PdoImage(())
-        self._tx = mapped_image(self.device, TX_ASSIGN) or PdoImage(())
-        self._received = False
+        self._lay_out()
         self._fed = None
         self.esc.memory[Register.WATCHDOG_STATUS] |= 0x01
         self.sync.configure()
         self._lock_process_data(False)
-        self._tx.pack(self.esc.sync_managers[INPUTS].buffer)
+        for data in self._inputs:
+            data.pack()
 
     def _lock_process_data(self, locked: bool) -> None:
-        self._lock(locked, OUTPUTS, INPUTS)
+        roles = self.device.roles
+        self._lock(locked, roles.outputs + roles.inputs)
 
-    def _lock(self, locked: bool, *indices: int) -> None:
+    def _lock(self, locked: bool, indices: Sequence[int]) -> None:
         for index in indices:
             self.esc.sync_managers[index].lock(locked)
         self.esc.on_layout()
@@ -166,12 +226,15 @@ class Application:
         self._op_wanted_at = None
         self._enter(state)
         if state == AlState.SAFE_OP:
-            self._lock(True, OUTPUTS if self._rx.byte_length else INPUTS)
             # What the master sent before does not count any more.
-            self._received = False
+            self._missing = {data.manager.index for data in self._outputs if data.image.byte_length}
+            self._lock(True, tuple(self._missing) or self.device.roles.inputs)
         self._refuse(code)
 
     def _recheck(self) -> None:
+        if self._emulated:
+            self._lay_out()
+            return
         for checks, fallback in HELD[self.state]:
             code = first_failure(checks, self.esc, self.device)
             if code:
@@ -183,15 +246,16 @@ class Application:
         asked = self._op_wanted_at
         if asked is None or self._faults.hangs:
             return
-        have_outputs = self._received or not self._rx.byte_length
+        have_outputs = not self._missing
         have_sync = self.sync.running or not self.sync.active
         if have_outputs and have_sync:
             self._op_wanted_at = None
-            self._latched = bytes(self.esc.sync_managers[OUTPUTS].buffer)
+            self.latch()
             self.sync.start()
-            self.state = AlState.OP
+            before, self.state = self.state, AlState.OP
             self.device.set_outputs_valid(True)
             self._report(AlStatusCode.NO_ERROR)
+            self.device.state_changed(before, AlState.OP)
         elif t - asked > OP_TIMEOUT:
             self._op_wanted_at = None
             self._refuse(AlStatusCode.NO_SYNC if have_outputs else AlStatusCode.SYNC_MANAGER_WATCHDOG)
@@ -204,26 +268,31 @@ class Application:
         fed = self._fed
         if fed is not None and 0 < esc.watchdog_ns < t - fed:
             self._fed = None
-            self._received = False
             esc.memory[Register.WATCHDOG_STATUS] &= 0xFE
             count = esc.memory[Register.WATCHDOG_COUNTERS]
             esc.memory[Register.WATCHDOG_COUNTERS] = min(count + 1, 0xFF)
-            if self.state == AlState.OP:
+            if self._emulated:
+                # Nobody leaves OP: the outputs are off until frames come again.
+                self.device.set_outputs_valid(False)
+            elif self.state == AlState.OP:
                 self.fall(AlState.SAFE_OP, AlStatusCode.SYNC_MANAGER_WATCHDOG)
-        if self.state == AlState.OP and self.sync.active and not self.sync.running:
+            else:
+                self._missing = {data.manager.index for data in self._outputs if data.image.byte_length}
+        if self.state == AlState.OP and self.sync.active and not self.sync.running and not self._emulated:
             self.fall(AlState.SAFE_OP, AlStatusCode.FATAL_SYNC_ERROR)
         if self._op_wanted_at is not None:
             self._try_op(t)
 
     def pulse(self, on_time: bool) -> None:
         """SYNC0 has come: take over the outputs. `on_time` tells that this process was not late in noticing it."""
-        self._latched = bytes(self.esc.sync_managers[OUTPUTS].buffer)
+        self.latch()
         if self.state == AlState.OP and self.sync.pulse(on_time):
             self.fall(AlState.SAFE_OP, AlStatusCode.SYNC_ERROR)
 
     def latch(self) -> None:
-        """Take over the outputs without SYNC0: the frame that brought them has passed."""
-        self._latched = bytes(self.esc.sync_managers[OUTPUTS].buffer)
+        """Take over the outputs: the frame that brought them has passed, or SYNC0 has come."""
+        for data in self._outputs:
+            data.latch()
 
     def due(self, t: int, interval: int) -> bool:
         """Whether the device was last stepped `interval` ns before `t` or earlier."""
@@ -234,11 +303,10 @@ class Application:
         passed = t - self._stepped_at
         self._stepped_at = max(t, self._stepped_at)
         if self.state == AlState.OP:
-            if len(self._latched) == self._rx.byte_length:  # the master may have changed the sync manager just now
-                self._rx.unpack(self._latched)
-            outputs = self.esc.sync_managers[OUTPUTS]
-            if outputs.control & CONTROL_ECAT_EVENT:
-                outputs.exchanged()
+            for data in self._outputs:
+                data.unpack()
+                if data.manager.control & CONTROL_ECAT_EVENT:
+                    data.manager.exchanged()
         step = self.device.step
         for _ in range(MOST_STEPS):
             if passed <= 0:
@@ -246,12 +314,17 @@ class Application:
             part = min(passed, LONGEST_STEP)
             step(part * 1e-9)
             passed -= part
-        if self.state >= AlState.SAFE_OP:
-            inputs = self.esc.sync_managers[INPUTS]
-            if inputs.length == self._tx.byte_length:
-                self._tx.pack(inputs.buffer)
-            if inputs.control & CONTROL_ECAT_EVENT:
-                inputs.exchanged()
+        if self.device.failure and not self._emulated:
+            code, self.device.failure = self.device.failure, 0
+            if self.state == AlState.OP:
+                self.fall(AlState.SAFE_OP, code)
+            elif self.state == AlState.SAFE_OP and not self._error:
+                self._refuse(code)
+        if self.state >= AlState.SAFE_OP or self._emulated:
+            for data in self._inputs:
+                data.pack()
+                if data.manager.control & CONTROL_ECAT_EVENT:
+                    data.manager.exchanged()
         mailbox = self._mailbox
         if mailbox is not None and mailbox.pending(t):
             mailbox.serve(self.state, t)
@@ -266,18 +339,21 @@ class Slave:
 
     __slots__ = ("_drift_ppm", "application", "clock", "delay", "device", "esc", "faults", "queued_until")
 
-    def __init__(self, device: DeviceModel, eeprom: bytes, drift_ppm: float, start: int, delay: int,
-                 turnaround: int | None, t: int) -> None:  # fmt: skip
-        """Power on at instant `t`, the clock showing `start` ns; `turnaround`: see `Esc`."""
+    def __init__(self, device: DeviceModel, eeprom: bytes, drift_ppm: float, start: int, delay: int, t: int) -> None:
+        """Power on at instant `t`, the clock showing `start` ns; the segment connects it."""
         self.device = device
         self.delay = delay
         self.faults = SlaveFaults()
         self._drift_ppm = drift_ppm
-        self.clock: Clock | None = Clock(drift_ppm, start, t) if device.supports_dc else None
-        self.esc = Esc(eeprom, self.clock, turnaround, (True, turnaround is not None))
-        self.application = Application(self.esc, device, self.faults, t)
         self.queued_until: int | None = None
         """Instant up to which the device is to be stepped; None while it does not wait for that."""
+        self._start(eeprom, drift_ppm, start, t)
+
+    def _start(self, eeprom: bytes, drift_ppm: float, start: int, t: int) -> None:
+        device = self.device
+        self.clock = Clock(drift_ppm, start, t) if device.supports_dc else None
+        self.esc = Esc(eeprom, self.clock, physics=device.physics, ram_size=device.ram_size)
+        self.application = Application(self.esc, device, self.faults, t)
 
     def power_off(self, t: int) -> None:
         """The supply goes: the device stops, nothing that controller and firmware held is left."""
@@ -290,25 +366,20 @@ class Slave:
         self._restart(t)
 
     def _restart(self, t: int) -> None:
-        self.clock = Clock(self._drift_ppm + self.faults.drift_ppm, 0, t) if self.device.supports_dc else None
         # The collector of garbage is off in a segment's process: no ring of references may be left.
         self.esc.detach()
-        self.esc = Esc(bytes(self.esc.eeprom.image), self.clock, None, (False, False))
+        self._start(bytes(self.esc.eeprom.image), self._drift_ppm + self.faults.drift_ppm, 0, t)
         if self.esc.dc is not None and self.faults.sync0_losses:
             self.esc.dc.sync0.suspend()
-        self.application = Application(self.esc, self.device, self.faults, t)
 
 
 def make_slaves(devices: Sequence[DeviceModel], drifts_ppm: Sequence[float], delays: Sequence[int],
                 aliases: Sequence[int], t: int) -> list[Slave]:  # fmt: skip
-    """Make a slave of every device, in the order of the wire; `delays` are ns from the master and must not fall."""
+    """Make a slave of every device, in the order of the wire; `delays` are ns from the master."""
     slaves = []
     for device in devices:
         device.join(devices)
     for position, (device, drift, delay, alias) in enumerate(zip(devices, drifts_ppm, delays, aliases, strict=True)):
-        last = position + 1 == len(devices)
-        # A frame comes back to a slave after the way to the end of the chain and back.
-        turnaround = None if last else 2 * (delays[-1] - delay)
-        eeprom = build_sii(device, SyncManagerLayout(), alias)
-        slaves.append(Slave(device, eeprom, drift, FIRST_LOCAL_TIME * (position + 1), delay, turnaround, t))
+        eeprom = device.eeprom(alias) or build_sii(device, SyncManagerLayout(), alias)
+        slaves.append(Slave(device, eeprom, drift, FIRST_LOCAL_TIME * (position + 1), delay, t))
     return slaves

@@ -141,9 +141,14 @@ class Wire:
         image = self._outputs
         for at, place, size in plan.outputs:
             image[place : place + size] = frame[data + at : data + at + size]
+        for at, shift, mask, place, image_shift, others in plan.output_bits:
+            image[place] = image[place] & others | (frame[data + at] >> shift & mask) << image_shift
         image = self._inputs
         for at, place, size in plan.inputs:
             frame[data + at : data + at + size] = image[place : place + size]
+        for at, shift, mask, place, image_shift, _ in plan.input_bits:
+            byte = frame[data + at] & ~(mask << shift) | (image[place] >> image_shift & mask) << shift
+            frame[data + at] = byte
         if plan.written or plan.others:
             self.done.append(plan)
         count = plan.counter

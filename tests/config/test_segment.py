@@ -42,7 +42,7 @@ MISTAKES = {
     "no slaves": ("slaves: []", "slaves: found an empty list, allowed is a list with at least one entry"),
     "no model": (
         "slaves: [{alias: 1}]",
-        "slaves[0]: the key model is missing; it must be a text of 1 to 64 characters",
+        "slaves[0]: found none of them, allowed is one of model, esi and sii",
     ),
     "an unknown key": (
         "slaves: [{model: m, drift: 3}]",

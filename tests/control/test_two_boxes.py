@@ -60,7 +60,7 @@ def move(arm: Simulation) -> None:
 
 def lose_desk(arm: Simulation) -> None:
     """Cut the cable before the last slave."""
-    arm.bus.segment.chain.cut(len(arm.bus.slaves) - 1)
+    arm.bus.segment.topology.cut(len(arm.bus.slaves) - 1)
     arm.bus.segment.rewire()
 
 

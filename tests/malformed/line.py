@@ -115,11 +115,11 @@ class Line:
 
     def reset(self) -> None:
         """What SOEM does first: INIT, and nothing left of what the last master set."""
-        chain = self.segment.chain
-        if chain.reach < len(SIZES) or not chain.returns:
+        topology = self.segment.topology
+        if len(topology.reached) < len(SIZES) or not topology.returns:
             # A mutated frame closed or opened a port: no frame of a master opens port 0 again, the supply does.
             for slave in self.segment.slaves:
-                chain.restart(slave, self.now)
+                topology.restart(slave, self.now)
             self.segment.rewire()
         self.write_all(0x0120, bytes((INIT | ACK, 0)))
         for offset, data in (
@@ -184,5 +184,5 @@ class Line:
         drive = _DRIVE.pack(controlword, target, 20_000, 0, 8)
         data = bytes(SIZES[0][0]) + drive * (len(SIZES) - 1) + bytes(_IMAGE_IN)
         answer = self.give(build(Datagram(DatagramCommand.LRW, 0, 0, 0, data)), PERIOD_NS)
-        assert (answer is not None) == (self.segment.chain.returns and self.segment.chain.reach > 0)
+        assert (answer is not None) == (self.segment.topology.returns and bool(self.segment.topology.reached))
         return next(parse(answer)).counter if answer else 0

@@ -22,7 +22,7 @@ class FileServer(DeviceModel):
     vendor_id, product_code = 0x0E2A, 3
     name, group, order_code = "File server", "Tests", "F1"
     uses_sync0 = False
-    channels = 1
+    channels = times = 1
 
     def __init__(self, **options: object) -> None:
         super().__init__(**options)
@@ -36,7 +36,7 @@ class FileServer(DeviceModel):
             for n in range(1, self.channels + 1)
         ]
         objects.record(0x6000, "Channels", entries)
-        mapped = [(0x6000, entry.subindex, 64) for entry in entries]
+        mapped = [(0x6000, entry.subindex, 64) for entry in entries] * self.times
         define_pdo_objects(objects, {}, {0x1A00: mapped}, [], [0x1A00], fixed=True)
 
     def step(self, dt: float) -> None:
@@ -63,6 +63,6 @@ class FileServer(DeviceModel):
 
 
 class TooLong(FileServer):
-    """320 bytes of inputs, more than a sync manager of the segment has."""
+    """3200 bytes of inputs, more than the memory has room for three times."""
 
-    channels = 40
+    channels, times = 200, 2

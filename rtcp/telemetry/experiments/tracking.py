@@ -17,7 +17,7 @@ from rtcp.config.segment import load_segment
 from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup, returned
 from rtcp.telemetry.experiments.latency import behind, fit_sine
 from rtcp.telemetry.reading import Recorded, read
-from rtcp.virtual.device import create
+from rtcp.virtual.descriptions import Descriptions
 from rtcp.virtual.models.cubemars import CubemarsDrive
 
 Array = npt.NDArray[np.float64]
@@ -227,10 +227,11 @@ def _truth(setup: Setup) -> dict[str, Friction]:
     """Return what the models of the virtual drives were given, by joint."""
     arm = setup.arm
     slots = {slave.name: entry for slave, entry in zip(arm.slaves, load_segment(segment_path(arm)).slaves, strict=True)}
+    descriptions = Descriptions(segment_path(arm).parent)
     found = {}
     for joint in arm.joints:
         entry = slots[joint.slave]
-        model = create(entry.model, **entry.options)
+        model = descriptions.make(entry)
         if isinstance(model, CubemarsDrive):
             mechanics = model.mechanics
             found[joint.name] = Friction(mechanics.inertia, mechanics.coulomb, mechanics.viscous)

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.config.document import shown
+from rtcp.virtual.behaviour import set_value
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.registry import FaultRegistry, installed, parse, sentence_of
 from rtcp.virtual.models.cubemars import CubemarsDrive
 from rtcp.virtual.models.diewu import CHANNELS, DiewuIoBox
+from rtcp.virtual.objects import Entry
 from rtcp.virtual.request_socket import RequestClient, RequestSocket, choose
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import Slave
@@ -45,6 +47,8 @@ class Control(RequestSocket):
             "truth": ((), lambda _, now: truth.answer(now)),
             "clear_peaks": ((), lambda _, now: truth.clear_peaks(now)),
             "edges": (("slave", "output"), self._edges),
+            "get": (("slave", "index", "subindex"), self._get),
+            "set": (("slave", "index", "subindex", "value"), self._set),
         }
         """What a request can ask for: its keys, and what answers it."""
         for name in installed():
@@ -73,11 +77,44 @@ class Control(RequestSocket):
             raise FaultRefused(f"found slave {shown(slave)}, output {shown(output)}, allowed are two numbers, from 1")
         return self._truth.edges(slave, output, now)
 
+    def _get(self, request: dict[str, Any], now: int) -> list[dict[str, Any]]:
+        slave = self._truth.slave_of(request.get("slave"))
+        if "index" in request:
+            return [_shown_entry(_entry_of(slave, request))]
+        roles = slave.device.roles
+        images = [slave.device.image(index) for index in roles.outputs + roles.inputs]
+        return [_shown_entry(entry) for image in images if image is not None for entry in image.entries]
+
+    def _set(self, request: dict[str, Any], now: int) -> dict[str, Any]:
+        slave = self._truth.slave_of(request.get("slave"))
+        entry, value = _entry_of(slave, request), request.get("value")
+        try:
+            if entry.is_bytes and isinstance(value, str):
+                value = bytes.fromhex(value[2:]) if value.startswith("0x") else value.encode()
+            set_value(entry, value)  # type: ignore[arg-type]  # it says which kinds an object takes
+        except ValueError as error:
+            raise FaultRefused(f"value: {error}") from error
+        return _shown_entry(entry)
+
     def _clear(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
         number = request.get("id")
         if number is not None and type(number) is not int:
             raise FaultRefused(f"id: found {shown(number)}, allowed is the number of a fault, or none for all")
         return {"cleared": self._registry.clear(number, now)}
+
+
+def _entry_of(slave: Slave, request: dict[str, Any]) -> Entry:
+    index, subindex = request.get("index"), request.get("subindex", 0)
+    if type(index) is not int or type(subindex) is not int:
+        raise FaultRefused(f"found object {shown(index)}:{shown(subindex)}, allowed are two numbers")
+    if (index, subindex) not in slave.device.objects:
+        raise FaultRefused(f"{slave.device.identity.name} has no object 0x{index:04X}:{subindex}")
+    return slave.device.objects[index, subindex]
+
+
+def _shown_entry(entry: Entry) -> dict[str, Any]:
+    value = f"0x{entry.value.hex()}" if isinstance(entry.value, bytes) else entry.value
+    return {"index": entry.index, "subindex": entry.subindex, "name": entry.name, "value": value}
 
 
 class _Joint:
@@ -129,7 +166,6 @@ class GroundTruth:
         self.watching = False
         self._asked: int | None = None
         """Instant of the last request; None: nobody has ever asked for the truth."""
-        self._chain = segment.chain
         self._segment = segment
         self._models = tuple(models)
         self._joints = {
@@ -184,6 +220,17 @@ class GroundTruth:
         watched[2].edges.clear()
         return found
 
+    def slave_of(self, wanted: object) -> Slave:
+        """Return the slave at a position from 1, or of a label; raises FaultRefused."""
+        slaves = self._segment.slaves
+        if type(wanted) is int and 1 <= wanted <= len(slaves):
+            return slaves[wanted - 1]
+        places = [place for place, label in enumerate(self._models) if label == wanted]
+        if len(places) != 1:
+            found = f"{len(places)} slaves are called {wanted}" if places else f"there is no slave {shown(wanted)}"
+            raise FaultRefused(f"slave: {found}; give a position from 1 to {len(slaves)}, or a name")
+        return slaves[places[0]]
+
     def _release_output(self) -> None:
         if self._output is not None:
             self._segment.slaves[self._output[0] - 1].application.outputs_watch = None
@@ -205,7 +252,7 @@ class GroundTruth:
             "position": position,
             "model": model,
             "al": slave.application.state.name.replace("_", "-"),
-            "reachable": position <= self._segment.chain.reach,
+            "reachable": slave in self._segment.topology.reached,
         }
         found |= slave.device.truth()
         joint = self._joints.get(slave)
@@ -262,3 +309,18 @@ class SegmentClient(RequestClient):
         The first question begins; each returns what came since the one before it, of which 1024 edges are kept.
         """
         return list(self.ask({"do": "edges", "slave": slave, "output": output}))
+
+    def get(self, slave: int | str, index: int | None = None, subindex: int = 0) -> list[dict[str, Any]]:
+        """Return an object of a slave, which is a position from 1 or a name; without `index` all of its process data.
+
+        Each has `index`, `subindex`, `name` and `value`; a string of bytes is `0x` and its digits.
+        """
+        request: dict[str, Any] = {"do": "get", "slave": slave}
+        if index is not None:
+            request |= {"index": index, "subindex": subindex}
+        return list(self.ask(request))
+
+    def set(self, slave: int | str, index: int, subindex: int, value: float | str) -> dict[str, Any]:
+        """Give an object of a slave a value past all rights, as its inputs; return it as `get` does."""
+        request = {"do": "set", "slave": slave, "index": index, "subindex": subindex, "value": value}
+        return dict(self.ask(request))

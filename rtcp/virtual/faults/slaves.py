@@ -56,10 +56,10 @@ class CableFault(Fault):
         cable = cable_of(segment, self.after)
 
         def join(_: int) -> None:
-            segment.chain.join(cable)
+            segment.topology.join(cable)
             segment.rewire()
 
-        segment.chain.cut(cable)
+        segment.topology.cut(cable)
         segment.rewire()
         return join
 
@@ -75,10 +75,10 @@ class PowerFault(SlaveFault):
         slave_at(segment, self.slave)
 
         def on(t: int) -> None:
-            segment.chain.power_on(self.slave, t)
+            segment.topology.power_on(self.slave, t)
             segment.rewire()
 
-        segment.chain.power_off(self.slave, t)
+        segment.topology.power_off(self.slave, t)
         segment.rewire()
         return on
 

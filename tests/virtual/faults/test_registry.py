@@ -83,9 +83,9 @@ def test_all_are_mended_at_once_and_numbers_are_not_given_twice() -> None:
 def test_a_broken_cable_is_whole_again_when_its_time_is_over() -> None:
     kept = Kept()
     kept.begin(fault="cable", after=1, lasts=0.1)
-    assert kept.line.segment.chain.reach == 1
+    assert len(kept.line.segment.topology.reached) == 1
     kept.pass_time(100 * MS)
-    assert kept.line.segment.chain.reach == 3
+    assert len(kept.line.segment.topology.reached) == 3
 
 
 def test_a_script_begins_and_ends_faults_at_its_times() -> None:

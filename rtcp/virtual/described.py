@@ -1,0 +1,367 @@
+"""A slave by its description, an ESI file or an SII image: objects, PDOs, sync managers, clock and mailbox protocols.
+
+What it does with its objects is its behaviour's; without one it answers by its dictionary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
+
+from rtcp.esi import types
+from rtcp.esi.model import Device, ObjectEntry, Pdo, PdoEntry
+from rtcp.esi.sii import crc
+from rtcp.virtual.behaviour import Behaviour, Runner
+from rtcp.virtual.device import CoeFeatures, DeviceModel, Identity
+from rtcp.virtual.foe import FoeServer
+from rtcp.virtual.objects import (
+    AbortCode,
+    Access,
+    DataType,
+    DictionaryObject,
+    Entry,
+    ObjectCode,
+    ObjectDictionary,
+    SdoAbort,
+    Value,
+)
+from rtcp.virtual.pdo import (
+    ASSIGN,
+    SM_TYPES,
+    PdoImage,
+    SyncManager,
+    SyncManagerType,
+    define_sync_manager_types,
+    mapped_bits,
+    restrict,
+)
+from rtcp.virtual.protocol import RAM_SIZE, REGISTER_SPACE, MailboxType
+
+LARGEST_RAM = 0xF000
+"""Bytes: addresses have 16 bits."""
+_LONGEST_GAP = 248
+_FIRST_OBJECT = 0x1000
+"""Below it stand data types, which a PDO maps as padding (ETG.1000.6, table 64)."""
+_BEYOND = 0x1_0000
+"""Internal numbers of PDOs that have no index, or the same as another one."""
+_WRITE = {"P": Access.WRITE_PREOP, "S": Access.WRITE_SAFEOP, "O": Access.WRITE_OP}
+_COMPATIBILITY = 0x06040043
+"""Abort code: general parameter incompatibility."""
+_MAPPED = Access.RXPDO | Access.TXPDO
+
+
+class DescribedDevice(DeviceModel):
+    """A device made of its description.
+
+    Args:
+        device: the description, its modules put in.
+        image: its EEPROM image; `alias` and checksum are set in it.
+        behaviour: class of what it does; None: nothing.
+        options: of the behaviour, and those that every model has.
+    """
+
+    def __init__(self, device: Device, image: Callable[[int], bytes], behaviour: type[Behaviour] | None = None,
+                 **options: object) -> None:  # fmt: skip
+        self.description = device
+        self._image = image
+        mailbox = device.mailbox
+        self.sync_managers = _layout(device)
+        self.supports_dc = bool(device.dc_modes)
+        self.sync_activations = frozenset(mode.assign_activate >> 8 for mode in device.dc_modes) - {0}
+        self.physics = device.physics or "YY"
+        coe = None if mailbox is None else mailbox.coe
+        self.coe = None if coe is None else CoeFeatures(coe.sdo_information, coe.complete_access)
+        self.smallest_mailbox = min([34, *(m.length for m in self.sync_managers if _is_mailbox(m) and m.length)])
+        if mailbox is not None and mailbox.foe:
+            self.bootstrap = _bootstrap(device.bootstrap)
+        self.options = {} if behaviour is None else behaviour.options
+        self._assignments: dict[int, list[int]] = {}
+        """Numbers of the PDOs that each sync manager has by default."""
+        super().__init__(**options)
+        self.runner = Runner(self, behaviour)
+        self.files = None if mailbox is None or not mailbox.foe else FoeServer(self.runner)
+        if self.files is not None:
+            self.mailbox_protocols[MailboxType.FOE] = self.files
+
+    def make_identity(self) -> Identity:
+        """Return the identity of the description; the serial number is an option."""
+        device = self.description
+        identity = device.identity
+        return Identity(
+            identity.vendor_id, identity.product_code, identity.revision, int(self.option("serial")),
+            device.name, device.group, device.type,
+        )  # fmt: skip
+
+    def eeprom(self, alias: int) -> bytes:
+        """Return its EEPROM image."""
+        return self._image(alias)
+
+    # -- objects ----------------------------------------------------------------------------------------------------
+
+    def define(self, objects: ObjectDictionary) -> None:
+        """Add the objects of the dictionary, and those that the PDOs need."""
+        device = self.description
+        identity = objects.object(0x1018)
+        for item in device.objects:
+            entries = {entry.sub_index: _entry(item.index, entry) for entry in item.entries}
+            if entries:
+                objects.add(DictionaryObject(item.index, item.name, ObjectCode(item.code), entries))
+        for subindex, entry in identity.entries.items():
+            if (0x1018, subindex) in objects:
+                objects[0x1018, subindex].value = entry.value
+        numbers = self._define_pdos(objects)
+        self._make_room(objects)
+        if self.coe is not None or (SM_TYPES, 0) not in objects:
+            define_sync_manager_types(objects, self.sync_managers)
+        for index in self.roles.outputs + self.roles.inputs:
+            self._define_assignment(objects, index, numbers)
+
+    def _define_pdos(self, objects: ObjectDictionary) -> dict[int, Pdo]:
+        """Add the mapping object of every PDO, and what it maps; return the PDOs by the number of this object."""
+        numbers: dict[int, Pdo] = {}
+        pdos = [(pdo, Access.RXPDO) for pdo in self.description.rx_pdos]
+        pdos += [(pdo, Access.TXPDO) for pdo in self.description.tx_pdos]
+        for pdo, wanted in pdos:
+            if pdo.virtual:
+                continue
+            number = pdo.index if pdo.index and pdo.index not in numbers else _BEYOND + len(numbers)
+            numbers[number] = pdo
+            if pdo.sync_manager is not None:
+                self._assignments.setdefault(pdo.sync_manager, []).append(number)
+            mapped = [mapping for entry in pdo.entries for mapping in _mappings(objects, entry, wanted)]
+            self._define_mapping(objects, number, pdo, wanted, mapped)
+        return numbers
+
+    def _define_mapping(
+        self, objects: ObjectDictionary, number: int, pdo: Pdo, wanted: Access, mapped: Sequence[int]
+    ) -> None:
+        described = objects.object(number) if (number, 0) in objects else None
+        places = 0 if described is None else described.highest_subindex
+        free = not pdo.fixed and self._writable(described, "pdo_configuration")
+        values = [*mapped, *[0] * (max(places, 16 if free else 0) - len(mapped))]
+        entries = [Entry(number, n, f"Mapped object {n}", DataType.UNSIGNED32, v) for n, v in enumerate(values, 1)]
+        made = objects.record(number, pdo.name or f"PDO mapping 0x{number:04X}", entries)
+        restrict(made, len(mapped), not free, lambda value: mapped_bits(objects, value, wanted), LARGEST_RAM)
+
+    def _writable(self, described: DictionaryObject | None, feature: str) -> bool:
+        """Whether the master may change a mapping or an assignment: by the dictionary, or as the mailbox says."""
+        mailbox = self.description.mailbox
+        if mailbox is None or mailbox.coe is None:
+            return False
+        in_dictionary = described is not None and bool(described.entries[0].access & Access.WO)
+        return in_dictionary or bool(getattr(mailbox.coe, feature))
+
+    def _define_assignment(self, objects: ObjectDictionary, manager: int, numbers: Mapping[int, Pdo]) -> None:
+        """Add the PDO assignment of a sync manager, which keeps what is mandatory and what excludes each other."""
+        index = ASSIGN + manager
+        outputs = manager in self.roles.outputs
+        pdos = self.description.rx_pdos if outputs else self.description.tx_pdos
+        own = {number: pdo for number, pdo in numbers.items() if pdo in pdos}
+        assigned = self._assignments.get(manager, [])
+        wanted = Access.RXPDO if outputs else Access.TXPDO
+        described = objects.object(index) if (index, 0) in objects else None
+        free = self._writable(described, "pdo_assignment")
+        room = max(len(assigned), len(own) if free else 0, 0 if described is None else described.highest_subindex)
+        values = [*assigned, *[0] * (room - len(assigned))]
+        entries = [Entry(index, n, f"Assigned PDO {n}", DataType.UNSIGNED16, v) for n, v in enumerate(values, 1)]
+        made = objects.record(index, f"PDO assignment of SM{manager}", entries, code=ObjectCode.ARRAY)
+        default = frozenset(assigned)
+
+        def bits_of(number: int) -> int:
+            if number not in own:
+                raise SdoAbort(AbortCode.NOT_MAPPABLE if number in numbers else AbortCode.NO_OBJECT)
+            mapping = objects.object(number)
+            used = range(1, int(mapping.entries[0].value) + 1)
+            return sum(mapped_bits(objects, int(mapping.entries[n].value), wanted) for n in used)
+
+        def accept(chosen: Sequence[int]) -> None:
+            others = frozenset(chosen)
+            if not others:
+                return
+            for number in chosen:
+                # What excludes each other by default, as some descriptions have it, may stay together.
+                if (own[number].excludes & others) - (default if number in default else frozenset()):
+                    raise SdoAbort(_COMPATIBILITY)
+            if any(own[number].mandatory and number not in others for number in assigned):
+                raise SdoAbort(_COMPATIBILITY)
+
+        restrict(made, len(assigned), not free, bits_of, LARGEST_RAM, accept)
+
+    def _make_room(self, objects: ObjectDictionary) -> None:
+        """Find how much memory the sync managers need, and whether they share it."""
+        areas = []
+        for n, manager in enumerate(self.sync_managers):
+            if manager.type in (SyncManagerType.OUTPUTS, SyncManagerType.INPUTS):
+                words = [
+                    int(entry.value)
+                    for number in self._assignments.get(n, [])
+                    for subindex, entry in objects.object(number).entries.items()
+                    if 0 < subindex <= int(objects[number, 0].value)
+                ]
+                bits = sum(objects.mappings[word][1] if word in objects.mappings else word & 0xFF for word in words)
+                length = (bits + 7) // 8
+            else:
+                length = manager.length
+            if length and manager.type != SyncManagerType.UNUSED:
+                areas.append((manager.start, manager.start + length * manager.buffers))
+        boot = self.bootstrap or (0, 0, 0, 0)
+        end = max([REGISTER_SPACE + RAM_SIZE, *(end for _, end in areas), boot[0] + boot[1], boot[2] + boot[3]])
+        self.ram_size = min(LARGEST_RAM, -(-(end - REGISTER_SPACE) // 1024) * 1024)
+        self.shares_memory = any(first[1] > second[0] for first, second in pairwise(sorted(areas)))
+
+    def lay_out(self, index: int) -> PdoImage:
+        """Return the process image of sync manager `index`; where they share memory all may fill it."""
+        if not self.shares_memory:
+            return super().lay_out(index)
+        return PdoImage.from_assignment(self.objects, ASSIGN + index, index in self.roles.outputs, self.ram_size)
+
+    # -- what it does -----------------------------------------------------------------------------------------------
+
+    def step(self, dt: float) -> None:
+        """Let `dt` seconds pass for the behaviour."""
+        self.runner.step(dt)
+
+    def power_on(self) -> None:
+        """The supply comes back: the objects have their defaults, and the behaviour begins anew."""
+        super().power_on()
+        self.runner.start()
+
+    def set_outputs_valid(self, valid: bool) -> None:
+        """Outputs become valid, or invalid: then they are 0."""
+        super().set_outputs_valid(valid)
+        if not valid and not self.runner.keeps_outputs:
+            for index in self.roles.outputs:
+                image = self.image(index)
+                for entry in () if image is None else image.entries:
+                    entry.value = bytes(len(entry.value)) if isinstance(entry.value, bytes) else 0
+        self.runner.outputs_valid(valid)
+
+    def open_mailbox(self, receive_size: int, send_size: int) -> None:
+        """No transfer of a file is under way."""
+        if self.files is not None:
+            self.files.open(receive_size)
+
+    def state_changed(self, before: int, after: int) -> None:
+        """Let the behaviour know."""
+        self.runner.state_changed(before, after)
+
+
+def _is_mailbox(manager: SyncManager) -> bool:
+    return manager.type in (SyncManagerType.MAILBOX_RECEIVE, SyncManagerType.MAILBOX_SEND)
+
+
+def _layout(device: Device) -> tuple[SyncManager, ...]:
+    """Return the sync managers; those that stand for registers, and the mailboxes of a device without, have no use."""
+    unused = SyncManagerType.UNUSED
+
+    def kind(manager_type: int, virtual: bool) -> SyncManagerType:
+        found = SyncManagerType(manager_type)
+        without = device.mailbox is None and found in (SyncManagerType.MAILBOX_RECEIVE, SyncManagerType.MAILBOX_SEND)
+        return unused if virtual or without else found
+
+    return tuple(
+        SyncManager(m.start, m.length, m.control, kind(m.type, m.virtual), int(m.enabled))
+        for m in device.sync_managers[:8]
+    )
+
+
+def _bootstrap(data: bytes) -> tuple[int, int, int, int] | None:
+    words = [int.from_bytes(data[n : n + 2], "little") for n in range(0, 8, 2)]
+    if len(data) < 8 or not words[1] or not words[3]:
+        return None
+    return words[0], words[1], words[2], words[3]
+
+
+def _data_type(base: types.BaseType) -> DataType:
+    try:
+        return DataType(base.number)
+    except ValueError:
+        return DataType.OCTET_STRING
+
+
+def _number(base: types.BaseType, data: bytes | None) -> float | None:
+    """Return a limit; None: none is given, or it is no number."""
+    value = None if data is None else types.decode(base, data)
+    return value if isinstance(value, int | float) else None
+
+
+def _value(base: types.BaseType, data: bytes | None, bits: int) -> Value:
+    if base.kind is types.Kind.TEXT:
+        return (data or b"")[: bits // 8].rstrip(b"\0")
+    if base.kind is types.Kind.BYTES:
+        return (data or b"")[: (bits + 7) // 8].ljust((bits + 7) // 8, b"\0")
+    value = types.decode(base, data or b"")
+    return value if isinstance(value, int | float) else 0
+
+
+def _entry(index: int, entry: ObjectEntry) -> Entry:
+    """Return an entry of the dictionary with its default, rights and range."""
+    bits = entry.bits or 8 * len(entry.default or b"")
+    base = types.resolve(entry.type, bits)
+    access = Access.RO if entry.readable else Access(0)
+    if entry.writable:
+        states = [_WRITE[state] for state in entry.write_states.upper() if state in _WRITE]
+        for state in states or [Access.WO]:
+            access |= state
+    access |= (Access.RXPDO if entry.rx_mappable else Access(0)) | (Access.TXPDO if entry.tx_mappable else Access(0))
+    low, high = _number(base, entry.minimum), _number(base, entry.maximum)
+    if low is not None and high is not None and low > high:
+        low = high = None
+    data_type = _data_type(base)
+    made = Entry(
+        index, entry.sub_index, entry.name, data_type, _value(base, entry.default, bits), access,
+        bit_length=bits, minimum=low, maximum=high,
+    )  # fmt: skip
+    if base.kind in (types.Kind.TEXT, types.Kind.BYTES) and not made.is_bytes:
+        made.data_type = DataType.OCTET_STRING
+    return made
+
+
+def _mappings(objects: ObjectDictionary, entry: PdoEntry, wanted: Access) -> Iterable[int]:
+    """Yield the mappings of a PDO's entry, one but for long gaps; add the object that it maps where there is none."""
+    if entry.index < _FIRST_OBJECT or entry.bits > 0xFF:
+        left = entry.bits
+        while left > 0:
+            yield min(left, _LONGEST_GAP)
+            left -= _LONGEST_GAP
+        return
+    word = entry.index << 16 | entry.sub_index << 8 | entry.bits
+    target = _mapped_entry(objects, entry, wanted)
+    if target.bit_length != entry.bits:
+        objects.mappings[word] = target, entry.bits
+    yield word
+
+
+def _mapped_entry(objects: ObjectDictionary, entry: PdoEntry, wanted: Access) -> Entry:
+    """Return the entry that is mapped, which is made where the dictionary lacks it."""
+    index, subindex = entry.index, entry.sub_index
+    if (index, subindex) not in objects:
+        base = types.resolve(entry.type, entry.bits)
+        access = Access.RO if wanted == Access.TXPDO else Access.RW
+        made = Entry(index, subindex, entry.name, _data_type(base), _value(base, None, entry.bits), access,
+                     bit_length=entry.bits)  # fmt: skip
+        if (index, 0) in objects:
+            found = objects.object(index)
+            found.entries[subindex] = made
+            found.code = ObjectCode.RECORD
+            found.entries = dict(sorted(found.entries.items()))
+        elif subindex:
+            objects.record(index, entry.name, [made])
+        else:
+            objects.add(DictionaryObject(index, entry.name, ObjectCode.VARIABLE, {0: made}))
+        found = objects.object(index)
+        if found.code != ObjectCode.VARIABLE and not found.entries[0].access & _MAPPED:
+            found.entries[0].value = max(int(found.entries[0].value or 0), found.highest_subindex)
+    target = objects[index, subindex]
+    target.access |= wanted
+    return target
+
+
+def with_alias(image: bytes, alias: int) -> bytes:
+    """Return an EEPROM image with a station alias and its checksum; 0: as it is."""
+    if not alias:
+        return image
+    head = bytearray(image[:16])
+    head[8:10] = alias.to_bytes(2, "little")
+    head[14] = crc(bytes(head[:14]))
+    return bytes(head) + image[16:]

@@ -1,0 +1,162 @@
+"""Slaves of an ESI file or an SII image, and what a master that knows none of them finds."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.config.model import ConfigError
+from rtcp.config.segment import load_segment
+from rtcp.esi.reader import find_device, read_esi
+from rtcp.esi.sii import write_sii
+from rtcp.virtual.behaviour import Behaviour, Option
+from rtcp.virtual.coe import read, write
+from rtcp.virtual.described import DescribedDevice
+from rtcp.virtual.objects import SdoAbort
+from rtcp.virtual.segment import check_segment, make_segment
+from tests.virtual.conftest import VENDOR, described
+
+OP, PRE_OP = 8, 2
+Master = Callable[..., dict[str, Any]]
+COUPLER, INPUTS, OUTPUTS, DRIVE, TWO = 0x10, 0x11, 0x12, 0x20, 0x30
+
+
+def device(product: int, behaviour: type[Behaviour] | None = None, **options: object) -> DescribedDevice:
+    found = find_device(read_esi(VENDOR), product=product)
+    return DescribedDevice(found, lambda alias: write_sii(found, alias), behaviour, **options)
+
+
+def assert_op(found: dict[str, Any], counter: int) -> None:
+    assert (found["safe_op"], found["state"]) == (4, OP)
+    assert found["codes"] == [[OP, 0]] * found["found"]
+    # A frame that this machine delays beyond the master's patience (-1) is no wrong counter.
+    assert {*found["counters"]} <= {counter, -1}
+    assert found["counters"].count(counter) > 0.8 * len(found["counters"])
+
+
+@pytest.mark.alone
+def test_terminals_with_a_few_bits_without_mailbox_share_bytes_with_their_neighbours(master: Master) -> None:
+    set_to = "behaviour: 'tests.virtual.test_described:Pattern', options: {levels: "
+    found = master(
+        described(COUPLER), described(INPUTS, set_to + "2}"), described(OUTPUTS), described(INPUTS, set_to + "1}"),
+        described(OUTPUTS), outputs=("", "", "a5", "", "a5"),
+    )  # fmt: skip
+    assert_op(found, 1 + 2 + 1 + 2)
+    assert found["inputs"][1:4:2] == ["06", "06"]  # both bytes are the same one: 2 in its low bits, 1 above them
+    assert found["bytes"] == 2
+
+
+class Pattern(Behaviour):
+    """Shows levels at its inputs."""
+
+    options = {"levels": Option(0, 0, 3, "levels", whole=True)}
+
+    def on_start(self) -> None:
+        levels = int(self.option("levels"))
+        self[0x6000, 1], self[0x6010, 1] = levels & 1, levels >> 1
+
+
+@pytest.mark.alone
+def test_a_drive_with_coe_of_an_esi_file_goes_to_op(master: Master) -> None:
+    found = master(described(DRIVE), described(DRIVE, "alias: 7"))
+    assert_op(found, 6)
+    assert [len(data) for data in found["inputs"]] == [26, 26]
+    assert found["dc"]
+
+
+@pytest.mark.alone
+def test_two_sync_managers_a_direction_one_of_a_single_buffer_carry_bits_24_bits_and_bytes(master: Master) -> None:
+    behaviour = "behaviour: 'tests.virtual.behaviours:Echo', options: {gain: 3}"
+    outputs = (100_000).to_bytes(3, "little").hex() + f"{9 << 3:02x}" + bytes(range(31)).hex()
+    found = master(described(TWO, behaviour), outputs=(outputs,))
+    assert_op(found, 3)
+    value, temperature, answer = found["inputs"][0][:6], found["inputs"][0][6:14], found["inputs"][0][14:]
+    assert int.from_bytes(bytes.fromhex(value), "little", signed=True) == -300_000
+    assert struct.unpack("<f", bytes.fromhex(temperature)) == (4.5,)
+    assert int.from_bytes(bytes.fromhex(answer), "little") == sum(range(31))
+
+
+@pytest.mark.alone
+def test_an_sii_image_alone_makes_the_same_slave(master: Master, tmp_path: Path) -> None:
+    image = write_sii(find_device(read_esi(VENDOR), product=DRIVE))
+    (tmp_path / "drive.bin").write_bytes(image)
+    found = master("sii: drive.bin", "sii: drive.bin, alias: 5")
+    assert_op(found, 6)
+    assert [len(data) for data in found["inputs"]] == [26, 26]
+
+
+def test_the_eeprom_is_that_of_the_description_with_the_alias_under_the_checksum(tmp_path: Path) -> None:
+    image = write_sii(find_device(read_esi(VENDOR), product=DRIVE))
+    (tmp_path / "drive.bin").write_bytes(image)
+    config = tmp_path / "segment.yaml"
+    config.write_text(f"slaves:\n- {{{described(DRIVE)}}}\n- sii: drive.bin\n- {{sii: drive.bin, alias: 5}}\n")
+    slaves = make_segment(load_segment(config), 0).slaves
+    assert [bytes(slave.esc.eeprom.image) == image for slave in slaves] == [True, True, False]
+    assert (slaves[2].esc.get(0x0012, 2), slaves[2].esc.eeprom.image[14:]) == (5, slaves[2].esc.eeprom.image[14:])
+    assert slaves[2].esc.get(0x0502, 2) & 0x0800 == 0
+
+
+def abort_of(call: Callable[..., object], *arguments: object) -> int:
+    with pytest.raises(SdoAbort) as caught:
+        call(*arguments)
+    return caught.value.code
+
+
+def assign(made: DescribedDevice, index: int, *pdos: int) -> None:
+    write(made.objects, index, 0, False, PRE_OP, b"\0")
+    for n, pdo in enumerate(pdos, 1):
+        write(made.objects, index, n, False, PRE_OP, pdo.to_bytes(2, "little"))
+    write(made.objects, index, 0, False, PRE_OP, bytes((len(pdos),)))
+
+
+def test_pdos_that_exclude_each_other_and_mandatory_ones_rule_the_assignment() -> None:
+    made = device(DRIVE)
+    assign(made, 0x1C12, 0x1601)
+    assert made.lay_out(2).byte_length == 4
+    assert abort_of(assign, made, 0x1C12, 0x1600, 0x1601) == 0x06040043
+    assert abort_of(assign, made, 0x1C12, 0x1A00) == 0x06040041
+    assert abort_of(assign, made, 0x1C12, 0x1602) == 0x06020000
+    assert abort_of(assign, device(TWO), 0x1C12, 0x1700) == 0x06010002
+
+
+def test_a_device_without_a_dictionary_has_the_objects_that_its_pdos_map() -> None:
+    made = device(DRIVE)
+    assert read(made.objects, 0x1600, 0, True, PRE_OP) == struct.pack("<BxIII", 3, 0x60400010, 0x607A0020, 0x60600008)
+    assert read(made.objects, 0x1018, 1, False, PRE_OP) == struct.pack("<I", 0x0E2A)
+    assert abort_of(write, made.objects, 0x6064, 0, False, PRE_OP, bytes(4)) == 0x06010002
+    write(made.objects, 0x607A, 0, False, PRE_OP, struct.pack("<i", -5))
+    assert made.objects[0x607A, 0].value == -5
+
+
+MISTAKES = {
+    "no such product": (described(0x99), "product", "no devices fit product 0x00000099"),
+    "no such file": ("esi: none.xml", "esi", "none.xml"),
+    "several devices": (f"esi: {VENDOR}", "esi", "5 devices fit without a choice"),
+    "a behaviour that is none": (described(DRIVE, "behaviour: toaster"), "behaviour", "allowed is one of cia402, or"),
+    "a module that is none": (described(DRIVE, "behaviour: 'no.such:Thing'"), "behaviour", "cannot be loaded"),
+    "an option that it has not": (
+        described(TWO, "behaviour: 'tests.virtual.behaviours:Echo', options: {loss: 3}"),
+        "options.loss", "the model has no option 'loss'; it has: serial, sync_error_limit, gain",
+    ),
+    "modules where there are no places": (described(DRIVE, "modules: [3]"), "modules", "Drive has no place 0"),
+    "no image": ("sii: segment.yaml", "sii", "the fixed part of an SII image alone has 128"),
+    "two descriptions": ("esi: a.xml, sii: b.bin", "", "found esi and sii, allowed is one of model, esi and sii"),
+    "a product of a model": ("model: diewu-io, product: 3", "product", "only a slave of an ESI file has this key"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("entry", "key", "text"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_a_mistake_in_a_description_is_named_with_file_line_and_key(
+    tmp_path: Path, entry: str, key: str, text: str
+) -> None:
+    config = tmp_path / "segment.yaml"
+    config.write_text(f"slaves:\n- model: diewu-io\n- {{{entry}}}\n")
+    with pytest.raises(ConfigError) as caught:
+        check_segment(config)
+    (problem,) = caught.value.problems
+    assert problem.startswith(f"{config}:3: slaves[1]{'.' if key else ''}{key}: ")
+    assert text in problem
