@@ -199,6 +199,8 @@ class DeviceModel:
         self.mailbox_protocols: dict[MailboxType, MailboxHandler] = {}
         """Mailbox protocols beside CoE, as FoE, that a subclass adds in its `__init__`; its SII lists them."""
         self.outputs_valid = False
+        self.servos: Sequence[Any] = ()
+        """Axes of a drive: `rtcp.virtual.models.servo.ServoAxis`."""
         self.failure = 0
         """AL status code with which the slave is to leave OP for SAFE-OP now; 0: none."""
         self.roles = roles_of(self.sync_managers)

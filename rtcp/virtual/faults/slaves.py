@@ -24,7 +24,7 @@ from rtcp.virtual.faults.fault import (
     place_of,
     slave_at,
 )
-from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
+from rtcp.virtual.models import DiewuIoBox
 from rtcp.virtual.models.diewu import BrokenTerminals
 from rtcp.virtual.models.protection import ErrorCode
 from rtcp.virtual.protocol import AlState
@@ -292,10 +292,16 @@ class DriveErrorFault(DeviceFault):
     once_unless_it_lasts = True
     slave: Position
     error: DriveError
+    axis: Annotated[int, Ge(1), Le(8)] = 1
 
     def begin(self, devices: Sequence[DeviceModel]) -> End:
         """Let the drive meet the error."""
-        drive = _device_at(devices, self.slave, CubemarsDrive, "drive")
+        device = devices[place_of(devices, self.slave)]
+        if not device.servos:
+            raise FaultRefused(f"slave {self.slave} ({device.identity.name}) is no drive")
+        if self.axis > len(device.servos):
+            raise FaultRefused(f"axis: found {self.axis}, but slave {self.slave} has {len(device.servos)}")
+        drive = device.servos[self.axis - 1]
         code = ErrorCode[self.error.upper().replace("-", "_")]
         drive.begin_fault(code)
         return lambda _: drive.end_fault(code)
