@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rtcp.api.results import (
     Arrival,
     Buffered,
+    Channel,
     EventRecord,
     GripperRest,
     JointLimits,
@@ -39,6 +40,7 @@ __all__ = [
     "AsyncRobot",
     "Buffered",
     "Cell",
+    "Channel",
     "ConnectionLost",
     "ControlMode",
     "DriveMode",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 from rtcp.ipc.robot_status import RobotStatus
@@ -225,16 +226,42 @@ class Levels(Mapping[str, bool]):
 
 
 @dataclass(frozen=True)
+class Channel:
+    """A channel with a number, of a slave of which nothing but its channels is known."""
+
+    name: str
+    """slave.channel"""
+    value: float
+    unit: str
+    is_output: bool
+    settable: bool
+    """Whether a command may set it: it is an output, and no process writes it."""
+    range: tuple[float, float]
+    """Smallest and largest value that may be set."""
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any]) -> Channel:
+        """Read an entry of the answer of the method `read_io`."""
+        low, high = found["range"] or (None, None)
+        ends = -math.inf if low is None else low, math.inf if high is None else high
+        value = math.nan if found["value"] is None else found["value"]
+        return cls(**{**found, "range": ends, "value": value})
+
+
+@dataclass(frozen=True)
 class Terminals:
-    """The IO boxes at one instant."""
+    """The IO boxes and other slaves' channels at one instant."""
 
     inputs: Levels
     outputs: Levels
+    channels: Mapping[str, Channel] = field(default_factory=dict)
+    """Channels with a number, by their names."""
 
     @classmethod
     def from_json(cls, found: Mapping[str, Any]) -> Terminals:
         """Read the answer of the method `read_io`."""
-        return cls(Levels(found["inputs"]), Levels(found["outputs"]))
+        channels = {one["name"]: Channel.from_json(one) for one in found["channels"]}
+        return cls(Levels(found["inputs"]), Levels(found["outputs"]), channels)
 
 
 @dataclass(frozen=True)

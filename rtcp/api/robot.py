@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Protocol
 from rtcp.api.results import (
     Arrival,
     Buffered,
+    Channel,
     EventRecord,
     GripperRest,
     JointLimits,
@@ -643,8 +644,17 @@ class Methods:
         return Call("wait_io", {"name": name, "value": value, "timeout_s": timeout_s}, _nothing)
 
     @Method
-    def set_output(self, output: int | str, value: bool, box: str | None = None) -> Call[None]:
-        """Set a digital output, by its name (`wait_io`) or counted from 1, of an IO box; `box`: needed with several."""
+    def set_output(self, output: int | str, value: bool | float, box: str | None = None) -> Call[None]:
+        """Set an output by its name (`wait_io`), or one of an IO box counted from 1; `box`: needed with several.
+
+        An output with a number, `slave.channel`, is set in its unit.
+
+        Raises:
+            Refused: reasons `channel_out_of_range` (`lowest`, `highest`), `channel_not_settable`, `reserved_output`.
+            Invalid: reason `unknown_terminal` (`name`, `allowed`).
+        """
+        if isinstance(output, str) and not isinstance(value, bool):
+            return Call("set_channel", {"name": output, "value": float(value)}, _nothing)
         if isinstance(output, str):
             return Call("write_io", {"name": output, "value": value}, _nothing)
         return Call("set_output", {"output": output, "value": value, "box": box}, _nothing)
@@ -854,7 +864,8 @@ class Robot(Methods):
 class Io:
     """Inputs and outputs of a robot: `robot.io["part_present"]`, `robot.io["blower"] = True`. True is a high level.
 
-    Names are those of `inputs.named` and `outputs.named` in the arm's file, of the functions there, and `box.number`.
+    Names are those of `inputs.named` and `outputs.named` in the arm's file, of the functions there, `box.number`, and
+    `slave.channel` of analog, encoder and generic slaves: `robot.io["valve.pressure"] = 2.5`, in the channel's unit.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -870,12 +881,19 @@ class Io:
         """Levels of all outputs now."""
         return self._robot.read_io().outputs
 
-    def __getitem__(self, name: str) -> bool:
-        """Return the level of an input, or else of an output; raises KeyError."""
+    @property
+    def channels(self) -> Mapping[str, Channel]:
+        """Channels with a number now."""
+        return self._robot.read_io().channels
+
+    def __getitem__(self, name: str) -> bool | float:
+        """Return the level of an input, or else of an output, or the value of a channel; raises KeyError."""
         terminals = self._robot.read_io()
+        if name in terminals.channels:
+            return terminals.channels[name].value
         return terminals.inputs[name] if name in terminals.inputs else terminals.outputs[name]
 
-    def __setitem__(self, name: str, value: bool) -> None:
+    def __setitem__(self, name: str, value: bool | float) -> None:
         """Set an output; raises as `Robot.set_output`."""
         self._robot.set_output(name, value)
 

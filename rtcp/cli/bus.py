@@ -250,29 +250,55 @@ def _scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[Renderab
     if not slaves:
         return [Text(f"{bus}: no slave answers")]
     counted = "1 slave" if len(slaves) == 1 else f"{len(slaves)} slaves"
-    headings = ("#", "station", "name", "state", "out bits", "in bits", "delay ns")
-    overview = table(headings, ("name", "state"), title=f"{bus}: {counted}")
+    headings = ("#", "behind", "name", "state", "out bits", "in bits", "delay ns", "errors")
+    overview = table(headings, ("behind", "name", "state"), title=f"{bus}: {counted}")
     parts: list[RenderableType] = [overview]
-    for slave in slaves:
+    for slave, branch in zip(slaves, _branches(slaves), strict=True):
         overview.add_row(
             str(slave["position"]),
-            _hex(slave["station"], 4),
-            Text(str(slave["name"])),
+            f"{slave['parent']} port {slave['parent_port']}" if slave["parent"] else "master",
+            Text("  " * branch + str(slave["name"])),
             str(slave["state"]),
             str(slave["output_bits"]),
             str(slave["input_bits"]),
             str(slave["delay_ns"]) if slave["dc"] else "no DC",
+            str(sum(slave["port_errors"]["rx"]) + sum(slave["port_errors"]["links"])),
         )
         parts += [Text(""), Text(f"{slave['position']}  {slave['name']}", "bold")]
         parts += [Padding(one, (0, 0, 0, 3)) for one in (_slave_facts(slave), _pdo_map(slave)) if one.row_count]
     return parts
 
 
+def _branches(slaves: Sequence[Mapping[str, Any]]) -> list[int]:
+    """Return of each slave how many branches lead to it: a junction's last one goes on where it stands."""
+    last = {slave["parent"]: slave["position"] for slave in slaves}
+    levels: dict[int, int] = {0: 0}
+    for slave in slaves:
+        parent, position = slave["parent"], slave["position"]
+        levels[position] = levels.get(parent, 0) + (parent != 0 and last[parent] != position)
+    return [levels[slave["position"]] for slave in slaves]
+
+
+def _port(slave: Mapping[str, Any], port: int) -> str:
+    errors = slave["port_errors"]
+    counted = [
+        f"{count} {one if count == 1 else several}"
+        for count, one, several in (
+            (errors["rx"][port], "damaged frame", "damaged frames"),
+            (errors["forwarded"][port], "forwarded error", "forwarded errors"),
+            (errors["links"][port], "lost link", "lost links"),
+        )
+        if count
+    ]
+    return f"{port} {slave['ports'][port]}" + (f" ({', '.join(counted)})" if counted else "")
+
+
 def _slave_facts(slave: Mapping[str, Any]) -> Table:
     rows = facts()
     vendor, product, revision = (_hex(slave[key]) for key in ("vendor_id", "product_code", "revision"))
     identity = f"vendor {vendor}, product {product}, revision {revision}"
-    rows.add_row("identity", f"{identity}\nserial {slave['serial']}, alias {slave['alias']}")
+    station = _hex(slave["station"], 4)
+    rows.add_row("identity", f"{identity}\nserial {slave['serial']}, alias {slave['alias']}, station {station}")
     code = slave["al_status_code"]
     rows.add_row("state", f"{slave['state']}" + (f", {_hex(code, 4)}: {slave['al_status']}" if code else ""))
     rows.add_row("mailbox", _mailbox(slave["mailbox"], bool(slave["has_coe"])))
@@ -285,8 +311,8 @@ def _slave_facts(slave: Mapping[str, Any]) -> Table:
         rows.add_row("sync", "\n".join(managers))
     rows.add_row("FMMUs", str(slave["fmmus"]))
     rows.add_row("clock", f"yes, {slave['delay_ns']} ns from the reference" if slave["dc"] else "none")
-    ports = ", ".join(f"{port} {found}" for port, found in enumerate(slave["ports"]))
-    behind = f"slave {slave['parent']}" if slave["parent"] else "the master"
+    ports = ", ".join(_port(slave, port) for port in range(len(slave["ports"])))
+    behind = f"slave {slave['parent']}, port {slave['parent_port']}" if slave["parent"] else "the master"
     rows.add_row("ports", f"{ports or '-'}; behind {behind}")
     return rows
 

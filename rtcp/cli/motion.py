@@ -172,6 +172,43 @@ def _output(
     report(f"output {number} is {'on' if level else 'off'}")
 
 
+@commands.command("io", context_settings=NUMBERS_AS_WRITTEN)
+def _io(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Input, output or SLAVE.CHANNEL; without it: list them.")
+    ] = None,
+    value: Annotated[str | None, as_written("[VALUE]", "on, off, or a number in its unit.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show inputs, outputs and channels of slaves by name, or set one."""
+    with connect("io") as robot:
+        if name is not None and value is not None:
+            level = {"on": True, "off": False}.get(value.lower())
+            robot.set_output(name, number(value, name) if level is None else level)
+            report(f"{name} is {value}")
+            return
+        found = robot.read_io()
+    rows = [
+        (one, direction, "on" if high else "off", "")
+        for direction, levels in (("input", found.inputs), ("output", found.outputs))
+        for one, high in levels.items()
+    ]
+    rows += [
+        (one.name, "output" if one.is_output else "input", f"{one.value:.6g}", one.unit)
+        for one in found.channels.values()
+    ]
+    rows = [row for row in rows if name in (None, row[0])]
+    if not rows:
+        raise CommandError(f"there is no input, output or channel {name}: see `rtcp io`")
+    if as_json:
+        emit_json({one: {"direction": which, "value": shown, "unit": unit} for one, which, shown, unit in rows})
+        return
+    listed = table(("name", "direction", "value", "unit"), ("name", "direction", "unit"))
+    for row in rows:
+        listed.add_row(*row)
+    show(listed)
+
+
 @commands.command("gripper")
 def _gripper(value: Annotated[str, typer.Argument(metavar="open|close")]) -> None:
     """Open or close the gripper; one with a drive is at rest on return. Ctrl-C stops it."""

@@ -149,7 +149,8 @@ def load(path: Path) -> ArmConfig:
         **{entry.name: getattr(arm, entry.name) for entry in fields(ArmSettings) if entry.name != "processes"},
         slaves=nodes
         or tuple(
-            SlaveConfig(slave.name, devices[slave.device], str(device_path(path, slave.device))) for slave in arm.slaves
+            SlaveConfig(slave.name, devices[slave.device], str(device_path(path, slave.device)), slave.alias)
+            for slave in arm.slaves
         ),
         processes=processes,
         arm=models[0] if models else None,

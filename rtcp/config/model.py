@@ -23,6 +23,7 @@ from rtcp.config.numbers import (
     U16,
     U32,
     Angle,
+    Factor,
     Fraction,
     Length,
     Milliseconds,
@@ -46,6 +47,8 @@ class HasBox(Protocol):
         """Name of the box; None: the only one."""
 
 
+CHANNEL_KINDS = frozenset({"analog", "encoder", "coupler", "generic"})
+"""Kinds of device of which nothing is known but their channels."""
 PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator", "tool"})
 """Parts of the cycle that are no devices: their fields have names of their own."""
 VIRTUAL = "virtual"
@@ -61,12 +64,16 @@ MOST_TOOLS = 16
 MOST_POINTS = 4096
 """Points or poses of a motion file."""
 
-DataTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
-                       "float32", "float64"]  # fmt: skip
+NumberTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int24", "uint24", "int32", "uint32",
+                         "int40", "uint40", "int48", "uint48", "int56", "uint56", "int64", "uint64",
+                         "float32", "float64"]  # fmt: skip
+DataTypeName = Literal[NumberTypeName, "bits", "bytes"]
 BITS: dict[str, int] = {
-    "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
+    "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int24": 24, "uint24": 24, "int32": 32, "uint32": 32,
+    "int40": 40, "uint40": 40, "int48": 48, "uint48": 48, "int56": 56, "uint56": 56, "int64": 64, "uint64": 64,
     "float32": 32, "float64": 64,
 }  # fmt: skip
+"""Lengths of the types that have one; `bits` and `bytes` are as long as their entry says."""
 AxisNumber = Annotated[int, Ge(1), Le(8)]
 """Axis of a drive, from 1: its objects stand 0x800 above those of the one before (CiA 402)."""
 DriveModeName = Literal["csp", "csv", "cst"]
@@ -105,31 +112,68 @@ class PluginError(ConfigError):
 
 @dataclass(frozen=True)
 class PdoEntry:
-    """One mapped object: `value in SI = counts * factor`. Index 0 is padding and needs no name."""
+    """One mapped object: `value in SI = counts * factor + offset`. Index 0 is padding and needs no name."""
 
     index: U16
     """Object index; 0: padding."""
     sub_index: U8
     """Object subindex."""
     type: DataTypeName
-    """Data type on the wire."""
+    """Data type on the wire; `bits`: unsigned, 1 to 64 bits, as BIT2; `bytes`: an array, which no record holds."""
     name: Name = "padding"
     """Channel name; the kind of device determines which names are needed."""
     factor: float = 1.0
     """SI units per count; not 0."""
     unit: str = ""
     """Unit of the value, for people and recordings; at most 32 characters, no comma, colon or line break."""
+    bits: Annotated[int, Ge(1), Le(255)] | None = None
+    """Length in bits of the types `bits` and `bytes`; of padding of type `bits` up to 255."""
+    offset: float = 0.0
+    """SI value at 0 counts: value = counts * factor + offset. Not of drives and IO boxes."""
+    modulo: Annotated[int, Ge(0)] = 0
+    """Of an input: counts after which it begins anew at 0, as an encoder of one turn; its value counts on. 0: never."""
+    min: float | None = None
+    """Of an output: smallest value that a command may set, in the channel's unit; left out: that of `type`."""
+    max: float | None = None
+    """Of an output: largest value that a command may set, in the channel's unit; left out: that of `type`."""
+    safe: float = 0.0
+    """Of an output: value, in the channel's unit, from the start until it is commanded, and after a fault."""
     axis: AxisNumber | None = None
     """Axis of a drive with several, where one PDO holds channels of more than one; left out: that of the PDO."""
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it is a channel with a value: no padding, and no array."""
+        return self.index != 0 and self.type != "bytes"
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Smallest and largest value that a command may set, SI: of `min` and `max`, and of the type."""
+        low, high = -math.inf, math.inf
+        if not self.type.startswith("float"):
+            low, high = sorted(end * self.factor + self.offset for end in integer_range(self.type, self.length))
+        return (
+            low if self.min is None else max(low, self.min),
+            high if self.max is None else min(high, self.max),
+        )
+
+    @property
+    def length(self) -> int:
+        """Length in bits."""
+        return BITS.get(self.type) or self.bits or 0
 
 
 @dataclass(frozen=True)
 class Pdo:
     """A process data object and the entries mapped into it, in order."""
 
-    index: U16
-    """PDO mapping object: 0x1600 to 0x17ff from the master, 0x1a00 to 0x1bff to it (ETG.1000.6)."""
+    index: Annotated[int, Ge(1), Le(0xFFFF)]
+    """PDO mapping object; most lie in 0x1600 to 0x17ff from the master, in 0x1a00 to 0x1bff to it (ETG.1000.6)."""
     channels: Annotated[tuple[PdoEntry, ...], MinLen(1)]
+    sync_manager: Annotated[int, Ge(0), Le(7)] | None = None
+    """Sync manager, assigned through 0x1C10 + its number; none: the device's only one of that direction."""
+    fixed: bool = False
+    """True: its entries are fixed in the device; only its assignment is written."""
     axis: AxisNumber = 1
     """Axis of a drive with several that the channels belong to."""
 
@@ -146,7 +190,7 @@ class StartupSdo:
     """Object index."""
     sub_index: U8
     """Object subindex."""
-    type: DataTypeName
+    type: NumberTypeName
     """Data type of the object."""
     value: float
     """Value to write, in the range of `type`."""
@@ -163,17 +207,20 @@ class DeviceDescription:
     name: Name
     """Device name, for messages."""
     kind: Name
-    """Driver: `cia402` moves a joint, `io` is a box of inputs and outputs; further ones from installed packages."""
+    """Driver: `cia402` moves joints, `io` is a box of inputs and outputs, `analog`, `encoder` and `generic` have named
+    channels, `coupler` has none; further ones from installed packages."""
     vendor_id: U32
     """Vendor id (0x1018:01); another one on the bus is refused."""
     product_id: U32
     """Product code (0x1018:02); another one on the bus is refused."""
-    rpdo: tuple[Pdo, ...]
-    """Outputs of the master, assigned through 0x1C12."""
-    tpdo: tuple[Pdo, ...]
-    """Inputs of the master, assigned through 0x1C13."""
+    rpdo: tuple[Pdo, ...] = ()
+    """Outputs of the master, by sync manager; without `sync_manager` assigned through 0x1C12."""
+    tpdo: tuple[Pdo, ...] = ()
+    """Inputs of the master, by sync manager; without `sync_manager` assigned through 0x1C13."""
     configurable_pdos: bool = True
     """False: the mapping is fixed in the device; it is compared and never written."""
+    coe: bool = True
+    """False: the device has no CoE or no mailbox; its lengths are compared with its EEPROM, its mapping is fixed."""
     complete_access: bool = True
     """False: the device answers SDO complete access of its PDO assignment wrongly although its EEPROM offers it."""
     sdo: tuple[StartupSdo, ...] = ()
@@ -181,10 +228,35 @@ class DeviceDescription:
     """DC AssignActivate word of the ESI: 0x0300 for SYNC0, 0x0700 for SYNC0 and SYNC1, 0 for no distributed clock."""
     sync0_shift_us: float = 0.0
     """SYNC0 shift, us; less than one cycle in either direction."""
+    sync0_factor: Factor = 1
+    """Cycle of SYNC0: above 0 a multiple of `cycle.period_us`, below 0 its part (-10: a tenth); 0: `sync0_cycle_us`."""
+    sync0_cycle_us: NotNegative = 0.0
+    """Cycle of SYNC0 where `sync0_factor` is 0, us."""
+    sync1_factor: Factor = 0
+    """Cycle of SYNC1: above 0 a multiple of SYNC0's, below 0 of `cycle.period_us`; 0: `sync1_cycle_us`."""
+    sync1_cycle_us: NotNegative = 0.0
+    """Cycle of SYNC1 where `sync1_factor` is 0, us; 0: that of SYNC0."""
+    sync1_shift_us: NotNegative = 0.0
+    """Time from SYNC0 to SYNC1, us."""
     watchdog_ms: Annotated[float, Gt(0), Le(6000)] = 100.0
     """Process-data (sync manager) watchdog, ms: without outputs for this time the device stops."""
     scaling: tuple[DriveScaling, ...] = ()
     """Of a CiA 402 drive: one for all its axes, or one an axis. Channels without `factor` have theirs from here."""
+
+    @property
+    def has_channels(self) -> bool:
+        """Whether commands see its channels by name, and set those of `rpdo`."""
+        return self.kind in CHANNEL_KINDS and not self.is_box
+
+    @property
+    def outputs(self) -> tuple[PdoEntry, ...]:
+        """The channels of `rpdo` that are numbers."""
+        return tuple(entry for pdo in self.rpdo for entry in pdo.channels if entry.is_number)
+
+    @property
+    def inputs(self) -> tuple[PdoEntry, ...]:
+        """The channels of `tpdo` that are numbers."""
+        return tuple(entry for pdo in self.tpdo for entry in pdo.channels if entry.is_number)
 
     @property
     def is_box(self) -> bool:
@@ -218,9 +290,8 @@ class DeviceDescription:
     def wire_range(self, channel: str) -> tuple[float, float]:
         """Return the range of a channel to the device, SI; infinite where it is a float or does not exist."""
         for entry in (entry for pdo in self.rpdo for entry in pdo.channels):
-            if entry.name == channel and not entry.type.startswith("float"):
-                low, high = sorted(end * entry.factor for end in integer_range(entry.type))
-                return low, high
+            if entry.name == channel:
+                return entry.range
         return -math.inf, math.inf
 
 
@@ -229,16 +300,17 @@ def _of_axis(pdos: Sequence[Pdo], axis: int) -> tuple[Pdo, ...]:
         replace(
             pdo,
             channels=tuple(
-                entry if pdo.axis_of(entry) == axis else PdoEntry(0, 0, entry.type) for entry in pdo.channels
+                entry if pdo.axis_of(entry) == axis else replace(entry, index=0, sub_index=0, name=PdoEntry.name)
+                for entry in pdo.channels
             ),
         )
         for pdo in pdos
     )
 
 
-def integer_range(kind: str) -> tuple[int, int]:
-    """Return the smallest and the largest number of an integer type."""
-    bits = BITS[kind]
+def integer_range(kind: str, bits: int = 0) -> tuple[int, int]:
+    """Return the smallest and the largest number of an integer type; `bits`: length where the type has none."""
+    bits = BITS.get(kind, bits)
     return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if kind.startswith("int") else (0, 2**bits - 1)
 
 
@@ -253,6 +325,8 @@ class SlaveEntry:
     """Slave name; unique."""
     device: Name
     """Device file: `devices/NAME.yaml` beside the arm's file, or a path that ends in .yaml."""
+    alias: U16 = 0
+    """Station alias by which the slave is found wherever it hangs; 0: by its place among those without."""
 
 
 @dataclass(frozen=True)
@@ -263,6 +337,8 @@ class SlaveConfig:
     device: DeviceDescription
     file: str = ""
     """Path of the device's file; empty: made by a program."""
+    alias: int = 0
+    """Station alias by which it is found; 0: by its place."""
 
 
 @dataclass(frozen=True)
@@ -938,6 +1014,14 @@ class ArmConfig(ArmSettings):
         boxes = self.boxes
         named = None if user is None else user.box
         return named if named is not None else boxes[0] if boxes else ""
+
+    @property
+    def process_outputs(self) -> frozenset[tuple[str, str]]:
+        """Slave and channel of every output that a process writes: no command sets it."""
+        written = (
+            text.partition(".") for one in self.processes for _, image, text in one.channels() if image == "rpdo"
+        )
+        return frozenset((slave, channel) for slave, _, channel in written)
 
     def terminals(self, section: InputsConfig | OutputsConfig) -> dict[str, tuple[str, int]]:
         """Return box and number of each terminal that a section names, by its name or the key of its function."""

@@ -52,6 +52,7 @@ class FractionOfPi:
 U8 = Annotated[int, Ge(0), Le(0xFF)]
 U16 = Annotated[int, Ge(0), Le(0xFFFF)]
 U32 = Annotated[int, Ge(0), Le(0xFFFFFFFF)]
+Factor = Annotated[int, Ge(-1000), Le(1000)]
 Terminal = Annotated[int, Ge(1), Le(16)]
 Positive = Annotated[float, Gt(0)]
 NotNegative = Annotated[float, Ge(0)]

@@ -49,6 +49,8 @@ from rtcp.config.validation import EVERY_KEY, rule
 
 _NUMERIC = tuple(name for name in BITS if name != "bool")
 _INTEGERS = tuple(name for name in _NUMERIC if "int" in name)
+_LONGEST = {"bits": 64, "bytes": 248}
+"""Bits of a channel at most; an entry's length is one byte (ETG.1000.6, 5.6.5)."""
 
 # The channels that a driver of each kind reads and writes, and their types. CiA 402-2 fixes 0x6040 and 0x6041 as
 # UINT16, 0x6060 and 0x6061 as INT8; the other widths are the device's own choice.
@@ -69,6 +71,7 @@ CHANNELS: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {
             "modes_of_operation_display": ("int8",),
         },
     },
+    "encoder": {"tpdo": {"position": _NUMERIC}},
     "io": {"rpdo": {"outputs": ("uint16",)}, "tpdo": {"inputs": ("uint16",), "counter": ("int32",)}},
 }
 OPTIONAL = {
@@ -76,8 +79,12 @@ OPTIONAL = {
     "counter",
 }  # fmt: skip
 """Channels that only some modes of a drive need (`MODE_CHANNELS`, `_drive_mode`), and only some boxes have."""
-PDO_RANGE = {"rpdo": (0x1600, 0x17FF), "tpdo": (0x1A00, 0x1BFF)}
-"""Objects of receive and transmit PDO mappings (ETG.1000.6)."""
+OTHER_PDOS = {"rpdo": ("tpdo", 0x1A00, 0x1BFF), "tpdo": ("rpdo", 0x1600, 0x17FF)}
+"""The other direction and its objects (ETG.1000.6); devices have PDOs outside both ranges too."""
+_OF_OUTPUTS: tuple[str, ...] = ("min", "max", "safe")
+_OF_INPUTS: tuple[str, ...] = ("modulo",)
+_ALL = (*_OF_OUTPUTS, *_OF_INPUTS, "offset")
+"""Keys of a channel that have a meaning in one direction, and all that a channel with a fixed meaning has not."""
 MODES_OF_OPERATION, CSP = 0x6060, 8
 """Object of the drive mode and its value for cyclic synchronous position (CiA 402-2, clause 10.1)."""
 JOYSTICK_TERMINALS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
@@ -111,8 +118,26 @@ def _min_below_max(low: float, high: float) -> str:
 def _entry(entry: PdoEntry) -> Iterator[Finding]:
     if entry.index and entry.factor == 0:
         yield ("factor",), "found 0, allowed is any number but 0"
+    if entry.min is not None and entry.max is not None and (text := _min_below_max(entry.min, entry.max)):
+        yield (), text
+    elif entry.factor and entry.is_number and entry.length and not entry.range[0] <= entry.safe <= entry.range[1]:
+        low, high = entry.range
+        yield ("safe",), f"found {entry.safe:g}, allowed is {low:g} to {high:g}, the range of the channel"
+    if entry.modulo and not ("int" in entry.type or entry.type == "bits"):
+        yield ("modulo",), f"found {entry.modulo} with the type {entry.type}, allowed is an integer type"
     if entry.index and entry.name == PdoEntry.name:
         yield (), f"the key name is missing; it must be a text of 1 to 64 characters other than {PdoEntry.name}"
+    longest = _LONGEST.get(entry.type)
+    if longest is None:
+        if entry.bits is not None:
+            text = f"found {entry.bits}, but the type {entry.type} has {BITS[entry.type]} bits; leave it out"
+            yield ("bits",), f"{text}, or write the type bits or bytes"
+    elif entry.bits is None:
+        yield (), f"the key bits is missing; the type {entry.type} needs a length of 1 to {longest}"
+    elif entry.type == "bytes" and (entry.bits % 8 or entry.bits > longest):
+        yield ("bits",), f"found {entry.bits}, allowed is a multiple of 8 from 8 to {longest} for the type bytes"
+    elif entry.index and entry.bits > longest:
+        yield ("bits",), f"found {entry.bits}, allowed is 1 to {longest} for a channel of the type {entry.type}"
 
 
 @rule(StartupSdo)
@@ -148,6 +173,30 @@ def _dc_word(device: DeviceDescription) -> Iterator[Finding]:
     if word and word & 0x0300 != 0x0300:
         wanted = "0 for no distributed clocks, or a word that activates SYNC0, as 0x0300 or 0x0700"
         yield ("assign_activate",), f"found {word:#06x}, allowed is {wanted}"
+
+
+@rule(DeviceDescription, "sync0_factor", "sync0_cycle_us")
+def _sync0_cycle(device: DeviceDescription) -> Iterator[Finding]:
+    if device.sync0_factor == 0 and device.sync0_cycle_us == 0:
+        yield ("sync0_cycle_us",), "found 0, allowed is a cycle above 0 us where sync0_factor is 0"
+
+
+@rule(DeviceDescription, "coe", "sdo")
+def _without_coe(device: DeviceDescription) -> Iterator[Finding]:
+    if device.sdo and not device.coe:
+        yield ("sdo",), f"found {len(device.sdo)} entries, but the device has no CoE (coe: false); leave them out"
+
+
+@rule(DeviceDescription, "rpdo", "tpdo")
+def _sync_managers(device: DeviceDescription) -> Iterator[Finding]:
+    used: dict[int | None, str] = {}
+    for direction, pdos in (("rpdo", device.rpdo), ("tpdo", device.tpdo)):
+        for i, pdo in enumerate(pdos):
+            where = (direction, i, "sync_manager")
+            if (pdo.sync_manager is None) != (pdos[0].sync_manager is None):
+                yield where, f"found it in some PDOs of the {direction} only; give it for all of them, or for none"
+            elif pdo.sync_manager is not None and used.setdefault(pdo.sync_manager, direction) != direction:
+                yield where, f"found {pdo.sync_manager}, a sync manager of the rpdo; each carries one direction"
 
 
 @rule(DeviceDescription, "rpdo", "tpdo", "sdo", "kind")
@@ -199,13 +248,13 @@ def _of_drive(scaling: DriveScaling) -> Iterator[Finding]:
 
 
 def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
-    low, high = PDO_RANGE[direction]
+    other, low, high = OTHER_PDOS[direction]
     first: dict[int, int] = {}
     axes: dict[int, dict[str, tuple[KeyPath, PdoEntry]]] = {}
     for i, pdo in enumerate(pdos):
-        if not low <= pdo.index <= high:
-            wanted = f"{low:#x} to {high:#x}, the objects of a {direction}"
-            yield (direction, i, "index"), f"found {pdo.index:#06x}, allowed is {wanted}"
+        if low <= pdo.index <= high:
+            text = f"found {pdo.index:#06x}, one of the objects of a {other} ({low:#x} to {high:#x})"
+            yield (direction, i, "index"), f"{text}; allowed is one of a {direction}"
         elif first.setdefault(pdo.index, i) != i:
             text = f"found {pdo.index:#06x}, the index of {direction}[{first[pdo.index]}]; each needs its own"
             yield (direction, i, "index"), text
@@ -215,11 +264,20 @@ def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
             if entry.index and names.setdefault(entry.name, (where, entry))[1] is not entry:
                 text = f'found the text "{entry.name}" again; each channel of the {direction} needs its own'
                 yield (*where, "name"), text
-    bits = sum(BITS[entry.type] for pdo in pdos for entry in pdo.channels)
-    if bits % 8:
-        wanted = "whole bytes; fill up with padding (`{index: 0, sub_index: 0, type: bool}`)"
-        yield (direction,), f"found {bits} bits in all, allowed are {wanted}"
     needed = CHANNELS.get(kind, {}).get(direction, {})
+    if kind == "coupler" and pdos:
+        yield (direction,), "found PDOs; a coupler has no process data: leave it out"
+    for i, pdo in enumerate(pdos):
+        for j, entry in enumerate(pdo.channels):
+            unused = _OF_OUTPUTS if direction == "tpdo" else _OF_INPUTS
+            if kind == "io" or (kind == "cia402" and entry.name in needed):
+                unused = (*_OF_OUTPUTS, *_OF_INPUTS, "offset")
+            for key in unused:
+                if getattr(entry, key) != getattr(PdoEntry, key):
+                    text = (
+                        f"found with {entry.name} in {direction} of kind {kind}, where it has no meaning; leave it out"
+                    )
+                    yield (direction, i, "channels", j, key), text
     for axis, names in (axes or {1: {}}).items():
         if missing := [name for name in needed if name not in names and name not in OPTIONAL]:
             there = f"its channels are {', '.join(names)}" if names else "it has no channels"
@@ -303,6 +361,8 @@ def axes_of(arm: ArmFile | ArmConfig) -> Iterator[tuple[KeyPath, Joint]]:
 @rule(ArmFile, "slaves")
 def _slave_names(arm: ArmFile) -> Iterator[Finding]:
     yield from _repeated(((("slaves", i, "name"), slave.name) for i, slave in enumerate(arm.slaves)), "name")
+    aliases = ((("slaves", i, "alias"), slave.alias) for i, slave in enumerate(arm.slaves) if slave.alias)
+    yield from _repeated(aliases, "alias")
     for i, slave in enumerate(arm.slaves):
         if slave.name in PLATFORM_PARTS:
             yield ("slaves", i, "name"), f'found the text "{slave.name}", the name of a part of the platform'

@@ -55,13 +55,15 @@ class DriveScaling:
     velocity_at: Literal["motor", "output"] = "motor"
     """Which shaft's revolutions per minute they are."""
     rated_torque: Annotated[float, Gt(0)] | None = None
-    """Rated torque of the motor, Nm (0x6076): torques are thousandths of it."""
+    """Rated torque, Nm (0x6076): torques are thousandths of it."""
     rated_torque_unit: TorqueUnit = "mNm"
     """Unit of 0x6076 in the drive."""
+    torque_at: Literal["motor", "output"] = "motor"
+    """Shaft of the rated torque, and of the torque constant; of an actuator with a gear mostly its output."""
     rated_current: Annotated[float, Gt(0)] | None = None
     """Rated current, A (0x6075): where torques are thousandths of it; with `torque_constant`."""
     torque_constant: Annotated[float, Gt(0)] | None = None
-    """Torque of the motor by its current, Nm/A."""
+    """Torque by current, Nm/A."""
 
     @property
     def counts_per_output_turn(self) -> float:
@@ -87,7 +89,8 @@ class DriveScaling:
         rated = self.rated_torque
         if rated is None and self.rated_current is not None and self.torque_constant is not None:
             rated = self.rated_current * self.torque_constant
-        return None if rated is None else PER_MILLE * rated * self.gear_ratio * self.external_gear_ratio
+        turns = self.external_gear_ratio * (self.gear_ratio if self.torque_at == "motor" else 1.0)
+        return None if rated is None else PER_MILLE * rated * turns
 
     def factor(self, quantity: str) -> float | None:
         """Return the factor of a quantity; None: the keys say nothing about it."""

@@ -14,6 +14,7 @@ from typing import Any, Final
 from kinematics.model import LinkMass
 from rtcp.config.model import ConfigError
 from rtcp.control.machine import StateMachine
+from rtcp.control.part import Device
 from rtcp.control.processes import ProcessPart
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.ipc.blackboard import Blackboard
@@ -33,6 +34,7 @@ from rtcp.ipc.commands import (
     RunInStep,
     RunLines,
     RunTrajectory,
+    SetChannel,
     SetControlMode,
     SetDriveMode,
     SetLimits,
@@ -58,6 +60,8 @@ from rtcp.ipc.events import (
 )
 from rtcp.ipc.layout import PLANS
 from rtcp.ipc.refusals import (
+    ChannelNotSettable,
+    ChannelOutOfRange,
     ClockNotLocked,
     DriveModeChanging,
     DriveModeFixed,
@@ -144,6 +148,7 @@ class CommandHandler:
             SetControlMode: self._set_control_mode,
             Halt: self._halt,
             SetOutput: self._set_output,
+            SetChannel: self._set_channel,
             MoveGripper: self._move_gripper,
             SetLimits: self._set_limits,
             SetSpeedOverride: self._set_speed_override,
@@ -158,6 +163,7 @@ class CommandHandler:
         stream = self._arm.controllers[OpenStream]
         assert isinstance(stream, StreamController)
         self._stream = stream
+        self._process_outputs = machine.context.config.process_outputs
         self._processes = [part for part in machine.context.parts if isinstance(part, ProcessPart)]
         for part in machine.context.parts:
             for kind in part.commands:
@@ -448,6 +454,19 @@ class CommandHandler:
             return ReservedOutput(output)
         box.set_output(output, command.value)
         return None
+
+    def _set_channel(self, command: SetChannel, lease: int) -> Refusal | None:
+        config, position, number = self._context.config, command.slave, command.channel
+        slave = config.slaves[position - 1] if 1 <= position <= len(config.slaves) else None
+        outputs = slave.device.outputs if slave is not None and slave.device.has_channels else ()
+        output = outputs[number] if 0 <= number < len(outputs) else None
+        if slave is None or output is None or (slave.name, output.name) in self._process_outputs:
+            return ChannelNotSettable(position, number)
+        low, high = output.range
+        if not low <= command.value <= high:
+            return ChannelOutOfRange(position, number, command.value, low, high)
+        device = next(part for part in self._context.parts if isinstance(part, Device) and part.slot + 1 == position)
+        return device.set_channel(output.name, command.value)
 
     def _move_gripper(self, command: MoveGripper, lease: int) -> Refusal | None:
         if self._operator.emergency_stop:

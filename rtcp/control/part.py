@@ -120,7 +120,7 @@ class Part:
 class Device(Part):
     """A slave that is no drive: its driver, which a package may have brought.
 
-    A driver that raises is a fault of that slave, and no end of the cycle: it is asked no more and its outputs are 0
+    A driver that raises is a fault of that slave, and no end of the cycle: it is asked no more and its outputs are safe
     until the machine is ready again.
 
     Args:
@@ -135,7 +135,6 @@ class Device(Part):
         self._stays_safe = False
         self._failed = False
         self._error: Exception | None = None
-        self._zeros = bytes(driver.output_bytes)
 
     def _fail(self, error: Exception) -> None:
         self._failed, self._error = True, error
@@ -155,6 +154,13 @@ class Device(Part):
         except Exception as error:
             self._fail(error)
             return DriverRaised(self.slot + 1)
+
+    def set_channel(self, name: str, value: float) -> Refusal | None:
+        """Set an output of a driver that offers its channels, from this cycle's frame on."""
+        if self._failed:
+            return DriverRaised(self.slot + 1)
+        self.driver.targets[name] = value
+        return None
 
     def update(self, context: PartContext) -> None:
         """Let the driver do its cycle."""
@@ -183,7 +189,7 @@ class Device(Part):
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the slave."""
-        outputs = self._zeros
+        outputs = self.driver.safe_outputs
         try:
             if not self._failed:
                 outputs = self.driver.encode()

@@ -15,6 +15,7 @@ import sys
 import time
 import traceback
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -113,9 +114,12 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 def _work(master: Master, session: Session, directory: Path, report: Report) -> None:
-    config = session.config
-    period_ns = round(config.cycle.period_us * 1000)
+    period_ns = round(session.config.cycle.period_us * 1000)
     data = master.start(directory, lambda sentence: report.tell("phase", text=sentence))
+    config = master.config
+    if config.slaves != session.config.slaves:
+        # The gateway counts the slaves as the bus does: it starts once the loop is ready.
+        replace(session, config=config).write(directory)
     discipline = make_discipline(config)
     partners = None if session.cell is None else Partners(session.cell, session.name)
     blackboard = Blackboard(blackboard_file(directory), record_schema(config, partners), period_ns)

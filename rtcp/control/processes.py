@@ -25,11 +25,12 @@ from rtcp.motion.step_group import Partner
 
 
 class Signal:
-    """A channel of a slave, in SI units."""
+    """A channel of a slave, in SI units; `safe`: the safe value of an output."""
 
-    def __init__(self, values: dict[str, float], name: str) -> None:
+    def __init__(self, values: dict[str, float], name: str, safe: float = 0.0) -> None:
         self._values = values
         self._name = name
+        self.safe = safe
 
     @property
     def value(self) -> float:
@@ -95,7 +96,7 @@ class Process:
 class ProcessPart(Part):
     """A process in the cycle.
 
-    One that raises is a fault: it is asked no more, and its outputs are 0 until the machine is ready again.
+    One that raises is a fault: it is asked no more, and its outputs are safe until the machine is ready again.
 
     Args:
         number: of the process in the configuration, from 0.
@@ -139,7 +140,7 @@ class ProcessPart(Part):
             self._error = None
         if self._failed:
             for output in self._outputs:
-                output.value = 0.0
+                output.value = output.safe
             if not self._reported:
                 self._reported = True
                 context.report(ProcessFailed(self._number))
@@ -174,7 +175,7 @@ def make_processes(config: ArmConfig, devices: Sequence[Device], partners: Partn
         for name in device.driver.values
     }
     outputs = {
-        f"{device.name}.{name}": Signal(device.driver.targets, name)
+        f"{device.name}.{name}": Signal(device.driver.targets, name, device.driver.safe_values[name])
         for device in devices
         for name in device.driver.targets
     }

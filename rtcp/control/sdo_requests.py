@@ -10,6 +10,7 @@ from typing import Any
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.emergency import error_words
 from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.mailbox import ABSENT
 from rtcp.fieldbus.registers import Steps
 from rtcp.fieldbus.supervision import SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
@@ -71,7 +72,12 @@ class SdoRequests:
 
     def _explanation(self, name: str, position: int, axis: int) -> Steps[None]:
         index = _ERROR_CODE + (axis - 1) * OBJECTS_PER_AXIS
-        code = yield from self._bus.sdo(position).reading_int(index, 0)
+        try:
+            code = yield from self._bus.sdo(position).reading_int(index, 0)
+        except SdoAborted as error:
+            if error.code not in ABSENT:
+                raise
+            code = 0  # the drive has no error code
         of = f", axis {axis}" if axis > 1 else ""
         if code:
             self._blackboard.text(f"{name} (slave {position}{of}): the drive's error code is {error_words(code)}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Final
+from typing import ClassVar, Final, cast
 
 from rtcp.config.model import MODE_CHANNELS, SlaveConfig
 from rtcp.devices.drive import CSP, CST, CSV, Drive, TargetState
@@ -92,7 +92,7 @@ class Cia402Drive(Drive):
 
     `encode` also takes `controlword`. A velocity that is not mapped is the mean one over 20 ms. In CSP the drive takes
     `speed_limit` from the field of the target velocity. A drive whose PDOs have no mode of operation stays in CSP, to
-    which a start-up SDO sets it. Whatever else is mapped, as the offsets 0x60B1 and 0x60B2, is sent as 0.
+    which a start-up SDO sets it. Whatever else is mapped, as the offsets 0x60B1 and 0x60B2, has its safe value, 0.
 
     Args:
         slave: the slave's name and description.
@@ -128,7 +128,7 @@ class Cia402Drive(Drive):
         self._in_factors = tuple(0.0 if slot < 0 else self.tpdo.channels[slot].factor for slot in self._in[1:4])
         (self._temperature_slot,) = _slots(self.tpdo, ("temperature",))
         self._unpack, self._pack = self.codec_in.unpack, self.codec_out.pack
-        self._fields: list[int] = [0] * len(self.rpdo.channels)
+        self._fields = cast(list[int], [self._counts_of(channel) for channel in self.rpdo.channels])
         self._position_slot, self._scale, self._range = self._out[1], self._scales[0], self._limits[0]
         self.controlword = DISABLE_VOLTAGE
         self._sent_mode, self._sent_word, self._changed = 0, -1, True

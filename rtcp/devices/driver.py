@@ -12,7 +12,7 @@ from mypy_extensions import mypyc_attr
 
 from rtcp.config.find import load_class, registered
 from rtcp.config.model import SlaveConfig
-from rtcp.fieldbus.pdo import TYPES, Channel, ImageLayout, layout
+from rtcp.fieldbus.pdo import STRUCT_CODES, Channel, ImageLayout, layout
 from rtcp.ipc.commands import Command
 from rtcp.ipc.events import Event
 from rtcp.ipc.refusals import Refusal
@@ -35,7 +35,8 @@ class Driver:
     A kind of device is one subclass: it names the channels that it cannot do without, unpacks the inputs in `decode`
     and packs the outputs in `encode`, each called once a cycle. This class keeps the layout of both images, and by
     itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name; all of
-    them are in the cycle record, named SLAVE_CHANNEL. A driver that is commanded names its `commands` and overrides
+    them are in the cycle record, named SLAVE_CHANNEL. Channels of type `bytes` are in neither: `arrays` holds those of
+    the inputs, `array_targets` those of the outputs. A driver that is commanded names its `commands` and overrides
     `accept`; one that does something by itself, or reports events, overrides `update`.
 
     Args:
@@ -71,15 +72,29 @@ class Driver:
                 )
         self.period_s = period_s
         self.codec_in, self.codec_out = make_codec(self.tpdo), make_codec(self.rpdo)
-        self.values: dict[str, float] = {channel.name: 0.0 for channel in self.tpdo.channels if channel.index}
-        self.targets: dict[str, float] = {channel.name: 0.0 for channel in self.rpdo.channels if channel.index}
+        self.values: dict[str, float] = {channel.name: 0.0 for channel in self.tpdo.channels if _is_number(channel)}
+        self.safe_values = {entry.name: entry.safe for entry in device.outputs}
+        """What the outputs are at the start and after a fault, SI."""
+        self.targets: dict[str, float] = dict(self.safe_values)
+        self.arrays = {name: bytes(length) for name, length in _arrays(self.tpdo)}
+        self.array_targets = {name: bytes(length) for name, length in _arrays(self.rpdo)}
+        self._in_offsets = {entry.name: entry.offset for entry in device.inputs}
+        self._out_offsets = {entry.name: entry.offset for entry in device.outputs}
+        self._counters = {entry.name: Counter(entry.modulo) for entry in device.inputs if entry.modulo}
+        self.safe_outputs = Driver.encode(self)
+        """The image of the outputs with these values, for a driver that raises."""
         self._input_names, self._output_names = tuple(self.values), tuple(self.targets)
 
     def decode(self, data: bytes) -> None:
         """Decode the inputs of the cycle (`input_bytes` long)."""
         for channel, counts in zip(self.tpdo.channels, self.codec_in.unpack(data), strict=True):
             if channel.index:
-                self.values[channel.name] = counts * channel.factor
+                if channel.type == "bytes":
+                    self.arrays[channel.name] = counts.to_bytes(channel.bits // 8, "little")
+                    continue
+                counter = self._counters.get(channel.name)
+                counts = counts if counter is None else counter.follow(counts)  # noqa: PLW2901
+                self.values[channel.name] = counts * channel.factor + self._in_offsets[channel.name]
 
     def accept(self, command: Command) -> Refusal | None:
         """Carry out one of `commands`; or return why not, and change nothing."""
@@ -95,9 +110,8 @@ class Driver:
         return None
 
     def safe(self) -> None:
-        """Set the outputs to their safe state, by default 0; called on a fault, on stale inputs and at the end."""
-        for name in self.targets:
-            self.targets[name] = 0.0
+        """Set the outputs to their safe values; called on a fault, on stale inputs and at the end."""
+        self.targets.update(self.safe_values)
 
     def fields(self) -> Sequence[Field]:
         """Return what it publishes in the cycle record, without the slave's name; by default every mapped channel."""
@@ -110,7 +124,7 @@ class Driver:
             )
             for image, about in ((self.tpdo, "Input"), (self.rpdo, "Output"))
             for channel in image.channels
-            if channel.index
+            if _is_number(channel)
         ]
 
     def publish(self, values: list[Any], at: int) -> None:
@@ -127,13 +141,44 @@ class Driver:
         return self.codec_out.pack(*(self._counts_of(channel) for channel in self.rpdo.channels))
 
     def _counts_of(self, channel: Channel) -> Number:
-        counts = self.targets[channel.name] / channel.factor if channel.index else 0
-        if isnan(counts):
-            return 0  # what is no number is no reason to end the cycle
+        if not channel.index:
+            return 0
+        if channel.type == "bytes":
+            return int.from_bytes(self.array_targets[channel.name][: channel.bits // 8], "little")
+        value = self.targets[channel.name]
+        if isnan(value):
+            value = self.safe_values[channel.name]  # what is no number is no reason to end the cycle
+        counts = (value - self._out_offsets[channel.name]) / channel.factor
         if channel.type.startswith("float"):
             return counts
         low, high = (0, 1) if channel.type == "bool" else integer_range(channel)
         return round(min(max(counts, low), high))
+
+
+class Counter:
+    """Counts that begin anew at 0 after `modulo` of them, counted on over that, in either direction.
+
+    Args:
+        modulo: number of different counts; a step of more than half of them is taken for one in the other direction.
+    """
+
+    __slots__ = ("_last", "_modulo", "_total")
+
+    def __init__(self, modulo: int) -> None:
+        self._modulo = modulo
+        self._last = -1
+        self._total = 0
+
+    def follow(self, counts: Number) -> int:
+        """Return the counts since 0 of the first turn; `counts`: as they came in this cycle."""
+        here, modulo = int(counts) % self._modulo, self._modulo
+        if self._last < 0:
+            self._total = here
+        else:
+            step = (here - self._last) % modulo
+            self._total += step - modulo if 2 * step > modulo else step
+        self._last = here
+        return self._total
 
 
 def make_driver(slave: SlaveConfig, period_s: float) -> Driver:
@@ -166,40 +211,64 @@ class Codec:
 
 
 def make_codec(layout: ImageLayout) -> Codec:
-    """Return the codec of an image; little endian, no gaps (ETG.1000.6, 5.6.5)."""
-    if any(channel.type == "bool" for channel in layout.channels):
+    """Return the codec of an image; little endian (ETG.1000.6, 5.6.5). Arrays of bytes are unsigned integers."""
+    codes = [STRUCT_CODES.get(channel.type, "") for channel in layout.channels]
+    if not all(codes):
         return _bit_codec(layout)
-    whole = struct.Struct("<" + "".join(TYPES[channel.type][1] for channel in layout.channels))
+    whole = struct.Struct("<" + "".join(codes))
     return Codec(whole.unpack, whole.pack)
 
 
 def _bit_codec(layout: ImageLayout) -> Codec:
-    # A lone value is brought from and to its bits by the struct of its type; a bool needs none.
-    parts = tuple(
-        (channel.bit_offset, (1 << channel.bits) - 1, channel.bits // 8, struct.Struct("<" + TYPES[channel.type][1]))
-        for channel in layout.channels
-    )
+    parts = tuple((channel.bit_offset, (1 << channel.bits) - 1, *_field(channel)) for channel in layout.channels)
     length = layout.bytes
 
     def unpack(data: bytes) -> tuple[Number, ...]:
         image = int.from_bytes(data, "little")
-        return tuple(
-            single.unpack((image >> offset & mask).to_bytes(width, "little"))[0] if width else image >> offset & 1
-            for offset, mask, width, single in parts
-        )
+        return tuple(read(image >> offset & mask) for offset, mask, read, _ in parts)
 
     def pack(*values: Number) -> bytes:
         image = 0
-        for value, (offset, _mask, width, single) in zip(values, parts, strict=True):
-            image |= (int.from_bytes(single.pack(value), "little") if width else int(bool(value))) << offset
+        for value, (offset, _mask, _read, write) in zip(values, parts, strict=True):
+            image |= write(value) << offset
         return image.to_bytes(length, "little")
 
     return Codec(unpack, pack)
 
 
+def _field(channel: Channel) -> tuple[Callable[[int], Number], Callable[[Number], int]]:
+    """Return what makes a value of a channel's bits, and what makes bits of a value or raises where it does not fit."""
+    if channel.type == "bool":
+        return int, lambda value: int(bool(value))
+    if channel.type.startswith("float"):
+        single, width = struct.Struct("<" + STRUCT_CODES[channel.type]), channel.bits // 8
+        return (
+            lambda raw: single.unpack(raw.to_bytes(width, "little"))[0],
+            lambda value: int.from_bytes(single.pack(value), "little"),
+        )
+    low, high = integer_range(channel)
+    mask = (1 << channel.bits) - 1
+    sign = -low
+
+    def write(value: Number) -> int:
+        if not low <= value <= high:
+            raise struct.error(f"{channel.name}: {value} does not fit {channel.type}: {low} to {high}")
+        return int(value) & mask
+
+    return (lambda raw: raw - ((raw & sign) << 1)), write
+
+
+def _is_number(channel: Channel) -> bool:
+    return channel.index != 0 and channel.type != "bytes"
+
+
+def _arrays(image: ImageLayout) -> list[tuple[str, int]]:
+    return [(one.name, one.bits // 8) for one in image.channels if one.index and one.type == "bytes"]
+
+
 def integer_range(channel: Channel) -> tuple[int, int]:
     """Return the smallest and the largest counts of a channel; raises DeviceError where it is of no integer type."""
-    if channel.type.startswith("uint"):
+    if channel.type.startswith(("uint", "bits", "bytes")):
         return 0, (1 << channel.bits) - 1
     if channel.type.startswith("int"):
         return -(1 << channel.bits - 1), (1 << channel.bits - 1) - 1

@@ -15,7 +15,7 @@ from rtcp.config.model import (
     SlaveConfig,
 )
 from rtcp.devices.driver import DeviceError, Driver
-from rtcp.fieldbus.pdo import TYPES, ImageLayout
+from rtcp.fieldbus.pdo import STRUCT_CODES, ImageLayout
 from rtcp.ipc.schema import Field
 
 
@@ -99,12 +99,12 @@ def _type(image: ImageLayout, name: str) -> str:
 def _field(box: Driver, image: ImageLayout, name: str) -> tuple[struct.Struct, int]:
     channel = image.find(name)
     assert channel is not None
-    if channel.bit_offset % 8 or "int" not in channel.type:
+    if channel.bit_offset % 8 or channel.type not in STRUCT_CODES or "int" not in channel.type:
         raise DeviceError(
             f"{box.device}: channel {name} is {channel.type} at bit {channel.bit_offset}; "
-            "it must be an integer at a whole byte"
+            "it must be an integer of 8, 16, 32 or 64 bits at a whole byte"
         )
-    return struct.Struct("<" + TYPES[channel.type][1]), channel.bit_offset // 8
+    return struct.Struct("<" + STRUCT_CODES[channel.type]), channel.bit_offset // 8
 
 
 class Switch:

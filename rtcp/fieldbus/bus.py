@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from rtcp.config.model import SlaveConfig
@@ -35,6 +35,23 @@ class PdoInfo:
         return sum(entry.bits for entry in self.entries)
 
 
+PORTS = 4
+LARGEST_MAILBOX = 1486
+"""Bytes of a mailbox that one datagram carries, and that SOEM has room for."""
+
+
+@dataclass(frozen=True)
+class PortErrors:
+    """What each of a slave's ports has counted."""
+
+    rx: list[int] = field(default_factory=lambda: [0] * PORTS)
+    """Damaged frames that came in over the cable of that port."""
+    forwarded: list[int] = field(default_factory=lambda: [0] * PORTS)
+    """Damaged frames that somebody before it has already counted."""
+    links: list[int] = field(default_factory=lambda: [0] * PORTS)
+    """Lost links."""
+
+
 @dataclass(frozen=True)
 class MailboxInfo:
     """The mailbox according to the SII (ETG.1000.6, 5.4: words 0x18 to 0x1C)."""
@@ -47,8 +64,13 @@ class MailboxInfo:
 
     @property
     def has_coe(self) -> bool:
-        """Whether it speaks CoE."""
-        return "CoE" in self.protocols
+        """Whether it speaks CoE, and its messages fit."""
+        return "CoE" in self.protocols and self.fits
+
+    @property
+    def fits(self) -> bool:
+        """Whether a datagram carries its messages."""
+        return max(self.receive_size, self.send_size) <= LARGEST_MAILBOX
 
 
 @dataclass(frozen=True)
@@ -99,7 +121,11 @@ class SlaveInfo:
     ports: tuple[str, ...]
     """Ports 0 to 3: `open` (a neighbour answers there), `closed`, `no link`."""
     parent: int
-    """Position of the slave before it on the cable; 0: the master."""
+    """Position of the slave before it; 0: the master."""
+    parent_port: int
+    """Port of that slave at which it hangs."""
+    port_errors: PortErrors
+    """Error counters of its ports since its power-on, each up to 255."""
 
 
 @dataclass(frozen=True)

@@ -45,13 +45,13 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
 
 
 def take_over_time(
-    port: RegisterPort, position: int, label: str, delay: bytes, others: Sequence[int], *, always: bool
+    port: RegisterPort, station: int, label: str, delay: bytes, others: Sequence[int], *, always: bool
 ) -> None:
     """Set the clock of one slave by that of another: one broadcast latches the local times of both (ETG.1000.4, 6.8).
 
     Args:
         port: the port for registers.
-        position: the slave whose clock is set; SYNC0 is off. It need not have a station address.
+        station: address of the slave whose clock is set; SYNC0 is off.
         label: how sentences name it.
         delay: its propagation delay from the reference clock, as register 0x0928 holds it.
         others: the other slaves that have a clock, the reference first; the first one that answers is believed.
@@ -61,33 +61,32 @@ def take_over_time(
         BusError: it stopped answering, or no slave took the broadcast.
     """
     if not always:
-        shown = port.read_at(position, Register.DC_DIFFERENCE, 4)
+        shown = port.read(station, Register.DC_DIFFERENCE, 4)
         if shown is not None and _difference(shown) < _SETTLED_NS:
             return
     # Without it the two registers below would hold times of two different frames.
     if port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4)) < 1:
         raise BusError(f"{label}: the local times could not be latched while its clock was set")
-    own = port.read_at(position, Register.DC_RECEIVE_TIME, 8)
+    own = port.read(station, Register.DC_RECEIVE_TIME, 8)
     if own is None:
         raise BusError(f"{label} stopped answering while its clock was set")
     # Where no other clock lives, the host's time is as good as any (SOEM starts with it): ns since 2000.
     time_then = time.time_ns() - _UNTIL_2000_NS
     for other in others:
-        station = station_of(other)
-        theirs = [port.read(station, address, 8) for address in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
-        their_delay = port.read(station, Register.DC_DELAY, 4)
+        theirs = [port.read(station_of(other), at, 8) for at in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
+        their_delay = port.read(station_of(other), Register.DC_DELAY, 4)
         if None not in theirs and their_delay is not None:
             time_then = sum(int.from_bytes(part or b"", "little") for part in theirs)
             time_then += int.from_bytes(delay, "little") - int.from_bytes(their_delay, "little")
             break
     offset = time_then - int.from_bytes(own, "little") & (1 << 64) - 1
-    port.put_at(position, Register.DC_DELAY, delay, label)
-    port.put_at(position, Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
+    port.put(station, Register.DC_DELAY, delay, label)
+    port.put(station, Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
 
 
-def forget_drift(port: RegisterPort, position: int, label: str) -> None:
+def forget_drift(port: RegisterPort, station: int, label: str) -> None:
     """Let a slave forget what drift compensation has learnt: it may have followed a reference that stood still."""
-    port.put_at(position, Register.DC_SPEED, _DC_SPEED_DEFAULT, label)
+    port.put(station, Register.DC_SPEED, _DC_SPEED_DEFAULT, label)
 
 
 def settle_clock(port: RegisterPort, station: int, label: str) -> Steps[None]:
@@ -111,37 +110,57 @@ def _difference(register: bytes) -> int:
     return int.from_bytes(register, "little") & 0x7FFF_FFFF
 
 
+def sync_cycles(device: DeviceDescription, period_ns: int) -> tuple[int, int]:
+    """Return the cycle of SYNC0 and the time from it to SYNC1 as registers 0x09A0 and 0x09A4 hold them, ns.
+
+    Where the latter is a cycle of SYNC0 or more, SYNC1 comes after that many of them only (ETG.1000.4, 6.8.5).
+    """
+    sync0 = _cycle(device.sync0_factor, device.sync0_cycle_us, period_ns, period_ns)
+    # As ETG.2000 gives it, SYNC1's cycle counts from the SYNC0 that it comes with; the register from the one after.
+    sync1 = _cycle(device.sync1_factor, device.sync1_cycle_us, sync0, period_ns)
+    return sync0, max(sync1 - sync0, 0) + round(device.sync1_shift_us * 1000)
+
+
+def _cycle(factor: int, cycle_us: float, multiple_of_ns: int, part_of_ns: int) -> int:
+    if factor > 0:
+        return factor * multiple_of_ns
+    return part_of_ns // -factor if factor else round(cycle_us * 1000)
+
+
 def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescription, period_ns: int) -> None:
-    """Start SYNC0 of one slave on the grid of the others: multiples of the period, shifted by `sync0_shift_us`.
+    """Start SYNC0 of one slave on the grid of the others: multiples of its cycle, shifted by `sync0_shift_us`.
 
     Raises:
         BusError: its first SYNC0 lies in the past, or the slave does not keep the activation.
     """
     shift = round(device.sync0_shift_us * 1000)
-    cycles = struct.pack("<II", period_ns, 0)
-    activation = bytes((device.assign_activate >> 8,))
+    sync0, after = sync_cycles(device, period_ns)
+    grid = max(sync0, period_ns)
+    cycles = struct.pack("<II", sync0, after)
+    activation = device.assign_activate.to_bytes(2, "little")
     for _ in range(_SYNC_ATTEMPTS):
-        port.put(station, Register.DC_ACTIVATION, b"\0", label)
-        port.put(station, Register.DC_CYCLIC_UNIT, b"\0", label)
+        port.put(station, Register.DC_CYCLIC_UNIT, bytes(2), label)
         now = port.read(station, Register.DC_SYSTEM_TIME, 8)
         if now is None:
             raise BusError(f"{label} stopped answering while its SYNC0 was started")
-        begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // period_ns * period_ns + period_ns + shift
+        begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // grid * grid + grid + shift
         port.put(station, Register.DC_START, begin.to_bytes(8, "little"), label)
         port.put(station, Register.DC_SYNC0_CYCLE, cycles, label)
         if port.read(station, Register.DC_SYNC0_CYCLE, len(cycles)) != cycles:
-            raise BusError(f"{label}: it does not keep the cycle of SYNC0, {period_ns / 1000:g} us (register 0x09A0)")
-        port.put(station, Register.DC_ACTIVATION, activation, label)
+            kept = f"SYNC0, {sync0 / 1000:g} us, and SYNC1, {after / 1000:g} us after it (registers 0x09A0 and 0x09A4)"
+            raise BusError(f"{label}: it does not keep the cycle of {kept}")
+        # The whole word at once, as IgH writes it: its low byte says who latches and who controls the unit.
+        port.put(station, Register.DC_CYCLIC_UNIT, activation, label)
         # A SYNC0 whose time had passed at the activation never comes (SOEM#757): frames may have been lost meanwhile.
         if first_sync_is_ahead(port, station):
             break
     else:
         raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
-    active = port.read(station, Register.DC_ACTIVATION, 1)
+    active = port.read(station, Register.DC_CYCLIC_UNIT, 2)
     if active != activation:
-        shown = "nothing" if active is None else f"0x{active[0]:02X}"
+        found = "nothing" if active is None else f"0x{int.from_bytes(active, 'little'):04X}"
         raise BusError(
-            f"{label}: `assign_activate` 0x{device.assign_activate:04X} reads back from register 0x0981 as {shown}"
+            f"{label}: `assign_activate` 0x{device.assign_activate:04X} reads back from register 0x0980 as {found}"
         )
 
 

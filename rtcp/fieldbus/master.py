@@ -18,7 +18,7 @@ class Master(ABC):
     """A bus from `open` to `close`; a kind of bus names its class in `MASTER` (docs/extending.md).
 
     Args:
-        config: the arm; `config.slaves` says what is on the bus.
+        config: the arm; `config.slaves` says what is on the bus, after `start` in the order in which it is there.
         interface: that of the session: as configured, or the virtual one.
         namespace_pid: process whose network namespace has it; 0: this process's own.
     """

@@ -11,23 +11,18 @@ from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
 from rtcp.fieldbus.registers import Steps
 
-# type: (bits, code of `struct`); bool stands in the image as single bits
-TYPES: dict[str, tuple[int, str]] = {
-    "bool": (1, ""),
-    "int8": (8, "b"),
-    "uint8": (8, "B"),
-    "int16": (16, "h"),
-    "uint16": (16, "H"),
-    "int32": (32, "i"),
-    "uint32": (32, "I"),
-    "int64": (64, "q"),
-    "uint64": (64, "Q"),
-    "float32": (32, "f"),
-    "float64": (64, "d"),
-}
+STRUCT_CODES: dict[str, str] = {
+    "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
+    "float32": "f", "float64": "d",
+}  # fmt: skip
+"""Codes of `struct`, for the types that it knows."""
 
 
-RX_ASSIGN, TX_ASSIGN = 0x1C12, 0x1C13
+ASSIGN = 0x1C10
+"""PDO assignment object of sync manager 0; those of the others follow (ETG.1000.6, 5.6.7.4)."""
+OUTPUTS, INPUTS = 2, 3
+"""Sync managers of process data where a device has a mailbox and one of each direction."""
+RX_ASSIGN, TX_ASSIGN = ASSIGN + OUTPUTS, ASSIGN + INPUTS
 Mapping = tuple[tuple[int, tuple[tuple[int, int, int], ...]], ...]
 """PDOs in order, each its index and its entries (index, subindex, bits)."""
 
@@ -63,39 +58,48 @@ class ImageLayout:
         return next((channel for channel in self.channels if channel.name == name and channel.index), None)
 
 
+def assignments(device: DeviceDescription) -> list[tuple[str, int, list[Pdo]]]:
+    """Return key, sync manager and PDOs of each assignment; a direction without PDOs has its usual one, empty."""
+    return [
+        (key, manager, group)
+        for key, pdos, usual in (("rpdo", device.rpdo, OUTPUTS), ("tpdo", device.tpdo, INPUTS))
+        for manager, group in (by_sync_manager(pdos, usual) or {usual: []}).items()
+    ]
+
+
+def by_sync_manager(pdos: Sequence[Pdo], usual: int) -> dict[int, list[Pdo]]:
+    """Return the PDOs of one direction by sync manager, in the order of its number.
+
+    Args:
+        pdos: the PDOs.
+        usual: the sync manager of those that name none.
+    """
+    groups: dict[int, list[Pdo]] = {}
+    for pdo in pdos:
+        groups.setdefault(usual if pdo.sync_manager is None else pdo.sync_manager, []).append(pdo)
+    return dict(sorted(groups.items()))
+
+
 def layout(pdos: Sequence[Pdo]) -> ImageLayout:
-    """Return where the entries of `pdos`, assigned in this order, stand."""
+    """Return where the entries of `pdos` stand: assigned in this order, each sync manager from a whole byte on."""
     channels = []
     offset = 0
-    for pdo in pdos:
-        for entry in pdo.channels:
-            bits = TYPES[entry.type][0]
+    for group in by_sync_manager(pdos, 0).values():
+        offset = -(-offset // 8) * 8
+        for entry in (entry for pdo in group for entry in pdo.channels):
             channels.append(
                 Channel(
-                    entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, bits, entry.unit
+                    entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, entry.length, entry.unit
                 )
             )  # fmt: skip
-            offset += bits
+            offset += entry.length
     return ImageLayout(tuple(channels), offset)
-
-
-def layout_faults(device: DeviceDescription) -> list[str]:
-    """Return a sentence for every image of `device` that cannot be exchanged.
-
-    Fewer than 8 bits would share a byte with the next slave (SOEM maps them so), where a byte cannot be written alone.
-    """
-    return [
-        f"{device.name}: {key} has {image.bits} bits; an image of 1 to 7 bits is not supported, add padding (index 0)"
-        for key, image in (("rpdo", layout(device.rpdo)), ("tpdo", layout(device.tpdo)))
-        if 0 < image.bits < 8
-    ]
 
 
 def mapping_of(pdos: Sequence[Pdo]) -> Mapping:
     """Return what `pdos` of a description map."""
     return tuple(
-        (pdo.index, tuple((e.index, e.sub_index if e.index else 0, TYPES[e.type][0]) for e in pdo.channels))
-        for pdo in pdos
+        (pdo.index, tuple((e.index, e.sub_index if e.index else 0, e.length) for e in pdo.channels)) for pdo in pdos
     )  # fmt: skip
 
 
@@ -109,10 +113,13 @@ def mapping_text(mapping: Mapping) -> str:
     return f"{bits} bits ({listed or 'no PDO'})"
 
 
-def write_mapping(sdo: SdoClient, assignment: int, mapping: Mapping) -> Steps[None]:
+def write_mapping(sdo: SdoClient, assignment: int, pdos: Sequence[Pdo]) -> Steps[None]:
     """Write PDO mapping and assignment: counts to 0, entries, counts (ETG.1000.6, 5.6.5.2)."""
+    mapping = mapping_of(pdos)
     yield from sdo.writing_int(assignment, 0, 0, 1)
-    for pdo, entries in mapping:
+    for (pdo, entries), fixed in zip(mapping, (pdo.fixed for pdo in pdos), strict=True):
+        if fixed:
+            continue
         yield from sdo.writing_int(pdo, 0, 0, 1)
         for i, (index, sub_index, bits) in enumerate(entries, 1):
             yield from sdo.writing_int(pdo, i, index << 16 | sub_index << 8 | bits, 4)

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from rtcp.fieldbus.bus import slave_label, station_of
+from rtcp.fieldbus.bus import PORTS, PortErrors, slave_label, station_of
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort
+from rtcp.fieldbus.topology import Topology
 
-_SIZE = 0x14
+ERROR_COUNTERS_SIZE = 0x14
+"""Bytes of the counters of all ports."""
 _FORWARDED, _LINKS = 0x08, 0x10
-_PORTS = 4
-_OF_FRAMES, _OF_LINKS = slice(0, _FORWARDED + _PORTS), slice(_LINKS, _LINKS + _PORTS)
+_OF_FRAMES, _OF_LINKS = slice(0, _FORWARDED + PORTS), slice(_LINKS, _LINKS + PORTS)
 """Cleared with one write each; the errors of the processing unit between them belong to no cable."""
 _CLEAR_FROM = 128
 """Counters stop at 255; from here on they are set to 0, which a write of any value does."""
@@ -25,16 +26,20 @@ _CALM_S = 60.0
 """After this time without an error the next one starts a new count, s."""
 
 
-@dataclass
-class PortErrors:
-    """What each of a slave's ports has counted since the start."""
+def read_port_errors(data: bytes) -> PortErrors:
+    """Return the counters in the registers from `Register.ERROR_COUNTERS` on."""
+    rx = [max(data[2 * port], data[2 * port + 1]) for port in range(PORTS)]
+    forwarded, links = (list(data[at : at + PORTS]) for at in (_FORWARDED, _LINKS))
+    return PortErrors(rx, forwarded, links)
 
-    rx: list[int] = field(default_factory=lambda: [0] * _PORTS)
-    """Damaged frames that came in over the cable of that port."""
-    forwarded: list[int] = field(default_factory=lambda: [0] * _PORTS)
-    """Damaged frames that somebody before it has already counted."""
-    links: list[int] = field(default_factory=lambda: [0] * _PORTS)
-    """Lost links."""
+
+@dataclass(frozen=True)
+class _Cable:
+    """A cable, by the positions of what is at its ends; 0: the master."""
+
+    near: int
+    far: int | None
+    """None: what was there is not part of the configuration."""
 
 
 @dataclass
@@ -54,15 +59,24 @@ class _CableErrors:
 class ErrorCounters:
     """Reads one slave's counters a call, the slaves in turn."""
 
-    def __init__(self, port: RegisterPort, names: Sequence[str], report: Callable[[str], None]) -> None:
-        """Take the slaves in the order of the cable; `report` receives the messages."""
+    def __init__(
+        self,
+        port: RegisterPort,
+        names: Sequence[str],
+        report: Callable[[str], None],
+        topology: Topology | None = None,
+    ) -> None:
+        """Take the slaves in the order of the cable; `report` receives the messages; without `topology`: a chain."""
+        self._topology = topology or Topology.chain(len(names))
         self._port = port
         self._names = names
         self._report = report
         # What was counted before is of no cable that is in use now: plugs were put in.
-        self._last = [port.read(station_of(at), Register.ERROR_COUNTERS, _SIZE) for at in range(1, len(names) + 1)]
+        self._last = [
+            port.read(station_of(at), Register.ERROR_COUNTERS, ERROR_COUNTERS_SIZE) for at in range(1, len(names) + 1)
+        ]
         self._turn = 0
-        self._cables: dict[tuple[str, int], _CableErrors] = {}
+        self._cables: dict[tuple[str, _Cable], _CableErrors] = {}
         self.of = [PortErrors() for _ in names]
         """By slave, in the order of the cable."""
 
@@ -70,7 +84,9 @@ class ErrorCounters:
         """Read the next slave's counters; a slave that does not answer keeps what it had."""
         index, self._turn = self._turn, (self._turn + 1) % len(self._names)
         station = station_of(index + 1)
-        found, wkc = self._port.exchange(DatagramCommand.FPRD, station, Register.ERROR_COUNTERS, bytes(_SIZE), tries=1)
+        found, wkc = self._port.exchange(
+            DatagramCommand.FPRD, station, Register.ERROR_COUNTERS, bytes(ERROR_COUNTERS_SIZE), tries=1
+        )
         if wkc != 1:
             return
         before = self._last[index]
@@ -86,21 +102,25 @@ class ErrorCounters:
     def _add(self, index: int, before: bytes, found: bytes) -> None:
         # A counter that shows less than before was set to 0 meanwhile.
         new = [now - then if now >= then else now for then, now in zip(before, found, strict=True)]
-        errors = self.of[index]
-        for port in range(_PORTS):
-            # A damaged frame may count as a receive error of the port, too.
-            damaged, links = max(new[2 * port], new[2 * port + 1]), new[_LINKS + port]
+        errors, position = self.of[index], index + 1
+        # A damaged frame may count as a receive error of the port, too.
+        counted = read_port_errors(bytes(new))
+        for port in range(PORTS):
+            damaged, links = counted.rx[port], counted.links[port]
             errors.rx[port] += damaged
-            errors.forwarded[port] += new[_FORWARDED + port]
+            errors.forwarded[port] += counted.forwarded[port]
             errors.links[port] += links
             # Port 0 looks towards the master, any other away from it.
-            cable = index if port == 0 else index + 1
+            if port == 0:
+                cable = _Cable(self._topology.parent(position), position)
+            else:
+                cable = _Cable(position, self._topology.child_at(position, port))
             if damaged:
                 self._note("errors", cable, damaged, far=port == 0)
             if links:
                 self._note("link", cable, links, far=port == 0)
 
-    def _note(self, kind: str, cable: int, count: int, *, far: bool) -> None:
+    def _note(self, kind: str, cable: _Cable, count: int, *, far: bool) -> None:
         now = time.monotonic()
         cable_errors = self._cables.get((kind, cable))
         if cable_errors is None or now - cable_errors.last_at > _CALM_S:
@@ -125,10 +145,10 @@ class ErrorCounters:
                 cable_errors.reported, cable_errors.reported_at = count, now
                 self._report(self._sentence(kind, cable, count, cable_errors.began))
 
-    def _sentence(self, kind: str, cable: int, count: int, began: str) -> str:
-        before = "the master" if cable == 0 else slave_label(cable, self._names[cable - 1])
-        if cable < len(self._names):
-            between = f"between {before} and {slave_label(cable + 1, self._names[cable])}"
+    def _sentence(self, kind: str, cable: _Cable, count: int, began: str) -> str:
+        before = "the master" if cable.near == 0 else slave_label(cable.near, self._names[cable.near - 1])
+        if cable.far is not None:
+            between = f"between {before} and {slave_label(cable.far, self._names[cable.far - 1])}"
         else:
             between = f"behind {before}"
         if kind == "errors":

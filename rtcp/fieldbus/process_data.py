@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, Final
 
+from rtcp.fieldbus.image import Place, Places, image_memory, missing_counts
 from rtcp.fieldbus.registers import DatagramCommand, build_frame, open_socket
 
 _LARGEST_FRAME_DATA: Final = 1466
@@ -31,6 +32,7 @@ class SoemProcessData:
         self,
         master: Any,
         slaves: Sequence[Any],
+        places: Sequence[Places],
         socket_fd: int,
         barrier: FrameBarrier,
         receive_us: int,
@@ -41,12 +43,13 @@ class SoemProcessData:
         Args:
             master: pysoem's master after `config_map`.
             slaves: its slaves.
+            places: where their images are.
             socket_fd: a duplicate of SOEM's packet socket, non-blocking.
             barrier: the frame barrier on the same interface.
             receive_us: how long an answer is waited for.
             barrier_us: how long the barrier frame is waited for.
         """
-        self.expected_wkc = int(master.expected_wkc)
+        self.expected_wkc = int(master.expected_wkc) + missing_counts(places)
         self.missed = 0
         self.stale = 0
         self._master = master
@@ -58,8 +61,14 @@ class SoemProcessData:
         self._inputs = [bytes(slave.input) for slave in slaves]
         self._outputs = [bytes(len(slave.output)) for slave in slaves]
         self._lengths = tuple(len(output) for output in self._outputs)
-        self._with_inputs = tuple((i, slave) for i, slave in enumerate(slaves) if self._inputs[i])
-        self._with_outputs = tuple((i, slave) for i, slave in enumerate(slaves) if self._outputs[i])
+        each = tuple(enumerate(zip(slaves, places, strict=True)))
+        self._with_inputs = tuple((i, s) for i, (s, at) in each if self._inputs[i] and not at.inputs.is_small)
+        self._with_outputs = tuple((i, s) for i, (s, at) in each if self._outputs[i] and not at.outputs.is_small)
+        small_inputs = [(i, at.inputs) for i, (_, at) in each if at.inputs.is_small]
+        small_outputs = [(i, at.outputs) for i, (_, at) in each if at.outputs.is_small]
+        self._small = (
+            SmallImages(image_memory(master), small_outputs, small_inputs) if (small_inputs or small_outputs) else None
+        )
         self._several_frames = sum(map(len, self._inputs + self._outputs)) > _LARGEST_FRAME_DATA
         self._buffer = ctypes.create_string_buffer(1518)
         # SOEM sends frames again while it configures: their late answers are around at the start.
@@ -76,6 +85,8 @@ class SoemProcessData:
         # All of them, each time: SOEM copies what comes back, also an older frame's outputs, over its image.
         for i, slave in self._with_outputs:
             slave.output = outputs[i]
+        if self._small is not None:
+            self._small.write(outputs)
         self._master.send_processdata()
 
     def receive(self) -> int:
@@ -96,6 +107,8 @@ class SoemProcessData:
         inputs = self._inputs
         for i, slave in self._with_inputs:
             inputs[i] = slave.input
+        if self._small is not None:
+            self._small.read(inputs)
         self.dc_time = self._master.dc_time
         return wkc
 
@@ -109,6 +122,44 @@ class SoemProcessData:
             self._outputs[index] = data
 
 
+class SmallImages:
+    """Images of 1 to 7 bits, which lie beside and across the bytes of others, in the order of the cable."""
+
+    def __init__(
+        self, image: memoryview, outputs: Sequence[tuple[int, Place]], inputs: Sequence[tuple[int, Place]]
+    ) -> None:
+        """Take the process image, and of each such image the slave's index and its place."""
+        self._image = image
+        self._reads = tuple(
+            (i, slice(place.first // 8, (place.first + place.bits + 7) // 8), place.first % 8, (1 << place.bits) - 1)
+            for i, place in inputs
+        )
+        # Bytes that are written at once, and who has which bits of them: slaves that share a byte.
+        runs: list[tuple[int, int, list[tuple[int, int, int]]]] = []
+        for i, place in sorted(outputs, key=lambda one: one[1].first):
+            begin, end = place.first // 8, (place.first + place.bits + 7) // 8
+            if not runs or begin >= runs[-1][1]:
+                runs.append((begin, end, []))
+            begin, last, members = runs[-1]
+            members.append((i, place.first - 8 * begin, (1 << place.bits) - 1))
+            runs[-1] = (begin, max(last, end), members)
+        self._writes = tuple((slice(begin, end), end - begin, tuple(members)) for begin, end, members in runs)
+
+    def write(self, outputs: Sequence[bytes]) -> None:
+        """Write the bits of each slave's outputs; the bits around them stay those of the others."""
+        for where, length, members in self._writes:
+            value = 0
+            for i, shift, mask in members:
+                value |= (outputs[i][0] & mask) << shift
+            self._image[where] = value.to_bytes(length, "little")
+
+    def read(self, inputs: list[bytes]) -> None:
+        """Read each slave's inputs."""
+        for i, where, shift, mask in self._reads:
+            inputs[i] = _BYTES[int.from_bytes(self._image[where], "little") >> shift & mask]
+
+
+_BYTES: Final = tuple(bytes((value,)) for value in range(256))
 _INDEX = 0xF0
 _NUMBER_AT: Final = 26
 # PyDLL keeps the interpreter's lock: the cycle must not have to win it back from another thread after each poll.

@@ -11,7 +11,8 @@ from rtcp.fieldbus.al_state import ERROR_BIT, AlState, refusal
 from rtcp.fieldbus.bus import SlaveState, slave_label, station_of
 from rtcp.fieldbus.errors import BusError, ForeignSlave
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, Steps
-from rtcp.fieldbus.slave_setup import SlaveRestorer
+from rtcp.fieldbus.slave_setup import SlaveRestorer, provisional_of
+from rtcp.fieldbus.topology import OPEN, Topology, port_words
 
 LONG_AGO = float("-inf")
 REPORT_INTERVAL_S = 10.0
@@ -68,6 +69,8 @@ class MonitoredSlave:
     """It is parked in PRE-OP and keeps its set-up."""
     leaving: bool = False
     """PRE-OP was requested and it has not left OP yet."""
+    provisional: bool = False
+    """It lost its address, and its restoration has given it another one for the time until it is known."""
     unfinished: bool = False
     """A restoration was started and has not ended."""
     work: Steps[None] | None = None
@@ -134,6 +137,7 @@ class SlaveRecovery:
         slaves: the slaves in the order of the cable.
         restorer: sets up a slave again.
         report: receives the messages.
+        topology: the tree of the slaves.
     """
 
     def __init__(
@@ -142,8 +146,10 @@ class SlaveRecovery:
         slaves: Sequence[MonitoredSlave],
         restorer: SlaveRestorer,
         report: Callable[[str], None],
+        topology: Topology,
     ) -> None:
         self._port = port
+        self._topology = topology
         self._slaves = slaves
         self._restorer = restorer
         self._report = report
@@ -193,7 +199,7 @@ class SlaveRecovery:
         if action is Action.MARK_LOST:
             self._probe(slave, now)
         elif action is Action.RECONFIGURE:
-            self._start_restoration(slave, lost_address=False)
+            self._start_restoration(slave, None)
         elif action is Action.ACKNOWLEDGE:
             slave.asked = action, state, error, now + _PAUSE_S
             self.request(slave, state, acknowledge=True)
@@ -228,31 +234,74 @@ class SlaveRecovery:
         """Look whether a slave that lost its address has come back to its place."""
         slave.asked = None
         slave.kept = False
-        if self._reached < slave.position or now < slave.probe_at:
+        if now < slave.probe_at:
             return
         slave.probe_at = now + _PROBE_S
-        place = 1 - slave.position & 0xFFFF
-        data, wkc = self._port.exchange(DatagramCommand.APRD, place, Register.STATION_ADDRESS, bytes(2), tries=1)
+        place = self._place_of(slave)
+        if place is None:
+            return
+        data, wkc = self._port.exchange(
+            DatagramCommand.APRD, 1 - place & 0xFFFF, Register.STATION_ADDRESS, bytes(2), tries=1
+        )
         if wkc != 1:
             return
         station = int.from_bytes(data, "little")
         other = next((one for one in self._slaves if one.station == station), None)
         if other is None:
-            self._start_restoration(slave, lost_address=True)
+            self._start_restoration(slave, place)
         elif other is not slave:
             slave.pause_until = now + _PAUSE_S
             self.report_limited(
                 slave, f"{slave.label}: at its place answers {other.label}: put the cables back in their order"
             )
 
-    def _start_restoration(self, slave: MonitoredSlave, *, lost_address: bool) -> None:
+    def _place_of(self, slave: MonitoredSlave) -> int | None:
+        """Return at which place in the frame's way a lost slave would answer, from 1; None: it cannot be there now.
+
+        Places count who answers. Whoever is lost and hangs at a slave that answers, behind a port with a link, is there
+        without an address: the first of them in the frame's way gets one first, the places behind it are not known yet.
+        """
+        addressed = {other.position for other in self._slaves if other is not slave and self._has_address(other)}
+        if self._reached <= len(addressed):
+            return None
+        for other in self._slaves:
+            if other.position not in addressed and self._is_linked(other):
+                return 1 + sum(position < slave.position for position in addressed) if other is slave else None
+        return None
+
+    def _has_address(self, slave: MonitoredSlave) -> bool:
+        """Whether a slave answers at its own address, or at the one that its restoration has given it."""
+        if slave.state is not AlState.NONE:
+            return True
+        if (
+            slave.provisional
+            and self._port.read(provisional_of(slave.position), Register.AL_STATUS, 2, tries=1) is None
+        ):
+            slave.provisional = False
+        return slave.provisional
+
+    def _is_linked(self, slave: MonitoredSlave) -> bool:
+        """Whether the slave before it answers and has a link to it."""
+        parent = self._topology.parent(slave.position)
+        if not parent:
+            return True
+        before = self._slaves[parent - 1]
+        if not self._has_address(before):
+            return False
+        station = provisional_of(parent) if before.state is AlState.NONE else before.station
+        status = self._port.read(station, Register.DL_STATUS, 2, tries=1)
+        ports = port_words(int.from_bytes(status or b"", "little"))
+        return ports[self._topology.port(slave.position)] == OPEN
+
+    def _start_restoration(self, slave: MonitoredSlave, place: int | None) -> None:
         slave.asked = None
         slave.kept = False
         slave.unfinished = True
-        what = "it was without supply" if lost_address else f"it is in {slave.words()}"
+        slave.provisional = place is not None
+        what = "it was without supply" if place is not None else f"it is in {slave.words()}"
         if slave.failed == 0 and slave.flaps == 0:
             self._report(f"{slave.label} is set up again: {what}")
-        slave.work = self._restorer.restore(slave.position, lost_address)
+        slave.work = self._restorer.restore(slave.position, place)
 
     def _continue_restoration(self, slave: MonitoredSlave, until: float) -> None:
         work = slave.work

@@ -223,11 +223,6 @@ class RegisterPort:
         """Write registers of the slave at `position` on the cable (APWR); return whether it took them."""
         return self.exchange(DatagramCommand.APWR, 1 - position & 0xFFFF, address, data).wkc == 1
 
-    def put_at(self, position: int, address: int, data: bytes, label: str) -> None:
-        """Write registers as `write_at` does; raises BusError where the slave, named `label`, does not take them."""
-        if not self.write_at(position, address, data):
-            raise BusError(_NOT_TAKEN.format(label=label, address=address))
-
     def read_all(self, address: int, length: int) -> Answer:
         """Read registers of all slaves (BRD): data OR-ed together, the working counter is their number."""
         return self.exchange(DatagramCommand.BRD, 0, address, bytes(length))

@@ -13,14 +13,16 @@ from rtcp.fieldbus.bus import MailboxInfo, PdoEntryInfo, PdoInfo, SlaveInfo, Syn
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, reading_assignment
+from rtcp.fieldbus.port_errors import ERROR_COUNTERS_SIZE, read_port_errors
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, finish
+from rtcp.fieldbus.topology import port_words
 
 _DEVICE_NAME = 0x1008
 _SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
 _EEPROM_US = 500_000
 """For a word of it: a shared host may be off its CPU for longer than the 20 ms that pysoem gives it."""
-_SMALLEST_MAILBOX, _LARGEST_MAILBOX = 16, 1486
-"""Bytes: headers and an SDO (ETG.1000.6, 5.6.2); what one datagram carries."""
+_SMALLEST_MAILBOX = 16
+"""Bytes: headers and an SDO (ETG.1000.6, 5.6.2)."""
 _PROTOCOLS = ("AoE", "EoE", "CoE", "FoE", "SoE", "VoE")
 """Bits 0 to 5 of SII word 0x1C (ETG.2010, table 4)."""
 _SYNC_MANAGER = struct.Struct("<HHBBBB")
@@ -31,7 +33,7 @@ def read_mailbox(slave: Any) -> MailboxInfo | None:
     receive_start, receive_size = struct.unpack("<HH", slave.eeprom_read(_SII_RECEIVE, _EEPROM_US))
     send_start, send_size = struct.unpack("<HH", slave.eeprom_read(_SII_SEND, _EEPROM_US))
     send_size = send_size or receive_size
-    if not _SMALLEST_MAILBOX <= min(receive_size, send_size) <= max(receive_size, send_size) <= _LARGEST_MAILBOX:
+    if min(receive_size, send_size) < _SMALLEST_MAILBOX:
         return None
     bits = slave.eeprom_read(_SII_PROTOCOLS, _EEPROM_US)[0]
     protocols = tuple(name for i, name in enumerate(_PROTOCOLS) if bits >> i & 1)
@@ -84,29 +86,6 @@ class _Names:
         )
 
 
-def _ports(dl_status: int) -> tuple[str, ...]:
-    # DL status (ETG.1000.4, table 34): bit 4 + n: link; bits 8 + 2n, 9 + 2n: loop closed, communication established.
-    words = []
-    for port in range(4):
-        link, loop, talks = dl_status >> 4 + port & 1, dl_status >> 8 + 2 * port & 1, dl_status >> 9 + 2 * port & 1
-        words.append("open" if talks and not loop else "closed" if link else "no link")
-    return tuple(words)
-
-
-def parents(ports: list[tuple[str, ...]]) -> list[int]:
-    """Return the parent (position, 0: the master) of each slave, given its ports in the order of the frame's way."""
-    result: list[int] = []
-    free: list[list[int]] = []  # [position, ports still without a child], innermost last
-    for i, port in enumerate(ports):
-        while free and free[-1][1] == 0:
-            free.pop()
-        result.append(free[-1][0] if free else i)
-        if free:
-            free[-1][1] -= 1
-        free.append([i + 1, max(port.count("open") - 1, 0)])
-    return result
-
-
 def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, ...]:
     data = port.read(station, Register.SYNC_MANAGER, 4 * _SYNC_MANAGER.size)
     if data is None:
@@ -135,6 +114,7 @@ def describe(
     def register(address: int, length: int) -> int:
         return int.from_bytes(port.read(station, address, length) or b"", "little")
 
+    counters = port.read(station, Register.ERROR_COUNTERS, ERROR_COUNTERS_SIZE) or bytes(ERROR_COUNTERS_SIZE)
     state, error, code = read_al(port, station)
     has_coe = mailbox is not None and mailbox.has_coe
     name = name_of(slave)
@@ -174,6 +154,8 @@ def describe(
         fmmus=register(Register.FMMU_COUNT, 1),
         dc=dc,
         delay_ns=register(Register.DC_DELAY, 4) if dc else 0,
-        ports=_ports(register(Register.DL_STATUS, 2)),
+        ports=port_words(register(Register.DL_STATUS, 2)),
         parent=0,
+        parent_port=0,
+        port_errors=read_port_errors(counters),
     )

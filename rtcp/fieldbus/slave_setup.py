@@ -11,24 +11,25 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
+from rtcp.config.model import BITS, DeviceDescription, SlaveConfig, StartupSdo
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
-from rtcp.fieldbus.bus import slave_label, station_of
+from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
-from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, TYPES, compare_mapping, mapping_of, write_mapping
+from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, mapping_of, write_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
 from rtcp.fieldbus.scaling import compare_scaling
 from rtcp.fieldbus.scan import name_of
 
 _FMMUS_SIZE = 0x80
 _SYNC_MANAGER_SIZE, _SYNC_MANAGER_COUNT = 8, 8
-_MAILBOXES = 2
-"""Sync managers 0 and 1 are the mailboxes."""
+_MODE, _MAILBOX = 0x03, 0x02
+"""Mode of a sync manager in its control register, and that of a mailbox (ETG.1000.4, 6.7.2)."""
 _EEPROM_READ, _EEPROM_BUSY, _EEPROM_FAILED = 0x0100, 0x8000, 0x2000
 _SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
 """Word addresses in the EEPROM (ETG.2010, table 2)."""
@@ -47,6 +48,8 @@ class SlaveSetup:
     """Propagation delay from the reference clock, as register 0x0928 holds it; None: it has no clock."""
     serial: int
     """Serial number in its EEPROM; 0: it has none."""
+    mailboxes: int
+    """How many sync managers, from 0 on, are mailboxes."""
 
 
 def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SlaveSetup:
@@ -57,13 +60,19 @@ def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> Sl
     features = port.read(station, Register.FEATURES, 2)
     if fmmus is None or managers is None or features is None:
         raise BusError(f"{slave_label(position, name)} stopped answering while its set-up was read")
-    own = (managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE))
+    own = [managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE)]
     return SlaveSetup(
         fmmus,
         tuple(one[:5] + bytes((0, one[6] & 1, 0)) for one in own),
         port.read(station, Register.DC_DELAY, 4) if features[0] & FEATURE_DC else None,
         serial,
+        sum(one[4] & _MODE == _MAILBOX for one in own[:2]),
     )
+
+
+def provisional_of(position: int) -> int:
+    """Return the address of a slave that has lost its own, until it is known to be the right one."""
+    return 0x2000 + position
 
 
 class SlaveRestorer:
@@ -93,12 +102,13 @@ class SlaveRestorer:
         self._period_ns = period_ns
         self._clocks = tuple(i for i, set_up in enumerate(set_ups, 1) if set_up.delay is not None)
 
-    def restore(self, position: int, lost_address: bool) -> Steps[None]:
+    def restore(self, position: int, place: int | None) -> Steps[None]:
         """Set up the slave at `position` and bring it to SAFE-OP.
 
         Args:
             position: its position on the cable, from 1.
-            lost_address: it has no station address: it was without supply.
+            place: where in the frame's way it answers, from 1: it was without supply and has no station address. None:
+                it has one.
 
         Raises:
             ForeignSlave: another device answers there.
@@ -106,28 +116,32 @@ class SlaveRestorer:
         """
         port, station, config = self._port, station_of(position), self._slaves[position - 1]
         set_up, label = self._set_ups[position - 1], self._label(position)
-        if lost_address:
-            yield from self._identify(position)
+        found_at = station
+        if place is not None:
+            # Its place changes with whoever comes or goes before it: from here on an address of its own is used.
+            found_at = provisional_of(position)
+            self._write_address(position, found_at, partial(port.write_at, place), partial(port.read_at, place))
+            yield from self._identify(position, found_at)
         if set_up.delay is not None:
             # SYNC0 first: it must not run on while the time is set. The address last: the frames of the cycle ask the
             # reference clock by its address, and every other slave follows its time.
-            port.put_at(position, Register.DC_ACTIVATION, b"\0", label)
+            port.put(found_at, Register.DC_ACTIVATION, b"\0", label)
             others = [other for other in self._clocks if other != position]
-            take_over_time(port, position, label, set_up.delay, others, always=lost_address)
-        if lost_address:
-            self._write_address(position)
+            take_over_time(port, found_at, label, set_up.delay, others, always=place is not None)
+        if place is not None:
+            self._write_address(position, station, partial(port.write, found_at), partial(port.read, station))
         if set_up.delay is not None:
-            forget_drift(port, position, label)
+            forget_drift(port, station, label)
         yield
         yield from self._change_state(position, AlState.INIT)
         port.put(station, Register.SYNC_MANAGER, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT), label)
         port.put(station, Register.FMMU, bytes(_FMMUS_SIZE), label)
-        self._write_sync_managers(position, range(_MAILBOXES))
+        self._write_sync_managers(position, range(set_up.mailboxes))
         if not eeprom_to_device(port, station):
             raise BusError(f"{label} did not take its EEPROM back")
         yield from self._change_state(position, AlState.PREOP)
         yield from configure_slave(self._sdo(position), port, station, config, self._period_ns)
-        self._write_sync_managers(position, range(_MAILBOXES, _SYNC_MANAGER_COUNT))
+        self._write_sync_managers(position, range(set_up.mailboxes, _SYNC_MANAGER_COUNT))
         port.put(station, Register.FMMU, set_up.fmmus, label)
         if config.device.assign_activate:
             if position != self._clocks[0]:
@@ -139,9 +153,9 @@ class SlaveRestorer:
     def _label(self, position: int) -> str:
         return slave_label(position, self._slaves[position - 1].name)
 
-    def _identify(self, position: int) -> Steps[None]:
-        vendor = yield from self._reading_eeprom(position, _SII_VENDOR)
-        product = yield from self._reading_eeprom(position, _SII_PRODUCT)
+    def _identify(self, position: int, station: int) -> Steps[None]:
+        vendor = yield from self._reading_eeprom(position, station, _SII_VENDOR)
+        product = yield from self._reading_eeprom(position, station, _SII_PRODUCT)
         device = self._slaves[position - 1].device
         if (vendor, product) != (device.vendor_id, device.product_id):
             raise ForeignSlave(
@@ -151,23 +165,23 @@ class SlaveRestorer:
             )
         # Two of a kind that were swapped move each other's joint.
         expected = self._set_ups[position - 1].serial
-        if expected and (serial := (yield from self._reading_eeprom(position, _SII_SERIAL))) != expected:
+        if expected and (serial := (yield from self._reading_eeprom(position, station, _SII_SERIAL))) != expected:
             raise ForeignSlave(
                 f"{self._label(position)}: at its place answers another {device.name} (serial number {serial}), "
                 f"expected serial number {expected}: it is left alone; put the right one there, or start anew with "
                 "this one"
             )
 
-    def _reading_eeprom(self, position: int, word: int) -> Steps[int]:
+    def _reading_eeprom(self, position: int, station: int, word: int) -> Steps[int]:
         """Return four bytes of the EEPROM from `word` on (ETG.1000.4, 6.4)."""
         port, label = self._port, self._label(position)
         # Taken back from the device by force, as it may have it after power-on.
-        port.put_at(position, Register.EEPROM_CONFIG, b"\x02", label)
-        port.put_at(position, Register.EEPROM_CONFIG, b"\x00", label)
-        port.put_at(position, Register.EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
+        port.put(station, Register.EEPROM_CONFIG, b"\x02", label)
+        port.put(station, Register.EEPROM_CONFIG, b"\x00", label)
+        port.put(station, Register.EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
         deadline = time.monotonic() + _EEPROM_S
         while True:
-            data = port.read_at(position, Register.EEPROM_CONTROL, 2)
+            data = port.read(station, Register.EEPROM_CONTROL, 2)
             if data is None:
                 raise BusError(f"{self._label(position)} stopped answering while its EEPROM was read")
             status = int.from_bytes(data, "little")
@@ -176,15 +190,20 @@ class SlaveRestorer:
             if time.monotonic() >= deadline:
                 raise BusError(f"{self._label(position)}: its EEPROM stays busy")
             yield
-        found = port.read_at(position, Register.EEPROM_DATA, 4)
+        found = port.read(station, Register.EEPROM_DATA, 4)
         if found is None or status & _EEPROM_FAILED:
             raise BusError(f"{self._label(position)}: its EEPROM cannot be read (status 0x{status:04X})")
         return int.from_bytes(found, "little")
 
-    def _write_address(self, position: int) -> None:
-        port, data = self._port, station_of(position).to_bytes(2, "little")
-        taken = port.write_at(position, Register.STATION_ADDRESS, data)
-        if not taken or port.read_at(position, Register.STATION_ADDRESS, 2) != data:
+    def _write_address(
+        self,
+        position: int,
+        station: int,
+        write: Callable[[int, bytes], bool],
+        read: Callable[[int, int], bytes | None],
+    ) -> None:
+        data = station.to_bytes(2, "little")
+        if not write(Register.STATION_ADDRESS, data) or read(Register.STATION_ADDRESS, 2) != data:
             raise BusError(f"{self._label(position)} does not keep its station address")
 
     def _write_sync_managers(self, position: int, numbers: range) -> None:
@@ -213,6 +232,33 @@ class SlaveRestorer:
 _DIVIDER = 2498
 """Watchdog divider of 100 us: (2498 + 2) * 40 ns (ETG.1000.4, 6.3)."""
 _INTERPOLATION = 0x60C2
+
+
+def by_alias(slaves: Sequence[SlaveConfig], found: Sequence[SlaveInfo]) -> tuple[SlaveConfig, ...]:
+    """Return the slaves of the configuration in the order of the cable: those with an alias where it was found.
+
+    Raises:
+        BusError: nobody has an alias, or several do.
+    """
+    at = {slave.alias: [info.position for info in found if info.alias == slave.alias] for slave in slaves}
+    there = ", ".join(f"slave {info.position} ({info.name}) has {info.alias}" for info in found if info.alias)
+    faults = []
+    for slave in slaves:
+        if slave.alias and not at[slave.alias]:
+            faults.append(
+                f"{slave.name}: no slave has the station alias {slave.alias} (key `slaves`): "
+                f"{there or 'none has any'}; `rtcp alias set` writes one"
+            )
+        elif slave.alias and len(at[slave.alias]) > 1:
+            places = " and ".join(f"slave {position}" for position in at[slave.alias])
+            faults.append(f"{slave.name}: {places} have the station alias {slave.alias}; `rtcp alias set` changes one")
+    if faults:
+        raise BusError(*faults)
+    placed = {at[slave.alias][0]: slave for slave in slaves if slave.alias}
+    if not placed or len(found) != len(slaves):
+        return tuple(slaves)
+    others = iter([slave for slave in slaves if not slave.alias])
+    return tuple(placed.get(info.position) or next(others) for info in found)
 
 
 def identity_faults(found: Sequence[Any], expected: Sequence[SlaveConfig]) -> list[str]:
@@ -262,10 +308,14 @@ def configure_slave(
     """
     device = config.device
     notes: list[str] = []
-    for assignment, pdos, key in ((RX_ASSIGN, device.rpdo, "rpdo"), (TX_ASSIGN, device.tpdo, "tpdo")):
+    set_watchdog(port, station, slave_label(sdo.position, sdo.name), device)
+    if not device.coe:
+        return notes
+    for key, manager, pdos in assignments(device):
+        assignment = ASSIGN + manager
         if device.configurable_pdos:
             try:
-                yield from write_mapping(sdo, assignment, mapping_of(pdos))
+                yield from write_mapping(sdo, assignment, pdos)
             except SdoAborted as error:
                 file = config.file or "the device's file"
                 sentence = f"{error.sentences[0]}; the device does not take the mapping of {file} (key `{key}`)"
@@ -278,18 +328,20 @@ def configure_slave(
         notes += yield from compare_scaling(sdo, config)
         for axis in device.axes:
             notes += yield from write_interpolation_time(sdo, period_ns, axis)
-    set_watchdog(port, station, slave_label(sdo.position, sdo.name), device)
     return notes
 
 
 def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     """Write a start-up SDO and read it back; return a note where the device lacks it and may."""
-    code = "B" if startup.type == "bool" else TYPES[startup.type][1]
-    packer = struct.Struct("<" + code)
-    data = packer.pack(startup.value if code in "fd" else int(startup.value))
+    if startup.type.startswith("float"):
+        packer = struct.Struct("<" + STRUCT_CODES[startup.type])
+        data = packer.pack(startup.value)
+    else:
+        length = max(BITS[startup.type] // 8, 1)
+        data = int(startup.value).to_bytes(length, "little", signed=startup.type.startswith("int"))
     what = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
     try:
-        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, packer)
+        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, startup.type)
     except SdoAborted as error:
         if startup.optional and error.code in ABSENT:
             return [f"{slave_label(sdo.position, sdo.name)} has no {what}; it is marked optional and was left out"]
@@ -297,15 +349,19 @@ def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     return []
 
 
-def _write_and_verify(
-    sdo: SdoClient, index: int, sub_index: int, data: bytes, what: str, packer: struct.Struct
-) -> Steps[None]:
+def _write_and_verify(sdo: SdoClient, index: int, sub_index: int, data: bytes, what: str, kind: str) -> Steps[None]:
     yield from sdo.writing(index, sub_index, data)
     kept = yield from sdo.reading(index, sub_index)
     if kept != data:
-        shown = f"{packer.unpack(kept)[0]}" if len(kept) == packer.size else f"bytes {kept.hex(' ')}"
+        found = _number(kept, kind) if len(kept) == len(data) else f"bytes {kept.hex(' ')}"
         where = slave_label(sdo.position, sdo.name)
-        raise BusError(f"{where}: {what} was set to {packer.unpack(data)[0]} and reads back as {shown}")
+        raise BusError(f"{where}: {what} was set to {_number(data, kind)} and reads back as {found}")
+
+
+def _number(data: bytes, kind: str) -> str:
+    if kind.startswith("float"):
+        return str(struct.unpack("<" + STRUCT_CODES[kind], data)[0])
+    return str(int.from_bytes(data, "little", signed=kind.startswith("int")))
 
 
 def interpolation_time(period_ns: int) -> tuple[int, int] | None:
@@ -328,11 +384,10 @@ def write_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> S
         us = period_ns / 1000
         return [f"{where}: its interpolation time (0x{index:04X}) cannot express {us:g} us and was left as it is"]
     try:
-        for sub_index, (number, packer) in enumerate(
-            zip(value, (struct.Struct("B"), struct.Struct("b")), strict=True), 1
-        ):
+        for sub_index, (number, kind) in enumerate(zip(value, ("uint8", "int8"), strict=True), 1):
             what = f"0x{index:04X}:{sub_index} (interpolation time)"
-            yield from _write_and_verify(sdo, index, sub_index, packer.pack(number), what, packer)
+            data = number.to_bytes(1, "little", signed=kind == "int8")
+            yield from _write_and_verify(sdo, index, sub_index, data, what, kind)
     except SdoAborted as error:
         if error.code in ABSENT:
             return [f"{where} has no interpolation time (0x{index:04X})"]

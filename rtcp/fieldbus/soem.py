@@ -17,19 +17,28 @@ from pysoem import pysoem
 from rtcp.config.model import ArmConfig, SlaveConfig
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
-from rtcp.fieldbus.bus import MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
+from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import start_clocks
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.image import MOST_SLAVES, Places, limit_faults, read_places
 from rtcp.fieldbus.interface import PromiscuousMode, check_interface, check_name, claim, enter
 from rtcp.fieldbus.mailbox import Mailboxes, SdoClient
 from rtcp.fieldbus.master import Master
-from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, layout, layout_faults
+from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, layout
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
-from rtcp.fieldbus.scan import describe, name_of, parents, read_mailbox, read_serial
-from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_device, identity_faults, read_set_up
+from rtcp.fieldbus.scan import describe, name_of, read_mailbox, read_serial
+from rtcp.fieldbus.slave_setup import (
+    SlaveRestorer,
+    by_alias,
+    configure_slave,
+    eeprom_to_device,
+    identity_faults,
+    read_set_up,
+)
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
+from rtcp.fieldbus.topology import Topology, port_words
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
 _BELOW_SAFEOP = 0x03
@@ -82,6 +91,7 @@ class SoemBus:
         self._serials: list[int] = []
         self._boxes: Mailboxes | None = None
         self._restorer: SlaveRestorer | None = None
+        self._topology: Topology | None = None
 
     def __enter__(self) -> SoemBus:
         self.open()
@@ -140,8 +150,10 @@ class SoemBus:
             describe(slave, self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), self._infos[i], self._serials[i])
             for i, slave in enumerate(self._master.slaves)
         ]
-        before = parents([info.ports for info in found])
-        return tuple(replace(info, parent=parent) for info, parent in zip(found, before, strict=True))
+        tree = Topology.of([info.ports for info in found])
+        return tuple(
+            replace(info, parent=tree.parent(info.position), parent_port=tree.port(info.position)) for info in found
+        )
 
     def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> SoemProcessData:
         """Bring the slaves from INIT to SAFE-OP as configured, with outputs of zero.
@@ -153,9 +165,8 @@ class SoemBus:
         Raises:
             BusError: what is on the bus differs from the configuration, or a slave refuses.
         """
-        faults = [fault for config in slaves for fault in layout_faults(config.device)]
-        if faults:
-            raise BusError(*dict.fromkeys(faults))
+        if faults := limit_faults(slaves):
+            raise BusError(*faults)
         failures = [0] * len(slaves)
         for attempt in range(1, _MAP_ATTEMPTS + 1):
             # SOEM appends to a mapping that it has begun: each attempt starts from INIT.
@@ -167,8 +178,9 @@ class SoemBus:
                 raise BusError(*(sentence for sentences in misread.values() for sentence in sentences))
             for position in misread:
                 failures[position - 1] += 1
+        places = read_places(self.port, slaves)
         start_clocks(self._master, self.port, slaves, period_ns)
-        data = self._process_data(period_ns)
+        data = self._process_data(places, period_ns)
         # Valid outputs, all zero, are in the slaves' buffers before any of them may use them.
         data.send()
         data.receive()
@@ -179,10 +191,15 @@ class SoemBus:
             read_set_up(self.port, position, config.name, serial)
             for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
         ]
+        self._topology = self._read_topology()
         self._restorer = SlaveRestorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
         # From here on a cycle runs, and slaves are watched beside it: what is lost is to be known soon.
         self.port.tries = TRIES
         return data
+
+    def _read_topology(self) -> Topology:
+        status = [self.port.read(station, Register.DL_STATUS, 2) for station in self._stations(None)]
+        return Topology.of([port_words(int.from_bytes(one or b"", "little")) for one in status])
 
     def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int, failures: Sequence[int]) -> None:
         """Bring the slaves from INIT to PRE-OP, each set up as configured; raises BusError.
@@ -197,6 +214,15 @@ class SoemBus:
         if faults:
             raise BusError(*faults)
         self._names[:] = [config.name for config in slaves]
+        for position, info in enumerate(self._infos, 1):
+            if info is not None and not info.fits:
+                size = max(info.receive_size, info.send_size)
+                faults.append(
+                    f"{slave_label(position, self._names[position - 1])}: its EEPROM gives a mailbox of {size} bytes; "
+                    f"SOEM has room for {LARGEST_MAILBOX}"
+                )
+        if faults:
+            raise BusError(*faults)
         first_of: dict[tuple[object, ...], int] = {}
         for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
             device = config.device
@@ -237,6 +263,9 @@ class SoemBus:
     def _discover(self) -> None:
         if self._master is None:
             raise BusError(f"the bus on {self.interface} is not open")
+        answering = self.port.read_all(Register.AL_STATUS, 1).wkc
+        if answering > MOST_SLAVES:
+            raise BusError(f"{answering} slaves answer on {self.interface}; SOEM has room for {MOST_SLAVES}")
         # Also stops SYNC0 and SYNC1 that the last run left active, and resets FMMUs and sync managers (SOEM#60).
         if not any(self._master.config_init() > 0 for _ in range(_DISCOVERY_ATTEMPTS)):
             raise BusError(f"no slave answers on {self.interface}: check the cable and the slaves' supply")
@@ -252,7 +281,7 @@ class SoemBus:
             raise BusError(f"SYNC0 of a slave on {self.interface} is still active and cannot be switched off")
 
     def _to_preop(self) -> tuple[str, ...]:
-        stations = self._stations(i + 1 for i, mailbox in enumerate(self._infos) if mailbox is not None)
+        stations = self._stations(None)
         al_state.request_state(self.port, stations, AlState.PREOP)
         return al_state.wait_for_state(self.port, stations, AlState.PREOP, self._state_timeout_s)
 
@@ -277,29 +306,33 @@ class SoemBus:
                 reported.setdefault(fault.slave_pos, []).append(what)
         faults: dict[int, list[str]] = {}
         for position, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True), 1):
-            images = (
-                ("rpdo", RX_ASSIGN, config.device.rpdo, slave.output),
-                ("tpdo", TX_ASSIGN, config.device.tpdo, slave.input),
-            )
-            for key, assignment, pdos, image in images:
-                if len(image) != (expected := layout(pdos).bytes):
+            images: dict[str, tuple[ImageLayout, bytes]] = {
+                "rpdo": (layout(config.device.rpdo), slave.output), "tpdo": (layout(config.device.tpdo), slave.input)
+            }  # fmt: skip
+            for key, (expected, image) in images.items():
+                if len(image) != expected.bytes:
                     # SOEM may report the same error hundreds of times.
                     causes = "; ".join(dict.fromkeys(reported.get(position, ())))
+                    objects = " and ".join(
+                        f"0x{ASSIGN + manager:04X}" for one, manager, _ in assignments(config.device) if one == key
+                    )
+                    origin = f"the PDO mapping assigned through {objects}" if config.device.coe else "the PDOs"
                     faults.setdefault(position, []).append(
-                        f"{slave_label(position, config.name)}: SOEM could not read the PDO mapping assigned through "
-                        f"0x{assignment:04X} (key `{key}`): expected {expected} bytes, found {len(image)}"
+                        f"{slave_label(position, config.name)}: SOEM could not read {origin} (key `{key}`): expected "
+                        f"{expected.bytes} bytes, found {len(image)}"
+                        + ("" if config.device.coe else " in its EEPROM")
                         + (f" ({causes})" if causes else "")
                     )
         return faults
 
-    def _process_data(self, period_ns: int) -> SoemProcessData:
+    def _process_data(self, places: Sequence[Places], period_ns: int) -> SoemProcessData:
         assert self._socket is not None
         assert self._barrier is not None
         period_us = period_ns / 1000
         receive_us = max(1, round(self._fraction * period_us))
         barrier_us = max(1, round(min(receive_us, 0.75 * period_us - receive_us)))
         return SoemProcessData(
-            self._master, self._master.slaves, self._socket.fileno(), self._barrier, receive_us, barrier_us
+            self._master, self._master.slaves, places, self._socket.fileno(), self._barrier, receive_us, barrier_us
         )  # fmt: skip
 
     def request_state(self, state: AlState, positions: Iterable[int] | None = None) -> None:
@@ -346,7 +379,7 @@ class SoemBus:
     def watcher(self, report: Callable[[str], None]) -> SlaveWatcher:
         """Return the watcher of the configured slaves, all of them in OP; `report` receives its messages."""
         assert self._restorer is not None, "only a configured bus has something to restore"
-        return SlaveWatcher(self.port, self._names, self._restorer, report)
+        return SlaveWatcher(self.port, self._names, self._restorer, report, self._topology)
 
     def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
         wanted = range(1, len(self._names) + 1) if positions is None else positions
@@ -411,6 +444,7 @@ class SoemMaster(Master):
         found = bus.scan()
         report(f"{len(found)} slaves on {self.interface}")
         (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in found]))
+        self.config = replace(self.config, slaves=by_alias(self.config.slaves, found))
         data = bus.configure(self.config.slaves, round(self.config.cycle.period_us * 1000))
         for note in bus.notes:
             report(note)

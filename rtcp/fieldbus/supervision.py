@@ -15,8 +15,9 @@ from rtcp.fieldbus.bus import Bus
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.port_errors import ErrorCounters
 from rtcp.fieldbus.recovery import LONG_AGO, REPORT_INTERVAL_S, MonitoredSlave, SlaveRecovery
-from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort
+from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, T
 from rtcp.fieldbus.slave_setup import SlaveRestorer
+from rtcp.fieldbus.topology import Topology
 
 _PARK_S = 3.0
 _SILENCE_S = 0.25
@@ -24,17 +25,17 @@ _RARELY_S = 0.1
 """Interval at which error counters and parked slaves are read, s."""
 
 
-def _runs(words: Iterable[tuple[MonitoredSlave, str]]) -> Iterator[tuple[MonitoredSlave, MonitoredSlave, str]]:
-    """Yield the first and the last of each run of neighbours with the same text, and the text."""
+def _runs(words: Iterable[tuple[MonitoredSlave, T]]) -> Iterator[tuple[MonitoredSlave, MonitoredSlave, T]]:
+    """Yield the first and the last of each run of neighbours of which the same is said, and that."""
     run: list[MonitoredSlave] = []
-    shared = ""
+    shared: T | None = None
     for slave, text in words:
-        if run and (text != shared or slave.position != run[-1].position + 1):
+        if run and shared is not None and (text != shared or slave.position != run[-1].position + 1):
             yield run[0], run[-1], shared
             run = []
         run.append(slave)
         shared = text
-    if run:
+    if run and shared is not None:
         yield run[0], run[-1], shared
 
 
@@ -54,16 +55,23 @@ class SlaveWatcher:
         names: the slaves' names in the order of the cable.
         restorer: sets up a slave again.
         report: receives the messages.
+        topology: the tree of the slaves; None: a chain.
     """
 
     def __init__(
-        self, port: RegisterPort, names: Sequence[str], restorer: SlaveRestorer, report: Callable[[str], None]
-    ) -> None:  # fmt: skip
+        self,
+        port: RegisterPort,
+        names: Sequence[str],
+        restorer: SlaveRestorer,
+        report: Callable[[str], None],
+        topology: Topology | None = None,
+    ) -> None:
         self._port = port
+        self._topology = topology or Topology.chain(len(names))
         self._report = report
         self.slaves = tuple(MonitoredSlave(position, name) for position, name in enumerate(names, 1))
-        self.errors = ErrorCounters(port, names, report)
-        self._recovery = SlaveRecovery(port, self.slaves, restorer, report)
+        self.errors = ErrorCounters(port, names, report, self._topology)
+        self._recovery = SlaveRecovery(port, self.slaves, restorer, report, self._topology)
         self._rarely_at = 0.0
         self._answered_at = time.monotonic()
         self._silent_since: float | None = None
@@ -196,12 +204,18 @@ class SlaveWatcher:
         return slave.unreported > 0 and not slave.well and now - slave.fall_reported_at >= REPORT_INTERVAL_S
 
     def _report_left(self, left: Sequence[MonitoredSlave], now: float) -> None:
-        for first, last, words in _runs((slave, slave.words() + _fall_count(slave.unreported)) for slave in left):
+        lost = {slave.position for slave in left if slave.state is AlState.NONE}
+        for first, last, (words, _) in _runs(
+            (slave, (slave.words() + _fall_count(slave.unreported), self._topology.first_lost(slave.position, lost)
+                     if slave.position in lost else 0))
+            for slave in left
+        ):  # fmt: skip
             if first.state is not AlState.NONE:
                 where = "it is in" if first is last else "each is in"
                 self._report(f"{_slaves_named(first, last)} left OP: {where} {words}")
                 continue
-            before = "the master" if first.position == 1 else self.slaves[first.position - 2].label
+            parent = self._topology.parent(first.position)
+            before = self.slaves[parent - 1].label if parent else "the master"
             what = "it does not answer" if first is last else "none of them answers"
             check = f"check the supply of {first.label} and the cable between {before} and {first.label}"
             self._report(f"{_slaves_named(first, last)} left OP: {what}; {check}{_fall_count(first.unreported)}")

@@ -680,13 +680,22 @@ class Methods:
 
     @method(at_once=True)
     async def read_io(self, caller: Caller) -> Json:
-        """Return `inputs` and `outputs` of all IO boxes: `name`, `box`, `number`, level `value`, `has_function`."""
+        """Return `inputs` and `outputs`: `name`, `box`, `number`, level `value`, `has_function` of all terminals.
+
+        Channels of one bit of other slaves are among them; `channels`: `name`, `value` and `unit` of those with a
+        number, and of outputs whether they are `settable`, and their `range`.
+        """
         return self._terminals.read()
 
     @method()
     async def write_io(self, caller: Caller, name: str, value: bool) -> Json:
-        """Set the digital output of a name (`outputs.named`, or `box.number`) as `set_output` does."""
+        """Set the digital output of a name (`outputs.named`, `box.number`, `slave.channel`) as `set_output` does."""
         return await self._terminals.write(caller, name, value)
+
+    @method()
+    async def set_channel(self, caller: Caller, name: str, value: float) -> Json:
+        """Set an output with a number, `slave.channel`, in its unit."""
+        return await self._terminals.write_number(caller, name, value)
 
     @method(at_once=True)
     async def wait_io(

@@ -117,6 +117,18 @@ class SetOutput(Command):
     """Index among the IO boxes, in the order of the cable."""
 
 
+class SetChannel(Command):
+    """Set an output channel of an analog, encoder or generic slave."""
+
+    states = CALM | {State.ENABLING, State.STOPPING, State.HOMING}
+    slave: int
+    """Position on the cable, from 1."""
+    channel: int
+    """Its place among the output channels of the slave, from 0; padding does not count."""
+    value: float
+    """In the unit of the channel."""
+
+
 class MoveGripper(Command):
     """Open or close the gripper."""
 

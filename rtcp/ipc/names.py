@@ -82,6 +82,13 @@ class Names:
         slaves = self.config.slaves
         return slaves[position - 1].name if 1 <= position <= len(slaves) else "not configured"
 
+    def channel(self, position: int, number: int) -> str:
+        """Return an output channel of the slave at `position`, as SLAVE.CHANNEL."""
+        slaves = self.config.slaves
+        outputs = slaves[position - 1].device.outputs if 1 <= position <= len(slaves) else ()
+        channel = outputs[number].name if 0 <= number < len(outputs) else f"channel {number}"
+        return f"{self.slave(position)}.{channel}"
+
     def process(self, number: int) -> str:
         """Return the name of a process by its place in the configuration, from 0."""
         processes = self.config.processes
@@ -160,6 +167,7 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "second_link": lambda names, about: names.link(about.second),
     "clearance": lambda names, about: names.config.cartesian.clearance,
     "process_name": lambda names, about: names.process(about.process),
+    "channel_name": lambda names, about: names.channel(about.slave, about.channel),
     "slave_name": lambda names, about: names.slave(about.slave),
     "reaction": Names.reaction,
     "lost_cycles": lambda names, about: names.lost_cycles(),

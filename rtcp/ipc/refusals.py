@@ -130,6 +130,26 @@ class ReservedOutput(Refusal):
     output: int
 
 
+class ChannelNotSettable(Refusal):
+    """{channel_name} cannot be set: only outputs of analog, encoder and generic slaves that no process writes can"""
+
+    slave: int
+    """Position on the cable, from 1."""
+    channel: int
+
+
+class ChannelOutOfRange(Refusal):
+    """{channel_name}: {value:.6g} cannot be set: allowed is {lowest:.6g} to {highest:.6g} (min, max and type in the
+    device file of slave {slave_name})"""
+
+    slave: int
+    """Position on the cable, from 1."""
+    channel: int
+    value: float
+    lowest: float
+    highest: float
+
+
 class NoGripper(Refusal):
     """no gripper is configured (gripper in {file})"""
 

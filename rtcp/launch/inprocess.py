@@ -15,7 +15,7 @@ from typing import Any, cast
 
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.al_state import AlState, state_name
-from rtcp.fieldbus.bus import SlaveInfo, SlaveState, slave_label, station_of
+from rtcp.fieldbus.bus import PortErrors, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.pdo import layout as image_of
@@ -413,4 +413,5 @@ def _info(slave: InProcessSlave) -> SlaveInfo:
         slave.position, status.station, identity.name, identity.vendor_id, identity.product_code, identity.revision,
         identity.serial, 0, status.words(), status.code, "", True, None, (), (), 8 * slave.output_bytes,
         8 * slave.input_bytes, (), 0, slave.device.supports_dc, 0, (), slave.position - 1,
+        1, PortErrors(),
     )  # fmt: skip

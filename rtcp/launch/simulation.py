@@ -22,6 +22,7 @@ from rtcp.control.cycle import Cycle, address_of, make_discipline, record_schema
 from rtcp.control.partners import Partners
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import ProcessData
+from rtcp.fieldbus.errors import SdoAborted
 from rtcp.fieldbus.master import Master
 from rtcp.fieldbus.supervision import SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
@@ -219,7 +220,9 @@ def _devices(config: ArmConfig, segment: SegmentConfig, positions: Sequence[floa
     options = [dict(slave.options) for slave in segment.slaves]
     slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
     for joint, position in zip(config.joints, positions or (), strict=False):
-        options[slots[joint.slave]]["initial_position"] = position
+        slot = slots[joint.slave]
+        of_axis = "" if segment.slaves[slot].model else f"axis{joint.axis}_"
+        options[slot][f"{of_axis}initial_position"] = position
     descriptions = Descriptions(segment.source.parent)
     return [
         descriptions.make(replace(slave, options=chosen)) for slave, chosen in zip(segment.slaves, options, strict=True)
@@ -301,8 +304,9 @@ class InlineService(BusService):
         if self._axis >= 0:
             axis, self._axis = self._axis, -1
             position, of_slave = self._addresses[axis]
-            index = _ERROR_CODE + (of_slave - 1) * OBJECTS_PER_AXIS
-            code = int.from_bytes(self._segment.sdo_read(position, index, 0), "little")
+            index, code = _ERROR_CODE + (of_slave - 1) * OBJECTS_PER_AXIS, 0
+            with contextlib.suppress(SdoAborted):
+                code = int.from_bytes(self._segment.sdo_read(position, index, 0), "little")
             if code:
                 self._board.text(f"{self._names[axis]}: the drive's error code is 0x{code:04X}")
         if turn % _WATCH_TURNS == 0:

@@ -142,7 +142,8 @@ class Harness:
         """Return the segment's ground truth of each joint's drive, as `position_rad`, `torque_on`."""
         found = {slave["position"]: slave for slave in self.segment.truth()["slaves"]}
         positions = {slave.name: at for at, slave in enumerate(self.config.slaves, 1)}
-        return [found[positions[joint.slave]] for joint in self.config.joints]
+        slaves = [(found[positions[joint.slave]], joint.axis) for joint in self.config.joints]
+        return [slave["axes"][axis - 1] if "axes" in slave else slave for slave, axis in slaves]
 
     def joint_positions(self) -> list[float]:
         """Return the true joint positions, rad."""
@@ -156,7 +157,8 @@ class Harness:
         """
 
         def moved_ns() -> int:
-            return max((one["moved_ns"] for one in self.segment.truth()["slaves"] if "moved_ns" in one), default=0)
+            drives = (one for slave in self.segment.truth()["slaves"] for one in slave.get("axes", [slave]))
+            return max((drive["moved_ns"] for drive in drives if "moved_ns" in drive), default=0)
 
         standstill_ns = round(_STANDSTILL_S * 1e9)
         if not self.wait_for(lambda: time.monotonic_ns() - moved_ns() > standstill_ns, _STOP_TIMEOUT_S):

@@ -60,6 +60,8 @@ SLAVE = {
     "delay_ns": 820,
     "ports": ["open", "no link", "closed", "closed"],
     "parent": 0,
+    "parent_port": 0,
+    "port_errors": {"rx": [0, 3, 0, 0], "forwarded": [0, 0, 0, 0], "links": [0, 1, 0, 0]},
 }
 
 

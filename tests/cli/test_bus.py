@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.cli.bus import STRUCTS, decode, encode, parse_object
+from rtcp.cli.bus import STRUCTS, _branches, decode, encode, parse_object
 from rtcp.cli.output import CommandError
 
 
@@ -20,10 +20,16 @@ def test_a_scan_shows_identity_state_pdo_map_clock_and_delay(platform: Any, rtcp
     for shown in (
         "virtual: 1 slave", "DIEWU 16DI16DO", "vendor 0x00000D1E", "product 0x00161602", "revision 0x00010000",
         "serial 7", "PRE-OP", "CoE", "0x1080 128 bytes", "SM0 0x1000", "RxPDO 0x1600", "0x7000:1", "TxPDO 0x1A00",
-        "(padding)", "2.4", "820", "0 open", "behind the master",
+        "(padding)", "2.4", "820", "0 open", "behind the master", "1 no link (3 damaged frames, 1 lost link)",
     ):  # fmt: skip
         assert shown in ended.out
     assert max(len(line) for line in ended.out.splitlines()) <= 80
+
+
+def test_the_slaves_of_a_branch_are_indented_and_the_last_branch_goes_on_where_its_junction_stands() -> None:
+    tree = [(0, 0), (1, 3), (2, 1), (1, 1), (4, 1)]
+    slaves = [{"position": n, "parent": parent, "parent_port": port} for n, (parent, port) in enumerate(tree, 1)]
+    assert _branches(slaves) == [0, 1, 1, 0, 0]
 
 
 def test_the_json_of_a_scan_is_the_list_of_slaves(platform: Any, rtcp: Callable[..., Any]) -> None:

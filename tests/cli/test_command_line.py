@@ -12,8 +12,8 @@ import pytest
 from rtcp import __version__
 
 COMMANDS = ("start", "stop", "status", "enable", "disable", "reset", "halt", "mode", "move", "run", "jog", "joystick",
-            "output", "gripper", "zero", "home", "limits", "scan", "sdo", "segment", "irc5", "demo", "soak", "doctor",
-            "service", "faults", "arm")  # fmt: skip
+            "output", "io", "gripper", "zero", "home", "limits", "scan", "sdo", "segment", "irc5", "demo", "soak",
+            "doctor", "service", "faults", "arm")  # fmt: skip
 SUBCOMMANDS = ("limits set", "sdo write", "segment fault", "irc5 fault", "irc5 mode", "service install", "faults show",
                "arm fk", "arm ik", "arm plot", "arm urdf", "arm export-c", "arm export-moveit")  # fmt: skip
 

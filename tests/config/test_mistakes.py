@@ -226,31 +226,44 @@ MISTAKES: list[tuple[str, Changes, str]] = [
     (ARM, driven("drive7", "drive6"),
      'gripper.joint.slave: found the text "drive6", the slave of joints[5].slave; each needs its own'),
     (DRIVE, [("kind: cia402", "kind: servo")],
-     'kind: found the text "servo", allowed is one of cia402, generic, io, joint'),
+     'kind: found the text "servo", allowed is one of analog, cia402, coupler, encoder, generic, io, joint'),
     (DRIVE, [("index: 0x6071", "index: 0x16071")],
      "rpdo[0].channels[3].index: found 90225, allowed is an integer from 0 to 65535"),
     (DRIVE, [("configurable_pdos: true", "configurable_pdos: yes")],
      'configurable_pdos: found the text "yes", allowed is true or false; yes, no, on and off are texts here'),
-    (DRIVE, [("type: int8, name: modes_of_operation}", "type: int24, name: modes_of_operation}")],
-     'rpdo[0].channels[4].type: found the text "int24", allowed is one of bool, int8, uint8, int16, uint16, int32, '
-     "uint32, int64, uint64, float32, float64"),
+    (DRIVE, [("type: int8, name: modes_of_operation}", "type: int12, name: modes_of_operation}")],
+     'rpdo[0].channels[4].type: found the text "int12", allowed is one of bool, int8, uint8, int16, uint16, int24, '
+     "uint24, int32, uint32, int40, uint40, int48, uint48, int56, uint56, int64, uint64, float32, float64, bits, "
+     "bytes"),
     (BOX, [("kind: io", "kind: cia402")],
      "rpdo: kind cia402 needs channels named controlword, target_position; "
      "its channels are outputs"),
     (DRIVE, [("type: uint16, name: controlword", "type: uint32, name: controlword")],
      "rpdo[0].channels[0].type: found uint32 for controlword, allowed is uint16"),
     (DRIVE, [(TORQUE, "{index: 0x6071, sub_index: 0, type: bool, name: target_torque, factor: 0.0001}")],
-     "rpdo[0].channels[3].type: found bool for target_torque, allowed is int8 or uint8 or int16 or uint16 or int32 "
-     "or uint32 or int64 or uint64"),
-    (DRIVE, [(TORQUE, TORQUE + "\n      - {index: 0, sub_index: 0, type: bool}")],
-     "rpdo: found 121 bits in all, allowed are whole bytes; fill up with padding (`{index: 0, sub_index: 0, type: "
-     "bool}`)"),
+     "rpdo[0].channels[3].type: found bool for target_torque, allowed is int8 or uint8 or int16 or uint16 or int24 "
+     "or uint24 or int32 or uint32 or int40 or uint40 or int48 or uint48 or int56 or uint56 or int64 or uint64"),
+    (DRIVE, [(TORQUE, TORQUE + "\n      - {index: 0, sub_index: 0, type: bits}")],
+     "rpdo[0].channels[4]: the key bits is missing; the type bits needs a length of 1 to 64"),
+    (DRIVE, [(TORQUE, TORQUE + "\n      - {index: 0x6072, sub_index: 0, type: bits, bits: 65, name: wide}")],
+     "rpdo[0].channels[4].bits: found 65, allowed is 1 to 64 for a channel of the type bits"),
+    (DRIVE, [(TORQUE, TORQUE + "\n      - {index: 0x6072, sub_index: 0, type: bytes, bits: 12, name: field}")],
+     "rpdo[0].channels[4].bits: found 12, allowed is a multiple of 8 from 8 to 248 for the type bytes"),
+    (DRIVE, [(TORQUE, TORQUE.replace("type: int32", "type: int32, bits: 8"))],
+     "rpdo[0].channels[3].bits: found 8, but the type int32 has 32 bits; leave it out, or write the type bits or "
+     "bytes"),
+    (DRIVE, [(f"index: {n}", f"sync_manager: 2\n    index: {n}") for n in ("0x1600", "0x1A00")],
+     "tpdo[0].sync_manager: found 2, a sync manager of the rpdo; each carries one direction"),
+    (DRIVE, [("configurable_pdos: true", "coe: false")],
+     "sdo: found 6 entries, but the device has no CoE (coe: false); leave them out"),
+    (DRIVE, [("assign_activate: 0x0300", "assign_activate: 0x0300\nsync0_factor: 0")],
+     "sync0_cycle_us: found 0, allowed is a cycle above 0 us where sync0_factor is 0"),
     (DRIVE, [("name: target_velocity", "name: target_position")],
      'rpdo[0].channels[2].name: found the text "target_position" again; each channel of the rpdo needs its own'),
     (DRIVE, [(TORQUE, "{index: 0x6071, sub_index: 0, type: int32, name: target_torque, factor: 0}")],
      "rpdo[0].channels[3].factor: found 0, allowed is any number but 0"),
     (DRIVE, [("index: 0x1A00", "index: 0x1600")],
-     "tpdo[0].index: found 0x1600, allowed is 0x1a00 to 0x1bff, the objects of a tpdo"),
+     "tpdo[0].index: found 0x1600, one of the objects of a rpdo (0x1600 to 0x17ff); allowed is one of a tpdo"),
     (BOX, [("    channels:\n      - {index: 0x7000, sub_index: 1, type: uint16, name: outputs}", "    channels: []\n")],
      "rpdo[0].channels: found an empty list, allowed is a list with at least one entry"),
     (DRIVE, [("type: int16, value: 6", "type: int16, value: 40000")],
@@ -354,7 +367,7 @@ def test_a_mistake_is_named_with_file_and_line(
         (ARM, USER, USER.replace("-0.1", "0.9"),
          "cartesian.keep_out[0]: found min 0.9 and max 0.85 in z; min must be less than max"),
         (DRIVE, "kind: cia402", "kind: servo",
-         'kind: found the text "servo", allowed is one of cia402, generic, io, joint'),
+         'kind: found the text "servo", allowed is one of analog, cia402, coupler, encoder, generic, io, joint'),
     ],
 )  # fmt: skip
 def test_one_mistake_gives_one_sentence_with_its_line(

@@ -20,6 +20,8 @@ OWN = [
     "simple_message.md",
     "devices.md",
     "descriptions.md",
+    "channels.md",
+    "drives.md",
     "segment.md",
     "behaviours.md",
     "guiding.md",
@@ -31,7 +33,7 @@ KEYS = {
     "motion": list(keys_of(MotionFile)),
 }
 UNITS = r"\b(m|rad)(/s[²³]?)?\b|\bNm\b|\bkg\b|\b1/s\b|, (s|ms|us|ns)\b|parts per million|, A\b|[Rr]evolution"
-WITHOUT_UNIT = r"[Ff]raction|[Mm]ultiple|Factor|per count|Value to write"
+WITHOUT_UNIT = r"SI value|channel's unit|[Ff]raction|[Mm]ultiple|Factor|per count|Value to write"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -43,9 +45,9 @@ def test_the_generated_parts_of_a_page_are_up_to_date(page: Path) -> None:
 @pytest.mark.parametrize("file", KEYS)
 def test_every_key_of_a_file_is_on_exactly_one_page(file: str) -> None:
     arm = "".join((FOLDER / name).read_text() for name in (*OWN[:5], "guiding.md", "kinematics.md", "processes.md"))
-    text = {"arm": arm} | {
-        kind: (FOLDER / page).read_text()
-        for kind, page in (("device", "devices.md"), ("segment", "segment.md"), ("motion", "motion.md"))
+    device = "".join((FOLDER / name).read_text() for name in ("devices.md", "channels.md", "drives.md"))
+    text = {"arm": arm, "device": device} | {
+        kind: (FOLDER / page).read_text() for kind, page in (("segment", "segment.md"), ("motion", "motion.md"))
     }
     written = re.findall(r"^\| `([\w.\[\]]+)` \|.*\|.*\|.*\|$", text[file], re.MULTILINE)
     assert sorted(set(written) & {key.path for key in KEYS[file]}) == sorted(key.path for key in KEYS[file])

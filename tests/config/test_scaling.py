@@ -69,6 +69,7 @@ TURN = 2 * math.pi
         (SCALING, TURN / 409600, TURN / 60 / 100, 0.5e-3 * 100),
         (SCALING | {"feed_constant": 36000}, TURN / 36000, TURN / 60 / 100, 0.5e-3 * 100),
         (SCALING | {"velocity_at": "output"}, TURN / 409600, TURN / 60, 0.5e-3 * 100),
+        (SCALING | {"torque_at": "output"}, TURN / 409600, TURN / 60 / 100, 0.5e-3),
         (SCALING | {"velocity_unit": "urpm"}, TURN / 409600, 1e-6 * TURN / 60 / 100, 0.5e-3 * 100),
         (SCALING | {"velocity_unit": "counts/s", "external_gear_ratio": -2}, *2 * (-TURN / 819200,), -1e-3 * 100),
         ({"encoder_increments": 524288, "rated_current": 4, "torque_constant": 2}, *2 * (TURN / 524288,), 8e-3),

@@ -28,6 +28,7 @@ from rtcp.ipc.commands import (
     RunInStep,
     RunLines,
     RunTrajectory,
+    SetChannel,
     SetControlMode,
     SetDriveMode,
     SetLimits,
@@ -75,7 +76,7 @@ HOLDING = [
     move_to(0.1, 0.1), RunTrajectory(0, 1), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
     RunInStep(0, 1, 1, 0, 0, 1, 0.1),
     Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2),
-    Guide(), Home(0), *READY[3:],
+    Guide(), Home(0), SetChannel(1, 0, 1.0), *READY[3:],
 ]  # fmt: skip
 WITH_LEASE = {State.READY: READY, State.HOLDING: HOLDING, State.FAULT: [Reset()]}
 """Commands that need the lease, in a state that accepts them."""

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from rtcp.config import default_config, load
+from rtcp.config import default_config, load, load_device, load_segment, segment_path
 from rtcp.config.model import ArmConfig, Pdo, SlaveConfig, StartupSdo
-from rtcp.ipc.commands import Enable, Home, MoveJoints, SetControlMode, SetDriveMode
+from rtcp.config.segment import SegmentConfig, SegmentSlave
+from rtcp.fieldbus.errors import BusError
+from rtcp.ipc.commands import Enable, Home, MoveJoints, Reset, SetControlMode, SetDriveMode
+from rtcp.ipc.events import DriveFault, ProcessDataLost, SlaveLost
 from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import DriveModeUnsupported, HomingUnsupported
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.launch.simulation import Simulation
+from rtcp.virtual.models.servo import ServoAxis
+from tests.drive_esi import Objects, write_esi
 
 SHIPPED = load(default_config())
 BENT = (0.0, 0.23, 2.38, 0.0, 0.57, 0.0)
@@ -64,3 +70,121 @@ def test_every_other_mode_is_refused_with_the_reason(arm: Simulation) -> None:
         "joint3 has no homing here: the PDOs of its drive have no modes_of_operation, so it stays in CSP"
     )
     assert arm.state is State.HOLDING
+
+
+# -- the device files of standard drives, on slaves of an ESI file -------------------------------------------------
+
+RATED = {"myactuator-x6-60": 9.5 * 2.1, "two-axis-drive": 40.0}
+"""Nm, by device file."""
+
+
+def objects(axes: tuple[int, ...], encoder: int = 131072, gear: int = 50) -> Objects:
+    """What a two-axis drive holds."""
+    return {
+        index + 0x800 * (axis - 1): held
+        for axis in axes
+        for index, held in (
+            (0x608F, (encoder, 1)),
+            (0x6091, (gear, 1)),
+            (0x6076, ("UDINT", 40_000)),
+            (0x603F, ("UINT", 0)),
+        )
+    }
+
+
+def arm_of(directory: Path, key: str, held: Objects, **options: float) -> tuple[ArmConfig, SegmentConfig]:
+    """The shipped arm with drives of another device file, as many as its joints need."""
+    device = load_device(default_config().parent / "devices" / f"{key}.yaml")
+    write_esi(directory / "drive.xml", device, held)
+    axes = len(device.axes)
+    slaves = tuple(SlaveConfig(f"drive{i + 1}", device, f"{key}.yaml") for i in range(6 // axes))
+    joints = tuple(
+        replace(joint, slave=f"drive{i // axes + 1}", axis=i % axes + 1) for i, joint in enumerate(SHIPPED.joints)
+    )
+    config = replace(SHIPPED, slaves=(SHIPPED.slaves[0], *slaves), joints=joints)
+    given = {**options, "rated_torque": RATED[key], "temperature": 30.0}
+    described = SegmentSlave(esi="drive.xml", behaviour="cia402", options=given)
+    shipped = load_segment(segment_path(SHIPPED))
+    segment = replace(
+        shipped, slaves=(shipped.slaves[0], *[described] * len(slaves)), source=directory / "segment.yaml"
+    )
+    return replace(config, cycle=replace(SHIPPED.cycle, period_us=1000.0)), segment
+
+
+ARMS = [
+    ("myactuator-x6-60", {}, {"counts_per_turn": 131072.0}),
+    ("two-axis-drive", objects((1, 2)), {}),
+]  # fmt: skip
+
+
+@pytest.fixture(params=ARMS, ids=lambda arm: arm[0])
+def standard(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Simulation]:
+    """Enabled at `BENT`."""
+    key, held, options = request.param
+    config, segment = arm_of(tmp_path, key, held, **options)
+    with Simulation(config, follow_clock=False, positions=BENT, segment=segment) as made:
+        start(made)
+        yield made
+
+
+def start(arm: Simulation) -> None:
+    assert arm.until(lambda: arm.state is State.READY, 5.0)
+    arm.run(0.1)
+    arm.acquire()
+    assert arm.send(Enable()).refusal is None
+    assert arm.until(lambda: arm.state is State.HOLDING, 5.0), arm.events
+
+
+def servos(arm: Simulation) -> list[ServoAxis]:
+    return [servo for slave in arm.bus.slaves for servo in slave.device.servos]
+
+
+def test_an_arm_of_standard_drives_moves_where_it_is_sent(standard: Simulation) -> None:
+    goal = (0.2, 0.35, 2.2, -0.2, 0.4, 0.3)
+    assert standard.send(MoveJoints(goal, 0.5, True)).refusal is None
+    standard.run(0.05)
+    assert standard.until(lambda: standard.state is State.HOLDING, 8.0)
+    standard.run(0.3)
+    assert [servo.mechanics.position for servo in servos(standard)] == [pytest.approx(q, abs=5e-3) for q in goal]
+    assert standard.loop.arm.state.actual == [pytest.approx(q, abs=5e-3) for q in goal]
+    held = [servo.axis.torque for servo in servos(standard)]
+    assert standard.loop.arm.state.actual_torque == [pytest.approx(torque, abs=0.5) for torque in held]
+    assert max(map(abs, held)) > 3.0
+
+
+def test_a_fault_of_one_axis_stops_all_and_names_its_joint(standard: Simulation) -> None:
+    assert standard.send(MoveJoints((0.3, *BENT[1:]), 0.3, True)).refusal is None
+    standard.run(0.2)
+    servos(standard)[1].inject_fault(0x2310)
+    assert standard.until(lambda: standard.state is State.FAULT, 2.0)
+    standard.run(0.5)
+    (fault,) = [record.event for record in standard.events if isinstance(record.event, DriveFault)]
+    assert fault.axis == 1
+    texts = [text.sentence for text in standard.observer.texts_since(0)]
+    has_code = standard.config.slaves[1].device.axes == (1, 2)
+    assert any(text.startswith("joint2: the drive's error code is 0x2310") for text in texts) is has_code, texts
+    assert not servos(standard)[1].powered
+    assert standard.send(Reset()).refusal is None
+    assert standard.until(lambda: standard.state is State.READY, 5.0)
+
+
+def test_the_loss_of_a_slave_concerns_all_its_axes(tmp_path: Path) -> None:
+    config, segment = arm_of(tmp_path, *ARMS[1][:2])
+    with Simulation(config, follow_clock=False, positions=BENT, segment=segment) as arm:
+        start(arm)
+        arm.bus.drop(3, 2, 0x001B)
+        assert arm.until(lambda: arm.state is State.FAULT, 2.0)
+        arm.run(0.5)
+        assert {type(record.event) for record in arm.events} & {SlaveLost, ProcessDataLost}
+        assert not any(servo.powered for servo in servos(arm)[2:4])
+        assert arm.send(Reset()).refusal is None
+        assert arm.until(lambda: arm.state is State.READY, 5.0)
+        assert arm.send(Enable()).refusal is None
+        assert arm.until(lambda: arm.state is State.HOLDING, 5.0)
+
+
+def test_a_drive_whose_second_axis_has_another_gear_does_not_start(tmp_path: Path) -> None:
+    held = {**objects((1, 2)), 0x6891: (100, 1)}
+    config, segment = arm_of(tmp_path, "two-axis-drive", held)
+    with pytest.raises(BusError, match=r"slave 2 \(drive1\), axis 2: .*0x6891 holds 100 .* the file has 50 "):
+        Simulation(config, segment=segment)

@@ -29,6 +29,7 @@ from rtcp.ipc.commands import (
     RunInStep,
     RunLines,
     RunTrajectory,
+    SetChannel,
     SetControlMode,
     SetDriveMode,
     SetLimits,
@@ -52,6 +53,7 @@ from rtcp.ipc.events import (
     SlaveLost,
 )
 from rtcp.ipc.refusals import (
+    ChannelNotSettable,
     DamagedRow,
     EmergencyStopPressed,
     MassesUnknown,
@@ -99,6 +101,7 @@ apply_torque     .     .     .     =     =     .     .     .     .     .     .  
 guide            .     .     .     =     .     .     .     .     .     .     .     .     .
 halt             .     =     .     =     stop  =     =     =     .     .     .     .     .
 set_output       .     =     =     =     =     =     =     =     .     =     .     .     .
+set_channel      .     =     =     =     =     =     =     =     .     .     .     .     .
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
 set_limits       .     =     .     =     =     .     =     .     .     =     =     .     .
 set_speed_override = = =     =     =     =     =     =     =     =     =     =     =
@@ -131,7 +134,8 @@ COMMANDS: dict[str, Command] = {
         Enable(), Disable(), Reset(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1),
         RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
         Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
-        MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Guide(), Halt(), SetOutput(5, True),
+        MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Guide(), Halt(),
+        SetOutput(5, True), SetChannel(1, 0, 1.0),
         MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), Pause(), Resume(), SetTool(0), SetPayload(0.1),
         SetZero(0, 0.0), Home(0), Shutdown(),
     )
@@ -141,6 +145,7 @@ FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
     RunTrajectory: (DamagedRow, PlanStartsElsewhere),
     RunInStep: (StartOutOfReach, WrongState),
     ExtendTrajectory: (NotOpen,),
+    SetChannel: (ChannelNotSettable,),
     RunLines: (NoGeometry,),
     MoveAtVelocity: (WrongControlMode,),
     ApplyTorque: (WrongControlMode,),

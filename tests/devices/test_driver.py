@@ -39,7 +39,9 @@ def test_a_driver_of_another_package_is_found_and_offers_its_channels_in_si_unit
 
 
 def test_a_kind_without_a_driver_is_refused_with_the_kinds_that_are_installed():
-    wanted = r"a force sensor: no driver is installed for kind force .* cia402, generic, io, joint"
+    wanted = (
+        r"a force sensor: no driver is installed for kind force .* analog, cia402, coupler, encoder, generic, io, joint"
+    )
     with pytest.raises(DeviceError, match=wanted):
         make_driver(SENSOR, 0.001)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import pytest
@@ -49,11 +50,11 @@ def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Dire
     port.lost = {(DatagramCommand.BWR, 0x0900)}
     before = port.read(STATION, 0x0920, 8)
     with pytest.raises(BusError, match=r"slave 3 \(drive2\): the local times could not be latched"):
-        take_over_time(port, 3, LABEL, bytes(4), (1, 2), always=True)
+        take_over_time(port, STATION, LABEL, bytes(4), (1, 2), always=True)
     assert port.read(STATION, 0x0920, 8) == before
 
 
-@pytest.mark.parametrize("register", [0x0981, 0x0980, 0x0990, 0x09A0])
+@pytest.mark.parametrize("register", [0x0980, 0x0990, 0x09A0])
 def test_sync0_is_not_started_with_half_of_its_settings(port: Direct, register: int) -> None:
     port.lost = {(DatagramCommand.FPWR, register)}
     with pytest.raises(BusError, match=rf"slave 3 \(drive2\) did not take .* 0x{register:04X}"):
@@ -65,7 +66,7 @@ def test_a_cycle_of_sync0_that_is_not_kept_is_told(port: Direct, monkeypatch: py
     # One that writes nothing: the slave answers and keeps what it had, a single SYNC0.
     put = port.put
     monkeypatch.setattr(port, "put", lambda station, address, *rest: address == 0x09A0 or put(station, address, *rest))
-    with pytest.raises(BusError, match=r"does not keep the cycle of SYNC0, 1000 us \(register 0x09A0\)"):
+    with pytest.raises(BusError, match=r"does not keep the cycle of SYNC0, 1000 us, .* \(registers 0x09A0 and"):
         start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
     assert port.read(STATION, 0x0981, 1) == b"\0"
 
@@ -74,11 +75,11 @@ def test_an_activation_that_is_not_kept_is_told(port: Direct, monkeypatch: pytes
     put = port.put
 
     def keeps_sync1_off(station: int, address: int, data: bytes, label: str) -> None:
-        put(station, address, b"\x03" if (address, data) == (0x0981, b"\x07") else data, label)
+        put(station, address, b"\x30\x03" if (address, data) == (0x0980, b"\x30\x07") else data, label)
 
     monkeypatch.setattr(port, "put", keeps_sync1_off)
-    device = with_device(arm(3)[2], assign_activate=0x0700).device
-    with pytest.raises(BusError, match="`assign_activate` 0x0700 reads back from register 0x0981 as 0x03"):
+    device = with_device(arm(3)[2], assign_activate=0x0730).device
+    with pytest.raises(BusError, match="`assign_activate` 0x0730 reads back from register 0x0980 as 0x0330"):
         start_sync(port, STATION, LABEL, device, PERIOD)
 
 
@@ -92,10 +93,33 @@ def test_sync0_that_would_have_begun_in_the_past_is_started_again(
     put = port.put
 
     def stalls_once(station: int, address: int, data: bytes, label: str) -> None:
-        if address == 0x0980:
+        if (address, data) == (0x0980, bytes(2)):
             monkeypatch.setattr(clocks, "_SYNC_DELAY_NS", next(delays))
         put(station, address, data, label)
 
     monkeypatch.setattr(port, "put", stalls_once)
     start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
     assert port.read(STATION, 0x0981, 1) == b"\x03"
+
+
+@pytest.mark.parametrize(
+    ("keys", "sync0", "after"),
+    [
+        ({}, 1_000_000, 0),
+        ({"sync0_factor": 2, "sync0_shift_us": 100.0}, 2_000_000, 0),
+        # Ten samples a cycle: SYNC1 with every tenth SYNC0.
+        ({"sync0_factor": -10, "sync1_factor": -1}, 100_000, 900_000),
+        ({"sync1_factor": 1, "sync1_shift_us": 25.5}, 1_000_000, 25_500),
+        ({"sync1_factor": 2}, 1_000_000, 1_000_000),
+        ({"sync0_factor": 0, "sync0_cycle_us": 250.0, "sync1_cycle_us": 500.0}, 250_000, 250_000),
+    ],
+)
+def test_sync0_and_sync1_follow_the_factors_of_the_dc_mode_and_the_word_is_written_whole(
+    port: Direct, keys: dict[str, float], sync0: int, after: int
+) -> None:
+    device = with_device(arm(3)[2], assign_activate=0x0730, **keys).device
+    start_sync(port, STATION, LABEL, device, PERIOD)
+    assert port.read(STATION, 0x0980, 2) == b"\x30\x07"
+    assert port.read(STATION, 0x09A0, 8) == struct.pack("<II", sync0, after)
+    start = int.from_bytes(port.read(STATION, 0x0990, 8) or b"", "little")
+    assert (start - round(device.sync0_shift_us * 1000)) % max(sync0, PERIOD) % sync0 == 0

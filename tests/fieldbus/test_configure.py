@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
 from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
-from rtcp.fieldbus.pdo import layout_faults, mapping_of, mapping_text
-from rtcp.fieldbus.scan import parents
-from rtcp.fieldbus.slave_setup import identity_faults, interpolation_time
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.image import limit_faults
+from rtcp.fieldbus.pdo import layout, mapping_of, mapping_text
+from rtcp.fieldbus.slave_setup import by_alias, identity_faults, interpolation_time
+from rtcp.fieldbus.topology import Topology
 
 
 def slave(name: str, vendor: int = 1, product: int = 2, entries=("uint16",)) -> SlaveConfig:
@@ -59,24 +62,80 @@ def test_a_mapping_lists_index_subindex_and_bits():
     assert mapping_text(mapping_of((padding,))) == "17 bits (0x1A00: 0x6041:0/16, 0x0000:0/1)"
 
 
-@pytest.mark.parametrize(("entries", "faults"), [(("bool",) * 3, 1), (("bool",) * 8, 0), (("uint8",), 0)])
-def test_an_image_below_a_byte_is_refused(entries, faults):
-    assert len(layout_faults(slave("a", entries=entries).device)) == faults
+def with_managers(*bits_of: tuple[int, int], sent: int = 1) -> SlaveConfig:
+    """A slave that maps so many bits into each of these sync managers of its inputs, and bytes into one of outputs."""
+    tpdo = tuple(
+        Pdo(0x1A00 + n, (PdoEntry(0x6000, n, "bits", f"c{n}", bits=bits),), manager)
+        for n, (manager, bits) in enumerate(bits_of)
+    )
+    rpdo = (Pdo(0x1600, (PdoEntry(0x7000, 1, "bytes", "out", bits=8 * sent),)),)
+    return SlaveConfig("a", DeviceDescription("kind", "io", 1, 2, rpdo, tpdo))
+
+
+def test_each_sync_manager_begins_at_a_whole_byte_in_the_order_of_its_number():
+    image = layout(with_managers((5, 3), (3, 12)).device.tpdo)
+    assert [(channel.name, channel.bit_offset) for channel in image.channels] == [("c1", 0), ("c0", 16)]
+    assert image.bits == 19
+
+
+@pytest.mark.parametrize(
+    ("slaves", "said"),
+    [
+        ([with_managers((3, 8), (4, 4))], ""),
+        ([with_managers((3, 4), (4, 4))], "slave 1 (a): the sync managers of key `tpdo` carry 4 and 4 bits, which need "
+         "2 bytes; SOEM gives them 1"),
+        ([with_managers(*((n, 8) for n in range(3, 7)))], "slave 1 (a): `rpdo` and `tpdo` use 5 sync managers, each of "
+         "which needs an FMMU; SOEM has room for 4"),
+        ([with_managers(sent=21)] * 199, "the process data of all slaves have 4179 bytes; SOEM has room for 4096"),
+        ([with_managers()] * 200, "(key `slaves`) lists 200 slaves; SOEM has room for 199"),
+    ],
+)  # fmt: skip
+def test_what_soem_has_no_room_for_is_told_before_it_maps(slaves, said):
+    assert "\n".join(limit_faults(slaves)).count(said) == 1 if said else not limit_faults(slaves)
 
 
 OPEN, NONE = "open", "no link"
+END, MIDDLE = (OPEN, NONE, NONE, NONE), (OPEN, OPEN, NONE, NONE)
 
 
 @pytest.mark.parametrize(
     ("ports", "expected"),
     [
-        ([(OPEN, OPEN, NONE, NONE)] * 3 + [(OPEN, NONE, NONE, NONE)], [0, 1, 2, 3]),
-        # A junction at 1 with a branch of two, then one more at its other port.
-        (
-            [(OPEN, OPEN, NONE, OPEN), (OPEN, OPEN, NONE, NONE), (OPEN, NONE, NONE, NONE), (OPEN, NONE, NONE, NONE)],
-            [0, 1, 2, 1],
-        ),
+        ([MIDDLE, MIDDLE, MIDDLE, END], [(0, 0), (1, 1), (2, 1), (3, 1)]),
+        # A junction with two slaves at port 3, which the frame visits first, one at port 1, two at port 2.
+        ([(OPEN,) * 4, MIDDLE, END, END, MIDDLE, END], [(0, 0), (1, 3), (2, 1), (1, 1), (1, 2), (5, 1)]),
+        # A junction behind a branch of another junction.
+        ([(OPEN, OPEN, NONE, OPEN), (OPEN, OPEN, OPEN, NONE), END, END, END], [(0, 0), (1, 3), (2, 1), (2, 2), (1, 1)]),
     ],
 )  # fmt: skip
-def test_the_parent_of_a_slave_follows_from_the_open_ports(ports, expected):
-    assert parents(ports) == expected
+def test_the_tree_of_the_slaves_follows_from_the_open_ports(ports, expected):
+    tree = Topology.of(ports)
+    assert [(tree.parent(position), tree.port(position)) for position in range(1, len(ports) + 1)] == expected
+    assert all(tree.child_at(*at) == position for position, at in enumerate(expected, 1))
+
+
+def test_the_first_of_the_slaves_that_are_lost_together_hangs_at_one_that_answers():
+    tree = Topology.of([(OPEN,) * 4, MIDDLE, END, END, MIDDLE, END])
+    lost = {2, 3, 5, 6}
+    assert [tree.first_lost(position, lost) for position in (2, 3, 5, 6)] == [2, 2, 5, 5]
+    assert [tree.depth(position) for position in range(1, 7)] == [0, 1, 2, 1, 1, 2]
+
+
+def answering(*aliases: int) -> list[SimpleNamespace]:
+    return [SimpleNamespace(position=n, name="thing", alias=alias) for n, alias in enumerate(aliases, 1)]
+
+
+def test_slaves_with_an_alias_are_found_where_they_hang_and_the_others_in_their_order():
+    slaves = [replace(slave(name), alias=alias) for name, alias in (("a", 7), ("b", 0), ("c", 9), ("d", 0))]
+    assert [one.name for one in by_alias(slaves, answering(0, 9, 5, 7))] == ["b", "c", "d", "a"]
+
+
+def test_an_alias_that_nobody_or_that_several_have_is_told_with_those_that_there_are():
+    slaves = [replace(slave(name), alias=alias) for name, alias in (("a", 7), ("b", 8))]
+    with pytest.raises(BusError) as told:
+        by_alias(slaves, answering(8, 8, 5))
+    assert told.value.sentences == (
+        "a: no slave has the station alias 7 (key `slaves`): slave 1 (thing) has 8, slave 2 (thing) has 8, slave 3 "
+        "(thing) has 5; `rtcp alias set` writes one",
+        "b: slave 1 and slave 2 have the station alias 8; `rtcp alias set` changes one",
+    )

@@ -88,7 +88,7 @@ class Bench:
     def wait(self, seconds: float) -> None:
         self.now += seconds
 
-    def restore(self, position: int, lost_address: bool) -> Steps[None]:
+    def restore(self, position: int, place: int | None) -> Steps[None]:
         self.restored.append(position)
         return self.restoration(position)
 

@@ -29,8 +29,8 @@ def port() -> Direct:
 
 @pytest.mark.parametrize("register", [0x0500, 0x0502, 0x0981, 0x0928, 0x0920, 0x0930])
 def test_a_write_that_got_lost_ends_the_attempt(port: Direct, register: int) -> None:
-    port.lost = {(DatagramCommand.APWR, register)}
-    set_up = SlaveSetup(bytes(0x80), (bytes(8),) * 8, bytes(4), 0)
+    port.lost = {(DatagramCommand.FPWR, register)}
+    set_up = SlaveSetup(bytes(0x80), (bytes(8),) * 8, bytes(4), 0, 2)
     restorer = SlaveRestorer(port, arm(3), [set_up] * 3, lambda position: pytest.fail("too far"), PERIOD)
     with pytest.raises(BusError, match=rf"slave 3 \(drive2\) did not take .* register 0x{register:04X}"):
-        finish(restorer.restore(3, lost_address=True))
+        finish(restorer.restore(3, place=3))

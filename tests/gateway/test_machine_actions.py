@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from rtcp.ipc.commands import (
     Home,
     MoveGripper,
     Reset,
+    SetChannel,
     SetControlMode,
     SetDriveMode,
     SetOutput,
@@ -28,7 +30,9 @@ from rtcp.ipc.commands import (
 from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, Homed, HomingFailed, OverSpeed, ZeroSet
 from rtcp.ipc.layout import EVENTS
 from rtcp.ipc.refusals import GripperDisabled, Refusal, TorquePresent, WrongState
+from rtcp.ipc.schema import Field
 from rtcp.ipc.states import ControlMode, DriveMode, State
+from tests.gateway import fake_loop
 from tests.gateway.fake_platform import FakePlatform, fake_platform
 from tests.two_boxes import two_boxes
 
@@ -145,6 +149,53 @@ def test_an_output_that_the_file_names_is_set_at_its_own_box(tmp_path: Path) -> 
         arm.ask("write_io", name="blower", value=True)
         arm.ask("write_io", name="io.5", value=False)
         assert arm.loop.commands == [SetOutput(5, True, 0), SetOutput(5, False, 0)]
+
+
+VALVES = """
+name: Valves
+kind: generic
+vendor_id: 1
+product_id: 2
+rpdo:
+  - index: 0x1600
+    channels:
+      - {index: 0x7000, sub_index: 1, type: bool, name: open}
+      - {index: 0x7000, sub_index: 2, type: float32, name: level, unit: m, min: 0.5, safe: 0.5}
+      - {index: 0, sub_index: 0, type: bits, bits: 7}
+tpdo:
+  - index: 0x1A00
+    channels:
+      - {index: 0x6000, sub_index: 1, type: bool, name: closed}
+      - {index: 0x6000, sub_index: 2, type: int16, name: level, unit: m}
+"""
+
+
+def test_channels_of_a_slave_are_read_and_set_by_name_and_those_of_one_bit_are_terminals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("closed", "level", "open", "level_sent")
+    more = tuple(Field(f"valves_{name}", "float64", part="valves") for name in names)
+    monkeypatch.setattr("tests.gateway.fake_loop.BOX", (*fake_loop.BOX, *more))
+    shutil.copytree(default_config().parent, tmp_path / "config")
+    (tmp_path / "config/devices/valves.yaml").write_text(VALVES)
+    file = tmp_path / "config/assistive_arm.yaml"
+    drive6 = "  - {name: drive6, device: cubemars-orh}\n"
+    file.write_text(file.read_text().replace(drive6, f"{drive6}  - {{name: valves, device: valves}}\n"))
+    with fake_platform(tmp_path, Q, config=load(file)) as arm:
+        found = arm.ask("read_io")
+        assert [one["name"] for one in found["inputs"]][-1] == "valves.closed"
+        assert [(one["name"], one["number"]) for one in found["outputs"]][-1] == ("valves.open", 1)
+        level = {"name": "valves.level", "value": 0.0, "unit": "m"}
+        assert found["channels"] == [
+            {**level, "is_output": False, "settable": False, "range": None},
+            {**level, "is_output": True, "settable": True, "range": [0.5, None]},
+        ]
+        arm.ask("write_io", name="valves.open", value=True)
+        arm.ask("set_channel", name="valves.level", value=1.25)
+        assert arm.loop.commands == [SetChannel(8, 0, 1.0), SetChannel(8, 1, 1.25)]
+        arm.ask("wait_io", name="valves.closed", value=False, timeout_s=1.0)
+        error = arm.error("set_channel", name="valves.closed", value=1.0)
+        assert (error.reason, error.fields["allowed"]) == ("unknown_terminal", ["valves.level"])
 
 
 def test_a_terminal_that_is_none_is_refused_with_those_there_are(arm: FakePlatform) -> None:

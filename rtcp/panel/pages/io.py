@@ -1,4 +1,4 @@
-"""I/O: every input and output of the boxes with its name and terminal; outputs set by hand."""
+"""I/O: inputs and outputs of the boxes, channels of other slaves, with name and terminal; outputs set by hand."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from nicegui import ui
 from nicegui.elements.mixins.text_element import TextElement
 
-from rtcp.api import Levels, RtcpError
+from rtcp.api import Channel, Levels, RtcpError
 from rtcp.config.model import ArmConfig, Level
-from rtcp.panel.page import View, no_platform, on_click, text
+from rtcp.panel.page import View, button, no_platform, number, on_click, table, text
 
 _INTERVAL_S = 0.2
 _JOYSTICK = ("forward", "backward", "left", "right", "mode_up", "mode_down")
@@ -24,12 +24,13 @@ async def build(view: View) -> None:
         no_platform()
         return
     found = await view.query(lambda robot: robot.read_io())
-    if not (found.inputs or found.outputs):
+    if not (found.inputs or found.outputs or found.channels):
         text("p", "This platform has no box with inputs or outputs.")
         return
     with ui.element("div").classes("columns"):
         inputs = _terminals("Inputs", found.inputs, lambda name: text("span", "", "level"), _active(view.live.config))
         outputs = _terminals("Outputs", found.outputs, lambda name: _switch(view, name), {})
+    channels = _channels(view, found.channels) if found.channels else {}
     text("p", "An output that the gripper, a lamp or a process drives is set again by it.")
 
     def show(places: Places, levels: Levels) -> None:
@@ -51,6 +52,8 @@ async def build(view: View) -> None:
             return  # the header says why
         show(inputs, now.inputs)
         show(outputs, now.outputs)
+        for name, place in channels.items():
+            place.text = f"{now.channels[name].value:.6g}"
 
     show(inputs, found.inputs)
     show(outputs, found.outputs)
@@ -81,6 +84,38 @@ def _terminals(
                         beside = text("span", "") if name in active else None
                     made[name] = control(name), beside, active.get(name)
     return made
+
+
+def _channels(view: View, channels: Mapping[str, Channel]) -> dict[str, TextElement]:
+    """Show channels with a number, with a field for those that can be set; return where each one's value stands."""
+    made: dict[str, TextElement] = {}
+    with table(("Channel", "Value", "Unit", "Set"), "Channels", "numbers"):
+        for name, one in channels.items():
+            with ui.element("tr"):
+                text("th", name, scope="row")
+                made[name] = text("td", f"{one.value:.6g}")
+                text("td", one.unit, "text")
+                with ui.element("td"):
+                    if one.settable:
+                        _setting(view, one)
+    return made
+
+
+def _setting(view: View, channel: Channel) -> None:
+    low, high = channel.range
+    wanted = number(f"Set {channel.name}", f"{channel.value:g}", channel.unit)
+    with ui.element("small"):
+        text("span", f"{low:g} to {high:g}")
+
+    async def send() -> None:
+        try:
+            value = wanted.number()
+        except RtcpError as error:
+            view.warn(error.message)
+            return
+        await view.act(lambda robot: robot.set_output(channel.name, value))
+
+    button("Set", send, plain=True)
 
 
 def _switch(view: View, name: str) -> TextElement:

@@ -1,0 +1,205 @@
+"""The process image that SOEM lays out: its limits, checked before it maps, and where it put each slave's images.
+
+SOEM checks none of its limits, gives a slave of several sync managers FMMUs of wrong lengths, and lets neighbours with
+fewer than 8 bits share a byte, of which pysoem tells neither the bit nor, where one crosses into a second byte, that.
+What it wrote into the FMMUs (ETG.1000.4, 6.6) says where everything is.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from rtcp.config.model import Pdo, SlaveConfig
+from rtcp.fieldbus.bus import slave_label, station_of
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.pdo import INPUTS, OUTPUTS, by_sync_manager, layout
+from rtcp.fieldbus.registers import Register, RegisterPort
+
+MOST_SLAVES, LARGEST_IMAGE, MOST_FMMUS = 199, 4096, 4
+"""What SOEM and pysoem have room for: slaves of a segment, bytes of the process image, FMMUs of a slave."""
+_FMMU = struct.Struct("<IHBBHBBB3x")
+_READ, _WRITE = 1, 2
+_SYNC_MANAGER = struct.Struct("<HH4x")
+_SYNC_MANAGERS = 8
+
+
+class Place(NamedTuple):
+    """Where the outputs or the inputs of a slave are in the process image."""
+
+    first: int
+    """First bit."""
+    bits: int
+    """Length in bits; 0: it has none."""
+
+    @property
+    def is_small(self) -> bool:
+        """Whether it has fewer than 8 bits, and may share its byte with a neighbour."""
+        return 0 < self.bits < 8
+
+
+class Places(NamedTuple):
+    """Where the images of a slave are."""
+
+    outputs: Place
+    inputs: Place
+
+
+def limit_faults(slaves: Sequence[SlaveConfig]) -> list[str]:
+    """Return a sentence for each limit of SOEM that the configuration exceeds."""
+    faults = []
+    if len(slaves) > MOST_SLAVES:
+        faults.append(f"the configuration (key `slaves`) lists {len(slaves)} slaves; SOEM has room for {MOST_SLAVES}")
+    size = sum(layout(pdos).bytes for slave in slaves for pdos in (slave.device.rpdo, slave.device.tpdo))
+    if size > LARGEST_IMAGE:
+        faults.append(
+            f"the process data of all slaves have {size} bytes; SOEM has room for {LARGEST_IMAGE}: map fewer objects"
+        )
+    for position, slave in enumerate(slaves, 1):
+        label, device = slave_label(position, slave.name), slave.device
+        areas = 0
+        for key, pdos, usual in (("rpdo", device.rpdo, OUTPUTS), ("tpdo", device.tpdo, INPUTS)):
+            groups = by_sync_manager(pdos, usual)
+            areas += len(groups)
+            lengths = [_bits(group) for group in groups.values()]
+            needed, given = sum((bits + 7) // 8 for bits in lengths), (sum(lengths) + 7) // 8
+            if needed != given:
+                faults.append(
+                    f"{label}: the sync managers of key `{key}` carry {' and '.join(map(str, lengths))} bits, which "
+                    f"need {needed} bytes; SOEM gives them {given}: map whole bytes into all but one of them"
+                )
+        if areas > MOST_FMMUS:
+            faults.append(
+                f"{label}: `rpdo` and `tpdo` use {areas} sync managers, each of which needs an FMMU; SOEM has room for "
+                f"{MOST_FMMUS} of a slave"
+            )
+    return faults
+
+
+def _bits(pdos: Sequence[Pdo]) -> int:
+    return sum(entry.length for pdo in pdos for entry in pdo.channels)
+
+
+class _Fmmu(NamedTuple):
+    """Bytes of the image and of the slave's memory that stand for each other."""
+
+    image: int
+    length: int
+    memory: int
+    kind: int
+
+    def pack(self) -> bytes:
+        return _FMMU.pack(self.image, self.length, 0, 7, self.memory, 0, self.kind, 1)
+
+    def covers(self) -> Iterator[tuple[int, int]]:
+        return zip(
+            range(self.image, self.image + self.length), range(self.memory, self.memory + self.length), strict=True
+        )
+
+
+def read_places(port: RegisterPort, slaves: Sequence[SlaveConfig]) -> list[Places]:
+    """Return where SOEM has put the images, and correct the FMMUs of slaves with several sync managers a direction.
+
+    Args:
+        port: the port for registers; SOEM has mapped.
+        slaves: the slaves of the configuration.
+
+    Raises:
+        BusError: a slave does not answer, or has too few FMMUs.
+    """
+    return [_read_places(port, position, slave) for position, slave in enumerate(slaves, 1)]
+
+
+def _read_places(port: RegisterPort, position: int, slave: SlaveConfig) -> Places:
+    station, label = station_of(position), slave_label(position, slave.name)
+    registers = port.read(station, Register.FMMU, _FMMU.size * MOST_FMMUS)
+    managers = port.read(station, Register.SYNC_MANAGER, _SYNC_MANAGER.size * _SYNC_MANAGERS)
+    if registers is None or managers is None:
+        raise BusError(f"{label} stopped answering while its mapping was read")
+    areas = list(_SYNC_MANAGER.iter_unpack(managers))
+    found: list[_Fmmu] = []
+    starts: dict[int, int] = {}
+    lengths: dict[int, int] = {}
+    for image, length, first_bit, last_bit, memory, _, kind, active in _FMMU.iter_unpack(registers):
+        if active & 1 and length:
+            found.append(_Fmmu(image, length, memory, kind & (_READ | _WRITE)))
+            begin = 8 * image + first_bit
+            starts[kind] = min(starts.get(kind, begin), begin)
+            lengths[kind] = lengths.get(kind, 0) + 8 * length - 7 + last_bit - first_bit
+    wanted: list[_Fmmu] = []
+    places = []
+    several = False
+    for key, pdos, kind in (("rpdo", slave.device.rpdo, _WRITE), ("tpdo", slave.device.tpdo, _READ)):
+        bits, first = layout(pdos).bits, starts.get(kind, 0)
+        places.append(Place(first, bits))
+        # Of longer images the bytes were compared.
+        if places[-1].is_small and bits != (mapped := lengths.get(kind, 0)):
+            raise BusError(f"{label}: it maps {mapped} bits, its device's file (key `{key}`) {bits}")
+        groups = by_sync_manager(pdos, 0)
+        several |= len(groups) > 1
+        at = first // 8
+        for number, group in groups.items() if len(groups) > 1 else ():
+            length = (_bits(group) + 7) // 8
+            wanted.append(_Fmmu(at, length, areas[number][0], kind))
+            at += length
+        if len(groups) == 1:
+            wanted += [fmmu for fmmu in found if fmmu.kind == kind]
+    if several and _bytes_of(found) != _bytes_of(wanted):
+        _rewrite(port, station, label, wanted)
+    return Places(*places)
+
+
+def _bytes_of(fmmus: Sequence[_Fmmu]) -> set[tuple[int, int, int]]:
+    return {(fmmu.kind, image, memory) for fmmu in fmmus for image, memory in fmmu.covers()}
+
+
+def _rewrite(port: RegisterPort, station: int, label: str, fmmus: Sequence[_Fmmu]) -> None:
+    """Write one FMMU for each sync manager; raises BusError."""
+    count = port.read(station, Register.FMMU_COUNT, 1)
+    if count is None or count[0] < len(fmmus):
+        has = "does not say how many it has" if count is None else f"has {count[0]}"
+        raise BusError(f"{label}: its process data need {len(fmmus)} FMMUs, it {has}")
+    data = b"".join(fmmu.pack() for fmmu in fmmus).ljust(_FMMU.size * MOST_FMMUS, b"\0")
+    port.put(station, Register.FMMU, data, label)
+    if port.read(station, Register.FMMU, len(data)) != data:
+        raise BusError(f"{label} does not keep its FMMUs (register 0x{Register.FMMU:04X})")
+
+
+def missing_counts(places: Sequence[Places]) -> int:
+    """Return by how much SOEM's expected working counter is too low: it leaves out who begins no byte of its own."""
+    uncounted = [[one.is_small and one.first % 8 + one.bits < 8 for one in both] for both in places]
+    return sum(2 * outputs + inputs for outputs, inputs in uncounted)
+
+
+_TIMEOUT_FIELD = 0x5A17C0DE
+
+
+def image_memory(master: Any) -> memoryview:
+    """Return the process image of pysoem's `master`, which it shows in whole bytes of single slaves only.
+
+    The image stands in the object itself, followed by two pointers to the two timeouts that follow them: where a
+    timeout with a value of its own is pointed at from two places before it, the image ends there.
+
+    Raises:
+        BusError: this build of pysoem is made otherwise.
+    """
+    kept = master.sdo_read_timeout
+    master.sdo_read_timeout = _TIMEOUT_FIELD
+    try:
+        content = ctypes.string_at(id(master), type(master).__basicsize__)
+    finally:
+        master.sdo_read_timeout = kept
+    pointers = struct.Struct("@PP")
+    at = content.find(_TIMEOUT_FIELD.to_bytes(4, "little"))
+    while at >= 0:
+        address, begins = id(master) + at, at - pointers.size
+        if begins >= LARGEST_IMAGE and pointers.unpack_from(content, begins) == (address, address + 4):
+            image = (ctypes.c_ubyte * LARGEST_IMAGE).from_address(id(master) + begins - LARGEST_IMAGE)
+            return memoryview(image).cast("B")
+        at = content.find(_TIMEOUT_FIELD.to_bytes(4, "little"), at + 1)
+    raise BusError(
+        "the process image of this build of pysoem cannot be reached, which images of fewer than 8 bits need: add "
+        "padding (index 0) to them, or install pysoem 1.1.13"
+    )

@@ -1,0 +1,103 @@
+"""An arm of three two-axis drives, and a slave of which only its channels are known, by their files alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+import rtcp
+from rtcp.config import load_device
+from rtcp.ipc.runtime_directory import control_socket
+from tests.drive_esi import write_esi
+from tests.e2e.conftest import Platform
+
+pytestmark = pytest.mark.alone
+
+VALVES = """
+name: Valve terminal
+kind: analog
+vendor_id: 0xA55
+product_id: 0x20
+rpdo:
+  - index: 0x1600
+    channels:
+      - {index: 0x7000, sub_index: 1, type: int16, name: current, factor: 0.001, unit: mA, min: 4, max: 20, safe: 4}
+      - {index: 0x7000, sub_index: 2, type: uint16, name: ramp, unit: ms}
+tpdo:
+  - index: 0x1A00
+    channels:
+      - {index: 0x6000, sub_index: 1, type: uint16, name: pressure, factor: 0.01, offset: -1, unit: bar}
+"""
+OBJECTS = {
+    index + shift: held
+    for shift in (0, 0x800)
+    for index, held in ((0x608F, (131072, 1)), (0x6091, (50, 1)), (0x6076, ("UDINT", 40_000)), (0x603F, ("UINT", 0)))
+}
+
+
+def build(folder: Path) -> None:
+    """Replace the six drives of the configuration in `folder` by three of two axes, and add the valves."""
+    devices = folder / "devices"
+    (devices / "valves.yaml").write_text(VALVES)
+    write_esi(folder / "drive.xml", load_device(devices / "two-axis-drive.yaml"), OBJECTS)
+    write_esi(folder / "valves.xml", load_device(devices / "valves.yaml"), {})
+    arm, segment = (yaml.safe_load((folder / name).read_text()) for name in ("assistive_arm.yaml", "segment.yaml"))
+    drives = [{"name": f"drive{i}", "device": "two-axis-drive"} for i in (1, 2, 3)]
+    arm["slaves"] = [arm["slaves"][0], *drives, {"name": "valves", "device": "valves"}]
+    for i, joint in enumerate(arm["joints"]):
+        joint |= {"slave": f"drive{i // 2 + 1}", "axis": i % 2 + 1}
+    drive = {"esi": "drive.xml", "behaviour": "cia402", "options": {"rated_torque": 40.0, "sync_error_limit": 0}}
+    segment["slaves"] = [segment["slaves"][0], *[drive] * 3, {"esi": "valves.xml"}]
+    for name, data in (("assistive_arm.yaml", arm), ("segment.yaml", segment)):
+        (folder / name).write_text(yaml.safe_dump(data))
+
+
+@pytest.fixture
+def started(platform: Platform) -> Platform:
+    platform.be_patient(2000)
+    build(platform.directory / "config")
+    platform.rtcp("start", "--detach")
+    return platform
+
+
+def test_an_arm_of_two_axis_drives_moves_is_recovered_and_its_channels_are_read_and_set(started: Platform) -> None:
+    goal = [0.2, 0.3, 0.4, -0.2, 0.4, 0.3]
+    with rtcp.connect("a test", control_socket(started.directory)) as robot:
+        robot.enable()
+        robot.move_joints(goal, speed=0.5)
+        assert robot.status().raw["joints"]["actual_position"] == [pytest.approx(q, abs=5e-3) for q in goal]
+        started.rtcp("segment", "set", "5", "0x6000:1", "350")
+        started.until(lambda found: robot.io["valves.pressure"] == pytest.approx(2.5), 10.0)
+        assert robot.io["valves.current"] == 4.0
+        robot.io["valves.current"] = 12.5
+        with pytest.raises(rtcp.Refused) as refused:
+            robot.io["valves.current"] = 21
+        assert (refused.value.reason, refused.value.fields["highest"]) == ("channel_out_of_range", 20.0)
+        assert "12500" in started.rtcp("segment", "get", "5", "0x7000:1").stdout
+        shown = json.loads(started.rtcp("io", "valves.current", "--json").stdout)
+        assert shown == {"valves.current": {"direction": "output", "value": "12.5", "unit": "mA"}}
+        robot.disable()
+    started.rtcp("io", "valves.current", "7.5")
+    assert "7500" in started.rtcp("segment", "get", "5", "0x7000:1").stdout
+    # A slave that loses its supply is set up again, both axes with it.
+    started.rtcp("segment", "fault", "power", "slave=3")
+    started.until(lambda found: found["state"] == "fault", 20.0)
+    started.rtcp("segment", "clear")
+    started.call("reset")
+    assert "4000" in started.rtcp("segment", "get", "5", "0x7000:1").stdout
+    started.call("enable")
+    assert started.status()["state"] == "holding"
+
+
+def test_a_drive_that_counts_otherwise_than_its_file_does_not_start(platform: Platform) -> None:
+    platform.be_patient(2000)
+    folder = platform.directory / "config"
+    build(folder)
+    write_esi(folder / "drive.xml", load_device(folder / "devices/two-axis-drive.yaml"), {**OBJECTS, 0x688F: (1024, 1)})
+    refused = platform.rtcp("start", "--detach", check=None)
+    assert refused.returncode != 0
+    said = " ".join((refused.stdout + refused.stderr).split())
+    assert "slave 2 (drive1), axis 2: the drive counts otherwise than its file: 0x688F holds 1024" in said
