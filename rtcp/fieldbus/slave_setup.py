@@ -174,8 +174,10 @@ class SlaveRestorer:
         """Return four bytes of the EEPROM from `word` on (ETG.1000.4, 6.4)."""
         port, label = self._port, self._label(position)
         # Taken back from the device by force, as it may have it after power-on.
-        port.put(station, Register.EEPROM_CONFIG, b"\x02", label)
-        port.put(station, Register.EEPROM_CONFIG, b"\x00", label)
+        if not eeprom_to_master(port, station):
+            raise BusError(
+                f"{label} did not take the request for its EEPROM in register 0x{Register.EEPROM_CONFIG:04X}"
+            )
         port.put(station, Register.EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
         deadline = time.monotonic() + _EEPROM_S
         while True:
@@ -408,3 +410,8 @@ def set_watchdog(port: RegisterPort, station: int, label: str, device: DeviceDes
 def eeprom_to_device(port: RegisterPort, station: int) -> bool:
     """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
     return port.write(station, Register.EEPROM_CONFIG, b"\x01\x00")
+
+
+def eeprom_to_master(port: RegisterPort, station: int) -> bool:
+    """Take the EEPROM from the slave, also by force; return whether it is the master's (ETG.1000.4, 6.4.2)."""
+    return all(port.write(station, Register.EEPROM_CONFIG, value) for value in (b"\x02\x00", b"\x00\x00"))

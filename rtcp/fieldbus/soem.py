@@ -34,6 +34,7 @@ from rtcp.fieldbus.slave_setup import (
     by_alias,
     configure_slave,
     eeprom_to_device,
+    eeprom_to_master,
     identity_faults,
     read_set_up,
 )
@@ -292,6 +293,10 @@ class SoemBus:
         corrects many errors by reading again.
         """
         reported: dict[int, list[str]] = {}
+        stations = [station_of(position) for position, one in enumerate(slaves, 1) if not one.device.coe]
+        for station in stations:
+            # Their PDOs are in the EEPROM alone, which SOEM takes for its own since it has read it.
+            eeprom_to_master(self.port, station)
         try:
             self._master.config_map()
         except pysoem.ConfigMapError as error:
@@ -304,6 +309,8 @@ class SoemBus:
                 else:
                     continue
                 reported.setdefault(fault.slave_pos, []).append(what)
+        for station in stations:
+            eeprom_to_device(self.port, station)
         faults: dict[int, list[str]] = {}
         for position, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True), 1):
             images: dict[str, tuple[ImageLayout, bytes]] = {

@@ -26,8 +26,10 @@ from rtcp.devices import Cia402Drive, TargetState
 from rtcp.fieldbus import AlState, BusError, SdoAborted
 from rtcp.fieldbus.bus import ProcessData, station_of
 from rtcp.fieldbus.interface import enter
+from rtcp.fieldbus.pdo import layout
 from rtcp.fieldbus.registers import RegisterPort
 from rtcp.fieldbus.soem import SoemBus
+from tests.fieldbus.terminals import slave
 
 ARM = Path(__file__).parents[2] / "config" / "assistive_arm.yaml"
 INTERFACE = "ecat0"
@@ -305,6 +307,30 @@ def outputs(bus: SoemBus, count: int) -> Any:
     return {"box": bus.sdo_read(1, 0x7000, 1).hex(), "display": data.input(1)[14]}
 
 
+def terminals(bus: SoemBus, count: int, kinds: list[str]) -> Any:
+    """Bring slaves of `terminals` to OP; send patterns, and tell what comes back of each."""
+    slaves = [slave(f"t{n}", kind) for n, kind in enumerate(kinds)]
+    data = bus.configure(slaves, 1_000_000)
+    cycle = Cycle(data, 1_000_000)
+    to_op(bus, cycle)
+    patterns = []
+    for pattern in (0xFF, 0x00, 0x55, 0xAA, 0x13):
+        sent = []
+        for index, one in enumerate(slaves):
+            image = layout(one.device.rpdo)
+            value = int.from_bytes(bytes((pattern + 7 * index & 0xFF,)) * image.bytes, "little") & (1 << image.bits) - 1
+            sent.append(value.to_bytes(image.bytes, "little"))
+            data.set_output(index, sent[-1])
+        cycle.for_cycles(40)
+        patterns.append(([one.hex() for one in sent], [data.input(index).hex() for index in range(count)]))
+    return {
+        "states": [state.words() for state in bus.read_states()], "expected_wkc": data.expected_wkc,
+        "soem_expected": bus._master.expected_wkc, "wkcs": cycle.wkcs, "patterns": patterns,
+        "objects": [bus.sdo_read(1, 0x7000, n).hex() for n in (1, 2, 3)] if kinds[0] == "areas" else [],
+        "sync": (bus.port.read(station_of(2), 0x0980, 2) or b"").hex(),
+    }  # fmt: skip
+
+
 def emergency(bus: SoemBus, count: int) -> Any:
     """A drive that is enabled loses its outputs: it faults and says so."""
     slaves = arm(count)
@@ -371,6 +397,7 @@ SCENARIOS = {
         stopped,
         beside,
         outputs,
+        terminals,
         emergency,
         killed,
         interrupted,
