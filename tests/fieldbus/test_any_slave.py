@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from tests.fieldbus.conftest import WATCHER
+
 pytestmark = pytest.mark.alone
 
 DIRECT = ("coupler", "bits2", "bits4", "output", "bits4", "bits7", "bits6", "input", "bits1", "bits6")
@@ -34,3 +36,18 @@ def test_several_sync_managers_of_a_direction_each_get_their_fmmu(start_segment)
         assert received[1:] == sent[1:]
     assert "".join(result["objects"]) == result["patterns"][-1][0][0]
     assert result["sync"] == "3007"
+
+
+def test_a_slave_on_one_branch_is_set_up_again_while_another_branch_is_lost(start_segment):
+    kinds = ("coupler", "bits4", "bits2", "areas", "output")
+    segment = start_segment((kinds[0], "bits4, after: 1, port: 3", "bits2", "areas, after: 1, port: 1", "output"))
+    result = segment.master("branches", child=WATCHER, control=str(segment.control), kinds=kinds)["result"]
+    assert result["acted"] == ["OP", "no answer", "no answer", "OP", "OP"]
+    assert result["states"] == ["OP"] * 5
+    assert result["after"] == result["before"]
+    assert result["whole"]
+    told = "\n".join(result["said"])
+    assert "slave 2 (t2) to slave 3 (t3) left OP: none of them answers" in told
+    assert "between slave 1 (t1) and slave 2 (t2)" in told
+    assert "slave 4 (t4) to slave 5 (t5) left OP" in told
+    assert "between slave 1 (t1) and slave 4 (t4)" in told
