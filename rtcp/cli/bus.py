@@ -43,8 +43,18 @@ commands.add_typer(sdo)
 
 
 @commands.command("scan")
-def _scan(bus: BusName = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
+def _scan(
+    bus: BusName = None,
+    config: ConfigFile = None,
+    describe: Annotated[str | None, option("--describe", "SLAVE", "All that this slave tells of itself.")] = None,
+    as_json: AsJson = False,
+) -> None:
     """Show the slaves: identity, state, PDO map, clocks and delays."""
+    if describe is not None:
+        from rtcp.cli.slaves import describe_slave  # which imports this module
+
+        describe_slave(describe, bus, config, as_json)
+        return
     with _bus("scan", bus, config) as asked:
         slaves = asked.access.scan()
     if as_json:
@@ -123,7 +133,7 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
             robot = connect(command)
         except NotRunning:
             refuse_second_platform()
-            yield _offline(name, config)
+            yield offline_bus(name, config)
             return
         with robot:
             status = robot.status().raw
@@ -131,10 +141,11 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
                 positions = {slave["name"]: slave["position"] for slave in status["slaves"]}
                 yield Bus(status["bus"], positions, robot)
             else:
-                yield _offline(name, config)
+                yield offline_bus(name, config)
 
 
-def _offline(name: str | None, config: Path | None) -> Bus:
+def offline_bus(name: str | None, config: Path | None) -> Bus:
+    """Return a bus that is opened for each question; raises ConfigError, RtcpError."""
     from rtcp.config.loader import segment_path
     from rtcp.virtual.segment import check_segment
 
@@ -158,7 +169,7 @@ def parse_object(text: str) -> tuple[int, int]:
     index = int(found["prefixed"] or found["suffixed"], 16)
     if index > 0xFFFF:
         raise CommandError(f"index 0x{index:X} is too large: at most 0xFFFF")
-    subindex = _integer(found["sub"] or "0", "subindex")
+    subindex = parse_integer(found["sub"] or "0", "subindex")
     if not 0 <= subindex <= 0xFF:
         raise CommandError(f"subindex {subindex} is not allowed: 0 to 255")
     return index, subindex
@@ -184,7 +195,9 @@ def encode(text: str, type_name: str) -> bytes:
             raise CommandError(f"{text!r} does not fit bool: 0, 1, true or false")
         return STRUCTS[type_name].pack(text.lower() in ("1", "true"))
     try:
-        return STRUCTS[type_name].pack(_finite(text, type_name) if "float" in type_name else _integer(text, type_name))
+        return STRUCTS[type_name].pack(
+            _finite(text, type_name) if "float" in type_name else parse_integer(text, type_name)
+        )
     except (struct.error, OverflowError) as error:
         span = "" if "float" in type_name else ": {} to {}".format(*integer_range(type_name))
         raise CommandError(f"{text} does not fit {type_name}{span}") from error
@@ -229,8 +242,8 @@ def _finite(text: str, type_name: str) -> float:
     return number
 
 
-def _integer(text: str, what: str) -> int:
-    """Return a whole number written in decimal or, after 0x, in hex."""
+def parse_integer(text: str, what: str) -> int:
+    """Return a whole number written in decimal or, after 0x, in hex; raises CommandError."""
     try:
         if "_" in text or not text.isascii():
             raise ValueError
@@ -250,7 +263,7 @@ def _scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[Renderab
     if not slaves:
         return [Text(f"{bus}: no slave answers")]
     counted = "1 slave" if len(slaves) == 1 else f"{len(slaves)} slaves"
-    headings = ("#", "behind", "name", "state", "out bits", "in bits", "delay ns", "errors")
+    headings = ("#", "behind", "name", "state", "out", "in", "delay ns", "errors")
     overview = table(headings, ("behind", "name", "state"), title=f"{bus}: {counted}")
     parts: list[RenderableType] = [overview]
     for slave, branch in zip(slaves, _branches(slaves), strict=True):

@@ -331,6 +331,42 @@ def terminals(bus: SoemBus, count: int, kinds: list[str]) -> Any:
     }  # fmt: skip
 
 
+def files(bus: SoemBus, count: int) -> Any:
+    """Files written and read, also in BOOT, and what the slave refuses."""
+    bus.scan()
+    refused, done = [], []
+    foe = bus.foe(1)
+    for size in (0, 5, 116, 1000):
+        data = os.urandom(size)
+        foe.write("settings", data, 0, done.append)
+        if foe.read("settings", 0, lambda count: None) != data:
+            refused.append(f"{size} bytes came back differently")
+    for attempt in (lambda: foe.read("nothing", 0, done.append), lambda: foe.write("firmware", b"x", 0, done.append),
+                    lambda: bus.foe(2).read("settings", 0, done.append), lambda: bus.boot(2)):  # fmt: skip
+        try:
+            attempt()
+        except BusError as error:
+            refused.append(str(error))
+    firmware = os.urandom(2000)
+    bus.boot(1)
+    in_boot = bus.read_states()[0].words()
+    bus.foe(1).write("firmware", firmware, 0, done.append)
+    kept = bus.foe(1).read("firmware", 0, lambda count: None) == firmware
+    return {"refused": refused, "done": done, "in_boot": in_boot, "kept": kept}
+
+
+def eeprom(bus: SoemBus, count: int) -> Any:
+    """Read an EEPROM, write it with one word changed, and the alias."""
+    bus.discover()
+    parts: list[float] = []
+    before = bus.read_eeprom(1, parts.append)
+    changed = before[:0x1C] + b"\x07\x00" + before[0x1E:]
+    written = [bus.write_eeprom(1, changed, parts.append) for _ in range(2)]
+    after = bus.read_eeprom(1, parts.append)
+    bus.release()
+    return {"before": before.hex(), "written": written, "same": after == changed, "parts": [parts[0], parts[-1]]}
+
+
 def emergency(bus: SoemBus, count: int) -> Any:
     """A drive that is enabled loses its outputs: it faults and says so."""
     slaves = arm(count)
@@ -398,6 +434,8 @@ SCENARIOS = {
         beside,
         outputs,
         terminals,
+        files,
+        eeprom,
         emergency,
         killed,
         interrupted,

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
 from rtcp.esi import model
 from rtcp.esi.sii import write_sii
-from rtcp.virtual.behaviour import Behaviour
+from rtcp.virtual.behaviour import Behaviour, FileBusy, FileRefused, FoeError
+from rtcp.virtual.protocol import AlState
 
 VENDOR = 0x0E2A
 OUT, IN = 0x7000, 0x6000
@@ -27,6 +30,24 @@ class Echo(Behaviour):
         for n in range(1, 9):
             if (OUT, n) in self and (IN, n) in self:
                 self[IN, n] = self[OUT, n]
+
+
+class Bootable(Echo):
+    """Takes its firmware in BOOT only, and is busy with it for a while."""
+
+    def on_start(self) -> None:
+        self.state, self.busy = AlState.INIT, 3
+
+    def on_state(self, old: AlState, new: AlState) -> None:
+        self.state = new
+
+    def on_file(self, name: str, data: bytes) -> None:
+        if name == "firmware" and self.state is not AlState.BOOTSTRAP:
+            raise FileRefused(FoeError.BOOTSTRAP_ONLY, "go to BOOT first")
+        if name == "firmware" and self.busy:
+            self.busy -= 1
+            raise FileBusy(3 - self.busy, 3)
+        super().on_file(name, data)
 
 
 def _type(bits: int) -> str:
@@ -74,6 +95,11 @@ DEVICES = {
     "output": device(21, [(0, 0x0F00, 16)], []),
     # Three areas of outputs with gaps between them: SOEM's own FMMUs are wrong.
     "areas": device(30, [(2, 0x1100, 8), (3, 0x1200, 32), (4, 0x1300, 8)], [(5, 0x1800, 16)], mailbox=True),
+    "files": replace(
+        device(40, [(2, 0x1200, 16)], [(3, 0x1300, 16)], mailbox=True),
+        mailbox=model.Mailbox(model.Coe(sdo_information=True), foe=True),
+        bootstrap=struct.pack("<4H", 0x1000, 256, 0x1400, 256),
+    ),
     "pairs": device(
         31, [(2, 0x1100, 16), (4, 0x1300, 24)], [(3, 0x1200, 16), (5, 0x1800, 24)], mailbox=True,
         modes=[model.DcMode("DC", 0x0730)],
@@ -110,6 +136,6 @@ def write_segment(file: Path, *entries: str) -> None:
     for entry in entries:
         kind, _, more = entry.partition(",")
         (file.parent / f"{kind}.bin").write_bytes(write_sii(DEVICES[kind]))
-        echo = "behaviour: 'tests.fieldbus.terminals:Echo'"
+        echo = f"behaviour: 'tests.fieldbus.terminals:{'Bootable' if kind == 'files' else 'Echo'}'"
         lines.append(f"- {{sii: {kind}.bin, {echo}{',' if more else ''}{more}}}\n")
     file.write_text("slaves:\n" + "".join(lines))

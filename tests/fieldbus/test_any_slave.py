@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from rtcp.esi.sii import write_sii
 from tests.fieldbus.conftest import WATCHER
+from tests.fieldbus.terminals import DEVICES
 
 pytestmark = pytest.mark.alone
 
@@ -51,3 +53,25 @@ def test_a_slave_on_one_branch_is_set_up_again_while_another_branch_is_lost(star
     assert "between slave 1 (t1) and slave 2 (t2)" in told
     assert "slave 4 (t4) to slave 5 (t5) left OP" in told
     assert "between slave 1 (t1) and slave 4 (t4)" in told
+
+
+def test_files_are_written_and_read_over_foe_and_firmware_in_boot(start_segment):
+    result = start_segment(("files", "bits4")).master("files")["result"]
+    assert result["refused"] == [
+        "slave 1 (Terminal 40) refused the read of file 'nothing': error 0x8001, there is no such file (file not "
+        "found)",
+        "slave 1 (Terminal 40) refused the write of 1 bytes to file 'firmware': error 0x8008, only in BOOT: add --boot "
+        "(go to BOOT first)",
+        "slave 2 (Terminal 14): read of file 'settings' is not possible, its EEPROM lists no FoE mailbox",
+        "slave 2 (Terminal 14): its EEPROM lists no mailboxes for BOOT (words 0x14 to 0x17)",
+    ]
+    assert (result["in_boot"], result["kept"]) == ("BOOT", True)
+    assert result["done"][-1] == 2000
+
+
+def test_an_eeprom_is_read_and_written_word_by_word_and_only_where_it_differs(start_segment):
+    result = start_segment(("files",)).master("eeprom")["result"]
+    assert bytes.fromhex(result["before"]) == write_sii(DEVICES["files"])
+    assert result["written"] == [1, 0]
+    assert result["same"]
+    assert result["parts"] == [8 / 2048, 1.0]
