@@ -1,4 +1,4 @@
-"""`rtcp scan` and `rtcp sdo`: the slaves, through the running platform or over the bus opened for one request."""
+"""`rtcp sdo`, and what commands for slaves share: the running platform's bus or one opened for a request, tables."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from rtcp.api import NotRunning, Robot
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, as_written, option
-from rtcp.cli.output import CommandError, emit, emit_json, facts, interruptible, report, show, table
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, BusName, ConfigFile, as_written, option
+from rtcp.cli.output import CommandError, emit, facts, interruptible, report, table
 from rtcp.cli.platform import connect, refuse_second_platform
 from rtcp.config.model import VIRTUAL, integer_range
 from rtcp.config.numbers import plain_number
@@ -42,27 +42,6 @@ sdo = typer.Typer(name="sdo", help="Read and write objects of a slave.", no_args
 commands.add_typer(sdo)
 
 
-@commands.command("scan")
-def _scan(
-    bus: BusName = None,
-    config: ConfigFile = None,
-    describe: Annotated[str | None, option("--describe", "SLAVE", "All that this slave tells of itself.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Show the slaves: identity, state, PDO map, clocks and delays."""
-    if describe is not None:
-        from rtcp.cli.slaves import describe_slave  # which imports this module
-
-        describe_slave(describe, bus, config, as_json)
-        return
-    with _bus("scan", bus, config) as asked:
-        slaves = asked.access.scan()
-    if as_json:
-        emit_json(slaves)
-    else:
-        show(*_scan_tables(asked.name, slaves))
-
-
 @sdo.command("read")
 def _sdo_read(
     slave: SlaveName,
@@ -74,7 +53,7 @@ def _sdo_read(
     """Read an object; without --type its bytes in hex and as each type of that size."""
     index, subindex = parse_object(where)
     known = None if type_name is None else _checked_type(type_name)
-    with _bus("sdo read", bus, config) as asked:
+    with open_bus("sdo read", bus, config) as asked:
         data = asked.access.sdo_read(asked.position(slave), index, subindex)
     emit(interpretations(data) if known is None else decode(data, known))
 
@@ -93,7 +72,7 @@ def _sdo_write(
         raise CommandError(f"found {len(value)} values: {' '.join(value)}; give one (quote a string)")
     index, subindex = parse_object(where)
     data = encode(value[0], _checked_type(type_name))
-    with _bus("sdo write", bus, config) as asked:
+    with open_bus("sdo write", bus, config) as asked:
         position = asked.position(slave)
         asked.access.sdo_write(position, index, subindex, data)
     report(f"slave {position}, 0x{index:04X}:{subindex}: {data.hex(' ') or '(empty)'} written")
@@ -120,7 +99,7 @@ class Bus(NamedTuple):
 
 
 @contextmanager
-def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
+def open_bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
     """Yield the running platform's bus where it is the requested one, else open the requested or configured one.
 
     Raises:
@@ -255,7 +234,7 @@ def parse_integer(text: str, what: str) -> int:
 # -- tables of a scan -----------------------------------------------------------------------------------------------
 
 
-def _scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
+def scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
     """Return the overview, and for each slave its facts and its PDO map."""
     from rich.padding import Padding
     from rich.text import Text

@@ -1,4 +1,4 @@
-"""`rtcp foe`, `eeprom`, `alias`, `state`: what is done with a slave while no platform holds its bus; `rtcp capture`."""
+"""`rtcp scan` and `capture`; and what needs the bus for itself: `rtcp foe`, `eeprom`, `alias`, `state`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtcp.api import NotRunning
-from rtcp.cli.arguments import BusName, ConfigFile, as_written, option, positive
-from rtcp.cli.bus import Bus, SlaveName, offline_bus, parse_integer
+from rtcp.cli.arguments import AsJson, BusName, ConfigFile, as_written, option, positive
+from rtcp.cli.bus import Bus, SlaveName, offline_bus, open_bus, parse_integer, scan_tables
 from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, facts, interruptible, report, show, table, transfer
 from rtcp.cli.platform import connect, loop_process, refuse_second_platform
 from rtcp.esi.model import EsiError
@@ -36,6 +36,25 @@ Password = Annotated[str, option("--password", "N", "Password of the file, a num
 Boot = Annotated[bool, option("--boot", "In BOOT, as most slaves want it for their firmware.")]
 LocalFile = Annotated[Path, typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="File to write.")]
 STATES = ("INIT", "PREOP", "BOOT", "SAFEOP")
+
+
+@commands.command("scan")
+def _scan(
+    bus: BusName = None,
+    config: ConfigFile = None,
+    describe: Annotated[str | None, option("--describe", "SLAVE", "All that this slave tells of itself.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the slaves: identity, state, PDO map, clocks and delays."""
+    if describe is not None:
+        _describe(describe, bus, config, as_json)
+        return
+    with open_bus("scan", bus, config) as asked:
+        slaves = asked.access.scan()
+    if as_json:
+        emit_json(slaves)
+    else:
+        show(*scan_tables(asked.name, slaves))
 
 
 @foe.command("read")
@@ -184,7 +203,7 @@ def _capture(
     report(f"{counted.frames} frames written to {out}{lost}")
 
 
-def describe_slave(slave: str, bus: str | None, config: Path | None, as_json: bool) -> None:
+def _describe(slave: str, bus: str | None, config: Path | None, as_json: bool) -> None:
     """Show what a slave tells of itself: identity, PDOs as they are assigned, object dictionary."""
     with (
         _own_bus("scan --describe", bus, config) as (asked, access),

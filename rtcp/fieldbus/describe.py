@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from rtcp.esi import model, types
 from rtcp.esi.sii import read_sii
-from rtcp.fieldbus.bus import PdoInfo, slave_label
+from rtcp.fieldbus.bus import PdoEntryInfo, PdoInfo, slave_label
 from rtcp.fieldbus.eeprom import Progress
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import SdoClient
@@ -28,6 +28,19 @@ _WRITE_STATES = ((0x08, "P"), (0x10, "S"), (0x20, "O"))
 _CODES = {code.value: code for code in model.ObjectCode}
 _COUNT = 0
 """Subindex of how many entries there are."""
+
+
+def pdos_of_eeprom(device: model.Device) -> tuple[tuple[PdoInfo, ...], tuple[PdoInfo, ...]]:
+    """Return the outputs and the inputs that an EEPROM assigns to sync managers by itself."""
+
+    def assigned(pdos: Sequence[model.Pdo]) -> tuple[PdoInfo, ...]:
+        return tuple(
+            PdoInfo(pdo.index, tuple(PdoEntryInfo(e.index, e.sub_index, e.bits, e.name) for e in pdo.entries))
+            for pdo in pdos
+            if pdo.sync_manager is not None
+        )
+
+    return assigned(device.rx_pdos), assigned(device.tx_pdos)
 
 
 def describe_device(sdo: SdoClient, has_coe: bool, eeprom: bytes, origin: str, progress: Progress) -> model.Device:
@@ -136,7 +149,7 @@ def _read_object(sdo: SdoClient, index: int) -> model.DictionaryObject | None:
     entries = []
     for sub_index in range(highest + 1 if kind is not model.ObjectCode.VARIABLE else 1):
         try:
-            entry = _read_entry(sdo, index, sub_index)
+            entry = read_entry(sdo, index, sub_index)
         except SdoAborted:
             continue  # a record may have gaps
         if entry is not None:
@@ -144,7 +157,8 @@ def _read_object(sdo: SdoClient, index: int) -> model.DictionaryObject | None:
     return model.DictionaryObject(index, _text(data[_DESCRIPTION.size :]), kind, tuple(entries))
 
 
-def _read_entry(sdo: SdoClient, index: int, sub_index: int) -> model.ObjectEntry | None:
+def read_entry(sdo: SdoClient, index: int, sub_index: int) -> model.ObjectEntry | None:
+    """Return the description of an entry; None: the answer holds none. Raises BusError."""
     data = finish(sdo.information(_ENTRY, struct.pack("<HBB", index, sub_index, 0)))
     if len(data) < _ENTRY_DESCRIPTION.size:
         return None

@@ -15,12 +15,13 @@ from typing import Any
 from pysoem import pysoem
 
 from rtcp.config.model import ArmConfig, SlaveConfig
-from rtcp.esi.model import Device
+from rtcp.esi.model import Device, EsiError
+from rtcp.esi.sii import read_sii
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import start_clocks
-from rtcp.fieldbus.describe import describe_device
+from rtcp.fieldbus.describe import describe_device, pdos_of_eeprom
 from rtcp.fieldbus.eeprom import (
     BOOTSTRAP_WORD,
     Progress,
@@ -432,6 +433,16 @@ class SoemBus:
         eeprom = self.read_eeprom(position, (lambda part: progress(part / 10)) if has_coe else progress)
         origin = f"bus {self.interface}, {slave_label(position, self._names[position - 1])}"
         return describe_device(sdo, has_coe, eeprom, origin, lambda part: progress(0.1 + 0.9 * part))
+
+    def with_eeprom_pdos(self, slave: SlaveInfo) -> SlaveInfo:
+        """Return a slave without assignment objects with the PDOs that its EEPROM assigns; any other as it is."""
+        if slave.outputs or slave.inputs:
+            return slave
+        with contextlib.suppress(EsiError):
+            outputs, inputs = pdos_of_eeprom(read_sii(self.read_eeprom(slave.position, lambda part: None)))
+            bits = [sum(pdo.bits for pdo in pdos) for pdos in (outputs, inputs)]
+            return replace(slave, outputs=outputs, inputs=inputs, output_bits=bits[0], input_bits=bits[1])
+        return slave
 
     def read_eeprom(self, position: int, progress: Progress, size: int | None = None) -> bytes:
         """Return the EEPROM of a slave, or its first `size` bytes; raises BusError."""

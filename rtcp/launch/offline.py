@@ -242,7 +242,7 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
             slaves = bus.scan()
             count = len(slaves)
             if do == "scan":
-                return {"slaves": [dataclasses.asdict(slave) for slave in slaves]}
+                return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(slave)) for slave in slaves]}
         position = question["slave"]
         if not 1 <= position <= count:
             missing = f"no slave at position {position}: the bus {question['interface']} has {count}"

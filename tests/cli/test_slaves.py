@@ -90,6 +90,9 @@ def test_a_live_slave_describes_itself(rtcp: Rtcp, files: tuple[str, ...]) -> No
     assert device["mailbox"]["foe"]
     plain = rtcp("scan", "--describe", "2", *files)
     assert "TxPDO 0x1A01" in plain.out
+    found = json.loads(rtcp("scan", "--json", *files).out)
+    assert [(one["output_bits"], one["input_bits"]) for one in found] == [(16, 16), (4, 4)]
+    assert found[0]["outputs"][0]["entries"][0]["name"] == "value 1"
 
 
 @pytest.mark.parametrize(
