@@ -296,7 +296,7 @@ def loaded() -> set[str]:
     """Names of the modules that a fresh interpreter has loaded for the loop's process, less those of its own start."""
     program = (
         "import json, sys; before = set(sys.modules)\n"
-        "import rtcp.control.process\n"
+        "import rtcp.control.process, rtcp.fieldbus.soem\n"
         "print(json.dumps(sorted(set(sys.modules) - before)))"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -34,6 +34,7 @@ from rtcp.cli import (
     segment,
     service,
     shape_set,
+    slaves,
     soak,
     status,
 )
@@ -73,8 +74,8 @@ def _root(
 
 
 _GROUPS = (
-    platform, status, cell, motion, process, jog, arm, bus, device, segment, irc5, demo, service, doctor, soak, faults, record,
-    recorded, live, experiment, panel, ros, shape_set,
+    platform, status, cell, motion, process, jog, arm, bus, device, slaves, segment, irc5, demo, service, doctor, soak, faults,
+    record, recorded, live, experiment, panel, ros, shape_set,
 )  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)

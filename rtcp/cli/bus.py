@@ -1,4 +1,4 @@
-"""`rtcp scan` and `rtcp sdo`: the slaves, through the running platform or over the bus opened for one request."""
+"""`rtcp sdo`, and what commands for slaves share: the running platform's bus or one opened for a request, tables."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from rtcp.api import NotRunning, Robot
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, as_written, option
-from rtcp.cli.output import CommandError, emit, emit_json, facts, interruptible, report, show, table
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, BusName, ConfigFile, as_written, option
+from rtcp.cli.output import CommandError, emit, facts, interruptible, report, table
 from rtcp.cli.platform import connect, refuse_second_platform
 from rtcp.config.model import VIRTUAL, integer_range
 from rtcp.config.numbers import plain_number
@@ -42,17 +42,6 @@ sdo = typer.Typer(name="sdo", help="Read and write objects of a slave.", no_args
 commands.add_typer(sdo)
 
 
-@commands.command("scan")
-def _scan(bus: BusName = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
-    """Show the slaves: identity, state, PDO map, clocks and delays."""
-    with _bus("scan", bus, config) as asked:
-        slaves = asked.access.scan()
-    if as_json:
-        emit_json(slaves)
-    else:
-        show(*_scan_tables(asked.name, slaves))
-
-
 @sdo.command("read")
 def _sdo_read(
     slave: SlaveName,
@@ -64,7 +53,7 @@ def _sdo_read(
     """Read an object; without --type its bytes in hex and as each type of that size."""
     index, subindex = parse_object(where)
     known = None if type_name is None else _checked_type(type_name)
-    with _bus("sdo read", bus, config) as asked:
+    with open_bus("sdo read", bus, config) as asked:
         data = asked.access.sdo_read(asked.position(slave), index, subindex)
     emit(interpretations(data) if known is None else decode(data, known))
 
@@ -83,7 +72,7 @@ def _sdo_write(
         raise CommandError(f"found {len(value)} values: {' '.join(value)}; give one (quote a string)")
     index, subindex = parse_object(where)
     data = encode(value[0], _checked_type(type_name))
-    with _bus("sdo write", bus, config) as asked:
+    with open_bus("sdo write", bus, config) as asked:
         position = asked.position(slave)
         asked.access.sdo_write(position, index, subindex, data)
     report(f"slave {position}, 0x{index:04X}:{subindex}: {data.hex(' ') or '(empty)'} written")
@@ -110,7 +99,7 @@ class Bus(NamedTuple):
 
 
 @contextmanager
-def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
+def open_bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
     """Yield the running platform's bus where it is the requested one, else open the requested or configured one.
 
     Raises:
@@ -123,7 +112,7 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
             robot = connect(command)
         except NotRunning:
             refuse_second_platform()
-            yield _offline(name, config)
+            yield offline_bus(name, config)
             return
         with robot:
             status = robot.status().raw
@@ -131,10 +120,11 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
                 positions = {slave["name"]: slave["position"] for slave in status["slaves"]}
                 yield Bus(status["bus"], positions, robot)
             else:
-                yield _offline(name, config)
+                yield offline_bus(name, config)
 
 
-def _offline(name: str | None, config: Path | None) -> Bus:
+def offline_bus(name: str | None, config: Path | None) -> Bus:
+    """Return a bus that is opened for each question; raises ConfigError, RtcpError."""
     from rtcp.config.loader import segment_path
     from rtcp.virtual.segment import check_segment
 
@@ -158,7 +148,7 @@ def parse_object(text: str) -> tuple[int, int]:
     index = int(found["prefixed"] or found["suffixed"], 16)
     if index > 0xFFFF:
         raise CommandError(f"index 0x{index:X} is too large: at most 0xFFFF")
-    subindex = _integer(found["sub"] or "0", "subindex")
+    subindex = parse_integer(found["sub"] or "0", "subindex")
     if not 0 <= subindex <= 0xFF:
         raise CommandError(f"subindex {subindex} is not allowed: 0 to 255")
     return index, subindex
@@ -184,7 +174,9 @@ def encode(text: str, type_name: str) -> bytes:
             raise CommandError(f"{text!r} does not fit bool: 0, 1, true or false")
         return STRUCTS[type_name].pack(text.lower() in ("1", "true"))
     try:
-        return STRUCTS[type_name].pack(_finite(text, type_name) if "float" in type_name else _integer(text, type_name))
+        return STRUCTS[type_name].pack(
+            _finite(text, type_name) if "float" in type_name else parse_integer(text, type_name)
+        )
     except (struct.error, OverflowError) as error:
         span = "" if "float" in type_name else ": {} to {}".format(*integer_range(type_name))
         raise CommandError(f"{text} does not fit {type_name}{span}") from error
@@ -229,8 +221,8 @@ def _finite(text: str, type_name: str) -> float:
     return number
 
 
-def _integer(text: str, what: str) -> int:
-    """Return a whole number written in decimal or, after 0x, in hex."""
+def parse_integer(text: str, what: str) -> int:
+    """Return a whole number written in decimal or, after 0x, in hex; raises CommandError."""
     try:
         if "_" in text or not text.isascii():
             raise ValueError
@@ -242,7 +234,7 @@ def _integer(text: str, what: str) -> int:
 # -- tables of a scan -----------------------------------------------------------------------------------------------
 
 
-def _scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
+def scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
     """Return the overview, and for each slave its facts and its PDO map."""
     from rich.padding import Padding
     from rich.text import Text
@@ -250,7 +242,7 @@ def _scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[Renderab
     if not slaves:
         return [Text(f"{bus}: no slave answers")]
     counted = "1 slave" if len(slaves) == 1 else f"{len(slaves)} slaves"
-    headings = ("#", "behind", "name", "state", "out bits", "in bits", "delay ns", "errors")
+    headings = ("#", "behind", "name", "state", "out", "in", "delay ns", "errors")
     overview = table(headings, ("behind", "name", "state"), title=f"{bus}: {counted}")
     parts: list[RenderableType] = [overview]
     for slave, branch in zip(slaves, _branches(slaves), strict=True):

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
@@ -27,6 +28,8 @@ PIPED_WIDTH = 80
 ABSENT = "-"
 _CONTROLS = {code: "?" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\r\t"}
 """What a name in a file could do to a terminal."""
+_LONG_S = 2.0
+"""Time after which the progress of a transfer is of interest, s."""
 
 
 def emit(text: str) -> None:
@@ -156,6 +159,34 @@ def progress() -> Iterator[ShowProgress]:
     finally:
         if bar.live.is_started:
             bar.stop()
+
+
+@contextmanager
+def transfer(what: str, total: float | None = None, *, quiet: bool = False) -> Iterator[Callable[[float], None]]:
+    """Yield a function that shows how far a transfer is: a bar on a terminal, else a line every 10 % of a long one.
+
+    Args:
+        what: what is done.
+        total: the whole; None: it is not known, no lines then.
+        quiet: nothing but the bar, where the output is for programs.
+    """
+    shown, began = 0, 0.0
+
+    def line(done: float) -> None:
+        nonlocal shown, began
+        began = began or time.monotonic()
+        if total and not quiet and time.monotonic() - began > _LONG_S and (tenth := int(10 * done / total)) > shown:
+            shown = tenth
+            report(f"{what}: {10 * tenth} %")
+
+    if not sys.stdout.isatty():
+        yield line
+        return
+    from rich.progress import Progress as Bar
+
+    with Bar(console=console(), transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda done: bar.update(task, completed=done)
 
 
 def _line_reporter() -> ShowProgress:

@@ -22,12 +22,15 @@ _RETRY_S = 0.01
 """Pause before a service is tried again, s."""
 _TIMEOUT_S = 0.7
 """Time for the answer to one request, s."""
-_PATIENCE_S = 3.0
+PATIENCE_S = 3.0
 """Time for the mailbox to become free while another service of the same slave is under way, s."""
 _SDO = struct.Struct("<BHBI")
 _COE_HEADER = 2
-_REQUEST, _RESPONSE = 2, 3
+_REQUEST, _RESPONSE, _INFORMATION = 2, 3, 8
 """CoE services (ETG.1000.6, table 29)."""
+_INFORMATION_HEADER = struct.Struct("<BxH")
+"""Operation code and whether fragments follow; how many."""
+_INCOMPLETE, _INFORMATION_ERROR = 0x80, 7
 _EXPEDITED, _SIZED, _TOGGLE, _LAST = 0x02, 0x01, 0x10, 0x01
 _DOWNLOAD, _DOWNLOAD_SEGMENT, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0x20, 0x00, 0x40, 0x60, 0x80
 """Commands of the client (upper three bits)."""
@@ -97,11 +100,55 @@ class SdoClient:
         """Write an unsigned integer of `length` bytes; raises as `read`."""
         return self.writing(index, subindex, value.to_bytes(length, "little"))
 
+    def information(self, service: int, data: bytes) -> Steps[bytes]:
+        """Return the answer to a service of SDO information (ETG.1000.6, 5.6.3), fragments joined; raises as `read`.
+
+        Args:
+            service: operation code of the request; that of the answer is the next one.
+            data: what follows the header of the request.
+        """
+        what = f"SDO information {service} of {data.hex(' ')}"
+        return self._call(what, lambda box: self._information(box, service, data))
+
+    def _information(self, mailbox: Mailbox, service: int, data: bytes) -> Steps[bytes]:
+        deadline = time.monotonic() + _TIMEOUT_S
+        yield from self._send_alone(mailbox, _INFORMATION, _INFORMATION_HEADER.pack(service, 0) + data, deadline)
+        answer = b""
+        while True:
+            if (message := mailbox.receive()) is None:
+                check_time(deadline, "no answer in time")
+                yield
+                continue
+            if len(message) < _COE_HEADER + _INFORMATION_HEADER.size or message[1] >> 4 != _INFORMATION:
+                self._other(message, self.position)
+                check_time(deadline, "no answer in time, but other messages")
+                continue
+            operation, left = _INFORMATION_HEADER.unpack_from(message, _COE_HEADER)
+            content = message[_COE_HEADER + _INFORMATION_HEADER.size :]
+            if operation & 0x7F == _INFORMATION_ERROR:
+                code = int.from_bytes(content[:4], "little")
+                raise SdoAborted(f"abort code 0x{code:08X}, {abort_meaning(code)}", code)
+            if operation & 0x7F != service + 1:
+                raise BusError(f"it answered something else (operation {operation & 0x7F})")
+            answer += content
+            if not operation & _INCOMPLETE or not left:
+                return answer
+            deadline = time.monotonic() + _TIMEOUT_S
+
+    def _send_alone(self, mailbox: Mailbox, service: int, request: bytes, deadline: float) -> Steps[None]:
+        """Empty the slave's mailbox, of which an old message would be taken for the answer, and send a request."""
+        while (left := mailbox.receive()) is not None:
+            self._other(left, self.position)
+            check_time(deadline, "its mailbox does not get empty")
+        while not mailbox.send((service << 12).to_bytes(2, "little") + request):
+            check_time(deadline, "its mailbox stays full")
+            yield
+
     def _call(self, what: str, service: Callable[[Mailbox], Steps[T]]) -> Steps[T]:
         where = slave_label(self.position, self.name)
         if self._mailbox is None:
             raise BusError(f"{where}: {what} is not possible, its EEPROM lists no CoE mailbox")
-        deadline = time.monotonic() + _PATIENCE_S
+        deadline = time.monotonic() + PATIENCE_S
         while not self._lock.acquire(blocking=False):
             if time.monotonic() >= deadline:
                 raise BusError(f"{where}, {what}: its mailbox is in use by others")
@@ -129,14 +176,7 @@ class SdoClient:
     ) -> Steps[bytes]:  # fmt: skip
         """Return the answer to an SDO request, from its command on; `address`: index and subindex it must repeat."""
         deadline = time.monotonic() + _TIMEOUT_S
-        # What is left of an earlier service, or an emergency, would be taken for the answer.
-        while (left := mailbox.receive()) is not None:
-            self._other(left, self.position)
-            _check_time(deadline, "its mailbox does not get empty")
-        while not mailbox.send((_REQUEST << 12).to_bytes(2, "little") + request):
-            if time.monotonic() >= deadline:
-                raise BusError("its mailbox stays full")
-            yield
+        yield from self._send_alone(mailbox, _REQUEST, request, deadline)
         while True:
             if (message := mailbox.receive()) is None:
                 if time.monotonic() >= deadline:
@@ -145,7 +185,7 @@ class SdoClient:
                 continue
             if len(message) < _COE_HEADER + _SDO.size or message[1] >> 4 not in {_REQUEST, _RESPONSE}:
                 self._other(message, self.position)
-                _check_time(deadline, "no answer in time, but other messages")
+                check_time(deadline, "no answer in time, but other messages")
                 continue
             command, index, subindex, number = _SDO.unpack_from(message, _COE_HEADER)
             if command == _ABORT:
@@ -200,7 +240,8 @@ class SdoClient:
             toggle ^= _TOGGLE
 
 
-def _check_time(deadline: float, sentence: str) -> None:
+def check_time(deadline: float, sentence: str) -> None:
+    """Raise BusError with this sentence once `deadline` (time.monotonic) has passed."""
     if time.monotonic() >= deadline:
         raise BusError(sentence)
 
@@ -256,8 +297,10 @@ class MailboxType(IntEnum):
 
     ERROR = 0
     COE = 3
+    FOE = 4
 
 
+_TYPES = {kind.value: kind for kind in MailboxType}
 # Detail codes of a mailbox error reply (ETG.1000.4, table 30)
 _ERRORS = {
     1: "syntax of the mailbox header is wrong",
@@ -290,11 +333,17 @@ class Mailbox:
         """For how long a service whose messages get lost is tried again, s."""
         return self._port.patience_s
 
-    def send(self, content: bytes) -> bool:
-        """Send the slave a CoE message; return False while its mailbox is still full.
+    @property
+    def sent_room(self) -> int:
+        """Bytes that a message of the slave's may have behind its mailbox header."""
+        return self._info.send_size - _HEADER.size
+
+    def send(self, content: bytes, kind: MailboxType = MailboxType.COE) -> bool:
+        """Send the slave a message; return False while its mailbox is still full.
 
         Args:
-            content: CoE header and what follows, `room` bytes at most.
+            content: what follows the mailbox header, `room` bytes at most.
+            kind: its protocol.
 
         Raises:
             BusError: the slave does not answer.
@@ -302,7 +351,7 @@ class Mailbox:
         if self._is_full(_SM0_STATUS):
             return False
         # Counter 0 is not checked by slaves; SOEM counts its own messages 1 to 7, unknown to us (ETG.1000.4, table 29).
-        message = _HEADER.pack(len(content), 0, 0, MailboxType.COE) + content
+        message = _HEADER.pack(len(content), 0, 0, kind) + content
         message = message.ljust(self._info.receive_size, b"\0")
         # Once only: whether a lost frame reached the slave is not known.
         start = self._info.receive_start
@@ -311,7 +360,12 @@ class Mailbox:
         return True
 
     def receive(self) -> bytes | None:
-        """Return a CoE message that waits (CoE header first), None where none does.
+        """Return a CoE message that waits (CoE header first), None where none does; raises as `receive_any`."""
+        message = self.receive_any()
+        return None if message is None or message[0] is not MailboxType.COE else message[1]
+
+    def receive_any(self) -> tuple[MailboxType | None, bytes] | None:
+        """Return protocol (None: another one) and content of a message that waits, None where none does.
 
         Raises:
             BusError: the slave answered with a mailbox error, or its message got lost.
@@ -327,7 +381,7 @@ class Mailbox:
         if kind & 0x0F == MailboxType.ERROR:
             code = int.from_bytes(content[2:4], "little")
             raise BusError(f"mailbox error {code}: {_ERRORS.get(code, 'not in the standard')}")
-        return content if kind & 0x0F == MailboxType.COE else None
+        return _TYPES.get(kind & 0x0F), content
 
     def _is_full(self, register: int) -> bool:
         status = self._port.read(self._station, register, 1)
@@ -357,6 +411,10 @@ class Mailboxes:
         info = self._infos[position - 1]
         mailbox = Mailbox(self._port, station_of(position), info) if info is not None and info.has_coe else None
         return SdoClient(mailbox, position, self._names[position - 1], self._locks[position - 1], self._keep)
+
+    def access(self, position: int) -> tuple[threading.Lock, Callable[[bytes, int], None]]:
+        """Return what another protocol of a slave's mailbox needs: the lock, and who takes CoE messages meanwhile."""
+        return self._locks[position - 1], self._keep
 
     def emergencies(self) -> tuple[Emergency, ...]:
         """Return the emergency messages that came since the last call; without any it takes one frame.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import struct
+from dataclasses import replace
 from typing import Any
 
-from pysoem import pysoem
-
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, code_meaning, read_al, state_name
-from rtcp.fieldbus.bus import MailboxInfo, PdoEntryInfo, PdoInfo, SlaveInfo, SyncManagerInfo
-from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.bus import MailboxInfo, PdoInfo, SlaveInfo, SyncManagerInfo
+from rtcp.fieldbus.describe import read_entry
+from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, reading_assignment
 from rtcp.fieldbus.port_errors import ERROR_COUNTERS_SIZE, read_port_errors
@@ -53,37 +53,26 @@ def read_serial(slave: Any) -> int:
     return int.from_bytes(slave.eeprom_read(_SII_SERIAL, _EEPROM_US), "little")
 
 
-class _Names:
-    """Names of objects by SDO information, as far as the slave offers it (ETG.1000.6, 5.6.3)."""
+def _with_names(sdo: SdoClient, pdos: tuple[PdoInfo, ...]) -> tuple[PdoInfo, ...]:
+    """Return the PDOs with the names of their entries, as far as the slave offers SDO information."""
+    offered = True
 
-    def __init__(self, slave: Any) -> None:
-        try:
-            self._objects = {found.index: found for found in slave.od}
-        except (pysoem.SdoInfoError, pysoem.SdoError, pysoem.MailboxError, pysoem.PacketError, pysoem.WkcError):
-            self._objects = {}
+    def name(index: int, sub_index: int) -> str:
+        nonlocal offered
+        if index and offered:
+            try:
+                entry = read_entry(sdo, index, sub_index)
+            except SdoAborted:
+                return ""
+            except BusError:
+                offered = False
+            else:
+                return "" if entry is None else entry.name
+        return ""
 
-    def of(self, index: int, sub_index: int) -> str:
-        found = self._objects.get(index)
-        if found is None:
-            return ""
-        try:
-            entries = found.entries
-            name = entries[sub_index].name if sub_index < len(entries) else found.name
-        except pysoem.SdoInfoError:
-            return ""
-        return name.decode("latin-1") if isinstance(name, bytes) else str(name)
-
-    def fill(self, pdos: tuple[PdoInfo, ...]) -> tuple[PdoInfo, ...]:
-        return tuple(
-            PdoInfo(
-                pdo.index,
-                tuple(
-                    PdoEntryInfo(e.index, e.sub_index, e.bits, self.of(e.index, e.sub_index) if e.index else "")
-                    for e in pdo.entries
-                ),
-            )
-            for pdo in pdos
-        )
+    return tuple(
+        replace(pdo, entries=tuple(replace(e, name=name(e.index, e.sub_index)) for e in pdo.entries)) for pdo in pdos
+    )
 
 
 def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, ...]:
@@ -125,9 +114,8 @@ def describe(
         with contextlib.suppress(BusError):
             name = sdo.read(_DEVICE_NAME, 0).rstrip(b"\0").decode("latin-1")
         try:
-            names = _Names(slave)
-            outputs = names.fill(finish(reading_assignment(sdo, RX_ASSIGN)))
-            inputs = names.fill(finish(reading_assignment(sdo, TX_ASSIGN)))
+            outputs = _with_names(sdo, finish(reading_assignment(sdo, RX_ASSIGN)))
+            inputs = _with_names(sdo, finish(reading_assignment(sdo, TX_ASSIGN)))
         except BusError:
             # A slave need not have assignment objects (ETG.1000.6, 5.6.7.4): its PDOs are then fixed in its EEPROM.
             outputs, inputs = (), ()

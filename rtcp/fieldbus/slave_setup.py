@@ -19,6 +19,7 @@ from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
 from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
+from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
 from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, mapping_of, write_mapping
@@ -30,11 +31,10 @@ _FMMUS_SIZE = 0x80
 _SYNC_MANAGER_SIZE, _SYNC_MANAGER_COUNT = 8, 8
 _MODE, _MAILBOX = 0x03, 0x02
 """Mode of a sync manager in its control register, and that of a mailbox (ETG.1000.4, 6.7.2)."""
-_EEPROM_READ, _EEPROM_BUSY, _EEPROM_FAILED = 0x0100, 0x8000, 0x2000
 _SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
 """Word addresses in the EEPROM (ETG.2010, table 2)."""
-_EEPROM_S, _STATE_S = 0.5, 3.0
-"""Time for one read of the EEPROM, and for one change of the AL state, s."""
+_STATE_S = 3.0
+"""Time for one change of the AL state, s."""
 
 
 @dataclass(frozen=True)
@@ -173,27 +173,13 @@ class SlaveRestorer:
             )
 
     def _reading_eeprom(self, position: int, station: int, word: int) -> Steps[int]:
-        """Return four bytes of the EEPROM from `word` on (ETG.1000.4, 6.4)."""
-        port, label = self._port, self._label(position)
-        # Taken back from the device by force, as it may have it after power-on.
-        port.put(station, Register.EEPROM_CONFIG, b"\x02", label)
-        port.put(station, Register.EEPROM_CONFIG, b"\x00", label)
-        port.put(station, Register.EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
-        deadline = time.monotonic() + _EEPROM_S
-        while True:
-            data = port.read(station, Register.EEPROM_CONTROL, 2)
-            if data is None:
-                raise BusError(f"{self._label(position)} stopped answering while its EEPROM was read")
-            status = int.from_bytes(data, "little")
-            if not status & _EEPROM_BUSY:
-                break
-            if time.monotonic() >= deadline:
-                raise BusError(f"{self._label(position)}: its EEPROM stays busy")
-            yield
-        found = port.read(station, Register.EEPROM_DATA, 4)
-        if found is None or status & _EEPROM_FAILED:
-            raise BusError(f"{self._label(position)}: its EEPROM cannot be read (status 0x{status:04X})")
-        return int.from_bytes(found, "little")
+        """Return four bytes of the EEPROM from `word` on; at power-on the device may have it, it is taken by force."""
+        label = self._label(position)
+        if not eeprom_to_master(self._port, station):
+            raise BusError(
+                f"{label} did not take the request for its EEPROM in register 0x{Register.EEPROM_CONFIG:04X}"
+            )
+        return int.from_bytes((yield from reading_words(self._port, station, word, label))[:4], "little")
 
     def _write_address(
         self,
@@ -408,8 +394,3 @@ def set_watchdog(port: RegisterPort, station: int, label: str, device: DeviceDes
                 f"{label}: watchdog register 0x{address:04X} was set to {value} (watchdog_ms: {device.watchdog_ms:g}) "
                 f"and reads back as {shown}"
             )
-
-
-def eeprom_to_device(port: RegisterPort, station: int) -> bool:
-    """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
-    return port.write(station, Register.EEPROM_CONFIG, b"\x01\x00")

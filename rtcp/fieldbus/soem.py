@@ -15,15 +15,27 @@ from typing import Any
 from pysoem import pysoem
 
 from rtcp.config.model import ArmConfig, SlaveConfig
+from rtcp.esi.model import Device, EsiError
+from rtcp.esi.sii import read_sii
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import start_clocks
+from rtcp.fieldbus.describe import describe_device, pdos_of_eeprom
+from rtcp.fieldbus.eeprom import (
+    BOOTSTRAP_WORD,
+    Progress,
+    eeprom_to_device,
+    eeprom_to_master,
+    read_eeprom,
+    write_eeprom,
+)
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.foe import FoeClient, bootstrap_mailbox, enter_boot
 from rtcp.fieldbus.image import MOST_SLAVES, Places, limit_faults, read_places
 from rtcp.fieldbus.interface import PromiscuousMode, check_interface, check_name, claim, enter
-from rtcp.fieldbus.mailbox import Mailboxes, SdoClient
+from rtcp.fieldbus.mailbox import Mailbox, Mailboxes, SdoClient
 from rtcp.fieldbus.master import Master
 from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, layout
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
@@ -33,7 +45,6 @@ from rtcp.fieldbus.slave_setup import (
     SlaveRestorer,
     by_alias,
     configure_slave,
-    eeprom_to_device,
     identity_faults,
     read_set_up,
 )
@@ -292,6 +303,10 @@ class SoemBus:
         corrects many errors by reading again.
         """
         reported: dict[int, list[str]] = {}
+        stations = [station_of(position) for position, one in enumerate(slaves, 1) if not one.device.coe]
+        for station in stations:
+            # Their PDOs are in the EEPROM alone, which SOEM takes for its own since it has read it.
+            eeprom_to_master(self.port, station)
         try:
             self._master.config_map()
         except pysoem.ConfigMapError as error:
@@ -304,6 +319,8 @@ class SoemBus:
                 else:
                     continue
                 reported.setdefault(fault.slave_pos, []).append(what)
+        for station in stations:
+            eeprom_to_device(self.port, station)
         faults: dict[int, list[str]] = {}
         for position, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True), 1):
             images: dict[str, tuple[ImageLayout, bytes]] = {
@@ -375,6 +392,72 @@ class SoemBus:
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps; raises BusError where there is no such slave."""
         return self._mailboxes.sdo(position)
+
+    def discover(self) -> int:
+        """Find the slaves, bring them to INIT with their mailboxes programmed; return how many there are."""
+        self._discover()
+        return len(self._names)
+
+    def boot(self, position: int) -> None:
+        """Bring a slave to BOOT, where its firmware is written; `foe` then speaks to the mailboxes that it has there.
+
+        Raises:
+            BusError: it has no BOOT, or refuses it.
+        """
+        station, label = station_of(position), slave_label(position, self._names[position - 1])
+        words = read_eeprom(self.port, station, label, lambda part: None, 2 * BOOTSTRAP_WORD + 8)[2 * BOOTSTRAP_WORD :]
+        mailbox = bootstrap_mailbox(words)
+        if mailbox is None:
+            raise BusError(f"{label}: its EEPROM lists no mailboxes for BOOT (words 0x14 to 0x17)")
+        enter_boot(self.port, station, label, mailbox, self._state_timeout_s)
+        self._infos[position - 1] = mailbox
+
+    def foe(self, position: int) -> FoeClient:
+        """Return access to the files of a slave; raises BusError where there is no such slave."""
+        self._mailboxes.sdo(position)
+        info = self._infos[position - 1]
+        mailbox = None
+        if info is not None and info.fits and "FoE" in info.protocols:
+            mailbox = Mailbox(self.port, station_of(position), info)
+        return FoeClient(mailbox, position, self._names[position - 1], *self._mailboxes.access(position))
+
+    def describe_device(self, position: int, progress: Progress) -> Device:
+        """Return the description of a slave in PRE-OP, source BUS; raises BusError or EsiError.
+
+        Args:
+            position: position on the cable, from 1.
+            progress: receives how much of it was read, 0 to 1.
+        """
+        sdo, info = self._mailboxes.sdo(position), self._infos[position - 1]
+        has_coe = info is not None and info.has_coe
+        eeprom = self.read_eeprom(position, (lambda part: progress(part / 10)) if has_coe else progress)
+        origin = f"bus {self.interface}, {slave_label(position, self._names[position - 1])}"
+        return describe_device(sdo, has_coe, eeprom, origin, lambda part: progress(0.1 + 0.9 * part))
+
+    def with_eeprom_pdos(self, slave: SlaveInfo) -> SlaveInfo:
+        """Return a slave without assignment objects with the PDOs that its EEPROM assigns; any other as it is."""
+        if slave.outputs or slave.inputs:
+            return slave
+        with contextlib.suppress(EsiError):
+            outputs, inputs = pdos_of_eeprom(read_sii(self.read_eeprom(slave.position, lambda part: None)))
+            bits = [sum(pdo.bits for pdo in pdos) for pdos in (outputs, inputs)]
+            return replace(slave, outputs=outputs, inputs=inputs, output_bits=bits[0], input_bits=bits[1])
+        return slave
+
+    def read_eeprom(self, position: int, progress: Progress, size: int | None = None) -> bytes:
+        """Return the EEPROM of a slave, or its first `size` bytes; raises BusError."""
+        label = slave_label(position, self._names[position - 1])
+        return read_eeprom(self.port, station_of(position), label, progress, size)
+
+    def write_eeprom(self, position: int, image: bytes, progress: Progress, first: int = 0) -> int:
+        """Write into the EEPROM of a slave from word `first` on; return how many words differed; raises BusError."""
+        label = slave_label(position, self._names[position - 1])
+        return write_eeprom(self.port, station_of(position), label, image, progress, first)
+
+    def release(self) -> None:
+        """Close everything and leave the slaves in their states."""
+        self._names = []
+        self.close()
 
     def watcher(self, report: Callable[[str], None]) -> SlaveWatcher:
         """Return the watcher of the configured slaves, all of them in OP; `report` receives its messages."""

@@ -108,7 +108,7 @@ class Terminals:
                         self._numbers.append(NumberChannel(slave.name, number, is_output, entry, field, settable))
 
     def read(self) -> Json:
-        """Return name, box, number, level, and if it has a function, of every terminal, by `inputs` and `outputs`, and the `channels`."""
+        """Return every terminal, by `inputs` and `outputs`, with its level, and the `channels`."""
         record = self._channel.record()
         found: Json = {
             which: [

@@ -7,12 +7,14 @@ on standard input, one on standard output.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -21,13 +23,18 @@ from typing import TYPE_CHECKING, Any
 from rtcp.ipc.errors import RtcpError
 from rtcp.launch.platform import defer_signals, read_lines, spawn
 
+Progress = Callable[[float], None]
+"""Receives how far a transfer is."""
+
 if TYPE_CHECKING:
     from rtcp.config.model import ArmConfig
+    from rtcp.fieldbus.soem import SoemBus
 
 SEGMENT_TIMEOUT_S = 10.0
 """A segment creates its namespace and its pair of interfaces in far less."""
 QUESTION_TIMEOUT_S = 30.0
 """A scan reads every slave's EEPROM; a slow one takes a second."""
+STATE_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 3.0
 
 
@@ -41,6 +48,10 @@ def configuration(config: Path | None) -> ArmConfig:
     from rtcp.config.loader import load
 
     return load(find_config(config))
+
+
+def ignore(done: float) -> None:
+    """Show no progress."""
 
 
 class OfflineBus:
@@ -70,11 +81,38 @@ class OfflineBus:
         """Write the object; `slave` counts from 1."""
         self._ask("sdo_write", slave=slave, index=index, subindex=subindex, hex=data.hex())
 
-    def _ask(self, do: str, **arguments: int | str) -> dict[str, Any]:
-        return _ask(self._bus, self._config, {"do": do, **arguments})
+    def describe(self, slave: int, progress: Progress = ignore) -> dict[str, Any]:
+        """Return the description of a slave: the fields of `rtcp.esi.model.Device`, bytes as hex."""
+        return dict(self._ask("describe", progress, slave=slave)["device"])
+
+    def foe_read(self, slave: int, name: str, password: int, boot: bool, progress: Progress = ignore) -> bytes:
+        """Return a file of a slave; `progress` receives bytes."""
+        answer = self._ask("foe_read", progress, slave=slave, name=name, password=password, boot=boot)
+        return bytes.fromhex(answer["hex"])
+
+    def foe_write(
+        self, slave: int, name: str, data: bytes, password: int, boot: bool, progress: Progress = ignore
+    ) -> None:  # fmt: skip
+        """Write a file of a slave; `progress` receives bytes."""
+        self._ask("foe_write", progress, slave=slave, name=name, hex=data.hex(), password=password, boot=boot)
+
+    def eeprom_read(self, slave: int, size: int = 0, progress: Progress = ignore) -> bytes:
+        """Return the first `size` bytes of a slave's EEPROM; 0: all of it."""
+        return bytes.fromhex(self._ask("eeprom_read", progress, slave=slave, size=size)["hex"])
+
+    def eeprom_write(self, slave: int, first: int, image: bytes, progress: Progress = ignore) -> int:
+        """Write into the EEPROM of a slave from word `first` on; return how many words differed."""
+        return int(self._ask("eeprom_write", progress, slave=slave, first=first, hex=image.hex())["written"])
+
+    def state(self, slave: int, state: str) -> str:
+        """Bring a slave to an AL state through those before it and leave it there; return its state in words."""
+        return str(self._ask("state", slave=slave, state=state)["state"])
+
+    def _ask(self, do: str, progress: Progress = ignore, **arguments: int | str | bool) -> dict[str, Any]:
+        return _ask(self._bus, self._config, {"do": do, **arguments}, progress)
 
 
-def _ask(bus: str, config: Path | None, question: Mapping[str, Any]) -> dict[str, Any]:
+def _ask(bus: str, config: Path | None, question: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
     from rtcp.config.loader import segment_path
     from rtcp.config.model import VIRTUAL
     from rtcp.fieldbus.errors import BusError
@@ -82,16 +120,16 @@ def _ask(bus: str, config: Path | None, question: Mapping[str, Any]) -> dict[str
 
     if bus == VIRTUAL:
         with _segment(segment_path(configuration(config))) as ready:
-            return _question({**question, "interface": ready["interface"], "namespace_pid": ready["pid"]})
+            return _question({**question, "interface": ready["interface"], "namespace_pid": ready["pid"]}, progress)
     try:
         check_name(bus)
     except BusError as error:
         raise RtcpError("invalid", str(error)) from error
-    return _question({**question, "interface": bus, "namespace_pid": None})
+    return _question({**question, "interface": bus, "namespace_pid": None}, progress)
 
 
-def _question(question: Mapping[str, Any]) -> dict[str, Any]:
-    """Ask one question in a child process and return its answer."""
+def _question(question: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+    """Ask one question in a child process and return its answer; `progress` receives how far it is."""
     bus = question["interface"]
     with ExitStack() as stack:
         # A signal between start and registration would leave a process that nobody ends.
@@ -104,18 +142,37 @@ def _question(question: Mapping[str, Any]) -> dict[str, Any]:
                 start_new_session=True,  # Ctrl-C reaches the command, which then ends this process in order
             )
             stack.callback(_end, child)
+        assert child.stdin is not None
+        assert child.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            child.stdin.write(json.dumps(question).encode())
+            child.stdin.close()
+        answer: dict[str, Any] = {}
         try:
-            answered, complaint = child.communicate(json.dumps(question).encode(), QUESTION_TIMEOUT_S)
-        except subprocess.TimeoutExpired as error:
-            raise RtcpError("timeout", f"the bus {bus} gave no answer within {QUESTION_TIMEOUT_S:g} s") from error
-    try:
-        answer: dict[str, Any] = json.loads(answered.splitlines()[-1])
-    except (IndexError, ValueError) as error:
-        last = complaint.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {child.returncode}"]
-        raise RtcpError("internal", f"asking the bus {bus} failed: {last[0]}") from error
+            for line in read_lines(os.dup(child.stdout.fileno()), QUESTION_TIMEOUT_S):
+                if "progress" in line:
+                    progress(line["progress"])
+                else:
+                    answer = line
+                    break
+            else:
+                answer = _silence(child, bus)
+        except ValueError as error:
+            raise RtcpError("internal", f"asking the bus {bus} failed: {error}") from error
     if "error" in answer:
         raise RtcpError(answer["kind"], str(answer["error"]))
     return answer
+
+
+def _silence(child: subprocess.Popen[bytes], bus: str) -> dict[str, Any]:
+    """Return why a child has ended its output, or stopped, without an answer."""
+    try:
+        code = child.wait(END_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return {"error": f"the bus {bus} gave no answer within {QUESTION_TIMEOUT_S:g} s", "kind": "timeout"}
+    assert child.stderr is not None
+    last = child.stderr.read().decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {code}"]
+    return {"error": f"asking the bus {bus} failed: {last[0]}", "kind": "internal"}
 
 
 @contextmanager
@@ -167,7 +224,7 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
         question: `interface`, `namespace_pid` (None: the caller's namespaces), `do` and its arguments.
 
     Returns:
-        `slaves`, `hex` or nothing, as asked; or `error`, a sentence, and its `kind`.
+        `slaves`, `hex` or whatever was asked for; or `error`, a sentence, and its `kind`.
 
     Raises:
         BusError: as the bus raises it.
@@ -177,19 +234,91 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
     bus = SoemBus(question["interface"], namespace_pid=question["namespace_pid"])
     bus.open()
     try:
-        slaves = bus.scan()
-        if question["do"] == "scan":
-            return {"slaves": [dataclasses.asdict(slave) for slave in slaves]}
-        position, index, subindex = question["slave"], question["index"], question["subindex"]
-        if not 1 <= position <= len(slaves):
-            missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
+        do = question["do"]
+        # What concerns the EEPROM or a state needs no slave in PRE-OP, which a wrong EEPROM may keep it from.
+        if do in ("eeprom_read", "eeprom_write", "state"):
+            count = bus.discover()
+        else:
+            slaves = bus.scan()
+            count = len(slaves)
+            if do == "scan":
+                return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(slave)) for slave in slaves]}
+        position = question["slave"]
+        if not 1 <= position <= count:
+            missing = f"no slave at position {position}: the bus {question['interface']} has {count}"
             return {"error": missing, "kind": "invalid"}
-        if question["do"] == "sdo_read":
-            return {"hex": bus.sdo_read(position, index, subindex).hex()}
-        bus.sdo_write(position, index, subindex, bytes.fromhex(question["hex"]))
-        return {}
+        return _ANSWERS[do](bus, position, question)
     finally:
         bus.close()
+
+
+def _tell(done: float) -> None:
+    print(json.dumps({"progress": done}), flush=True)
+
+
+def _tell_part(done: float) -> None:
+    # A line a word would be thousands.
+    if int(1000 * done) % 10 == 0:
+        _tell(done)
+
+
+def _sdo_read(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    return {"hex": bus.sdo_read(position, question["index"], question["subindex"]).hex()}
+
+
+def _sdo_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    bus.sdo_write(position, question["index"], question["subindex"], bytes.fromhex(question["hex"]))
+    return {}
+
+
+def _describe(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    return {"device": dataclasses.asdict(bus.describe_device(position, _tell_part))}
+
+
+def _foe_read(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    if question["boot"]:
+        bus.boot(position)
+    return {"hex": bus.foe(position).read(question["name"], question["password"], _tell).hex()}
+
+
+def _foe_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    if question["boot"]:
+        bus.boot(position)
+    bus.foe(position).write(question["name"], bytes.fromhex(question["hex"]), question["password"], _tell)
+    return {}
+
+
+def _eeprom_read(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    return {"hex": bus.read_eeprom(position, _tell_part, question["size"] or None).hex()}
+
+
+def _eeprom_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    image = bytes.fromhex(question["hex"])
+    return {"written": bus.write_eeprom(position, image, _tell_part, question["first"])}
+
+
+def _state(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    from rtcp.fieldbus.al_state import way_to
+
+    for state in way_to(question["state"]):
+        bus.request_state(state, [position])
+        if refused := bus.wait_for_state(state, STATE_TIMEOUT_S, [position]):
+            return {"error": "\n".join(refused), "kind": "refused"}
+    words = bus.read_states()[position - 1].words()
+    bus.release()
+    return {"state": words}
+
+
+_ANSWERS: dict[str, Callable[[SoemBus, int, dict[str, Any]], dict[str, Any]]] = {
+    "sdo_read": _sdo_read,
+    "sdo_write": _sdo_write,
+    "describe": _describe,
+    "foe_read": _foe_read,
+    "foe_write": _foe_write,
+    "eeprom_read": _eeprom_read,
+    "eeprom_write": _eeprom_write,
+    "state": _state,
+}
 
 
 def _plain(value: object) -> object:
@@ -204,6 +333,7 @@ def _plain(value: object) -> object:
 def main() -> int:
     """Answer the question on standard input; errors of the bus are answers too."""
     from rtcp.fieldbus.errors import BusError, SdoAborted
+    from rtcp.fieldbus.foe import FoeRefused
 
     # An interrupted command ends this process: the bus is closed on the way out.
     signal.signal(signal.SIGTERM, _leave)
@@ -211,7 +341,7 @@ def main() -> int:
     try:
         found = answer(question)
     except BusError as error:
-        found = {"error": str(error), "kind": "refused" if isinstance(error, SdoAborted) else "fault"}
+        found = {"error": str(error), "kind": "refused" if isinstance(error, SdoAborted | FoeRefused) else "fault"}
     print(json.dumps(found, default=_plain), flush=True)
     return 0
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.fieldbus.terminals import write_segment
+
 CHILD = Path(__file__).with_name("master_child.py")
 WATCHER = Path(__file__).with_name("watcher_child.py")
 MODELS = ("diewu-io", *("cubemars-orh70",) * 3, "cubemars-orh60", "cubemars-orh50", "cubemars-orh40")
@@ -18,9 +20,16 @@ MODELS = ("diewu-io", *("cubemars-orh70",) * 3, "cubemars-orh60", "cubemars-orh5
 class Segment:
     """A virtual segment in a process of its own, and masters that are started against it."""
 
-    def __init__(self, file: Path, count: int, program: Sequence[str] = ("-m", "rtcp.virtual")) -> None:
-        file.write_text("slaves:\n" + "".join(f"  - model: {model}\n" for model in MODELS[:count]))
-        self.count = count
+    def __init__(
+        self, file: Path, slaves: int | Sequence[str], program: Sequence[str] = ("-m", "rtcp.virtual")
+    ) -> None:  # fmt: skip
+        """Start it with so many of the arm's slaves, or with these of `terminals`."""
+        if isinstance(slaves, int):
+            file.write_text("slaves:\n" + "".join(f"  - model: {model}\n" for model in MODELS[:slaves]))
+            self.count = slaves
+        else:
+            write_segment(file, *slaves)
+            self.count = len(slaves)
         # Short: a Unix socket's path has 107 bytes at most.
         self.directory = Path(tempfile.mkdtemp(prefix="rtcp-segment-", dir="/tmp"))
         self.control = self.directory / "segment.sock"
@@ -60,8 +69,8 @@ class Segment:
 def start_segment(tmp_path):
     running: list[Segment] = []
 
-    def start(count: int, **program: Sequence[str]) -> Segment:
-        running.append(Segment(tmp_path / f"segment{len(running)}.yaml", count, **program))
+    def start(slaves: int | Sequence[str], **program: Sequence[str]) -> Segment:
+        running.append(Segment(tmp_path / f"segment{len(running)}.yaml", slaves, **program))
         return running[-1]
 
     yield start

@@ -26,8 +26,10 @@ from rtcp.devices import Cia402Drive, TargetState
 from rtcp.fieldbus import AlState, BusError, SdoAborted
 from rtcp.fieldbus.bus import ProcessData, station_of
 from rtcp.fieldbus.interface import enter
+from rtcp.fieldbus.pdo import layout
 from rtcp.fieldbus.registers import RegisterPort
 from rtcp.fieldbus.soem import SoemBus
+from tests.fieldbus.terminals import slave
 
 ARM = Path(__file__).parents[2] / "config" / "assistive_arm.yaml"
 INTERFACE = "ecat0"
@@ -305,6 +307,66 @@ def outputs(bus: SoemBus, count: int) -> Any:
     return {"box": bus.sdo_read(1, 0x7000, 1).hex(), "display": data.input(1)[14]}
 
 
+def terminals(bus: SoemBus, count: int, kinds: list[str]) -> Any:
+    """Bring slaves of `terminals` to OP; send patterns, and tell what comes back of each."""
+    slaves = [slave(f"t{n}", kind) for n, kind in enumerate(kinds)]
+    data = bus.configure(slaves, 1_000_000)
+    cycle = Cycle(data, 1_000_000)
+    to_op(bus, cycle)
+    patterns = []
+    for pattern in (0xFF, 0x00, 0x55, 0xAA, 0x13):
+        sent = []
+        for index, one in enumerate(slaves):
+            image = layout(one.device.rpdo)
+            value = int.from_bytes(bytes((pattern + 7 * index & 0xFF,)) * image.bytes, "little") & (1 << image.bits) - 1
+            sent.append(value.to_bytes(image.bytes, "little"))
+            data.set_output(index, sent[-1])
+        cycle.for_cycles(40)
+        patterns.append(([one.hex() for one in sent], [data.input(index).hex() for index in range(count)]))
+    return {
+        "states": [state.words() for state in bus.read_states()], "expected_wkc": data.expected_wkc,
+        "soem_expected": bus._master.expected_wkc, "wkcs": cycle.wkcs, "patterns": patterns,
+        "objects": [bus.sdo_read(1, 0x7000, n).hex() for n in (1, 2, 3)] if kinds[0] == "areas" else [],
+        "sync": (bus.port.read(station_of(2), 0x0980, 2) or b"").hex(),
+    }  # fmt: skip
+
+
+def files(bus: SoemBus, count: int) -> Any:
+    """Files written and read, also in BOOT, and what the slave refuses."""
+    bus.scan()
+    refused, done = [], []
+    foe = bus.foe(1)
+    for size in (0, 5, 116, 1000):
+        data = os.urandom(size)
+        foe.write("settings", data, 0, done.append)
+        if foe.read("settings", 0, lambda count: None) != data:
+            refused.append(f"{size} bytes came back differently")
+    for attempt in (lambda: foe.read("nothing", 0, done.append), lambda: foe.write("firmware", b"x", 0, done.append),
+                    lambda: bus.foe(2).read("settings", 0, done.append), lambda: bus.boot(2)):  # fmt: skip
+        try:
+            attempt()
+        except BusError as error:
+            refused.append(str(error))
+    firmware = os.urandom(2000)
+    bus.boot(1)
+    in_boot = bus.read_states()[0].words()
+    bus.foe(1).write("firmware", firmware, 0, done.append)
+    kept = bus.foe(1).read("firmware", 0, lambda count: None) == firmware
+    return {"refused": refused, "done": done, "in_boot": in_boot, "kept": kept}
+
+
+def eeprom(bus: SoemBus, count: int) -> Any:
+    """Read an EEPROM, write it with one word changed, and the alias."""
+    bus.discover()
+    parts: list[float] = []
+    before = bus.read_eeprom(1, parts.append)
+    changed = before[:0x1C] + b"\x07\x00" + before[0x1E:]
+    written = [bus.write_eeprom(1, changed, parts.append) for _ in range(2)]
+    after = bus.read_eeprom(1, parts.append)
+    bus.release()
+    return {"before": before.hex(), "written": written, "same": after == changed, "parts": [parts[0], parts[-1]]}
+
+
 def emergency(bus: SoemBus, count: int) -> Any:
     """A drive that is enabled loses its outputs: it faults and says so."""
     slaves = arm(count)
@@ -371,6 +433,9 @@ SCENARIOS = {
         stopped,
         beside,
         outputs,
+        terminals,
+        files,
+        eeprom,
         emergency,
         killed,
         interrupted,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from rtcp.fieldbus.slave_setup import SlaveRestorer, read_set_up
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.fieldbus.supervision import SlaveWatcher
 from rtcp.virtual.faults.control import SegmentClient
+from tests.fieldbus import terminals
 
 PERIOD = 1_000_000
 PATIENCE_S = 20.0
@@ -99,11 +101,13 @@ def patient(config: SlaveConfig) -> SlaveConfig:
 class Watched:
     """A segment in OP, its cycle and its watcher; an episode is a fault and what becomes of it."""
 
-    def __init__(self, bus: SoemBus, count: int, client: SegmentClient) -> None:
+    def __init__(
+        self, bus: SoemBus, count: int, client: SegmentClient, slaves: Sequence[SlaveConfig] | None = None
+    ) -> None:  # fmt: skip
         self.bus = bus
         self.count = count
         self.client = client
-        self.slaves = [patient(config) for config in arm(count)]
+        self.slaves = [patient(config) for config in slaves or arm(count)]
         self.data = bus.configure(self.slaves, PERIOD)
         self.cycle = Cycle(self.data, PERIOD)
         to_op(bus, self.cycle)
@@ -239,7 +243,23 @@ def episodes(bus: SoemBus, count: int, control: str) -> Any:
         }
 
 
+def branches(bus: SoemBus, count: int, control: str, kinds: list[str]) -> Any:
+    """Break the cable to the branch that frames pass first, and the supply of the other one's first slave."""
+    with SegmentClient(Path(control)) as client:
+        one = Watched(bus, count, client, [terminals.slave(f"t{n}", kind) for n, kind in enumerate(kinds, 1)])
+
+        def other_branch(watching: Watching) -> list[str]:
+            watching.until(lambda: watching.watcher.slaves[3].recovered)
+            found = [slave.words() for slave in watching.watcher.slaves]
+            client.clear(cable)
+            return found
+
+        cable = client.fault({"fault": "cable", "after": 1})
+        return one.episode([{"fault": "power", "slave": 4, "lasts": 0.05}], other_branch)
+
+
 master_child.SCENARIOS["episodes"] = episodes
+master_child.SCENARIOS["branches"] = branches
 
 if __name__ == "__main__":
     master_child.main()

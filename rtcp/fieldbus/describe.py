@@ -1,0 +1,180 @@
+"""A live slave as a device description: its EEPROM, its registers, and its object dictionary by SDO information."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+from rtcp.esi import model, types
+from rtcp.esi.sii import read_sii
+from rtcp.fieldbus.bus import PdoEntryInfo, PdoInfo, slave_label
+from rtcp.fieldbus.eeprom import Progress
+from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.mailbox import SdoClient
+from rtcp.fieldbus.pdo import ASSIGN, reading_assignment
+from rtcp.fieldbus.registers import finish
+
+_LIST, _OBJECT, _ENTRY = 1, 3, 5
+"""Services of SDO information (ETG.1000.6, 5.6.3): a list of objects, an object's description, an entry's."""
+_ALL_OBJECTS = 1
+_DESCRIPTION = struct.Struct("<HHBB")
+"""Index, data type, highest subindex, object code; the name follows."""
+_ENTRY_DESCRIPTION = struct.Struct("<HBBHHH")
+"""Index, subindex, what more there is, data type, bits, access; the name follows where nothing more was asked for."""
+_READ, _WRITE, _RX, _TX = 0x07, 0x38, 0x40, 0x80
+"""Access: read and write in PRE-OP, SAFE-OP and OP, mappable in RxPDOs and TxPDOs."""
+_WRITE_STATES = ((0x08, "P"), (0x10, "S"), (0x20, "O"))
+_CODES = {code.value: code for code in model.ObjectCode}
+_COUNT = 0
+"""Subindex of how many entries there are."""
+
+
+def pdos_of_eeprom(device: model.Device) -> tuple[tuple[PdoInfo, ...], tuple[PdoInfo, ...]]:
+    """Return the outputs and the inputs that an EEPROM assigns to sync managers by itself."""
+
+    def assigned(pdos: Sequence[model.Pdo]) -> tuple[PdoInfo, ...]:
+        return tuple(
+            PdoInfo(pdo.index, tuple(PdoEntryInfo(e.index, e.sub_index, e.bits, e.name) for e in pdo.entries))
+            for pdo in pdos
+            if pdo.sync_manager is not None
+        )
+
+    return assigned(device.rx_pdos), assigned(device.tx_pdos)
+
+
+def describe_device(sdo: SdoClient, has_coe: bool, eeprom: bytes, origin: str, progress: Progress) -> model.Device:
+    """Return the description of a slave in PRE-OP; its PDOs as they are assigned now.
+
+    Args:
+        sdo: SDO access to it.
+        has_coe: whether it speaks CoE.
+        eeprom: its EEPROM.
+        origin: the bus and its position, in words.
+        progress: receives the part of the object dictionary that was read.
+
+    Raises:
+        BusError: it stopped answering.
+        EsiError: its EEPROM is too short to hold anything.
+    """
+    device = replace(read_sii(eeprom, origin), source=model.Source.BUS, origin=origin)
+    if not has_coe:
+        return device
+    objects = tuple(_read_objects(sdo, progress))
+    names = {(one.index, entry.sub_index): entry for one in objects for entry in one.entries}
+    assigned = _assignments(sdo, device)
+    if not assigned:
+        return replace(device, objects=objects)
+    pdos: dict[bool, list[model.Pdo]] = {True: [], False: []}
+    for number, found in assigned.items():
+        outputs = device.sync_managers[number].type is model.SyncManagerType.OUTPUTS
+        pdos[outputs] += [_pdo(pdo, number, names, objects) for pdo in found]
+    return replace(
+        device,
+        objects=objects,
+        rx_pdos=_with_the_others(pdos[True], device.rx_pdos),
+        tx_pdos=_with_the_others(pdos[False], device.tx_pdos),
+    )
+
+
+def _with_the_others(assigned: Sequence[model.Pdo], known: Sequence[model.Pdo]) -> tuple[model.Pdo, ...]:
+    """Return the assigned PDOs with what the EEPROM says of them, and the EEPROM's others, which can be assigned."""
+    listed = {pdo.index: pdo for pdo in known}
+    now = [
+        replace(listed[pdo.index], entries=pdo.entries, sync_manager=pdo.sync_manager) if pdo.index in listed else pdo
+        for pdo in assigned
+    ]
+    there = {pdo.index for pdo in assigned}
+    return (*now, *(replace(pdo, sync_manager=None) for pdo in known if pdo.index not in there))
+
+
+def _assignments(sdo: SdoClient, device: model.Device) -> dict[int, tuple[PdoInfo, ...]]:
+    """Return the PDOs assigned to each sync manager of process data, as far as it has assignment objects."""
+    kinds = (model.SyncManagerType.OUTPUTS, model.SyncManagerType.INPUTS)
+    found = {}
+    for number, manager in enumerate(device.sync_managers):
+        if manager.type in kinds:
+            try:
+                found[number] = finish(reading_assignment(sdo, ASSIGN + number))
+            except SdoAborted:
+                continue
+    return found
+
+
+def _pdo(
+    pdo: PdoInfo,
+    number: int,
+    names: dict[tuple[int, int], model.ObjectEntry],
+    objects: Sequence[model.DictionaryObject],
+) -> model.Pdo:
+    entries = []
+    for entry in pdo.entries:
+        known = names.get((entry.index, entry.sub_index)) if entry.index else None
+        kind = known.type if known is not None else types.of_bits(entry.bits).name if entry.index else ""
+        entries.append(
+            model.PdoEntry(entry.index, entry.sub_index, entry.bits, known.name if known is not None else "", kind)
+        )
+    name = next((one.name for one in objects if one.index == pdo.index), "")
+    count = names.get((pdo.index, _COUNT))
+    return model.Pdo(pdo.index, name, tuple(entries), number, fixed=count is not None and not count.writable)
+
+
+def _read_objects(sdo: SdoClient, progress: Progress) -> Iterator[model.DictionaryObject]:
+    """Yield the objects of the dictionary; none where the slave offers no SDO information."""
+    try:
+        listed = finish(sdo.information(_LIST, struct.pack("<H", _ALL_OBJECTS)))
+    except SdoAborted:
+        return
+    indices = [index for (index,) in struct.iter_unpack("<H", listed[2 : len(listed) // 2 * 2])]
+    for at, index in enumerate(indices, 1):
+        # What is listed and not described exists in some slaves; it is of no use.
+        try:
+            made = _read_object(sdo, index)
+        except SdoAborted:
+            made = None
+        if made is not None:
+            yield made
+        progress(at / len(indices))
+
+
+def _read_object(sdo: SdoClient, index: int) -> model.DictionaryObject | None:
+    data = finish(sdo.information(_OBJECT, struct.pack("<H", index)))
+    if len(data) < _DESCRIPTION.size:
+        return None
+    found, _, highest, code = _DESCRIPTION.unpack_from(data)
+    if found != index:
+        where = slave_label(sdo.position, sdo.name)
+        raise BusError(f"{where}: asked for object 0x{index:04X}, it described 0x{found:04X}")
+    kind = _CODES.get(code, model.ObjectCode.RECORD if highest else model.ObjectCode.VARIABLE)
+    entries = []
+    for sub_index in range(highest + 1 if kind is not model.ObjectCode.VARIABLE else 1):
+        try:
+            entry = read_entry(sdo, index, sub_index)
+        except SdoAborted:
+            continue  # a record may have gaps
+        if entry is not None:
+            entries.append(entry)
+    return model.DictionaryObject(index, _text(data[_DESCRIPTION.size :]), kind, tuple(entries))
+
+
+def read_entry(sdo: SdoClient, index: int, sub_index: int) -> model.ObjectEntry | None:
+    """Return the description of an entry; None: the answer holds none. Raises BusError."""
+    data = finish(sdo.information(_ENTRY, struct.pack("<HBB", index, sub_index, 0)))
+    if len(data) < _ENTRY_DESCRIPTION.size:
+        return None
+    _, _, _, kind, bits, access = _ENTRY_DESCRIPTION.unpack_from(data)
+    return model.ObjectEntry(
+        sub_index,
+        _text(data[_ENTRY_DESCRIPTION.size :]),
+        types.of_number(kind, bits).name,
+        bits,
+        readable=bool(access & _READ),
+        writable=bool(access & _WRITE),
+        write_states="" if access & _WRITE == _WRITE else "".join(name for bit, name in _WRITE_STATES if access & bit),
+        rx_mappable=bool(access & _RX),
+        tx_mappable=bool(access & _TX),
+    )
+
+
+def _text(data: bytes) -> str:
+    return data.rstrip(b"\0").decode("latin-1")

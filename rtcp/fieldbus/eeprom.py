@@ -1,0 +1,125 @@
+"""The EEPROM of a slave, its SII: who may access it, and words read and written (ETG.1000.4, 6.4)."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable
+
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.registers import Register, RegisterPort, Steps, finish, pause
+
+ALIAS_WORD, CHECKSUM_WORD, BOOTSTRAP_WORD, SIZE_WORD = 0x04, 0x07, 0x14, 0x3E
+"""Word addresses (ETG.2010, table 2): alias, checksum of the words before it, mailboxes in BOOT, size in KiBit."""
+_EIGHT_BYTES = 0x0040
+"""Status bit: a read gives eight bytes."""
+_READ, _WRITE = 0x0100, 0x0201
+"""Commands; a write carries its own permission (bit 0)."""
+_BUSY, _FAILED = 0x8000, 0x6000
+"""Status bits: busy; command not acknowledged or wrong, write without permission. A wrong checksum is no failure."""
+_READY_S = 0.5
+_ATTEMPTS = 5
+_RETRY_S = 0.005
+Progress = Callable[[float], None]
+"""Receives how much of a transfer is done, 0 to 1."""
+
+
+def eeprom_to_device(port: RegisterPort, station: int) -> bool:
+    """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
+    return port.write(station, Register.EEPROM_CONFIG, b"\x01\x00")
+
+
+def eeprom_to_master(port: RegisterPort, station: int) -> bool:
+    """Take the EEPROM from the slave, also by force; return whether it is the master's (ETG.1000.4, 6.4.2)."""
+    return all(port.write(station, Register.EEPROM_CONFIG, value) for value in (b"\x02\x00", b"\x00\x00"))
+
+
+def reading_words(port: RegisterPort, station: int, word: int, label: str) -> Steps[bytes]:
+    """Return four or eight bytes from `word` on; the EEPROM is the master's. Raises BusError."""
+    status = 0
+    for _ in range(_ATTEMPTS):
+        status = yield from _command(port, station, _READ, word, label, "read")
+        found = port.read(station, Register.EEPROM_DATA, 8 if status & _EIGHT_BYTES else 4)
+        if found is not None and not status & _FAILED:
+            return found
+        # An EEPROM is busy for some milliseconds after a write and refuses commands meanwhile.
+        yield from pause(_RETRY_S)
+    raise BusError(f"{label}: word 0x{word:04X} of its EEPROM cannot be read (status 0x{status:04X})")
+
+
+def writing_word(port: RegisterPort, station: int, word: int, data: bytes, label: str) -> Steps[None]:
+    """Write the two bytes of `word` and read them back, again where that failed (SOEM#675); raises BusError."""
+    status = 0
+    kept = b""
+    for _ in range(_ATTEMPTS):
+        port.put(station, Register.EEPROM_DATA, data, label)
+        status = yield from _command(port, station, _WRITE, word, label, "written")
+        if not status & _FAILED:
+            kept = (yield from reading_words(port, station, word, label))[:2]
+            if kept == data:
+                return
+        yield from pause(_RETRY_S)
+    found = f"reads back as {kept.hex(' ')}" if kept else f"was refused (status 0x{status:04X})"
+    raise BusError(f"{label}: word 0x{word:04X} of its EEPROM was set to {data.hex(' ')} and {found}")
+
+
+def _command(port: RegisterPort, station: int, command: int, word: int, label: str, done: str) -> Steps[int]:
+    """Give a command and return the status after it."""
+    port.put(station, Register.EEPROM_CONTROL, struct.pack("<HI", command, word), label)
+    deadline = time.monotonic() + _READY_S
+    while True:
+        data = port.read(station, Register.EEPROM_CONTROL, 2)
+        if data is None:
+            raise BusError(f"{label} stopped answering while its EEPROM was {done}")
+        status = int.from_bytes(data, "little")
+        if not status & _BUSY:
+            return status
+        if time.monotonic() >= deadline:
+            raise BusError(f"{label}: its EEPROM stays busy")
+        yield
+
+
+def read_eeprom(port: RegisterPort, station: int, label: str, progress: Progress, size: int | None = None) -> bytes:
+    """Return `size` bytes of a slave's EEPROM, None: all that it says it has; raises BusError."""
+    _take(port, station, label)
+    try:
+        if size is None:
+            size = 128 * (int.from_bytes(finish(reading_words(port, station, SIZE_WORD, label))[:2], "little") + 1)
+        image = bytearray()
+        while len(image) < size:
+            image += finish(reading_words(port, station, len(image) // 2, label))
+            progress(min(len(image) / size, 1.0))
+        return bytes(image[:size])
+    finally:
+        eeprom_to_device(port, station)
+
+
+def write_eeprom(
+    port: RegisterPort, station: int, label: str, image: bytes, progress: Progress, first: int = 0
+) -> int:  # fmt: skip
+    """Write `image` from word `first` on, as far as it differs, each word read back; return how many were written.
+
+    Raises:
+        BusError: a word is not kept, or the slave stopped answering; what was written before stays.
+    """
+    _take(port, station, label)
+    written = 0
+    try:
+        at = 0
+        while at < len(image):
+            there = finish(reading_words(port, station, first + at // 2, label))
+            wanted = image[at : at + len(there)]
+            for i in range(0, len(wanted), 2):
+                if wanted[i : i + 2] != there[i : i + 2]:
+                    finish(writing_word(port, station, first + (at + i) // 2, wanted[i : i + 2], label))
+                    written += 1
+            at += len(there)
+            progress(min(at / len(image), 1.0))
+        return written
+    finally:
+        eeprom_to_device(port, station)
+
+
+def _take(port: RegisterPort, station: int, label: str) -> None:
+    if not eeprom_to_master(port, station):
+        raise BusError(f"{label} did not take the request for its EEPROM in register 0x{Register.EEPROM_CONFIG:04X}")

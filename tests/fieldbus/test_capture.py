@@ -1,0 +1,58 @@
+"""`rtcp capture`: the frames of a segment in a pcapng file, read here by the format's own description."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rtcp.ipc.errors import RtcpError
+from rtcp.launch.capturing import Capture
+
+pytestmark = pytest.mark.alone
+
+SECTION, INTERFACE, PACKET = 0x0A0D0D0A, 1, 6
+OUTBOUND = 2
+
+
+def blocks(file: Path) -> Iterator[tuple[int, bytes]]:
+    data = file.read_bytes()
+    at = 0
+    while at < len(data):
+        kind, length = struct.unpack_from("<II", data, at)
+        assert struct.unpack_from("<I", data, at + length - 4) == (length,)
+        yield kind, data[at + 8 : at + length - 4]
+        at += length
+    assert at == len(data)
+
+
+def test_every_frame_of_a_scan_is_in_the_file_with_its_time_and_direction(segment, tmp_path):
+    out = tmp_path / "scan.pcapng"
+    began = time.time_ns()
+    with Capture("ecat0", segment.pid, out) as capture:
+        assert len(segment.master("scan")["result"]) == 3
+        counted = capture.wait(0.5)
+    (first, section), (second, interface), *packets = blocks(out)
+    assert (first, section[:8]) == (SECTION, struct.pack("<IHH", 0x1A2B3C4D, 1, 0))
+    assert (second, interface[:2]) == (INTERFACE, b"\x01\x00")
+    assert b"ecat0" in interface
+    assert (counted.frames, counted.lost) == (len(packets), 0)
+    directions, last = [], began
+    for kind, content in packets:
+        _, high, low, captured, original = struct.unpack_from("<IIIII", content)
+        frame, options = content[20 : 20 + captured], content[20 + (captured + 3 & ~3) :]
+        assert (kind, captured) == (PACKET, original)
+        assert frame[12:14] == b"\x88\xa4"
+        assert last - 1_000_000_000 < (last := high << 32 | low) < time.time_ns()
+        directions.append(struct.unpack_from("<HHI", options)[2])
+    # Each frame goes out and comes back.
+    assert directions.count(OUTBOUND) == pytest.approx(len(packets) / 2, rel=0.05)
+    assert len(packets) > 500
+
+
+def test_an_interface_that_does_not_exist_is_told(tmp_path):
+    with pytest.raises(RtcpError, match="there is no network interface rtcp-none0"):
+        Capture("rtcp-none0", None, tmp_path / "x.pcapng")
