@@ -1,4 +1,4 @@
-"""A device's file (`config/devices/NAME.yaml`) made of its description, with what a person needs to know as comments."""
+"""A device's file (`config/devices/NAME.yaml`) made of its description, with comments for the person who uses it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rtcp.config.model import BITS
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.esi import units
 from rtcp.esi.dictionary import complete
-from rtcp.esi.model import Device, DcMode, ObjectEntry, Pdo, PdoEntry, SyncManagerType
+from rtcp.esi.model import DcMode, Device, ObjectEntry, Pdo, PdoEntry, SyncManagerType
 from rtcp.esi.types import Kind, decode, resolve
 
 _DRIVE_PROFILE = 402
@@ -43,6 +43,8 @@ _DRIVE_CHANNELS = {
 _NEEDED = {True: (0x6040, 0x607A), False: (0x6041, 0x6064)}
 """Objects that the driver of a drive cannot do without, by whether they are outputs."""
 _MODE_OBJECT, _CSP = 0x6060, 8
+_SYNC0 = 0x0200
+"""Bit of AssignActivate that activates SYNC0."""
 _DRIVE_WATCHDOG_MS, _WATCHDOG_MS = 20, 100
 _ANALOG_BITS = 16
 """Shortest analog value."""
@@ -67,7 +69,8 @@ def kind_of(device: Device) -> str:
     rx, tx = (entries_of(assigned(device, outputs)) for outputs in (True, False))
     if not rx and not tx:
         return "coupler"
-    if _axes(device):
+    coe = None if device.mailbox is None else device.mailbox.coe
+    if _axes(device) and (coe is not None or _MODE_OBJECT in {entry.index for entry in rx}):
         return "cia402"
     if any(_COUNTER.search(entry.name) for entry in tx):
         return "encoder"
@@ -168,7 +171,7 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
         yield from _scaling_lines(device)
     names: Counter[str] = Counter()
     for key, outputs in (("rpdo", True), ("tpdo", False)):
-        yield from _pdo_lines(device, kind, key, assigned(device, outputs), outputs, names)
+        yield from _pdo_lines(device, kind, key, assigned(device, outputs), outputs, names, configurable)
         yield from _others(device, key, outputs)
 
 
@@ -177,17 +180,23 @@ def _clock_lines(device: Device, kind: str) -> Iterator[str]:
     chosen = modes[0] if modes else None
     if kind == "cia402":
         chosen = next((mode for mode in modes if mode.assign_activate & 0x0100), chosen)
+    if chosen is not None and not chosen.assign_activate & _SYNC0:
+        chosen = next((mode for mode in modes if not mode.assign_activate), replace(chosen, assign_activate=0))
     word = 0 if chosen is None else chosen.assign_activate
     yield f"assign_activate: 0x{word:04X}     # " + (
         "it has no distributed clock" if chosen is None else _mode_text(chosen)
     )
     if chosen is not None:
-        if chosen.sync0_factor not in (0, 1):
+        if chosen.sync0_cycle:
+            yield f"sync0_factor: 0\nsync0_cycle_us: {chosen.sync0_cycle / 1000:g}"
+        elif chosen.sync0_factor not in (0, 1):
             yield f"sync0_factor: {chosen.sync0_factor}"
         if chosen.sync0_shift:
             yield f"sync0_shift_us: {chosen.sync0_shift / 1000:g}"
         if chosen.assign_activate & 0x0400:
-            if chosen.sync1_factor:
+            if chosen.sync1_cycle:
+                yield f"sync1_cycle_us: {chosen.sync1_cycle / 1000:g}"
+            elif chosen.sync1_factor:
                 yield f"sync1_factor: {chosen.sync1_factor}"
             if chosen.sync1_shift:
                 yield f"sync1_shift_us: {chosen.sync1_shift / 1000:g}"
@@ -211,6 +220,8 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
     for command in device.init_commands:
         if command.index in mapping or 0x1C10 <= command.index <= 0x1C2F:
             continue  # what the mapping below says
+        if kind == "cia402" and command.index % OBJECTS_PER_AXIS == _MODE_OBJECT % OBJECTS_PER_AXIS:
+            continue  # below
         entry = _object(device, command.index, command.sub_index)
         kept = None if entry is None else resolve(entry.type, entry.bits)
         name = (command.comment or ("" if entry is None else entry.name)).strip()
@@ -229,17 +240,17 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
             + "}"
         )
     mapped = {entry.index for entry in entries_of(assigned(device, True))}
-    listed = {command.index for command in device.init_commands}
     for axis in (_axes(device) or (1,)) if kind == "cia402" else ():
         index = _MODE_OBJECT + (axis - 1) * OBJECTS_PER_AXIS
-        if index not in mapped and index not in listed:
+        if index not in mapped:
             written.append(
                 f"  - {{index: 0x{index:04X}, sub_index: 0, type: int8, value: {_CSP}, name: modes of operation}}"
                 "   # CSP; no PDO has it"
             )
     if written:
         yield "# Start-up SDOs, written in PRE-OP in this order and read back, in the device's own units."
-        yield "sdo:"
+        if any(line.startswith("  - ") for line in written):
+            yield "sdo:"
         yield from written
         yield ""
 
@@ -295,7 +306,7 @@ def _axes(device: Device) -> tuple[int, ...]:
 
 
 def _pdo_lines(
-    device: Device, kind: str, key: str, pdos: Sequence[Pdo], outputs: bool, names: Counter[str]
+    device: Device, kind: str, key: str, pdos: Sequence[Pdo], outputs: bool, names: Counter[str], configurable: bool
 ) -> Iterator[str]:
     yield f"# {'Master to device' if outputs else 'Device to master'}. SI value = counts * factor."
     filled = [pdo for pdo in pdos if pdo.entries]
@@ -304,6 +315,7 @@ def _pdo_lines(
         yield ""
         return
     usual = _usual_sync_manager(device, outputs)
+    named_managers = any(pdo.sync_manager != usual for pdo in filled)
     yield f"{key}:"
     repeated = Counter(name for pdo in filled for name in {entry.name for entry in pdo.entries})
     for pdo in filled:
@@ -312,7 +324,9 @@ def _pdo_lines(
             marks.append("excludes " + ", ".join(f"0x{index:04X}" for index in sorted(pdo.excludes)))
         said = "; ".join([pdo.name, *marks] if pdo.name else marks)
         yield f"  - index: 0x{pdo.index:04X}" + (f"     # {_clean(said)}" if said else "")
-        if pdo.sync_manager is not None and pdo.sync_manager != usual:
+        if pdo.fixed and configurable:
+            yield "    fixed: true"
+        if named_managers:
             yield f"    sync_manager: {pdo.sync_manager}"
         axis = _axis_of(pdo) if kind == "cia402" else 1
         if axis > 1:
@@ -395,7 +409,7 @@ def _type_keys(name: str, bits: int) -> str:
     data_type = resolve(name, bits)
     if data_type.kind is Kind.REAL:
         return f"type: float{bits}"
-    if data_type.kind in (Kind.TEXT, Kind.BYTES):
+    if data_type.kind in (Kind.TEXT, Kind.BYTES) and not bits % 8:
         return f"type: bytes, bits: {bits}"
     if bits == 1:
         return "type: bool"

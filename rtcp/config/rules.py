@@ -159,12 +159,12 @@ def _kind(device: DeviceDescription) -> Iterator[Finding]:
 
 @rule(DeviceDescription, "rpdo", "kind")
 def _rpdo(device: DeviceDescription) -> Iterator[Finding]:
-    return _pdos("rpdo", device.rpdo, device.kind)
+    return _pdos("rpdo", device.rpdo, device)
 
 
 @rule(DeviceDescription, "tpdo", "kind")
 def _tpdo(device: DeviceDescription) -> Iterator[Finding]:
-    return _pdos("tpdo", device.tpdo, device.kind)
+    return _pdos("tpdo", device.tpdo, device)
 
 
 @rule(DeviceDescription, "assign_activate")
@@ -247,12 +247,14 @@ def _of_drive(scaling: DriveScaling) -> Iterator[Finding]:
         yield ("rated_torque",), "found beside rated_current, allowed is one of them: what torques are thousandths of"
 
 
-def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
+def _pdos(direction: str, pdos: Sequence[Pdo], device: DeviceDescription) -> Iterator[Finding]:
+    kind = device.kind
     other, low, high = OTHER_PDOS[direction]
     first: dict[int, int] = {}
     axes: dict[int, dict[str, tuple[KeyPath, PdoEntry]]] = {}
     for i, pdo in enumerate(pdos):
-        if low <= pdo.index <= high:
+        # Some devices with a fixed mapping call their inputs RxPDOs.
+        if low <= pdo.index <= high and device.configurable_pdos:
             text = f"found {pdo.index:#06x}, one of the objects of a {other} ({low:#x} to {high:#x})"
             yield (direction, i, "index"), f"{text}; allowed is one of a {direction}"
         elif first.setdefault(pdo.index, i) != i:
