@@ -41,6 +41,7 @@ from rtcp.cli import (
 from rtcp.cli.arguments import PlatformName, choose_platform
 from rtcp.cli.output import CommandError, ExitCode, code_of, complain, emit, interruption_code, mute
 from rtcp.config.model import ConfigError
+from rtcp.esi.model import EsiError
 
 app = typer.Typer(
     name="rtcp",
@@ -74,8 +75,8 @@ def _root(
 
 
 _GROUPS = (
-    platform, status, cell, motion, process, jog, arm, bus, device, slaves, segment, irc5, demo, service, doctor, soak, faults,
-    record, recorded, live, experiment, panel, ros, shape_set,
+    platform, status, cell, motion, process, jog, arm, bus, device, slaves, segment, irc5, demo, service, doctor, soak,
+    faults, record, recorded, live, experiment, panel, ros, shape_set,
 )  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)
@@ -99,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except RtcpError as error:
         complain(error.message)
         code = code_of(error.kind)
-    except ConfigError as error:
+    except (ConfigError, EsiError) as error:
         complain(str(error))
         code = ExitCode.USAGE
     except CommandError as error:

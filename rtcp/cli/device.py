@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtcp.cli.arguments import AsJson, BusName, ConfigFile, option
-from rtcp.cli.bus import bus_access
-from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table
-from rtcp.config.numbers import plain_number
+from rtcp.cli.bus import open_bus, parse_integer
+from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table, transfer
+from rtcp.cli.slaves import own_bus
 
 if TYPE_CHECKING:
     from rtcp.config.model import DeviceDescription, Pdo
@@ -40,13 +41,13 @@ def _list(
         modules = [{"ident": module.ident, "name": module.name} for module in content.modules]
         emit_json({"vendor_id": content.vendor_id, "vendor": content.vendor_name, "devices": rows, "modules": modules})
         return
-    headings = ("product", "revision", "name", "kind", "out bits", "in bits", "mailbox", "clock", "slots")
-    title = f"{content.vendor_name or file.name}, vendor 0x{content.vendor_id:08X}"
-    overview = table(headings, ("name", "kind", "mailbox", "clock"), title=title)
+    headings = ("product", "revision", "name", "kind", "out", "in", "mailbox", "clock", "slots")
+    title = f"{content.vendor_name or file.name}, vendor 0x{content.vendor_id:08X}; process data in bits"
+    overview = table(headings, ("kind", "mailbox", "clock"), title=title, fill="name", expand=True)
     for row in rows:
-        numbers = [f"0x{row[key]:08X}" for key in ("product", "revision")]
-        overview.add_row(*numbers, *(str(row[key]) for key in ("name", "kind", "output_bits", "input_bits", "mailbox")),
-                         "yes" if row["dc"] else "no", str(row["slots"] or ""))  # fmt: skip
+        numbers = [f"0x{row[key]:X}" for key in ("product", "revision")]
+        texts = [str(row[key]) for key in ("name", "kind", "output_bits", "input_bits", "mailbox")]
+        overview.add_row(*numbers, *texts, "yes" if row["dc"] else "no", str(row["slots"] or ""))
     parts = [overview]
     if content.modules:
         parts.append(table(("ident", "module"), ("module",)))
@@ -91,7 +92,6 @@ def _new(
     """Write a device's file that a person reads: process data with types and units, start-up SDOs, clocks, watchdog."""
     from rtcp.config.device_file import file_text
     from rtcp.config.loader import load_device
-    from rtcp.esi.model import EsiError
     from rtcp.esi.modules import assemble
     from rtcp.esi.reader import find_device
 
@@ -108,14 +108,16 @@ def _new(
     elif chosen:
         raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
     else:
-        made = _of_image(sii) if sii is not None else _of_bus(str(from_bus), int(slave or 0), config)
+        made = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
     text = file_text(made, kind)
-    if out.exists():
-        raise CommandError(f"{out}: there is such a file; it is not overwritten")
-    out.write_text(text)
+    try:
+        with out.open("x") as file:
+            file.write(text)
+    except FileExistsError:
+        raise CommandError(f"{out}: there is such a file; it is not overwritten") from None
     load_device(out)
-    marks = text.count("CHECK")
-    report(f"{out}: {made.name}" + (f"; {marks} lines marked CHECK need a person" if marks else ""))
+    marks = text.count("CHECK:")
+    report(f"{out}: {made.name}" + (f"; lines marked CHECK, {marks} of them, need a person" if marks else ""))
 
 
 @device.command("check")
@@ -138,7 +140,7 @@ def _check(
     report(f"{file}: {described.name}, kind {described.kind}, {bits}: no mistake in it")
     if bus is None:
         return
-    with bus_access("device check", bus, config) as asked:
+    with open_bus("device check", bus, config) as asked:
         slaves = asked.access.scan()
     same = [slave for slave in slaves if (slave["vendor_id"], slave["product_code"]) == _identity(described)]
     if not same:
@@ -172,9 +174,8 @@ def _differences(described: DeviceDescription, slave: Mapping[str, Any]) -> list
         bus_entries = [(e["index"], e["sub_index"], e["bits"]) for pdo in slave[direction] for e in pdo["entries"]]
         if described.coe and file_entries != bus_entries:
             said = "will be written" if described.configurable_pdos else "cannot be written"
-            differences.append(
-                f"{key}: the file has {_entries(file_entries)}; the slave has {_entries(bus_entries)}; the mapping {said}"
-            )
+            found = f"the file has {_entries(file_entries)}; the slave has {_entries(bus_entries)}"
+            differences.append(f"{key}: {found}; the mapping {said}")
     return differences
 
 
@@ -200,27 +201,38 @@ def _identity_text(of: DeviceDescription | Mapping[str, Any]) -> str:
 
 
 def _read(file: Path) -> DeviceFile:
-    """Read an ESI file, say what was accepted of it with a warning; raises CommandError."""
-    from rtcp.esi.model import EsiError
+    """Read an ESI file, say what was accepted of it with a warning; raises EsiError."""
     from rtcp.esi.reader import read_esi
 
-    try:
-        content = read_esi(file)
-    except EsiError as error:
-        raise CommandError(str(error)) from error
+    content = read_esi(file)
     for warning in content.warnings:
         report(f"warning: {warning}")
     return content
 
 
 def _of_image(file: Path) -> Device:
-    from rtcp.esi.model import EsiError
-    from rtcp.esi.sii import read_sii
+    """Read an EEPROM image, say what is wrong in it; raises CommandError where it is none."""
+    from rtcp.esi import sii
 
-    try:
-        return read_sii(file.read_bytes(), str(file))
-    except EsiError as error:
-        raise CommandError(str(error)) from error
+    image = file.read_bytes()
+    if len(image) < sii.HEADER_BYTES or sii.crc(image[:14]) != image[14]:
+        raise CommandError(f"{file}: it is no EEPROM image: too short, or the checksum of its first 14 bytes is wrong")
+    for sentence in sii.check_sii(image):
+        report(f"warning: {file}: {sentence}")
+    return sii.read_sii(image, str(file))
+
+
+def _of_bus(bus: str, slave: int, config: Path | None) -> Device:
+    """Ask a slave what it is; raises as `own_bus`."""
+    from pydantic import ConfigDict, TypeAdapter
+
+    from rtcp.esi import model
+
+    with own_bus("device new", bus, config) as (_, access), transfer("reading", 1.0) as progress:
+        answer = access.describe(slave, progress)
+    # Of a list: settings of an adapter do not reach a dataclass that is its own type.
+    adapter = TypeAdapter(list[model.Device], config=ConfigDict(val_json_bytes="hex"))
+    return adapter.validate_json(json.dumps([answer]))[0]
 
 
 def _slots(given: Sequence[str]) -> dict[int, int]:
@@ -234,9 +246,4 @@ def _slots(given: Sequence[str]) -> dict[int, int]:
 
 
 def _number(name: str, text: str | None) -> int | None:
-    if text is None:
-        return None
-    number = plain_number(text)
-    if number is None or number != int(number) or not 0 <= number <= 0xFFFFFFFF:
-        raise CommandError(f"{name}: found {text!r}, allowed is a whole number, decimal or as 0x0001A")
-    return int(number)
+    return None if text is None else parse_integer(text, name)

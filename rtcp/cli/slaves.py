@@ -69,7 +69,7 @@ def _foe_read(
 ) -> None:
     """Read a file of a slave."""
     number = parse_integer(password, "--password")
-    with _own_bus("foe read", bus, config) as (asked, access), transfer(f"reading {name}") as progress:
+    with own_bus("foe read", bus, config) as (asked, access), transfer(f"reading {name}") as progress:
         data = access.foe_read(asked.position(slave), name, number, boot, progress)
     out.write_bytes(data)
     report(f"{len(data)} bytes written to {out}")
@@ -87,7 +87,7 @@ def _foe_write(
 ) -> None:
     """Write a file to a slave."""
     number, data, name = parse_integer(password, "--password"), file.read_bytes(), name or file.name
-    with _own_bus("foe write", bus, config) as (asked, access), transfer(f"writing {name}", len(data)) as progress:
+    with own_bus("foe write", bus, config) as (asked, access), transfer(f"writing {name}", len(data)) as progress:
         position = asked.position(slave)
         access.foe_write(position, name, data, number, boot, progress)
     report(f"slave {position}: {len(data)} bytes written to its file {name}")
@@ -101,7 +101,7 @@ def _eeprom_read(
     config: ConfigFile = None,
 ) -> None:
     """Read the whole EEPROM into a file."""
-    with _own_bus("eeprom read", bus, config) as (asked, access), transfer("reading", 1.0) as progress:
+    with own_bus("eeprom read", bus, config) as (asked, access), transfer("reading", 1.0) as progress:
         image = access.eeprom_read(asked.position(slave), progress=progress)
     out.write_bytes(image)
     report(f"{len(image)} bytes written to {out}")
@@ -112,7 +112,7 @@ def _eeprom_dump(slave: SlaveName, bus: BusName = None, config: ConfigFile = Non
     """Show what the EEPROM says, and what is wrong in it."""
     from rtcp.esi.sii import check_sii, read_sii
 
-    with _own_bus("eeprom dump", bus, config) as (asked, access), transfer("reading", 1.0) as progress:
+    with own_bus("eeprom dump", bus, config) as (asked, access), transfer("reading", 1.0) as progress:
         position = asked.position(slave)
         image = access.eeprom_read(position, progress=progress)
     show(*_description(read_sii(image, f"slave {position}"), len(image)))
@@ -131,7 +131,7 @@ def _eeprom_write(
 ) -> None:
     """Write an image into the EEPROM, word by word, each read back. A wrong image makes a slave useless."""
     image = file.read_bytes()
-    with _own_bus("eeprom write", bus, config) as (asked, access):
+    with own_bus("eeprom write", bus, config) as (asked, access):
         position = asked.position(slave)
         with transfer("reading", 1.0) as progress:
             before = access.eeprom_read(position, progress=progress)
@@ -158,7 +158,7 @@ def _alias_set(
     value = parse_integer(number, "ALIAS")
     if not 0 <= value <= 0xFFFF:
         raise CommandError(f"alias {value} is not allowed: 0 to 65535")
-    with _own_bus("alias set", bus, config) as (asked, access):
+    with own_bus("alias set", bus, config) as (asked, access):
         position = asked.position(slave)
         image = bytearray(access.eeprom_read(position, 2 * (CHECKSUM_WORD + 1)))
         image[2 * ALIAS_WORD : 2 * ALIAS_WORD + 2] = value.to_bytes(2, "little")
@@ -178,7 +178,7 @@ def _state(
     wanted = state.upper().replace("-", "")
     if wanted not in STATES:
         raise CommandError(f"state {state!r} is not known: {', '.join(STATES)}; OP needs a cycle: `rtcp start`")
-    with _own_bus("state", bus, config) as (asked, access):
+    with own_bus("state", bus, config) as (asked, access):
         position = asked.position(slave)
         found = access.state(position, wanted)
     report(f"slave {position}: {found}")
@@ -206,7 +206,7 @@ def _capture(
 def _describe(slave: str, bus: str | None, config: Path | None, as_json: bool) -> None:
     """Show what a slave tells of itself: identity, PDOs as they are assigned, object dictionary."""
     with (
-        _own_bus("scan --describe", bus, config) as (asked, access),
+        own_bus("scan --describe", bus, config) as (asked, access),
         transfer("reading", 1.0, quiet=as_json) as progress,
     ):
         device = access.describe(asked.position(slave), progress)
@@ -238,7 +238,7 @@ def _plain(text: str) -> str:
 
 
 @contextmanager
-def _own_bus(command: str, name: str | None, config: Path | None) -> Iterator[tuple[Bus, OfflineBus]]:
+def own_bus(command: str, name: str | None, config: Path | None) -> Iterator[tuple[Bus, OfflineBus]]:
     """Yield the bus where no platform holds it.
 
     Raises:

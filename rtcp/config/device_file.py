@@ -16,6 +16,8 @@ from rtcp.esi.model import DcMode, Device, ObjectEntry, Pdo, PdoEntry, SyncManag
 from rtcp.esi.types import Kind, decode, resolve
 
 _DRIVE_PROFILE = 402
+MAPPINGS = {True: range(0x1600, 0x1800), False: range(0x1A00, 0x1C00)}
+"""Usual indices of PDOs, by whether they are outputs (ETG.1000.6)."""
 _MOST_AXES, _WORD = 8, 16
 _AXES = range(0x6000, 0x6000 + _MOST_AXES * OBJECTS_PER_AXIS)
 _MAPPED_OBJECTS = {
@@ -48,7 +50,7 @@ _SYNC0 = 0x0200
 _DRIVE_WATCHDOG_MS, _WATCHDOG_MS = 20, 100
 _ANALOG_BITS = 16
 """Shortest analog value."""
-_COUNTER = re.compile(r"counter|encoder", re.IGNORECASE)
+_COUNTER = re.compile(r"counter value|encoder value|encoder position|^position$|^position value", re.IGNORECASE)
 _CHANNEL = re.compile(r"(?:channel|ch\.?)\s*(\d+)", re.IGNORECASE)
 _WIDTH = 118
 
@@ -70,14 +72,24 @@ def kind_of(device: Device) -> str:
     if not rx and not tx:
         return "coupler"
     coe = None if device.mailbox is None else device.mailbox.coe
-    if _axes(device) and (coe is not None or _MODE_OBJECT in {entry.index for entry in rx}):
+    if _axes(device) and (coe is not None or {_MODE_OBJECT, _MODE_OBJECT + 1} <= {entry.index for entry in (*rx, *tx)}):
         return "cia402"
-    if any(_COUNTER.search(entry.name) for entry in tx):
+    if _counter(device) is not None:
         return "encoder"
     values = [entry for entry in (*rx, *tx) if entry.bits >= _ANALOG_BITS]
     if values and all(resolve(entry.type, entry.bits).kind in (Kind.SIGNED, Kind.REAL) for entry in values):
         return "analog"
     return "generic"
+
+
+def _counter(device: Device) -> PdoEntry | None:
+    """Return the one input that counts turns; None: there is none, or there are several."""
+    counters = [
+        entry
+        for entry in entries_of(assigned(device, outputs=False))
+        if entry.bits >= _ANALOG_BITS and _COUNTER.search(entry.name)
+    ]
+    return counters[0] if len(counters) == 1 else None
 
 
 def for_drive(device: Device) -> Device:
@@ -86,10 +98,33 @@ def for_drive(device: Device) -> Device:
     Other PDOs of the description are taken where some have the objects, else one PDO is mapped of the objects that may
     be mapped. A device that has neither is returned as it is.
     """
-    if _axes(device) or not _is_drive(device):
+    if not _is_drive(device):
         return device
+    if _axes(device):
+        return _with_mode_display(device)
     rx, tx = (_chosen(device, device.rx_pdos if outputs else device.tx_pdos, outputs) for outputs in (True, False))
-    return device if rx is None or tx is None else replace(device, rx_pdos=rx, tx_pdos=tx)
+    return device if rx is None or tx is None else _with_mode_display(replace(device, rx_pdos=rx, tx_pdos=tx))
+
+
+def _with_mode_display(device: Device) -> Device:
+    """Return a drive whose mode of operation, where it is in an RxPDO, comes back in a TxPDO, if that can be."""
+    rx, tx = ({entry.index for entry in entries_of(assigned(device, outputs))} for outputs in (True, False))
+    if _MODE_OBJECT not in rx or _MODE_OBJECT + 1 in tx:
+        return device
+    manager, there = _usual_sync_manager(device, outputs=False), {pdo.index for pdo in assigned(device, False)}
+    shown = _object(device, _MODE_OBJECT + 1, 0)
+    can_map = device.mailbox is not None and device.mailbox.coe is not None and device.mailbox.coe.pdo_configuration
+    tx_pdos = list(device.tx_pdos)
+    for at, pdo in enumerate(tx_pdos):
+        if _MODE_OBJECT + 1 in {entry.index for entry in pdo.entries} and not pdo.excludes & there:
+            tx_pdos[at] = replace(pdo, sync_manager=manager)
+            return replace(device, tx_pdos=tuple(tx_pdos))
+    for at, pdo in enumerate(tx_pdos):
+        if pdo.index in there and not pdo.fixed and can_map and shown is not None:
+            entry = PdoEntry(_MODE_OBJECT + 1, 0, shown.bits, shown.name, shown.type)
+            tx_pdos[at] = replace(pdo, entries=(*pdo.entries, entry))
+            break
+    return replace(device, tx_pdos=tuple(tx_pdos))
 
 
 def _is_drive(device: Device) -> bool:
@@ -160,8 +195,8 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
     coe = None if device.mailbox is None else device.mailbox.coe
     if coe is None:
         yield "coe: false                  # it has no object dictionary: its mapping is that of its EEPROM"
-    configurable = coe is not None and coe.pdo_assignment and coe.pdo_configuration and not _is_fixed(device)
-    said = "the entries below are written to it" if configurable else "fixed in the device: compared, never written"
+    configurable = coe is not None and coe.pdo_assignment and not _calls_inputs_outputs(device)
+    said = "the PDOs below are assigned and mapped at the start" if configurable else "fixed: compared, never written"
     yield f"configurable_pdos: {str(configurable).lower():10}# {said}"
     if coe is not None and not coe.complete_access:
         yield "complete_access: false"
@@ -209,9 +244,9 @@ def _mode_text(mode: DcMode) -> str:
     return mode.name + (f": {mode.description}" if mode.description and mode.description != mode.name else "")
 
 
-def _is_fixed(device: Device) -> bool:
-    pdos = (*assigned(device, True), *assigned(device, False))
-    return bool(pdos) and all(pdo.fixed for pdo in pdos)
+def _calls_inputs_outputs(device: Device) -> bool:
+    """Whether a PDO has an index of the other direction: its mapping is left alone."""
+    return any(pdo.index in MAPPINGS[not outputs] for outputs in (True, False) for pdo in assigned(device, outputs))
 
 
 def _startup_lines(device: Device, kind: str) -> Iterator[str]:
@@ -240,12 +275,13 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
             + "}"
         )
     mapped = {entry.index for entry in entries_of(assigned(device, True))}
+    shown = {axis for axis in _axes(device) if _shows_mode(device, axis)}
     for axis in (_axes(device) or (1,)) if kind == "cia402" else ():
         index = _MODE_OBJECT + (axis - 1) * OBJECTS_PER_AXIS
-        if index not in mapped:
+        if index not in mapped or axis not in shown:
             written.append(
                 f"  - {{index: 0x{index:04X}, sub_index: 0, type: int8, value: {_CSP}, name: modes of operation}}"
-                "   # CSP; no PDO has it"
+                "   # CSP"
             )
     if written:
         yield "# Start-up SDOs, written in PRE-OP in this order and read back, in the device's own units."
@@ -271,6 +307,11 @@ def _scaling_lines(device: Device) -> Iterator[str]:
         else:
             yield f"    rated_torque: 1.0     # Nm, 0x{0x6076 + base:04X}, has no default: read it from the drive"
     yield ""
+
+
+def _shows_mode(device: Device, axis: int) -> bool:
+    index = _MODE_OBJECT + 1 + (axis - 1) * OBJECTS_PER_AXIS
+    return any(entry.index == index for entry in entries_of(assigned(device, outputs=False)))
 
 
 def _ratio(device: Device, index: int, otherwise: float) -> tuple[float, str]:
@@ -314,6 +355,8 @@ def _pdo_lines(
         yield f"{key}: []"
         yield ""
         return
+    coe = None if device.mailbox is None else device.mailbox.coe
+    can_map = coe is not None and coe.pdo_configuration
     usual = _usual_sync_manager(device, outputs)
     named_managers = any(pdo.sync_manager != usual for pdo in filled)
     yield f"{key}:"
@@ -324,7 +367,7 @@ def _pdo_lines(
             marks.append("excludes " + ", ".join(f"0x{index:04X}" for index in sorted(pdo.excludes)))
         said = "; ".join([pdo.name, *marks] if pdo.name else marks)
         yield f"  - index: 0x{pdo.index:04X}" + (f"     # {_clean(said)}" if said else "")
-        if pdo.fixed and configurable:
+        if configurable and (pdo.fixed or not can_map):
             yield "    fixed: true"
         if named_managers:
             yield f"    sync_manager: {pdo.sync_manager}"
@@ -347,12 +390,19 @@ def _channel_lines(
     known = None
     if kind == "cia402" and entry.index in _AXES:
         known = _DRIVE_CHANNELS.get((entry.index - (axis - 1) * OBJECTS_PER_AXIS, entry.sub_index))
+    elif kind == "encoder" and key == "tpdo" and (entry.index, entry.sub_index) == _place_of(_counter(device)):
+        known = "position"
+    is_constant = known == "modes_of_operation" and not _shows_mode(device, axis)
+    if is_constant:
+        known = "mode_sent"
     name = known or _unique(_identifier(entry), names, f"{key}.{axis}")
     if known:
         names[f"{key}.{axis}.{known}"] += 1
     keys = (
         f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {_type_keys(entry.type, entry.bits)}, name: {name}"
     )
+    if is_constant:
+        keys += f", safe: {_CSP}"  # no PDO shows the mode: it is not changed
     described = _object(device, entry.index, entry.sub_index)
     unit = None if described is None or described.unit is None or known else units.unit(described.unit)
     if unit is not None and unit.si:
@@ -367,6 +417,10 @@ def prefix_of(pdo: Pdo) -> str:
     """Return what tells a PDO's channels from those of another: `channel 2`, else its name."""
     channel = _CHANNEL.search(pdo.name)
     return f"channel {channel[1]}" if channel else pdo.name or f"x{pdo.index:04x}"
+
+
+def _place_of(entry: PdoEntry | None) -> tuple[int, int] | None:
+    return None if entry is None else (entry.index, entry.sub_index)
 
 
 def _range_text(entry: ObjectEntry) -> list[str]:

@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from enum import Enum
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -322,12 +323,12 @@ _ANSWERS: dict[str, Callable[[SoemBus, int, dict[str, Any]], dict[str, Any]]] = 
 
 
 def _plain(value: object) -> object:
-    """Return the JSON form of what `json` does not know: bytes as hex, sets as lists, enums as text."""
+    """Return the JSON form of what `json` does not know: bytes as hex, sets as lists, enums as their values."""
     if isinstance(value, bytes):
         return value.hex()
     if isinstance(value, set | frozenset):
         return sorted(value)
-    return str(value)
+    return value.value if isinstance(value, Enum) else str(value)
 
 
 def main() -> int:

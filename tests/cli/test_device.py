@@ -1,0 +1,104 @@
+"""`rtcp device`: ESI files listed, device files made and compared with a bus that answers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.config import default_config
+from rtcp.config.device_file import file_text, kind_of
+from rtcp.config.loader import load_device
+from rtcp.esi.modules import assemble
+from rtcp.esi.reader import find_device, read_esi
+
+FILES = Path(__file__).parents[1] / "esi" / "files"
+DRIVE, AXES, TERMINALS = FILES / "drive.xml", FILES / "axes.xml", FILES / "terminals.xml"
+
+
+def test_a_file_is_listed_with_its_devices_modules_and_what_is_hidden(rtcp: Callable[..., Any]) -> None:
+    listed = rtcp("device", "list", str(AXES))
+    assert "0x00000100   Cyclic position" in listed.out
+    assert "Sample Drives, vendor 0x00000E51" in listed.out
+    hidden = json.loads(rtcp("device", "list", str(DRIVE), "--all", "--json").out)["devices"]
+    shown = json.loads(rtcp("device", "list", str(DRIVE), "--json").out)["devices"]
+    assert len(hidden) == len(shown) + 1
+    assert {device["kind"] for device in shown} == {"cia402"}
+
+
+def test_a_drive_becomes_a_file_that_the_platform_reads(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    out = tmp_path / "drive.yaml"
+    done = rtcp("device", "new", "--esi", str(DRIVE), "--out", str(out))
+    assert done.code == 0
+    assert "CHECK" in done.out
+    device, described = load_device(out), find_device(read_esi(DRIVE))
+    assert (device.kind, device.vendor_id) == ("cia402", described.identity.vendor_id)
+    assert device.product_id == described.identity.product_code
+    assert {"controlword", "target_position"} <= {entry.name for entry in device.outputs}
+    assert {"statusword", "position"} <= {entry.name for entry in device.inputs}
+    assert device.assign_activate in {mode.assign_activate for mode in described.dc_modes}
+    assert device.scaling
+    again = rtcp("device", "new", "--esi", str(DRIVE), "--out", str(out))
+    assert (again.code, "it is not overwritten" in again.trouble) == (2, True)
+
+
+def test_modules_are_put_into_slots_and_a_wrong_one_is_named_with_those_allowed(
+    rtcp: Callable[..., Any], tmp_path: Path
+) -> None:
+    out = tmp_path / "axes.yaml"
+    chosen = ("--module", "0=0x100", "--module", "1=0x100")
+    assert rtcp("device", "new", "--esi", str(AXES), *chosen, "--out", str(out)).code == 0
+    indices = {entry.index for entry in load_device(out).outputs}
+    assert {0x6040, 0x607A, 0x6840, 0x687A} <= indices
+    wrong = rtcp("device", "new", "--esi", str(AXES), "--module", "0=0x999", "--out", str(tmp_path / "x.yaml"))
+    assert wrong.code == 2
+    assert "0x100" in wrong.trouble
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((), "give one of --esi, --sii, --from-bus"),
+        (("--esi", str(DRIVE), "--sii", "x.bin"), "found --esi and --sii"),
+        (("--from-bus", "virtual"), "--from-bus and --slave belong together"),
+        (("--esi", str(TERMINALS)), "3 devices fit without a choice"),
+        (("--esi", str(TERMINALS), "--product", "0x99"), "no devices fit product 0x00000099"),
+        (("--esi", str(TERMINALS), "--product", "x"), "'x' is not a whole number (--product)"),
+        (("--esi", str(AXES), "--module", "0"), "allowed is SLOT=IDENT"),
+        (("--esi", "there-is-none.xml"), "there-is-none.xml: cannot be read"),
+        (("--sii", str(DRIVE)), "it is no EEPROM image"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_in_a_sentence_and_nothing_is_written(
+    rtcp: Callable[..., Any], tmp_path: Path, arguments: tuple[str, ...], sentence: str
+) -> None:
+    done = rtcp("device", "new", *arguments, "--out", str(tmp_path / "x.yaml"))
+    assert (done.code, sentence in done.trouble) == (2, True), done.trouble
+    assert not (tmp_path / "x.yaml").exists()
+
+
+def test_every_sample_becomes_a_file_that_can_be_read(tmp_path: Path) -> None:
+    for path in sorted(FILES.glob("*.xml")):
+        content = read_esi(path)
+        for number, device in enumerate(content.devices):
+            whole = assemble(device, content.modules) if device.slots else device
+            out = tmp_path / f"{path.stem}-{number}.yaml"
+            out.write_text(file_text(whole))
+            load_device(out)
+
+
+def test_the_kind_follows_from_the_default_process_data() -> None:
+    kinds = {device.name: kind_of(device) for device in read_esi(TERMINALS).devices}
+    assert kinds["2 digital outputs"] == "generic"
+    assert kinds["End cover"] == "coupler"
+
+
+def test_a_device_file_is_checked_alone(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    sound = default_config().parent / "devices" / "cubemars-orh.yaml"
+    assert "no mistake in it" in rtcp("device", "check", str(sound)).out
+    broken = tmp_path / "broken.yaml"
+    broken.write_text(sound.read_text().replace("name: statusword", "name: statusw0rd"))
+    assert rtcp("device", "check", str(broken)).code == 2
