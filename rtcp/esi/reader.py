@@ -177,9 +177,12 @@ class _Reader:
     @staticmethod
     def profiles(node: Node) -> tuple[int | None, tuple[int, ...]]:
         """Return the profile of a device, that of drives first, and those of its channels."""
-        own = [value for item in node.below("Profile/ProfileNo") if (value := number(item.text)) is not None]
-        nodes = node.below("Profile/ChannelInfo/ProfileNo")
-        channels = tuple(value for item in nodes if (value := number(item.text)) is not None)
+        own, channels = (
+            tuple(
+                value for item in node.below(path) if (value := number(item.text)) is not None and 0 <= value <= 0xFFFF
+            )
+            for path in ("Profile/ProfileNo", "Profile/ChannelInfo/ProfileNo")
+        )
         known = (*own, *channels)
         return (402 if 402 in known else known[0] if known else None), channels[:256]
 
