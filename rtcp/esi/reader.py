@@ -125,7 +125,7 @@ class _Reader:
             values.number(node, "Type/@ProductCode", 0) & 0xFFFFFFFF,
             values.number(node, "Type/@RevisionNo", 0) & 0xFFFFFFFF,
         )
-        kind = node.value("Type") or ""
+        kind = name_of(node, "Type")
         if node.value("Type/@ProductCode") is None:
             values.warnings.add(node.line, f"{kind}: no product code; it is no slave, or cannot be told from others")
         for tag, count in (node.unread or {}).items():
@@ -347,7 +347,7 @@ class _Reader:
         values = self.values
         return Module(
             ident=values.number(node, "Type/@ModuleIdent") & 0xFFFFFFFF,
-            name=name_of(node) or node.value("Type") or "",
+            name=name_of(node) or name_of(node, "Type"),
             rx_pdos=values.each(node.below("RxPdo"), self.pdo),
             tx_pdos=values.each(node.below("TxPdo"), self.pdo),
             objects=self.objects.dictionary(node),
