@@ -63,8 +63,10 @@ for _number, _bits, _kind, _names in re.findall(r"(0x\w+)\s+(\d+) (\w)((?: [A-Z]
     _BY_NAME.update(dict.fromkeys(_names, BaseType(_names[0], int(_number, 16), int(_bits), _KINDS[_kind])))
 _BY_NAME |= {f"BIT{bits}": BaseType(f"BIT{bits}", 0x2F + bits, bits, Kind.UNSIGNED) for bits in range(1, 17)}
 _BY_NUMBER = {entry.number: entry for entry in _BY_NAME.values()}
-_PLAIN = "BOOL BIT2 BIT3 BIT4 BIT5 BIT6 BIT7 USINT UINT UINT24 UDINT UINT40 UINT48 UINT56 ULINT"
-_BY_BITS = {_BY_NAME[name].bits: _BY_NAME[name] for name in _PLAIN.split()}
+_PLAIN = ["BOOL", "USINT", "UINT", "UINT24", "UDINT", "UINT40", "UINT48", "UINT56", "ULINT"]
+_BY_BITS = {_BY_NAME[name].bits: _BY_NAME[name] for name in (*(f"BIT{bits}" for bits in range(2, 16)), *_PLAIN)}
+_OCTETS = 0x0A
+"""Number of a type of any number of bytes."""
 _STRING = re.compile(r"(STRING|VISIBLE_STRING|OCTET_STRING|UNICODE_STRING|WSTRING)\s*[\[(]\s*(\d{1,6})\s*[\])]")
 _ARRAY = re.compile(r"ARRAY\s*\[\s*(\d{1,6})\s*\.\.\s*(\d{1,6})\s*\]\s*OF\s+(\w+)")
 _CHARACTER_BITS = {"UNICODE_STRING": 16, "WSTRING": 16}
@@ -90,9 +92,11 @@ def named(name: str) -> BaseType | None:
 
 def of_bits(bits: int) -> BaseType:
     """Return the plainest type of a length: unsigned, or an array of bytes."""
-    if bits in _BY_BITS:
-        return _BY_BITS[bits]
-    return BaseType(f"ARRAY [0..{max((bits + 7) // 8 - 1, 0)}] OF BYTE", 0x0A, bits, Kind.BYTES)
+    return _BY_BITS[bits] if bits in _BY_BITS else _bytes(bits)
+
+
+def _bytes(bits: int) -> BaseType:
+    return BaseType(f"ARRAY [0..{max((bits + 7) // 8 - 1, 0)}] OF BYTE", _OCTETS, bits, Kind.BYTES)
 
 
 def of_number(number: int, bits: int) -> BaseType:
@@ -100,7 +104,12 @@ def of_number(number: int, bits: int) -> BaseType:
     entry = _BY_NUMBER.get(number)
     if entry is None or (entry.bits and bits and entry.bits != bits):
         return of_bits(bits)
-    return entry
+    if entry.bits or not bits:
+        return entry
+    if number == _OCTETS:
+        return _bytes(bits)
+    name = f"{entry.name}({bits // 8})" if entry.kind is Kind.TEXT else entry.name
+    return BaseType(name, number, bits, entry.kind)
 
 
 @lru_cache(maxsize=1024)
