@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import TypeVar
 
 from rtcp.esi.model import Device, DictionaryObject, EsiError, InitCommand, Module, Pdo, Slot
 
+_Item = TypeVar("_Item", DictionaryObject, InitCommand)
 IDENT_LIST = 0xF030
 """Configured module ident list (ETG.5001.1)."""
 
@@ -66,9 +68,9 @@ def assemble(device: Device, modules: Iterable[Module], chosen: Mapping[int, int
             for pdo in added:
                 _add_pdo(pdos, _shifted_pdo(pdo, pdo_shift, shift, place), place)
         for item in module.objects:
-            moved = _shifted_object(item, shift, pdo_shift, place)
+            moved = _moved(item, shift, pdo_shift, place)
             objects[moved.index] = moved
-        commands += [_shifted_command(command, shift, pdo_shift, place) for command in module.init_commands]
+        commands += [_moved(command, shift, pdo_shift, place) for command in module.init_commands]
     if device.download_module_idents and present:
         commands += _ident_commands(present)
     return replace(
@@ -127,21 +129,11 @@ def _shifted_pdo(pdo: Pdo, pdo_shift: int, shift: int, place: str) -> Pdo:
     )
 
 
-def _shift_of(index: int, shift: int, pdo_shift: int) -> int:
-    """Return by how much an object's index grows: mapping objects grow as their PDOs do."""
-    return pdo_shift if 0x1600 <= index < 0x1C00 else shift
-
-
-def _shifted_object(item: DictionaryObject, shift: int, pdo_shift: int, place: str) -> DictionaryObject:
+def _moved(item: _Item, shift: int, pdo_shift: int, place: str) -> _Item:
+    """Return an object or a command for a place; mapping objects grow as their PDOs do."""
     if not item.depends_on_slot:
         return item
-    return replace(item, index=_index(item.index, _shift_of(item.index, shift, pdo_shift), place))
-
-
-def _shifted_command(command: InitCommand, shift: int, pdo_shift: int, place: str) -> InitCommand:
-    if not command.depends_on_slot:
-        return command
-    return replace(command, index=_index(command.index, _shift_of(command.index, shift, pdo_shift), place))
+    return replace(item, index=_index(item.index, pdo_shift if 0x1600 <= item.index < 0x1C00 else shift, place))
 
 
 def _ident_commands(present: Mapping[int, int]) -> list[InitCommand]:

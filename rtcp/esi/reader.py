@@ -125,7 +125,7 @@ class _Reader:
             values.number(node, "Type/@ProductCode", 0) & 0xFFFFFFFF,
             values.number(node, "Type/@RevisionNo", 0) & 0xFFFFFFFF,
         )
-        kind = node.value("Type") or ""
+        kind = name_of(node, "Type")
         if node.value("Type/@ProductCode") is None:
             values.warnings.add(node.line, f"{kind}: no product code; it is no slave, or cannot be told from others")
         for tag, count in (node.unread or {}).items():
@@ -177,9 +177,12 @@ class _Reader:
     @staticmethod
     def profiles(node: Node) -> tuple[int | None, tuple[int, ...]]:
         """Return the profile of a device, that of drives first, and those of its channels."""
-        own = [value for item in node.below("Profile/ProfileNo") if (value := number(item.text)) is not None]
-        nodes = node.below("Profile/ChannelInfo/ProfileNo")
-        channels = tuple(value for item in nodes if (value := number(item.text)) is not None)
+        own, channels = (
+            tuple(
+                value for item in node.below(path) if (value := number(item.text)) is not None and 0 <= value <= 0xFFFF
+            )
+            for path in ("Profile/ProfileNo", "Profile/ChannelInfo/ProfileNo")
+        )
         known = (*own, *channels)
         return (402 if 402 in known else known[0] if known else None), channels[:256]
 
@@ -344,7 +347,7 @@ class _Reader:
         values = self.values
         return Module(
             ident=values.number(node, "Type/@ModuleIdent") & 0xFFFFFFFF,
-            name=name_of(node) or node.value("Type") or "",
+            name=name_of(node) or name_of(node, "Type"),
             rx_pdos=values.each(node.below("RxPdo"), self.pdo),
             tx_pdos=values.each(node.below("TxPdo"), self.pdo),
             objects=self.objects.dictionary(node),

@@ -41,78 +41,32 @@ class BaseType:
         return (self.bits + 7) // 8
 
 
-def _table() -> dict[str, BaseType]:
-    table: dict[str, BaseType] = {}
-
-    def add(kind: Kind, number: int, bits: int, *names: str) -> None:
-        table.update(dict.fromkeys(names, BaseType(names[0], number, bits, kind)))
-
-    add(Kind.UNSIGNED, 0x01, 1, "BOOL", "BOOLEAN", "BIT")
-    for number, bits, *names in (
-        (0x02, 8, "SINT", "INT8"),
-        (0x03, 16, "INT", "INT16"),
-        (0x04, 32, "DINT", "INT32"),
-        (0x10, 24, "INT24"),
-        (0x12, 40, "INT40"),
-        (0x13, 48, "INT48"),
-        (0x14, 56, "INT56"),
-        (0x15, 64, "LINT", "INT64"),
-    ):
-        add(Kind.SIGNED, number, bits, *names, f"INTEGER{bits}")
-    for number, bits, *names in (
-        (0x05, 8, "USINT", "UINT8", "ENUM8"),
-        (0x06, 16, "UINT", "UINT16", "ENUM16"),
-        (0x07, 32, "UDINT", "UINT32", "ENUM32"),
-        (0x16, 24, "UINT24"),
-        (0x18, 40, "UINT40"),
-        (0x19, 48, "UINT48"),
-        (0x1A, 56, "UINT56"),
-        (0x1B, 64, "ULINT", "UINT64"),
-    ):
-        add(Kind.UNSIGNED, number, bits, *names, f"UNSIGNED{bits}")
-    for number, bits, name in (
-        (0x1E, 8, "BYTE"),
-        (0x1F, 16, "WORD"),
-        (0x20, 32, "DWORD"),
-        (0x0C, 48, "TIME_OF_DAY"),
-        (0x0D, 48, "TIME_DIFFERENCE"),
-        (0x2D, 8, "BITARR8"),
-        (0x2E, 16, "BITARR16"),
-        (0x2F, 32, "BITARR32"),
-    ):
-        add(Kind.UNSIGNED, number, bits, name)
-    for bits in range(1, 17):
-        add(Kind.UNSIGNED, 0x2F + bits, bits, f"BIT{bits}")
-    add(Kind.REAL, 0x08, 32, "REAL", "REAL32", "FLOAT")
-    add(Kind.REAL, 0x11, 64, "LREAL", "REAL64", "DOUBLE")
-    add(Kind.TEXT, 0x09, 0, "STRING", "VISIBLE_STRING")
-    add(Kind.BYTES, 0x0A, 0, "OCTET_STRING", "ARRAY OF BYTE")
-    add(Kind.BYTES, 0x0B, 0, "UNICODE_STRING", "WSTRING")
-    add(Kind.BYTES, 0x0F, 0, "DOMAIN")
-    add(Kind.BYTES, 0x1D, 128, "GUID")
-    add(Kind.BYTES, 0x260, 0, "ARRAY OF INT")
-    add(Kind.BYTES, 0x261, 0, "ARRAY OF SINT")
-    add(Kind.BYTES, 0x262, 0, "ARRAY OF DINT")
-    add(Kind.BYTES, 0x263, 0, "ARRAY OF UDINT")
-    return table
-
-
-_BY_NAME = _table()
-_BY_NUMBER = {entry.number: entry for entry in reversed(_BY_NAME.values())}
-_BY_BITS = {entry.bits: entry for entry in reversed(_BY_NAME.values()) if 0x30 <= entry.number < 0x37} | {
-    bits: _BY_NAME[name]
-    for bits, name in (
-        (1, "BOOL"),
-        (8, "USINT"),
-        (16, "UINT"),
-        (24, "UINT24"),
-        (32, "UDINT"),
-        (40, "UINT40"),
-        (48, "UINT48"),
-        (56, "UINT56"),
-        (64, "ULINT"),
-    )
-}
+_TABLE = """
+0x01   1 u BOOL BOOLEAN BIT               0x02  8 s SINT INT8 INTEGER8       0x03 16 s INT INT16 INTEGER16
+0x04  32 s DINT INT32 INTEGER32           0x05  8 u USINT UINT8 UNSIGNED8    0x06 16 u UINT UINT16 UNSIGNED16
+0x07  32 u UDINT UINT32 UNSIGNED32        0x08 32 r REAL REAL32 FLOAT        0x09  0 t STRING VISIBLE_STRING
+0x0A   0 b OCTET_STRING ARRAY_OF_BYTE     0x0B  0 b UNICODE_STRING WSTRING   0x0C 48 u TIME_OF_DAY
+0x0D  48 u TIME_DIFFERENCE                0x0F  0 b DOMAIN                   0x10 24 s INT24 INTEGER24
+0x11  64 r LREAL REAL64 DOUBLE            0x12 40 s INT40 INTEGER40          0x13 48 s INT48 INTEGER48
+0x14  56 s INT56 INTEGER56                0x15 64 s LINT INT64 INTEGER64     0x16 24 u UINT24 UNSIGNED24
+0x18  40 u UINT40 UNSIGNED40              0x19 48 u UINT48 UNSIGNED48        0x1A 56 u UINT56 UNSIGNED56
+0x1B  64 u ULINT UINT64 UNSIGNED64        0x1D 128 b GUID                    0x1E  8 u BYTE
+0x1F  16 u WORD                           0x20 32 u DWORD                    0x2D  8 u BITARR8
+0x2E  16 u BITARR16                       0x2F 32 u BITARR32                 0x260 0 b ARRAY_OF_INT
+0x261  0 b ARRAY_OF_SINT                  0x262 0 b ARRAY_OF_DINT            0x263 0 b ARRAY_OF_UDINT
+"""
+"""Number, bits, kind, names. BIT1 to BIT16 follow: 0x30 to 0x3F."""
+_KINDS = dict(zip("usrtb", Kind, strict=True))
+_BY_NAME: dict[str, BaseType] = {}
+for _number, _bits, _kind, _names in re.findall(r"(0x\w+)\s+(\d+) (\w)((?: [A-Z]\w+)+)", _TABLE):
+    _names = _names.split()
+    _BY_NAME.update(dict.fromkeys(_names, BaseType(_names[0], int(_number, 16), int(_bits), _KINDS[_kind])))
+_BY_NAME |= {f"BIT{bits}": BaseType(f"BIT{bits}", 0x2F + bits, bits, Kind.UNSIGNED) for bits in range(1, 17)}
+_BY_NUMBER = {entry.number: entry for entry in _BY_NAME.values()}
+_PLAIN = ["BOOL", "USINT", "UINT", "UINT24", "UDINT", "UINT40", "UINT48", "UINT56", "ULINT"]
+_BY_BITS = {_BY_NAME[name].bits: _BY_NAME[name] for name in (*(f"BIT{bits}" for bits in range(2, 16)), *_PLAIN)}
+_OCTETS = 0x0A
+"""Number of a type of any number of bytes."""
 _STRING = re.compile(r"(STRING|VISIBLE_STRING|OCTET_STRING|UNICODE_STRING|WSTRING)\s*[\[(]\s*(\d{1,6})\s*[\])]")
 _ARRAY = re.compile(r"ARRAY\s*\[\s*(\d{1,6})\s*\.\.\s*(\d{1,6})\s*\]\s*OF\s+(\w+)")
 _CHARACTER_BITS = {"UNICODE_STRING": 16, "WSTRING": 16}
@@ -130,16 +84,19 @@ def named(name: str) -> BaseType | None:
     if match := _ARRAY.fullmatch(name):
         element = _BY_NAME.get(match[3])
         if element is not None and element.bits and int(match[2]) >= int(match[1]):
-            number = _BY_NAME[f"ARRAY OF {element.name}"].number if f"ARRAY OF {element.name}" in _BY_NAME else 0
+            listed = _BY_NAME.get(f"ARRAY_OF_{element.name}")
+            number = listed.number if listed is not None else 0
             return BaseType(name, number, (int(match[2]) - int(match[1]) + 1) * element.bits, Kind.BYTES)
     return None
 
 
 def of_bits(bits: int) -> BaseType:
     """Return the plainest type of a length: unsigned, or an array of bytes."""
-    if bits in _BY_BITS:
-        return _BY_BITS[bits]
-    return BaseType(f"ARRAY [0..{max((bits + 7) // 8 - 1, 0)}] OF BYTE", 0x0A, bits, Kind.BYTES)
+    return _BY_BITS[bits] if bits in _BY_BITS else _bytes(bits)
+
+
+def _bytes(bits: int) -> BaseType:
+    return BaseType(f"ARRAY [0..{max((bits + 7) // 8 - 1, 0)}] OF BYTE", _OCTETS, bits, Kind.BYTES)
 
 
 def of_number(number: int, bits: int) -> BaseType:
@@ -147,7 +104,12 @@ def of_number(number: int, bits: int) -> BaseType:
     entry = _BY_NUMBER.get(number)
     if entry is None or (entry.bits and bits and entry.bits != bits):
         return of_bits(bits)
-    return entry
+    if entry.bits or not bits:
+        return entry
+    if number == _OCTETS:
+        return _bytes(bits)
+    name = f"{entry.name}({bits // 8})" if entry.kind is Kind.TEXT else entry.name
+    return BaseType(name, number, bits, entry.kind)
 
 
 @lru_cache(maxsize=1024)

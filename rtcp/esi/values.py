@@ -11,6 +11,8 @@ from rtcp.esi.xml_tree import Node, Warnings
 
 LIST_LIMIT = 4096
 """PDOs of a direction, entries of a PDO, and the like."""
+NAME_LIMIT = 255
+"""Characters of a name; more are cut, as an SII image does."""
 ENGLISH = "1033"
 """LcId of English."""
 _HEXADECIMAL = re.compile(r"#?x+(?:0x)?([0-9a-f]{1,16})|#([0-9a-f]{1,16})|0x([0-9a-f]{1,16})", re.IGNORECASE)
@@ -35,8 +37,8 @@ def name_of(node: Node, tag: str = "Name") -> str:
     for language in (ENGLISH, None, "0"):
         for name in names:
             if name.attributes.get("LcId") == language:
-                return name.text
-    return names[0].text if names else ""
+                return name.text[:NAME_LIMIT]
+    return names[0].text[:NAME_LIMIT] if names else ""
 
 
 class Values:

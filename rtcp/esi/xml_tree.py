@@ -80,10 +80,6 @@ class Node:
         self.unread: Counter[str] | None = None
         """Elements within it that are neither read nor known to be of no use, by name."""
 
-    def all(self, tag: str) -> list[Node]:
-        """Return the children of a name."""
-        return [child for child in self.children if child.tag == tag]
-
     def first(self, path: str) -> Node | None:
         """Return the first child of a name, and so on down a path such as `Info/Electrical`; None: there is none."""
         node: Node | None = self
@@ -118,7 +114,7 @@ class Warnings:
     def add(self, line: int, sentence: str) -> None:
         """Add a sentence."""
         if len(self.sentences) < WARNING_LIMIT:
-            self.sentences.append(f"{self.path}:{line}: {sentence}")
+            self.sentences.append(f"{self.path}:{line}: {sentence[:300]}")
         else:
             self._left_out += 1
 

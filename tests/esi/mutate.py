@@ -59,9 +59,12 @@ def mutated_bytes(data: bytes, random: Random) -> bytes:
 def mutated_elements(data: bytes, random: Random) -> bytes:
     root = ElementTree.fromstring(data)
     nodes = list(root.iter())
+    growing, copies = 4, random.choice((1, 1, 3, 300))
     for _ in range(random.choice((1, 1, 2, 4, 16, 64))):
         node, other = random.choice(nodes), random.choice(nodes)
-        match random.randrange(8):
+        kind = random.randrange(8)
+        growing -= kind >= 6
+        match kind if growing >= 0 else 0:
             case 0 | 1 | 2:
                 node.text = random.choice(VALUES)
             case 3:
@@ -75,8 +78,8 @@ def mutated_elements(data: bytes, random: Random) -> bytes:
             case 6:
                 if len(node):
                     child = random.choice(list(node))
-                    for _ in range(random.choice((1, 1, 3, 300))):
-                        node.append(child)
+                    node.extend([child] * copies)
+                    copies = 1
             case 7:
                 if other not in node.iter() and node not in other.iter():
                     node.append(other)

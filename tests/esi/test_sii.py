@@ -6,10 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rtcp.esi.model import Coe, DcMode, Device, EsiError, FmmuUse, Mailbox, Pdo, PdoEntry, Source, SyncManagerType
 from rtcp.esi.reader import find_device, read_esi
 from rtcp.esi.sii import check_sii, crc, read_sii, write_sii
+from rtcp.esi.types import of_bits
 
 FILES = Path(__file__).parent / "files"
 
@@ -70,6 +73,48 @@ def test_what_is_written_is_read_again(request: pytest.FixtureRequest, name: str
     assert read_sii(image, "image") == without_lost(device)
     assert check_sii(image) == ()
     assert len(image) == device.eeprom_bytes
+
+
+TEXTS = st.text(st.characters(blacklist_categories=["Cs", "Cc"]), max_size=20)
+ENTRIES = st.builds(
+    lambda index, sub_index, bits, name: PdoEntry(index, sub_index, bits, name, of_bits(bits).name if index else ""),
+    st.integers(0, 0xFFFF),
+    st.integers(0, 0xFF),
+    st.integers(1, 64),
+    TEXTS,
+)
+PDOS = st.builds(
+    Pdo,
+    index=st.integers(0, 0xFFFF),
+    name=TEXTS,
+    entries=st.lists(ENTRIES, max_size=12).map(tuple),
+    sync_manager=st.none() | st.integers(0, 15),
+    fixed=st.booleans(),
+    mandatory=st.booleans(),
+    virtual=st.booleans(),
+)
+MODES = st.builds(
+    DcMode,
+    name=TEXTS,
+    assign_activate=st.integers(0, 0xFFFF),
+    description=TEXTS,
+    sync0_cycle=st.integers(0, (1 << 31) - 1),
+    sync0_factor=st.integers(-32768, 32767),
+    sync0_shift=st.integers(-(1 << 31), (1 << 31) - 1),
+    sync1_factor=st.integers(-32768, 32767),
+    sync1_shift=st.integers(-(1 << 31), (1 << 31) - 1),
+)
+
+
+@given(
+    st.lists(PDOS, max_size=4).map(tuple), st.lists(PDOS, max_size=4).map(tuple), st.lists(MODES, max_size=3).map(tuple)
+)
+def test_pdos_and_modes_of_any_device_are_read_as_they_were_written(
+    rx_pdos: tuple[Pdo, ...], tx_pdos: tuple[Pdo, ...], modes: tuple[DcMode, ...]
+) -> None:
+    device = find_device(read_esi(FILES / "terminals.xml"), name="DO-2")
+    found = read_sii(write_sii(replace(device, eeprom_bytes=0, rx_pdos=rx_pdos, tx_pdos=tx_pdos, dc_modes=modes)))
+    assert (found.rx_pdos, found.tx_pdos, found.dc_modes) == (rx_pdos, tx_pdos, modes)
 
 
 def test_the_categories_stand_in_the_order_that_masters_need_each_once(drive: Device) -> None:
