@@ -95,7 +95,7 @@ class SyncManager:
     """It is enabled in OP only."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PdoEntry:
     """A mapped object; index 0 is padding."""
 
@@ -109,7 +109,7 @@ class PdoEntry:
     """In a module: its index grows with the slot."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Pdo:
     """A process data object."""
 
@@ -136,7 +136,7 @@ class Pdo:
         return sum(entry.bits for entry in self.entries)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ObjectEntry:
     """A subindex of an object."""
 
@@ -153,14 +153,14 @@ class ObjectEntry:
     rx_mappable: bool = False
     tx_mappable: bool = False
     default: bytes | None = None
-    """Value at power-on, little endian; None: none is given, 0 is meant."""
+    """Value at power-on, little endian; None: 0. Of a text or an array it may be shorter than `bits`."""
     minimum: bytes | None = None
     maximum: bytes | None = None
     unit: int | None = None
     """Unit in the notation of ETG.1004."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class DictionaryObject:
     """An object of the object dictionary."""
 
@@ -171,7 +171,6 @@ class DictionaryObject:
     """By rising subindex, subindex 0 among them."""
     depends_on_slot: bool = False
     """In a module: its index grows with the slot."""
-    overwritten_by_module: bool = False
 
 
 @dataclass(frozen=True)
@@ -318,6 +317,8 @@ class Device:
     """Current that it takes from the E-bus, mA; below 0: that it feeds."""
     no_lrw: bool = False
     """It does not support the command LRW."""
+    unit_symbols: Mapping[int, str] = field(default_factory=dict)
+    """Symbols of units of its own, by their notation index, see `rtcp.esi.units`."""
     hidden: bool = False
     """A tool offers it no more: a later revision takes its place."""
     unread: Mapping[str, int] = field(default_factory=dict)

@@ -6,19 +6,14 @@ is left out with its reason, and the others are read.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
-from rtcp.esi import types
 from rtcp.esi.model import (
     Coe,
     DcMode,
     Device,
     DeviceFile,
-    DictionaryObject,
     EsiError,
     FmmuUse,
     Identity,
@@ -26,8 +21,6 @@ from rtcp.esi.model import (
     LookupFailure,
     Mailbox,
     Module,
-    ObjectCode,
-    ObjectEntry,
     Pdo,
     PdoEntry,
     Slot,
@@ -35,16 +28,15 @@ from rtcp.esi.model import (
     SyncManager,
     SyncManagerType,
 )
-from rtcp.esi.xml_tree import Node, Warnings, read_trees
+from rtcp.esi.object_reader import FileTooLarge, ObjectReader
+from rtcp.esi.values import Values, name_of, number
+from rtcp.esi.xml_tree import Node, read_trees
 
-ENGLISH = "1033"
-"""LcId of English."""
+DEVICE_LIMIT = 10_000
+"""Devices and modules in a file."""
 SLOT_LIMIT = 1024
 """Places for modules of one slot element."""
 _MAX_ENTRY_BITS = 8 * 1486
-_HEXADECIMAL = re.compile(r"#?x+(?:0x)?([0-9a-f]{1,16})|#([0-9a-f]{1,16})|0x([0-9a-f]{1,16})", re.IGNORECASE)
-_DECIMAL = re.compile(r"[+-]?\d{1,20}")
-_TRUE = {"1": True, "true": True, "0": False, "false": False, "": False}
 _SYNC_MANAGERS = {
     "mboxout": SyncManagerType.MAILBOX_RECEIVE,
     "mboxin": SyncManagerType.MAILBOX_SEND,
@@ -60,38 +52,14 @@ _FMMUS = {
     "": FmmuUse.UNUSED,
 }
 _FMMU_OF = {SyncManagerType.OUTPUTS: FmmuUse.OUTPUTS, SyncManagerType.INPUTS: FmmuUse.INPUTS}
-_STATES = (("PREOP", "P"), ("SAFEOP", "S"), ("OP", "O"))
-_T = TypeVar("_T")
-
-
-def number(text: str) -> int | None:
-    """Return an integer of an ESI file: `#x1A`, `0x1A`, `26`, `#x0x1A`; None: it is none."""
-    text = text.strip()
-    if _DECIMAL.fullmatch(text):
-        return int(text)
-    if match := _HEXADECIMAL.fullmatch(text):
-        return int(match[1] or match[2] or match[3], 16)
-    return None
-
-
-def name_of(node: Node, tag: str = "Name") -> str:
-    """Return a name in English; in the language without a number, or the first, where there is none in English."""
-    names = node.all(tag)
-    for language in (ENGLISH, None, "0"):
-        for name in names:
-            if name.attributes.get("LcId") == language and name.text:
-                return name.text
-    return next((name.text for name in names if name.text), "")
-
-
-@dataclass(frozen=True)
-class _Hiding:
-    """A revision that a device hides."""
-
-    by: tuple[int, int]
-    type: str
-    product: int | None
-    revision: int | None
+_COE = (
+    ("sdo_information", "@SdoInfo"),
+    ("pdo_assignment", "@PdoAssign"),
+    ("pdo_configuration", "@PdoConfig"),
+    ("pdo_upload", "@PdoUpload"),
+    ("complete_access", "@CompleteAccess"),
+    ("segmented", "@SegmentedSdo"),
+)
 
 
 class _Reader:
@@ -99,561 +67,302 @@ class _Reader:
 
     def __init__(self, path: Path) -> None:
         self.path = str(path)
-        self.warnings = Warnings(self.path)
+        self.values = Values(self.path)
+        self.objects = ObjectReader(self.values)
         self.vendor_id = 0
         self.vendor_name = ""
         self.groups: dict[str, str] = {}
         self.devices: list[Device] = []
         self.modules: list[Module] = []
         self.failures: list[str] = []
-        self.hidings: list[_Hiding] = []
+        self.hiding: dict[tuple[int | str, int | None], set[tuple[int, int]]] = {}
+        """Product code or type, and revision or None for all, to the devices that hide such ones."""
 
     def collect(self, node: Node) -> None:
         """Take a tree of the file."""
+        if len(self.devices) + len(self.modules) + len(self.failures) >= DEVICE_LIMIT:
+            raise self.values.error(node, f"more than {DEVICE_LIMIT} devices and modules")
         try:
             if node.tag == "Vendor":
-                self.vendor_id = self.number(node, "Id", default=0) & 0xFFFFFFFF
+                self.vendor_id = self.values.number(node, "Id", 0) & 0xFFFFFFFF
                 self.vendor_name = name_of(node)
             elif node.tag == "Group":
-                self.groups[node.value("Type")] = name_of(node)
+                self.groups[node.value("Type") or ""] = name_of(node)
             elif node.tag == "Device":
                 self.devices.append(self.device(node))
             else:
                 self.modules.append(self.module(node))
+        except FileTooLarge:
+            raise
         except EsiError as error:
             self.failures.append(str(error))
 
     def file(self) -> DeviceFile:
         """Return what has been read."""
-        devices = [
-            replace(device, hidden=True) if any(_hides(hiding, device) for hiding in self.hidings) else device
-            for device in self.devices
-        ]
+        devices = [replace(device, hidden=True) if self.is_hidden(device) else device for device in self.devices]
         return DeviceFile(
             path=self.path,
             vendor_id=self.vendor_id,
             vendor_name=self.vendor_name,
             devices=tuple(devices),
             modules=tuple(self.modules),
-            warnings=self.warnings.all(),
+            warnings=self.values.warnings.all(),
             failures=tuple(self.failures),
         )
 
-    # Values
-
-    def error(self, node: Node, problem: str) -> EsiError:
-        return EsiError(f"{self.path}:{node.line}", problem)
-
-    def _number(self, node: Node, what: str, text: str | None, default: int | None) -> int:
-        if text is not None and (value := number(text)) is not None:
-            return value
-        if default is None:
-            problem = f"{what} is missing" if not text else f"{what} is {text[:40]!r}, not a number"
-            raise self.error(node, f"{node.tag}: {problem}")
-        if text:
-            self.warnings.add(node.line, f"{node.tag}: {what} is {text[:40]!r}, not a number; {default} is used")
-        return default
-
-    def number(self, node: Node, tag: str, default: int | None = None) -> int:
-        """Return the number of a child; without a default it must be there."""
-        return self._number(node, tag, node.value(tag), default)
-
-    def attribute(self, node: Node, name: str, default: int | None = None) -> int:
-        """Return the number of an attribute; without a default it must be there."""
-        return self._number(node, name, node.attributes.get(name), default)
-
-    def flag(self, node: Node | None, name: str, default: bool = False) -> bool:
-        """Return whether an attribute is set."""
-        if node is None or name not in node.attributes:
-            return default
-        text = node.attributes[name].strip().lower()
-        if text not in _TRUE:
-            value = number(text)
-            self.warnings.add(node.line, f"{node.tag}: {name} is {text[:40]!r}, neither true nor false")
-            return bool(value and value & 1)
-        return _TRUE[text]
-
-    def data(self, node: Node | None, tag: str, limit: int = 1 << 16) -> bytes:
-        """Return the bytes of a child in hexadecimal; as far as they are some."""
-        child = node.first(tag) if node is not None else None
-        if child is None or not child.text:
-            return b""
-        text = re.sub(r"[\s,]|#x|0x", "", child.text, flags=re.IGNORECASE)
-        if match := re.match(r"(?:[0-9a-fA-F]{2})*", text):
-            if len(match[0]) != len(text):
-                self.warnings.add(
-                    child.line, f"{tag} is {child.text[:40]!r}, not bytes in hexadecimal; read up to there"
-                )
-            return bytes.fromhex(match[0])[:limit]
-        return b""
-
-    def each(self, nodes: Iterable[Node], build: Callable[[Node], _T | None]) -> tuple[_T, ...]:
-        """Return what is built of each node; those of which nothing can be are left out."""
-        return tuple(item for item in map(build, nodes) if item is not None)
-
-    def within(self, node: Node, what: str, value: int, limit: int) -> int:
-        """Return a value that must be 0 to a limit."""
-        if not 0 <= value <= limit:
-            raise self.error(node, f"{node.tag}: {what} is {value}; it can be 0 to {limit}")
-        return value
+    def is_hidden(self, device: Device) -> bool:
+        """Return whether another device of the file hides this one."""
+        own = (device.identity.product_code, device.identity.revision)
+        keys = ((kind, revision) for kind in (own[0], device.type) for revision in (own[1], None))
+        return any(self.hiding.get(key, set()) - {own} for key in keys)
 
     # Devices
 
     def device(self, node: Node) -> Device:
-        kind = node.first("Type")
-        if kind is None:
-            raise self.error(node, "a device without a Type")
+        values = self.values
         identity = Identity(
             self.vendor_id,
-            self.attribute(kind, "ProductCode", default=0) & 0xFFFFFFFF,
-            self.attribute(kind, "RevisionNo", default=0) & 0xFFFFFFFF,
+            values.number(node, "Type/@ProductCode", 0) & 0xFFFFFFFF,
+            values.number(node, "Type/@RevisionNo", 0) & 0xFFFFFFFF,
         )
-        if "ProductCode" not in kind.attributes:
-            self.warnings.add(kind.line, f"{kind.text}: no product code; it is no slave, or cannot be told from others")
-        for hidden in node.all("HideType"):
-            product, revision = (hidden.attributes.get(name) for name in ("ProductCode", "RevisionNo"))
-            revision = revision or hidden.attributes.get("ProductRevision")
-            self.hidings.append(
-                _Hiding(
-                    (identity.product_code, identity.revision),
-                    hidden.text,
-                    number(product) if product else None,
-                    number(revision) if revision else None,
-                )
-            )
-        rx_pdos = self.each(node.all("RxPdo"), self.pdo)
-        tx_pdos = self.each(node.all("TxPdo"), self.pdo)
-        mailbox = node.first("Mailbox")
-        assigned = {pdo.sync_manager: SyncManagerType.OUTPUTS for pdo in rx_pdos} | {
-            pdo.sync_manager: SyncManagerType.INPUTS for pdo in tx_pdos
-        }
-        sync_managers = tuple(
-            self.sync_manager(item, assigned.get(number_), mailbox is not None)
-            for number_, item in enumerate(node.all("Sm"))
-        )
-        profiles, channels = self.profiles(node)
-        slots = node.first("Slots")
-        eeprom = node.first("Eeprom")
-        group = node.value("GroupType")
+        kind = node.value("Type") or ""
+        if node.value("Type/@ProductCode") is None:
+            values.warnings.add(node.line, f"{kind}: no product code; it is no slave, or cannot be told from others")
+        for tag, count in (node.unread or {}).items():
+            values.warnings.add(node.line, f"{count} elements {tag} of {kind} are not read")
+        for item in node.below("HideType"):
+            revision = item.value("@RevisionNo") or item.value("@ProductRevision")
+            key = (number(item.value("@ProductCode")) or item.text or identity.product_code, number(revision))
+            self.hiding.setdefault(key, set()).add((identity.product_code, identity.revision))
+        rx_pdos = values.each(node.below("RxPdo"), self.pdo)
+        tx_pdos = values.each(node.below("TxPdo"), self.pdo)
+        sync_managers = self.sync_managers(node, rx_pdos, tx_pdos)
+        profile, channels = self.profiles(node)
+        group = node.value("GroupType") or ""
+        symbols = [
+            (number(item.value("NotationIndex")), item.value("Symbol"))
+            for item in node.below("Profile/Dictionary/UnitTypes/UnitType")
+        ]
         return Device(
             identity=identity,
-            name=name_of(node) or kind.text,
+            name=name_of(node) or kind,
             source=Source.ESI,
             origin=f"{self.path}:{node.line}",
-            type=kind.text,
+            type=kind,
             vendor_name=self.vendor_name,
             group=group,
             group_name=self.groups.get(group, ""),
-            physics=node.attributes.get("Physics", "").rstrip()[:4],
+            physics=(node.value("@Physics") or "").rstrip()[:4],
             sync_managers=sync_managers,
             fmmus=self.fmmus(node, sync_managers),
             rx_pdos=rx_pdos,
             tx_pdos=tx_pdos,
-            mailbox=self.mailbox(mailbox) if mailbox is not None else None,
-            objects=self.dictionaries(node),
-            init_commands=self.init_commands(mailbox),
-            dc_modes=self.each(self.below(node, "Dc", "OpMode"), self.dc_mode),
-            slots=self.each(slots.all("Slot"), lambda slot: self.slot(slots, slot)) if slots is not None else (),
-            download_module_idents=self.flag(slots, "DownloadModuleIdentList"),
-            eeprom_bytes=self.within(eeprom, "ByteSize", self.number(eeprom, "ByteSize", default=0), 1 << 22)
-            if eeprom is not None
-            else 0,
-            config_data=self.data(eeprom, "ConfigData", limit=14),
-            bootstrap=self.data(eeprom, "BootStrap", limit=8),
-            profile=profiles,
+            mailbox=self.mailbox(node),
+            objects=self.objects.dictionary(node),
+            init_commands=values.each(node.below("Mailbox/CoE/InitCmd"), self.init_command),
+            dc_modes=values.each(node.below("Dc/OpMode"), self.dc_mode),
+            slots=values.each(node.below("Slots/Slot"), lambda slot: self.slot(node, slot)),
+            download_module_idents=values.flag(node, "Slots/@DownloadModuleIdentList"),
+            eeprom_bytes=values.number(node, "Eeprom/ByteSize", 0, low=0, high=1 << 22),
+            config_data=values.data(node, "Eeprom/ConfigData", limit=14),
+            bootstrap=values.data(node, "Eeprom/BootStrap", limit=8),
+            profile=profile,
             channel_profiles=channels,
-            ebus_current=self.ebus_current(node),
-            no_lrw=self.flag(kind, "UseLrdLwr"),
+            ebus_current=values.number(node, "Info/Electrical/EBusCurrent", 0, low=-32768, high=32767),
+            no_lrw=values.flag(node, "Type/@UseLrdLwr"),
+            unit_symbols={index: symbol[:40] for index, symbol in symbols if index is not None and symbol},
             unread=dict(node.unread or {}),
         )
 
     @staticmethod
-    def below(node: Node, *path: str) -> list[Node]:
-        """Return the last elements of a path under all of those before."""
-        nodes = [node]
-        for tag in path:
-            nodes = [child for parent in nodes for child in parent.all(tag)]
-        return nodes
+    def profiles(node: Node) -> tuple[int | None, tuple[int, ...]]:
+        """Return the profile of a device, that of drives first, and those of its channels."""
+        own = [value for item in node.below("Profile/ProfileNo") if (value := number(item.text)) is not None]
+        nodes = node.below("Profile/ChannelInfo/ProfileNo")
+        channels = tuple(value for item in nodes if (value := number(item.text)) is not None)
+        known = (*own, *channels)
+        return (402 if 402 in known else known[0] if known else None), channels[:256]
 
-    def ebus_current(self, node: Node) -> int:
-        electrical = node.first("Info", "Electrical")
-        value = self.number(electrical, "EBusCurrent", default=0) if electrical is not None else 0
-        return max(min(value, 32767), -32768)
-
-    def profiles(self, node: Node) -> tuple[int | None, tuple[int, ...]]:
-        """Return the profile of a device, drives first, and of its channels."""
-        numbers = [number(item.text) for item in self.below(node, "Profile", "ProfileNo")]
-        channels = [number(item.text) for item in self.below(node, "Profile", "ChannelInfo", "ProfileNo")]
-        known = [value for value in (*numbers, *channels) if value is not None]
-        return (402 if 402 in known else known[0] if known else None), tuple(v for v in channels if v is not None)
+    def sync_managers(self, node: Node, rx_pdos: tuple[Pdo, ...], tx_pdos: tuple[Pdo, ...]) -> tuple[SyncManager, ...]:
+        nodes = node.below("Sm")
+        if len(nodes) > 16:
+            raise self.values.error(nodes[16], f"{len(nodes)} sync managers; no slave controller has more than 16")
+        assigned = {pdo.sync_manager: SyncManagerType.OUTPUTS for pdo in rx_pdos} | {
+            pdo.sync_manager: SyncManagerType.INPUTS for pdo in tx_pdos
+        }
+        has_mailbox = node.first("Mailbox") is not None
+        return tuple(self.sync_manager(item, assigned.get(n), has_mailbox) for n, item in enumerate(nodes))
 
     def sync_manager(self, node: Node, assigned: SyncManagerType | None, has_mailbox: bool) -> SyncManager:
-        control = number(node.attributes.get("ControlByte", ""))
+        values = self.values
+        control = number(node.value("@ControlByte"))
         kind = _SYNC_MANAGERS.get(node.text.lower())
         if kind is None:
             outputs = control is not None and control >> 2 & 1
             if assigned is not None:
                 kind = assigned
-            elif control is not None and control & 3 == 2 and has_mailbox:
-                kind = SyncManagerType.MAILBOX_RECEIVE if outputs else SyncManagerType.MAILBOX_SEND
-            elif control is not None:
-                kind = SyncManagerType.OUTPUTS if outputs else SyncManagerType.INPUTS
-            else:
+            elif control is None:
                 kind = SyncManagerType.UNUSED
-            self.warnings.add(
-                node.line, f"Sm: the type {node.text[:40]!r} is not known; {kind.name} by its control byte"
-            )
-        sizes = {
-            name: self.attribute(node, name, default=-1) if name in node.attributes else -1
-            for name in ("DefaultSize", "MinSize", "MaxSize")
-        }
-        for name, size in sizes.items():
-            if size > 0xFFFF:
-                raise self.error(node, f"Sm: {name} is {size}; it can be 0 to 65535")
-        enable = self.attribute(node, "Enable", default=1)
+            elif control & 3 == 2 and has_mailbox:
+                kind = SyncManagerType.MAILBOX_RECEIVE if outputs else SyncManagerType.MAILBOX_SEND
+            else:
+                kind = SyncManagerType.OUTPUTS if outputs else SyncManagerType.INPUTS
+            values.warnings.add(node.line, f"Sm: the type {node.text[:40]!r} is not known; taken as {kind.name}")
+        minimum, maximum = (values.number(node, f"@{name}Size", -1, low=-1, high=0xFFFF) for name in ("Min", "Max"))
+        enable = values.number(node, "@Enable", 1)
         return SyncManager(
-            start=self.within(node, "StartAddress", self.attribute(node, "StartAddress", default=0), 0xFFFF),
-            length=max(sizes["DefaultSize"], 0),
+            start=values.number(node, "@StartAddress", 0, low=0, high=0xFFFF),
+            length=values.number(node, "@DefaultSize", 0, low=0, high=0xFFFF),
             control=_CONTROL.get(kind, 0) if control is None else control & 0xFF,
             type=kind,
-            enabled=bool(enable & 1) if "Enable" in node.attributes else True,
-            virtual=self.flag(node, "Virtual"),
-            minimum=sizes["MinSize"] if sizes["MinSize"] >= 0 else None,
-            maximum=sizes["MaxSize"] if sizes["MaxSize"] >= 0 else None,
-            op_only=self.flag(node, "OpOnly") or bool(enable & 8),
+            enabled=bool(enable & 1),
+            virtual=values.flag(node, "@Virtual"),
+            minimum=minimum if minimum >= 0 else None,
+            maximum=maximum if maximum >= 0 else None,
+            op_only=values.flag(node, "@OpOnly") or bool(enable & 8),
         )
 
     def fmmus(self, node: Node, sync_managers: tuple[SyncManager, ...]) -> tuple[FmmuUse, ...]:
         """Return the uses of the FMMUs; one that is named as a sync manager has that one's direction."""
-        named = {item.text: sync.type for item, sync in zip(node.all("Sm"), sync_managers, strict=True)}
+        nodes = node.below("Fmmu")
+        if len(nodes) > 16:
+            raise self.values.error(nodes[16], f"{len(nodes)} FMMUs; no slave controller has more than 16")
+        named = {item.text: sync.type for item, sync in zip(node.below("Sm"), sync_managers, strict=True)}
         uses = []
-        for item in node.all("Fmmu"):
+        for item in nodes:
             use = _FMMUS.get(item.text.lower())
             if use is None:
                 use = _FMMU_OF.get(named.get(item.text, SyncManagerType.UNUSED), FmmuUse.UNUSED)
-                self.warnings.add(item.line, f"Fmmu: the use {item.text[:40]!r} is not known; taken as {use.name}")
+                warning = f"Fmmu: the use {item.text[:40]!r} is not known; taken as {use.name}"
+                self.values.warnings.add(item.line, warning)
             uses.append(use)
         return tuple(uses)
 
     def pdo(self, node: Node) -> Pdo | None:
-        index = number(node.value("Index"))
-        if index is None:
-            self.warnings.add(node.line, f"{node.tag} without an index is left out")
+        values = self.values
+        if not node.value("Index"):
+            values.warnings.add(node.line, f"{node.tag} without an index is left out")
             return None
-        sync_manager = node.attributes.get("Sm", "").strip()
-        excludes = frozenset(v & 0xFFFF for v in (number(item.text) for item in node.all("Exclude")) if v is not None)
+        index = values.number(node, "Index", low=0, high=0xFFFF)
+        excluded = (number(item.text) for item in node.below("Exclude"))
         return Pdo(
-            index=self.within(node, "Index", index, 0xFFFF),
+            index=index,
             name=name_of(node),
-            entries=self.each(node.all("Entry"), self.pdo_entry),
-            sync_manager=self.within(node, "Sm", self.attribute(node, "Sm"), 15) if sync_manager else None,
-            fixed=self.flag(node, "Fixed"),
-            mandatory=self.flag(node, "Mandatory"),
-            virtual=self.flag(node, "Virtual"),
-            excludes=excludes - {index},
-            depends_on_slot=self.flag(node.first("Index"), "DependOnSlot"),
-            overwritten_by_module=self.flag(node, "OverwrittenByModule"),
+            entries=values.each(node.below("Entry"), self.pdo_entry),
+            sync_manager=values.number(node, "@Sm", low=0, high=15) if node.value("@Sm") else None,
+            fixed=values.flag(node, "@Fixed"),
+            mandatory=values.flag(node, "@Mandatory"),
+            virtual=values.flag(node, "@Virtual"),
+            excludes=frozenset(value & 0xFFFF for value in excluded if value is not None) - {index},
+            depends_on_slot=values.flag(node, "Index/@DependOnSlot"),
+            overwritten_by_module=values.flag(node, "@OverwrittenByModule"),
         )
 
     def pdo_entry(self, node: Node) -> PdoEntry | None:
-        bits = self.number(node, "BitLen")
+        values = self.values
+        bits = values.number(node, "BitLen", low=0, high=_MAX_ENTRY_BITS)
         if bits == 0:
-            self.warnings.add(node.line, "Entry of 0 bits is left out")
+            values.warnings.add(node.line, "Entry of 0 bits is left out")
             return None
         return PdoEntry(
-            index=self.within(node, "Index", self.number(node, "Index", default=0), 0xFFFF),
-            sub_index=self.within(node, "SubIndex", self.number(node, "SubIndex", default=0), 0xFF),
-            bits=self.within(node, "BitLen", bits, _MAX_ENTRY_BITS),
+            index=values.number(node, "Index", 0, low=0, high=0xFFFF),
+            sub_index=values.number(node, "SubIndex", 0, low=0, high=0xFF),
+            bits=bits,
             name=name_of(node),
-            type=node.value("DataType"),
-            depends_on_slot=self.flag(node.first("Index"), "DependOnSlot"),
+            type=node.value("DataType") or "",
+            depends_on_slot=values.flag(node, "Index/@DependOnSlot"),
         )
 
-    def mailbox(self, node: Node) -> Mailbox:
-        coe = node.first("CoE")
-        return Mailbox(
-            coe=None
-            if coe is None
-            else Coe(
-                sdo_information=self.flag(coe, "SdoInfo"),
-                pdo_assignment=self.flag(coe, "PdoAssign"),
-                pdo_configuration=self.flag(coe, "PdoConfig"),
-                pdo_upload=self.flag(coe, "PdoUpload"),
-                complete_access=self.flag(coe, "CompleteAccess"),
-                segmented=self.flag(coe, "SegmentedSdo"),
-                ds402_channels=min(max(self.attribute(coe, "DS402Channels", default=0), 0), 255),
-            ),
-            data_link_layer=self.flag(node, "DataLinkLayer"),
-            **{key: node.first(tag) is not None for tag, key in _PROTOCOLS},
-        )
-
-    def init_commands(self, mailbox: Node | None) -> tuple[InitCommand, ...]:
-        nodes = self.below(mailbox, "CoE", "InitCmd") if mailbox is not None else []
-        return self.each(nodes, self.init_command)
+    def mailbox(self, node: Node) -> Mailbox | None:
+        mailbox = node.first("Mailbox")
+        if mailbox is None:
+            return None
+        flag = self.values.flag
+        coe = mailbox.first("CoE")
+        described = None
+        if coe is not None:
+            channels = self.values.number(coe, "@DS402Channels", 0, low=0, high=255)
+            described = Coe(**{name: flag(coe, path) for name, path in _COE}, ds402_channels=channels)
+        others = {name.lower(): mailbox.first(name) is not None for name in ("FoE", "EoE", "AoE", "SoE", "VoE")}
+        return Mailbox(coe=described, **others, data_link_layer=flag(mailbox, "@DataLinkLayer"))
 
     def init_command(self, node: Node) -> InitCommand:
+        values = self.values
         return InitCommand(
-            transitions=tuple(item.text.upper() for item in node.all("Transition") if item.text),
-            index=self.within(node, "Index", self.number(node, "Index"), 0xFFFF),
-            sub_index=self.within(node, "SubIndex", self.number(node, "SubIndex", default=0), 0xFF),
-            data=self.data(node, "Data"),
-            complete_access=self.flag(node, "CompleteAccess"),
-            fixed=self.flag(node, "Fixed"),
+            transitions=tuple(item.text.upper() for item in node.below("Transition") if item.text),
+            index=values.number(node, "Index", low=0, high=0xFFFF),
+            sub_index=values.number(node, "SubIndex", 0, low=0, high=0xFF),
+            data=values.data(node, "Data"),
+            complete_access=values.flag(node, "@CompleteAccess"),
+            fixed=values.flag(node, "@Fixed"),
             comment=name_of(node, "Comment"),
-            depends_on_slot=self.flag(node.first("Index"), "DependOnSlot"),
+            depends_on_slot=values.flag(node, "Index/@DependOnSlot"),
         )
 
     def dc_mode(self, node: Node) -> DcMode:
-        def factor(tag: str, default: int) -> int:
-            child = node.first(tag)
-            return self.attribute(child, "Factor", default) if child is not None else 0
+        def time(tag: str, low: int = -(1 << 31)) -> int:
+            return self.values.number(node, tag, 0, low=low, high=(1 << 31) - 1)
 
-        times = {
-            tag: max(min(self.number(node, tag, default=0), (1 << 31) - 1), -(1 << 31))
-            for tag in ("CycleTimeSync0", "ShiftTimeSync0", "CycleTimeSync1", "ShiftTimeSync1")
-        }
+        def factor(tag: str, default: int) -> int:
+            return self.values.number(node, f"{tag}/@Factor", default if node.first(tag) is not None else 0)
+
         return DcMode(
-            name=node.value("Name"),
-            assign_activate=self.number(node, "AssignActivate", default=0) & 0xFFFF,
-            description=node.value("Desc"),
-            sync0_cycle=max(times["CycleTimeSync0"], 0),
+            name=node.value("Name") or "",
+            assign_activate=self.values.number(node, "AssignActivate", 0) & 0xFFFF,
+            description=node.value("Desc") or "",
+            sync0_cycle=time("CycleTimeSync0", low=0),
             sync0_factor=factor("CycleTimeSync0", 1),
-            sync0_shift=times["ShiftTimeSync0"],
-            sync1_cycle=max(times["CycleTimeSync1"], 0),
+            sync0_shift=time("ShiftTimeSync0"),
+            sync1_cycle=time("CycleTimeSync1", low=0),
             sync1_factor=factor("CycleTimeSync1", 0),
-            sync1_shift=times["ShiftTimeSync1"],
+            sync1_shift=time("ShiftTimeSync1"),
         )
 
     # Slots and modules
 
-    def slot(self, slots: Node, node: Node) -> Slot:
-        def increment(name: str) -> int:
-            item = node if name in node.attributes else slots
-            return self.within(item, name, self.attribute(item, name, default=0), 0xFFFF)
+    def slot(self, device: Node, node: Node) -> Slot:
+        values = self.values
 
-        idents = [(self.number_of(item), self.flag(item, "Default")) for item in node.all("ModuleIdent")]
-        maximum = self.within(node, "MaxInstances", self.attribute(node, "MaxInstances", default=1), SLOT_LIMIT)
+        def increment(name: str) -> int:
+            common = values.number(device, f"Slots/@{name}", 0, low=0, high=0xFFFF)
+            return values.number(node, f"@{name}", common, low=0, high=0xFFFF)
+
+        idents = [(number(item.text), item) for item in node.below("ModuleIdent")]
+        maximum = values.number(node, "@MaxInstances", 1, low=0, high=SLOT_LIMIT)
         return Slot(
             name=name_of(node),
-            idents=tuple(ident for ident, _ in idents),
-            minimum=min(max(self.attribute(node, "MinInstances", default=0), 0), maximum),
+            idents=tuple(ident for ident, _ in idents if ident is not None),
+            minimum=min(values.number(node, "@MinInstances", 0, low=0), maximum),
             maximum=maximum,
             pdo_increment=increment("SlotPdoIncrement"),
             index_increment=increment("SlotIndexIncrement"),
-            classes=tuple(item.text for item in self.below(node, "ModuleClass", "Class") if item.text),
-            default=next((ident for ident, default in idents if default), None),
+            classes=tuple(item.text for item in node.below("ModuleClass/Class") if item.text),
+            default=next((ident for ident, item in idents if values.flag(item, "@Default")), None),
         )
 
-    def number_of(self, node: Node) -> int:
-        """Return the number that an element holds."""
-        return self._number(node, "its text", node.text, None)
-
     def module(self, node: Node) -> Module:
-        kind = node.first("Type")
-        if kind is None:
-            raise self.error(node, "a module without a Type")
-        mailbox = node.first("Mailbox")
+        values = self.values
         return Module(
-            ident=self.attribute(kind, "ModuleIdent") & 0xFFFFFFFF,
-            name=name_of(node) or kind.text,
-            rx_pdos=self.each(node.all("RxPdo"), self.pdo),
-            tx_pdos=self.each(node.all("TxPdo"), self.pdo),
-            objects=self.dictionaries(node),
-            init_commands=self.init_commands(mailbox),
-            module_class=kind.attributes.get("ModuleClass", ""),
+            ident=values.number(node, "Type/@ModuleIdent") & 0xFFFFFFFF,
+            name=name_of(node) or node.value("Type") or "",
+            rx_pdos=values.each(node.below("RxPdo"), self.pdo),
+            tx_pdos=values.each(node.below("TxPdo"), self.pdo),
+            objects=self.objects.dictionary(node),
+            init_commands=values.each(node.below("Mailbox/CoE/InitCmd"), self.init_command),
+            module_class=node.value("Type/@ModuleClass") or "",
             profile=self.profiles(node)[0],
             origin=f"{self.path}:{node.line}",
         )
-
-    # Dictionaries
-
-    def dictionaries(self, node: Node) -> tuple[DictionaryObject, ...]:
-        objects: dict[int, DictionaryObject] = {}
-        for dictionary in self.below(node, "Profile", "Dictionary"):
-            data_types: dict[str, Node] = {}
-            for item in self.below(dictionary, "DataTypes", "DataType"):
-                data_types.setdefault(item.value("Name"), item)
-            for item in self.below(dictionary, "Objects", "Object"):
-                try:
-                    built = self.object(item, data_types)
-                except EsiError as error:
-                    self.warnings.add(item.line, f"Object is left out: {error.problem}")
-                    continue
-                if built.index in objects:
-                    self.warnings.add(item.line, f"Object 0x{built.index:04X} occurs twice; the first is used")
-                    continue
-                objects[built.index] = built
-        return tuple(objects[index] for index in sorted(objects))
-
-    def object(self, node: Node, data_types: dict[str, Node]) -> DictionaryObject:
-        index = self.within(node, "Index", self.number(node, "Index"), 0xFFFF)
-        type_name = node.value("Type")
-        data_type = data_types.get(type_name)
-        parts = data_type.all("SubItem") if data_type is not None else []
-        info = node.first("Info")
-        code = ObjectCode.VARIABLE
-        if not parts:
-            bits = self.number(node, "BitSize", default=0)
-            entries = [
-                self.object_entry(node, 0, name_of(node), type_name, bits, node.first("Flags"), info, data_types)
-            ]
-        else:
-            slots = self.sub_items(parts, data_types)
-            code = ObjectCode.ARRAY if any(element for *_, element in slots) else ObjectCode.RECORD
-            infos = _matched(info.all("SubItem") if info is not None else [], slots)
-            entries = []
-            for (sub_index, part, entry_type, bits, element), given in zip(slots, infos, strict=True):
-                flags = part.first("Flags") or node.first("Flags")
-                name = (name_of(given) if element and given is not None else "") or name_of(part)
-                values = given.first("Info") if given is not None else part
-                entries.append(self.object_entry(part, sub_index, name, entry_type, bits, flags, values, data_types))
-            entries = [item for number_, item in sorted({item.sub_index: item for item in reversed(entries)}.items())]
-            if entries[0].sub_index == 0 and not entries[0].default:
-                entries[0] = replace(entries[0], default=bytes([entries[-1].sub_index]))
-        return DictionaryObject(
-            index=index,
-            name=name_of(node),
-            code=code,
-            entries=tuple(entries),
-            depends_on_slot=self.flag(node.first("Index"), "DependOnSlot"),
-            overwritten_by_module=self.flag(node.first("Index"), "OverwrittenByModule"),
-        )
-
-    def sub_items(self, parts: list[Node], data_types: dict[str, Node]) -> list[_Part]:
-        """Return the subindexes of a type; an array's elements one by one."""
-        slots: list[_Part] = []
-        for part in parts:
-            type_name = part.value("Type")
-            bits = self.number(part, "BitSize", default=0)
-            given = number(part.value("SubIdx"))
-            array = data_types[type_name].first("ArrayInfo") if type_name in data_types else None
-            following = slots[-1][0] + 1 if slots else 0
-            if given is None and array is not None:
-                count = self.number(array, "Elements", default=0)
-                first = max(self.number(array, "LBound", default=1), following, 1)
-                element = data_types[type_name].value("BaseType")
-                if not 0 <= count <= 255:
-                    raise self.error(part, f"an array of {count} elements")
-                slots += [(first + i, part, element, bits // count, True) for i in range(min(count, 256 - first))]
-            else:
-                sub_index = self.within(part, "SubIdx", following if given is None else given, 255)
-                slots.append((sub_index, part, type_name, bits, False))
-        return slots
-
-    def object_entry(
-        self,
-        node: Node,
-        sub_index: int,
-        name: str,
-        type_name: str,
-        bits: int,
-        flags: Node | None,
-        info: Node | None,
-        data_types: dict[str, Node],
-    ) -> ObjectEntry:
-        base, bits = self.base_type(node, type_name, bits, data_types)
-        access = flags.first("Access") if flags is not None else None
-        rights = access.text.lower() if access is not None else "ro"
-        restrictions = access.attributes.get("WriteRestrictions", "") if access is not None else ""
-        mapping = flags.value("PdoMapping").upper() if flags is not None else ""
-        unit = number(info.value("Unit")) if info is not None else None
-        return ObjectEntry(
-            sub_index=sub_index,
-            name=name,
-            type=base.name,
-            bits=bits,
-            readable=rights != "wo",
-            writable=rights in ("rw", "wo"),
-            write_states="".join(letter for state, letter in _STATES if state in restrictions.upper().split("_")),
-            rx_mappable="R" in mapping,
-            tx_mappable="T" in mapping,
-            default=self.given(info, base, "Default", f"0x{sub_index:02X} {name}"),
-            minimum=self.given(info, base, "Min", name),
-            maximum=self.given(info, base, "Max", name),
-            unit=None if unit is None else unit & 0xFFFFFFFF,
-        )
-
-    def base_type(self, node: Node, name: str, bits: int, data_types: dict[str, Node]) -> tuple[types.BaseType, int]:
-        """Return the base type under a name of the file, and its length."""
-        for _ in range(8):
-            found = types.named(name)
-            data_type = data_types.get(name)
-            if found is not None or data_type is None or not data_type.value("BaseType"):
-                break
-            bits = bits or self.number(data_type, "BitSize", default=0)
-            name = data_type.value("BaseType")
-        declared = data_types.get(name)
-        bits = bits or (found.bits if found is not None else 0)
-        if not bits and declared is not None:
-            bits = self.number(declared, "BitSize", default=0)
-        bits = self.within(node, "BitSize", bits, 1 << 22)
-        base = types.resolve(name, bits)
-        return base, bits or base.bits
-
-    def given(self, info: Node | None, base: types.BaseType, which: str, name: str) -> bytes | None:
-        """Return a value of `Info`: data, a number or a text, of the type's length."""
-        if info is None:
-            return None
-        data: bytes | None = None
-        if info.first(f"{which}Data") is not None:
-            data = self.data(info, f"{which}Data")
-        elif text := info.value(f"{which}String"):
-            data = text.encode("utf-8")
-        elif text := info.value(f"{which}Value"):
-            value: types.Value | None = text if base.kind in (types.Kind.TEXT, types.Kind.REAL) else number(text)
-            try:
-                data = types.encode(base, value if value is not None else float(text))
-            except (EsiError, ValueError):
-                self.warnings.add(info.line, f"{name}: {which}Value {text[:40]!r} is no {base.name}; it is left out")
-                return None
-        if not data:
-            return data
-        if base.size and base.kind is not types.Kind.TEXT:
-            if len(data) > base.size and any(data[base.size :]):
-                self.warnings.add(
-                    info.line, f"{name}: {which}Data has {len(data)} bytes, the type {base.size}; it is cut"
-                )
-            data = data[: base.size].ljust(base.size, b"\0")
-        return data
-
-
-_Part = tuple[int, Node, str, int, bool]
-"""Subindex, element, type, bits, whether it is an array's element."""
-_PROTOCOLS = (("FoE", "foe"), ("EoE", "eoe"), ("AoE", "aoe"), ("SoE", "soe"), ("VoE", "voe"))
-
-
-def _matched(infos: list[Node], slots: list[_Part]) -> list[Node | None]:
-    """Return the values of each subindex: by position, as their names often differ; by name where some are missing."""
-    if len(infos) == len(slots):
-        return list(infos)
-    named = {name_of(info): info for info in reversed(infos)}
-    by_name = [named.get(name_of(part)) for _, part, *_ in slots]
-    if len(infos) < len(slots) and sum(found is not None for found in by_name) == len(infos):
-        return list(by_name)
-    return [infos[position] if position < len(infos) else None for position in range(len(slots))]
-
-
-def _hides(hiding: _Hiding, device: Device) -> bool:
-    identity = device.identity
-    if (identity.product_code, identity.revision) == hiding.by:
-        return False
-    if hiding.product is not None:
-        alike = identity.product_code == hiding.product
-    elif hiding.type:
-        alike = device.type == hiding.type
-    else:
-        alike = identity.product_code == hiding.by[0]
-    return alike and hiding.revision in (None, identity.revision)
 
 
 def read_esi(path: Path | str) -> DeviceFile:
     """Return the devices and modules of an ESI file.
 
-    Raises EsiError where the file is no ESI file, or beyond the limits of `xml_tree`. A device or module that cannot be
-    understood is in `failures` instead.
+    Raises EsiError where the file is no ESI file, or beyond the limits of this module and of `xml_tree`. A device or
+    module that cannot be understood is in `failures` instead.
     """
     reader = _Reader(Path(path))
-    root = read_trees(Path(path), reader.collect, reader.warnings)
+    root = read_trees(Path(path), reader.collect, reader.values.warnings)
     if not (reader.devices or reader.modules or reader.failures):
         raise EsiError(str(path), f"{root} holds no device and no module")
     return reader.file()
@@ -673,9 +382,9 @@ def find_devices(
     return tuple(
         device
         for device in file.devices
-        if (product is None or device.identity.product_code == product)
-        and (revision is None or device.identity.revision == revision)
-        and (wanted is None or wanted in (device.type.lower(), device.name.lower()))
+        if product in (None, device.identity.product_code)
+        and revision in (None, device.identity.revision)
+        and wanted in (None, device.type.lower(), device.name.lower())
     )
 
 
@@ -691,18 +400,12 @@ def find_device(
         fitting = tuple(device for device in fitting if not device.hidden) or fitting
     if len(fitting) == 1:
         return fitting[0]
-    offered = fitting or file.devices
-    candidates = tuple(describe(device) for device in offered)
-    asked = ", ".join(
-        f"{key} {value}"
-        for key, value in (
-            ("product", None if product is None else f"0x{product:08X}"),
-            ("revision", None if revision is None else f"0x{revision:08X}"),
-            ("name", name),
-        )
-        if value is not None
-    )
-    problem = f"{len(fitting) or 'no'} devices fit {asked or 'without a choice'}"
+    candidates = tuple(describe(device) for device in fitting or file.devices)
+    asked = [
+        f"{key} 0x{value:08X}" for key, value in (("product", product), ("revision", revision)) if value is not None
+    ]
+    asked += [f"name {name}"] if name is not None else []
     shown = "; ".join(candidates[:20]) + (f"; and {len(candidates) - 20} more" if len(candidates) > 20 else "")
     failed = f"; not readable: {'; '.join(file.failures[:5])}" if file.failures else ""
+    problem = f"{len(fitting) or 'no'} devices fit {', '.join(asked) or 'without a choice'}"
     raise LookupFailure(file.path, f"{problem}; there are: {shown or 'none'}{failed}", candidates)

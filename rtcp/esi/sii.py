@@ -191,7 +191,7 @@ def _categories(device: Device, pdos: bool, entry_names: bool) -> bytes:
     data = {
         _STRINGS: texts.data(),
         _GENERAL: general,
-        _FMMU: bytes(device.fmmus),
+        _FMMU: bytes(use or 0xFF for use in device.fmmus),
         _SYNC_MANAGER: sync_managers,
         _TX_PDO: tx_pdos,
         _RX_PDO: rx_pdos,

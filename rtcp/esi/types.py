@@ -6,6 +6,7 @@ import re
 import struct
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 
 from rtcp.esi.model import EsiError
 
@@ -117,6 +118,7 @@ _ARRAY = re.compile(r"ARRAY\s*\[\s*(\d{1,6})\s*\.\.\s*(\d{1,6})\s*\]\s*OF\s+(\w+
 _CHARACTER_BITS = {"UNICODE_STRING": 16, "WSTRING": 16}
 
 
+@lru_cache(maxsize=1024)
 def named(name: str) -> BaseType | None:
     """Return the type of a name, `STRING(12)` and `ARRAY [0..30] OF BYTE` among them; None: it is no base type."""
     name = name.strip().upper()
@@ -148,6 +150,7 @@ def of_number(number: int, bits: int) -> BaseType:
     return entry
 
 
+@lru_cache(maxsize=1024)
 def resolve(name: str, bits: int) -> BaseType:
     """Return the type of a name; where it is none, or of another length than `bits`, the plainest of the length."""
     entry = named(name)

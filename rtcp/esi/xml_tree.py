@@ -13,8 +13,8 @@ from rtcp.esi.model import EsiError
 
 FILE_LIMIT = 64 << 20
 """Largest file, bytes; the largest public one has 4.2 million."""
-NODE_LIMIT = 2_000_000
-"""Elements that are read in a file."""
+NODE_LIMIT = 300_000
+"""Elements that are read of a device; the largest public one has 84 thousand."""
 TEXT_LIMIT = 1 << 18
 """Characters in an element."""
 TOKEN_LIMIT = 4 << 20
@@ -41,9 +41,10 @@ READ = frozenset(
         Access AoE ArrayInfo AssignActivate BaseType BitLen BitSize BootStrap ByteSize ChannelInfo Class CoE Comment
         ConfigData CycleTimeSync0 CycleTimeSync1 Data DataType DataTypes Dc DefaultData DefaultString DefaultValue
         Desc Descriptions Device Devices Dictionary EBusCurrent Eeprom Electrical Elements Entry EoE Exclude Flags
-        Fmmu FoE Group GroupType Groups HideType Id Index Info InitCmd LBound Mailbox MaxData MaxValue MinData
-        MinValue Module ModuleClass ModuleIdent Modules Name Object Objects OpMode PdoMapping Profile ProfileNo RxPdo
-        ShiftTimeSync0 ShiftTimeSync1 Slot Slots Sm SoE SubIdx SubIndex SubItem Transition TxPdo Type Unit Vendor VoE
+        Fmmu FoE Group Groups GroupType HideType Id Index Info InitCmd LBound Mailbox MaxData MaxValue MinData
+        MinValue Module ModuleClass ModuleIdent Modules Name NotationIndex Object Objects OpMode PdoMapping Profile
+        ProfileNo RxPdo ShiftTimeSync0 ShiftTimeSync1 Slot Slots Sm SoE SubIdx SubIndex SubItem Symbol Transition
+        TxPdo Type Unit UnitType UnitTypes Vendor VoE
         """,
     )
 )
@@ -52,11 +53,11 @@ IGNORED = frozenset(
     re.findall(
         r"\w+",
         """
-        AddInfo AlternativeType Backup Category ChannelCount DataString DcOpModeName DiagFile DiagMessages
-        DictionaryFile DisplayName ESC Enum EnumInfo EtherCATController EtherCATp ExecutionUnit IdentificationAdo
+        AddInfo AlternativeType Backup BitOffs Category ChannelCount DataString DcOpModeName DiagFile DiagMessages
+        DictionaryFile DisplayName Enum EnumInfo ESC EtherCATController EtherCATp ExecutionUnit IdentificationAdo
         IdentificationReg134 Image16x14 ImageData16x14 ImageFile16x14 InfoReference MaxSlotCount Port ProducerInfo
         Properties Property ReadAccess SafetyMapping SafetyParaMapping SdoAccess Setting SlotSelections StateMachine
-        StationAliasSupported Su SubDevice Text Timeout TreeView URL UnitTypes VendorSpecific
+        StationAliasSupported Su SubDevice Text Timeout TreeView URL VendorSpecific
         """,
     )
 )
@@ -83,17 +84,27 @@ class Node:
         """Return the children of a name."""
         return [child for child in self.children if child.tag == tag]
 
-    def first(self, *path: str) -> Node | None:
-        """Return the first child of a name, and so on down the path; None: there is none."""
+    def first(self, path: str) -> Node | None:
+        """Return the first child of a name, and so on down a path such as `Info/Electrical`; None: there is none."""
         node: Node | None = self
-        for tag in path:
+        for tag in path.split("/"):
             node = next((child for child in node.children if child.tag == tag), None) if node is not None else None
         return node
 
-    def value(self, *path: str) -> str:
-        """Return the text of the first child of a name, and so on down the path; "": there is none."""
-        node = self.first(*path)
-        return node.text if node is not None else ""
+    def below(self, path: str) -> list[Node]:
+        """Return all elements at the end of a path."""
+        nodes = [self]
+        for tag in path.split("/"):
+            nodes = [child for node in nodes for child in node.children if child.tag == tag]
+        return nodes
+
+    def value(self, path: str) -> str | None:
+        """Return the text of the first element at a path, or an attribute of it as in `Index/@Default`; None: none."""
+        path, _, attribute = path.partition("@")
+        node = self.first(path.rstrip("/")) if path else self
+        if node is None:
+            return None
+        return node.attributes.get(attribute) if attribute else node.text
 
 
 class Warnings:
@@ -155,14 +166,14 @@ class _Trees:
             if self._skipped > DEPTH_LIMIT:
                 raise self._error(f"elements are nested more than {DEPTH_LIMIT} deep")
             return
-        self._count += 1
-        if self._count > NODE_LIMIT:
-            raise self._error(f"more than {NODE_LIMIT} elements")
         if len(self._stack) >= DEPTH_LIMIT:
             raise self._error(f"elements are nested more than {DEPTH_LIMIT} deep")
         parent = self._stack[-1] if self._stack else ""
         if self._open or (tag in _COLLECTED and (_COLLECTED[tag] in (parent, None))):
             node = Node(tag, attributes, self._parser.CurrentLineNumber)
+            self._count = self._count + 1 if self._open else 1
+            if self._count > NODE_LIMIT:
+                raise self._error(f"{self._open[0].tag} of more than {NODE_LIMIT} elements")
             if self._open:
                 self._open[-1].children.append(node)
             self._open.append(node)

@@ -57,7 +57,7 @@ def check_mailboxes(esc: Esc, device: DeviceModel) -> bool:
         )
         and out.master_writes
         and not in_.master_writes
-        and (out.end <= in_.start or in_.end <= out.start)
+        and (device.shares_memory or out.end <= in_.start or in_.end <= out.start)
     )
 
 

@@ -16,7 +16,7 @@ from rtcp.config.document import read
 from rtcp.config.loader import load_kinematics
 from rtcp.config.segment import SegmentConfig
 from rtcp.virtual.device import DeviceModel
-from rtcp.virtual.models.cubemars import CubemarsDrive
+from rtcp.virtual.models.servo import ServoAxis
 
 PERIOD = 5_000_000
 """ns between two looks at where the joints are: at 0.5 rad/s a weight changes by less than 0.1 Nm."""
@@ -32,7 +32,7 @@ class VirtualArm:
         drives: of joints 1 to 6.
     """
 
-    def __init__(self, model: ArmModel, drives: Sequence[CubemarsDrive]) -> None:
+    def __init__(self, model: ArmModel, drives: Sequence[ServoAxis]) -> None:
         self._model = model
         self._mechanics = [drive.mechanics for drive in drives]
         self._wrench = [0.0] * 6
@@ -81,7 +81,7 @@ def make_arm(config: SegmentConfig, devices: Sequence[DeviceModel]) -> VirtualAr
     Raises:
         ConfigError: of the arm's file.
     """
-    drives = [device for device in devices if isinstance(device, CubemarsDrive)]
+    drives: list[ServoAxis] = [servo for device in devices for servo in device.servos]
     file = config.arm
     if file is None or len(drives) < JOINTS or "kinematics" not in read(file).data:
         return None

@@ -30,7 +30,7 @@ from typing import Any, ClassVar
 from rtcp.config.find import load_class
 from rtcp.config.model import PluginError
 from rtcp.virtual.device import DeviceModel, Emergency, Option, OptionError
-from rtcp.virtual.objects import SIGNED, Entry, SdoAbort, Value
+from rtcp.virtual.objects import Entry, SdoAbort, Value, bounds
 from rtcp.virtual.protocol import AlState
 
 __all__ = ["Behaviour", "FileBusy", "FileRefused", "FoeError", "Option", "SdoAbort"]
@@ -178,13 +178,6 @@ def set_value(entry: Entry, value: Value) -> None:
     entry.value = value
 
 
-def bounds(entry: Entry) -> tuple[int, int]:
-    """Return the lowest and the highest number that the bits of an entry hold."""
-    if entry.data_type in SIGNED:
-        return -(1 << entry.bit_length - 1), (1 << entry.bit_length - 1) - 1
-    return 0, (1 << entry.bit_length) - 1
-
-
 class HookHangs(BaseException):
     """Raised inside a hook that takes too long; no `except Exception` of the hook catches it."""
 
@@ -236,7 +229,7 @@ class Runner:
     """Calls the hooks of a device's behaviour, and reports each failure in one sentence."""
 
     def __init__(self, device: DeviceModel, kind: type[Behaviour] | None) -> None:
-        """Make the behaviour; None: the device answers by its dictionary.
+        """Make the behaviour; None: the device answers by its dictionary and keeps files.
 
         Raises:
             OptionError: it cannot be made.
@@ -247,10 +240,9 @@ class Runner:
         """What a sentence calls the device."""
         self._broken = False
         self._told: set[str] = set()
-        self.behaviour: Behaviour | None = None
         self._steps: Callable[[float], None] | None = None
         if kind is None:
-            return
+            kind = Behaviour
         try:
             self.behaviour = kind(device)
         except Exception as error:  # whatever a behaviour raises
@@ -268,13 +260,12 @@ class Runner:
     @property
     def keeps_outputs(self) -> bool:
         """Whether outputs keep their values when they become invalid."""
-        return self.behaviour is not None and self.behaviour.keeps_outputs
+        return self.behaviour.keeps_outputs
 
     def start(self) -> None:
         """Power has come on."""
         self._broken = False
-        if self.behaviour is not None:
-            self._try("on_start", self.behaviour.on_start)
+        self._try("on_start", self.behaviour.on_start)
 
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass."""
@@ -286,7 +277,7 @@ class Runner:
             WATCH.active = True
             steps(dt)
         except BaseException as error:  # whatever a behaviour raises, and HookHangs
-            self._fail("on_outputs", error)
+            self.fail("on_outputs", error)
         finally:
             WATCH.active = False
 
@@ -297,22 +288,18 @@ class Runner:
 
     def state_changed(self, before: int, after: int) -> None:
         """The slave went to another AL state."""
-        if self.behaviour is not None and _overrides(type(self.behaviour), "on_state"):
+        if _overrides(type(self.behaviour), "on_state"):
             self._try("on_state", self.behaviour.on_state, AlState(before), AlState(after))
 
     def on_file(self, name: str, data: bytes) -> None:
         """Hand a file over; raises HookFailed, and what `Behaviour.on_file` may raise."""
-        if self.behaviour is not None:
-            with self._guarded("on_file", (FileBusy, FileRefused)):
-                self.behaviour.on_file(name, data)
+        with self._guarded("on_file", (FileBusy, FileRefused)):
+            self.behaviour.on_file(name, data)
 
     def read_file(self, name: str) -> bytes | None:
         """Return a file, None where there is none; raises as `on_file`."""
-        found: bytes | None = None
-        if self.behaviour is not None:
-            with self._guarded("read_file", (FileBusy, FileRefused)):
-                found = self.behaviour.read_file(name)
-        return found
+        with self._guarded("read_file", (FileBusy, FileRefused)):
+            return self.behaviour.read_file(name)
 
     def _try(self, hook: str, call: Callable[..., object], *arguments: object) -> None:
         """Call a hook whose failure takes the slave out of OP."""
@@ -324,7 +311,6 @@ class Runner:
             self._broken = True
 
     def _read(self, entry: Entry) -> None:
-        assert self.behaviour is not None
         try:
             with self._guarded("on_sdo_read", (SdoAbort,)):
                 value = self.behaviour.on_sdo_read(entry.index, entry.subindex)
@@ -334,7 +320,6 @@ class Runner:
             raise SdoAbort(GENERAL_ERROR) from None
 
     def _write(self, entry: Entry, value: Value) -> None:
-        assert self.behaviour is not None
         try:
             with self._guarded("on_sdo_write", (SdoAbort,)):
                 self.behaviour.on_sdo_write(entry.index, entry.subindex, value)
@@ -356,7 +341,8 @@ class Runner:
         finally:
             WATCH.active = False
 
-    def _fail(self, hook: str, error: BaseException) -> None:
+    def fail(self, hook: str, error: BaseException) -> None:
+        """Take the slave out of OP for a failure, and report that."""
         self._broken = True
         self._device.failure = UNSPECIFIED_ERROR
         self._tell(hook, error)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 
 from rtcp.esi import types
+from rtcp.esi.dictionary import complete
 from rtcp.esi.model import Device, ObjectEntry, Pdo, PdoEntry
 from rtcp.esi.sii import crc
 from rtcp.virtual.behaviour import Behaviour, Runner
@@ -62,7 +63,8 @@ class DescribedDevice(DeviceModel):
 
     def __init__(self, device: Device, image: Callable[[int], bytes], behaviour: type[Behaviour] | None = None,
                  **options: object) -> None:  # fmt: skip
-        self.description = device
+        has_coe = device.mailbox is not None and device.mailbox.coe is not None
+        self.description = device = complete(device) if has_coe else device
         self._image = image
         mailbox = device.mailbox
         self.sync_managers = _layout(device)
@@ -121,6 +123,7 @@ class DescribedDevice(DeviceModel):
         numbers: dict[int, Pdo] = {}
         pdos = [(pdo, Access.RXPDO) for pdo in self.description.rx_pdos]
         pdos += [(pdo, Access.TXPDO) for pdo in self.description.tx_pdos]
+        own = frozenset(pdo.index for pdo, _ in pdos)
         for pdo, wanted in pdos:
             if pdo.virtual:
                 continue
@@ -128,7 +131,7 @@ class DescribedDevice(DeviceModel):
             numbers[number] = pdo
             if pdo.sync_manager is not None:
                 self._assignments.setdefault(pdo.sync_manager, []).append(number)
-            mapped = [mapping for entry in pdo.entries for mapping in _mappings(objects, entry, wanted)]
+            mapped = [mapping for entry in pdo.entries for mapping in _mappings(objects, entry, wanted, own)]
             self._define_mapping(objects, number, pdo, wanted, mapped)
         return numbers
 
@@ -202,12 +205,14 @@ class DescribedDevice(DeviceModel):
                 length = (bits + 7) // 8
             else:
                 length = manager.length
-            if length and manager.type != SyncManagerType.UNUSED:
+            if manager.type != SyncManagerType.UNUSED:
                 areas.append((manager.start, manager.start + length * manager.buffers))
         boot = self.bootstrap or (0, 0, 0, 0)
         end = max([REGISTER_SPACE + RAM_SIZE, *(end for _, end in areas), boot[0] + boot[1], boot[2] + boot[3]])
         self.ram_size = min(LARGEST_RAM, -(-(end - REGISTER_SPACE) // 1024) * 1024)
-        self.shares_memory = any(first[1] > second[0] for first, second in pairwise(sorted(areas)))
+        self.shares_memory = any(
+            first[1] > second[0] for first, second in pairwise(sorted(area for area in areas if area[0] < area[1]))
+        )
 
     def lay_out(self, index: int) -> PdoImage:
         """Return the process image of sync manager `index`; where they share memory all may fill it."""
@@ -236,6 +241,10 @@ class DescribedDevice(DeviceModel):
                     entry.value = bytes(len(entry.value)) if isinstance(entry.value, bytes) else 0
         self.runner.outputs_valid(valid)
 
+    def unpackable(self, error: Exception) -> None:
+        """An error of the behaviour, which has written to an entry past `Behaviour.__setitem__`."""
+        self.runner.fail("on_outputs", error)
+
     def open_mailbox(self, receive_size: int, send_size: int) -> None:
         """No transfer of a file is under way."""
         if self.files is not None:
@@ -252,16 +261,19 @@ def _is_mailbox(manager: SyncManager) -> bool:
 
 def _layout(device: Device) -> tuple[SyncManager, ...]:
     """Return the sync managers; those that stand for registers, and the mailboxes of a device without, have no use."""
-    unused = SyncManagerType.UNUSED
+    process_data = (SyncManagerType.OUTPUTS, SyncManagerType.INPUTS)
+    assigned = [{pdo.sync_manager for pdo in pdos if not pdo.virtual} for pdos in (device.rx_pdos, device.tx_pdos)]
 
-    def kind(manager_type: int, virtual: bool) -> SyncManagerType:
-        found = SyncManagerType(manager_type)
-        without = device.mailbox is None and found in (SyncManagerType.MAILBOX_RECEIVE, SyncManagerType.MAILBOX_SEND)
-        return unused if virtual or without else found
+    def kind(n: int, found: SyncManagerType, virtual: bool) -> SyncManagerType:
+        if virtual or (device.mailbox is None and found not in process_data):
+            return SyncManagerType.UNUSED
+        carries = [wanted for wanted, managers in zip(process_data, assigned, strict=True) if n in managers]
+        # Some descriptions call inputs outputs.
+        return carries[0] if found in process_data and len(carries) == 1 else found
 
     return tuple(
-        SyncManager(m.start, m.length, m.control, kind(m.type, m.virtual), int(m.enabled))
-        for m in device.sync_managers[:8]
+        SyncManager(m.start, m.length, m.control, kind(n, SyncManagerType(m.type), m.virtual), int(m.enabled))
+        for n, m in enumerate(device.sync_managers[:8])
     )
 
 
@@ -317,8 +329,11 @@ def _entry(index: int, entry: ObjectEntry) -> Entry:
     return made
 
 
-def _mappings(objects: ObjectDictionary, entry: PdoEntry, wanted: Access) -> Iterable[int]:
-    """Yield the mappings of a PDO's entry, one but for long gaps; add the object that it maps where there is none."""
+def _mappings(objects: ObjectDictionary, entry: PdoEntry, wanted: Access, pdos: frozenset[int]) -> Iterable[int]:
+    """Yield the mappings of a PDO's entry, one but for long gaps; add the object that it maps where there is none.
+
+    What maps the mapping object of one of the `pdos`, as some descriptions do, holds a value of its own.
+    """
     if entry.index < _FIRST_OBJECT or entry.bits > 0xFF:
         left = entry.bits
         while left > 0:
@@ -326,6 +341,13 @@ def _mappings(objects: ObjectDictionary, entry: PdoEntry, wanted: Access) -> Ite
             left -= _LONGEST_GAP
         return
     word = entry.index << 16 | entry.sub_index << 8 | entry.bits
+    if entry.index in pdos:
+        base = types.resolve(entry.type, entry.bits)
+        value = _value(base, None, entry.bits)
+        hidden = Entry(entry.index, entry.sub_index, entry.name, _data_type(base), value, bit_length=entry.bits)
+        objects.mappings[word] = hidden, entry.bits
+        yield word
+        return
     target = _mapped_entry(objects, entry, wanted)
     if target.bit_length != entry.bits:
         objects.mappings[word] = target, entry.bits

@@ -61,6 +61,8 @@ class Option:
     high: float
     meaning: str
     whole: bool = False
+    listed: bool = True
+    """Whether a sentence on what there is names it."""
 
 
 class OptionError(ValueError):
@@ -199,6 +201,8 @@ class DeviceModel:
         self.mailbox_protocols: dict[MailboxType, MailboxHandler] = {}
         """Mailbox protocols beside CoE, as FoE, that a subclass adds in its `__init__`; its SII lists them."""
         self.outputs_valid = False
+        self.servos: Sequence[Any] = ()
+        """Axes of a drive: `rtcp.virtual.models.servo.ServoAxis`."""
         self.failure = 0
         """AL status code with which the slave is to leave OP for SAFE-OP now; 0: none."""
         self.roles = roles_of(self.sync_managers)
@@ -267,6 +271,10 @@ class DeviceModel:
         """Return its EEPROM image with the station alias; empty: it is made of its objects."""
         return b""
 
+    def unpackable(self, error: Exception) -> None:
+        """Inputs hold what does not fit into the process data: an error of the model."""
+        raise error
+
     def open_mailbox(self, receive_size: int, send_size: int) -> None:
         """The mailbox opens: what the master writes at once, and reads, in bytes with all headers."""
 
@@ -312,7 +320,7 @@ def _read_options(table: Mapping[str, Option], given: Mapping[str, object]) -> d
     for name, value in given.items():
         option = table.get(name)
         if option is None:
-            findings.append((("options", name), f"the model has no option {name!r}; it has: {', '.join(table)}"))
+            findings.append((("options", name), f"the model has no option {name!r}; it has: {_names(table)}"))
             continue
         kind = int if option.whole else (int, float)
         sound = isinstance(value, kind) and not isinstance(value, bool)
@@ -324,6 +332,10 @@ def _read_options(table: Mapping[str, Option], given: Mapping[str, object]) -> d
     if findings:
         raise OptionError(*findings)
     return chosen
+
+
+def _names(table: Mapping[str, Option]) -> str:
+    return ", ".join(name for name, option in table.items() if option.listed)
 
 
 def models() -> dict[str, EntryPoint]:

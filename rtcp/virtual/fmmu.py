@@ -86,15 +86,16 @@ def copy_bits(source: bytes | bytearray, source_bit: int, target: bytearray, tar
     target[first:end] = whole.to_bytes(end - first, "little")
 
 
-def transfer(esc: Esc, command: int, address: int, data: bytearray, t: int) -> int:
+def touched(esc: Esc, address: int, length: int) -> Parts:
+    """Return what a datagram of `length` bytes at logical `address` touches of a slave's FMMUs."""
+    return [(fmmu, part) for fmmu in active_fmmus(esc) if (part := overlap(fmmu, address, length)) is not None]
+
+
+def transfer(esc: Esc, command: int, parts: Parts, data: bytearray, t: int) -> int:
     """Let one slave handle a logical datagram's `data`; return what it adds to the working counter."""
-    length = len(data)
     incoming = bytes(data)
     read = wrote = False
-    for fmmu in active_fmmus(esc):
-        part = overlap(fmmu, address, length)
-        if part is None:
-            continue
+    for fmmu, part in parts:
         first, end = part.physical // 8, (part.physical + part.bits + 7) // 8
         if end > len(esc.memory):
             # An FMMU that reaches beyond the memory maps nothing there.
@@ -109,6 +110,10 @@ def transfer(esc: Esc, command: int, address: int, data: bytearray, t: int) -> i
             copy_bits(incoming, part.at, changed, part.physical - 8 * first, part.bits)
             wrote |= esc.write(first, bytes(changed), t)
     return read + (2 * wrote if command == DatagramCommand.LRW else wrote)
+
+
+Parts = list[tuple[Fmmu, Overlap]]
+"""FMMUs and the part of each that a datagram touches."""
 
 
 class Copy(NamedTuple):
@@ -150,7 +155,7 @@ class Plan:
     """What each slave has in `counter`."""
     written: list[tuple[Esc, SyncManager]] = field(default_factory=list)
     """Buffers that the copies complete."""
-    others: list[Esc] = field(default_factory=list)
+    others: list[tuple[Esc, Parts]] = field(default_factory=list)
     """Slaves, in the order of the wire, that need `transfer`."""
 
 
@@ -187,19 +192,19 @@ def compile_plan(slaves: Sequence[Esc], images: dict[SyncManager, int], command:
                  length: int) -> Plan:  # fmt: skip
     """Work out the copies of a logical datagram; `images` gives each buffer's place in the image of its direction."""
     plan = Plan()
-    used: list[tuple[Esc, list[Overlap]]] = []
+    used: list[tuple[Esc, Parts]] = []
     taken: list[tuple[int, int, int]] = []
     for position, esc in enumerate(slaves):
-        parts = [(fmmu, part) for fmmu in active_fmmus(esc) if (part := overlap(fmmu, address, length)) is not None]
+        parts = touched(esc, address, length)
         if not parts:
             continue
-        used.append((esc, [part for _, part in parts]))
+        used.append((esc, parts))
         taken += [(part.at, part.at + part.bits, position) for _, part in parts]
         if not _fast(plan, esc, parts, images, command):
-            plan.others.append(esc)
+            plan.others.append((esc, parts))
     # Where slaves share bits of the datagram their order matters: then all go the exact way, one after another.
     if _shared(taken):
-        return Plan(others=[esc for esc, _ in used])
+        return Plan(others=used)
     plan.outputs = _join(plan.outputs)
     plan.inputs = _join(plan.inputs)
     return plan
@@ -218,7 +223,7 @@ def _shared(taken: list[tuple[int, int, int]]) -> bool:
     return False
 
 
-def _fast(plan: Plan, esc: Esc, parts: list[tuple[Fmmu, Overlap]], images: dict[SyncManager, int],
+def _fast(plan: Plan, esc: Esc, parts: Parts, images: dict[SyncManager, int],
           command: int) -> bool:  # fmt: skip
     """Add one slave's part to `plan` if whole buffers are all it has; otherwise leave the plan alone."""
     outputs: list[Copy | BitCopy] = []

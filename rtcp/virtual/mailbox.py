@@ -194,9 +194,10 @@ class MailboxService:
         protocols = device.mailbox_protocols
         if boot:
             protocols = {kind: handler for kind, handler in protocols.items() if kind == MailboxType.FOE}
+        coe = None if boot else device.coe
         self._mailbox = Mailbox(
-            device.objects, device.emergencies, out.length, in_.length, faults, protocols,
-            None if boot else device.coe,
+            device.objects, device.emergencies if coe else deque(), out.length, in_.length, faults, protocols,
+            coe,
         )  # fmt: skip
         self._outbox: deque[bytes] = deque()
         self._present: bytes | None = None

@@ -286,6 +286,13 @@ def decode(entry: Entry, data: bytes) -> Value:
     return int.from_bytes(data, "little", signed=entry.data_type in SIGNED)
 
 
+def bounds(entry: Entry) -> tuple[int, int]:
+    """Return the lowest and the highest number that the bits of an entry hold."""
+    if entry.data_type in SIGNED:
+        return -(1 << entry.bit_length - 1), (1 << entry.bit_length - 1) - 1
+    return 0, (1 << entry.bit_length) - 1
+
+
 def to_bits(entry: Entry) -> int:
     """Return the stored value as an unsigned integer of `entry.bit_length` bits."""
     return int.from_bytes(encode(entry, entry.value), "little") & ((1 << entry.bit_length) - 1)

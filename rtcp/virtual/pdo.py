@@ -96,7 +96,7 @@ def room(layout: Sequence[SyncManager], index: int, memory_end: int) -> int:
     """Return the most bytes that sync manager `index` can have: up to the next one in the memory, or its end."""
     own = layout[index]
     ends = [other.start for n, other in enumerate(layout) if n != index and other.start > own.start]
-    return (min([*ends, memory_end]) - own.start) // own.buffers
+    return max(0, min([*ends, memory_end]) - own.start) // own.buffers
 
 
 class PdoImage:

@@ -11,6 +11,7 @@ from rtcp.config.document import Finding, read
 from rtcp.config.model import ConfigError
 from rtcp.config.segment import SegmentConfig, load_segment, place_of
 from rtcp.virtual.arm import VirtualArm, make_arm
+from rtcp.virtual.described import DescribedDevice
 from rtcp.virtual.descriptions import Descriptions
 from rtcp.virtual.device import DeviceModel, OptionError
 from rtcp.virtual.objects import SdoAbort
@@ -450,6 +451,10 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
     slaves = make_slaves(devices, drifts, [cable.arrival for cable in cables], aliases, t)
     segment = Segment(slaves, t, connections)
     segment.arm = make_arm(config, devices)
+    document = read(config.source)
+    for i, device in enumerate(devices):
+        if isinstance(device, DescribedDevice):
+            device.runner.place = f"{config.source}:{document.line(('slaves', i))}: slave {i + 1}"
     return segment
 
 

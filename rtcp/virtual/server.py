@@ -17,6 +17,7 @@ from pathlib import Path
 from types import FrameType
 
 from rtcp.config.segment import load_segment
+from rtcp.virtual.behaviour import WATCH
 from rtcp.virtual.faults.control import Control, GroundTruth
 from rtcp.virtual.faults.fault import FOR_EVER
 from rtcp.virtual.faults.registry import FaultRegistry, Planned, load_script
@@ -274,6 +275,8 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
         control = None if listener is None else Control(listener, server.registry, truth)
         if control is not None:
             kept.callback(control.close)
+        if any(slave.behaviour is not None for slave in config.slaves):
+            WATCH.start()
         request_prompt_scheduling()
         # A master that finds its interface up finds the slaves answering.
         bring_up()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
 
 from rtcp.virtual.al_state import HELD, AlStatusCode, SyncMonitor, first_failure, judge
@@ -25,32 +26,21 @@ _EMPTY = PdoImage(())
 class ProcessData:
     """A sync manager of process data with its image and, of outputs, what the device has taken over last."""
 
-    __slots__ = ("image", "latched", "manager")
+    __slots__ = ("image", "latched", "manager", "single")
 
-    def __init__(self, manager: SyncManager) -> None:
+    def __init__(self, manager: SyncManager, single: bool) -> None:
         self.manager = manager
+        self.single = single
+        """Whether it has one buffer, which is empty once it was read, and not three."""
         self.image = _EMPTY
         self.latched = b""
-
-    def latch(self) -> None:
-        """Take over the outputs that are there now; a single buffer is empty then."""
-        manager = self.manager
-        if not manager.mailbox:
-            self.latched = bytes(manager.buffer)
-        elif manager.full:
-            self.latched = manager.take()
-
-    def unpack(self) -> None:
-        """Put the outputs taken over into their objects."""
-        if len(self.latched) == self.image.byte_length:  # the master may have changed the sync manager just now
-            self.image.unpack(self.latched)
 
     def pack(self) -> None:
         """Put the inputs where the master reads them; into a single buffer once it was read."""
         manager, image = self.manager, self.image
         if manager.length != image.byte_length:
             return
-        if not manager.mailbox:
+        if not self.single:
             image.pack(manager.buffer)
         elif not manager.full and not manager.locked and manager.length:
             packed = bytearray(image.byte_length)
@@ -71,8 +61,10 @@ class Application:
         self._mailbox: MailboxService | None = None
         roles = device.roles
         self._mailboxes = roles.mailboxes or ()
-        self._outputs = tuple(ProcessData(esc.sync_managers[index]) for index in roles.outputs)
-        self._inputs = tuple(ProcessData(esc.sync_managers[index]) for index in roles.inputs)
+        self._outputs, self._inputs = (
+            tuple(ProcessData(esc.sync_managers[index], device.sync_managers[index].buffers == 1) for index in indices)
+            for indices in (roles.outputs, roles.inputs)
+        )
         self._emulated = not self._mailboxes and bool(esc.memory[Register.PDI_CONTROL + 1] & DEVICE_EMULATION)
         """Whether there is no firmware: the controller itself follows every request (ETG.1000.4, 6.1.4)."""
         self._fed: int | None = None
@@ -292,7 +284,10 @@ class Application:
     def latch(self) -> None:
         """Take over the outputs: the frame that brought them has passed, or SYNC0 has come."""
         for data in self._outputs:
-            data.latch()
+            if not data.single:
+                data.latched = bytes(data.manager.buffer)
+            elif data.manager.full:
+                data.latched = data.manager.take()
 
     def due(self, t: int, interval: int) -> bool:
         """Whether the device was last stepped `interval` ns before `t` or earlier."""
@@ -304,7 +299,9 @@ class Application:
         self._stepped_at = max(t, self._stepped_at)
         if self.state == AlState.OP:
             for data in self._outputs:
-                data.unpack()
+                image = data.image
+                if len(data.latched) == image.byte_length:  # the master may have changed the sync manager just now
+                    image.unpack(data.latched)
                 if data.manager.control & CONTROL_ECAT_EVENT:
                     data.manager.exchanged()
         step = self.device.step
@@ -321,10 +318,14 @@ class Application:
             elif self.state == AlState.SAFE_OP and not self._error:
                 self._refuse(code)
         if self.state >= AlState.SAFE_OP or self._emulated:
-            for data in self._inputs:
-                data.pack()
-                if data.manager.control & CONTROL_ECAT_EVENT:
-                    data.manager.exchanged()
+            try:
+                for data in self._inputs:
+                    data.pack()
+                    if data.manager.control & CONTROL_ECAT_EVENT:
+                        data.manager.exchanged()
+            except (struct.error, ArithmeticError, TypeError, AttributeError) as error:
+                # A behaviour has put something into an object that its bits do not hold.
+                self.device.unpackable(error)
         mailbox = self._mailbox
         if mailbox is not None and mailbox.pending(t):
             mailbox.serve(self.state, t)

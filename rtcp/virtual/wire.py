@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from rtcp.virtual.esc import Esc, SyncManager
-from rtcp.virtual.fmmu import Plan, compile_plan, transfer
+from rtcp.virtual.fmmu import Plan, compile_plan, touched, transfer
 from rtcp.virtual.protocol import (
     COUNTER,
     DATAGRAM_HEADER,
@@ -155,8 +155,8 @@ class Wire:
         miscounts = self._miscounts
         if plan.others:
             content = frame[data : data + length]
-            for esc in plan.others:
-                share = transfer(esc, command, address, content, t)
+            for esc, parts in plan.others:
+                share = transfer(esc, command, parts, content, t)
                 count += share - self._kept_back(esc, share) if miscounts else share
             frame[data : data + length] = content
         if miscounts:
@@ -174,7 +174,7 @@ class Wire:
     def _make_plan(self, command: int, address: int, length: int) -> Plan:
         if self._passing:
             # The images belong to the lasting wire.
-            return Plan(others=list(self._escs))
+            return Plan(others=[(esc, touched(esc, address, length)) for esc in self._escs])
         if len(self._plans) >= MOST_KNOWN:
             self._plans.clear()
         if not self._plans:

@@ -60,7 +60,7 @@ def test_faults_are_made_listed_and_cleared_on_the_segment_that_runs(
 
     made = rtcp("segment", "fault", "cable", "after=1")
     assert (made.code, made.err) == (0, "")
-    assert made.out == "fault 1: cable after=1, until it is cleared; to clear it: rtcp segment clear 1\n"
+    assert made.out == "fault 1: cable after=1 port=1, until it is cleared; to clear it: rtcp segment clear 1\n"
     assert rtcp("segment", "fault", "sdo_abort", "slave=2", "code=0x06090030", "--lasts", "60").out == (
         "fault 2: sdo_abort slave=2 code=0x6090030 index=0x0000, for 60 s; to clear it: rtcp segment clear 2\n"
     )
@@ -72,7 +72,7 @@ def test_faults_are_made_listed_and_cleared_on_the_segment_that_runs(
     listed = json.loads(rtcp("segment", "faults", "--json").out)
     assert [(each["id"], each["fault"]["fault"]) for each in listed] == [(1, "cable"), (2, "sdo_abort"), (3, "loss")]
     lines = rtcp("segment", "faults").out.splitlines()
-    assert re.fullmatch(r"fault 1: cable after=1, for \d+\.\d s, until it is cleared", lines[0])
+    assert re.fullmatch(r"fault 1: cable after=1 port=1, for \d+\.\d s, until it is cleared", lines[0])
     assert re.fullmatch(r"fault 2: .*, for \d+\.\d s, \d\d\.\d s left", lines[1])
     assert lines[2].endswith("0 lost before, 0 lost behind")
 
@@ -117,6 +117,30 @@ def test_where_the_runtime_directory_cannot_be_made_the_socket_is_elsewhere(
     process, _ = begin()
     own = tmp_path / f"rtcp-segment-{process.pid}.sock"
     assert rtcp("segment", "faults", "--segment", str(own)).out == "no fault is active\n"
+
+
+def test_objects_of_a_described_slave_are_shown_and_set(
+    rtcp: Rtcp, begin: Callable[..., Segment], config: Path
+) -> None:
+    vendor = Path(__file__).parents[1] / "virtual" / "vendor.xml"
+    config.write_text(f"slaves:\n- {{esi: {vendor}, product: 0x30, name: box}}\n- {{esi: {vendor}, product: 0x11}}\n")
+    begin()
+    assert rtcp("segment", "set", "2", "0x6000:1", "1").out == "0x6000:1 Input: 1\n"
+    shown = rtcp("segment", "get", "2")
+    assert shown.out == "0x6000:1 Input: 1\n0x6010:1 Input: 0\n"
+    rtcp("segment", "set", "box", "0x6000:2", "-2.5")
+    rtcp("segment", "set", "box", "0x7010", "0x0102ff")
+    assert json.loads(rtcp("segment", "get", "box", "0x6000:2", "--json").out)[0]["value"] == -2.5
+    assert rtcp("segment", "get", "box", "0x7010").out.endswith(" Text: 0x0102ff\n")
+    for arguments, said in (
+        (("set", "2", "0x6000:1", "2"), "value: 0x6000:1 Input takes 0 to 1, not 2"),
+        (("get", "2", "0x9999"), "2 digital inputs has no object 0x9999:0"),
+        (("get", "3"), "slave: there is no slave 3; give a position from 1 to 2, or a name"),
+        (("get", "2", "six"), "'six' is no object: write index and subindex, as 0x6000:1"),
+    ):
+        refused = rtcp("segment", *arguments)
+        assert refused.code != 0
+        assert said in refused.err
 
 
 @pytest.mark.parametrize("command", [("fault", "cable", "after=1"), ("clear",), ("clear", "3"), ("faults",)])

@@ -20,6 +20,7 @@ OWN = [
     "simple_message.md",
     "devices.md",
     "segment.md",
+    "behaviours.md",
     "guiding.md",
 ]
 KEYS = {

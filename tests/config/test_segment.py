@@ -46,8 +46,8 @@ MISTAKES = {
     ),
     "an unknown key": (
         "slaves: [{model: m, drift: 3}]",
-        "slaves[0].drift: this key does not exist; did you mean drift_ppm? allowed are model, drift_ppm, delay_ns, "
-        "alias, options",
+        "slaves[0].drift: this key does not exist; did you mean drift_ppm? allowed are model, esi, sii, product, "
+        "revision, modules, behaviour, name, after, port, drift_ppm, delay_ns, alias, options",
     ),
     "a wild drift": (
         "slaves: [{model: m, drift_ppm: 5000}]",

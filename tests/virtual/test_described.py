@@ -118,6 +118,8 @@ def test_pdos_that_exclude_each_other_and_mandatory_ones_rule_the_assignment() -
     assign(made, 0x1C12, 0x1601)
     assert made.lay_out(2).byte_length == 4
     assert abort_of(assign, made, 0x1C12, 0x1600, 0x1601) == 0x06040043
+    assert abort_of(assign, made, 0x1C13, 0x1A01) == 0x06040043
+    assign(made, 0x1C13, 0x1A00, 0x1A01)
     assert abort_of(assign, made, 0x1C12, 0x1A00) == 0x06040041
     assert abort_of(assign, made, 0x1C12, 0x1602) == 0x06020000
     assert abort_of(assign, device(TWO), 0x1C12, 0x1700) == 0x06010002

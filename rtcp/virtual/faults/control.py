@@ -16,8 +16,8 @@ from rtcp.config.document import shown
 from rtcp.virtual.behaviour import set_value
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.registry import FaultRegistry, installed, parse, sentence_of
-from rtcp.virtual.models.cubemars import CubemarsDrive
 from rtcp.virtual.models.diewu import CHANNELS, DiewuIoBox
+from rtcp.virtual.models.servo import ServoAxis
 from rtcp.virtual.objects import Entry
 from rtcp.virtual.request_socket import RequestClient, RequestSocket, choose
 from rtcp.virtual.segment import Segment
@@ -122,7 +122,7 @@ class _Joint:
 
     __slots__ = ("drive", "moved", "peak")
 
-    def __init__(self, drive: CubemarsDrive) -> None:
+    def __init__(self, drive: ServoAxis) -> None:
         self.drive = drive
         self.moved = 0
         self.peak = 0.0
@@ -169,14 +169,13 @@ class GroundTruth:
         self._segment = segment
         self._models = tuple(models)
         self._joints = {
-            slave: _Joint(slave.device) for slave in segment.slaves if isinstance(slave.device, CubemarsDrive)
+            slave: [_Joint(servo) for servo in slave.device.servos] for slave in segment.slaves if slave.device.servos
         }
         self._output: tuple[int, int, _Output] | None = None
 
     def look(self, slave: Slave, now: int) -> None:
         """See whether the joint of `slave`, which was stepped, moves at instant `now`."""
-        joint = self._joints.get(slave)
-        if joint is not None:
+        for joint in self._joints.get(slave, ()):
             joint.look(now)
         if self._asked is not None and now - self._asked > PATIENCE:
             self.watching = False
@@ -194,8 +193,9 @@ class GroundTruth:
     def clear_peaks(self, now: int) -> None:
         """Forget how fast the joints were."""
         self._watch(now)
-        for joint in self._joints.values():
-            joint.peak = 0.0
+        for joints in self._joints.values():
+            for joint in joints:
+                joint.peak = 0.0
 
     def edges(self, position: int, output: int, now: int) -> list[int]:
         """Return when frames changed an output since the last question, ns of its slave's own clock.
@@ -239,8 +239,9 @@ class GroundTruth:
     def answer(self, now: int) -> dict[str, Any]:
         """Return what is true at instant `now`, slave by slave."""
         self._watch(now)
-        for joint in self._joints.values():
-            joint.look(now)
+        for joints in self._joints.values():
+            for joint in joints:
+                joint.look(now)
         slaves = zip(self._segment.slaves, self._models, strict=True)
         return {
             "time_ns": now,
@@ -255,18 +256,24 @@ class GroundTruth:
             "reachable": slave in self._segment.topology.reached,
         }
         found |= slave.device.truth()
-        joint = self._joints.get(slave)
-        if joint is not None:
-            drive = joint.drive
-            found |= {
-                "position_rad": drive.mechanics.position,
-                "velocity_rad_s": drive.mechanics.velocity,
-                "state": drive.state.name.lower().replace("_", " "),
-                "torque_on": drive.powered,
-                "moved_ns": joint.moved,
-                "peak_rad_s": joint.peak,
-            }
+        joints = [_truth_of(joint) for joint in self._joints.get(slave, ())]
+        if joints:
+            found |= joints[0]
+        if len(joints) > 1:
+            found["axes"] = joints
         return found
+
+
+def _truth_of(joint: _Joint) -> dict[str, Any]:
+    drive = joint.drive
+    return {
+        "position_rad": drive.mechanics.position,
+        "velocity_rad_s": drive.mechanics.velocity,
+        "state": drive.state.name.lower().replace("_", " "),
+        "torque_on": drive.powered,
+        "moved_ns": joint.moved,
+        "peak_rad_s": joint.peak,
+    }
 
 
 class SegmentClient(RequestClient):
@@ -293,7 +300,8 @@ class SegmentClient(RequestClient):
 
         `time_ns` (CLOCK_MONOTONIC) and `slaves`, a list with `position`, `model`, `al` (as "SAFE-OP"), `reachable`; of
         drives `position_rad`, `velocity_rad_s`, `state` (CiA 402), `torque_on`, `moved_ns` (last instant at which it
-        was faster than 0.002 rad/s; 0: not since the first question) and `peak_rad_s` (since `clear_peaks`); of a shape
+        was faster than 0.002 rad/s; 0: not since the first question) and `peak_rad_s` (since `clear_peaks`), of drives
+        with several axes those of the first, and of each in `axes`; of a shape
         setter's box `gate`, `relay`, `relay_closed`, `current` (A) and `middle_temperature` (C). Who asks for nothing
         for 10 s misses what moves until the next request.
         """

@@ -25,6 +25,8 @@ Position = Annotated[int, Ge(1), Le(255)]
 """A slave: they count from 1, as on the cable; 0 is the master."""
 Cable = Annotated[int, Ge(0), Le(254)]
 """The cable behind this slave; 0: between the master and slave 1."""
+Port = Annotated[int, Ge(1), Le(3)]
+"""The port of that slave at which the cable begins."""
 Rate = Annotated[float, Gt(0), Le(1)]
 Burst = Annotated[int, Ge(1), Le(100_000)]
 Seed = Annotated[int, Ge(0), Le(0xFFFFFFFF)]
@@ -295,11 +297,16 @@ def place_of(slaves: Sequence[object], number: int) -> int:
     return number - 1
 
 
-def cable_of(segment: Segment, after: int) -> int:
-    """Return the number of a cable that the segment has; raises FaultRefused."""
+def cable_of(segment: Segment, after: int, port: int = 1) -> int:
+    """Return the number of the cable at a port of slave `after`, 0: the master's; raises FaultRefused."""
     last = len(segment.slaves)
-    if after >= last:
-        raise FaultRefused(
-            f"there is no cable behind slave {after}: cables lie behind slaves 0 (the master) to {last - 1}"
-        )
-    return after
+    cable = segment.topology.cable_behind(after - 1, port) if 0 < after <= last else None if after else 0
+    if cable is None:
+        # Of a chain the sentence says where it has cables.
+        places = [n for n in range(last) if n == 0 or segment.topology.cable_behind(n - 1, port) is not None]
+        if port == 1 and places == list(range(last)):
+            raise FaultRefused(
+                f"there is no cable behind slave {after}: cables lie behind slaves 0 (the master) to {last - 1}"
+            )
+        raise FaultRefused(f"there is no cable behind slave {after} at port {port}")
+    return cable

@@ -17,6 +17,7 @@ from rtcp.virtual.faults.fault import (
     Fault,
     FaultRefused,
     Frames,
+    Port,
     Position,
     SlaveFault,
     StrikingFault,
@@ -24,7 +25,7 @@ from rtcp.virtual.faults.fault import (
     place_of,
     slave_at,
 )
-from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
+from rtcp.virtual.models import DiewuIoBox
 from rtcp.virtual.models.diewu import BrokenTerminals
 from rtcp.virtual.models.protection import ErrorCode
 from rtcp.virtual.protocol import AlState
@@ -50,10 +51,11 @@ class CableFault(Fault):
 
     name = "cable"
     after: Cable
+    port: Port = 1
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
         """Cut the cable."""
-        cable = cable_of(segment, self.after)
+        cable = cable_of(segment, self.after, self.port)
 
         def join(_: int) -> None:
             segment.topology.join(cable)
@@ -96,10 +98,11 @@ class Corrupt(StrikingFault):
     counted = ("corrupted",)
     after: Cable
     way: Literal["out", "back"] = "out"
+    port: Port = 1
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
         """Damage frames from now on."""
-        damage = Damage(cable_of(segment, self.after), self.strikes, self.way == "back")
+        damage = Damage(cable_of(segment, self.after, self.port), self.strikes, self.way == "back")
         return self.listed(segment.damages, damage)
 
 
@@ -292,10 +295,16 @@ class DriveErrorFault(DeviceFault):
     once_unless_it_lasts = True
     slave: Position
     error: DriveError
+    axis: Annotated[int, Ge(1), Le(8)] = 1
 
     def begin(self, devices: Sequence[DeviceModel]) -> End:
         """Let the drive meet the error."""
-        drive = _device_at(devices, self.slave, CubemarsDrive, "drive")
+        device = devices[place_of(devices, self.slave)]
+        if not device.servos:
+            raise FaultRefused(f"slave {self.slave} ({device.identity.name}) is no drive")
+        if self.axis > len(device.servos):
+            raise FaultRefused(f"axis: found {self.axis}, but slave {self.slave} has {len(device.servos)}")
+        drive = device.servos[self.axis - 1]
         code = ErrorCode[self.error.upper().replace("-", "_")]
         drive.begin_fault(code)
         return lambda _: drive.end_fault(code)

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from rtcp.virtual.device import number
+from rtcp.virtual.device import Number
 from rtcp.virtual.models.cia402 import Status
-from rtcp.virtual.models.drive_objects import UNIT
 from rtcp.virtual.models.mechanics import Axis
-from rtcp.virtual.objects import ObjectDictionary
+from rtcp.virtual.models.units import AxisObjects
 
 # Plain ints: flag arithmetic is too slow for every step.
 REACHED = int(Status.TARGET_REACHED)
@@ -54,39 +53,41 @@ class Motion:
 class Profile:
     """The objects that shape a profile, in SI units; 0x60C5 and 0x607F bound what the master asks for."""
 
-    def __init__(self, objects: ObjectDictionary) -> None:
-        self._velocity = number(objects, 0x6081)
-        self._acceleration = number(objects, 0x6083)
-        self._deceleration = number(objects, 0x6084)
-        self._most = number(objects, 0x60C5)
-        self._top = number(objects, 0x607F)
-        self._low = number(objects, 0x607D, 1)
-        self._high = number(objects, 0x607D, 2)
+    def __init__(self, objects: AxisObjects) -> None:
+        self._units = objects.units
+        self._velocity = objects.number(0x6081)
+        self._acceleration = objects.number(0x6083)
+        self._deceleration = objects.number(0x6084)
+        self._most = objects.number(0x60C5)
+        self._top = objects.number(0x607F)
+        self._low = objects.number(0x607D, 1)
+        self._high = objects.number(0x607D, 2)
 
     @property
     def velocity(self) -> float:
         """Profile velocity, rad/s."""
-        return min(self._velocity.value, self._top.value) * UNIT
+        return min(self._velocity.value, self._top.value) * self._units.velocity
 
     @property
     def top(self) -> float:
         """Largest velocity of any profile, rad/s."""
-        return self._top.value * UNIT
+        return self._top.value * self._units.velocity
 
     @property
     def acceleration(self) -> float:
         """Profile acceleration, rad/s^2, never zero."""
-        return max(1, min(self._acceleration.value, self._most.value)) * UNIT
+        return max(1, min(self._acceleration.value, self._most.value)) * self._units.acceleration
 
     @property
     def deceleration(self) -> float:
         """Profile deceleration, rad/s^2, never zero."""
-        return max(1, min(self._deceleration.value, self._most.value)) * UNIT
+        return max(1, min(self._deceleration.value, self._most.value)) * self._units.acceleration
 
     @property
     def range(self) -> tuple[float, float]:
         """The software position limits, rad."""
-        return self._low.value * UNIT, self._high.value * UNIT
+        unit = self._units.position
+        return self._low.value * unit, self._high.value * unit
 
 
 class Hold(Motion):
@@ -104,18 +105,23 @@ class Hold(Motion):
 
 
 class CyclicPosition(Motion):
-    """CSP (8): interpolates from set-point to set-point over 0x60C2; 0x60FF limits its speed, 0 means no motion."""
+    """CSP (8): interpolates from set-point to set-point, by `speed` and `top` fast at most.
 
-    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+    `period` and `exponent` (0x60C2) tell how long a set-point lasts; 0: as long as a step.
+    """
+
+    def __init__(self, axis: Axis, objects: AxisObjects, speed: Number, top: Number, period: Number,
+                 exponent: Number) -> None:  # fmt: skip
         super().__init__(axis)
-        self._target = number(objects, 0x607A)
-        self._offset = number(objects, 0x60B0)
-        self._speed = number(objects, 0x60FF)
-        self._top = number(objects, 0x607F)
-        self._low = number(objects, 0x607D, 1)
-        self._high = number(objects, 0x607D, 2)
-        self._period = number(objects, 0x60C2, 1)
-        self._exponent = number(objects, 0x60C2, 2)
+        self._units = objects.units
+        self._target = objects.number(0x607A)
+        self._offset = objects.number(0x60B0)
+        self._speed = speed
+        self._top = top
+        self._low = objects.number(0x607D, 1)
+        self._high = objects.number(0x607D, 2)
+        self._period = period
+        self._exponent = exponent
         self._period_told = self._exponent_told = 0
         self._period_s = 0.0
         self._set_point: int | None = None
@@ -151,14 +157,14 @@ class CyclicPosition(Motion):
         if allowed < low:  # noqa: PLR1730
             allowed = low
         self._clamped = allowed != counts
-        self._goal = allowed * UNIT
+        self._goal = allowed * self._units.position
         value, exponent = self._period.value, self._exponent.value
         if value != self._period_told or exponent != self._exponent_told:
             self._period_told, self._exponent_told = value, exponent
             self._period_s = value * 10.0**exponent
         highest = self._top.value
         size = -limit if limit < 0 else limit
-        top = (highest if highest < size else size) * UNIT
+        top = (highest if highest < size else size) * self._units.velocity
         slope = (self._goal - self._axis.demand) / (self._period_s or step)
         self._slope = top if slope > top else -top if slope < -top else slope
         self._held_back = self._slope != slope
@@ -170,31 +176,29 @@ class _WithoutPosition(Motion):
 
     closed = False
 
-    def __init__(self, axis: Axis, objects: ObjectDictionary, target: int, offset: int) -> None:
+    def __init__(self, axis: Axis, objects: AxisObjects, target: int, offset: int) -> None:
         super().__init__(axis)
-        self._target = number(objects, target)
-        self._offset = number(objects, offset)
+        self._units = objects.units
+        self._target = objects.number(target)
+        self._offset = objects.number(offset)
         self._profile = Profile(objects)
-        self._deceleration = number(objects, 0x6085)
-
-    def _wanted(self) -> float:
-        return (self._target.value + self._offset.value) * UNIT
+        self._deceleration = objects.number(0x6085)
 
     def _limits(self) -> tuple[float, float, float]:
         """Return the lowest and the highest position and the deceleration before them."""
-        return *self._profile.range, self._deceleration.value * UNIT
+        return *self._profile.range, self._deceleration.value * self._units.acceleration
 
 
 class CyclicVelocity(_WithoutPosition):
     """CSV (9): the velocity loop follows 0x60FF + 0x60B1 within 0x607F, and stops at the software position limits."""
 
-    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+    def __init__(self, axis: Axis, objects: AxisObjects) -> None:
         super().__init__(axis, objects, 0x60FF, 0x60B1)
 
     def update(self, controlword: int, h: float, count: int) -> None:
         """Run at the velocity commanded."""
         axis = self._axis
-        allowed = wanted = self._wanted()
+        allowed = wanted = (self._target.value + self._offset.value) * self._units.velocity
         top = self._profile.top
         low, high, deceleration = self._limits()
         for _ in range(count):
@@ -209,13 +213,13 @@ class CyclicVelocity(_WithoutPosition):
 class CyclicTorque(_WithoutPosition):
     """CST (10): applies 0x6071 + 0x60B2 within 0x6072, and stops at the software position limits."""
 
-    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+    def __init__(self, axis: Axis, objects: AxisObjects) -> None:
         super().__init__(axis, objects, 0x6071, 0x60B2)
 
     def update(self, controlword: int, h: float, count: int) -> None:
         """Apply the torque commanded."""
         axis = self._axis
-        wanted = self._wanted()
+        wanted = (self._target.value + self._offset.value) * self._units.torque
         low, high, deceleration = self._limits()
         for _ in range(count):
             slowest, fastest = axis.velocity_range(low, high, deceleration)

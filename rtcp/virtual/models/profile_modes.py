@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from enum import Enum
 from math import floor, pi, sqrt
 
-from rtcp.virtual.device import number
 from rtcp.virtual.models.cyclic_modes import ERROR, LIMIT, REACHED, SPECIFIC, Motion, Profile
-from rtcp.virtual.models.drive_objects import HOMING_METHODS, UNIT
-from rtcp.virtual.models.mechanics import GEAR_RATIO, Axis, ramp
-from rtcp.virtual.objects import ObjectDictionary
+from rtcp.virtual.models.drive_objects import HOMING_METHODS
+from rtcp.virtual.models.mechanics import Axis, ramp
+from rtcp.virtual.models.units import AxisObjects
 
 
 def approach(
@@ -60,12 +59,13 @@ class SetPoint:
 class ProfilePosition(Motion):
     """Profile position (1): set-points by the handshake of controlword bit 4 and statusword bit 12; one is buffered."""
 
-    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+    def __init__(self, axis: Axis, objects: AxisObjects) -> None:
         super().__init__(axis)
+        self._units = objects.units
         self._profile = Profile(objects)
-        self._target = number(objects, 0x607A)
-        self._window = number(objects, 0x6067)
-        self._window_time = number(objects, 0x6068)
+        self._target = objects.number(0x607A)
+        self._window = objects.number(0x6067)
+        self._window_time = objects.number(0x6068)
         self._active: SetPoint | None = None
         self._queued: SetPoint | None = None
         self._last = 0.0
@@ -120,7 +120,7 @@ class ProfilePosition(Motion):
 
     def _set_point(self, controlword: int) -> SetPoint:
         profile = self._profile
-        wanted = self._target.value * UNIT
+        wanted = self._target.value * self._units.position
         if controlword & _RELATIVE:
             wanted += self._last
         low, high = profile.range
@@ -134,7 +134,7 @@ class ProfilePosition(Motion):
         bits = self.bits & SPECIFIC
         if point is not None:
             arrived = self._queued is None and self._axis.reference == point.position
-            if arrived and abs(point.position - self._axis.position) <= self._window.value * UNIT:
+            if arrived and abs(point.position - self._axis.position) <= self._window.value * self._units.position:
                 self._inside += dt
             else:
                 self._inside = 0.0
@@ -150,14 +150,15 @@ class ProfileVelocity(Motion):
 
     closed = False
 
-    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+    def __init__(self, axis: Axis, objects: AxisObjects) -> None:
         super().__init__(axis)
+        self._units = objects.units
         self._profile = Profile(objects)
-        self._target = number(objects, 0x60FF)
-        self._window = number(objects, 0x606D)
-        self._window_time = number(objects, 0x606E)
-        self._threshold = number(objects, 0x606F)
-        self._threshold_time = number(objects, 0x6070)
+        self._target = objects.number(0x60FF)
+        self._window = objects.number(0x606D)
+        self._window_time = objects.number(0x606E)
+        self._threshold = objects.number(0x606F)
+        self._threshold_time = objects.number(0x6070)
         self._inside = self._still = 0.0
 
     def enter(self) -> None:
@@ -168,7 +169,7 @@ class ProfileVelocity(Motion):
     def update(self, controlword: int, h: float, count: int) -> None:
         """Ramp towards the target velocity and keep it."""
         axis, profile = self._axis, self._profile
-        wanted = self._target.value * UNIT
+        wanted = self._target.value * self._units.velocity
         low, high = profile.range
         acceleration, deceleration = profile.acceleration, profile.deceleration
         target = max(-profile.top, min(profile.top, wanted))
@@ -182,8 +183,8 @@ class ProfileVelocity(Motion):
         axis.synchronise()
         axis.reference_velocity = velocity
         actual, dt = axis.mechanics.velocity, h * count
-        self._inside = self._inside + dt if abs(wanted - actual) <= self._window.value * UNIT else 0.0
-        self._still = self._still + dt if abs(actual) <= self._threshold.value * UNIT else 0.0
+        self._inside = self._inside + dt if abs(wanted - actual) <= self._window.value * self._units.velocity else 0.0
+        self._still = self._still + dt if abs(actual) <= self._threshold.value * self._units.velocity else 0.0
         bits = LIMIT if limited else 0
         if self._inside and self._inside * 1000.0 >= self._window_time.value:
             bits |= REACHED
@@ -202,19 +203,18 @@ class Phase(Enum):
     FAILED = ERROR | REACHED
 
 
-_INDEX_PITCH = 2 * pi / GEAR_RATIO
-"""The index pulse comes once a turn of the motor: so far apart (rad) at the output."""
-
-
 class Homing(Motion):
     """Homing (6) by methods 33, 34 (next index pulse), 35 and 37 (where it stands): home then reads 0x607C."""
 
-    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+    def __init__(self, axis: Axis, objects: AxisObjects, gear_ratio: float) -> None:
+        """The index pulse comes once a turn of the motor: `gear_ratio` times a turn of the output."""
         super().__init__(axis)
-        self._method = number(objects, 0x6098)
-        self._home_offset = number(objects, 0x607C)
-        self._speed = number(objects, 0x6099, 2)
-        self._acceleration = number(objects, 0x609A)
+        self._units = objects.units
+        self._pitch = 2 * pi / gear_ratio
+        self._method = objects.number(0x6098)
+        self._home_offset = objects.number(0x607C)
+        self._speed = objects.number(0x6099, 2)
+        self._acceleration = objects.number(0x609A)
         self._phase = Phase.IDLE
         self._start: int | None = None
         self._velocity = 0.0
@@ -240,7 +240,7 @@ class Homing(Motion):
             self._phase = Phase.IDLE
         self._start = start
         axis = self._axis
-        acceleration = max(1, self._acceleration.value) * UNIT
+        acceleration = max(1, self._acceleration.value) * self._units.acceleration
         for _ in range(count):
             axis.ramp(self._velocity if self._phase is Phase.SEARCHING else 0.0, acceleration, h)
             if self._phase is Phase.SEARCHING:
@@ -257,12 +257,12 @@ class Homing(Motion):
         elif method not in HOMING_METHODS or self._speed.value == 0:
             self._phase = Phase.FAILED
         else:
-            turn = floor(position / _INDEX_PITCH)
+            turn = floor(position / self._pitch)
             if method == 33:
-                self._index = (turn if turn * _INDEX_PITCH < position else turn - 1) * _INDEX_PITCH
+                self._index = (turn if turn * self._pitch < position else turn - 1) * self._pitch
             else:
-                self._index = (turn + 1) * _INDEX_PITCH
-            self._velocity = self._speed.value * UNIT * (-1.0 if method == 33 else 1.0)
+                self._index = (turn + 1) * self._pitch
+            self._velocity = self._speed.value * self._units.velocity * (-1.0 if method == 33 else 1.0)
             self._phase = Phase.SEARCHING
 
     def _search(self) -> None:
@@ -272,5 +272,5 @@ class Homing(Motion):
 
     def _attain(self, home: float) -> None:
         axis = self._axis
-        axis.shift(self._home_offset.value * UNIT - (home + axis.offset))
+        axis.shift(self._home_offset.value * self._units.position - (home + axis.offset))
         self._phase = Phase.STOPPING

@@ -7,10 +7,10 @@ from enum import IntEnum
 from math import pi
 from types import MappingProxyType
 
-from rtcp.virtual.device import Emergency, number
-from rtcp.virtual.models.drive_objects import COUNTS, HISTORY_LENGTH, TEMPERATURE_LOCK, VOLTAGE_LOCK
-from rtcp.virtual.models.mechanics import INCREMENTS_PER_RAD, ActuatorSize, Axis
-from rtcp.virtual.objects import ObjectDictionary
+from rtcp.virtual.device import Emergency
+from rtcp.virtual.models.drive_objects import HISTORY_LENGTH, TEMPERATURE_LOCK, VOLTAGE_LOCK
+from rtcp.virtual.models.mechanics import ActuatorSize, Axis
+from rtcp.virtual.models.units import AxisObjects
 
 
 class ErrorCode(IntEnum):
@@ -112,53 +112,57 @@ def error_register(code: int) -> int:
 class Feedback:
     """The actual and demand values of a drive: entries kept, nothing looked up in a step."""
 
-    def __init__(self, objects: ObjectDictionary, rated_torque: float) -> None:
+    def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
+        self._units = objects.units
         self._rated_torque = rated_torque
-        self._statusword = number(objects, 0x6041)
-        self._position_demand = number(objects, 0x6062)
-        self._increments = number(objects, 0x6063)
-        self._position = number(objects, 0x6064)
-        self._velocity_demand = number(objects, 0x606B)
-        self._velocity = number(objects, 0x606C)
-        self._torque_demand = number(objects, 0x6074)
-        self._torque = number(objects, 0x6077)
-        self._current = number(objects, 0x6078)
-        self._following = number(objects, 0x60F4)
-        self._temperature = number(objects, 0x2000, 1)
-        self._bus_voltage = number(objects, 0x2000, 2)
-        self._overload = number(objects, 0x2000, 3)
+        self._statusword = objects.number(0x6041)
+        self._position_demand = objects.number(0x6062)
+        self._increments = objects.number(0x6063)
+        self._position = objects.number(0x6064)
+        self._velocity_demand = objects.number(0x606B)
+        self._velocity = objects.number(0x606C)
+        self._torque_demand = objects.number(0x6074)
+        self._torque = objects.number(0x6077)
+        self._current = objects.number(0x6078)
+        self._following = objects.number(0x60F4)
+        self.update_units()
+
+    def update_units(self) -> None:
+        """Take over the units, which have changed."""
+        units = self._units
+        self._increments_per_rad = units.increments
+        self._positions, self._velocities = 1.0 / units.position, 1.0 / units.velocity
+        self._torques = 1.0 / units.torque
 
     def publish(self, status: int, axis: Axis, following: float) -> None:
         """Write the statusword and what is measured; `following` is the following error in rad."""
         mechanics = axis.mechanics
-        increments = round(mechanics.position * INCREMENTS_PER_RAD)
+        per_rad, positions, velocities = self._increments_per_rad, self._positions, self._velocities
+        increments = round(mechanics.position * per_rad)
         self._statusword.value = status
         self._increments.value = increments
-        self._position.value = round((increments / INCREMENTS_PER_RAD + axis.offset) * COUNTS)
-        self._velocity.value = round(mechanics.velocity * COUNTS)
+        self._position.value = round((increments / per_rad + axis.offset) * positions)
+        self._velocity.value = round(mechanics.velocity * velocities)
         # The current loop is ideal: the torque demanded is there.
-        self._torque.value = self._torque_demand.value = round(axis.torque * COUNTS)
-        self._position_demand.value = round(axis.demand * COUNTS)
-        self._velocity_demand.value = round(axis.reference_velocity * COUNTS)
-        self._following.value = round(following * COUNTS)
+        self._torque.value = self._torque_demand.value = round(axis.torque * self._torques)
+        self._position_demand.value = round(axis.demand * positions)
+        self._velocity_demand.value = round(axis.reference_velocity * velocities)
+        self._following.value = round(following * positions)
 
     def publish_condition(self, condition: Condition, torque: float) -> None:
-        """Write what changes slowly, and the current that goes with `torque` Nm."""
-        self._temperature.value = round(condition.temperature * 10.0)
-        self._bus_voltage.value = round(condition.bus_voltage * 100.0)
-        self._overload.value = min(0xFFFF, round(condition.overload * 1000.0))
+        """Write what changes slowly: the current that goes with `torque` Nm."""
         self._current.value = round(1000.0 * torque / self._rated_torque)
 
 
 class ErrorLog:
     """The errors of a drive: 0x603F, 0x1001, 0x1003 and the emergency messages that wait to be sent."""
 
-    def __init__(self, objects: ObjectDictionary, emergencies: deque[Emergency]) -> None:
+    def __init__(self, objects: AxisObjects, emergencies: deque[Emergency]) -> None:
         self.emergencies = emergencies
-        self._code = number(objects, 0x603F)
-        self._register = number(objects, 0x1001)
-        self._count = number(objects, 0x1003)
-        self._fields = [number(objects, 0x1003, place) for place in range(1, HISTORY_LENGTH + 1)]
+        self._code = objects.number(0x603F)
+        self._register = objects.number(0x1001)
+        self._count = objects.number(0x1003)
+        self._fields = [objects.number(0x1003, n) for n in range(1, HISTORY_LENGTH + 1) if (0x1003, n) in objects]
 
     def add(self, code: int) -> None:
         """Report an error: the newest stands at 0x1003:1."""
@@ -167,7 +171,8 @@ class ErrorLog:
         fields = self._fields
         for newer, older in zip(fields[-2::-1], fields[:0:-1], strict=True):
             older.value = newer.value
-        fields[0].value = code
+        if fields:
+            fields[0].value = code
         self._count.value = min(len(fields), self._count.value + 1)
         self.emergencies.append(Emergency(code, self._register.value))
 

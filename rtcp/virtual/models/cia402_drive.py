@@ -1,0 +1,232 @@
+"""The behaviour `cia402`: a described servo drive of one or more axes with the units of the standard.
+
+Positions count 0x6092 a turn where the drive has it, else 0x608F times 0x6091; velocities and accelerations the same
+a second and a second squared; torques per mille of 0x6076, at the joint (CiA 402-2, ETG.6010). It works on whatever
+objects the drive has: what is 0 or missing gets a default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import pi
+from types import MappingProxyType
+from typing import ClassVar
+
+from rtcp.virtual.behaviour import Behaviour, Option
+from rtcp.virtual.device import DeviceModel
+from rtcp.virtual.models.cubemars import CONDITION_OPTIONS, SERVO_OPTIONS
+from rtcp.virtual.models.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, Hold, Motion
+from rtcp.virtual.models.mechanics import SIZES, ActuatorSize, Axis, Mechanics
+from rtcp.virtual.models.profile_modes import Homing, ProfilePosition, ProfileVelocity
+from rtcp.virtual.models.protection import Condition, ErrorLog, Feedback
+from rtcp.virtual.models.servo import ServoAxis
+from rtcp.virtual.models.units import AXIS_STRIDE, LIMITLESS, Absent, AxisObjects, Units
+from rtcp.virtual.protocol import AlState
+
+MOST_AXES = 8
+"""Axes of a drive: their objects fill 0x6000 to 0x9FFF (ETG.6010)."""
+_CONTROLWORD = 0x6040
+_COUNTS_PER_TURN = 65536
+_ACCELERATION = 20.0
+"""Of profiles, rad/s^2, where the description leaves it open."""
+_QUICK_STOP = 50.0
+_MODEL = SIZES["orh60"]
+"""Its inertia and friction, in proportion to the rated torque, are those of a drive that says nothing of its own."""
+_POSITION_LIMIT = (1 << 31) - 1
+_SUPPORTED = {1: 0x607A, 3: 0x60FF, 6: 0x6098, 8: 0x607A, 9: 0x60FF, 10: 0x6071}
+"""Modes, and the object without which a drive has not got them."""
+_AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
+    "rated_torque": Option(None, 0.001, 10_000.0, "Nm at the joint; left out: 0x6076, else 28"),
+    "peak_torque": Option(None, 0.001, 30_000.0, "Nm; left out: twice the rated torque"),
+    "max_speed": Option(10.0, 0.01, 1000.0, "speed above which the drive fails, rad/s"),
+    "counts_per_turn": Option(None, 1.0, 2.0**40, "counts of a turn of the joint; left out: by 0x608F, 0x6091, 0x6092"),
+    **SERVO_OPTIONS,
+})  # fmt: skip
+
+
+def _options() -> Mapping[str, Option]:
+    """Return the options: those of the axes for all of them, and with the number of one before them for it alone."""
+    own = {
+        f"axis{n}_{name}": Option(None, option.low, option.high, option.meaning, listed=False)
+        for n in range(1, MOST_AXES + 1)
+        for name, option in _AXIS_OPTIONS.items()
+    }
+    return MappingProxyType({**_AXIS_OPTIONS, **CONDITION_OPTIONS, **own})
+
+
+class Cia402Drive(Behaviour):
+    """A servo drive; every 0x800 objects from 0x6040 on there is another axis."""
+
+    options: ClassVar[Mapping[str, Option]] = _options()
+    keeps_outputs = True
+
+    def __init__(self, device: DeviceModel) -> None:
+        super().__init__(device)
+        count = next(
+            (n for n in range(MOST_AXES) if (_CONTROLWORD + AXIS_STRIDE * n, 0) not in device.objects), MOST_AXES
+        )
+        if not count:
+            raise ValueError(f"cia402 moves a drive, and {device.identity.name} has no controlword (0x6040)")
+        self.axes = [_StandardAxis(self, n) for n in range(count)]
+        device.servos = [axis.servo for axis in self.axes]
+
+    def on_start(self) -> None:
+        """Power comes on."""
+        for axis in self.axes:
+            axis.read_units()
+            axis.servo.power_on()
+
+    def on_state(self, old: AlState, new: AlState) -> None:
+        """Take over what start-up commands have written, and whether outputs count."""
+        if old < AlState.SAFE_OP <= new:
+            for axis in self.axes:
+                axis.read_units()
+
+    def on_outputs(self, dt: float) -> None:
+        """Let time pass for every axis."""
+        valid = self.device.outputs_valid
+        for axis in self.axes:
+            servo = axis.servo
+            if servo.outputs_valid != valid:
+                servo.set_outputs_valid(valid)
+            servo.step(dt)
+
+
+class _BoundedFeedback(Feedback):
+    """Shows what is beyond an object's bits as the most that it holds."""
+
+    def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
+        super().__init__(objects, rated_torque)
+        indices = (0x6062, 0x6063, 0x6064, 0x606B, 0x606C, 0x6074, 0x6077, 0x6078, 0x60F4)
+        self._bounded = [(objects.number(n), *objects.bounds(n)) for n in indices if (n, 0) in objects]
+
+    def publish(self, status: int, axis: Axis, following: float) -> None:
+        """Write the statusword and what is measured."""
+        super().publish(status, axis, following)
+        for entry, low, high in self._bounded:
+            value = entry.value
+            if not low <= value <= high:
+                entry.value = low if value < low else high
+
+
+class _StandardAxis:
+    """One axis: its units and defaults, and the servo that turns it."""
+
+    def __init__(self, drive: Behaviour, number: int) -> None:
+        self._drive = drive
+        self._number = number
+        objects = self._objects = AxisObjects(drive.device.objects, Units(1.0, 1.0, 1.0, 1.0, 1.0), number)
+        self._rated = objects.number(0x6076)
+        given = self._option("rated_torque", 0.0) or self._rated.value * 1e-3 or _MODEL.rated_torque
+        size = self._size = _size_of(given, self._option("peak_torque", 2.0 * given))
+        self._max_speed = Absent(0)
+        mechanics = Mechanics(
+            size.rotor_inertia + self._option("load_inertia", size.load_inertia),
+            self._option("friction", size.coulomb),
+            self._option("viscous_friction", size.viscous),
+            holding_torque=self._option("holding_torque", size.peak_torque),
+            load_mass_moment=self._option("load_mass_moment"),
+            gravity_phase=self._option("gravity_phase"),
+            position=self._option("initial_position"),
+        )
+        self._read_units()
+        self._feedback = _BoundedFeedback(objects, size.rated_torque)
+        condition = Condition(size, drive.option("temperature"), drive.option("bus_voltage"))
+        errors = ErrorLog(objects, drive.device.emergencies)
+        self.servo = ServoAxis(
+            objects, size, mechanics, condition, self._feedback, errors, self._modes, self._max_speed,
+            _POSITION_LIMIT * objects.units.position,
+        )  # fmt: skip
+
+    def _option(self, name: str, otherwise: float = 0.0) -> float:
+        drive = self._drive
+        return drive.option(f"axis{self._number + 1}_{name}", drive.option(name, otherwise))
+
+    def read_units(self) -> None:
+        """Take over what the objects say of units now."""
+        self._read_units()
+        self._feedback.update_units()
+
+    def _read_units(self) -> None:
+        objects, units = self._objects, self._objects.units
+        turn = self._option("counts_per_turn", self._counts_per_turn())
+        units.position = units.velocity = units.acceleration = 2 * pi / turn
+        units.increments = turn / (2 * pi)
+        rated = self._rated
+        if not rated.value or self._option("rated_torque", 0.0):
+            rated.value = round(self._size.rated_torque * 1000.0)
+        units.torque = rated.value * 1e-6
+        self._max_speed.value = round(self._option("max_speed") / units.velocity)
+        objects.fill(self._defaults(units))
+
+    def _counts_per_turn(self) -> float:
+        """Return the counts of a turn of the joint by the objects of the standard."""
+        feed = self._ratio(0x6092)
+        if feed:
+            return feed
+        resolution, gear = self._ratio(0x608F), self._ratio(0x6091)
+        return (resolution or _COUNTS_PER_TURN) * (gear or 1.0)
+
+    def _ratio(self, index: int) -> float:
+        objects = self._objects
+        if (index, 1) not in objects:
+            return 0.0
+        return objects.number(index, 1).value / (objects.number(index, 2).value or 1)
+
+    def _defaults(self, units: Units) -> dict[tuple[int, int], int]:
+        counts = round(1.0 / units.position)
+        acceleration = round(_ACCELERATION / units.acceleration)
+        limit = min(_POSITION_LIMIT, LIMITLESS)
+        defaults = {
+            (0x6065, 0): 0xFFFF_FFFF,
+            (0x6066, 0): 100,
+            (0x6067, 0): max(1, counts // 1000),
+            (0x606D, 0): min(0xFFFF, max(1, counts // 100)),
+            (0x606F, 0): min(0xFFFF, max(1, counts // 200)),
+            (0x6072, 0): round(1000.0 * self._size.peak_torque / self._size.rated_torque),
+            (0x607F, 0): self._max_speed.value,
+            (0x6081, 0): round(1.0 / units.velocity),
+            (0x6083, 0): acceleration,
+            (0x6084, 0): acceleration,
+            (0x6085, 0): round(_QUICK_STOP / units.acceleration),
+            (0x6098, 0): 37,
+            (0x6099, 1): round(0.2 / units.velocity),
+            (0x6099, 2): round(0.1 / units.velocity),
+            (0x609A, 0): acceleration,
+            (0x60C5, 0): 0xFFFF_FFFF,
+            (0x6502, 0): sum(1 << mode - 1 for mode, index in _SUPPORTED.items() if (index, 0) in self._objects),
+            (0x605A, 0): 2,
+            (0x605C, 0): 1,
+            (0x605D, 0): 1,
+            (0x605E, 0): 2,
+        }
+        low, high = (self._objects.number(0x607D, n).value for n in (1, 2))
+        if low >= high:
+            self._objects.number(0x607D, 1).value, self._objects.number(0x607D, 2).value = -limit, limit
+        return {at: value for at, value in defaults.items() if at not in _OPTION_CODES or at not in self._objects}
+
+    def _modes(self, axis: Axis, objects: AxisObjects) -> dict[int, Motion]:
+        gear = self._ratio(0x6091) or 1.0
+        unlimited = Absent(LIMITLESS)
+        modes: dict[int, Motion] = {
+            1: ProfilePosition(axis, objects),
+            3: ProfileVelocity(axis, objects),
+            6: Homing(axis, objects, gear),
+            8: CyclicPosition(axis, objects, unlimited, unlimited, Absent(0), Absent(0)),
+            9: CyclicVelocity(axis, objects),
+            10: CyclicTorque(axis, objects),
+        }
+        return {0: Hold(axis), **{mode: motion for mode, motion in modes.items() if (_SUPPORTED[mode], 0) in objects}}
+
+
+_OPTION_CODES = frozenset({(0x605A, 0), (0x605C, 0), (0x605D, 0), (0x605E, 0)})
+"""Objects whose 0 has a meaning: it holds where the drive has them."""
+
+
+def _size_of(rated: float, peak: float) -> ActuatorSize:
+    """Return an actuator of a rated torque, Nm."""
+    share = rated / _MODEL.rated_torque
+    return ActuatorSize(
+        "described", rated, peak, peak, rated, _MODEL.input_speed, _MODEL.rated_current, _MODEL.peak_current,
+        _MODEL.rotor_inertia * share, _MODEL.load_inertia * share, _MODEL.coulomb * share, _MODEL.viscous * share,
+    )  # fmt: skip

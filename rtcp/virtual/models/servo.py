@@ -1,0 +1,348 @@
+"""One axis of a servo drive: power state machine, modes, protection and feedback (CiA 402-2, ETG.6010).
+
+It is the same for every drive; units, modes and which objects there are differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil
+
+from rtcp.virtual.device import Number
+from rtcp.virtual.models.cia402 import STATE_BITS, DriveState, DriveStateMachine, Status
+from rtcp.virtual.models.cyclic_modes import ERROR, LIMIT, Motion, Profile, Stop
+from rtcp.virtual.models.mechanics import ActuatorSize, Axis, Mechanics
+from rtcp.virtual.models.protection import AT_ONCE, Condition, ErrorCode, ErrorLog, Feedback
+from rtcp.virtual.models.units import AxisObjects
+
+SELF_TEST = 0.1
+"""How long (s) the drive stays in Not Ready To Switch On after power-on."""
+_HALT = 0x100
+_LONGEST = Axis.LONGEST_STEP * 1.000001
+
+Modes = Callable[[Axis, AxisObjects], dict[int, Motion]]
+"""Makes the modes of an axis, by their numbers in 0x6060; 0 holds it."""
+
+
+class ServoAxis:
+    """An axis that turns a joint.
+
+    With the power stage off a brake holds the joint, which its gear alone would not do under the
+    weight of an arm. `mechanics` and `condition` may be changed from outside: a payload, a collision, heat.
+    """
+
+    def __init__(self, objects: AxisObjects, size: ActuatorSize, mechanics: Mechanics, condition: Condition,
+                 feedback: Feedback, errors: ErrorLog, modes: Modes, max_speed: Number,
+                 encoder_range: float) -> None:  # fmt: skip
+        """Join the parts; `max_speed` in counts, `encoder_range` in rad each way. Call `power_on` then."""
+        self.objects = objects
+        self.size = size
+        self.mechanics = mechanics
+        self.condition = condition
+        self.axis = Axis(mechanics)
+        self._units = objects.units
+        self._lasting: list[int] = []
+        """Faults whose cause lasts, made from outside."""
+        self._feedback = feedback
+        self._errors = errors
+        self._make_modes = modes
+        self._max_speed = max_speed
+        self._range = encoder_range
+        # `step` looks nothing up.
+        self._controlword = objects.number(0x6040)
+        self._mode_wanted = objects.number(0x6060)
+        self._mode_display = objects.number(0x6061)
+        self._window = objects.number(0x6065)
+        self._window_time = objects.number(0x6066)
+        self._max_torque = objects.number(0x6072)
+        self._quick_deceleration = objects.number(0x6085)
+        self._quick_stop_option = objects.number(0x605A)
+        self._shutdown_option = objects.number(0x605B)
+        self._disable_option = objects.number(0x605C)
+        self._halt_option = objects.number(0x605D)
+        self._fault_option = objects.number(0x605E)
+
+    @property
+    def state(self) -> DriveState:
+        """The state of the power state machine."""
+        return self._machine.state
+
+    @property
+    def powered(self) -> bool:
+        """Whether the power stage is on and the brake open."""
+        return self._motion is not None
+
+    def power_on(self) -> None:
+        """The supply comes back: all is as at power-on. The joint stands where it stands; its encoder is absolute."""
+        self.condition.overload = 0.0
+        self.axis.offset = self.axis.torque_limit = 0.0
+        self.axis.synchronise()
+        self._supplied = True
+        self._machine = DriveStateMachine()
+        self._stop = Stop(self.axis)
+        self._profile = Profile(self.objects)
+        self._modes = self._make_modes(self.axis, self.objects)
+        self._mode = 0
+        self._motion: Motion | None = None
+        """What moves the axis; None while the power stage is off."""
+        self._pending = False
+        """Whether a ramp is under way that ends in transition 5 or 8."""
+        self._busy = True
+        self._last_controlword = 0
+        self.outputs_valid = False
+        self._self_test = SELF_TEST
+        self._following_time = 0.0
+        self._torque_counts = -1
+        self._bits = 0
+        self._report_condition()
+        self._feedback.publish(self._bits, self.axis, 0.0)
+
+    def power_off(self) -> None:
+        """The supply goes: no torque, the brake closes."""
+        self._supplied = False
+        self.outputs_valid = False
+        self._switch_off(DriveState.NOT_READY_TO_SWITCH_ON)
+
+    def set_outputs_valid(self, valid: bool) -> None:
+        """Set whether process data outputs are valid (OP) or ignored; ignored, the controlword counts as 0.
+
+        Losing them with the power stage on is fault 0x8130.
+        """
+        if self.outputs_valid and not valid and self._motion is not None:
+            self._fail(ErrorCode.COMMUNICATION)
+        self.outputs_valid = valid
+        self._compose()
+
+    def inject_fault(self, code: int) -> None:
+        """Let the fault `code` (0x603F) happen now; codes outside `AT_ONCE` react as 0x605E says.
+
+        Raises:
+            ValueError: `code` is no error code.
+        """
+        if not 0x1000 <= code <= 0xFFFF:
+            raise ValueError(f"error code 0x{code:X} is none: allowed are 0x1000 to 0xFFFF (CiA 402-2)")
+        self._fail(code)
+
+    def begin_fault(self, code: int) -> None:
+        """Let the fault `code` happen now, and its cause last until `end_fault`: no fault reset succeeds."""
+        self._lasting.append(code)
+        if self._supplied and self._machine.state is not DriveState.NOT_READY_TO_SWITCH_ON:
+            self._fail(code)
+
+    def end_fault(self, code: int) -> None:
+        """Let the cause of a fault be gone: from now on a fault reset succeeds."""
+        self._lasting.remove(code)
+
+    def step(self, dt: float) -> None:
+        """Let `dt` seconds pass: obey the RxPDO objects, move, write the TxPDO objects."""
+        if dt <= 0.0:
+            return
+        if not self._supplied:
+            self._stand(dt)
+            return
+        controlword = self._controlword.value if self.outputs_valid else 0
+        if self._busy or controlword != self._last_controlword:
+            self._last_controlword = controlword
+            self._control(controlword, dt)
+        if self._mode_wanted.value != self._mode:
+            self._choose_mode(self._mode_wanted.value)
+        if self._max_torque.value != self._torque_counts:
+            self._torque_counts = self._max_torque.value
+            self.axis.torque_limit = min(self._torque_counts * self._units.torque, self.size.start_stop_torque)
+        if dt <= _LONGEST:
+            count, h = 1, dt
+        else:
+            count = ceil(dt / _LONGEST)
+            h = dt / count
+        axis = self.axis
+        motion = self._motion
+        following = 0.0
+        if motion is None:
+            for _ in range(count):
+                axis.rest(h)
+            bits = 0
+        else:
+            motion.update(controlword, h, count)
+            bits = motion.bits
+            if axis.saturated:
+                bits |= LIMIT
+            if motion.closed:
+                following = axis.demand - axis.mechanics.position - axis.offset
+                window = self._window.value * self._units.position
+                if following > window or following < -window:
+                    bits |= ERROR
+                    self._following_time += dt
+                    if self._following_time * 1000.0 >= self._window_time.value:
+                        self._fail(ErrorCode.FOLLOWING_ERROR)
+                else:
+                    self._following_time = 0.0
+        self._protect(dt)
+        if self._motion is not motion:
+            # A fault has ended the mode, and with it what its bits say.
+            bits = 0
+        self._feedback.publish(self._bits | bits, axis, following)
+
+    def _stand(self, dt: float) -> None:
+        """Without supply only the mechanics go on."""
+        count = ceil(dt / _LONGEST)
+        for _ in range(count):
+            self.axis.rest(dt / count)
+
+    def _protect(self, dt: float) -> None:
+        mechanics = self.mechanics
+        fastest = self._max_speed.value * self._units.velocity
+        if not -fastest <= mechanics.velocity <= fastest:
+            self._fail(ErrorCode.OVER_SPEED)
+        if not -self._range <= mechanics.position <= self._range:
+            self._fail(ErrorCode.POSITION_RANGE)
+        if self.condition.wear(self.axis.torque, dt):
+            self._report_condition()
+            code = self.condition.fault()
+            if code:
+                self._fail(code)
+
+    def _report_condition(self) -> None:
+        """Refresh what changes slowly, and the warning bit."""
+        self._feedback.publish_condition(self.condition, self.axis.torque)
+        self._compose()
+
+    def _compose(self) -> None:
+        """Work out the bits of the statusword that do not change from step to step."""
+        bits = STATE_BITS[self._machine.state]
+        if self._machine.state is not DriveState.NOT_READY_TO_SWITCH_ON:
+            bits |= Status.VOLTAGE_ENABLED
+        if self.condition.warning:
+            bits |= Status.WARNING
+        if self.outputs_valid:
+            bits |= Status.REMOTE
+        self._bits = int(bits)
+
+    def _enter(self, state: DriveState) -> None:
+        self._machine.state = state
+        self._compose()
+
+    def _control(self, controlword: int, dt: float) -> None:
+        """Walk at most one transition of the state machine; start and end the stops that go with it."""
+        before = self._machine.state
+        asked = self._machine.request(controlword)
+        if before is DriveState.NOT_READY_TO_SWITCH_ON:
+            self._self_test -= dt
+            if self._self_test <= 0.0:
+                self._enter(DriveState.SWITCH_ON_DISABLED)
+                if self._lasting:
+                    self._fail(self._lasting[-1])
+        elif before is DriveState.FAULT_REACTION_ACTIVE:
+            if self._motion is None or self._stop.done:
+                self._switch_off(DriveState.FAULT)
+        elif before is DriveState.QUICK_STOP_ACTIVE:
+            self._control_quick_stop(asked)
+        elif asked is not None:
+            self._follow_transition(*asked)
+        elif self._pending and controlword & 0x8F == 0x0F:
+            # Enabled again before the ramp of transition 5 or 8 has ended.
+            self._start_mode()
+        if self._machine.state is DriveState.OPERATION_ENABLED and not self._pending:
+            self._control_halt(controlword)
+        self._busy = self._pending or self._machine.state is not before or self._machine.state in (
+            DriveState.NOT_READY_TO_SWITCH_ON, DriveState.FAULT_REACTION_ACTIVE, DriveState.QUICK_STOP_ACTIVE,
+        )  # fmt: skip
+
+    def _follow_transition(self, transition: int, state: DriveState) -> None:
+        if transition == 4:
+            self.axis.release()
+            self._enter(state)
+            self._start_mode()
+        elif transition in (5, 8):
+            option = self._disable_option if transition == 5 else self._shutdown_option
+            if option.value == 0 or (self._pending and self._stop.done):
+                self._switch_off(state)
+            elif not self._pending:
+                self._pending = True
+                self._start_stop(quick=False)
+        elif transition == 11 and self._quick_stop_option.value:
+            self._pending = False
+            self._enter(state)
+            self._start_stop(quick=self._quick_stop_option.value in (2, 6))
+        elif transition == 11:
+            self._switch_off(DriveState.SWITCH_ON_DISABLED)
+        elif transition == 15:
+            self._reset()
+        else:
+            self._switch_off(state)
+
+    def _control_quick_stop(self, asked: tuple[int, DriveState] | None) -> None:
+        stays = self._quick_stop_option.value in (5, 6)
+        if asked is not None and asked[0] == 12:
+            self._switch_off(asked[1])
+        elif asked is not None and stays:
+            self._enter(asked[1])
+            self._start_mode()
+        elif self._stop.done and not stays:
+            self._switch_off(DriveState.SWITCH_ON_DISABLED)
+
+    def _control_halt(self, controlword: int) -> None:
+        halted = self._motion is self._stop
+        if controlword & _HALT and not halted:
+            self._start_stop(quick=self._halt_option.value == 2)
+        elif halted and not controlword & _HALT:
+            self._motion = self._modes[self._mode]
+            self.axis.synchronise()
+            self._motion.resume()
+
+    def _start_mode(self) -> None:
+        self._pending = False
+        self._following_time = 0.0
+        self.axis.synchronise()
+        self._motion = self._modes[self._mode]
+        self._motion.enter()
+
+    def _start_stop(self, *, quick: bool) -> None:
+        quickest = max(1, self._quick_deceleration.value) * self._units.acceleration
+        self._stop.deceleration = quickest if quick else self._profile.deceleration
+        self._stop.enter()
+        self._motion = self._stop
+
+    def _switch_off(self, state: DriveState) -> None:
+        self._motion = None
+        self._pending = False
+        self._enter(state)
+
+    def _choose_mode(self, wanted: int) -> None:
+        """Change to a supported mode; another value keeps the old one (CiA 402-2, object 0x6060)."""
+        if wanted not in self._modes or wanted == 0:
+            return
+        running = self._motion is self._modes[self._mode]
+        self._mode = self._mode_display.value = wanted
+        if running:
+            self._start_mode()
+        else:
+            self._modes[wanted].enter()
+
+    def _fail(self, code: int) -> None:
+        """Transition 13: tell the fault and begin the reaction to it (0x605E)."""
+        state = self._machine.state
+        at_once = code in AT_ONCE
+        if state is DriveState.FAULT or (state is DriveState.FAULT_REACTION_ACTIVE and not at_once):
+            return
+        self._errors.add(code)
+        self._pending = False
+        self._following_time = 0.0
+        if self._motion is not None and self._fault_option.value and not at_once:
+            self._start_stop(quick=self._fault_option.value == 2)
+        else:
+            self._motion = None
+        self._enter(DriveState.FAULT_REACTION_ACTIVE)
+        self._busy = True
+
+    def _reset(self) -> None:
+        """Transition 15, refused for as long as what caused the fault lasts (CiA 402-2, transition 15)."""
+        mechanics = self.mechanics
+        if self._lasting:
+            self._errors.add(self._lasting[-1])
+            return
+        if self.condition.fault() or abs(mechanics.position) > self._range:
+            return
+        if abs(mechanics.velocity) > self._max_speed.value * self._units.velocity:
+            return
+        self._errors.reset()
+        self._enter(DriveState.SWITCH_ON_DISABLED)

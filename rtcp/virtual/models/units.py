@@ -1,0 +1,74 @@
+"""The objects of one axis of a drive, and what their counts mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from rtcp.virtual.device import Number, number
+from rtcp.virtual.objects import ObjectDictionary, bounds
+
+AXIS_STRIDE = 0x800
+"""Distance of the objects of two axes of a drive: 0x6040 and 0x6840 (ETG.6010, CiA 402-2)."""
+LIMITLESS = 0x7FFF_FFFF
+"""A limit that is none."""
+_PROFILE = range(0x6000, 0x6800)
+"""Objects of the first axis; those below belong to the whole device."""
+
+
+class Units:
+    """What a count is in SI units: rad, rad/s, rad/s^2, Nm; and increments of the encoder for one rad."""
+
+    __slots__ = ("acceleration", "increments", "position", "torque", "velocity")
+
+    def __init__(self, position: float, velocity: float, acceleration: float, torque: float, increments: float) -> None:
+        self.position = position
+        self.velocity = velocity
+        self.acceleration = acceleration
+        self.torque = torque
+        self.increments = increments
+
+
+class Absent:
+    """Stands for an object that a drive has not."""
+
+    __slots__ = ("value",)
+
+    def __init__(self, value: int) -> None:
+        self.value = value
+
+
+class AxisObjects:
+    """The objects of one axis by their numbers of the first axis, and its units."""
+
+    def __init__(self, objects: ObjectDictionary, units: Units, axis: int = 0) -> None:
+        """Take the objects of `axis`, from 0."""
+        self.dictionary = objects
+        self.units = units
+        self._shift = AXIS_STRIDE * axis
+        self._absent: dict[tuple[int, int], Absent] = {}
+
+    def __contains__(self, key: tuple[int, int]) -> bool:
+        return self._key(*key) in self.dictionary
+
+    def number(self, index: int, subindex: int = 0) -> Number:
+        """Return an entry, or what stands for it where the drive lacks it."""
+        key = self._key(index, subindex)
+        if key in self.dictionary:
+            return number(self.dictionary, *key)
+        return self._absent.setdefault(key, Absent(0))
+
+    def fill(self, defaults: Mapping[tuple[int, int], int]) -> None:
+        """Set what a description leaves open: objects that are 0 or absent."""
+        for at, value in defaults.items():
+            entry = self.number(*at)
+            if not entry.value:
+                low, high = self.bounds(*at)
+                entry.value = min(max(value, low), high)
+
+    def bounds(self, index: int, subindex: int = 0) -> tuple[int, int]:
+        """Return the lowest and the highest number that an entry holds."""
+        key = self._key(index, subindex)
+        return bounds(self.dictionary[key]) if key in self.dictionary else (-LIMITLESS, 0xFFFF_FFFF)
+
+    def _key(self, index: int, subindex: int) -> tuple[int, int]:
+        return index + self._shift if index in _PROFILE else index, subindex

@@ -1,0 +1,176 @@
+"""Behaviours of described slaves: what a hook can do, and what one that fails must not do."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.virtual.coe import read, write
+from rtcp.virtual.mailbox import Mailbox
+from rtcp.virtual.objects import SdoAbort
+from rtcp.virtual.protocol import MailboxType
+from tests.virtual import behaviours
+from tests.virtual.conftest import ROOT, described
+from tests.virtual.test_described import DRIVE, OP, OUTPUTS, TWO, device
+
+PRE_OP, BOOT = 2, 3
+Master = Callable[..., dict[str, Any]]
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize(
+    ("behaviour", "said"),
+    [("Raises", "RuntimeError: out of order"), ("Hangs", "it has not returned for ")],
+)
+def test_a_hook_that_raises_or_hangs_takes_its_own_slave_out_of_op_with_one_sentence(
+    master: Master, behaviour: str, said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    failing = described(TWO, f"behaviour: 'tests.virtual.behaviours:{behaviour}'")
+    found = master(described(OUTPUTS), failing, described(DRIVE))
+    assert found["safe_op"] == 4
+    assert found["codes"] == [[OP, 0], [4 | 0x10, 0x0001], [OP, 0]]
+    sentences = [line for line in capfd.readouterr().err.splitlines() if "on_outputs failed" in line]
+    assert len(sentences) == 1
+    assert ":3: slave 2: on_outputs failed at " in sentences[0]
+    assert f"{Path(behaviours.__file__)}:" in sentences[0]
+    assert said in sentences[0]
+    # The others answer: what the slave in SAFE-OP lacks is its outputs.
+    assert found["counters"][-10:].count(2 + 1 + 3) >= 8
+
+
+def abort_of(call: Callable[..., object], *arguments: object) -> int:
+    with pytest.raises(SdoAbort) as caught:
+        call(*arguments)
+    return caught.value.code
+
+
+def test_hooks_answer_and_refuse_sdos_and_send_emergencies() -> None:
+    made = device(DRIVE, behaviours.Talkative)
+    assert read(made.objects, 0x6064, 0, False, PRE_OP) == struct.pack("<i", 4711)
+    assert abort_of(write, made.objects, 0x607A, 0, False, PRE_OP, struct.pack("<i", 13)) == 0x06090030
+    assert (made.objects[0x607A, 0].value, len(made.emergencies)) == (0, 0)
+    write(made.objects, 0x607A, 0, False, PRE_OP, struct.pack("<i", 14))
+    assert made.objects[0x607A, 0].value == 14
+    assert (made.emergencies[0].error_code, made.emergencies[0].data) == (0x5000, b"late\0")
+
+
+def test_a_hook_of_a_service_that_fails_aborts_it_and_is_told_of_once() -> None:
+    made = device(DRIVE, behaviours.FailsEverywhere)
+    said: list[str] = []
+    made.runner.report = said.append
+    for _ in range(3):
+        assert abort_of(read, made.objects, 0x6064, 0, False, PRE_OP) == 0x08000000
+        assert abort_of(write, made.objects, 0x607A, 0, False, PRE_OP, bytes(4)) == 0x08000000
+    assert [sentence.split(": ")[1].split(" ")[0] for sentence in said] == ["on_sdo_read", "on_sdo_write"]
+    assert "0x6041:0 Statusword takes 0 to 65535, not 1048576" in said[1]
+
+
+# -- files over EtherCAT --------------------------------------------------------------------------------------------
+
+REQUEST, WRITE, DATA, ACKNOWLEDGE, ERROR, BUSY = 1, 2, 3, 4, 5, 6
+
+
+class FoeClient:
+    """Talks FoE with a device through its mailbox, as frames would."""
+
+    def __init__(self, behaviour: type[Any], size: int = 64) -> None:
+        self.device = device(DRIVE, behaviour)
+        self.device.open_mailbox(size, size)
+        self.most = size - 12
+        self._mailbox = Mailbox(
+            self.device.objects, self.device.emergencies, size, size, protocols=self.device.mailbox_protocols, coe=None
+        )
+        self._counter = 0
+
+    def ask(self, operation: int, number: int, content: bytes = b"") -> tuple[int, int, bytes] | None:
+        self._counter = self._counter % 7 + 1
+        message = struct.pack("<BxI", operation, number) + content
+        head = struct.pack("<HHBB", len(message), 0, 0, self._counter << 4 | MailboxType.FOE)
+        self._mailbox.receive((head + message).ljust(self.most + 12, b"\0"), BOOT)
+        answer = self._mailbox.next_message()
+        if answer is None:
+            return None
+        length = struct.unpack_from("<H", answer)[0]
+        operation, number = struct.unpack_from("<BxI", answer, 6)
+        return operation, number, answer[12 : 6 + length]
+
+    def write(self, name: str, data: bytes) -> tuple[int, int]:
+        """Write a file; return the last answer."""
+        answer = self.ask(WRITE, 0, name.encode())
+        packet = 0
+        while answer is not None and answer[0] in (ACKNOWLEDGE, BUSY):
+            if answer[0] == ACKNOWLEDGE:
+                packet += 1
+                part = data[(packet - 1) * self.most : packet * self.most]
+                if len(part) < self.most and answer[1] == packet - 1 and packet > len(data) // self.most + 1:
+                    break
+            answer = self.ask(DATA, packet, part)
+            if answer is not None and answer[:2] == (ACKNOWLEDGE, packet) and len(part) < self.most:
+                break
+        assert answer is not None
+        return answer[0], answer[1]
+
+    def read(self, name: str) -> bytes | int:
+        """Read a file; return it, or the error code."""
+        answer = self.ask(REQUEST, 0, name.encode())
+        data = b""
+        while answer is not None and answer[0] == DATA:
+            data += answer[2]
+            answer = self.ask(ACKNOWLEDGE, answer[1])
+        return data if answer is None else answer[1]
+
+
+@pytest.mark.parametrize("length", [0, 1, 51, 52, 53, 104, 1000])
+def test_a_file_of_any_length_is_written_and_read_back(length: int) -> None:
+    client = FoeClient(behaviours.Talkative)
+    data = bytes(n % 251 for n in range(length))
+    assert client.write("firmware", data)[0] == ACKNOWLEDGE
+    assert client.read("firmware") == data
+
+
+def test_a_behaviour_refuses_a_file_and_is_busy_and_fails() -> None:
+    client = FoeClient(behaviours.Talkative)
+    assert client.write("secret", b"1234") == (ERROR, 0x800A)
+    assert client.read("nothing") == 0x8001
+    assert client.write("slow", b"late but whole") == (ACKNOWLEDGE, 1)
+    assert client.read("slow") == b"late but whole"
+    failing = FoeClient(behaviours.FailsEverywhere)
+    said: list[str] = []
+    failing.device.runner.report = said.append
+    assert failing.write("any", b"1") == (ERROR, 0x800B)
+    assert "on_file failed at" in said[0]
+
+
+def test_packets_out_of_order_and_messages_that_fit_nothing_are_errors() -> None:
+    client = FoeClient(behaviours.Talkative)
+    client.ask(WRITE, 0, b"a")
+    assert client.ask(DATA, 2, b"x")[:2] == (ERROR, 0x8005)
+    assert client.ask(DATA, 1, b"x")[:2] == (ERROR, 0x8004)
+    assert client.ask(99, 0)[:2] == (ERROR, 0x8004)
+    assert client.ask(ACKNOWLEDGE, 5) is None
+    client.device.runner.behaviour.files["b"] = bytes(200)
+    client.ask(REQUEST, 0, b"b")
+    assert client.ask(ACKNOWLEDGE, 7)[:2] == (ERROR, 0x8005)
+
+
+@pytest.mark.alone
+def test_a_real_master_writes_firmware_in_boot_and_reads_it(tmp_path: Path) -> None:
+    from tests.virtual.conftest import segment
+
+    config = tmp_path / "segment.yaml"
+    config.write_text(f"slaves:\n- {{{described(DRIVE)}}}\n")
+    with segment(config) as pid:
+        command = [sys.executable, str(Path(__file__).with_name("boot_child.py")), str(pid), "ecat0"]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT)
+    found = json.loads(done.stdout)
+    assert found["boot"] == BOOT
+    assert found["read"] == found["written"]
+    assert found["no_coe_in_boot"]
+    assert found["after"] == PRE_OP
