@@ -52,7 +52,8 @@ def test_a_closed_bus_refuses_everything_in_a_sentence():
 
 def test_a_map_is_judged_by_its_images_and_names_what_soem_reported_of_a_slave_whose_image_is_wrong():
     errors = [
-        pysoem.PacketError(1, 1), pysoem.PacketError(2, 4), *[pysoem.SdoError(2, 0x1C12, 1, 0x06020000, "The object does not exist")] * 200,
+        pysoem.PacketError(1, 1), pysoem.PacketError(2, 4),
+        *[pysoem.SdoError(2, 0x1C12, 1, 0x06020000, "The object does not exist")] * 200,
     ]  # fmt: skip
 
     class Master:
