@@ -55,8 +55,9 @@ class SegmentSlave:
     """Name of the slave, for `after`."""
     after: Annotated[str, NumberAsText(), MinLen(1), MaxLen(64)] | None = None
     """Slave behind which it hangs, by name or position from 1; left out: the one before it."""
-    port: Literal[1, 2, 3] = 1
-    """Port of that slave. Frames go to port 3 first, then 1, then 2: the list has this order."""
+    port: Literal[1, 2, 3] | None = None
+    """Port of that slave; left out: 1, where it has none the lowest. Frames go to port 3 first, then 1, then 2: the
+    list has this order."""
     drift_ppm: Annotated[float, Ge(-1000), Le(1000)] = 0.0
     """How much faster than the host its own clock runs, parts per million."""
     delay_ns: Annotated[int, Ge(0), Le(1_000_000)] | None = None

@@ -70,7 +70,7 @@ class DescribedDevice(DeviceModel):
         self.sync_managers = _layout(device)
         self.supports_dc = bool(device.dc_modes)
         self.sync_activations = frozenset(mode.assign_activate >> 8 for mode in device.dc_modes) - {0}
-        self.physics = device.physics or "YY"
+        self.physics = _ports(device.physics)
         coe = None if mailbox is None else mailbox.coe
         self.coe = None if coe is None else CoeFeatures(coe.sdo_information, coe.complete_access)
         self.smallest_mailbox = min([34, *(m.length for m in self.sync_managers if _is_mailbox(m) and m.length)])
@@ -253,6 +253,13 @@ class DescribedDevice(DeviceModel):
     def state_changed(self, before: int, after: int) -> None:
         """Let the behaviour know."""
         self.runner.state_changed(before, after)
+
+
+def _ports(physics: str) -> str:
+    """Return the ports; a device with one alone has a second, so that any can stand anywhere in a chain."""
+    if any(kind != " " for kind in physics[1:]):
+        return physics
+    return (physics.strip() or "Y")[0] * 2
 
 
 def _is_mailbox(manager: SyncManager) -> bool:

@@ -242,10 +242,10 @@ def _fast(plan: Plan, esc: Esc, parts: Parts, images: dict[SyncManager, int],
             written.append((esc, manager))
         elif not manager.master_writes and fmmu.readable and command in READS:
             inputs.append(copy)
-    for copy in outputs:
-        plan.outputs.append(copy) if isinstance(copy, Copy) else plan.output_bits.append(copy)
-    for copy in inputs:
-        plan.inputs.append(copy) if isinstance(copy, Copy) else plan.input_bits.append(copy)
+    plan.outputs += [copy for copy in outputs if isinstance(copy, Copy)]
+    plan.output_bits += [copy for copy in outputs if isinstance(copy, BitCopy)]
+    plan.inputs += [copy for copy in inputs if isinstance(copy, Copy)]
+    plan.input_bits += [copy for copy in inputs if isinstance(copy, BitCopy)]
     plan.written += written
     share = bool(inputs) + bool(outputs) * (2 if command == DatagramCommand.LRW else 1)
     plan.counter += share

@@ -435,7 +435,7 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
     connections, misplaced = _connections(config, devices if len(devices) == len(config.slaves) else None)
     findings += misplaced
     arrivals: list[int | None] = [entry.delay_ns for entry in config.slaves]
-    if connections == chain(len(arrivals)):
+    if [connection.parent for connection in connections] == [None, *range(len(arrivals) - 1)]:
         usual = default_delays(len(arrivals))
         arrivals = [own if given is None else given for given, own in zip(arrivals, usual, strict=True)]
     cables = [] if misplaced else lay_cables(arrivals, connections)
@@ -467,12 +467,14 @@ def _connections(
     taken: dict[Connection, int] = {}
     for i, entry in enumerate(config.slaves):
         parent = i - 1 if entry.after is None else place_of(entry.after, config.slaves[:i])
-        made = Connection(None if i == 0 else parent, entry.port if i else 1)
-        connections.append(made)
         if parent is None or i == 0:
+            connections.append(Connection(None))
             continue
         label = f"slave {parent + 1} ({config.slaves[parent].label})"
-        ports = [] if devices is None else [n for n, kind in enumerate(devices[parent].physics) if n and kind != " "]
+        physics = "" if devices is None else devices[parent].physics[:4]
+        ports = [port for port, kind in enumerate(physics) if port and kind != " "]
+        made = Connection(parent, entry.port or (1 if 1 in ports or not ports else ports[0]))
+        connections.append(made)
         if devices is not None and made.port not in ports:
             text = f"found {made.port}, but {label} has {_listed(ports)} to hang something at"
             findings.append((("slaves", i, "port"), text))
