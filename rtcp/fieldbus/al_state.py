@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
 
-from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort
+from rtcp.fieldbus.registers import DEVICE_EMULATION, PATIENT_TRIES, TRIES, Register, RegisterPort
 
 ERROR_BIT = 0x10
 """Error indication in AL status, acknowledge in AL control (ETG.1000.6, 5.3.1 and 5.3.2)."""
@@ -167,11 +167,17 @@ def read_al(port: RegisterPort, station: int, tries: int | None = None) -> tuple
     return state, bool(status & ERROR_BIT), int.from_bytes(data[4:6], "little")
 
 
+def is_emulated(port: RegisterPort, station: int) -> bool:
+    """Whether a slave has no state machine of its own: AL status shows what AL control was set to, all bits of it."""
+    configuration = port.read(station, Register.ESC_CONFIGURATION, 1)
+    return configuration is not None and bool(configuration[0] & DEVICE_EMULATION)
+
+
 def request_state(port: RegisterPort, stations: Iterable[int], state: AlState) -> None:
     """Request `state` of the slaves; an error that one of them shows is acknowledged with it. Nothing is waited for."""
     for station in stations:
-        error = read_al(port, station)[1]
-        port.write(station, Register.AL_CONTROL, (state | (ERROR_BIT if error else 0)).to_bytes(2, "little"))
+        acknowledge = read_al(port, station)[1] and not is_emulated(port, station)
+        port.write(station, Register.AL_CONTROL, (state | (ERROR_BIT if acknowledge else 0)).to_bytes(2, "little"))
 
 
 def broadcast_state(port: RegisterPort, state: AlState) -> int:
@@ -183,7 +189,8 @@ def acknowledge(port: RegisterPort, station: int) -> AlState:
     """Acknowledge a slave's error; it stays in the state that it is in, which is returned."""
     state = read_al(port, station)[0]
     if state is not AlState.NONE:
-        port.write(station, Register.AL_CONTROL, (state | ERROR_BIT).to_bytes(2, "little"))
+        word = state if is_emulated(port, station) else state | ERROR_BIT
+        port.write(station, Register.AL_CONTROL, word.to_bytes(2, "little"))
     return state
 
 
@@ -211,6 +218,9 @@ def wait_for_state(
             found, error, code = read_al(port, station, PATIENT_TRIES if late else TRIES)
             if found is state and not error:
                 del waiting[station]
+            elif error and not late and is_emulated(port, station):
+                # It shows the acknowledgement of a broadcast.
+                port.write(station, Register.AL_CONTROL, state.to_bytes(2, "little"))
             elif error or late:
                 refused[station] = refusal(label, state, found | (ERROR_BIT if error else 0), code)
                 del waiting[station]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from rtcp.fieldbus.al_state import ERROR_BIT, AlState, refusal
+from rtcp.fieldbus.al_state import ERROR_BIT, AlState, is_emulated, refusal
 from rtcp.fieldbus.bus import SlaveState, slave_label, station_of
 from rtcp.fieldbus.errors import BusError, ForeignSlave
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, Steps
@@ -209,7 +209,7 @@ class SlaveRecovery:
 
     def request(self, slave: MonitoredSlave, state: AlState, *, acknowledge: bool = False) -> bool:
         """Request `state` of a slave; return False where it certainly did not receive that."""
-        word = state | (ERROR_BIT if acknowledge else 0)
+        word = state | (ERROR_BIT if acknowledge and not is_emulated(self._port, slave.station) else 0)
         data = word.to_bytes(2, "little")
         return self._port.exchange(DatagramCommand.FPWR, slave.station, Register.AL_CONTROL, data, tries=1).wkc != 0
 

@@ -53,6 +53,7 @@ class Register(IntEnum):
     AL_CONTROL = 0x0120
     AL_STATUS = 0x0130
     """AL status (2 bytes), two reserved bytes, AL status code (2 bytes)."""
+    ESC_CONFIGURATION = 0x0141
     ERROR_COUNTERS = 0x0300
     WATCHDOG_DIVIDER = 0x0400
     WATCHDOG_PROCESS_DATA = 0x0420
@@ -79,6 +80,8 @@ class Register(IntEnum):
     """Four bytes; those of SYNC1 follow."""
 
 
+DEVICE_EMULATION = 0x01
+"""Bit of ESC_CONFIGURATION: AL status is a copy of AL control."""
 FEATURE_DC = 0x04
 """Bit of FEATURES: the slave has a distributed clock."""
 _ANSWER_S = 0.02

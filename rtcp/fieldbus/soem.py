@@ -315,7 +315,7 @@ class SoemBus:
                 if isinstance(fault, pysoem.SdoError):
                     what = f"object 0x{fault.index:04X}:{fault.subindex}: {fault.desc}"
                 elif isinstance(fault, (pysoem.MailboxError, pysoem.PacketError)):
-                    what = str(fault.desc)
+                    what = _words(fault)
                 else:
                     continue
                 reported.setdefault(fault.slave_pos, []).append(what)
@@ -570,6 +570,14 @@ def open_master(interface: str) -> tuple[Any, socket.socket]:
     duplicate.setblocking(False)
     attach_filter(duplicate, 0, _SOEM_LAST_INDEX)
     return master, duplicate
+
+
+def _words(fault: Any) -> str:
+    """Return what pysoem says of an error; it knows not all codes of a packet error."""
+    try:
+        return str(fault.desc)
+    except KeyError:
+        return f"packet error {fault.error_code}"
 
 
 def _sockets() -> set[tuple[int, str]]:

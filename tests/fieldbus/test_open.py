@@ -52,7 +52,8 @@ def test_a_closed_bus_refuses_everything_in_a_sentence():
 
 def test_a_map_is_judged_by_its_images_and_names_what_soem_reported_of_a_slave_whose_image_is_wrong():
     errors = [
-        pysoem.PacketError(1, 1), *[pysoem.SdoError(2, 0x1C12, 1, 0x06020000, "The object does not exist")] * 200,
+        pysoem.PacketError(1, 1), pysoem.PacketError(2, 4),
+        *[pysoem.SdoError(2, 0x1C12, 1, 0x06020000, "The object does not exist")] * 200,
     ]  # fmt: skip
 
     class Master:
@@ -66,6 +67,6 @@ def test_a_map_is_judged_by_its_images_and_names_what_soem_reported_of_a_slave_w
     assert bus._map(arm(2)) == {
         2: [
             "slave 2 (drive1): SOEM could not read the PDO mapping assigned through 0x1C12 (key `rpdo`): expected 15 "
-            "bytes, found 14 (object 0x1C12:1: The object does not exist)"
+            "bytes, found 14 (packet error 4; object 0x1C12:1: The object does not exist)"
         ]
     }
