@@ -56,6 +56,8 @@ class JointGroup(Part):
         self.period_s = config.cycle.period_us * 1e-6
         self.pairs = list(drives)
         self.drives = [drive for _, drive in drives]
+        self.shares_slaves = False
+        """Whether a drive of it is one of several axes of its slave."""
         self.state = ArmState(len(config.joints))
         self.limits = Limits(config)
         self.output_limiter = OutputLimiter(self.limits, self.period_s)
@@ -73,9 +75,13 @@ class JointGroup(Part):
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the drives."""
+        if self.shares_slaves:
+            for slot, drive in self.pairs:
+                own, slave = drive.encode(), drive.slave
+                data.set_output(slot, own if slave is None else slave.outputs(drive, own))
+            return
         for slot, drive in self.pairs:
-            own, slave = drive.encode(), drive.slave
-            data.set_output(slot, own if slave is None else slave.outputs(drive, own))
+            data.set_output(slot, drive.encode())
 
     def set_limits(self, new: Values) -> None:
         """Put other limits into force."""
@@ -142,6 +148,8 @@ class Joints:
         self.pairs = [pair for group in self.groups for pair in group.pairs]
         """Index of its slave and driver of each drive."""
         share_slaves(self.pairs)
+        for group in self.groups:
+            group.shares_slaves = any(drive.slave is not None for drive in group.drives)
         self.drives = [drive for _, drive in self.pairs]
 
     def advance(self, target: TargetState) -> None:

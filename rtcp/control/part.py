@@ -189,12 +189,11 @@ class Device(Part):
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the slave."""
-        outputs = self.driver.safe_outputs
         try:
-            if not self._failed:
-                outputs = self.driver.encode()
+            outputs = self.driver.safe_outputs if self._failed else self.driver.encode()
         except Exception as error:
             self._fail(error)
+            outputs = self.driver.safe_outputs
         data.set_output(self.slot, outputs)
 
     def publish(self, values: list[Any]) -> None:

@@ -121,13 +121,16 @@ class Cia402Drive(Drive):
         """Whether its mode of operation can be commanded; else it stays in CSP."""
         if self.changes_mode and self._in[4] < 0:
             raise DeviceError(f"{self.device}: `rpdo` maps modes_of_operation, `tpdo` no modes_of_operation_display")
-        if self._in[4] < 0:
-            self.mode_display = CSP
         self._limits = tuple((0, 0) if channel is None else integer_range(channel) for channel in targets)
         self._scales = tuple(0.0 if channel is None else 1.0 / channel.factor for channel in targets)
         self._in_factors = tuple(0.0 if slot < 0 else self.tpdo.channels[slot].factor for slot in self._in[1:4])
         (self._temperature_slot,) = _slots(self.tpdo, ("temperature",))
         self._unpack, self._pack = self.codec_in.unpack, self.codec_out.pack
+        if self._in[4] < 0:
+            # The mode to which the start-up SDO sets it stands behind what the drive sends.
+            unpack = self._unpack
+            self._unpack = lambda data: (*unpack(data), CSP)
+            self._in = (*self._in[:4], len(self.tpdo.channels))
         self._fields = cast(list[int], [self._counts_of(channel) for channel in self.rpdo.channels])
         self._position_slot, self._scale, self._range = self._out[1], self._scales[0], self._limits[0]
         self.controlword = DISABLE_VOLTAGE
@@ -156,7 +159,8 @@ class Cia402Drive(Drive):
         self.velocity = values[velocity] * by_velocity if velocity >= 0 else self._measured_velocity(shown)
         if torque >= 0:
             self.torque = values[torque] * by_torque
-        if mode >= 0 and (display := values[mode]) != self.mode_display:
+        display: int = values[mode]
+        if display != self.mode_display:
             self.mode_display = display
             self._changed = True
         if self._temperature_slot >= 0:

@@ -301,8 +301,11 @@ def _diagnostics(feed: Feed, record: Any, ahead_ns: int) -> Diagnostics:
         "ticks skipped": str(record["missed"]),
         "error code": str(record["fault"] or record["limit"]),
     }
-    processes = {one.name for one in feed.config.processes}
+    # Processes, and slaves of which nothing is known but their channels.
+    shown = {one.name for one in feed.config.processes}
+    shown |= {slave.name for slave in feed.config.slaves if slave.device.has_channels}
     for field in feed.schema.fields:
-        if field.part in processes:
-            values[f"{field.part} {field.local_name}"] = str(record[field.name])
+        if field.part in shown:
+            unit = f" {field.unit}" if field.unit else ""
+            values[f"{field.part} {field.local_name}"] = f"{record[field.name]}{unit}"
     return Diagnostics(int(record["time_ns"]) + ahead_ns, level, state.words, tuple(values.items()))

@@ -106,7 +106,8 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      'slaves[6].name: found the text "io", the name of slaves[0].name; each needs its own'),
     (ARM, [("device: diewu-io", "device: diewu")],
      'slaves[0].device: found the text "diewu", but there is no file devices/diewu.yaml; in devices are '
-     "cubemars-orh, diewu-io, shape-setter-box, shape-setter-meter"),
+     "cubemars-orh, diewu-io, myactuator-x6-60, shape-setter-box, shape-setter-meter, synapticon-somanet, "
+     "two-axis-drive"),
     (ARM, [("interface: virtual", "interface: a-very-long-name")],
      'bus.interface: found the text "a-very-long-name", allowed is virtual, or a network interface of at most 15 '
      "characters without spaces and /"),

@@ -184,3 +184,18 @@ def test_a_joint_that_names_a_wrong_axis_or_what_the_drive_cannot_express_is_ref
     with pytest.raises(ConfigError) as refused:
         arm_with(tmp_path, joint)
     assert [problem.split(": ", 1)[1] for problem in refused.value.problems] == [sentence]
+
+
+def test_the_shipped_drives_count_as_their_makers_say() -> None:
+    folder = default_config().parent / "devices"
+    somanet, actuator, both = (
+        load_device(folder / f"{name}.yaml", 1000.0)
+        for name in ("synapticon-somanet", "myactuator-x6-60", "two-axis-drive")
+    )
+    assert [entry.factor for entry in somanet.outputs][2:] == [
+        pytest.approx(factor) for factor in (0.064, TURN / 52_428_800, TURN / 6000)
+    ]
+    assert [entry.factor for entry in actuator.inputs][1:4] == [
+        pytest.approx(factor) for factor in (TURN / 131_072, TURN / 131_072, 0.01995)
+    ]
+    assert (both.axes, both.startup(0x6085, 2), both.of_axis(2).outputs[0].index) == ((1, 2), 10430251, 0x6840)

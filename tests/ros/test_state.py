@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -14,6 +15,7 @@ from rtcp.api import ControlMode, NotRunning, RtcpError, State
 from rtcp.api.feed import Feed
 from rtcp.config.find import default_config
 from rtcp.config.loader import load
+from rtcp.control.cycle import record_schema
 from rtcp.ipc.observer import record_type
 from rtcp.ipc.schema import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING, arm_schema
 from rtcp.motion.planning.interpolation import rotation
@@ -25,9 +27,11 @@ from rtcp.ros.state import (
     RobotStatus,
     StatePublisher,
     TriState,
+    _diagnostics,
     robot_status,
     transforms_of,
 )
+from tests.control.test_channels import config as with_valves
 
 SCHEMA = arm_schema(6)
 CONFIG = load(default_config())
@@ -320,3 +324,14 @@ def test_the_tool_has_a_frame_and_the_links_where_that_is_asked_for() -> None:
     position, turn = alone[TOOL_FRAME]
     assert position == pytest.approx(pose.position)
     assert rotation(turn) == pytest.approx(pose.rotation)
+
+
+def test_diagnostics_name_the_channels_of_slaves_with_their_units() -> None:
+    config = with_valves()
+    schema = record_schema(config)
+    feed = SimpleNamespace(config=config, schema=schema, holder="")
+    (found,) = np.zeros(1, record_type(schema))
+    found["state"], found["valves_pressure"] = State.READY, 2.5
+    values = dict(_diagnostics(cast(Feed, feed), found, 0).values)
+    assert values["valves pressure"] == "2.5 bar"
+    assert values["valves current"] == "0.0 mA"
