@@ -427,7 +427,9 @@ def _range_text(entry: ObjectEntry) -> list[str]:
     if entry.minimum is None and entry.maximum is None:
         return []
     data_type = resolve(entry.type, entry.bits)
-    low, high = ("" if end is None else f"{decode(data_type, end)}" for end in (entry.minimum, entry.maximum))
+    if data_type.kind in (Kind.TEXT, Kind.BYTES):
+        return []
+    low, high = ("" if end is None else str(decode(data_type, end)) for end in (entry.minimum, entry.maximum))
     return [f"{low} to {high}" if low and high else f"at least {low}" if low else f"at most {high}"]
 
 

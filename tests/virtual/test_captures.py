@@ -47,4 +47,6 @@ def test_each_datagram_is_answered_as_by_the_devices_but_for_what_no_eeprom_tell
     assert [difference for difference in differences if not reason_of(difference)] == []
     same = len(answers) - len(differences)
     of_eeprom = sum(reason_of(difference) == "the kind of EEPROM" for difference in differences)
-    assert same + of_eeprom > 0.75 * len(answers), f"{same} of {len(answers)} the same, {of_eeprom} but for the kind of EEPROM"
+    assert same + of_eeprom > 0.75 * len(answers), (
+        f"{same} of {len(answers)} the same, {of_eeprom} but for the kind of EEPROM"
+    )
