@@ -102,18 +102,14 @@ class FoeClient:
         return operation, number, answer[12 : 6 + length]
 
     def write(self, name: str, data: bytes) -> tuple[int, int]:
-        """Write a file; return the last answer."""
+        """Write a file, of which the last packet is shorter than the others; return the last answer."""
         answer = self.ask(WRITE, 0, name.encode())
-        packet = 0
-        while answer is not None and answer[0] in (ACKNOWLEDGE, BUSY):
-            if answer[0] == ACKNOWLEDGE:
-                packet += 1
-                part = data[(packet - 1) * self.most : packet * self.most]
-                if len(part) < self.most and answer[1] == packet - 1 and packet > len(data) // self.most + 1:
-                    break
-            answer = self.ask(DATA, packet, part)
-            if answer is not None and answer[:2] == (ACKNOWLEDGE, packet) and len(part) < self.most:
-                break
+        parts = [data[at : at + self.most] for at in range(0, len(data) + 1, self.most)]
+        for packet, part in enumerate(parts, 1):
+            if answer is not None and answer[0] == ACKNOWLEDGE:
+                answer = self.ask(DATA, packet, part)
+            while answer is not None and answer[0] == BUSY:
+                answer = self.ask(DATA, packet, part)
         assert answer is not None
         return answer[0], answer[1]
 

@@ -18,7 +18,7 @@ from tests.virtual.frames import Datagram, build, parse
 from tests.virtual.line import MS, begin
 from tests.virtual.test_described import DRIVE, OUTPUTS
 
-JUNCTION = 0x13
+JUNCTION, WITHOUT_PORT_1 = 0x13, 0x14
 Master = Callable[..., dict[str, Any]]
 #  1 -port 3- 2 -port 1- 3
 #  |port 1
@@ -68,6 +68,12 @@ def test_frames_go_to_port_3_then_1_then_2_and_every_slave_has_its_links_and_its
     assert ask(segment, DatagramCommand.BRD, 0, 0x0130, bytes(2)).counter == 7
     # Position 5 is the slave that frames come to sixth.
     assert ask(segment, DatagramCommand.APRD, -5 & 0xFFFF, 0x0910, bytes(8)).counter == 1
+
+
+def test_where_no_port_is_given_a_slave_hangs_at_the_lowest_that_there_is(tmp_path: Path) -> None:
+    segment = tree(tmp_path, described(WITHOUT_PORT_1), described(DRIVE))
+    assert [ports(segment, n) for n in (1, 2)] == ["02", "0"]
+    assert segment.slaves[0].esc.memory[0x0007] == 0b11_11_00_11
 
 
 def test_ports_latch_when_the_frame_comes_back_from_each_branch(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_a_device_without_a_dictionary_has_the_objects_that_its_pdos_map() -> No
 MISTAKES = {
     "no such product": (described(0x99), "product", "no devices fit product 0x00000099"),
     "no such file": ("esi: none.xml", "esi", "none.xml"),
-    "several devices": (f"esi: {VENDOR}", "esi", "6 devices fit without a choice"),
+    "several devices": (f"esi: {VENDOR}", "esi", "7 devices fit without a choice"),
     "a behaviour that is none": (described(DRIVE, "behaviour: toaster"), "behaviour", "allowed is one of cia402, or"),
     "a module that is none": (described(DRIVE, "behaviour: 'no.such:Thing'"), "behaviour", "cannot be loaded"),
     "an option that it has not": (
