@@ -36,8 +36,9 @@ class Driver:
     and packs the outputs in `encode`, each called once a cycle. This class keeps the layout of both images, and by
     itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name; all of
     them are in the cycle record, named SLAVE_CHANNEL. Channels of type `bytes` are in neither: `arrays` holds those of
-    the inputs, `array_targets` those of the outputs. A driver that is commanded names its `commands` and overrides
-    `accept`; one that does something by itself, or reports events, overrides `update`.
+    the inputs, `array_targets` those of the outputs, where the device has such channels. A driver that is commanded
+    names its `commands` and overrides `accept`; one that does something by itself, or reports events, overrides
+    `update`.
 
     Args:
         slave: the slave's name and description.
@@ -74,8 +75,11 @@ class Driver:
         self.codec_in, self.codec_out = make_codec(self.tpdo), make_codec(self.rpdo)
         self.values: dict[str, float] = {channel.name: 0.0 for channel in self.tpdo.channels if _is_number(channel)}
         self.targets: dict[str, float] = {channel.name: 0.0 for channel in self.rpdo.channels if _is_number(channel)}
-        self.arrays = {name: bytes(length) for name, length in _arrays(self.tpdo)}
-        self.array_targets = {name: bytes(length) for name, length in _arrays(self.rpdo)}
+        # Only where there are some: an instance of more than 30 attributes is slower in the interpreter.
+        if arrays := _arrays(self.tpdo):
+            self.arrays = arrays
+        if arrays := _arrays(self.rpdo):
+            self.array_targets = arrays
         self._input_names, self._output_names = tuple(self.values), tuple(self.targets)
 
     def decode(self, data: bytes) -> None:
@@ -225,8 +229,8 @@ def _is_number(channel: Channel) -> bool:
     return channel.index != 0 and channel.type != "bytes"
 
 
-def _arrays(image: ImageLayout) -> list[tuple[str, int]]:
-    return [(one.name, one.bits // 8) for one in image.channels if one.index and one.type == "bytes"]
+def _arrays(image: ImageLayout) -> dict[str, bytes]:
+    return {one.name: bytes(one.bits // 8) for one in image.channels if one.index and one.type == "bytes"}
 
 
 def integer_range(channel: Channel) -> tuple[int, int]:
