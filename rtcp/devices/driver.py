@@ -36,8 +36,9 @@ class Driver:
     and packs the outputs in `encode`, each called once a cycle. This class keeps the layout of both images, and by
     itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name; all of
     them are in the cycle record, named SLAVE_CHANNEL. Channels of type `bytes` are in neither: `arrays` holds those of
-    the inputs, `array_targets` those of the outputs. A driver that is commanded names its `commands` and overrides
-    `accept`; one that does something by itself, or reports events, overrides `update`.
+    the inputs, `array_targets` those of the outputs, where the device has such channels. A driver that is commanded
+    names its `commands` and overrides `accept`; one that does something by itself, or reports events, overrides
+    `update`.
 
     Args:
         slave: the slave's name and description.
@@ -76,11 +77,14 @@ class Driver:
         self.safe_values = {entry.name: entry.safe for entry in device.outputs}
         """What the outputs are at the start and after a fault, SI."""
         self.targets: dict[str, float] = dict(self.safe_values)
-        self.arrays = {name: bytes(length) for name, length in _arrays(self.tpdo)}
-        self.array_targets = {name: bytes(length) for name, length in _arrays(self.rpdo)}
         self._in_offsets = {entry.name: entry.offset for entry in device.inputs}
         self._out_offsets = {entry.name: entry.offset for entry in device.outputs}
         self._counters = {entry.name: Counter(entry.modulo) for entry in device.inputs if entry.modulo}
+        # Only where there are some: an instance of more than 30 attributes is slower in the interpreter.
+        if arrays := _arrays(self.tpdo):
+            self.arrays = arrays
+        if arrays := _arrays(self.rpdo):
+            self.array_targets = arrays
         self.safe_outputs = Driver.encode(self)
         """The image of the outputs with these values, for a driver that raises."""
         self._input_names, self._output_names = tuple(self.values), tuple(self.targets)
@@ -262,8 +266,8 @@ def _is_number(channel: Channel) -> bool:
     return channel.index != 0 and channel.type != "bytes"
 
 
-def _arrays(image: ImageLayout) -> list[tuple[str, int]]:
-    return [(one.name, one.bits // 8) for one in image.channels if one.index and one.type == "bytes"]
+def _arrays(image: ImageLayout) -> dict[str, bytes]:
+    return {one.name: bytes(one.bits // 8) for one in image.channels if one.index and one.type == "bytes"}
 
 
 def integer_range(channel: Channel) -> tuple[int, int]:

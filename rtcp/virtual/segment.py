@@ -451,9 +451,9 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
     slaves = make_slaves(devices, drifts, [cable.arrival for cable in cables], aliases, t)
     segment = Segment(slaves, t, connections)
     segment.arm = make_arm(config, devices)
-    document = read(config.source)
+    document = read(config.source) if any(isinstance(device, DescribedDevice) for device in devices) else None
     for i, device in enumerate(devices):
-        if isinstance(device, DescribedDevice):
+        if isinstance(device, DescribedDevice) and document is not None:
             device.runner.place = f"{config.source}:{document.line(('slaves', i))}: slave {i + 1}"
     return segment
 

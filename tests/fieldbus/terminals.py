@@ -91,6 +91,8 @@ def bits(product: int, count: int, place: int = 0) -> model.Device:
 DEVICES = {
     "coupler": device(1, [], []),
     **{f"bits{count}": bits(10 + count, count) for count in range(1, 8)},
+    # AL status is a copy of AL control (PDI configuration, byte 1 bit 0), as in most terminals.
+    "emulated": replace(bits(19, 4), config_data=bytes((0x05, 0x01))),
     "input": device(20, [], [(0, 0x1000, 3)]),
     "output": device(21, [(0, 0x0F00, 16)], []),
     # Three areas of outputs with gaps between them: SOEM's own FMMUs are wrong.

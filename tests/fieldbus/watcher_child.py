@@ -254,7 +254,7 @@ def branches(bus: SoemBus, count: int, control: str, kinds: list[str]) -> Any:
             client.clear(cable)
             return found
 
-        cable = client.fault({"fault": "cable", "after": 1})
+        cable = client.fault({"fault": "cable", "after": 1, "port": 3})
         return one.episode([{"fault": "power", "slave": 4, "lasts": 0.05}], other_branch)
 
 
