@@ -306,6 +306,7 @@ def _scaling_lines(device: Device) -> Iterator[str]:
             yield f"    rated_torque: {rated / 1000:.10g}     # Nm; 0x{0x6076 + base:04X}, default"
         else:
             yield f"    rated_torque: 1.0     # Nm, 0x{0x6076 + base:04X}, has no default: read it from the drive"
+        yield "    torque_at: motor     # or output: the shaft of the rated torque"
     yield ""
 
 

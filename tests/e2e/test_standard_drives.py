@@ -92,6 +92,25 @@ def test_an_arm_of_two_axis_drives_moves_is_recovered_and_its_channels_are_read_
     assert started.status()["state"] == "holding"
 
 
+def test_an_arm_is_built_from_the_makers_file_and_moves(platform: Platform) -> None:
+    platform.be_patient(2000)
+    folder = platform.directory / "config"
+    build(folder)
+    made, arm = folder / "devices" / "made.yaml", folder / "assistive_arm.yaml"
+    said = platform.rtcp("device", "new", "--esi", str(folder / "drive.xml"), "--out", str(made)).stdout
+    assert "CHECK" in said
+    made.write_text(made.read_text().replace("torque_at: motor", "torque_at: output"))
+    arm.write_text(arm.read_text().replace("device: two-axis-drive", "device: made"))
+    compared = platform.rtcp("device", "check", str(made), "--bus", "virtual").stdout
+    assert compared.count("as the file says") == 3
+    platform.rtcp("start", "--detach")
+    goal = [0.2, 0.3, 0.4, -0.2, 0.4, 0.3]
+    with rtcp.connect("a test", control_socket(platform.directory)) as robot:
+        robot.enable()
+        robot.move_joints(goal, speed=0.5)
+        assert robot.positions == pytest.approx(goal, abs=5e-3)
+
+
 def test_a_drive_that_counts_otherwise_than_its_file_does_not_start(platform: Platform) -> None:
     platform.be_patient(2000)
     folder = platform.directory / "config"
