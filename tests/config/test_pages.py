@@ -25,6 +25,8 @@ OWN = [
     "segment.md",
     "behaviours.md",
     "guiding.md",
+    "conformance.md",
+    "your_own_arm.md",
 ]
 KEYS = {
     "arm": list(keys_of(ArmFile)),
@@ -79,3 +81,10 @@ def test_a_page_is_short_and_its_links_lead_somewhere(name: str) -> None:
         assert target.exists(), link
         titles = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE) if anchor else []
         assert not anchor or anchor in [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
+
+
+def test_every_test_that_the_conformance_page_names_exists() -> None:
+    tests = "".join(file.read_text() for file in (FOLDER.parent / "tests").rglob("test_*.py"))
+    named = re.findall(r"`(test_\w+)`", (FOLDER / "conformance.md").read_text())
+    assert len(named) > 40
+    assert [name for name in named if f"def {name}(" not in tests] == []
