@@ -25,6 +25,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket, segment_control
 from rtcp.ipc.session import read_processes
 from rtcp.virtual.faults.control import SegmentClient
+from tests.e2e.arms import replace_drives
 
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
@@ -67,6 +68,8 @@ class Platform:
         segment = mine / "segment.yaml"
         segment.write_text(re.sub(r", initial_position: [-0-9.]+", "", segment.read_text()))
         self.environment["RTCP_CONFIG"] = str(file)
+        if other := os.environ.get("RTCP_TEST_ARM"):
+            replace_drives(mine, other)
 
     def rtcp(self, *arguments: str, check: int | None = 0) -> subprocess.CompletedProcess[str]:
         """Run `rtcp` with `arguments`; assert its exit code unless `check` is None."""

@@ -12,6 +12,7 @@ import rtcp
 from rtcp.config import load_device
 from rtcp.ipc.runtime_directory import control_socket
 from tests.drive_esi import write_esi
+from tests.e2e.arms import TWO_AXIS, replace_drives
 from tests.e2e.conftest import Platform
 
 pytestmark = pytest.mark.alone
@@ -31,28 +32,20 @@ tpdo:
     channels:
       - {index: 0x6000, sub_index: 1, type: uint16, name: pressure, factor: 0.01, offset: -1, unit: bar}
 """
-OBJECTS = {
-    index + shift: held
-    for shift in (0, 0x800)
-    for index, held in ((0x608F, (131072, 1)), (0x6091, (50, 1)), (0x6076, ("UDINT", 40_000)), (0x603F, ("UINT", 0)))
-}
 
 
 def build(folder: Path) -> None:
     """Replace the six drives of the configuration in `folder` by three of two axes, and add the valves."""
-    devices = folder / "devices"
-    (devices / "valves.yaml").write_text(VALVES)
-    write_esi(folder / "drive.xml", load_device(devices / "two-axis-drive.yaml"), OBJECTS)
-    write_esi(folder / "valves.xml", load_device(devices / "valves.yaml"), {})
-    arm, segment = (yaml.safe_load((folder / name).read_text()) for name in ("assistive_arm.yaml", "segment.yaml"))
-    drives = [{"name": f"drive{i}", "device": "two-axis-drive"} for i in (1, 2, 3)]
-    arm["slaves"] = [arm["slaves"][0], *drives, {"name": "valves", "device": "valves"}]
-    for i, joint in enumerate(arm["joints"]):
-        joint |= {"slave": f"drive{i // 2 + 1}", "axis": i % 2 + 1}
-    drive = {"esi": "drive.xml", "behaviour": "cia402", "options": {"rated_torque": 40.0, "sync_error_limit": 0}}
-    segment["slaves"] = [segment["slaves"][0], *[drive] * 3, {"esi": "valves.xml"}]
-    for name, data in (("assistive_arm.yaml", arm), ("segment.yaml", segment)):
-        (folder / name).write_text(yaml.safe_dump(data))
+    replace_drives(folder, "two-axis")
+    (folder / "devices" / "valves.yaml").write_text(VALVES)
+    write_esi(folder / "valves.xml", load_device(folder / "devices" / "valves.yaml"), {})
+    for file, slave in (
+        ("assistive_arm.yaml", {"name": "valves", "device": "valves"}),
+        ("segment.yaml", {"esi": "valves.xml"}),
+    ):
+        data = yaml.safe_load((folder / file).read_text())
+        data["slaves"].append(slave)
+        (folder / file).write_text(yaml.safe_dump(data))
 
 
 @pytest.fixture
@@ -115,7 +108,9 @@ def test_a_drive_that_counts_otherwise_than_its_file_does_not_start(platform: Pl
     platform.be_patient(2000)
     folder = platform.directory / "config"
     build(folder)
-    write_esi(folder / "drive.xml", load_device(folder / "devices/two-axis-drive.yaml"), {**OBJECTS, 0x688F: (1024, 1)})
+    write_esi(
+        folder / "drive.xml", load_device(folder / "devices/two-axis-drive.yaml"), {**TWO_AXIS, 0x688F: (1024, 1)}
+    )
     refused = platform.rtcp("start", "--detach", check=None)
     assert refused.returncode != 0
     said = " ".join((refused.stdout + refused.stderr).split())
