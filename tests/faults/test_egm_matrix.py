@@ -54,7 +54,7 @@ def test_what_the_controller_does_not_offer_is_refused_with_the_reason(trials: T
     assert trials.harness.move(START) == ""
     done = trials.platform.rtcp("sdo", "read", "1", "0x6041", check=3)
     assert "no SDO on a bus of kind egm: a robot controller has no SDO" in done.stderr
-    with pytest.raises(RtcpError, match="joint_1 has no homing here: its robot controller knows"):
+    with pytest.raises(RtcpError, match="joint_1 has no homing here: the robot controller knows"):
         trials.harness.robot.home("joint_1")
     assert trials.harness.state().name == "HOLDING"
 
