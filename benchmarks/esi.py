@@ -34,7 +34,7 @@ def vendor(file: DeviceFile) -> str:
 
 
 def read_files(folder: Path) -> tuple[list[DeviceFile], list[str]]:
-    """Return the files, and the reason of each that is none; copies of a file count once."""
+    """Return the ESI files, and why each other file was refused; copies count once."""
     files, refused = [], []
     seen = set()
     for path in sorted(folder.rglob("*")):

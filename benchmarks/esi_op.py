@@ -130,7 +130,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--only", default="", help="only devices with this in file or name")
     parser.add_argument("--batch", type=int, default=8)
-    parser.add_argument("--every", type=int, default=1, help="only each so many")
+    parser.add_argument("--every", type=int, default=1, help="only every n-th device")
     parser.add_argument("--json", type=Path, help="also write the reasons to this file")
     parser.add_argument("--child", type=json.loads, help=argparse.SUPPRESS)
     given = parser.parse_args()

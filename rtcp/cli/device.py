@@ -103,8 +103,8 @@ def _new(
     chosen = _slots(module or ())
     if esi is not None:
         content = _read(esi)
-        found = find_device(content, product=_number("--product", product), revision=_number("--revision", revision))
-        made = assemble(found, content.modules, chosen) if found.slots or chosen else found
+        bare = find_device(content, product=_number("--product", product), revision=_number("--revision", revision))
+        made = assemble(bare, content.modules, chosen) if bare.slots or chosen else bare
     elif chosen:
         raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
     else:

@@ -71,7 +71,7 @@ def kind_of(device: Device) -> str:
     rx, tx = (entries_of(assigned(device, outputs)) for outputs in (True, False))
     if not rx and not tx:
         return "coupler"
-    coe = None if device.mailbox is None else device.mailbox.coe
+    coe = device.coe
     if _axes(device) and (coe is not None or {_MODE_OBJECT, _MODE_OBJECT + 1} <= {entry.index for entry in (*rx, *tx)}):
         return "cia402"
     if _counter(device) is not None:
@@ -113,7 +113,7 @@ def _with_mode_display(device: Device) -> Device:
         return device
     manager, there = _usual_sync_manager(device, outputs=False), {pdo.index for pdo in assigned(device, False)}
     shown = _object(device, _MODE_OBJECT + 1, 0)
-    can_map = device.mailbox is not None and device.mailbox.coe is not None and device.mailbox.coe.pdo_configuration
+    can_map = device.coe is not None and device.coe.pdo_configuration
     tx_pdos = list(device.tx_pdos)
     for at, pdo in enumerate(tx_pdos):
         if _MODE_OBJECT + 1 in {entry.index for entry in pdo.entries} and not pdo.excludes & there:
@@ -141,7 +141,7 @@ def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, 
     if fitting := [pdo for pdo in pdos if needed <= {entry.index for entry in pdo.entries} and not pdo.virtual]:
         best = min(fitting, key=lambda pdo: (pdo.bits, pdo.index))
         return tuple(replace(pdo, sync_manager=manager if pdo is best else None) for pdo in pdos)
-    coe = None if device.mailbox is None else device.mailbox.coe
+    coe = device.coe
     if coe is None or not coe.pdo_configuration:
         return None
     entries = []
@@ -192,7 +192,7 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
         "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
     )
     yield f"watchdog_ms: {watchdog}             # ms; {note}"
-    coe = None if device.mailbox is None else device.mailbox.coe
+    coe = device.coe
     if coe is None:
         yield "coe: false                  # it has no object dictionary: its mapping is that of its EEPROM"
     configurable = coe is not None and coe.pdo_assignment and not _calls_inputs_outputs(device)
@@ -356,7 +356,7 @@ def _pdo_lines(
         yield f"{key}: []"
         yield ""
         return
-    coe = None if device.mailbox is None else device.mailbox.coe
+    coe = device.coe
     can_map = coe is not None and coe.pdo_configuration
     usual = _usual_sync_manager(device, outputs)
     named_managers = any(pdo.sync_manager != usual for pdo in filled)

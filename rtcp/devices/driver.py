@@ -77,8 +77,6 @@ class Driver:
         self.safe_values = {entry.name: entry.safe for entry in device.outputs}
         """What the outputs are at the start and after a fault, SI."""
         self.targets: dict[str, float] = dict(self.safe_values)
-        self._in_offsets = {entry.name: entry.offset for entry in device.inputs}
-        self._out_offsets = {entry.name: entry.offset for entry in device.outputs}
         self._counters = {entry.name: Counter(entry.modulo) for entry in device.inputs if entry.modulo}
         # Only where there are some: an instance of more than 30 attributes is slower in the interpreter.
         if arrays := _arrays(self.tpdo):
@@ -98,7 +96,7 @@ class Driver:
                     continue
                 counter = self._counters.get(channel.name)
                 counts = counts if counter is None else counter.follow(counts)  # noqa: PLW2901
-                self.values[channel.name] = counts * channel.factor + self._in_offsets[channel.name]
+                self.values[channel.name] = counts * channel.factor + channel.offset
 
     def accept(self, command: Command) -> Refusal | None:
         """Carry out one of `commands`; or return why not, and change nothing."""
@@ -152,7 +150,7 @@ class Driver:
         value = self.targets[channel.name]
         if isnan(value):
             value = self.safe_values[channel.name]  # what is no number is no reason to end the cycle
-        counts = (value - self._out_offsets[channel.name]) / channel.factor
+        counts = (value - channel.offset) / channel.factor
         if channel.type.startswith("float"):
             return counts
         low, high = (0, 1) if channel.type == "bool" else integer_range(channel)
@@ -160,7 +158,7 @@ class Driver:
 
 
 class Counter:
-    """Counts that begin anew at 0 after `modulo` of them, counted on over that, in either direction.
+    """Continues the count of a counter that wraps to 0 after `modulo` counts, in either direction.
 
     Args:
         modulo: number of different counts; a step of more than half of them is taken for one in the other direction.

@@ -324,6 +324,11 @@ class Device:
     unread: Mapping[str, int] = field(default_factory=dict)
     """Parts of the description that were not understood, by name, with how often; they are warned of."""
 
+    @property
+    def coe(self) -> Coe | None:
+        """What it can do over CoE; None: it has none."""
+        return None if self.mailbox is None else self.mailbox.coe
+
 
 @dataclass(frozen=True)
 class DeviceFile:

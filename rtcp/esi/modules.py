@@ -14,7 +14,7 @@ IDENT_LIST = 0xF030
 
 
 def places(device: Device) -> tuple[Slot, ...]:
-    """Return the slot of each place, by number: a slot for several modules counts so many times."""
+    """Return the slot of each place, by number: a slot that holds n modules has n places."""
     return tuple(slot for slot in device.slots for _ in range(slot.maximum))
 
 

@@ -214,7 +214,7 @@ def write_sii(device: Device, alias: int | None = None) -> bytes:
     alias = device.station_alias if alias is None else alias
     size = device.eeprom_bytes
     forms = [(True, True)]
-    if device.mailbox is not None and device.mailbox.coe is not None:
+    if device.coe is not None:
         forms.append((False, True))
     else:
         forms.append((True, False))

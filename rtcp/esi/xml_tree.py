@@ -104,7 +104,7 @@ class Node:
 
 
 class Warnings:
-    """Sentences on what is accepted, each with its file and line; only so many."""
+    """Warnings about accepted deviations, each with file and line; their number is bounded."""
 
     def __init__(self, path: str) -> None:
         self.path = path

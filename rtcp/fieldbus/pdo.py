@@ -39,6 +39,8 @@ class Channel:
     bit_offset: int
     bits: int
     unit: str = ""
+    offset: float = 0.0
+    """SI value at 0 counts."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,8 @@ def layout(pdos: Sequence[Pdo]) -> ImageLayout:
         for entry in (entry for pdo in group for entry in pdo.channels):
             channels.append(
                 Channel(
-                    entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, entry.length, entry.unit
+                    entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, entry.length,
+                    entry.unit, entry.offset,
                 )
             )  # fmt: skip
             offset += entry.length

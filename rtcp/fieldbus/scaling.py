@@ -119,6 +119,6 @@ def _counts(count: float) -> Reading:
 
 
 def _velocity_unit(sdo: SdoClient, index: int) -> Steps[Value | None]:
-    """Return the unit of velocities; one that is none of those of `velocity_unit` by its number."""
+    """Return the unit of velocities; a unit that `velocity_unit` does not know as its number."""
     code = yield from _reading(sdo, index, 0)
     return None if not code else _UNITS.get(code, f"the unit 0x{code:08X}")

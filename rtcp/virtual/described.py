@@ -63,15 +63,14 @@ class DescribedDevice(DeviceModel):
 
     def __init__(self, device: Device, image: Callable[[int], bytes], behaviour: type[Behaviour] | None = None,
                  **options: object) -> None:  # fmt: skip
-        has_coe = device.mailbox is not None and device.mailbox.coe is not None
-        self.description = device = complete(device) if has_coe else device
+        self.description = device = device if device.coe is None else complete(device)
         self._image = image
         mailbox = device.mailbox
         self.sync_managers = _layout(device)
         self.supports_dc = bool(device.dc_modes)
         self.sync_activations = frozenset(mode.assign_activate >> 8 for mode in device.dc_modes) - {0}
         self.physics = _ports(device.physics)
-        coe = None if mailbox is None else mailbox.coe
+        coe = device.coe
         self.coe = None if coe is None else CoeFeatures(coe.sdo_information, coe.complete_access)
         self.smallest_mailbox = min([34, *(m.length for m in self.sync_managers if _is_mailbox(m) and m.length)])
         if mailbox is not None and mailbox.foe:

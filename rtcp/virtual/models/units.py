@@ -10,7 +10,7 @@ from rtcp.virtual.objects import ObjectDictionary, bounds
 AXIS_STRIDE = 0x800
 """Distance of the objects of two axes of a drive: 0x6040 and 0x6840 (ETG.6010, CiA 402-2)."""
 LIMITLESS = 0x7FFF_FFFF
-"""A limit that is none."""
+"""Stands for an unlimited value."""
 _PROFILE = range(0x6000, 0x6800)
 """Objects of the first axis; those below belong to the whole device."""
 
