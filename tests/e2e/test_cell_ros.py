@@ -49,12 +49,14 @@ def test_twelve_joints_are_one_group(irbs: RunningCell) -> None:
         assert call(session, "robot_enable", "std_srvs/srv/Trigger").success
         until(lambda: received and sorted(joints()) == sorted(NAMES), "the joints of both arms")
         begin = [joints()[name] for name in NAMES]
+        # The cell is there from the first test to the last: who comes again stands where the test ends.
+        there = HOME if begin == pytest.approx(THERE, abs=0.1) else THERE
         records = Records(irbs)
-        points = [point(0.0, begin), point(3.0, THERE)]
+        points = [point(0.0, begin), point(3.0, there)]
         trajectory = make("trajectory_msgs/msg/JointTrajectory", joint_names=NAMES, points=points)
         answer = call(session, "joint_path_command", "industrial_msgs/srv/CmdJointTrajectory", trajectory=trajectory)
         assert answer.code.val == 1
-        until(lambda: [joints()[name] for name in NAMES] == pytest.approx(THERE, abs=2e-3), "the end of the trajectory")
+        until(lambda: [joints()[name] for name in NAMES] == pytest.approx(there, abs=2e-3), "the end of the trajectory")
         (began, ended), (other_began, other_ended) = instants(records.read()).values()
         assert abs(began - other_began) <= 4_200_000
         assert abs(ended - other_ended) <= 8_400_000
@@ -63,7 +65,7 @@ def test_twelve_joints_are_one_group(irbs: RunningCell) -> None:
         publisher = session.declare_publisher(key_of(0, "joint_command", POINT))
         start = time.monotonic()
         while (t := time.monotonic() - start) < 3.0:
-            moved = make(POINT, positions=[q + 0.08 * sin(3.0 * t) * min(t, 1.0) for q in THERE])
+            moved = make(POINT, positions=[q + 0.08 * sin(3.0 * t) * min(t, 1.0) for q in there])
             publisher.put(encode(POINT, moved))
             time.sleep(1.0 / 30.0)
         found = records.read()
