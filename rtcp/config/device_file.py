@@ -7,9 +7,10 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from math import isclose
 
 from rtcp.config.model import BITS
-from rtcp.config.scaling import OBJECTS_PER_AXIS
+from rtcp.config.scaling import BOUNDING_OBJECTS, OBJECTS_PER_AXIS, TORQUE_UNITS, VELOCITY_UNITS, TorqueUnit
 from rtcp.esi import units
 from rtcp.esi.dictionary import complete
 from rtcp.esi.model import DcMode, Device, ObjectEntry, Pdo, PdoEntry, SyncManagerType
@@ -45,6 +46,9 @@ _DRIVE_CHANNELS = {
 _NEEDED = {True: (0x6040, 0x607A), False: (0x6041, 0x6064)}
 """Objects that the driver of a drive cannot do without, by whether they are outputs."""
 _MODE_OBJECT, _CSP = 0x6060, 8
+_MOST_SPEED, _RATED = 0x6080, 1000
+"""Of the objects that bound a drive: the one that is no torque; the rated torque, in the unit of the others."""
+_QUICK_STOP_OPTION, _RAMP_AND_HOLD = 0x605A, 6
 _SYNC0 = 0x0200
 """Bit of AssignActivate that activates SYNC0."""
 _DRIVE_WATCHDOG_MS, _WATCHDOG_MS = 20, 100
@@ -177,12 +181,7 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
     yield from _comment("Made by `rtcp device new`. Lines marked CHECK need a person.")
     yield ""
     yield f"name: {_quoted(device.name or f'0x{identity.product_code:08X}')}"
-    needed = ", ".join(f"0x{index:04X}" for outputs in (True, False) for index in _NEEDED[outputs])
-    yield f"kind: {kind}" + (
-        f"     # CHECK: a drive whose PDOs lack one of {needed}: it can move no joint"
-        if kind != "cia402" and _is_drive(device)
-        else ""
-    )
+    yield f"kind: {kind}" + _kind_note(device, kind)
     yield f"vendor_id: 0x{identity.vendor_id:08X}"
     yield f"product_id: 0x{identity.product_code:08X}"
     yield ""
@@ -208,6 +207,13 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
     for key, outputs in (("rpdo", True), ("tpdo", False)):
         yield from _pdo_lines(device, kind, key, assigned(device, outputs), outputs, names, configurable)
         yield from _others(device, key, outputs)
+
+
+def _kind_note(device: Device, kind: str) -> str:
+    if kind != "cia402" and _is_drive(device):
+        needed = ", ".join(f"0x{index:04X}" for outputs in (True, False) for index in _NEEDED[outputs])
+        return f"     # CHECK: a drive whose PDOs lack one of {needed}: it can move no joint"
+    return "     # CHECK: by the names of its inputs; else generic" if kind == "encoder" else ""
 
 
 def _clock_lines(device: Device, kind: str) -> Iterator[str]:
@@ -283,6 +289,14 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
                 f"  - {{index: 0x{index:04X}, sub_index: 0, type: int8, value: {_CSP}, name: modes of operation}}"
                 "   # CSP"
             )
+    set_by_file = {command.index for command in device.init_commands}
+    for axis in (_axes(device) or (1,)) if kind == "cia402" else ():
+        index = _QUICK_STOP_OPTION + (axis - 1) * OBJECTS_PER_AXIS
+        if index not in set_by_file and _object(device, index, 0) is not None:
+            written.append(
+                f"  - {{index: 0x{index:04X}, sub_index: 0, type: int16, value: {_RAMP_AND_HOLD}, "
+                "name: quick stop option code, optional: true}   # CHECK: 6: ramp down, then hold; 2 drops the torque"
+            )
     if written:
         yield "# Start-up SDOs, written in PRE-OP in this order and read back, in the device's own units."
         if any(line.startswith("  - ") for line in written):
@@ -292,7 +306,7 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
 
 
 def _scaling_lines(device: Device) -> Iterator[str]:
-    yield "# CHECK: what the drive counts in; compared with the drive's own objects at the start (docs/devices.md)."
+    yield "# CHECK: what the drive counts in; compared with the drive's own objects at the start (docs/drives.md)."
     yield "scaling:"
     for axis in _axes(device) or (1,):
         base = (axis - 1) * OBJECTS_PER_AXIS
@@ -301,13 +315,31 @@ def _scaling_lines(device: Device) -> Iterator[str]:
         yield f"  - encoder_increments: {increments:.10g}     # per motor revolution; {where}"
         gear, where = _ratio(device, 0x6091 + base, 1)
         yield f"    gear_ratio: {gear:.10g}     # motor revolutions per revolution of the output; {where}"
+        yield from _velocity_lines(device, 0x60A9 + base)
         rated = _default(device, 0x6076 + base, 0)
+        unit = _torque_unit(device, 0x6076 + base)
         if rated:
-            yield f"    rated_torque: {rated / 1000:.10g}     # Nm; 0x{0x6076 + base:04X}, default"
+            yield f"    rated_torque: {rated * TORQUE_UNITS[unit]:.10g}     # Nm; 0x{0x6076 + base:04X}, default"
         else:
-            yield f"    rated_torque: 1.0     # Nm, 0x{0x6076 + base:04X}, has no default: read it from the drive"
-        yield "    torque_at: motor     # or output: the shaft of the rated torque"
+            yield f"    rated_torque: 1.0     # CHECK: Nm; 0x{0x6076 + base:04X} has no default: read it from the drive"
+        if unit != "mNm":
+            yield f"    rated_torque_unit: {unit}"
+        yield "    torque_at: motor     # CHECK: or output; no object tells the shaft of the rated torque. Where motor is wrong"
+        yield "                         # the torques shown are too large by the gear, and the arm stops as it moves."
     yield ""
+
+
+def _torque_unit(device: Device, index: int) -> TorqueUnit:
+    entry = _object(device, index, 0)
+    unit = None if entry is None or entry.unit is None else units.unit(entry.unit)
+    fitting = (name for name, factor in TORQUE_UNITS.items() if unit is not None and isclose(factor, unit.factor))
+    return next(fitting, "mNm") if unit is not None and unit.si == "Nm" else "mNm"
+
+
+def _velocity_lines(device: Device, index: int) -> Iterator[str]:
+    code = _default(device, index, 0)
+    if code is not None and (unit := VELOCITY_UNITS.get(int(code))) not in (None, "counts/s"):
+        yield f"    velocity_unit: {unit}     # 0x{index:04X}, default"
 
 
 def _shows_mode(device: Device, axis: int) -> bool:
@@ -319,7 +351,8 @@ def _ratio(device: Device, index: int, otherwise: float) -> tuple[float, str]:
     """Return the default of a ratio, subindex 1 by 2, and where it is from; `otherwise` where there is none."""
     above, below = _default(device, index, 1), _default(device, index, 2)
     if not above:
-        return otherwise, f"0x{index:04X} has no default: read it from the drive or its manual"
+        mark = "" if otherwise == 1 else "CHECK: "
+        return otherwise, f"{mark}0x{index:04X} has no default: read it from the drive or its manual"
     return above / (below or 1.0), f"0x{index:04X}, default"
 
 
@@ -405,13 +438,25 @@ def _channel_lines(
     if is_constant:
         keys += f", safe: {_CSP}"  # no PDO shows the mode: it is not changed
     described = _object(device, entry.index, entry.sub_index)
-    unit = None if described is None or described.unit is None or known else units.unit(described.unit)
+    is_bound = kind == "cia402" and key == "rpdo" and entry.index - (axis - 1) * OBJECTS_PER_AXIS in BOUNDING_OBJECTS
+    if is_bound:
+        keys += f", safe: {_default(device, entry.index, entry.sub_index) or _widest(entry, axis):.10g}"
+    has_unit = described is not None and described.unit is not None and not known and not is_bound
+    unit = units.unit(described.unit) if has_unit else None
     if unit is not None and unit.si:
         keys += f", factor: {unit.factor:.10g}, unit: {_quoted(unit.si)}"
     said = [_clean(entry.name), entry.type if entry.type.upper() not in ("", "BOOL") else ""]
     if described is not None:
         said += _range_text(described)
+    if is_bound:
+        said.append("CHECK: always sent; at 0 the drive has no torque")
     yield f"      - {{{keys}}}   # {', '.join(text for text in said if text)}".rstrip(" #")
+
+
+def _widest(entry: PdoEntry, axis: int) -> int:
+    """Return what bounds a drive least: its rated torque, or the largest speed that the object can hold."""
+    is_speed = entry.index - (axis - 1) * OBJECTS_PER_AXIS == _MOST_SPEED
+    return (1 << entry.bits - 1) - 1 if is_speed else _RATED
 
 
 def prefix_of(pdo: Pdo) -> str:

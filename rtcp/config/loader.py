@@ -38,7 +38,7 @@ from rtcp.config.model import (
     SlaveConfig,
 )
 from rtcp.config.numbers import Name
-from rtcp.config.scaling import QUANTITIES, DriveScaling
+from rtcp.config.scaling import FACTOR_TOLERANCE, QUANTITIES, DriveScaling
 from rtcp.config.validation import EVERY_KEY, Checker, FileRule, allowed, keys, rule
 
 RENAMED = {
@@ -268,7 +268,7 @@ def load_device(path: Path, period_us: float | None = None) -> DeviceDescription
 def _with_factors(data: Any) -> tuple[Any, list[Finding]]:
     """Return a device's file with the factors that follow from its scaling, and what the scaling says too little for.
 
-    A factor that is written stays. What is no valid scaling is left to the checker.
+    A factor that is written must be the same. What is no valid scaling is left to the checker.
     """
     written = data.get("scaling")
     made = [_SCALING.check(entry)[0] for entry in written] if isinstance(written, list) else []
@@ -287,12 +287,19 @@ def _with_factors(data: Any) -> tuple[Any, list[Finding]]:
             for j, channel in enumerate(channels):
                 images[image][-1]["channels"].append(channel)
                 quantity = QUANTITIES.get(str(channel.get("name"))) if isinstance(channel, dict) else None
-                if quantity is None or "factor" in channel:
+                if quantity is None:
                     continue
                 axis = channel.get("axis") or pdo.get("axis", 1)
                 scaling = made[0] if len(made) == 1 else made[axis - 1] if axis in range(1, len(made) + 1) else None
                 factor = None if scaling is None else scaling.factor(quantity)
-                if factor is not None:
+                if "factor" in channel:
+                    found = channel["factor"]
+                    if factor is None or not isinstance(found, int | float):
+                        continue
+                    if not math.isclose(found, factor, rel_tol=FACTOR_TOLERANCE):
+                        text = f"found {found:.10g}, but from scaling follows {factor:.10g}: leave it out"
+                        findings.append(((image, i, "channels", j, "factor"), text))
+                elif factor is not None:
                     images[image][-1]["channels"][-1] = {**channel, "factor": factor}
                 elif scaling is not None:
                     text = "the key factor is missing; without it scaling needs rated_torque, or rated_current and "

@@ -8,6 +8,7 @@ of the attribute docstrings here.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
@@ -74,6 +75,8 @@ BITS: dict[str, int] = {
     "float32": 32, "float64": 64,
 }  # fmt: skip
 """Lengths of the types that have one; `bits` and `bytes` are as long as their entry says."""
+LARGEST = {"float32": (2.0 - 2.0**-23) * 2.0**127, "float64": sys.float_info.max}
+"""Largest finite values of the types that are no integers."""
 AxisNumber = Annotated[int, Ge(1), Le(8)]
 """Axis of a drive, from 1: its objects stand 0x800 above those of the one before (CiA 402)."""
 DriveModeName = Literal["csp", "csv", "cst"]
@@ -133,9 +136,9 @@ class PdoEntry:
     modulo: Annotated[int, Ge(0)] = 0
     """Of an input: counts after which it begins anew at 0, as an encoder of one turn; its value counts on. 0: never."""
     min: float | None = None
-    """Of an output: smallest value that a command may set, in the channel's unit; left out: that of `type`."""
+    """Of an output: smallest value that is sent, in the channel's unit; left out: that of `type`."""
     max: float | None = None
-    """Of an output: largest value that a command may set, in the channel's unit; left out: that of `type`."""
+    """Of an output: largest value that is sent, in the channel's unit; left out: that of `type`."""
     safe: float = 0.0
     """Of an output: value, in the channel's unit, from the start until it is commanded, and after a fault."""
     axis: AxisNumber | None = None
@@ -148,10 +151,9 @@ class PdoEntry:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Smallest and largest value that a command may set, SI: of `min` and `max`, and of the type."""
-        low, high = -math.inf, math.inf
-        if not self.type.startswith("float"):
-            low, high = sorted(end * self.factor + self.offset for end in integer_range(self.type, self.length))
+        """Smallest and largest value that it is given, SI: of `min` and `max`, and of the type."""
+        ends = sorted(end * self.factor + self.offset for end in type_range(self.type, self.length))
+        low, high = max(ends[0], -LARGEST["float64"]), min(ends[1], LARGEST["float64"])
         return (
             low if self.min is None else max(low, self.min),
             high if self.max is None else min(high, self.max),
@@ -246,7 +248,7 @@ class DeviceDescription:
     @property
     def has_channels(self) -> bool:
         """Whether commands see its channels by name, and set those of `rpdo`."""
-        return self.kind in CHANNEL_KINDS and not self.is_box
+        return self.kind in CHANNEL_KINDS
 
     @property
     def outputs(self) -> tuple[PdoEntry, ...]:
@@ -262,7 +264,8 @@ class DeviceDescription:
     def is_box(self) -> bool:
         """Whether inputs and outputs with a function may hang on it: it maps channels of these names."""
         mapped = [{entry.name for pdo in pdos for entry in pdo.channels} for pdos in (self.rpdo, self.tpdo)]
-        return self.kind == "io" or (self.kind != "cia402" and "outputs" in mapped[0] and "inputs" in mapped[1])
+        other = self.kind not in CHANNEL_KINDS and self.kind != "cia402"
+        return self.kind == "io" or (other and "outputs" in mapped[0] and "inputs" in mapped[1])
 
     @property
     def axes(self) -> tuple[int, ...]:
@@ -288,7 +291,7 @@ class DeviceDescription:
         return next((sdo.value for sdo in reversed(self.sdo) if (sdo.index, sdo.sub_index) == (index, 0)), None)
 
     def wire_range(self, channel: str) -> tuple[float, float]:
-        """Return the range of a channel to the device, SI; infinite where it is a float or does not exist."""
+        """Return the range of a channel to the device, SI; infinite where it does not exist."""
         for entry in (entry for pdo in self.rpdo for entry in pdo.channels):
             if entry.name == channel:
                 return entry.range
@@ -306,6 +309,12 @@ def _of_axis(pdos: Sequence[Pdo], axis: int) -> tuple[Pdo, ...]:
         )
         for pdo in pdos
     )
+
+
+def type_range(kind: str, bits: int = 0) -> tuple[float, float]:
+    """Return the smallest and the largest finite number of a type; `bits`: length where the type has none."""
+    largest = LARGEST.get(kind)
+    return integer_range(kind, bits) if largest is None else (-largest, largest)
 
 
 def integer_range(kind: str, bits: int = 0) -> tuple[int, int]:

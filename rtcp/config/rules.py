@@ -44,7 +44,7 @@ from rtcp.config.model import (
     Tool,
     integer_range,
 )
-from rtcp.config.scaling import OBJECTS_PER_AXIS, DriveScaling
+from rtcp.config.scaling import BOUNDING_OBJECTS, FACTOR_TOLERANCE, OBJECTS_PER_AXIS, QUANTITIES, DriveScaling
 from rtcp.config.validation import EVERY_KEY, rule
 
 _NUMERIC = tuple(name for name in BITS if name != "bool")
@@ -234,6 +234,39 @@ def _scaling(device: DeviceDescription) -> Iterator[Finding]:
         yield (), f"found channels of axis {' and '.join(map(str, axes))}; axes are counted from 1, without a gap"
     elif len(axes) > 1 and device.kind in CHANNELS and device.kind != "cia402":
         yield (), f"found channels of {len(axes)} axes, allowed is kind cia402 for a device with several"
+
+
+@rule(DeviceDescription, "rpdo", "tpdo", "kind")
+def _drive_channels(device: DeviceDescription) -> Iterator[Finding]:
+    """What would turn a joint another way than its position shows, or leave an enabled drive without torque."""
+    if device.kind != "cia402":
+        return
+    channels = [
+        (pdo.axis_of(entry), (direction, i, "channels", j), entry)
+        for direction, pdos in (("rpdo", device.rpdo), ("tpdo", device.tpdo))
+        for i, pdo in enumerate(pdos)
+        for j, entry in enumerate(pdo.channels)
+        if entry.index
+    ]
+    positions = {
+        axis: (where, entry) for axis, where, entry in reversed(channels) if QUANTITIES.get(entry.name) == "position"
+    }
+    for axis, where, entry in channels:
+        bound = BOUNDING_OBJECTS.get(entry.index - (axis - 1) * OBJECTS_PER_AXIS)
+        if bound is not None and where[0] == "rpdo" and entry.safe == 0:
+            text = (
+                f"found 0 for {entry.name} ({bound}), which the drive is always sent: enabled it would have no torque, "
+            )
+            yield (*where, "safe"), f"{text}or no motion; allowed is any other value"
+        quantity = QUANTITIES.get(entry.name)
+        if quantity is None or axis not in positions:
+            continue
+        of, first = positions[axis]
+        said = f"found {entry.factor:.10g} for {entry.name}, and {first.factor:.10g} for {first.name} ({dotted(of)})"
+        if quantity == "position" and not math.isclose(entry.factor, first.factor, rel_tol=FACTOR_TOLERANCE):
+            yield (*where, "factor"), f"{said}; all positions of an axis have the same factor"
+        elif (entry.factor < 0) != (first.factor < 0):
+            yield (*where, "factor"), f"{said}; all factors of an axis have the same sign"
 
 
 @rule(DriveScaling)

@@ -16,11 +16,17 @@ OBJECTS_PER_AXIS = 0x800
 """Distance of the objects of one axis from those of the next (IEC 61800-7-201, 0x6000 to 0x67FF is the first)."""
 
 VelocityUnit = Literal["counts/s", "rpm", "mrpm", "urpm"]
+VELOCITY_UNITS: dict[int, VelocityUnit] = {
+    0x00B44700: "rpm", 0xFDB44700: "mrpm", 0xFAB44700: "urpm", 0x00B50300: "counts/s",
+}  # fmt: skip
+"""Their numbers in 0x60A9: prefix, numerator and denominator in the notation of ETG.1004."""
 _RPM: dict[VelocityUnit, float] = {"rpm": 1.0, "mrpm": 1e-3, "urpm": 1e-6}
 TorqueUnit = Literal["mNm", "uNm"]
 TORQUE_UNITS: dict[TorqueUnit, float] = {"mNm": 1e-3, "uNm": 1e-6}
 """Nm per count of 0x6076."""
 PER_MILLE = 1e-3
+FACTOR_TOLERANCE = 1e-6
+"""Up to which two factors of the same quantity are the same."""
 
 QUANTITIES: dict[str, str] = {
     "target_position": "position",
@@ -34,6 +40,11 @@ QUANTITIES: dict[str, str] = {
     "torque_offset": "torque",
 }
 """Channels of a CiA 402 drive whose factors follow from the scaling."""
+BOUNDING_OBJECTS = {
+    0x6072: "max torque", 0x6080: "max motor speed",
+    0x60E0: "positive torque limit", 0x60E1: "negative torque limit",
+}  # fmt: skip
+"""Objects of the first axis with which a drive bounds itself: 0 leaves an enabled drive without torque or motion."""
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import isnan
+from math import isfinite
 from typing import Any, ClassVar
 
 from mypy_extensions import mypyc_attr
 
 from rtcp.config.find import load_class, registered
-from rtcp.config.model import SlaveConfig
+from rtcp.config.model import LARGEST, SlaveConfig, type_range
 from rtcp.fieldbus.pdo import STRUCT_CODES, Channel, ImageLayout, layout
 from rtcp.ipc.commands import Command
 from rtcp.ipc.events import Event
@@ -147,14 +147,13 @@ class Driver:
             return 0
         if channel.type == "bytes":
             return int.from_bytes(self.array_targets[channel.name][: channel.bits // 8], "little")
-        value = self.targets[channel.name]
-        if isnan(value):
-            value = self.safe_values[channel.name]  # what is no number is no reason to end the cycle
+        value, (low, high) = self.targets[channel.name], channel.range
+        # What a process sets is bounded as what a command sets; what is no number is no reason to end the cycle.
+        value = min(max(value, low), high) if isfinite(value) else self.safe_values[channel.name]
         counts = (value - channel.offset) / channel.factor
-        if channel.type.startswith("float"):
-            return counts
-        low, high = (0, 1) if channel.type == "bool" else integer_range(channel)
-        return round(min(max(counts, low), high))
+        low, high = type_range(channel.type, channel.bits)
+        bounded = min(max(counts, low), high)
+        return bounded if channel.type in LARGEST else round(bounded)
 
 
 class Counter:

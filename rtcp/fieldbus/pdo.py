@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 
 from rtcp.config.model import DeviceDescription, Pdo
 from rtcp.fieldbus.bus import PdoEntryInfo, PdoInfo, slave_label
@@ -41,6 +42,8 @@ class Channel:
     unit: str = ""
     offset: float = 0.0
     """SI value at 0 counts."""
+    range: tuple[float, float] = (-inf, inf)
+    """Of an output: smallest and largest value that is sent, SI."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ def layout(pdos: Sequence[Pdo]) -> ImageLayout:
             channels.append(
                 Channel(
                     entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, entry.length,
-                    entry.unit, entry.offset,
+                    entry.unit, entry.offset, entry.range if entry.is_number else Channel.range,
                 )
             )  # fmt: skip
             offset += entry.length

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 from rtcp.config.model import SlaveConfig
-from rtcp.config.scaling import OBJECTS_PER_AXIS, TORQUE_UNITS, DriveScaling
+from rtcp.config.scaling import OBJECTS_PER_AXIS, TORQUE_UNITS, VELOCITY_UNITS, DriveScaling
 from rtcp.fieldbus.bus import slave_label
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
@@ -22,8 +22,9 @@ _ENCODER, _GEAR, _FEED = 0x608F, 0x6091, 0x6092
 _RATED_CURRENT, _RATED_TORQUE, _VELOCITY_UNIT = 0x6075, 0x6076, 0x60A9
 _TOLERANCE: Final = 1e-6
 _AMPERE_PER_COUNT: Final = 1e-3
-_UNITS: Final = {0x00B44700: "rpm", 0xFDB44700: "mrpm", 0xFAB44700: "urpm", 0x00B50300: "counts/s"}
-"""Revolutions per minute and increments per second in the notation of ETG.1004: prefix, numerator, denominator."""
+_QUICK_STOP_OPTION: Final = 0x605A
+_HOLDING: Final = range(5, 9)
+"""Quick stop option codes after which the drive stays in quick stop active, with torque."""
 _WRITE_ONLY: Final = 0x06010001
 _UNREADABLE: Final = ABSENT | {_WRITE_ONLY}
 
@@ -121,4 +122,21 @@ def _counts(count: float) -> Reading:
 def _velocity_unit(sdo: SdoClient, index: int) -> Steps[Value | None]:
     """Return the unit of velocities; a unit that `velocity_unit` does not know as its number."""
     code = yield from _reading(sdo, index, 0)
-    return None if not code else _UNITS.get(code, f"the unit 0x{code:08X}")
+    return None if not code else VELOCITY_UNITS.get(code, f"the unit 0x{code:08X}")
+
+
+def check_quick_stop(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
+    """Read what each axis of a drive does at a quick stop; return a sentence for each that then drops the torque."""
+    notes = []
+    for axis in config.device.axes:
+        index = _QUICK_STOP_OPTION + (axis - 1) * OBJECTS_PER_AXIS
+        option = yield from _reading(sdo, index, 0)
+        if option is not None and option not in _HOLDING:
+            signed = option - (1 << 16) if option >> 15 else option
+            where = slave_label(sdo.position, sdo.name) + ("" if config.device.axes == (1,) else f", axis {axis}")
+            file = config.file or "its device file"
+            notes.append(
+                f"{where}: after a quick stop it does not hold (0x{index:04X} is {signed}; 5 to 8 hold): write it among "
+                f"the start-up SDOs of {file}"
+            )
+    return notes

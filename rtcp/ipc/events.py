@@ -325,16 +325,16 @@ class ResetWhileMoving(FaultEvent, number=22):
 
 
 class DriverFailed(FaultEvent, number=113):
-    """the driver of slave {slave} ({slave_name}) raised an error, which the log names: its outputs are 0, {reaction};
-    then `rtcp reset`"""
+    """the driver of slave {slave} ({slave_name}) raised an error, which the log names: its outputs are safe,
+    {reaction}; then `rtcp reset`"""
 
     slave: int
     """Position on the cable, from 1."""
 
 
 class ProcessFailed(FaultEvent, number=126):
-    """the process {process_name} raised an error, which the log names: its outputs are 0, {reaction}; then `rtcp
-    reset`"""
+    """the process {process_name} raised an error, which the log names: its outputs are safe, {reaction}; then
+    `rtcp reset`"""
 
     process: int
     """Its place in the configuration, from 0."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ import pytest
 from rtcp.config import default_config
 from rtcp.config.device_file import file_text, kind_of
 from rtcp.config.loader import load_device
+from rtcp.config.model import PdoEntry
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
+from tests.drive_esi import write_esi
 
 FILES = Path(__file__).parents[1] / "esi" / "files"
 DRIVE, AXES, TERMINALS = FILES / "drive.xml", FILES / "axes.xml", FILES / "terminals.xml"
@@ -94,6 +97,20 @@ def test_the_kind_follows_from_the_default_process_data() -> None:
     kinds = {device.name: kind_of(device) for device in read_esi(TERMINALS).devices}
     assert kinds["2 digital outputs"] == "generic"
     assert kinds["End cover"] == "coupler"
+
+
+def test_a_drive_that_bounds_itself_by_process_data_is_not_sent_0_and_holds_after_a_quick_stop(tmp_path: Path) -> None:
+    sample = load_device(default_config().parent / "devices" / "two-axis-drive.yaml")
+    bounds = (PdoEntry(0x6872, 0, "uint16", "max torque"), PdoEntry(0x6880, 0, "uint32", "max motor speed"))
+    first, second = sample.rpdo
+    bounding = replace(sample, rpdo=(first, replace(second, channels=(*second.channels, *bounds))))
+    write_esi(tmp_path / "drive.xml", bounding, {0x6872: ("UINT", 800)})
+    out = tmp_path / "drive.yaml"
+    out.write_text(text := file_text(find_device(read_esi(tmp_path / "drive.xml"))))
+    made = load_device(out)
+    assert {entry.index: entry.safe for entry in made.outputs[-2:]} == {0x6872: 1000, 0x6880: 2**31 - 1}
+    assert [made.startup(0x605A, axis) for axis in (1, 2)] == [6, 6]
+    assert text.count("CHECK: always sent; at 0 the drive has no torque") == 2
 
 
 def test_a_device_file_is_checked_alone(rtcp: Callable[..., Any], tmp_path: Path) -> None:

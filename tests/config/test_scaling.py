@@ -86,10 +86,39 @@ def test_the_factors_follow_from_what_the_drive_counts_in(written, scaling, posi
     )  # fmt: skip
 
 
-def test_a_factor_that_is_written_wins_also_where_it_is_1(written) -> None:
-    made = written(rpdo=pdos("rpdo", target_position=1.0, target_torque=0.25))
-    assert [entry.factor for entry in made.rpdo[0].channels][1:4:2] == [1.0, 0.25]
-    assert made.tpdo[0].channels[1].factor == pytest.approx(TURN / 409600)
+def test_a_factor_that_contradicts_the_scaling_is_refused_with_both(written, problems) -> None:
+    assert written(rpdo=pdos("rpdo", target_torque=0.05)).rpdo[0].channels[3].factor == 0.05
+    assert problems(rpdo=pdos("rpdo", target_torque=0.25)) == [
+        "rpdo[0].channels[3].factor: found 0.25, but from scaling follows 0.05: leave it out"
+    ]
+
+
+def test_factors_of_one_axis_that_would_turn_it_another_way_than_it_shows_are_refused(written, problems) -> None:
+    agree = {"target_position": -1e-4, "position": -1e-4, "target_velocity": -1.0, "velocity": -2.0,
+             "target_torque": -0.1, "torque": -0.1}  # fmt: skip
+    written(scaling=None, **{image: pdos(image, **agree) for image in ("rpdo", "tpdo")})
+    for name, factor, said in (
+        ("position", 1e-4, "all positions of an axis have the same factor"),
+        ("position", -2e-4, "all positions of an axis have the same factor"),
+        ("target_velocity", 1.0, "all factors of an axis have the same sign"),
+        ("torque", 0.1, "all factors of an axis have the same sign"),
+    ):
+        differ = {image: pdos(image, **agree | {name: factor}) for image in ("rpdo", "tpdo")}
+        (problem,) = problems(scaling=None, **differ)
+        assert problem.endswith(
+            f"found {factor:.10g} for {name}, and -0.0001 for target_position (rpdo[0].channels[1]); {said}"
+        )
+
+
+@pytest.mark.parametrize("index", [0x6072, 0x6080, 0x60E0, 0x60E1])
+def test_a_drive_is_not_sent_that_it_may_have_no_torque_or_speed(written, problems, index) -> None:
+    outputs = pdos("rpdo", 2)
+    outputs[0]["channels"].append({"index": index + 0x800, "sub_index": 0, "type": "uint16", "name": "most"})
+    both = {"rpdo": [*pdos("rpdo"), *outputs], "tpdo": [*pdos("tpdo"), *pdos("tpdo", 2)]}
+    (problem,) = problems(**both)
+    assert problem.startswith("rpdo[1].channels[5].safe: found 0 for most (")
+    outputs[0]["channels"][-1]["safe"] = 1000
+    written(**both)
 
 
 def test_each_axis_has_its_own_scaling_or_all_have_one(written) -> None:

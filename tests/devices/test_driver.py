@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from importlib.metadata import EntryPoint, EntryPoints
+from math import inf, nan
 
 import pytest
 
 from rtcp.config import find
-from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
+from rtcp.config.model import LARGEST, DeviceDescription, Pdo, PdoEntry, SlaveConfig
 from rtcp.devices import Cia402Drive, DeviceError, Driver, IoBox, make_driver
 from tests.devices.conftest import slave
 from tests.devices.test_io_box import INPUTS, OUTPUTS
@@ -36,6 +38,22 @@ def test_a_driver_of_another_package_is_found_and_offers_its_channels_in_si_unit
     assert sensor.values == pytest.approx({"x": -0.5, "y": 3.0})
     sensor.targets["range"] = 7.0
     assert sensor.encode() == b"\x07\x00"
+
+
+def test_what_is_set_is_bounded_by_the_channel_and_what_is_no_number_is_safe():
+    outputs = (
+        PdoEntry(0x7000, 1, "int16", "current", 0.5, max=10.0, safe=1.0),
+        PdoEntry(0x7000, 2, "float32", "flow", 1e-3, min=-2.0),
+    )
+    driver = Driver(SlaveConfig("valves", DeviceDescription("valves", "analog", 1, 2, (Pdo(0x1600, outputs),))), 0.001)
+    sent = struct.Struct("<hf")
+    for current, flow, counts in (
+        (1e9, -1e9, (20, -2000.0)),
+        (inf, nan, (2, 0.0)),
+        (-1e9, 1e39, (-(2**15), LARGEST["float32"])),
+    ):
+        driver.targets |= {"current": current, "flow": flow}
+        assert sent.unpack(driver.encode()) == pytest.approx(counts)
 
 
 def test_a_kind_without_a_driver_is_refused_with_the_kinds_that_are_installed():

@@ -16,7 +16,8 @@ from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.models import CubemarsDrive, create
 from rtcp.virtual.objects import DataType, Entry
 
-DEVICE = replace(load(default_config()).slaves[1].device, sdo=())
+_WHOLE = load(default_config()).slaves[1].device
+DEVICE = replace(_WHOLE, sdo=tuple(sdo for sdo in _WHOLE.sdo if sdo.index == 0x605A))
 PERIOD_NS = 1_000_000
 MODEL = create("cubemars-orh70")
 assert isinstance(MODEL, CubemarsDrive)
@@ -74,6 +75,17 @@ def test_a_drive_that_counts_otherwise_is_refused_with_both_values(scaling, held
     assert sentence.startswith("slave 1 (drive1): the drive counts otherwise than its file: ")
     assert named in sentence
     assert sentence.endswith("correct the one that is wrong before the arm moves")
+
+
+@pytest.mark.parametrize("option", [0, 2])
+def test_a_drive_that_drops_its_torque_after_a_quick_stop_is_noted(option: int) -> None:
+    bus = InProcessBus([create("cubemars-orh70")])
+    stop = replace(DEVICE.sdo[0], value=option)
+    bus.configure([SlaveConfig("drive1", replace(DEVICE, sdo=(stop,)), "devices/x.yaml")], PERIOD_NS)
+    assert bus.notes == [
+        f"slave 1 (drive1): after a quick stop it does not hold (0x605A is {option}; 5 to 8 hold): write it among the "
+        "start-up SDOs of devices/x.yaml"
+    ]
 
 
 def test_a_feed_constant_that_the_drive_does_not_count_in_is_not_compared() -> None:
