@@ -34,6 +34,8 @@ def _list(
     as_json: AsJson = False,
 ) -> None:
     """List the devices and modules of an ESI file."""
+    from rich.markup import escape
+
     content = _read(file)
     devices = [device for device in content.devices if older or not device.hidden]
     rows = [_facts(device) for device in devices]
@@ -42,17 +44,17 @@ def _list(
         emit_json({"vendor_id": content.vendor_id, "vendor": content.vendor_name, "devices": rows, "modules": modules})
         return
     headings = ("product", "revision", "name", "kind", "out", "in", "mailbox", "clock", "slots")
-    title = f"{content.vendor_name or file.name}, vendor 0x{content.vendor_id:08X}; process data in bits"
+    title = f"{escape(content.vendor_name or file.name)}, vendor 0x{content.vendor_id:08X}; process data in bits"
     overview = table(headings, ("kind", "mailbox", "clock"), title=title, fill="name", expand=True)
     for row in rows:
         numbers = [f"0x{row[key]:X}" for key in ("product", "revision")]
-        texts = [str(row[key]) for key in ("name", "kind", "output_bits", "input_bits", "mailbox")]
+        texts = [escape(str(row[key])) for key in ("name", "kind", "output_bits", "input_bits", "mailbox")]
         overview.add_row(*numbers, *texts, "yes" if row["dc"] else "no", str(row["slots"] or ""))
     parts = [overview]
     if content.modules:
         parts.append(table(("ident", "module"), ("module",)))
         for module in content.modules:
-            parts[-1].add_row(f"0x{module.ident:08X}", module.name)
+            parts[-1].add_row(f"0x{module.ident:08X}", escape(module.name))
     show(*parts)
     if len(devices) < len(content.devices):
         report(f"{len(content.devices) - len(devices)} older revisions are not listed: --all")
@@ -92,6 +94,7 @@ def _new(
     """Write a device's file that a person reads: process data with types and units, start-up SDOs, clocks, watchdog."""
     from rtcp.config.device_file import file_text
     from rtcp.config.loader import load_device
+    from rtcp.config.model import ConfigError
     from rtcp.esi.modules import assemble
     from rtcp.esi.reader import find_device
 
@@ -115,7 +118,11 @@ def _new(
             file.write(text)
     except FileExistsError:
         raise CommandError(f"{out}: there is such a file; it is not overwritten") from None
-    load_device(out)
+    try:
+        load_device(out)
+    except ConfigError:
+        out.unlink()
+        raise
     marks = text.count("CHECK:")
     report(f"{out}: {made.name}" + (f"; lines marked CHECK, {marks} of them, need a person" if marks else ""))
 

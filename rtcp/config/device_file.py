@@ -324,8 +324,8 @@ def _scaling_lines(device: Device) -> Iterator[str]:
             yield f"    rated_torque: 1.0     # CHECK: Nm; 0x{0x6076 + base:04X} has no default: read it from the drive"
         if unit != "mNm":
             yield f"    rated_torque_unit: {unit}"
-        yield "    torque_at: motor     # CHECK: or output; no object tells the shaft of the rated torque. Where motor is wrong"
-        yield "                         # the torques shown are too large by the gear, and the arm stops as it moves."
+        yield "    torque_at: motor     # CHECK: or output; no object tells the shaft of the rated torque. Where motor"
+        yield "                         # is wrong the torques shown are too large by the gear, and the arm stops."
     yield ""
 
 
@@ -432,17 +432,15 @@ def _channel_lines(
     name = known or _unique(_identifier(entry), names, f"{key}.{axis}")
     if known:
         names[f"{key}.{axis}.{known}"] += 1
-    keys = (
-        f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {_type_keys(entry.type, entry.bits)}, name: {name}"
-    )
+    keys = f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {_type_keys(entry.type, entry.bits)}, "
+    keys += f"name: {_quoted(name)}"
     if is_constant:
         keys += f", safe: {_CSP}"  # no PDO shows the mode: it is not changed
     described = _object(device, entry.index, entry.sub_index)
     is_bound = kind == "cia402" and key == "rpdo" and entry.index - (axis - 1) * OBJECTS_PER_AXIS in BOUNDING_OBJECTS
     if is_bound:
         keys += f", safe: {_default(device, entry.index, entry.sub_index) or _widest(entry, axis):.10g}"
-    has_unit = described is not None and described.unit is not None and not known and not is_bound
-    unit = units.unit(described.unit) if has_unit else None
+    unit = None if described is None or described.unit is None or known or is_bound else units.unit(described.unit)
     if unit is not None and unit.si:
         keys += f", factor: {unit.factor:.10g}, unit: {_quoted(unit.si)}"
     said = [_clean(entry.name), entry.type if entry.type.upper() not in ("", "BOOL") else ""]
@@ -521,7 +519,8 @@ def _type_keys(name: str, bits: int) -> str:
 
 def _identifier(entry: PdoEntry) -> str:
     name = re.sub(r"[^a-z0-9]+", "_", entry.name.lower()).strip("_")
-    return name[:48].rstrip("_") or f"x{entry.index:04x}_{entry.sub_index}"
+    name = name[:48].rstrip("_") or f"x{entry.index:04x}_{entry.sub_index}"
+    return "padding_entry" if name == "padding" else name
 
 
 def _unique(name: str, names: Counter[str], scope: str) -> str:
@@ -533,7 +532,12 @@ def _unique(name: str, names: Counter[str], scope: str) -> str:
 def _quoted(text: str) -> str:
     """Return a YAML scalar."""
     clean = _clean(text)[:64]
-    return clean if re.fullmatch(r"[A-Za-z][A-Za-z0-9 ._/()+-]*[A-Za-z0-9.)]|[A-Za-z]", clean) else f'"{clean}"'
+    is_word = clean.lower() not in ("null", "true", "false")
+    return (
+        clean
+        if is_word and re.fullmatch(r"[A-Za-z][A-Za-z0-9 ._/()+-]*[A-Za-z0-9.)]|[A-Za-z]", clean)
+        else f'"{clean}"'
+    )
 
 
 def _file_name(origin: str) -> str:

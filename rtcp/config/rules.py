@@ -123,6 +123,9 @@ def _entry(entry: PdoEntry) -> Iterator[Finding]:
     elif entry.factor and entry.is_number and entry.length and not entry.range[0] <= entry.safe <= entry.range[1]:
         low, high = entry.range
         yield ("safe",), f"found {entry.safe:g}, allowed is {low:g} to {high:g}, the range of the channel"
+    if entry.type == "bool" and entry.index and (entry.factor, entry.offset) != (1.0, 0.0):
+        key = "factor" if entry.factor != 1 else "offset"
+        yield (key,), f"found {getattr(entry, key):g} with the type bool, allowed is none: it is 0 or 1; leave it out"
     if entry.modulo and not ("int" in entry.type or entry.type == "bits"):
         yield ("modulo",), f"found {entry.modulo} with the type {entry.type}, allowed is an integer type"
     if entry.index and entry.name == PdoEntry.name:

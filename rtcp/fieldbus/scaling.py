@@ -136,7 +136,7 @@ def check_quick_stop(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
             where = slave_label(sdo.position, sdo.name) + ("" if config.device.axes == (1,) else f", axis {axis}")
             file = config.file or "its device file"
             notes.append(
-                f"{where}: after a quick stop it does not hold (0x{index:04X} is {signed}; 5 to 8 hold): write it among "
-                f"the start-up SDOs of {file}"
+                f"{where}: after a quick stop it does not hold (0x{index:04X} is {signed}; 5 to 8 hold): write it "
+                f"among the start-up SDOs of {file}"
             )
     return notes

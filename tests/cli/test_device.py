@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +112,20 @@ def test_a_drive_that_bounds_itself_by_process_data_is_not_sent_0_and_holds_afte
     assert {entry.index: entry.safe for entry in made.outputs[-2:]} == {0x6872: 1000, 0x6880: 2**31 - 1}
     assert [made.startup(0x605A, axis) for axis in (1, 2)] == [6, 6]
     assert text.count("CHECK: always sent; at 0 the drive has no torque") == 2
+
+
+def test_names_that_mean_something_to_others_are_names_here(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    text, file, out = TERMINALS.read_text(), tmp_path / "named.xml", tmp_path / "named.yaml"
+    for pair in (("1", "null"), ("1e5", "padding"), ("true", "No")):
+        names = iter(pair)
+        renamed = re.sub("<Name>Output</Name>", lambda _, names=names: f"<Name>{next(names)}</Name>", text)
+        file.write_text(renamed.replace("2 digital outputs", "[/bold]"))
+        out.write_text(file_text(read_esi(file).devices[0]))
+        assert len(load_device(out).outputs) == 2
+    listed = rtcp("device", "list", str(file))
+    assert (listed.code, "[/bold]" in listed.out) == (0, True), listed.trouble
+    refused = rtcp("device", "new", "--esi", str(DRIVE), "--kind", "nosuch", "--out", str(tmp_path / "x.yaml"))
+    assert (refused.code, (tmp_path / "x.yaml").exists()) == (2, False)
 
 
 def test_a_device_file_is_checked_alone(rtcp: Callable[..., Any], tmp_path: Path) -> None:
