@@ -241,7 +241,9 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      "its channels are outputs"),
     (DRIVE, [("type: uint16, name: controlword", "type: uint32, name: controlword")],
      "rpdo[0].channels[0].type: found uint32 for controlword, allowed is uint16"),
-    (DRIVE, [(TORQUE, "{index: 0x6071, sub_index: 0, type: bool, name: target_torque, factor: 0.0001}")],
+    (DRIVE, [(TORQUE, TORQUE + "\n      - {index: 0x2000, sub_index: 1, type: bool, name: light, factor: 2}")],
+     "rpdo[0].channels[4].factor: found 2 with the type bool, allowed is none: it is 0 or 1; leave it out"),
+    (DRIVE, [(TORQUE, "{index: 0x6071, sub_index: 0, type: bool, name: target_torque}")],
      "rpdo[0].channels[3].type: found bool for target_torque, allowed is int8 or uint8 or int16 or uint16 or int24 "
      "or uint24 or int32 or uint32 or int40 or uint40 or int48 or uint48 or int56 or uint56 or int64 or uint64"),
     (DRIVE, [(TORQUE, TORQUE + "\n      - {index: 0, sub_index: 0, type: bits}")],
