@@ -11,8 +11,8 @@ import yaml
 import rtcp
 from rtcp.config import load_device
 from rtcp.ipc.runtime_directory import control_socket
-from tests.drive_esi import write_esi
-from tests.e2e.arms import TWO_AXIS, replace_drives
+from tests.drive_esi import TWO_AXIS, write_esi
+from tests.e2e.arms import replace_drives
 from tests.e2e.conftest import Platform
 
 pytestmark = pytest.mark.alone
