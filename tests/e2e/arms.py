@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -11,20 +10,28 @@ from rtcp.config import load_device
 from tests.drive_esi import ARMS, write_esi
 
 
+def slaves_of(name: str) -> int:
+    """Return how many slaves an arm has, its IO box counted; "": the shipped one."""
+    return 4 if name == "two-axis" else 7
+
+
 def replace_drives(folder: Path, name: str) -> None:
     """Replace the six drives of the configuration in `folder` by those of another arm."""
     device, objects, own = ARMS[name]
     described = load_device(folder / "devices" / f"{device}.yaml")
-    axes = len(described.axes)
     write_esi(folder / "drive.xml", described, objects)
+    axes = len(described.axes)
     arm, segment = (yaml.safe_load((folder / file).read_text()) for file in ("assistive_arm.yaml", "segment.yaml"))
-    drives = [{"name": f"drive{i}", "device": device} for i in range(1, 6 // axes + 1)]
-    arm["slaves"] = [arm["slaves"][0], *drives]
-    for i, joint in enumerate(arm["joints"]):
-        joint |= {"slave": f"drive{i // axes + 1}", "axis": i % axes + 1}
     # A described drive has no 0x10F1: its limit of missed SYNC0 is an option.
-    options: dict[str, Any] = {**own, "sync_error_limit": 0}
-    drive = {"esi": "drive.xml", "behaviour": "cia402", "options": options}
-    segment["slaves"] = [segment["slaves"][0], *[drive] * len(drives)]
+    drives = [{"esi": "drive.xml", "behaviour": "cia402", "options": {**own, "sync_error_limit": 0}}
+              for _ in range(6 // axes)]  # fmt: skip
+    # Its inertia at the last joint is not that of the smallest Cubemars: the gains of the joint before it suit.
+    arm["joints"][5] |= {key: value for key, value in arm["joints"][4].items() if key.startswith("cst_")}
+    for i, joint in enumerate(arm["joints"]):
+        at, axis = i // axes, i % axes + 1
+        joint |= {"slave": f"drive{at + 1}", "axis": axis, "torque": 1000.0 * described.scaling_of(axis).torque}
+        drives[at]["options"][f"axis{axis}_load_inertia"] = segment["slaves"][i + 1]["options"]["load_inertia"]
+    arm["slaves"] = [arm["slaves"][0], *({"name": f"drive{i + 1}", "device": device} for i in range(len(drives)))]
+    segment["slaves"] = [segment["slaves"][0], *drives]
     for file, data in (("assistive_arm.yaml", arm), ("segment.yaml", segment)):
         (folder / file).write_text(yaml.safe_dump(data, sort_keys=False))

@@ -13,9 +13,9 @@ from rtcp.config import load_device
 from rtcp.ipc.runtime_directory import control_socket
 from tests.drive_esi import TWO_AXIS, write_esi
 from tests.e2e.arms import replace_drives
-from tests.e2e.conftest import Platform
+from tests.e2e.conftest import CUBEMARS, Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, CUBEMARS]
 
 VALVES = """
 name: Valve terminal
