@@ -13,7 +13,7 @@ from rtcp.config.model import ArmConfig, Pdo, SlaveConfig, StartupSdo
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus.errors import BusError
 from rtcp.ipc.commands import Enable, Home, MoveJoints, Reset, SetControlMode, SetDriveMode
-from rtcp.ipc.events import DriveFault, ProcessDataLost, SlaveLost
+from rtcp.ipc.events import DriveFault, Homed, HomingFailed, ProcessDataLost, SlaveLost
 from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import DriveModeUnsupported, HomingUnsupported
 from rtcp.ipc.states import ControlMode, DriveMode, State
@@ -145,6 +145,18 @@ def test_a_fault_of_one_axis_stops_all_and_names_its_joint(standard: Simulation)
     assert not servos(standard)[1].powered
     assert standard.send(Reset()).refusal is None
     assert standard.until(lambda: standard.state is State.READY, 5.0)
+
+
+def test_a_drive_homes_where_it_can_and_otherwise_the_arm_holds(standard: Simulation) -> None:
+    homes = (0x6098, 0) in standard.bus.slaves[1].device.objects
+    before = standard.loop.arm.state.actual[2]
+    assert standard.send(Home(2)).refusal is None
+    standard.run(0.05)
+    assert standard.until(lambda: standard.state is State.HOLDING, 5.0)
+    (end,) = [record.event for record in standard.events if isinstance(record.event, Homed | HomingFailed)]
+    assert (isinstance(end, Homed), end.axis) == (homes, 2)
+    if isinstance(end, HomingFailed):
+        assert (end.mode, standard.loop.arm.state.actual[2]) == (8, pytest.approx(before, abs=1e-3))
 
 
 def test_the_loss_of_a_slave_concerns_all_its_axes(tmp_path: Path) -> None:
