@@ -6,13 +6,14 @@ from pathlib import Path
 
 import yaml
 
-from rtcp.config import load_device
+from rtcp.config import default_config, load_device
 from tests.drive_esi import ARMS, write_esi
 
 
 def slaves_of(name: str) -> int:
-    """Return how many slaves an arm has, its IO box counted; "": the shipped one."""
-    return 4 if name == "two-axis" else 7
+    """Return how many slaves an arm has, its IO box counted."""
+    device, _, _ = ARMS[name]
+    return 1 + 6 // len(load_device(default_config().parent / "devices" / f"{device}.yaml").axes)
 
 
 def replace_drives(folder: Path, name: str) -> None:

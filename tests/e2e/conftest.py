@@ -35,7 +35,7 @@ PERIOD_US = 2000
 
 OTHER_ARM = os.environ.get("RTCP_TEST_ARM", "")
 """Arm of `tests.drive_esi.ARMS` that the tests run with in place of the shipped one."""
-SLAVES = slaves_of(OTHER_ARM)
+SLAVES = slaves_of(OTHER_ARM) if OTHER_ARM else 7
 CUBEMARS = pytest.mark.other_arms()
 """Of a test that reads process data or objects as the shipped arm's drives have them."""
 FULL_CIA402 = pytest.mark.other_arms("two-axis", "synapticon")
