@@ -6,7 +6,7 @@ BIN := .venv/bin
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup oracles run panel test test-all test-ros fast faults lint format clean
+.PHONY: help setup oracles run panel test test-all test-arms test-ros fast faults lint format clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -34,6 +34,15 @@ test-all: oracles ## run all tests: every sample, systemd as PID 1, in a browser
 	@status=0; \
 	RTCP_SLOW=1 $(BIN)/python -m pytest -m 'not alone' --numprocesses auto || status=1; \
 	RTCP_SLOW=1 $(BIN)/python -m pytest -m alone || status=1; \
+	exit $$status
+
+test-arms: setup ## run the end-to-end tests of the arm with the drives of each other arm (tests/drive_esi.py)
+	@status=0; \
+	for arm in two-axis myactuator synapticon; do \
+		echo "== $$arm"; \
+		RTCP_TEST_ARM=$$arm $(BIN)/python -m pytest tests/e2e -m 'alone and not slow' \
+			-k 'not test_abb and not test_cell and not test_heater and not test_shape and not test_systemd' || status=1; \
+	done; \
 	exit $$status
 
 test-ros: setup ## run the tests on ROS 1 and Fast DDS in network namespaces; as root on Debian 12 they are installed first

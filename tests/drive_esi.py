@@ -18,6 +18,24 @@ _RATIO = """<DataType><Name>RATIO</Name><BitSize>80</BitSize>
 <Flags><Access>rw</Access></Flags></SubItem></DataType>"""
 Objects = Mapping[int, tuple[str, int] | tuple[int, int]]
 """By index: type and value of a variable, or the two parts of a ratio."""
+TWO_AXIS: Objects = {
+    index + shift: held
+    for shift in (0, 0x800)
+    for index, held in (
+        (0x603F, ("UINT", 0)), (0x6076, ("UDINT", 40_000)), (0x608F, (131072, 1)), (0x6091, (50, 1)),
+        (0x6098, ("SINT", 37)),
+    )
+}  # fmt: skip
+SYNAPTICON: Objects = {
+    0x603F: ("UINT", 0), 0x6076: ("UDINT", 640), 0x6091: (100, 1), 0x6098: ("SINT", 37),
+    0x60A9: ("UDINT", 0x00B44700),
+}  # fmt: skip
+ARMS: dict[str, tuple[str, Objects, dict[str, float]]] = {
+    "two-axis": ("two-axis-drive", TWO_AXIS, {"rated_torque": 40.0, "torque_ratio": 1.0}),
+    "myactuator": ("myactuator-x6-60", {}, {"rated_torque": 9.5 * 2.1, "counts_per_turn": 131072.0}),
+    "synapticon": ("synapticon-somanet", SYNAPTICON, {"counts_per_turn": 524288.0 * 100}),
+}
+"""Other arms by name: file of their drives, what these hold, options of the behaviour `cia402`."""
 
 
 def write_esi(path: Path, device: DeviceDescription, objects: Objects) -> None:

@@ -84,6 +84,7 @@ class Homing:
 
     __slots__ = (
         "_cycles", "_drive", "_latched", "_longest", "_mode_cycles", "_outcome", "_rest", "_turned", "phase", "shown",
+        "shown_mode",
     )  # fmt: skip
 
     def __init__(self, period_s: float, longest_s: float = _LONGEST_S) -> None:
@@ -105,6 +106,8 @@ class Homing:
         self.phase = _P.IDLE
         self.shown = 0
         """Statusword that ended the search, for the sentence about a failure."""
+        self.shown_mode = HOMING
+        """Mode at that time: another one where the drive does not home."""
 
     @property
     def ended(self) -> bool:
@@ -125,7 +128,7 @@ class Homing:
         self._drive = drive
         self._latched = self._turned = False
         self._outcome = _P.STOPPED
-        self.shown = 0
+        self.shown, self.shown_mode = 0, HOMING
         drive.mode = HOMING
         self._enter(_P.ENTERING)
 
@@ -156,7 +159,8 @@ class Homing:
                 self._enter(_P.SEARCHING)
                 drive.controlword = START
             elif self._cycles > self._mode_cycles:
-                self._leave(_P.STUCK)
+                self.shown, self.shown_mode = drive.statusword, drive.mode_display
+                self._leave(_P.FAILED)
         elif phase is _P.SEARCHING:
             self._search(drive)
         elif phase is _P.STOPPING:
@@ -290,4 +294,8 @@ class HomingSequence:
         homing = self._homing
         if homing.phase is HomingPhase.HOMED:
             return Homed(self.axis, homing.position)
-        return HomingFailed(self.axis, homing.shown) if homing.phase is HomingPhase.FAILED else Stopped()
+        return (
+            HomingFailed(self.axis, homing.shown, homing.shown_mode)
+            if homing.phase is HomingPhase.FAILED
+            else Stopped()
+        )

@@ -221,11 +221,13 @@ class Homed(Event, number=35):
 
 
 class HomingFailed(Event, number=36):
-    """{joint}: homing failed (statusword 0x{statusword:04X}); the arm holds"""
+    """{joint}: homing failed (the drive shows mode {mode}, statusword 0x{statusword:04X}); the arm holds"""
 
     is_warning = True
     axis: int
     statusword: int
+    mode: int
+    """Another one than 6: the drive does not home."""
 
 
 class HomingInBox(Event, number=42):

@@ -16,16 +16,15 @@ from typing import Any, cast
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.al_state import AlState, state_name
 from rtcp.fieldbus.bus import PortErrors, SlaveInfo, SlaveState, slave_label, station_of
+from rtcp.fieldbus.clocks import sync_cycles
 from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.pdo import layout as image_of
 from rtcp.fieldbus.registers import Steps, finish
 from rtcp.fieldbus.slave_setup import configure_slave, identity_faults
 from rtcp.virtual import coe
-from rtcp.virtual.al_state import INPUTS, MAILBOX_IN, OUTPUTS
 from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.objects import SdoAbort
-from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage, SyncManagerLayout
 from rtcp.virtual.protocol import (
     COUNTER,
     DATAGRAM_HEADER,
@@ -46,7 +45,6 @@ from rtcp.virtual.slave import Slave
 _EPOCH_NS = 1_000_000_000
 """The reference clock shows at least this at the start of time."""
 _MAILBOX_HEADER = 6
-_SYNC0_ON = b"\x03"
 
 
 class InProcessSlave:
@@ -77,12 +75,17 @@ class InProcessSlave:
     @property
     def output_bytes(self) -> int:
         """Length of its outputs by the PDO assignment."""
-        return PdoImage.from_assignment(self.device.objects, RX_ASSIGN).byte_length
+        return sum(self.length(index) for index in self.device.roles.outputs)
 
     @property
     def input_bytes(self) -> int:
         """Length of its inputs by the PDO assignment."""
-        return PdoImage.from_assignment(self.device.objects, TX_ASSIGN).byte_length
+        return sum(self.length(index) for index in self.device.roles.inputs)
+
+    def length(self, index: int) -> int:
+        """Length of what a sync manager carries by its PDO assignment, bytes."""
+        image = self.device.image(index)
+        return 0 if image is None else image.byte_length
 
     def status(self) -> SlaveState:
         """Return what its AL status says."""
@@ -128,6 +131,8 @@ class InProcessSlave:
         return self.writing(index, subindex, value.to_bytes(length, "little"))
 
     def _mailbox_state(self) -> int:
+        if self.device.roles.mailboxes is None or self.device.coe is None:
+            raise BusError(f"{slave_label(self.position, self.name)} has no CoE: its device file needs `coe: false`")
         if self.state < AlState.PREOP:
             raise BusError(f"{slave_label(self.position, self.name)} is in INIT, where it has no mailbox")
         return int(self.state)
@@ -139,7 +144,9 @@ class InProcessSlave:
 
     def emergencies(self) -> Iterable[Emergency]:
         """Yield the emergency messages in its mailbox."""
-        mailbox = self.virtual.esc.sync_managers[MAILBOX_IN]
+        if self.device.roles.mailboxes is None:
+            return
+        mailbox = self.virtual.esc.sync_managers[self.device.roles.mailboxes[1]]
         while mailbox.enabled and mailbox.full:
             message = self.read(0, mailbox.start, mailbox.length) or b""
             self._bus.segment.settle(self._bus.now_ns)
@@ -291,14 +298,18 @@ class InProcessBus:
         self.request_state(AlState.PREOP, [position])
         client = cast(Any, slave)
         notes = finish(configure_slave(client, client, 0, config, self._period_ns))
-        layout = SyncManagerLayout()
         # As they will be mapped: slaves after this one may still have another mapping.
         outputs = [image_of(other.device.rpdo).bytes for other in self._configs]
         inputs = [image_of(other.device.tpdo).bytes for other in self._configs]
-        at = sum(outputs[: position - 1])
-        self._map(slave, OUTPUTS, layout.outputs.start, layout.outputs.control, at, slave.output_bytes)
-        at = sum(outputs) + sum(inputs[: position - 1])
-        self._map(slave, INPUTS, layout.inputs.start, layout.inputs.control, at, slave.input_bytes)
+        found, expected = (slave.output_bytes, slave.input_bytes), (outputs[position - 1], inputs[position - 1])
+        if found != expected:
+            raise BusError(
+                f"{slave_label(position, config.name)} has {found[0]} bytes of outputs and {found[1]} of inputs, its "
+                f"device file {expected[0]} and {expected[1]} (keys `rpdo` and `tpdo`)"
+            )
+        roles = slave.device.roles
+        self._map(slave, roles.outputs, sum(outputs[: position - 1]), 0)
+        self._map(slave, roles.inputs, sum(outputs) + sum(inputs[: position - 1]), len(roles.outputs))
         device = config.device
         clock = slave.virtual.clock
         if device.assign_activate and clock is not None:
@@ -306,29 +317,34 @@ class InProcessBus:
             shown = self.now_ns + self.offset_ns
             offset = shown - clock.local(self.now_ns)
             slave.write(0, Register.DC_OFFSET, offset.to_bytes(8, "little", signed=True))
-            start = shown + (shift - shown) % self._period_ns
+            sync0, after = sync_cycles(device, self._period_ns)
+            start = shown + (shift - shown) % max(sync0, self._period_ns)
             slave.write(0, Register.DC_START_TIME, start.to_bytes(8, "little"))
-            slave.write(0, Register.DC_SYNC0_CYCLE, self._period_ns.to_bytes(4, "little"))
-            slave.write(0, Register.DC_ACTIVATION, _SYNC0_ON)
+            slave.write(0, Register.DC_SYNC0_CYCLE, sync0.to_bytes(4, "little") + after.to_bytes(4, "little"))
+            slave.write(0, Register.DC_ACTIVATION, bytes((device.assign_activate >> 8,)))
         return notes
 
-    def _map(self, slave: InProcessSlave, manager: int, start: int, control: int, logical: int, length: int) -> None:
-        """Configure a sync manager and the FMMU for it (ETG.1000.4, 6.6 and 6.7)."""
-        if not length:
-            return
-        head = start.to_bytes(2, "little") + length.to_bytes(2, "little")
-        slave.write(0, Register.SYNC_MANAGER + SM_SIZE * manager, head + bytes((control, 0, 1, 0)))
-        direction = 2 if manager == OUTPUTS else 1
-        fmmu = logical.to_bytes(4, "little") + length.to_bytes(2, "little") + b"\x00\x07"
-        fmmu += start.to_bytes(2, "little") + bytes((0, direction, 1, 0, 0, 0))
-        slave.write(0, Register.FMMU + FMMU_SIZE * (manager - OUTPUTS), fmmu)
+    def _map(self, slave: InProcessSlave, managers: Sequence[int], logical: int, first: int) -> None:
+        """Configure the sync managers of a direction, one after the other, and their FMMUs from number `first` on
+        (ETG.1000.4, 6.6 and 6.7)."""
+        for fmmu, index in enumerate(managers, first):
+            manager, length = slave.device.sync_managers[index], slave.length(index)
+            if not length:
+                continue
+            start = manager.start.to_bytes(2, "little")
+            head = start + length.to_bytes(2, "little")
+            slave.write(0, Register.SYNC_MANAGER + SM_SIZE * index, head + bytes((manager.control, 0, 1, 0)))
+            direction = 1 if index in slave.device.roles.inputs else 2
+            setting = logical.to_bytes(4, "little") + length.to_bytes(2, "little") + b"\x00\x07"
+            slave.write(0, Register.FMMU + FMMU_SIZE * fmmu, setting + start + bytes((0, direction, 1, 0, 0, 0)))
+            logical += length
 
     def request_state(self, state: int, positions: Iterable[int] | None = None) -> None:
         """Request `state` of the slaves at `positions`, None: of all; a way down acknowledges an error."""
         for slave in self._at(positions):
             if state >= AlState.PREOP and slave.state == AlState.INIT:
-                layout = SyncManagerLayout()
-                for number, manager in enumerate((layout.mailbox_receive, layout.mailbox_send)):
+                for number in slave.device.roles.mailboxes or ():
+                    manager = slave.device.sync_managers[number]
                     head = manager.start.to_bytes(2, "little") + manager.length.to_bytes(2, "little")
                     settings = head + bytes((manager.control, 0, 1, 0))
                     slave.write(0, Register.SYNC_MANAGER + SM_SIZE * number, settings)

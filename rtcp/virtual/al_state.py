@@ -13,8 +13,6 @@ from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.esc import Esc, SyncManager
 from rtcp.virtual.protocol import REGISTER_SPACE, AlState, Register
 
-MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(4)
-"""Sync managers of a slave with mailbox, by their use (ETG.1000.6, 5.6.7.4)."""
 MINIMUM_CYCLE = (0x1C32, 5)
 
 

@@ -13,13 +13,13 @@ from rtcp.config.model import ArmConfig, Pdo, SlaveConfig, StartupSdo
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus.errors import BusError
 from rtcp.ipc.commands import Enable, Home, MoveJoints, Reset, SetControlMode, SetDriveMode
-from rtcp.ipc.events import DriveFault, ProcessDataLost, SlaveLost
+from rtcp.ipc.events import DriveFault, Homed, HomingFailed, ProcessDataLost, SlaveLost
 from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import DriveModeUnsupported, HomingUnsupported
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.launch.simulation import Simulation
 from rtcp.virtual.models.servo import ServoAxis
-from tests.drive_esi import Objects, write_esi
+from tests.drive_esi import ARMS, Objects, write_esi
 
 SHIPPED = load(default_config())
 BENT = (0.0, 0.23, 2.38, 0.0, 0.57, 0.0)
@@ -74,36 +74,19 @@ def test_every_other_mode_is_refused_with_the_reason(arm: Simulation) -> None:
 
 # -- the device files of standard drives, on slaves of an ESI file -------------------------------------------------
 
-RATED = {"myactuator-x6-60": 9.5 * 2.1, "two-axis-drive": 40.0}
-"""Nm, by device file."""
 
-
-def objects(axes: tuple[int, ...], encoder: int = 131072, gear: int = 50) -> Objects:
-    """What a two-axis drive holds."""
-    return {
-        index + 0x800 * (axis - 1): held
-        for axis in axes
-        for index, held in (
-            (0x608F, (encoder, 1)),
-            (0x6091, (gear, 1)),
-            (0x6076, ("UDINT", 40_000)),
-            (0x603F, ("UINT", 0)),
-        )
-    }
-
-
-def arm_of(directory: Path, key: str, held: Objects, **options: float) -> tuple[ArmConfig, SegmentConfig]:
-    """The shipped arm with drives of another device file, as many as its joints need."""
+def arm_of(directory: Path, name: str, differing: Objects | None = None) -> tuple[ArmConfig, SegmentConfig]:
+    """The shipped arm with the drives of another one, as many as its joints need."""
+    key, held, options = ARMS[name]
     device = load_device(default_config().parent / "devices" / f"{key}.yaml")
-    write_esi(directory / "drive.xml", device, held)
+    write_esi(directory / "drive.xml", device, {**held, **(differing or {})})
     axes = len(device.axes)
     slaves = tuple(SlaveConfig(f"drive{i + 1}", device, f"{key}.yaml") for i in range(6 // axes))
     joints = tuple(
         replace(joint, slave=f"drive{i // axes + 1}", axis=i % axes + 1) for i, joint in enumerate(SHIPPED.joints)
     )
     config = replace(SHIPPED, slaves=(SHIPPED.slaves[0], *slaves), joints=joints)
-    given = {**options, "rated_torque": RATED[key], "temperature": 30.0}
-    described = SegmentSlave(esi="drive.xml", behaviour="cia402", options=given)
+    described = SegmentSlave(esi="drive.xml", behaviour="cia402", options=options)
     shipped = load_segment(segment_path(SHIPPED))
     segment = replace(
         shipped, slaves=(shipped.slaves[0], *[described] * len(slaves)), source=directory / "segment.yaml"
@@ -111,17 +94,10 @@ def arm_of(directory: Path, key: str, held: Objects, **options: float) -> tuple[
     return replace(config, cycle=replace(SHIPPED.cycle, period_us=1000.0)), segment
 
 
-ARMS = [
-    ("myactuator-x6-60", {}, {"counts_per_turn": 131072.0}),
-    ("two-axis-drive", objects((1, 2)), {}),
-]  # fmt: skip
-
-
-@pytest.fixture(params=ARMS, ids=lambda arm: arm[0])
+@pytest.fixture(params=ARMS)
 def standard(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Simulation]:
     """Enabled at `BENT`."""
-    key, held, options = request.param
-    config, segment = arm_of(tmp_path, key, held, **options)
+    config, segment = arm_of(tmp_path, request.param)
     with Simulation(config, follow_clock=False, positions=BENT, segment=segment) as made:
         start(made)
         yield made
@@ -142,7 +118,10 @@ def servos(arm: Simulation) -> list[ServoAxis]:
 def test_an_arm_of_standard_drives_moves_where_it_is_sent(standard: Simulation) -> None:
     goal = (0.2, 0.35, 2.2, -0.2, 0.4, 0.3)
     assert standard.send(MoveJoints(goal, 0.5, True)).refusal is None
-    standard.run(0.05)
+    standard.run(0.6)
+    assert min(abs(servo.mechanics.velocity) for servo in servos(standard)) > 0.02
+    speeds = [pytest.approx(servo.mechanics.velocity, abs=5e-3) for servo in servos(standard)]
+    assert standard.loop.arm.state.actual_velocity == speeds
     assert standard.until(lambda: standard.state is State.HOLDING, 8.0)
     standard.run(0.3)
     assert [servo.mechanics.position for servo in servos(standard)] == [pytest.approx(q, abs=5e-3) for q in goal]
@@ -161,15 +140,27 @@ def test_a_fault_of_one_axis_stops_all_and_names_its_joint(standard: Simulation)
     (fault,) = [record.event for record in standard.events if isinstance(record.event, DriveFault)]
     assert fault.axis == 1
     texts = [text.sentence for text in standard.observer.texts_since(0)]
-    has_code = standard.config.slaves[1].device.axes == (1, 2)
+    has_code = (0x603F, 0) in standard.bus.slaves[1].device.objects
     assert any(text.startswith("joint2: the drive's error code is 0x2310") for text in texts) is has_code, texts
     assert not servos(standard)[1].powered
     assert standard.send(Reset()).refusal is None
     assert standard.until(lambda: standard.state is State.READY, 5.0)
 
 
+def test_a_drive_homes_where_it_can_and_otherwise_the_arm_holds(standard: Simulation) -> None:
+    homes = (0x6098, 0) in standard.bus.slaves[1].device.objects
+    before = standard.loop.arm.state.actual[2]
+    assert standard.send(Home(2)).refusal is None
+    standard.run(0.05)
+    assert standard.until(lambda: standard.state is State.HOLDING, 5.0)
+    (end,) = [record.event for record in standard.events if isinstance(record.event, Homed | HomingFailed)]
+    assert (isinstance(end, Homed), end.axis) == (homes, 2)
+    if isinstance(end, HomingFailed):
+        assert (end.mode, standard.loop.arm.state.actual[2]) == (8, pytest.approx(before, abs=1e-3))
+
+
 def test_the_loss_of_a_slave_concerns_all_its_axes(tmp_path: Path) -> None:
-    config, segment = arm_of(tmp_path, *ARMS[1][:2])
+    config, segment = arm_of(tmp_path, "two-axis")
     with Simulation(config, follow_clock=False, positions=BENT, segment=segment) as arm:
         start(arm)
         arm.bus.drop(3, 2, 0x001B)
@@ -184,7 +175,6 @@ def test_the_loss_of_a_slave_concerns_all_its_axes(tmp_path: Path) -> None:
 
 
 def test_a_drive_whose_second_axis_has_another_gear_does_not_start(tmp_path: Path) -> None:
-    held = {**objects((1, 2)), 0x6891: (100, 1)}
-    config, segment = arm_of(tmp_path, "two-axis-drive", held)
+    config, segment = arm_of(tmp_path, "two-axis", {0x6891: (100, 1)})
     with pytest.raises(BusError, match=r"slave 2 \(drive1\), axis 2: .*0x6891 holds 100 .* the file has 50 "):
         Simulation(config, segment=segment)

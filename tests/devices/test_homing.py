@@ -174,7 +174,8 @@ def test_a_drive_that_knows_no_homing_stays_in_csp(drive, wire):
     homing = Homing(PERIOD_S)
     homing.start(drive)
     assert told(homing, wire, ENABLED, 1999, mode=8) is P.ENTERING
-    assert told(homing, wire, ENABLED, 4, mode=8) is P.STUCK
+    assert told(homing, wire, ENABLED, 4, mode=8) is P.FAILED
+    assert (homing.shown, homing.shown_mode) == (ENABLED, 8)
     assert (wire.hears()[0], wire.hears()[4]) == (0x0F, 8)
 
 

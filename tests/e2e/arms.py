@@ -3,38 +3,36 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import yaml
 
-from rtcp.config import load_device
-from tests.drive_esi import Objects, write_esi
+from rtcp.config import default_config, load_device
+from tests.drive_esi import ARMS, write_esi
 
-TWO_AXIS: Objects = {
-    index + shift: held
-    for shift in (0, 0x800)
-    for index, held in ((0x608F, (131072, 1)), (0x6091, (50, 1)), (0x6076, ("UDINT", 40_000)), (0x603F, ("UINT", 0)))
-}
-MYACTUATOR: Objects = {0x608F: (131072, 1), 0x603F: ("UINT", 0)}
-ARMS: dict[str, tuple[str, int, Objects, float]] = {
-    "two-axis": ("two-axis-drive", 2, TWO_AXIS, 40.0),
-    "myactuator": ("myactuator-x6-60", 1, MYACTUATOR, 9.5 * 2.1),
-}
-"""By name: device file, axes of a drive, what the drive holds, its rated torque, Nm."""
+
+def slaves_of(name: str) -> int:
+    """Return how many slaves an arm has, its IO box counted."""
+    device, _, _ = ARMS[name]
+    return 1 + 6 // len(load_device(default_config().parent / "devices" / f"{device}.yaml").axes)
 
 
 def replace_drives(folder: Path, name: str) -> None:
     """Replace the six drives of the configuration in `folder` by those of another arm."""
-    device, axes, objects, rated_torque = ARMS[name]
-    write_esi(folder / "drive.xml", load_device(folder / "devices" / f"{device}.yaml"), objects)
+    device, objects, own = ARMS[name]
+    described = load_device(folder / "devices" / f"{device}.yaml")
+    write_esi(folder / "drive.xml", described, objects)
+    axes = len(described.axes)
     arm, segment = (yaml.safe_load((folder / file).read_text()) for file in ("assistive_arm.yaml", "segment.yaml"))
-    drives = [{"name": f"drive{i}", "device": device} for i in range(1, 6 // axes + 1)]
-    arm["slaves"] = [arm["slaves"][0], *drives]
-    for i, joint in enumerate(arm["joints"]):
-        joint |= {"slave": f"drive{i // axes + 1}", "axis": i % axes + 1}
     # A described drive has no 0x10F1: its limit of missed SYNC0 is an option.
-    options: dict[str, Any] = {"rated_torque": rated_torque, "sync_error_limit": 0}
-    drive = {"esi": "drive.xml", "behaviour": "cia402", "options": options}
-    segment["slaves"] = [segment["slaves"][0], *[drive] * len(drives)]
+    drives = [{"esi": "drive.xml", "behaviour": "cia402", "options": {**own, "sync_error_limit": 0}}
+              for _ in range(6 // axes)]  # fmt: skip
+    # Its inertia at the last joint is not that of the smallest Cubemars: the gains of the joint before it suit.
+    arm["joints"][5] |= {key: value for key, value in arm["joints"][4].items() if key.startswith("cst_")}
+    for i, joint in enumerate(arm["joints"]):
+        at, axis = i // axes, i % axes + 1
+        joint |= {"slave": f"drive{at + 1}", "axis": axis, "torque": 1000.0 * described.scaling_of(axis).torque}
+        drives[at]["options"][f"axis{axis}_load_inertia"] = segment["slaves"][i + 1]["options"]["load_inertia"]
+    arm["slaves"] = [arm["slaves"][0], *({"name": f"drive{i + 1}", "device": device} for i in range(len(drives)))]
+    segment["slaves"] = [segment["slaves"][0], *drives]
     for file, data in (("assistive_arm.yaml", arm), ("segment.yaml", segment)):
         (folder / file).write_text(yaml.safe_dump(data, sort_keys=False))

@@ -25,12 +25,31 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket, segment_control
 from rtcp.ipc.session import read_processes
 from rtcp.virtual.faults.control import SegmentClient
-from tests.e2e.arms import replace_drives
+from tests.e2e.arms import replace_drives, slaves_of
 
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
 PERIOD_US = 2000
 """Cycle of a platform under test: a shared host does not hold a shorter one beside what is tested."""
+
+
+OTHER_ARM = os.environ.get("RTCP_TEST_ARM", "")
+"""Arm of `tests.drive_esi.ARMS` that the tests run with in place of the shipped one."""
+SLAVES = slaves_of(OTHER_ARM) if OTHER_ARM else 7
+CUBEMARS = pytest.mark.other_arms()
+"""Of a test that reads process data or objects as the shipped arm's drives have them."""
+FULL_CIA402 = pytest.mark.other_arms("two-axis", "synapticon")
+"""Of a test for which MyActuator's drives lack modes or objects: they have CSP alone, and do not home."""
+SEVEN_SLAVES = pytest.mark.other_arms("myactuator", "synapticon")
+"""Of a test that names slaves which an arm of three drives has not got."""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests that another arm is no subject of."""
+    markers = [(item, item.get_closest_marker("other_arms")) for item in items]
+    left_out = [item for item, marker in markers if OTHER_ARM and marker is not None and OTHER_ARM not in marker.args]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in left_out]
 
 
 class Platform:
@@ -68,8 +87,8 @@ class Platform:
         segment = mine / "segment.yaml"
         segment.write_text(re.sub(r", initial_position: [-0-9.]+", "", segment.read_text()))
         self.environment["RTCP_CONFIG"] = str(file)
-        if other := os.environ.get("RTCP_TEST_ARM"):
-            replace_drives(mine, other)
+        if OTHER_ARM:
+            replace_drives(mine, OTHER_ARM)
 
     def rtcp(self, *arguments: str, check: int | None = 0) -> subprocess.CompletedProcess[str]:
         """Run `rtcp` with `arguments`; assert its exit code unless `check` is None."""

@@ -17,7 +17,7 @@ from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_
 from rtcp.ipc.schema import FLAG_ALL_OP, FLAG_DC_LOCKED, arm_schema
 from rtcp.telemetry.reading import target_steps
 from rtcp.virtual.faults.control import SegmentClient
-from tests.e2e.conftest import Platform, gone, kill, lives
+from tests.e2e.conftest import CUBEMARS, FULL_CIA402, SLAVES, Platform, gone, kill, lives
 from tests.e2e.wire import outputs
 
 pytestmark = pytest.mark.alone
@@ -61,7 +61,7 @@ def test_a_stop_leaves_slaves_in_init_and_nothing_behind(running: Platform) -> N
     blackboard = blackboard_file(running.directory)
     os.kill(pids["loop"], signal.SIGTERM)
     gone(pids["loop"])
-    assert running.al_states() == [INIT] * 7
+    assert running.al_states() == [INIT] * SLAVES
     running.rtcp("stop")
     assert not any(lives(pid) for pid in pids.values())
     assert not blackboard.exists()
@@ -117,12 +117,13 @@ def test_a_segment_that_stands_still_for_longer_than_allowed_is_a_fault_and_can_
     assert f"; the fault: {status['message']}" in running.rtcp("enable", check=3).stderr
     running.until(lambda found: all(slave["state"] == "OP" for slave in found["slaves"]), "OP")
     running.call("reset")
-    assert running.al_states() == [OP] * 7
+    assert running.al_states() == [OP] * SLAVES
     assert running.status()["state"] == "ready"
     running.call("enable")
     running.call("move_joints", q=ZERO)
 
 
+@CUBEMARS
 @pytest.mark.parametrize("mode", ["csp", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("csv", "cst"))])
 def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform, mode: str) -> None:
     running.call("mode", name=mode)
@@ -136,7 +137,7 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform
         running.wire("init", "0")
         assert moving.wait() == 5
         # Not the first look alone: the cycle that it shows may be one whose frame a shared host held up.
-        status = running.until(lambda found: 0 < found["wkc"]["actual"] < 21, "an answer without the IO box")
+        status = running.until(lambda found: 0 < found["wkc"]["actual"] < 3 * SLAVES, "an answer without the IO box")
         assert status["state"] == "fault"
 
         def drives() -> list[dict[str, Any]]:
@@ -166,6 +167,7 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform
         assert running.rtcp("reset", check=5).stderr
 
 
+@FULL_CIA402
 def test_an_object_is_not_written_while_drives_have_torque(running: Platform) -> None:
     running.call("enable")
     done = running.rtcp("sdo", "write", "2", "0x6065:0", "9999", "--type", "uint32", check=3)
@@ -229,7 +231,7 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdog(running: Platform) ->
     pids = running.pids()
     kill(pids["loop"])
     end = time.monotonic() + 20
-    while running.al_states()[1:] != [SAFE_OP_ERROR] * 6:
+    while running.al_states()[1:] != [SAFE_OP_ERROR] * (SLAVES - 1):
         assert time.monotonic() < end, running.al_states()
     status = running.status()
     assert status["state"] == "fault"

@@ -6,7 +6,7 @@ import pytest
 
 from rtcp.fieldbus.bus import station_of
 from rtcp.ipc.errors import Faulted
-from tests.e2e.conftest import Platform
+from tests.e2e.conftest import SLAVES, Platform
 
 pytestmark = pytest.mark.alone
 
@@ -25,7 +25,7 @@ def test_a_reference_clock_that_lost_its_station_address_stops_the_arm_and_is_fo
     assert "clock_lost" in running.events(since)
     status = running.status()
     assert (status["state"], status["dc"]["locked"]) == ("fault", False)
-    assert running.al_states() == [OP] * 7
+    assert running.al_states() == [OP] * SLAVES
     with pytest.raises(Faulted) as failed:
         running.call("reset")
     assert failed.value.reason == "reset_without_frames"

@@ -15,7 +15,7 @@ import pytest
 from rtcp.ipc.runtime_directory import segment_control
 from rtcp.ipc.session import read_session
 from rtcp.virtual.faults.control import SegmentClient
-from tests.e2e.conftest import Platform, gone, kill, lives
+from tests.e2e.conftest import CUBEMARS, SEVEN_SLAVES, SLAVES, Platform, gone, kill, lives
 from tests.e2e.wire import inputs, outputs
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow]
@@ -113,9 +113,9 @@ def test_a_loop_that_hangs_is_stopped_by_the_watchdog_and_moves_again_after_rese
         assert time.monotonic() < end
     last_ns = max(drive["moved_ns"] for drive in drives(platform))
     assert (last_ns - stopped_ns) * 1e-9 < 0.6
-    while platform.al_states()[1:] != [SAFE_OP_ERROR] * 6:
+    while platform.al_states()[1:] != [SAFE_OP_ERROR] * (SLAVES - 1):
         assert time.monotonic() < end
-    assert json.loads(platform.wire("codes"))[1:] == [SYNC_MANAGER_WATCHDOG] * 6
+    assert json.loads(platform.wire("codes"))[1:] == [SYNC_MANAGER_WATCHDOG] * (SLAVES - 1)
     said = f"the loop (process {loop}) has published nothing for"
     status = platform.until(lambda found: said in found["message"], "the silence")
     assert status["state"] == "fault"
@@ -180,6 +180,7 @@ def test_a_stop_that_had_to_kill_the_loop_says_so_and_fails(platform: Platform) 
     assert not lives(loop)
 
 
+@SEVEN_SLAVES
 def test_a_stop_names_the_slaves_that_did_not_come_to_init_and_fails(platform: Platform) -> None:
     platform.be_patient(2000)
     platform.rtcp("start", "--detach")
@@ -223,6 +224,7 @@ def test_a_loop_that_is_terminated_alone_is_a_fault_of_the_foreground_start(plat
     assert not any(lives(pid) for pid in pids.values())
 
 
+@CUBEMARS
 def test_a_defect_in_the_cycle_ramps_the_joints_down_and_leaves_slaves_in_init(platform: Platform) -> None:
     # A defect cannot be ordered from outside: the interpreter's own start-up hook puts one into the real loop.
     hook = platform.directory / "hook"
@@ -256,5 +258,5 @@ def test_a_defect_in_the_cycle_ramps_the_joints_down_and_leaves_slaves_in_init(p
     turning = [drive.statusword & STATE_BITS for _, drives in shown for drive in drives if abs(drive.velocity) > 100]
     assert set(turning) == {OPERATION_ENABLED, QUICK_STOP_ACTIVE}
     assert {drive.statusword & 0x4F for drive in shown[-1][1]} == {SWITCH_ON_DISABLED}
-    assert platform.al_states() == [INIT] * 7
+    assert platform.al_states() == [INIT] * SLAVES
     assert "ended unexpectedly" in platform.status()["message"]

@@ -17,7 +17,7 @@ from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import Refused
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
-from tests.e2e.conftest import Platform, kill
+from tests.e2e.conftest import FULL_CIA402, Platform, kill
 
 pytestmark = pytest.mark.alone
 
@@ -179,6 +179,7 @@ def test_a_stream_is_followed_and_its_end_stops_the_arm(bent: Platform, client: 
     assert abs(found["joints"]["commanded_position"][0] - q[0]) < 0.03
 
 
+@FULL_CIA402
 def test_joint_speeds_move_in_mode_velocity_only(bent: Platform, client: ControlClient) -> None:
     with pytest.raises(Refused) as refused:
         client.call("move_at_velocity", {"velocity": [0.1, 0, 0, 0, 0, 0]})
@@ -193,6 +194,7 @@ def test_joint_speeds_move_in_mode_velocity_only(bent: Platform, client: Control
     assert 0.05 < found["joints"]["commanded_position"][0] - start < 0.25
 
 
+@FULL_CIA402
 def test_a_stiffness_in_mode_torque_holds_the_arm_where_it_is(bent: Platform, client: ControlClient) -> None:
     client.call("mode", {"name": "torque"})
     start = client.call("status")["joints"]["actual_position"]
@@ -253,6 +255,7 @@ def test_the_gripper_switches_its_output(bent: Platform) -> None:
         )
 
 
+@FULL_CIA402
 def test_a_joint_is_homed_and_holds_again(bent: Platform) -> None:
     bent.call("home", joint="joint6")
     assert bent.status()["state"] == "holding"

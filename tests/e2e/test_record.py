@@ -18,7 +18,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.session import read_processes
 from rtcp.telemetry.reading import read
 
-from .conftest import Platform
+from .conftest import CUBEMARS, Platform
 from .wire import COUNTS_PER_RAD, inputs, outputs
 
 pytestmark = pytest.mark.alone
@@ -56,6 +56,7 @@ def test_a_move_is_recorded_cycle_by_cycle_while_the_gateway_is_killed(enabled: 
     assert len(Path(first["files"][1]).read_text().splitlines()) == 1 + len(found)
 
 
+@CUBEMARS
 def test_the_columns_of_a_csv_are_those_of_the_frames_captured_at_the_segment(
     enabled: Platform, tmp_path: Path
 ) -> None:

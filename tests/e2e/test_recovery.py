@@ -14,7 +14,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, segment_control
 from rtcp.virtual.faults.control import SegmentClient
-from tests.e2e.conftest import PERIOD_US, Platform
+from tests.e2e.conftest import CUBEMARS, PERIOD_US, SEVEN_SLAVES, SLAVES, Platform
 from tests.e2e.wire import outputs
 
 pytestmark = pytest.mark.alone
@@ -64,6 +64,7 @@ def reset_and_enable(platform: Platform) -> None:
     assert platform.status()["state"] == "holding"
 
 
+@CUBEMARS
 def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
     enabled: Platform, segment: SegmentClient, tmp_path: Path
 ) -> None:
@@ -147,17 +148,18 @@ def test_slaves_behind_a_mended_cable_are_back_when_the_arm_is_reset(enabled: Pl
 def test_a_reset_while_a_slave_is_still_away_fails_and_a_later_one_does_not(
     enabled: Platform, segment: SegmentClient
 ) -> None:
-    away = segment.fault({"fault": "power", "slave": 7})
+    away = segment.fault({"fault": "power", "slave": SLAVES})
     enabled.until(lambda found: found["state"] == "fault", "the fault")
     with pytest.raises(RtcpError):
         enabled.call("reset")
     assert enabled.status()["state"] == "fault"
-    assert enabled.status()["slaves"][6]["state"] == "no answer"
+    assert enabled.status()["slaves"][-1]["state"] == "no answer"
     segment.clear(away)
     assert well(enabled)["state"] == "fault"
     reset_and_enable(enabled)
 
 
+@SEVEN_SLAVES
 def test_a_cable_that_damages_frames_is_named_with_the_errors_counted(shared: Platform, segment: SegmentClient) -> None:
     before = shared.status()["slaves"]
     segment.fault({"fault": "corrupt", "after": 4, "burst": 40})

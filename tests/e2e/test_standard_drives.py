@@ -1,4 +1,4 @@
-"""An arm of three two-axis drives, and a slave of which only its channels are known, by their files alone."""
+"""Arms of other drives, and a slave of which only its channels are known, by their files alone."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import yaml
 import rtcp
 from rtcp.config import load_device
 from rtcp.ipc.runtime_directory import control_socket
-from tests.drive_esi import write_esi
-from tests.e2e.arms import TWO_AXIS, replace_drives
-from tests.e2e.conftest import Platform
+from tests.drive_esi import TWO_AXIS, write_esi
+from tests.e2e.arms import replace_drives
+from tests.e2e.conftest import CUBEMARS, Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, CUBEMARS]
 
 VALVES = """
 name: Valve terminal
@@ -56,12 +56,35 @@ def started(platform: Platform) -> Platform:
     return platform
 
 
-def test_an_arm_of_two_axis_drives_moves_is_recovered_and_its_channels_are_read_and_set(started: Platform) -> None:
+def move_and_stop(platform: Platform) -> None:
+    """Enable, move by the joints and on a line, press the virtual emergency stop, end the platform."""
     goal = [0.2, 0.3, 0.4, -0.2, 0.4, 0.3]
-    with rtcp.connect("a test", control_socket(started.directory)) as robot:
+    with rtcp.connect("a test", control_socket(platform.directory)) as robot:
         robot.enable()
         robot.move_joints(goal, speed=0.5)
-        assert robot.status().raw["joints"]["actual_position"] == [pytest.approx(q, abs=5e-3) for q in goal]
+        assert robot.positions == pytest.approx(goal, abs=5e-3)
+        before = robot.status().pose[2]
+        robot.mode("cartesian")
+        robot.move_by((0.0, 0.0, -0.03, 0.0, 0.0, 0.0))
+        assert robot.status().pose[2] - before == pytest.approx(-0.03, abs=5e-3)
+    platform.rtcp("joystick", "estop", "--seconds", "0.3")
+    platform.until(
+        lambda found: found["state"] == "emergency_stop" and not found["robot"]["drives_powered"], "emergency stop"
+    )
+    platform.rtcp("stop")
+
+
+@pytest.mark.parametrize("name", ["myactuator", "synapticon"])
+def test_an_arm_of_other_drives_moves_and_stops(platform: Platform, name: str) -> None:
+    platform.be_patient(2000)
+    replace_drives(platform.directory / "config", name)
+    platform.rtcp("start", "--detach")
+    move_and_stop(platform)
+
+
+def test_an_arm_of_two_axis_drives_moves_is_recovered_and_its_channels_are_read_and_set(started: Platform) -> None:
+    with rtcp.connect("a test", control_socket(started.directory)) as robot:
+        robot.enable()
         started.rtcp("segment", "set", "5", "0x6000:1", "350")
         started.until(lambda found: robot.io["valves.pressure"] == pytest.approx(2.5), 10.0)
         assert robot.io["valves.current"] == 4.0
@@ -81,8 +104,7 @@ def test_an_arm_of_two_axis_drives_moves_is_recovered_and_its_channels_are_read_
     started.rtcp("segment", "clear")
     started.call("reset")
     assert "4000" in started.rtcp("segment", "get", "5", "0x7000:1").stdout
-    started.call("enable")
-    assert started.status()["state"] == "holding"
+    move_and_stop(started)
 
 
 def test_an_arm_is_built_from_the_makers_file_and_moves(platform: Platform) -> None:

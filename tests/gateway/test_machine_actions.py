@@ -353,7 +353,7 @@ def test_the_gripper_with_a_drive_has_a_zero_too(driven: FakePlatform) -> None:
 def test_homing_returns_the_position_or_fails_with_the_drives_answer(arm: FakePlatform) -> None:
     arm.loop.reports[Home] = [Homed(1, 0.2)]
     assert arm.ask("home", joint="joint2") == {"joint": "joint2", "position": 0.2}
-    arm.loop.reports[Home] = [HomingFailed(1, 0x2637)]
+    arm.loop.reports[Home] = [HomingFailed(1, 0x2637, 6)]
     error = arm.error("home", joint="joint2")
     assert (error.kind, error.reason, error.fields["statusword"]) == ("fault", "homing_failed", 0x2637)
     arm.loop.reports[Home] = []

@@ -20,8 +20,10 @@ from rtcp.ipc.events import SlaveLost
 from rtcp.ipc.states import State as MachineState
 from rtcp.launch.inprocess import InProcessBus, InProcessData
 from rtcp.launch.simulation import Frame, Simulation
+from rtcp.virtual.described import DescribedDevice
 from rtcp.virtual.models import create
 from rtcp.virtual.protocol import AlState
+from tests.fieldbus.terminals import DEVICES, Echo, slave
 
 PERIOD_NS = 1_000_000
 MS = 1_000_000
@@ -152,6 +154,45 @@ def test_another_slave_than_the_configuration_lists_is_refused_with_both_named(c
         bus.configure(config.slaves, PERIOD_NS)
     with pytest.raises(BusError, match=r"3 slaves answer, the configuration .* lists 2"):
         bus.configure(config.slaves[:2], PERIOD_NS)
+
+
+def test_slaves_without_mailbox_or_with_several_sync_managers_a_direction_carry_their_process_data() -> None:
+    kinds = ("coupler", "bits4", "areas", "emulated", "pairs", "input", "output", "files")
+    bus = InProcessBus([DescribedDevice(DEVICES[kind], lambda alias: b"", Echo) for kind in kinds], 1)
+    data = bus.configure([slave(kind, kind) for kind in kinds], PERIOD_NS)
+    sent = [bytes(0xA1 + n for n in range(length)) for length in data._lengths]
+
+    def exchange(cycles: int) -> int:
+        for _ in range(cycles):
+            bus.advance_to(bus.now_ns + PERIOD_NS)
+            data.send()
+            wkc = data.receive()
+        return wkc
+
+    exchange(1)
+    bus.request_state(AlState.OP)
+    assert bus.wait_for_state(AlState.OP, 0.0) == ()
+    for index, output in enumerate(sent):
+        data.set_output(index, output)
+    assert exchange(4) == data.expected_wkc == 5 * 3 + 1 + 2
+    four_bits, first_of_three = bytes((sent[1][0] & 0x0F,)), sent[2][:1] + b"\0"
+    assert data.inputs == [b"", four_bits, first_of_three, bytes((sent[3][0] & 0x0F,)), sent[4], b"\0", b"", sent[7]]
+
+
+def test_a_slave_whose_file_has_other_lengths_or_services_is_refused_in_a_sentence() -> None:
+    for kind, config, said in (
+        ("bits4", slave("t", "areas"), "position 1 (t): expected Terminal 30"),
+        (
+            "areas",
+            replace(slave("t", "areas"), device=replace(slave("t", "areas").device, coe=False, rpdo=())),
+            "bytes",
+        ),
+        ("bits4", replace(slave("t", "bits4"), device=replace(slave("t", "bits4").device, coe=True)), "has no CoE"),
+    ):
+        bus = InProcessBus([DescribedDevice(DEVICES[kind], lambda alias: b"", None)], 1)
+        with pytest.raises(BusError) as refused:
+            bus.configure([config], PERIOD_NS)
+        assert said in str(refused.value)
 
 
 def test_a_description_that_a_fixed_mapping_does_not_fit_is_refused(config: ArmConfig) -> None:

@@ -1,8 +1,9 @@
 """The behaviour `cia402`: a described servo drive of one or more axes with the units of the standard.
 
-Positions count 0x6092 a turn where the drive has it, else 0x608F times 0x6091; velocities and accelerations the same
-a second and a second squared; torques per mille of 0x6076, at the joint (CiA 402-2, ETG.6010). It works on whatever
-objects the drive has: what is 0 or missing gets a default.
+Positions count 0x6092 a turn where the drive has it, else 0x608F times 0x6091; velocities in the unit of 0x60A9, else
+the same a second; accelerations in that of 0x60AA, else velocities a second; torques per mille of 0x6076. Revolutions
+and torques are the motor's, 0x6091 the gear behind it (CiA 402-2, ETG.6010). It works on whatever objects the drive
+has: what is 0 or missing gets a default.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from rtcp.virtual.models.mechanics import SIZES, ActuatorSize, Axis, Mechanics
 from rtcp.virtual.models.profile_modes import Homing, ProfilePosition, ProfileVelocity
 from rtcp.virtual.models.protection import Condition, ErrorLog, Feedback
 from rtcp.virtual.models.servo import ServoAxis
-from rtcp.virtual.models.units import AXIS_STRIDE, LIMITLESS, Absent, AxisObjects, Units
+from rtcp.virtual.models.units import AXIS_STRIDE, LIMITLESS, Absent, AxisObjects, Units, rate_unit
 from rtcp.virtual.protocol import AlState
 
 MOST_AXES = 8
@@ -36,10 +37,13 @@ _POSITION_LIMIT = (1 << 31) - 1
 _SUPPORTED = {1: 0x607A, 3: 0x60FF, 6: 0x6098, 8: 0x607A, 9: 0x60FF, 10: 0x6071}
 """Modes, and the object without which a drive has not got them."""
 _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
-    "rated_torque": Option(None, 0.001, 10_000.0, "Nm at the joint; left out: 0x6076, else 28"),
+    "rated_torque": Option(None, 0.001, 10_000.0, "Nm at the joint; left out: by 0x6076, else 28"),
     "peak_torque": Option(None, 0.001, 30_000.0, "Nm; left out: twice the rated torque"),
     "max_speed": Option(10.0, 0.01, 1000.0, "speed above which the drive fails, rad/s"),
     "counts_per_turn": Option(None, 1.0, 2.0**40, "counts of a turn of the joint; left out: by 0x608F, 0x6091, 0x6092"),
+    "velocity_ratio": Option(None, 1e-3, 1e6, "turns that 0x60A9 counts in for one of the joint; left out: by 0x6091"),
+    "torque_ratio": Option(None, 1e-6, 1e6, "Nm at the joint for 1000 of 0x6076; left out: by 0x6091"),
+    "rated_current": Option(_MODEL.rated_current, 0.001, 10_000.0, "A (0x6075)"),
     **SERVO_OPTIONS,
 })  # fmt: skip
 
@@ -117,7 +121,8 @@ class _StandardAxis:
         self._number = number
         objects = self._objects = AxisObjects(drive.device.objects, Units(1.0, 1.0, 1.0, 1.0, 1.0), number)
         self._rated = objects.number(0x6076)
-        given = self._option("rated_torque", 0.0) or self._rated.value * 1e-3 or _MODEL.rated_torque
+        stated = self._rated.value * 1e-3 * self._torque_ratio
+        given = self._option("rated_torque", 0.0) or stated or _MODEL.rated_torque
         size = self._size = _size_of(given, self._option("peak_torque", 2.0 * given))
         self._max_speed = Absent(0)
         mechanics = Mechanics(
@@ -150,12 +155,15 @@ class _StandardAxis:
     def _read_units(self) -> None:
         objects, units = self._objects, self._objects.units
         turn = self._option("counts_per_turn", self._counts_per_turn())
-        units.position = units.velocity = units.acceleration = 2 * pi / turn
+        units.position = 2 * pi / turn
+        ratio = self._option("velocity_ratio", self._gear_ratio)
+        units.velocity = rate_unit(objects.number(0x60A9).value, units.position, ratio) or units.position
+        units.acceleration = rate_unit(objects.number(0x60AA).value, units.position, ratio) or units.velocity
         units.increments = turn / (2 * pi)
         rated = self._rated
         if not rated.value or self._option("rated_torque", 0.0):
-            rated.value = round(self._size.rated_torque * 1000.0)
-        units.torque = rated.value * 1e-6
+            rated.value = round(self._size.rated_torque * 1000.0 / self._torque_ratio)
+        units.torque = rated.value * 1e-6 * self._torque_ratio
         self._max_speed.value = round(self._option("max_speed") / units.velocity)
         objects.fill(self._defaults(units))
 
@@ -164,8 +172,16 @@ class _StandardAxis:
         feed = self._ratio(0x6092)
         if feed:
             return feed
-        resolution, gear = self._ratio(0x608F), self._ratio(0x6091)
-        return (resolution or _COUNTS_PER_TURN) * (gear or 1.0)
+        return (self._ratio(0x608F) or _COUNTS_PER_TURN) * self._gear_ratio
+
+    @property
+    def _gear_ratio(self) -> float:
+        """Turns of the motor for one of the joint."""
+        return self._ratio(0x6091) or 1.0
+
+    @property
+    def _torque_ratio(self) -> float:
+        return self._option("torque_ratio", self._gear_ratio)
 
     def _ratio(self, index: int) -> float:
         objects = self._objects
@@ -174,18 +190,19 @@ class _StandardAxis:
         return objects.number(index, 1).value / (objects.number(index, 2).value or 1)
 
     def _defaults(self, units: Units) -> dict[tuple[int, int], int]:
-        counts = round(1.0 / units.position)
+        counts, speed = round(1.0 / units.position), round(1.0 / units.velocity)
         acceleration = round(_ACCELERATION / units.acceleration)
         limit = min(_POSITION_LIMIT, LIMITLESS)
         defaults = {
             (0x6065, 0): 0xFFFF_FFFF,
             (0x6066, 0): 100,
             (0x6067, 0): max(1, counts // 1000),
-            (0x606D, 0): min(0xFFFF, max(1, counts // 100)),
-            (0x606F, 0): min(0xFFFF, max(1, counts // 200)),
+            (0x606D, 0): min(0xFFFF, max(1, speed // 100)),
+            (0x606F, 0): min(0xFFFF, max(1, speed // 200)),
+            (0x6075, 0): round(1000.0 * self._option("rated_current")),
             (0x6072, 0): round(1000.0 * self._size.peak_torque / self._size.rated_torque),
             (0x607F, 0): self._max_speed.value,
-            (0x6081, 0): round(1.0 / units.velocity),
+            (0x6081, 0): speed,
             (0x6083, 0): acceleration,
             (0x6084, 0): acceleration,
             (0x6085, 0): round(_QUICK_STOP / units.acceleration),
@@ -206,12 +223,11 @@ class _StandardAxis:
         return {at: value for at, value in defaults.items() if at not in _OPTION_CODES or at not in self._objects}
 
     def _modes(self, axis: Axis, objects: AxisObjects) -> dict[int, Motion]:
-        gear = self._ratio(0x6091) or 1.0
         unlimited = Absent(LIMITLESS)
         modes: dict[int, Motion] = {
             1: ProfilePosition(axis, objects),
             3: ProfileVelocity(axis, objects),
-            6: Homing(axis, objects, gear),
+            6: Homing(axis, objects, self._gear_ratio),
             8: CyclicPosition(axis, objects, unlimited, unlimited, Absent(0), Absent(0)),
             9: CyclicVelocity(axis, objects),
             10: CyclicTorque(axis, objects),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import pi
 
 from rtcp.virtual.device import Number, number
 from rtcp.virtual.objects import ObjectDictionary, bounds
@@ -13,6 +14,21 @@ LIMITLESS = 0x7FFF_FFFF
 """Stands for an unlimited value."""
 _PROFILE = range(0x6000, 0x6800)
 """Objects of the first axis; those below belong to the whole device."""
+_INCREMENT = 0xB5
+_ANGLES = {0xB4: 2 * pi, 0xB6: 2 * pi / 60, 0x10: 1.0, 0x41: pi / 180}
+"""Notation index of a numerator -> rad: revolution, the same a minute, radian, degree (ETG.1004, CiA 303-2)."""
+_TIMES = {0x03: 1.0, 0x47: 60.0, 0x57: 1.0}
+"""Notation index of a denominator -> s: second, minute, second squared."""
+
+
+def rate_unit(notation: int, increment: float, gear_ratio: float) -> float | None:
+    """Return what a count is at the joint, rad/s or rad/s^2, by 0x60A9 or 0x60AA; None: it is no such unit.
+
+    `increment` is that of the position, rad; angles turn `gear_ratio` times as far as the joint.
+    """
+    exponent, above, below = (notation >> 24 & 0xFF ^ 0x80) - 0x80, notation >> 16 & 0xFF, notation >> 8 & 0xFF
+    angle = increment if above == _INCREMENT else _ANGLES.get(above, 0.0) / gear_ratio
+    return 10.0**exponent * angle / _TIMES[below] if angle and below in _TIMES else None
 
 
 class Units:

@@ -40,9 +40,13 @@ def ratio(index: int, above: int, below: int) -> DictionaryObject:
     return DictionaryObject(index, "", ObjectCode.RECORD, tuple(entries))
 
 
+def variable(index: int, value: int) -> DictionaryObject:
+    entry = ObjectEntry(0, "", "UDINT", 32, default=value.to_bytes(4, "little"), writable=True)
+    return DictionaryObject(index, "", ObjectCode.VARIABLE, (entry,))
+
+
 def rated(millinewtonmetres: int) -> DictionaryObject:
-    entry = ObjectEntry(0, "Rated torque", "UDINT", 32, default=millinewtonmetres.to_bytes(4, "little"))
-    return DictionaryObject(0x6076, "Rated torque", ObjectCode.VARIABLE, (entry,))
+    return variable(0x6076, millinewtonmetres)
 
 
 def pdos(first: int, entries: tuple[tuple[int, int], ...], manager: int, axes: int) -> tuple[Pdo, ...]:
@@ -125,6 +129,46 @@ def test_csp_follows_its_targets_at_any_speed_and_csv_keeps_counts_a_second() ->
     bench.run(1.0)
     assert bench[0x606C] == pytest.approx(2500, abs=10)
     assert bench.device.servos[0].mechanics.velocity == pytest.approx(pi / 2, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("unit", "options", "counts"),
+    [
+        (0x00B44700, {}, 50 * 60 / (2 * pi)),
+        (0xFDB44700, {}, 50 * 60_000 / (2 * pi)),
+        (0xFDB44700, {"velocity_ratio": 1.0}, 60_000 / (2 * pi)),
+        (0x00B50300, {}, 4096 * 50 / (2 * pi)),
+        (0xFD410300, {"velocity_ratio": 1.0}, 180_000 / pi),
+        (0x00B60000, {}, 4096 * 50 / (2 * pi)),
+    ],
+    ids=["rpm", "mrpm", "mrpm of the joint", "counts a second", "millidegrees a second", "no rate"],
+)
+def test_velocities_count_in_the_unit_of_the_si_notation_and_accelerations_the_same_a_second(
+    unit: int, options: dict[str, float], counts: float
+) -> None:
+    bench = Bench(ratio(0x608F, 4096, 1), ratio(0x6091, 50, 1), variable(0x60A9, unit), variable(0x6083, 0), **options)
+    bench.enable(9)
+    bench[0x60FF] = round(counts)
+    bench.run(1.0)
+    assert bench.device.servos[0].mechanics.velocity == pytest.approx(1.0, rel=5e-3)
+    assert bench[0x606C] == pytest.approx(counts, rel=5e-3)
+    assert bench[0x6083] == pytest.approx(20.0 * counts, rel=1e-3)
+
+
+def test_accelerations_count_in_a_unit_of_their_own_where_the_drive_has_one() -> None:
+    units = variable(0x60A9, 0x00B44700), variable(0x60AA, 0xFD105700)
+    bench = Bench(ratio(0x6091, 50, 1), *units, variable(0x6083, 0))
+    assert bench[0x6083] == 20_000 * 50
+
+
+def test_rated_torque_and_current_are_the_motors_and_options_say_them_at_the_joint() -> None:
+    gear, current = ratio(0x6091, 50, 1), variable(0x6075, 0)
+    bench = Bench(gear, current, rated(400))
+    assert bench.device.servos[0].size.rated_torque == pytest.approx(20.0)
+    bench = Bench(gear, current, rated(0), rated_torque=20.0, rated_current=9.5)
+    assert (bench[0x6076], bench[0x6075]) == (400, 9500)
+    bench = Bench(gear, rated(20_000), torque_ratio=1.0)
+    assert bench.device.servos[0].size.rated_torque == pytest.approx(20.0)
 
 
 def test_torque_counts_per_mille_of_the_rated_torque() -> None:
