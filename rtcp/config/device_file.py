@@ -396,7 +396,7 @@ def _channel_lines(
     is_constant = known == "modes_of_operation" and not _shows_mode(device, axis)
     if is_constant:
         known = "mode_sent"
-    name = known or _unique(_identifier(entry), names, f"{key}.{axis}")
+    name = known or _unique(_identifier(entry), names, key, axis)
     if known:
         names[f"{key}.{axis}.{known}"] += 1
     keys = (
@@ -479,10 +479,12 @@ def _identifier(entry: PdoEntry) -> str:
     return name[:48].rstrip("_") or f"x{entry.index:04x}_{entry.sub_index}"
 
 
-def _unique(name: str, names: Counter[str], scope: str) -> str:
-    names[f"{scope}.{name}"] += 1
-    count = names[f"{scope}.{name}"]
-    return name if count == 1 else _unique(f"{name}_{count}", names, scope)
+def _unique(name: str, names: Counter[str], key: str, axis: int) -> str:
+    if key == "tpdo" and names[f"rpdo.{axis}.{name}"]:
+        return _unique(f"{name}_in", names, key, axis)
+    names[f"{key}.{axis}.{name}"] += 1
+    count = names[f"{key}.{axis}.{name}"]
+    return name if count == 1 else _unique(f"{name}_{count}", names, key, axis)
 
 
 def _quoted(text: str) -> str:

@@ -167,6 +167,16 @@ def _tpdo(device: DeviceDescription) -> Iterator[Finding]:
     return _pdos("tpdo", device.tpdo, device)
 
 
+@rule(DeviceDescription, "rpdo", "tpdo", "kind")
+def _one_name(device: DeviceDescription) -> Iterator[Finding]:
+    outputs = {entry.name for entry in device.outputs} if device.has_channels else set()
+    for i, pdo in enumerate(device.tpdo):
+        for j, entry in enumerate(pdo.channels):
+            if entry.is_number and entry.name in outputs:
+                text = f'found the text "{entry.name}", an output\'s name too; each channel of the device needs its own'
+                yield ("tpdo", i, "channels", j, "name"), text
+
+
 @rule(DeviceDescription, "assign_activate")
 def _dc_word(device: DeviceDescription) -> Iterator[Finding]:
     word = device.assign_activate

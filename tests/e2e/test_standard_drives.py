@@ -37,6 +37,11 @@ tpdo:
 def build(folder: Path) -> None:
     """Replace the six drives of the configuration in `folder` by three of two axes, and add the valves."""
     replace_drives(folder, "two-axis")
+    add_valves(folder)
+
+
+def add_valves(folder: Path) -> None:
+    """Add an analog terminal behind the slaves of the configuration in `folder`, and to its segment."""
     (folder / "devices" / "valves.yaml").write_text(VALVES)
     write_esi(folder / "valves.xml", load_device(folder / "devices" / "valves.yaml"), {})
     for file, slave in (
