@@ -255,22 +255,22 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
     for command in device.init_commands:
         if command.index in mapping or 0x1C10 <= command.index <= 0x1C2F:
             continue  # what the mapping below says
+        if not command.data:
+            continue
         if kind == "cia402" and command.index % OBJECTS_PER_AXIS == _MODE_OBJECT % OBJECTS_PER_AXIS:
             continue  # below
         entry = _object(device, command.index, command.sub_index)
         kept = None if entry is None else resolve(entry.type, entry.bits)
         name = (command.comment or ("" if entry is None else entry.name)).strip()
-        if command.complete_access or len(command.data) not in (1, 2, 4, 8) or (kept and kept.kind is Kind.TEXT):
-            written.append(
-                f"  # CHECK: not written, {len(command.data)} bytes to 0x{command.index:04X}:{command.sub_index}: "
-                f"{command.data[:16].hex(' ')} {name}"
-            )
-            continue
         signed = kept is not None and kept.kind is Kind.SIGNED
-        value = int.from_bytes(command.data, "little", signed=signed)
+        as_bytes = kept is not None and kept.kind in (Kind.TEXT, Kind.BYTES)
+        if command.complete_access or as_bytes or len(command.data) not in (1, 2, 4, 8):
+            what = f'type: bytes, data: "{command.data.hex(" ")}"' + ", complete: true" * command.complete_access
+        else:
+            number = int.from_bytes(command.data, "little", signed=signed)
+            what = f"type: {'int' if signed else 'uint'}{8 * len(command.data)}, value: {number}"
         written.append(
-            f"  - {{index: 0x{command.index:04X}, sub_index: {command.sub_index}, "
-            f"type: {'int' if signed else 'uint'}{8 * len(command.data)}, value: {value}"
+            f"  - {{index: 0x{command.index:04X}, sub_index: {command.sub_index}, {what}"
             + (f", name: {_quoted(name)}" if name else "")
             + "}"
         )

@@ -28,13 +28,19 @@ THERE = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1]
 
 
 @pytest.fixture
-def platform() -> Iterator[Platform]:
-    """A started platform, which forgives what a shared host does."""
+def prepared() -> Iterator[Platform]:
+    """A platform that forgives what a shared host does, not yet started."""
     made = Platform()
     made.be_patient(2000)
-    made.rtcp("start", "--detach")
     yield made
     made.end()
+
+
+@pytest.fixture
+def platform(prepared: Platform) -> Platform:
+    """A started platform."""
+    prepared.rtcp("start", "--detach")
+    return prepared
 
 
 def test_the_arm_is_enabled_moved_and_seen_over_zenoh(platform: Platform) -> None:
@@ -64,9 +70,8 @@ def test_the_arm_is_enabled_moved_and_seen_over_zenoh(platform: Platform) -> Non
     router.close()
 
 
-def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_everywhere() -> None:
-    platform, router = Platform(), Router()
-    platform.be_patient(2000)
+def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_everywhere(prepared: Platform) -> None:
+    platform, router = prepared, Router()
     add_valves(platform.directory / "config")
     platform.rtcp("start", "--detach")
     node = platform.background("ros", "--zenoh", "--router", router.address, "--name", "arm")
@@ -104,7 +109,6 @@ def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_every
     node.send_signal(signal.SIGINT)
     node.communicate()
     router.close()
-    platform.end()
 
 
 def test_without_a_router_the_node_waits_and_ends_when_it_is_asked_to(platform: Platform) -> None:
