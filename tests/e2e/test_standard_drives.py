@@ -124,6 +124,7 @@ def test_a_drive_that_counts_otherwise_than_its_file_does_not_start(platform: Pl
 
 
 def test_what_a_slave_has_otherwise_than_its_file_is_told_in_words(platform: Platform) -> None:
+    platform.be_patient(2000)
     folder = platform.directory / "config"
     (folder / "segment.yaml").write_text(f"slaves:\n  - {{esi: {ESI_FILES / 'analog.xml'}}}\n")
     sound, wrong = folder / "devices" / "sound.yaml", folder / "devices" / "wrong.yaml"
