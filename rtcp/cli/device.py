@@ -89,6 +89,7 @@ def _new(
     revision: Annotated[str | None, option("--revision", "NUMBER", "Revision. Default: the newest.")] = None,
     module: Annotated[list[str] | None, option("--module", "SLOT=IDENT", "Module in a slot; again for more.")] = None,
     kind: Annotated[str | None, option("--kind", "KIND", "Driver. Default: the one that fits.")] = None,
+    mode: Annotated[str | None, option("--mode", "NAME", "Clock mode, and the PDOs that it assigns.")] = None,
     config: ConfigFile = None,
 ) -> None:
     """Write a device's file that a person reads: process data with types and units, start-up SDOs, clocks, watchdog."""
@@ -111,7 +112,7 @@ def _new(
         raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
     else:
         made = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
-    text = file_text(made, kind)
+    text = file_text(made, kind, mode)
     try:
         with out.open("x") as file:
             file.write(text)

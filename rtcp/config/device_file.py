@@ -12,7 +12,7 @@ from rtcp.config.model import BITS
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.esi import units
 from rtcp.esi.dictionary import complete
-from rtcp.esi.model import DcMode, Device, ObjectEntry, Pdo, PdoEntry, SyncManagerType
+from rtcp.esi.model import DcMode, Device, EsiError, ObjectEntry, Pdo, PdoEntry, SyncManagerType
 from rtcp.esi.types import Kind, decode, resolve
 
 _DRIVE_PROFILE = 402
@@ -55,15 +55,42 @@ _CHANNEL = re.compile(r"(?:channel|ch\.?)\s*(\d+)", re.IGNORECASE)
 _WIDTH = 118
 
 
-def file_text(device: Device, kind: str | None = None) -> str:
+def file_text(device: Device, kind: str | None = None, mode: str | None = None) -> str:
     """Return the text of the device's file.
 
     Args:
         device: its description, with its modules in place.
         kind: the driver; None: the one that fits its process data.
+        mode: name of the clock mode; None: the one that fits.
+
+    Raises:
+        EsiError: it has no such mode, or one that assigns a PDO several times over.
     """
-    made = complete(for_drive(device))
-    return "\n".join(_lines(made, kind or kind_of(made))) + "\n"
+    made = complete(for_drive(device if mode is None else _in_mode(device, mode)))
+    return "\n".join(_lines(made, kind or kind_of(made), mode is not None)) + "\n"
+
+
+def _in_mode(device: Device, name: str) -> Device:
+    """Return a device with one clock mode before the others, and the PDOs assigned that this mode assigns."""
+    mode = next((one for one in device.dc_modes if one.name == name), None)
+    if mode is None:
+        there = ", ".join(one.name for one in device.dc_modes) or "none"
+        raise EsiError(device.origin, f"it has no clock mode {name!r}; there are: {there}")
+    if mode.oversamples:
+        raise EsiError(device.origin, f"clock mode {name} takes several values a cycle, which is not supported")
+    places = {index: manager for manager, indices in mode.pdos for index in indices}
+    managers = {manager for manager, _ in mode.pdos}
+
+    def assigned_by(pdos: tuple[Pdo, ...]) -> tuple[Pdo, ...]:
+        return tuple(
+            replace(pdo, sync_manager=places.get(pdo.index))
+            if pdo.index in places or pdo.sync_manager in managers
+            else pdo
+            for pdo in pdos
+        )
+
+    modes = (mode, *(one for one in device.dc_modes if one is not mode))
+    return replace(device, dc_modes=modes, rx_pdos=assigned_by(device.rx_pdos), tx_pdos=assigned_by(device.tx_pdos))
 
 
 def kind_of(device: Device) -> str:
@@ -167,7 +194,7 @@ def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:
     return [entry for pdo in pdos for entry in pdo.entries if entry.index]
 
 
-def _lines(device: Device, kind: str) -> Iterator[str]:
+def _lines(device: Device, kind: str, has_mode: bool) -> Iterator[str]:
     identity = device.identity
     yield from _comment(
         f"{device.name}{f' ({device.type})' if device.type else ''}"
@@ -186,7 +213,7 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
     yield f"vendor_id: 0x{identity.vendor_id:08X}"
     yield f"product_id: 0x{identity.product_code:08X}"
     yield ""
-    yield from _clock_lines(device, kind)
+    yield from _clock_lines(device, kind == "cia402" and not has_mode)
     watchdog = _DRIVE_WATCHDOG_MS if kind == "cia402" else _WATCHDOG_MS
     note = (
         "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
@@ -210,10 +237,10 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
         yield from _others(device, key, outputs)
 
 
-def _clock_lines(device: Device, kind: str) -> Iterator[str]:
+def _clock_lines(device: Device, wants_clock: bool) -> Iterator[str]:
     modes = device.dc_modes
     chosen = modes[0] if modes else None
-    if kind == "cia402":
+    if wants_clock:
         chosen = next((mode for mode in modes if mode.assign_activate & 0x0100), chosen)
     if chosen is not None and not chosen.assign_activate & _SYNC0:
         chosen = next((mode for mode in modes if not mode.assign_activate), replace(chosen, assign_activate=0))
