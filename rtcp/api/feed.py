@@ -21,6 +21,7 @@ from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.recording import ERROR, INFORMATION, WARNING
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.ipc.session import SessionError, read_session
+from rtcp.ipc.terminals import named, terminals_of
 from rtcp.ipc.tool_motion import ToolMotion
 
 Records: TypeAlias = npt.NDArray[np.void]
@@ -40,6 +41,7 @@ class Feed:
         period_ns: of a cycle.
         schema: of the records: name, type, unit and meaning of each field; those of the tool (`rtcp.ipc.tool_motion`)
             are computed here.
+        channels: what programs know by a name: terminals of IO boxes, and channels of other slaves.
 
     Raises:
         NotRunning: no platform runs there.
@@ -56,6 +58,7 @@ class Feed:
         self.period_ns = self._observer.period_ns
         self._tool = ToolMotion(self.config.models, self._observer.schema)
         self.schema = self._tool.schema
+        self.channels = named(*terminals_of(self.config, self.schema))
         self._loop = select.poll()
         try:
             self._process = os.pidfd_open(self._observer.loop_pid)

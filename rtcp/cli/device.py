@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,9 +15,10 @@ from rtcp.cli.arguments import AsJson, BusName, ConfigFile, option
 from rtcp.cli.bus import open_bus, parse_integer
 from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table, transfer
 from rtcp.cli.slaves import own_bus
+from rtcp.launch.offline import OfflineBus
 
 if TYPE_CHECKING:
-    from rtcp.config.model import DeviceDescription, Pdo
+    from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, StartupSdo
     from rtcp.esi.model import Device, DeviceFile
 
 EsiPath = Annotated[Path, typer.Argument(metavar="FILE", help="ESI file of the device's maker.")]
@@ -89,6 +91,7 @@ def _new(
     revision: Annotated[str | None, option("--revision", "NUMBER", "Revision. Default: the newest.")] = None,
     module: Annotated[list[str] | None, option("--module", "SLOT=IDENT", "Module in a slot; again for more.")] = None,
     kind: Annotated[str | None, option("--kind", "KIND", "Driver. Default: the one that fits.")] = None,
+    mode: Annotated[str | None, option("--mode", "NAME", "Clock mode, and the PDOs that it assigns.")] = None,
     config: ConfigFile = None,
 ) -> None:
     """Write a device's file that a person reads: process data with types and units, start-up SDOs, clocks, watchdog."""
@@ -112,7 +115,7 @@ def _new(
         raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
     else:
         made = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
-    text = file_text(made, kind)
+    text = file_text(made, kind, mode)
     try:
         with out.open("x") as file:
             file.write(text)
@@ -147,15 +150,23 @@ def _check(
     report(f"{file}: {described.name}, kind {described.kind}, {bits}: no mistake in it")
     if bus is None:
         return
+    objects = _objects(described)
+    lengths: dict[int, list[int | None]] = {}
     with open_bus("device check", bus, config) as asked:
         slaves = asked.access.scan()
-    same = [slave for slave in slaves if (slave["vendor_id"], slave["product_code"]) == _identity(described)]
+        same = [slave for slave in slaves if (slave["vendor_id"], slave["product_code"]) == _identity(described)]
+        for slave in same:
+            # A running platform has written and read all of them at its start.
+            if isinstance(asked.access, OfflineBus) and described.coe and slave["has_coe"]:
+                places = [(one.index, one.sub_index) for one in objects]
+                lengths[slave["position"]] = asked.access.object_lengths(slave["position"], places)
     if not same:
         there = "; ".join(f"{slave['position']}: {slave['name']} {_identity_text(slave)}" for slave in slaves) or "none"
         raise CommandError(f"{asked.name}: no slave has {_identity_text(described)}; found are {there}", ExitCode.FAULT)
     differences = 0
     for slave in same:
         found = _differences(described, slave)
+        found += _lacking(objects, lengths.get(slave["position"], []))
         differences += len(found)
         emit(
             f"slave {slave['position']} ({slave['name']}): "
@@ -179,11 +190,55 @@ def _differences(described: DeviceDescription, slave: Mapping[str, Any]) -> list
     for (key, pdos), direction in zip(_images(described), ("outputs", "inputs"), strict=True):
         file_entries = [(e.index, e.sub_index if e.index else 0, e.length) for pdo in pdos for e in pdo.channels]
         bus_entries = [(e["index"], e["sub_index"], e["bits"]) for pdo in slave[direction] for e in pdo["entries"]]
-        if described.coe and file_entries != bus_entries:
-            said = "will be written" if described.configurable_pdos else "cannot be written"
+        if (described.coe or bus_entries) and file_entries != bus_entries:
+            said = "will be written" if described.coe and described.configurable_pdos else "cannot be written"
             found = f"the file has {_entries(file_entries)}; the slave has {_entries(bus_entries)}"
             differences.append(f"{key}: {found}; the mapping {said}")
     return differences
+
+
+@dataclass(frozen=True)
+class _Object:
+    """An object that a device's file names."""
+
+    where: str
+    """Key and object, in words."""
+    index: int
+    sub_index: int
+    length: int | None
+    """In bytes; None: any."""
+
+
+def _objects(described: DeviceDescription) -> list[_Object]:
+    """Return what the start writes or maps: start-up SDOs, PDOs, and what is mapped into them."""
+    found = [
+        _Object(f"sdo: {_object_text(one)}", one.index, one.sub_index, None if one.type == "bytes" else one.length)
+        for one in described.sdo
+        if not one.optional
+    ]
+    for key, pdos in _images(described):
+        for pdo in pdos:
+            found.append(_Object(f"{key}: PDO 0x{pdo.index:04X}", pdo.index, 0, 1))
+            for one in pdo.channels:
+                length = None if one.length % 8 else one.length // 8
+                if one.index:
+                    found.append(_Object(f"{key}: {_object_text(one)}", one.index, one.sub_index, length))
+    return found
+
+
+def _object_text(of: PdoEntry | StartupSdo) -> str:
+    return f"0x{of.index:04X}:{of.sub_index}" + (f" ({of.name})" if of.name else "")
+
+
+def _lacking(objects: Sequence[_Object], lengths: Sequence[int | None]) -> list[str]:
+    """Return a sentence for each object that a slave lacks, or has in another length."""
+    sentences = []
+    for one, length in zip(objects, lengths, strict=False):
+        if length == -1:
+            sentences.append(f"{one.where}: the slave has no such object")
+        elif None not in (length, one.length) and length != one.length:
+            sentences.append(f"{one.where}: the file says {one.length} bytes, the slave has {length}")
+    return sentences
 
 
 def _images(described: DeviceDescription) -> tuple[tuple[str, Sequence[Pdo]], ...]:

@@ -13,7 +13,7 @@ from rtcp.config.model import BITS
 from rtcp.config.scaling import BOUNDING_OBJECTS, OBJECTS_PER_AXIS, TORQUE_UNITS, VELOCITY_UNITS, TorqueUnit
 from rtcp.esi import units
 from rtcp.esi.dictionary import complete
-from rtcp.esi.model import DcMode, Device, ObjectEntry, Pdo, PdoEntry, SyncManagerType
+from rtcp.esi.model import DcMode, Device, EsiError, ObjectEntry, Pdo, PdoEntry, SyncManagerType
 from rtcp.esi.types import Kind, decode, resolve
 
 _DRIVE_PROFILE = 402
@@ -59,15 +59,42 @@ _CHANNEL = re.compile(r"(?:channel|ch\.?)\s*(\d+)", re.IGNORECASE)
 _WIDTH = 118
 
 
-def file_text(device: Device, kind: str | None = None) -> str:
+def file_text(device: Device, kind: str | None = None, mode: str | None = None) -> str:
     """Return the text of the device's file.
 
     Args:
         device: its description, with its modules in place.
         kind: the driver; None: the one that fits its process data.
+        mode: name of the clock mode; None: the one that fits.
+
+    Raises:
+        EsiError: it has no such mode, or one that assigns a PDO several times over.
     """
-    made = complete(for_drive(device))
-    return "\n".join(_lines(made, kind or kind_of(made))) + "\n"
+    made = complete(for_drive(device if mode is None else _in_mode(device, mode)))
+    return "\n".join(_lines(made, kind or kind_of(made), mode is not None)) + "\n"
+
+
+def _in_mode(device: Device, name: str) -> Device:
+    """Return a device with one clock mode before the others, and the PDOs assigned that this mode assigns."""
+    mode = next((one for one in device.dc_modes if one.name == name), None)
+    if mode is None:
+        there = ", ".join(one.name for one in device.dc_modes) or "none"
+        raise EsiError(device.origin, f"it has no clock mode {name!r}; there are: {there}")
+    if mode.oversamples:
+        raise EsiError(device.origin, f"clock mode {name} takes several values a cycle, which is not supported")
+    places = {index: manager for manager, indices in mode.pdos for index in indices}
+    managers = {manager for manager, _ in mode.pdos}
+
+    def assigned_by(pdos: tuple[Pdo, ...]) -> tuple[Pdo, ...]:
+        return tuple(
+            replace(pdo, sync_manager=places.get(pdo.index))
+            if pdo.index in places or pdo.sync_manager in managers
+            else pdo
+            for pdo in pdos
+        )
+
+    modes = (mode, *(one for one in device.dc_modes if one is not mode))
+    return replace(device, dc_modes=modes, rx_pdos=assigned_by(device.rx_pdos), tx_pdos=assigned_by(device.tx_pdos))
 
 
 def kind_of(device: Device) -> str:
@@ -171,7 +198,7 @@ def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:
     return [entry for pdo in pdos for entry in pdo.entries if entry.index]
 
 
-def _lines(device: Device, kind: str) -> Iterator[str]:
+def _lines(device: Device, kind: str, has_mode: bool) -> Iterator[str]:
     identity = device.identity
     yield from _comment(
         f"{device.name}{f' ({device.type})' if device.type else ''}"
@@ -185,7 +212,7 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
     yield f"vendor_id: 0x{identity.vendor_id:08X}"
     yield f"product_id: 0x{identity.product_code:08X}"
     yield ""
-    yield from _clock_lines(device, kind)
+    yield from _clock_lines(device, kind == "cia402" and not has_mode)
     watchdog = _DRIVE_WATCHDOG_MS if kind == "cia402" else _WATCHDOG_MS
     note = (
         "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
@@ -216,10 +243,10 @@ def _kind_note(device: Device, kind: str) -> str:
     return "     # CHECK: by the names of its inputs; else generic" if kind == "encoder" else ""
 
 
-def _clock_lines(device: Device, kind: str) -> Iterator[str]:
+def _clock_lines(device: Device, wants_clock: bool) -> Iterator[str]:
     modes = device.dc_modes
     chosen = modes[0] if modes else None
-    if kind == "cia402":
+    if wants_clock:
         chosen = next((mode for mode in modes if mode.assign_activate & 0x0100), chosen)
     if chosen is not None and not chosen.assign_activate & _SYNC0:
         chosen = next((mode for mode in modes if not mode.assign_activate), replace(chosen, assign_activate=0))
@@ -261,22 +288,22 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
     for command in device.init_commands:
         if command.index in mapping or 0x1C10 <= command.index <= 0x1C2F:
             continue  # what the mapping below says
+        if not command.data:
+            continue
         if kind == "cia402" and command.index % OBJECTS_PER_AXIS == _MODE_OBJECT % OBJECTS_PER_AXIS:
             continue  # below
         entry = _object(device, command.index, command.sub_index)
         kept = None if entry is None else resolve(entry.type, entry.bits)
         name = (command.comment or ("" if entry is None else entry.name)).strip()
-        if command.complete_access or len(command.data) not in (1, 2, 4, 8) or (kept and kept.kind is Kind.TEXT):
-            written.append(
-                f"  # CHECK: not written, {len(command.data)} bytes to 0x{command.index:04X}:{command.sub_index}: "
-                f"{command.data[:16].hex(' ')} {name}"
-            )
-            continue
         signed = kept is not None and kept.kind is Kind.SIGNED
-        value = int.from_bytes(command.data, "little", signed=signed)
+        as_bytes = kept is not None and kept.kind in (Kind.TEXT, Kind.BYTES)
+        if command.complete_access or as_bytes or len(command.data) not in (1, 2, 4, 8):
+            what = f'type: bytes, data: "{command.data.hex(" ")}"' + ", complete: true" * command.complete_access
+        else:
+            number = int.from_bytes(command.data, "little", signed=signed)
+            what = f"type: {'int' if signed else 'uint'}{8 * len(command.data)}, value: {number}"
         written.append(
-            f"  - {{index: 0x{command.index:04X}, sub_index: {command.sub_index}, "
-            f"type: {'int' if signed else 'uint'}{8 * len(command.data)}, value: {value}"
+            f"  - {{index: 0x{command.index:04X}, sub_index: {command.sub_index}, {what}"
             + (f", name: {_quoted(name)}" if name else "")
             + "}"
         )
@@ -429,7 +456,7 @@ def _channel_lines(
     is_constant = known == "modes_of_operation" and not _shows_mode(device, axis)
     if is_constant:
         known = "mode_sent"
-    name = known or _unique(_identifier(entry), names, f"{key}.{axis}")
+    name = known or _unique(_identifier(entry), names, key, axis)
     if known:
         names[f"{key}.{axis}.{known}"] += 1
     keys = f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {_type_keys(entry.type, entry.bits)}, "
@@ -523,10 +550,12 @@ def _identifier(entry: PdoEntry) -> str:
     return "padding_entry" if name == "padding" else name
 
 
-def _unique(name: str, names: Counter[str], scope: str) -> str:
-    names[f"{scope}.{name}"] += 1
-    count = names[f"{scope}.{name}"]
-    return name if count == 1 else _unique(f"{name}_{count}", names, scope)
+def _unique(name: str, names: Counter[str], key: str, axis: int) -> str:
+    if key == "tpdo" and names[f"rpdo.{axis}.{name}"]:
+        return _unique(f"{name}_in", names, key, axis)
+    names[f"{key}.{axis}.{name}"] += 1
+    count = names[f"{key}.{axis}.{name}"]
+    return name if count == 1 else _unique(f"{name}_{count}", names, key, axis)
 
 
 def _quoted(text: str) -> str:

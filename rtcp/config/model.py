@@ -192,14 +192,23 @@ class StartupSdo:
     """Object index."""
     sub_index: U8
     """Object subindex."""
-    type: NumberTypeName
-    """Data type of the object."""
-    value: float
-    """Value to write, in the range of `type`."""
+    type: Literal[NumberTypeName, "bytes"]
+    """Data type of the object; `bytes`: a text, an array, or several entries at once."""
+    value: float | None = None
+    """Value to write, in the range of `type`; not of the type `bytes`."""
     name: str = ""
     """Text for messages."""
     optional: bool = False
     """True: the device may lack the object."""
+    data: str = ""
+    """Bytes to write, of the type `bytes`, in hexadecimal, as "54 41 4E 4B"."""
+    complete: bool = False
+    """True: written by SDO complete access: `data` are all entries from `sub_index` 0 or 1 on, read-only ones too."""
+
+    @property
+    def length(self) -> int:
+        """Length in bytes."""
+        return len(bytes.fromhex(self.data)) if self.type == "bytes" else max(BITS[self.type] // 8, 1)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ runs.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 
@@ -145,7 +146,21 @@ def _entry(entry: PdoEntry) -> Iterator[Finding]:
 
 @rule(StartupSdo)
 def _startup_value(sdo: StartupSdo) -> Iterator[Finding]:
-    if sdo.type.startswith("float"):
+    if sdo.type == "bytes":
+        if not re.fullmatch(r"([0-9a-fA-F]{2} ?)+", sdo.data):
+            text = f'found the text "{sdo.data}"' if sdo.data else "the key is missing"
+            yield ("data",), f'{text}, allowed are bytes in hexadecimal, as "54 41 4E 4B", for the type bytes'
+        if sdo.value is not None:
+            yield ("value",), f"found {sdo.value:g}, allowed is the key data for the type bytes"
+        if sdo.complete and sdo.sub_index > 1:
+            yield ("sub_index",), f"found {sdo.sub_index}, allowed is 0 or 1 with complete access"
+        return
+    for key in ("data", "complete"):
+        if getattr(sdo, key):
+            yield (key,), f"found with the type {sdo.type}, allowed is the type bytes"
+    if sdo.value is None:
+        yield (), f"the key value is missing; the type {sdo.type} needs it"
+    if sdo.value is None or sdo.type.startswith("float"):
         return
     low, high = integer_range(sdo.type)
     if not low <= sdo.value <= high or sdo.value != int(sdo.value):
@@ -168,6 +183,16 @@ def _rpdo(device: DeviceDescription) -> Iterator[Finding]:
 @rule(DeviceDescription, "tpdo", "kind")
 def _tpdo(device: DeviceDescription) -> Iterator[Finding]:
     return _pdos("tpdo", device.tpdo, device)
+
+
+@rule(DeviceDescription, "rpdo", "tpdo", "kind")
+def _one_name(device: DeviceDescription) -> Iterator[Finding]:
+    outputs = {entry.name for entry in device.outputs} if device.has_channels else set()
+    for i, pdo in enumerate(device.tpdo):
+        for j, entry in enumerate(pdo.channels):
+            if entry.is_number and entry.name in outputs:
+                text = f'found the text "{entry.name}", an output\'s name too; each channel of the device needs its own'
+                yield ("tpdo", i, "channels", j, "name"), text
 
 
 @rule(DeviceDescription, "assign_activate")

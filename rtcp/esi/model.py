@@ -235,6 +235,10 @@ class DcMode:
     sync1_factor: int = 0
     """Above 0: multiple of SYNC0's cycle, below: of the master's."""
     sync1_shift: int = 0
+    pdos: tuple[tuple[int, tuple[int, ...]], ...] = field(default=(), compare=False)
+    """Sync managers whose PDOs it assigns in place of the default ones, and these; an EEPROM does not hold them."""
+    oversamples: bool = field(default=False, compare=False)
+    """It assigns a PDO several times over, for several values a cycle."""
 
 
 @dataclass(frozen=True)

@@ -309,6 +309,10 @@ class _Reader:
         def factor(tag: str, default: int) -> int:
             return self.values.number(node, f"{tag}/@Factor", default if node.first(tag) is not None else 0)
 
+        def assigned(manager: Node) -> tuple[int, ...]:
+            return tuple(index for item in manager.below("Pdo") if (index := number(item.text)) is not None)
+
+        managers = [(number(item.value("@No")), assigned(item)) for item in node.below("Sm")]
         return DcMode(
             name=node.value("Name") or "",
             assign_activate=self.values.number(node, "AssignActivate", 0) & 0xFFFF,
@@ -319,6 +323,8 @@ class _Reader:
             sync1_cycle=time("CycleTimeSync1", low=0),
             sync1_factor=factor("CycleTimeSync1", 0),
             sync1_shift=time("ShiftTimeSync1"),
+            pdos=tuple((manager, indices) for manager, indices in managers if manager is not None and indices),
+            oversamples=any((number(item.value("@OSFac")) or 1) > 1 for item in node.below("Sm/Pdo")),
         )
 
     # Slots and modules

@@ -42,9 +42,9 @@ READ = frozenset(
         ConfigData CycleTimeSync0 CycleTimeSync1 Data DataType DataTypes Dc DefaultData DefaultString DefaultValue
         Desc Descriptions Device Devices Dictionary EBusCurrent Eeprom Electrical Elements Entry EoE Exclude Flags
         Fmmu FoE Group Groups GroupType HideType Id Index Info InitCmd LBound Mailbox MaxData MaxValue MinData
-        MinValue Module ModuleClass ModuleIdent Modules Name NotationIndex Object Objects OpMode PdoMapping Profile
-        ProfileNo RxPdo ShiftTimeSync0 ShiftTimeSync1 Slot Slots Sm SoE SubIdx SubIndex SubItem Symbol Transition
-        TxPdo Type Unit UnitType UnitTypes Vendor VoE
+        MinValue Module ModuleClass ModuleIdent Modules Name NotationIndex Object Objects OpMode Pdo PdoMapping
+        Profile ProfileNo RxPdo ShiftTimeSync0 ShiftTimeSync1 Slot Slots Sm SoE SubIdx SubIndex SubItem Symbol
+        Transition TxPdo Type Unit UnitType UnitTypes Vendor VoE
         """,
     )
 )

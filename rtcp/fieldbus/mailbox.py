@@ -31,7 +31,7 @@ _REQUEST, _RESPONSE, _INFORMATION = 2, 3, 8
 _INFORMATION_HEADER = struct.Struct("<BxH")
 """Operation code and whether fragments follow; how many."""
 _INCOMPLETE, _INFORMATION_ERROR = 0x80, 7
-_EXPEDITED, _SIZED, _TOGGLE, _LAST = 0x02, 0x01, 0x10, 0x01
+_EXPEDITED, _SIZED, _TOGGLE, _LAST, _COMPLETE = 0x02, 0x01, 0x10, 0x01, 0x10
 _DOWNLOAD, _DOWNLOAD_SEGMENT, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0x20, 0x00, 0x40, 0x60, 0x80
 """Commands of the client (upper three bits)."""
 _UPLOADED, _UPLOADED_SEGMENT, _DOWNLOADED, _DOWNLOADED_SEGMENT = 0x40, 0x00, 0x60, 0x20
@@ -82,15 +82,18 @@ class SdoClient:
         """Write an object's value; raises as `read`."""
         finish(self.writing(index, subindex, data))
 
-    def reading(self, index: int, subindex: int) -> Steps[bytes]:
-        """Return an object's value; raises as `read`."""
-        return self._call(f"read of 0x{index:04X}:{subindex}", lambda box: self._upload(box, index, subindex))
+    def reading(self, index: int, subindex: int, complete: bool = False) -> Steps[bytes]:
+        """Return an object's value; `complete`: of all entries from `subindex`, 0 or 1, on. Raises as `read`."""
+        how = ", complete access" if complete else ""
+        return self._call(
+            f"read of 0x{index:04X}:{subindex}{how}", lambda box: self._upload(box, index, subindex, complete)
+        )
 
-    def writing(self, index: int, subindex: int, data: bytes) -> Steps[None]:
-        """Write an object's value; raises as `read`."""
+    def writing(self, index: int, subindex: int, data: bytes, complete: bool = False) -> Steps[None]:
+        """Write an object's value; `complete` as of `reading`. Raises as `read`."""
         shown = data.hex(" ") if len(data) <= 8 else f"{len(data)} bytes"
-        what = f"write of {shown or 'nothing'} to 0x{index:04X}:{subindex}"
-        return self._call(what, lambda box: self._download(box, index, subindex, data))
+        what = f"write of {shown or 'nothing'} to 0x{index:04X}:{subindex}{', complete access' if complete else ''}"
+        return self._call(what, lambda box: self._download(box, index, subindex, data, complete))
 
     def reading_int(self, index: int, subindex: int) -> Steps[int]:
         """Return an object's value as an unsigned integer; raises as `read`."""
@@ -194,8 +197,8 @@ class SdoClient:
                 raise BusError(f"it answered something else (command 0x{command:02X})")
             return message[_COE_HEADER:]
 
-    def _upload(self, mailbox: Mailbox, index: int, subindex: int) -> Steps[bytes]:
-        request = _SDO.pack(_UPLOAD, index, subindex, 0)
+    def _upload(self, mailbox: Mailbox, index: int, subindex: int, complete: bool) -> Steps[bytes]:
+        request = _SDO.pack(_UPLOAD | complete * _COMPLETE, index, subindex, 0)
         answer = yield from self._exchange(mailbox, request, _UPLOADED, (index, subindex))
         command, _, _, size = _SDO.unpack_from(answer)
         if command & _EXPEDITED:
@@ -220,14 +223,15 @@ class SdoClient:
                 raise BusError("it sent a segment without data")
         return bytes(data[:size])
 
-    def _download(self, mailbox: Mailbox, index: int, subindex: int, data: bytes) -> Steps[None]:
-        if 1 <= len(data) <= 4:
+    def _download(self, mailbox: Mailbox, index: int, subindex: int, data: bytes, complete: bool) -> Steps[None]:
+        if 1 <= len(data) <= 4 and not complete:
             command = _DOWNLOAD | _EXPEDITED | _SIZED | (4 - len(data)) << 2
             request = _SDO.pack(command, index, subindex, 0)[:4] + data.ljust(4, b"\0")
             yield from self._exchange(mailbox, request, _DOWNLOADED, (index, subindex))
             return
         first = mailbox.room - _COE_HEADER - _SDO.size
-        request = _SDO.pack(_DOWNLOAD | _SIZED, index, subindex, len(data)) + data[:first]
+        command = _DOWNLOAD | _SIZED | complete * _COMPLETE
+        request = _SDO.pack(command, index, subindex, len(data)) + data[:first]
         yield from self._exchange(mailbox, request, _DOWNLOADED, (index, subindex))
         size = mailbox.room - _COE_HEADER - 1
         toggle = 0

@@ -109,6 +109,17 @@ def mapping_of(pdos: Sequence[Pdo]) -> Mapping:
     )  # fmt: skip
 
 
+def entries_of(mapping: Mapping) -> list[tuple[int, int, int]]:
+    """Return the entries of a mapping in one list, paddings behind each other as one."""
+    found: list[tuple[int, int, int]] = []
+    for entry in (entry for _, entries in mapping for entry in entries):
+        if found and not entry[0] and not found[-1][0]:
+            found[-1] = 0, 0, found[-1][2] + entry[2]
+        else:
+            found.append(entry if entry[0] else (0, 0, entry[2]))
+    return found
+
+
 def mapping_text(mapping: Mapping) -> str:
     """Return a mapping in words, with its length."""
     bits = sum(entry[2] for _, entries in mapping for entry in entries)

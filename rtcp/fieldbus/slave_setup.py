@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from rtcp.config.model import BITS, DeviceDescription, SlaveConfig, StartupSdo
+from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
 from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
@@ -320,15 +320,16 @@ def configure_slave(
 
 def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     """Write a start-up SDO and read it back; return a note where the device lacks it and may."""
-    if startup.type.startswith("float"):
-        packer = struct.Struct("<" + STRUCT_CODES[startup.type])
-        data = packer.pack(startup.value)
+    value = 0 if startup.value is None else startup.value
+    if startup.type == "bytes":
+        data = bytes.fromhex(startup.data)
+    elif startup.type.startswith("float"):
+        data = struct.Struct("<" + STRUCT_CODES[startup.type]).pack(value)
     else:
-        length = max(BITS[startup.type] // 8, 1)
-        data = int(startup.value).to_bytes(length, "little", signed=startup.type.startswith("int"))
+        data = int(value).to_bytes(startup.length, "little", signed=startup.type.startswith("int"))
     what = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
     try:
-        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, startup.type)
+        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, startup.type, startup.complete)
     except SdoAborted as error:
         if startup.optional and error.code in ABSENT:
             return [f"{slave_label(sdo.position, sdo.name)} has no {what}; it is marked optional and was left out"]
@@ -336,16 +337,24 @@ def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     return []
 
 
-def _write_and_verify(sdo: SdoClient, index: int, sub_index: int, data: bytes, what: str, kind: str) -> Steps[None]:
-    yield from sdo.writing(index, sub_index, data)
-    kept = yield from sdo.reading(index, sub_index)
+def _write_and_verify(
+    sdo: SdoClient, index: int, sub_index: int, data: bytes, what: str, kind: str, complete: bool = False
+) -> Steps[None]:
+    yield from sdo.writing(index, sub_index, data, complete)
+    kept = yield from sdo.reading(index, sub_index, complete)
+    if complete:
+        kept = kept[: len(data)]  # entries behind those that were written
+    elif kind == "bytes":
+        kept = kept.rstrip(b"\0").ljust(len(data), b"\0")  # a text comes back with zeros behind it, or without
     if kept != data:
-        found = _number(kept, kind) if len(kept) == len(data) else f"bytes {kept.hex(' ')}"
+        found = _shown(kept, kind) if len(kept) == len(data) else f"bytes {kept.hex(' ')}"
         where = slave_label(sdo.position, sdo.name)
-        raise BusError(f"{where}: {what} was set to {_number(data, kind)} and reads back as {found}")
+        raise BusError(f"{where}: {what} was set to {_shown(data, kind)} and reads back as {found}")
 
 
-def _number(data: bytes, kind: str) -> str:
+def _shown(data: bytes, kind: str) -> str:
+    if kind == "bytes":
+        return data.hex(" ")
     if kind.startswith("float"):
         return str(struct.unpack("<" + STRUCT_CODES[kind], data)[0])
     return str(int.from_bytes(data, "little", signed=kind.startswith("int")))

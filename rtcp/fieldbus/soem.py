@@ -19,7 +19,7 @@ from rtcp.esi.model import Device, EsiError
 from rtcp.esi.sii import read_sii
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
-from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
+from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, PdoInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import start_clocks
 from rtcp.fieldbus.describe import describe_device, pdos_of_eeprom
 from rtcp.fieldbus.eeprom import (
@@ -37,7 +37,7 @@ from rtcp.fieldbus.image import MOST_SLAVES, Places, limit_faults, read_places
 from rtcp.fieldbus.interface import PromiscuousMode, check_interface, check_name, claim, enter
 from rtcp.fieldbus.mailbox import Mailbox, Mailboxes, SdoClient
 from rtcp.fieldbus.master import Master
-from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, layout
+from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, entries_of, layout, mapping_of, mapping_text
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
 from rtcp.fieldbus.scan import describe, name_of, read_mailbox, read_serial
@@ -242,7 +242,7 @@ class SoemBus:
                 self._hide_mailbox(slave, i + 1)
             elif failures[i] % 2 or not device.complete_access:
                 slave._disable_complete_access()
-        if faults := list(self._to_preop()):
+        if faults := [*self._eeprom_faults(slaves), *self._to_preop()]:
             raise BusError(*faults)
         for i, config in enumerate(slaves):
             try:
@@ -252,6 +252,33 @@ class SoemBus:
                 faults += error.sentences
         if faults:
             raise BusError(*faults)
+
+    def _eeprom_faults(self, slaves: Sequence[SlaveConfig]) -> list[str]:
+        """Return a sentence for each slave without CoE whose EEPROM maps something else than its device's file."""
+        faults = []
+        known: dict[tuple[int, int, int], tuple[tuple[PdoInfo, ...], tuple[PdoInfo, ...]]] = {}
+        for position, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True), 1):
+            device, identity = config.device, (slave.man, slave.id, slave.rev)
+            if device.coe or not (device.rpdo or device.tpdo):
+                continue
+            if identity not in known:
+                try:
+                    known[identity] = pdos_of_eeprom(read_sii(self.read_eeprom(position, lambda part: None)))
+                except EsiError as error:
+                    faults.append(f"{slave_label(position, config.name)}: its EEPROM cannot be read: {error}")
+                    continue
+            for key, pdos, found in zip(("rpdo", "tpdo"), (device.rpdo, device.tpdo), known[identity], strict=True):
+                mapping = tuple(
+                    (pdo.index, tuple((e.index, e.sub_index, e.bits) for e in pdo.entries)) for pdo in found
+                )
+                # An EEPROM need not list PDOs; their lengths are compared all the same.
+                if mapping and entries_of(mapping) != entries_of(mapping_of(pdos)):
+                    faults.append(
+                        f"{slave_label(position, config.name)}: the PDOs in its EEPROM differ from the device's file "
+                        f"(key `{key}`): expected {mapping_text(mapping_of(pdos))}, found {mapping_text(mapping)}; "
+                        "`rtcp device new --from-bus` describes it as it is"
+                    )
+        return faults
 
     def _hide_mailbox(self, slave: Any, position: int) -> None:
         """Let SOEM forget the mailbox of a slave that is in INIT; its registers keep it. Raises BusError."""

@@ -694,8 +694,8 @@ class Methods:
 
     @method()
     async def set_channel(self, caller: Caller, name: str, value: float) -> Json:
-        """Set an output with a number, `slave.channel`, in its unit."""
-        return await self._terminals.write_number(caller, name, value)
+        """Set an output with a number, `slave.channel`, in its unit; or as `write_io`, to 0 or 1."""
+        return await self._terminals.write(caller, name, value)
 
     @method(at_once=True)
     async def wait_io(

@@ -4,63 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
-from rtcp.config.model import PdoEntry
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json
 from rtcp.ipc.commands import SetChannel, SetOutput
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.schema import identifier
+from rtcp.ipc.terminals import NumberChannel, Terminal, terminals_of
 
 _REPORT_S = 0.5
 """Interval between progress reports of a wait: the client sees that the platform lives."""
-
-
-@dataclass(frozen=True)
-class Terminal:
-    """An input or output of an IO box, or a channel of one bit."""
-
-    name: str
-    """Of the file, or `box.number`; of a channel `slave.channel`."""
-    box: str
-    """The slave."""
-    number: int
-    """On the box; of a channel among those of the slave in its direction, from 1."""
-    field: str
-    """Of the cycle record."""
-    has_function: bool
-    """The platform reads or writes it itself."""
-    is_channel: bool = False
-
-    @property
-    def bit(self) -> int:
-        """Of the field."""
-        return 0 if self.is_channel else self.number - 1
-
-    @property
-    def place(self) -> str:
-        """The name that every terminal has."""
-        return f"{self.box}.{self.number}"
-
-
-@dataclass(frozen=True)
-class NumberChannel:
-    """A channel with a number."""
-
-    slave: str
-    number: int
-    """Among those of the slave in its direction, from 1."""
-    is_output: bool
-    entry: PdoEntry
-    field: str
-    """Of the cycle record."""
-    settable: bool
-
-    @property
-    def name(self) -> str:
-        """By which programs know it."""
-        return f"{self.slave}.{self.entry.name}"
 
 
 class Terminals:
@@ -72,40 +25,7 @@ class Terminals:
 
     def __init__(self, channel: CommandChannel) -> None:
         self._channel = channel
-        config, schema = channel.config, channel.observer.schema
-        functions = {"inputs": config.terminals(config.inputs), "outputs": config.terminals(config.outputs)}
-        gripper = config.gripper
-        if gripper is not None and gripper.output is not None:
-            functions["outputs"]["gripper"] = config.box_of(gripper), gripper.output
-        self._all: dict[str, list[Terminal]] = {"inputs": [], "outputs": []}
-        for which, terminals in self._all.items():
-            names = {place: name for name, place in functions[which].items()}
-            free = {terminal.name for terminal in getattr(config, which).named}
-            for box in config.boxes:
-                field = f"{identifier(box)}_{which}"
-                bits = int(schema[field].type.lstrip("uint")) if field in schema.names else 0
-                for number in range(1, bits + 1):
-                    name = names.get((box, number), f"{box}.{number}")
-                    has_function = (box, number) in names and name not in free
-                    terminals.append(Terminal(name, box, number, field, has_function))
-        self._numbers: list[NumberChannel] = []
-        taken = config.process_outputs
-        for slave in config.slaves:
-            inputs = {entry.name for entry in slave.device.inputs}
-            for which, entries in (("inputs", slave.device.inputs), ("outputs", slave.device.outputs)):
-                for number, entry in enumerate(entries if slave.device.has_channels else (), 1):
-                    sent = "_sent" if which == "outputs" and entry.name in inputs else ""
-                    field = f"{identifier(slave.name)}_{identifier(entry.name)}{sent}"
-                    if field not in schema.names:
-                        continue
-                    if entry.type == "bool":
-                        name = f"{slave.name}.{entry.name}"
-                        is_taken = which == "outputs" and (slave.name, entry.name) in taken
-                        self._all[which].append(Terminal(name, slave.name, number, field, is_taken, is_channel=True))
-                    else:
-                        is_output = which == "outputs"
-                        settable = is_output and (slave.name, entry.name) not in taken
-                        self._numbers.append(NumberChannel(slave.name, number, is_output, entry, field, settable))
+        self._terminals, self._numbers = terminals_of(channel.config, channel.observer.schema)
 
     def read(self) -> Json:
         """Return every terminal, by `inputs` and `outputs`, with its level, and the `channels`."""
@@ -114,19 +34,20 @@ class Terminals:
             which: [
                 {
                     "name": one.name,
-                    "box": one.box,
+                    "box": one.slave,
                     "number": one.number,
-                    "value": _is_set(int(record[one.field]), one),
+                    "value": one.value(record),
                     "has_function": one.has_function,
                 }
-                for one in terminals
+                for one in self._terminals
+                if one.is_output is is_output
             ]
-            for which, terminals in self._all.items()
+            for which, is_output in (("inputs", False), ("outputs", True))
         }
         found["channels"] = [
             {
                 "name": one.name,
-                "value": _finite(float(record[one.field])),
+                "value": _finite(one.value(record)),
                 "unit": one.entry.unit,
                 "is_output": one.is_output,
                 "settable": one.settable,
@@ -136,33 +57,31 @@ class Terminals:
         ]
         return found
 
-    async def write(self, caller: Caller, name: str, value: bool) -> Json:
-        """Set an output."""
-        terminal = self._find("outputs", name)
-        if terminal.is_channel:
-            return await self._send(caller, terminal.box, terminal.number, float(value))
+    async def write(self, caller: Caller, name: str, value: float) -> Json:
+        """Set an output; one with two levels to 0 or 1, one with a number not by a truth value."""
+        numbers = () if isinstance(value, bool) else self._numbers
+        one = _find([one for one in (*self._terminals, *numbers) if one.is_output], name)
+        if isinstance(one, NumberChannel):
+            return await self._send(caller, one, value)
+        if value not in (0.0, 1.0):
+            text = f"value: found {value:g}, allowed is 0 or 1 for {one.name}, which has two levels"
+            raise RtcpError("invalid", text, "wrong_level", {"name": name, "value": value})
+        if one.is_channel:
+            return await self._send(caller, one, value)
         async with self._channel.lease(caller) as lease:
-            box = self._channel.config.boxes.index(terminal.box)
-            await self._channel.send(lease, SetOutput(terminal.number, value, box))
+            box = self._channel.config.boxes.index(one.slave)
+            await self._channel.send(lease, SetOutput(one.number, bool(value), box))
         return {}
 
-    async def write_number(self, caller: Caller, name: str, value: float) -> Json:
-        """Set an output channel with a number."""
-        outputs = [one for one in self._numbers if one.is_output]
-        for one in outputs:
-            if one.name == name:
-                return await self._send(caller, one.slave, one.number, value)
-        raise _unknown(name, [one.name for one in outputs], "no slave has such outputs")
-
-    async def _send(self, caller: Caller, slave: str, number: int, value: float) -> Json:
-        position = 1 + [one.name for one in self._channel.config.slaves].index(slave)
+    async def _send(self, caller: Caller, one: Terminal | NumberChannel, value: float) -> Json:
+        position = 1 + [slave.name for slave in self._channel.config.slaves].index(one.slave)
         async with self._channel.lease(caller) as lease:
-            await self._channel.send(lease, SetChannel(position, number - 1, value))
+            await self._channel.send(lease, SetChannel(position, one.number - 1, float(value)))
         return {}
 
     async def wait(self, caller: Caller, name: str, value: bool, timeout_s: float | None) -> Json:
         """Return once the level is `value` in a cycle from now on; a level of one cycle counts."""
-        terminal = self._find("inputs", name, self._all["outputs"])
+        terminal = _find(sorted(self._terminals, key=lambda one: one.is_output), name)
         channel = self._channel
         patience_s = math.inf if timeout_s is None else timeout_s
         message = f"{terminal.name} was not {'high' if value else 'low'} within {patience_s:g} s"
@@ -189,22 +108,19 @@ class Terminals:
 
         return look
 
-    def _find(self, which: str, name: str, others: list[Terminal] | None = None) -> Terminal:
-        terminals = [*self._all[which], *(others or [])]
-        for terminal in terminals:
-            if name in (terminal.name, terminal.place):
-                return terminal
-        raise _unknown(name, [one.name for one in terminals], "there is no IO box")
+
+_Found = TypeVar("_Found", bound=Terminal | NumberChannel)
 
 
-def _unknown(name: str, allowed: list[str], why: str) -> RtcpError:
-    text = f'name: found the text "{name}", allowed is one of {", ".join(allowed) or f"none: {why}"}'
-    return RtcpError("invalid", text, "unknown_terminal", {"name": name, "allowed": allowed})
+def _find(terminals: Sequence[_Found], name: str) -> _Found:
+    for terminal in terminals:
+        if name in terminal.names:
+            return terminal
+    allowed = [one.name for one in terminals]
+    none = "none: there is no IO box, and no slave with channels"
+    text = f'name: found the text "{name}", allowed is one of {", ".join(allowed) or none}'
+    raise RtcpError("invalid", text, "unknown_terminal", {"name": name, "allowed": allowed})
 
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _is_set(levels: int, terminal: Terminal) -> bool:
-    return bool(levels >> terminal.bit & 1)

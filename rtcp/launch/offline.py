@@ -14,7 +14,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from enum import Enum
 from pathlib import Path
@@ -82,6 +82,10 @@ class OfflineBus:
         """Write the object; `slave` counts from 1."""
         self._ask("sdo_write", slave=slave, index=index, subindex=subindex, hex=data.hex())
 
+    def object_lengths(self, slave: int, objects: Sequence[tuple[int, int]]) -> list[int | None]:
+        """Return the bytes that objects, by index and subindex, have; -1: there is none; None: it cannot be read."""
+        return list(self._ask("object_lengths", slave=slave, objects=[list(one) for one in objects])["lengths"])
+
     def describe(self, slave: int, progress: Progress = ignore) -> dict[str, Any]:
         """Return the description of a slave: the fields of `rtcp.esi.model.Device`, bytes as hex."""
         return dict(self._ask("describe", progress, slave=slave)["device"])
@@ -109,7 +113,9 @@ class OfflineBus:
         """Bring a slave to an AL state through those before it and leave it there; return its state in words."""
         return str(self._ask("state", slave=slave, state=state)["state"])
 
-    def _ask(self, do: str, progress: Progress = ignore, **arguments: int | str | bool) -> dict[str, Any]:
+    def _ask(
+        self, do: str, progress: Progress = ignore, **arguments: int | str | bool | list[list[int]]
+    ) -> dict[str, Any]:
         return _ask(self._bus, self._config, {"do": do, **arguments}, progress)
 
 
@@ -267,6 +273,19 @@ def _sdo_read(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str
     return {"hex": bus.sdo_read(position, question["index"], question["subindex"]).hex()}
 
 
+def _object_lengths(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    from rtcp.fieldbus.errors import SdoAborted
+    from rtcp.fieldbus.mailbox import ABSENT
+
+    lengths: list[int | None] = []
+    for index, subindex in question["objects"]:
+        try:
+            lengths.append(len(bus.sdo_read(position, index, subindex)))
+        except SdoAborted as error:
+            lengths.append(-1 if error.code in ABSENT else None)
+    return {"lengths": lengths}
+
+
 def _sdo_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
     bus.sdo_write(position, question["index"], question["subindex"], bytes.fromhex(question["hex"]))
     return {}
@@ -313,6 +332,7 @@ def _state(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, A
 _ANSWERS: dict[str, Callable[[SoemBus, int, dict[str, Any]], dict[str, Any]]] = {
     "sdo_read": _sdo_read,
     "sdo_write": _sdo_write,
+    "object_lengths": _object_lengths,
     "describe": _describe,
     "foe_read": _foe_read,
     "foe_write": _foe_write,

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -277,6 +277,13 @@ class Commander:
     async def set_speed_override(self, fraction: float) -> None:
         """speed_override: move at a fraction of the speed from now on, also what is under way."""
         await (await self.connected()).set_speed_override(fraction)
+
+    async def set_outputs(self, values: Iterable[tuple[str, str, float]]) -> None:
+        """Set outputs, each by slave, name and value, in this order; the first that is refused ends it."""
+        self._require_timely()
+        robot = await self.connected()
+        for slave, name, value in values:
+            await robot.set_output(f"{slave}.{name}", float(value))
 
     async def disable(self) -> str:
         """robot_disable: stop, remove the torque; return a sentence."""

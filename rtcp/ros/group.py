@@ -29,7 +29,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.fieldbus.simple_message.messages import RobotMode, TriState
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.ros.commands import Connect
-from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, Sink, StatePublisher
+from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus, Sink, StatePublisher
 
 T = TypeVar("T")
 Numbers = Sequence[float]
@@ -185,6 +185,15 @@ class GroupRobot:
     async def set_speed_override(self, fraction: float) -> None:
         """Set it of all arms; below 1 motions in step are refused."""
         await self._all(lambda robot: robot.set_speed_override(fraction))
+
+    async def set_output(self, output: str, value: float) -> None:
+        """Set an output of one arm: the arm's name and an underscore before the output's."""
+        for name, robot in self._arms.items():
+            if output.startswith(f"{name}_"):
+                await robot.set_output(output.removeprefix(f"{name}_"), value)
+                return
+        text = f"name: found {output!r}, allowed is the name of an output behind one of {', '.join(self._arms)} and _"
+        raise RtcpError("invalid", text, "unknown_terminal", {"name": output})
 
     async def halt(self) -> None:
         """Stop every motion."""
@@ -405,6 +414,12 @@ class GroupStates:
         """Publish the diagnostics of an arm, with its name."""
         self._sink.diagnostics(dataclasses.replace(diagnostics, message=f"{prefix.rstrip('_')}: {diagnostics.message}"))
 
+    def channels(self, sample: ChannelSample, prefix: str) -> None:
+        """Publish the channels of an arm, its name before those of the slaves."""
+        values = {prefix + slave: found for slave, found in sample.values.items()}
+        settable = [(prefix + slave, name) for slave, name in sample.settable]
+        self._sink.channels(ChannelSample(sample.stamp_ns, values, settable))
+
 
 class _Part:
     """The newest that one arm has said."""
@@ -432,6 +447,10 @@ class _Part:
     def diagnostics(self, diagnostics: Diagnostics) -> None:
         """Pass them on."""
         self._group.diagnostics(diagnostics, self._prefix)
+
+    def channels(self, sample: ChannelSample) -> None:
+        """Pass them on."""
+        self._group.channels(sample, self._prefix)
 
 
 def _opens(directory: Path) -> Callable[[], Feed]:

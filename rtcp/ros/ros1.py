@@ -10,6 +10,7 @@ import concurrent.futures
 import contextlib
 import http.client
 import os
+import re
 import signal
 import sys
 import threading
@@ -48,7 +49,7 @@ from rtcp.ros.commands import (
     TrajectoryPoint,
 )
 from rtcp.ros.group import GroupStates, connects
-from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, transforms_of
+from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus, StatePublisher, transforms_of
 
 T = TypeVar("T")
 
@@ -153,6 +154,7 @@ class Publications:
         self._speed_override = rospy.Publisher("speed_override_state", Float64, queue_size=10)
         self._diagnostics = rospy.Publisher("/diagnostics", DiagnosticArray, queue_size=10)
         self._tf = rospy.Publisher("/tf", TFMessage, queue_size=100, tcp_nodelay=True)
+        self._channels: dict[tuple[str, str], rospy.Publisher] = {}
 
     def connected(self, config: ArmConfig) -> None:
         """Set robot_description, where the geometry is known and nobody has set it."""
@@ -218,6 +220,17 @@ class Publications:
         message.header.stamp = _time(diagnostics.stamp_ns)
         self._diagnostics.publish(message)
 
+    def channels(self, sample: ChannelSample) -> None:
+        """Publish each channel on a topic of its own, and take commands for those that can be set."""
+        for slave, values in sample.values.items():
+            for name, value in values.items():
+                if (slave, name) not in self._channels:
+                    topic = "/".join(("gpio", *(re.sub(r"\W", "_", part, flags=re.ASCII) for part in (slave, name))))
+                    self._channels[slave, name] = rospy.Publisher(topic, Float64, queue_size=10)
+                    if (slave, name) in sample.settable:
+                        self._commands.take_output(f"{topic}/command", slave, name)
+                self._channels[slave, name].publish(value)
+
 
 class Commands:
     """Takes topics, services and the action; the core carries them out on an event loop in a thread of its own."""
@@ -253,6 +266,14 @@ class Commands:
     def note_stop(self) -> None:
         """See `Commander`; from any thread."""
         self._loop.call_soon_threadsafe(self.commander.note_stop)
+
+    def take_output(self, topic: str, slave: str, name: str) -> None:
+        """Set an output by a topic from now on."""
+
+        def carry_out(message: Any) -> Coroutine[Any, Any, None]:
+            return self.commander.set_outputs([(slave, name, message.data)])
+
+        rospy.Subscriber(topic, Float64, self._begin, (topic, carry_out), queue_size=100)
 
     def publish_feedback(self, feedback: Any) -> None:
         """Publish it to the clients of the goals under way."""

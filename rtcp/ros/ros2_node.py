@@ -11,7 +11,7 @@ import contextlib
 import logging
 import signal
 import threading
-from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Protocol
@@ -33,10 +33,11 @@ from rtcp.ros.commands import (
     Tolerances,
     Trajectory,
     TrajectoryPoint,
+    refusal,
 )
 from rtcp.ros.group import GroupStates, connects
-from rtcp.ros.ros2_types import CANCEL, FOLLOW, PATH_COMMAND, STOP_MOTION, TRIGGER
-from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher
+from rtcp.ros.ros2_types import CANCEL, FOLLOW, GROUP_VALUES, PATH_COMMAND, STOP_MOTION, TRIGGER
+from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus, StatePublisher
 
 Make = Callable[..., Any]
 """Makes a message from the name of its type and its fields."""
@@ -53,6 +54,7 @@ OUT: Mapping[str, str] = {
     "tf": "tf2_msgs/msg/TFMessage",
     "robot_description": "std_msgs/msg/String",
     "speed_override_state": "std_msgs/msg/Float64",
+    "gpio_controller/gpio_states": GROUP_VALUES,
 }
 """Topics that are published, with their types."""
 IN: Mapping[str, str] = {
@@ -60,6 +62,7 @@ IN: Mapping[str, str] = {
     "joint_path_command": _TRAJECTORY,
     "joint_trajectory": _TRAJECTORY,
     "speed_override": "std_msgs/msg/Float64",
+    "gpio_controller/commands": GROUP_VALUES,
 }
 """Topics that are taken."""
 SERVICES: Mapping[str, str] = {
@@ -174,6 +177,8 @@ class Commands:
             command = self.commander.command_joints(trajectory_of(message))
         elif topic == "speed_override":
             command = self.commander.set_speed_override(float(message.data))
+        elif topic == "gpio_controller/commands":
+            command = self.commander.set_outputs(outputs_of(message))
         else:
             command = self.commander.begin_trajectory(trajectory_of(message))
 
@@ -307,6 +312,21 @@ class Publications:
         )
         self._publish("diagnostics", header=self._header(diagnostics.stamp_ns), status=[entry])
 
+    def channels(self, sample: ChannelSample) -> None:
+        """Publish gpio_states."""
+        if "gpio_controller/gpio_states" not in self._wire.topics:
+            return
+        values = [
+            self._make("control_msgs/msg/InterfaceValue", interface_names=list(found), values=list(found.values()))
+            for found in sample.values.values()
+        ]
+        self._publish(
+            "gpio_controller/gpio_states",
+            header=self._header(sample.stamp_ns),
+            interface_groups=list(sample.values),
+            interface_values=values,
+        )
+
     def _publish(self, topic: str, **fields: Any) -> None:
         self._wire.publish(topic, self._make(OUT[topic], **fields))
 
@@ -371,6 +391,20 @@ def trajectory_of(message: Any) -> Trajectory:
     """Return a trajectory_msgs/JointTrajectory as the core has it."""
     points = [point_of(point) for point in message.points]
     return Trajectory(list(message.joint_names), points, seconds(message.header.stamp))
+
+
+def outputs_of(message: Any) -> Iterator[tuple[str, str, float]]:
+    """Yield slave, name and value of each output of a control_msgs/DynamicInterfaceGroupValues.
+
+    Raises:
+        RtcpError: a list is longer than the one that belongs to it.
+    """
+    try:
+        for slave, one in zip(message.interface_groups, message.interface_values, strict=True):
+            for name, value in zip(one.interface_names, one.values, strict=True):
+                yield slave, name, value
+    except ValueError:
+        raise refusal("wrong_count", "found lists of different lengths, allowed is a value for each name") from None
 
 
 def point_of(message: Any) -> TrajectoryPoint:

@@ -36,6 +36,7 @@ class Field:
 
 
 FOLLOW = "control_msgs/action/FollowJointTrajectory"
+GROUP_VALUES = "control_msgs/msg/DynamicInterfaceGroupValues"
 CANCEL = "action_msgs/srv/CancelGoal"
 TRIGGER = "std_srvs/srv/Trigger"
 STOP_MOTION = "industrial_msgs/srv/StopMotion"
@@ -65,6 +66,13 @@ _MESSAGES = {
         float64 position
         float64 velocity
         float64 acceleration""",
+    "control_msgs/msg/InterfaceValue": """
+        string[] interface_names
+        float64[] values""",
+    GROUP_VALUES: """
+        std_msgs/Header header
+        string[] interface_groups
+        control_msgs/InterfaceValue[] interface_values""",
     f"{FOLLOW}_Goal": """
         trajectory_msgs/JointTrajectory trajectory
         trajectory_msgs/MultiDOFJointTrajectory multi_dof_trajectory

@@ -7,7 +7,7 @@ Joints come from cycles in which every slave answered; in the others the record 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -28,7 +28,7 @@ RECONNECT_S = 1.0
 """Interval between two tries to reach the platform (ROS-Industrial driver specification, 1.2.2)."""
 _SECOND_NS = 1_000_000_000
 _STATUS_NS = _SECOND_NS // 10
-"""Longest interval between two statuses; a change comes at once."""
+"""Longest interval between two statuses, where a change comes at once, and between two samples of the channels."""
 _DIAGNOSTICS_NS = _SECOND_NS
 _STALE_NS = _SECOND_NS // 2
 """Age at which a record, or a measured value in one, says nothing about now: far beyond the stalls of a busy host."""
@@ -86,6 +86,17 @@ class Diagnostics:
     values: tuple[tuple[str, str], ...] = ()
 
 
+@dataclass(frozen=True)
+class ChannelSample:
+    """Inputs and outputs of IO boxes that have a name, and channels of slaves, in one cycle, by slave and name."""
+
+    stamp_ns: int
+    values: Mapping[str, Mapping[str, float]]
+    """In the unit of the device's file; a level is 0 or 1."""
+    settable: Collection[tuple[str, str]] = ()
+    """Slave and name of those that a command may set."""
+
+
 class Sink(Protocol):
     """Who publishes it."""
 
@@ -100,6 +111,9 @@ class Sink(Protocol):
 
     def diagnostics(self, diagnostics: Diagnostics) -> None:
         """Publish diagnostics."""
+
+    def channels(self, sample: ChannelSample) -> None:
+        """Publish the channels."""
 
 
 def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: bool = False) -> RobotStatus:
@@ -174,6 +188,8 @@ class StatePublisher:
         """When each is due, CLOCK_MONOTONIC."""
         self._joints_ns = 0
         """When the next sample is due, CLOCK_MONOTONIC of its cycle."""
+        self._channels_ns = 0
+        """As `_joints_ns`, of the channels."""
         self._measured_ns = 0
         """Cycle of the last sample, CLOCK_MONOTONIC."""
         self._last: Any = None
@@ -212,7 +228,7 @@ class StatePublisher:
         except NotRunning as error:
             self._why = error.message
             return
-        self._last, self._level, self._measured_ns, self._joints_ns = None, (), 0, 0
+        self._last, self._level, self._measured_ns, self._joints_ns, self._channels_ns = None, (), 0, 0, 0
         self._feed, self._names = feed, tuple(joint.name for joint in feed.config.joints)
         self._sink.connected(feed.config)
 
@@ -235,6 +251,9 @@ class StatePublisher:
                     due = self._joints_ns + self._period_ns
                     self._joints_ns = due if due > instant else instant + self._period_ns
                     self._sink.joints(self._names, _sample(records[at], instant + ahead_ns))
+                if feed.channels and instant >= self._channels_ns:
+                    self._channels_ns = instant + _STATUS_NS
+                    self._sink.channels(_channels(feed, records[at], instant + ahead_ns))
             if level != self._level:
                 self._level = level
                 self._publish_status(feed, records[at], instant, ahead_ns)
@@ -285,6 +304,13 @@ def _sample(record: Any, stamp_ns: int) -> JointSample:
         numbers("commanded_position"),
         int(record["tool"]),
     )
+
+
+def _channels(feed: Feed, record: Any, stamp_ns: int) -> ChannelSample:
+    values: dict[str, dict[str, float]] = {}
+    for one in feed.channels:
+        values.setdefault(one.slave, {})[one.local_name] = float(one.value(record))
+    return ChannelSample(stamp_ns, values, [(one.slave, one.local_name) for one in feed.channels if one.settable])
 
 
 def _diagnostics(feed: Feed, record: Any, ahead_ns: int) -> Diagnostics:

@@ -20,7 +20,7 @@ from rtcp.esi.reader import find_device, read_esi
 from tests.drive_esi import write_esi
 
 FILES = Path(__file__).parents[1] / "esi" / "files"
-DRIVE, AXES, TERMINALS = FILES / "drive.xml", FILES / "axes.xml", FILES / "terminals.xml"
+DRIVE, AXES, TERMINALS, ANALOG = (FILES / f"{name}.xml" for name in ("drive", "axes", "terminals", "analog"))
 
 
 def test_a_file_is_listed_with_its_devices_modules_and_what_is_hidden(rtcp: Callable[..., Any]) -> None:
@@ -71,6 +71,8 @@ def test_modules_are_put_into_slots_and_a_wrong_one_is_named_with_those_allowed(
         (("--esi", str(TERMINALS)), "3 devices fit without a choice"),
         (("--esi", str(TERMINALS), "--product", "0x99"), "no devices fit product 0x00000099"),
         (("--esi", str(TERMINALS), "--product", "x"), "'x' is not a whole number (--product)"),
+        (("--esi", str(ANALOG), "--mode", "DC"), "no clock mode 'DC'; there are: FreeRun, DcTimed, DcOversampling"),
+        (("--esi", str(ANALOG), "--mode", "DcOversampling"), "takes several values a cycle, which is not supported"),
         (("--esi", str(AXES), "--module", "0"), "allowed is SLOT=IDENT"),
         (("--esi", "there-is-none.xml"), "there-is-none.xml: cannot be read"),
         (("--sii", str(DRIVE)), "it is no EEPROM image"),
@@ -92,6 +94,27 @@ def test_every_sample_becomes_a_file_that_can_be_read(tmp_path: Path) -> None:
             out = tmp_path / f"{path.stem}-{number}.yaml"
             out.write_text(file_text(whole))
             load_device(out)
+
+
+def test_an_input_of_an_outputs_name_gets_a_name_of_its_own_and_a_file_without_is_refused(
+    rtcp: Callable[..., Any], tmp_path: Path
+) -> None:
+    out = tmp_path / "analog.yaml"
+    assert rtcp("device", "new", "--esi", str(ANALOG), "--out", str(out)).code == 0
+    device = load_device(out)
+    assert [entry.name for entry in (*device.outputs, *device.inputs)] == ["enable", "value", "enable_in", "value_in"]
+    out.write_text(out.read_text().replace("name: value_in", "name: value"))
+    refused = rtcp("device", "check", str(out))
+    text = 'tpdo[0].channels[2].name: found the text "value", an output\'s name too; each channel of the device needs'
+    assert (refused.code, text in refused.trouble) == (2, True), refused.trouble
+
+
+def test_a_clock_mode_is_chosen_by_name_with_the_pdos_that_it_assigns(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    out = tmp_path / "analog.yaml"
+    assert rtcp("device", "new", "--esi", str(ANALOG), "--mode", "DcTimed", "--out", str(out)).code == 0
+    device = load_device(out)
+    assert (device.assign_activate, [pdo.index for pdo in device.tpdo]) == (0x0300, [0x1A01])
+    assert [pdo.index for pdo in device.rpdo] == [0x1600]
 
 
 def test_the_kind_follows_from_the_default_process_data() -> None:

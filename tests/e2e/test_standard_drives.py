@@ -14,6 +14,7 @@ from rtcp.ipc.runtime_directory import control_socket
 from tests.drive_esi import TWO_AXIS, write_esi
 from tests.e2e.arms import replace_drives
 from tests.e2e.conftest import CUBEMARS, Platform
+from tests.fieldbus.terminals import ESI_FILES
 
 pytestmark = [pytest.mark.alone, CUBEMARS]
 
@@ -37,6 +38,11 @@ tpdo:
 def build(folder: Path) -> None:
     """Replace the six drives of the configuration in `folder` by three of two axes, and add the valves."""
     replace_drives(folder, "two-axis")
+    add_valves(folder)
+
+
+def add_valves(folder: Path) -> None:
+    """Add an analog terminal behind the slaves of the configuration in `folder`, and to its segment."""
     (folder / "devices" / "valves.yaml").write_text(VALVES)
     write_esi(folder / "valves.xml", load_device(folder / "devices" / "valves.yaml"), {})
     for file, slave in (
@@ -137,3 +143,31 @@ def test_a_drive_that_counts_otherwise_than_its_file_does_not_start(platform: Pl
     assert refused.returncode != 0
     said = " ".join((refused.stdout + refused.stderr).split())
     assert "slave 2 (drive1), axis 2: the drive counts otherwise than its file: 0x688F holds 1024" in said
+
+
+def test_what_a_slave_has_otherwise_than_its_file_is_told_in_words(platform: Platform) -> None:
+    platform.be_patient(2000)
+    folder = platform.directory / "config"
+    (folder / "segment.yaml").write_text(f"slaves:\n  - {{esi: {ESI_FILES / 'analog.xml'}}}\n")
+    sound, wrong = folder / "devices" / "sound.yaml", folder / "devices" / "wrong.yaml"
+    platform.rtcp("device", "new", "--esi", str(ESI_FILES / "analog.xml"), "--out", str(sound))
+    assert "as the file says" in platform.rtcp("device", "check", str(sound), "--bus", "virtual").stdout
+    text = sound.read_text()
+    for old, new in (
+        ("index: 0x8001", "index: 0x8011"),
+        ("index: 0x7000, sub_index: 2, type: int16", "index: 0x7000, sub_index: 2, type: int32"),
+        ("index: 0x1A00 ", "index: 0x1A05 "),
+    ):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    wrong.write_text(text)
+    said = " ".join(platform.rtcp("device", "check", str(wrong), "--bus", "virtual", check=None).stdout.split())
+    for sentence in (
+        "sdo: 0x8011:0 (its tag): the slave has no such object",
+        "rpdo: 0x7000:2 (value): the file says 4 bytes, the slave has 2",
+        "tpdo: PDO 0x1A05: the slave has no such object",
+    ):
+        assert sentence in said
+    wrong.write_text(sound.read_text().replace("product_id: 0x00000041", "product_id: 0x00000042"))
+    refused = platform.rtcp("device", "check", str(wrong), "--bus", "virtual", check=None)
+    assert "no slave has vendor 0x00000E51, product 0x00000042" in " ".join((refused.stdout + refused.stderr).split())

@@ -17,10 +17,11 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rtcp.config.loader import load
+from rtcp.config.loader import load, load_device
 from rtcp.config.model import Pdo, PdoEntry, SlaveConfig, StartupSdo
 from rtcp.devices import Cia402Drive, TargetState
 from rtcp.fieldbus import AlState, BusError, SdoAborted
@@ -331,6 +332,20 @@ def terminals(bus: SoemBus, count: int, kinds: list[str]) -> Any:
     }  # fmt: skip
 
 
+def described(bus: SoemBus, count: int, file: str) -> Any:
+    """Set a slave up by its device's file; return what its start-up SDOs have written."""
+    bus.configure([SlaveConfig("aio", load_device(Path(file)), file)], 1_000_000)
+    return [bus.sdo_read(1, 0x8001, 0).hex(), *(bus.sdo_read(1, 0x8000, n).hex() for n in (1, 2, 3))]
+
+
+def contradicted(bus: SoemBus, count: int) -> None:
+    """A terminal's file maps as many bits as its EEPROM, of another object."""
+    slaves = [slave("t1", "input"), slave("t2", "bits4")]
+    (pdo,) = slaves[1].device.rpdo
+    other = replace(pdo, channels=(replace(pdo.channels[0], sub_index=9),))
+    bus.configure([slaves[0], with_device(slaves[1], rpdo=(other,))], 1_000_000)
+
+
 def files(bus: SoemBus, count: int) -> Any:
     """Files written and read, also in BOOT, and what the slave refuses."""
     bus.scan()
@@ -435,6 +450,8 @@ SCENARIOS = {
         outputs,
         terminals,
         files,
+        described,
+        contradicted,
         eeprom,
         emergency,
         killed,

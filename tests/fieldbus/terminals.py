@@ -13,6 +13,7 @@ from rtcp.esi.sii import write_sii
 from rtcp.virtual.behaviour import Behaviour, FileBusy, FileRefused, FoeError
 from rtcp.virtual.protocol import AlState
 
+ESI_FILES = Path(__file__).parents[1] / "esi" / "files"
 VENDOR = 0x0E2A
 OUT, IN = 0x7000, 0x6000
 MAILBOX = (
@@ -133,9 +134,12 @@ def slave(name: str, kind: str, alias: int = 0) -> SlaveConfig:
 
 
 def write_segment(file: Path, *entries: str) -> None:
-    """Write a segment's file of these devices, each with the keys behind its name: `bits4, alias: 7`."""
+    """Write a segment's file of these devices, each with keys behind its name (`bits4, alias: 7`), or of ESI files."""
     lines = []
     for entry in entries:
+        if entry.endswith(".xml"):
+            lines.append(f"- {{esi: {ESI_FILES / entry}}}\n")
+            continue
         kind, _, more = entry.partition(",")
         (file.parent / f"{kind}.bin").write_bytes(write_sii(DEVICES[kind]))
         echo = f"behaviour: 'tests.fieldbus.terminals:{'Bootable' if kind == 'files' else 'Echo'}'"

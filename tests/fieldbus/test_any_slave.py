@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from rtcp.config.device_file import file_text
+from rtcp.esi.reader import find_device, read_esi
 from rtcp.esi.sii import write_sii
 from tests.fieldbus.conftest import WATCHER
-from tests.fieldbus.terminals import DEVICES
+from tests.fieldbus.terminals import DEVICES, ESI_FILES
 
 pytestmark = pytest.mark.alone
 
@@ -77,3 +79,23 @@ def test_an_eeprom_is_read_and_written_word_by_word_and_only_where_it_differs(st
     assert result["written"] == [1, 0]
     assert result["same"]
     assert result["parts"] == [8 / 2048, 1.0]
+
+
+def test_texts_and_complete_objects_of_the_makers_start_up_commands_are_written_at_the_start(start_segment, tmp_path):
+    file = tmp_path / "analog.yaml"
+    file.write_text(file_text(find_device(read_esi(ESI_FILES / "analog.xml"))))
+    segment = start_segment(("analog.xml",))
+    written = ["54414e4b2050524553535552", "64000000", "0000c03f", "feffffff"]
+    assert segment.master("described", file=str(file))["result"] == written
+    file.write_text(file.read_text().replace("54 41", "54 41 54 41"))
+    assert segment.master("described", file=str(file))["error"] == [
+        "slave 1 (aio) refused the write of 14 bytes to 0x8001:0: abort code 0x06070012, data type does not match: "
+        "too long"
+    ]
+
+
+def test_a_terminal_whose_eeprom_maps_other_objects_than_its_file_is_refused(start_segment):
+    assert start_segment(("input", "bits4")).master("contradicted")["error"] == [
+        "slave 2 (t2): the PDOs in its EEPROM differ from the device's file (key `rpdo`): expected 4 bits (0x1601: "
+        "0x7000:9/4), found 4 bits (0x1601: 0x7000:1/4); `rtcp device new --from-bus` describes it as it is"
+    ]

@@ -166,14 +166,14 @@ tpdo:
   - index: 0x1A00
     channels:
       - {index: 0x6000, sub_index: 1, type: bool, name: closed}
-      - {index: 0x6000, sub_index: 2, type: int16, name: level, unit: m}
+      - {index: 0x6000, sub_index: 2, type: int16, name: depth, unit: m}
 """
 
 
 def test_channels_of_a_slave_are_read_and_set_by_name_and_those_of_one_bit_are_terminals(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = ("closed", "level", "open", "level_sent")
+    names = ("closed", "depth", "open", "level")
     more = tuple(Field(f"valves_{name}", "float64", part="valves") for name in names)
     monkeypatch.setattr("tests.gateway.fake_loop.BOX", (*fake_loop.BOX, *more))
     shutil.copytree(default_config().parent, tmp_path / "config")
@@ -185,17 +185,22 @@ def test_channels_of_a_slave_are_read_and_set_by_name_and_those_of_one_bit_are_t
         found = arm.ask("read_io")
         assert [one["name"] for one in found["inputs"]][-1] == "valves.closed"
         assert [(one["name"], one["number"]) for one in found["outputs"]][-1] == ("valves.open", 1)
-        level = {"name": "valves.level", "value": 0.0, "unit": "m"}
+        still = {"value": 0.0, "unit": "m"}
         assert found["channels"] == [
-            {**level, "is_output": False, "settable": False, "range": None},
-            {**level, "is_output": True, "settable": True, "range": [0.5, None]},
+            {"name": "valves.depth", **still, "is_output": False, "settable": False, "range": None},
+            {"name": "valves.level", **still, "is_output": True, "settable": True, "range": [0.5, None]},
         ]
         arm.ask("write_io", name="valves.open", value=True)
         arm.ask("set_channel", name="valves.level", value=1.25)
         assert arm.loop.commands == [SetChannel(8, 0, 1.0), SetChannel(8, 1, 1.25)]
         arm.ask("wait_io", name="valves.closed", value=False, timeout_s=1.0)
+        arm.ask("set_channel", name="valves.open", value=1)
+        arm.ask("set_channel", name="io.gripper", value=0)
+        assert arm.loop.commands[2:] == [SetChannel(8, 0, 1.0), SetOutput(4, False, 0)]
+        assert arm.error("set_channel", name="valves.open", value=0.5).reason == "wrong_level"
+        assert arm.error("write_io", name="valves.level", value=True).reason == "unknown_terminal"
         error = arm.error("set_channel", name="valves.closed", value=1.0)
-        assert (error.reason, error.fields["allowed"]) == ("unknown_terminal", ["valves.level"])
+        assert (error.reason, error.fields["allowed"][-2:]) == ("unknown_terminal", ["valves.open", "valves.level"])
 
 
 def test_a_terminal_that_is_none_is_refused_with_those_there_are(arm: FakePlatform) -> None:

@@ -85,6 +85,10 @@ class FakeArm:
     async def set_speed_override(self, fraction: float) -> None:
         self.calls.append(("speed_override", fraction))
 
+    async def set_output(self, output: str, value: float) -> None:
+        self._check()
+        self.calls.append((output, value))
+
     async def enable(self) -> None:
         self.calls.append("enable")
         self.state = State.HOLDING
@@ -674,7 +678,7 @@ def test_what_waited_while_the_node_did_not_run_moves_nothing(arm: FakeArm, monk
         await commander.command_point(point(1.0))
         time.sleep(0.4)  # nothing of the process runs
         await commander.command_point(point(2.0))
-        for command in (commander.begin_trajectory(PATH), commander.enable()):
+        for command in (commander.begin_trajectory(PATH), commander.enable(), commander.set_outputs([("io", "3", 1)])):
             with pytest.raises(RtcpError) as refused:
                 await command
             assert refused.value.reason == "held_up"
@@ -798,3 +802,17 @@ def test_robot_enable_leaves_a_fault_first(arm: FakeArm, state: State, calls: li
 
     carry_out(arm, test)
     assert arm.calls == calls
+
+
+# -- outputs --------------------------------------------------------------------------------------------------------
+
+
+def test_outputs_are_set_in_their_order_up_to_the_first_that_is_refused(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        await commander.set_outputs([("valves", "current", 12.5), ("valves", "open", 1)])
+        arm.refusal = RtcpError("refused", "beyond its range", "channel_out_of_range")
+        with pytest.raises(RtcpError, match="beyond its range"):
+            await commander.set_outputs([("valves", "current", 99.0), ("io", "blower", 1.0)])
+
+    carry_out(arm, test)
+    assert arm.calls == [("valves.current", 12.5), ("valves.open", 1.0)]

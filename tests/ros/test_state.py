@@ -15,12 +15,22 @@ from rtcp.api import ControlMode, NotRunning, RtcpError, State
 from rtcp.api.feed import Feed
 from rtcp.config.find import default_config
 from rtcp.config.loader import load
+from rtcp.config.model import ArmConfig
 from rtcp.control.cycle import record_schema
 from rtcp.ipc.observer import record_type
-from rtcp.ipc.schema import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING, arm_schema
+from rtcp.ipc.schema import (
+    FLAG_EMERGENCY_STOP,
+    FLAG_ENABLED,
+    FLAG_MOTION_ALLOWED,
+    FLAG_SWITCHING,
+    RecordSchema,
+    arm_schema,
+)
+from rtcp.ipc.terminals import named, terminals_of
 from rtcp.motion.planning.interpolation import rotation
 from rtcp.ros.state import (
     TOOL_FRAME,
+    ChannelSample,
     Diagnostics,
     JointSample,
     RobotMode,
@@ -52,9 +62,11 @@ def record(time_ns: int = 0, **fields: Any) -> Any:
 class FakeFeed:
     """Records that a test adds."""
 
-    config, period_ns, schema = CONFIG, 2 * MS, SCHEMA
+    period_ns = 2 * MS
 
-    def __init__(self) -> None:
+    def __init__(self, config: ArmConfig = CONFIG, schema: RecordSchema = SCHEMA) -> None:
+        self.config, self.schema = config, schema
+        self.channels = named(*terminals_of(config, schema))
         self.holder = ""
         self.waiting: list[Any] = []
         self.has_ended = self.is_closed = False
@@ -67,7 +79,7 @@ class FakeFeed:
 
     def records(self) -> tuple[Any, int]:
         found, self.waiting = self.waiting, []
-        return np.array(found, record_type(SCHEMA)), 0
+        return np.array(found, record_type(self.schema)), 0
 
     def close(self) -> None:
         self.is_closed = True
@@ -80,6 +92,7 @@ class Heard:
         self.samples: list[JointSample] = []
         self.statuses: list[RobotStatus] = []
         self.entries: list[Diagnostics] = []
+        self.sampled: list[ChannelSample] = []
         self.names: tuple[str, ...] = ()
         self.connections = 0
 
@@ -95,6 +108,9 @@ class Heard:
 
     def diagnostics(self, diagnostics: Diagnostics) -> None:
         self.entries.append(diagnostics)
+
+    def channels(self, sample: ChannelSample) -> None:
+        self.sampled.append(sample)
 
 
 @pytest.fixture
@@ -335,3 +351,21 @@ def test_diagnostics_name_the_channels_of_slaves_with_their_units() -> None:
     values = dict(_diagnostics(cast(Feed, feed), found, 0).values)
     assert values["valves pressure"] == "2.5 bar"
     assert values["valves current"] == "0.0 mA"
+
+
+def test_channels_and_named_terminals_are_published_ten_times_a_second_by_slave_and_name(heard: Heard) -> None:
+    config = with_valves()
+    feed = FakeFeed(config, record_schema(config))
+    publisher = StatePublisher(heard, lambda: cast(Feed, feed))
+    made = np.zeros(151, record_type(feed.schema))
+    made["time_ns"] = time.monotonic_ns() + np.arange(151) * 2 * MS
+    made["valves_pressure"], made["io_inputs"], made["io_outputs"] = 2.5, 0b10, 0b1000
+    made["wkc"][50:55] = -1  # of a cycle without an answer only what came before is known
+    feed.waiting = list(made)
+    publisher.step(0)
+    assert [one.stamp_ns - heard.sampled[0].stamp_ns for one in heard.sampled] == [0, 110 * MS, 210 * MS]
+    sample = heard.sampled[0]
+    assert sample.values["valves"] == {"pressure": 2.5, "angle": 0.0, "current": 0.0}
+    assert {name for name, level in sample.values["io"].items() if level} == {"backward", "gripper"}
+    assert not [name for name in sample.values["io"] if name[0].isdigit()]
+    assert sample.settable == [("valves", "current")]

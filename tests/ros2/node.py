@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rtcp.config.find import default_config
 from rtcp.config.loader import load
 from rtcp.ros.commands import CommandOptions
 from rtcp.ros.ros2_node import Commands, Ros2Options
-from rtcp.ros.ros2_types import make
+from rtcp.ros.ros2_types import GROUP_VALUES, make
 from rtcp.ros.state import JointSample
 from tests.ros.test_commands import HERE, NAMES, FakeArm
 
@@ -45,6 +45,13 @@ def point(t: float, q: Any, **fields: Any) -> Any:
 def trajectory(names: Any = NAMES) -> Any:
     points = [point(0.0, HERE), point(1.5, (0.0, 0.0, 0.0))]
     return make("trajectory_msgs/msg/JointTrajectory", joint_names=list(names), points=points)
+
+
+def outputs(values: Mapping[str, Mapping[str, float]], make: Any = make) -> Any:
+    """Return a command of outputs by slave and name."""
+    kind = "control_msgs/msg/InterfaceValue"
+    each = [make(kind, interface_names=list(some), values=list(some.values())) for some in values.values()]
+    return make(GROUP_VALUES, interface_groups=list(values), interface_values=each)
 
 
 def commanded(arm: FakeArm, topic: str) -> list[Any]:

@@ -15,7 +15,7 @@ from rtcp.fieldbus.simple_message.messages import RobotMode, TriState
 from rtcp.ros.ros2_action import ActionServer
 from rtcp.ros.ros2_node import ACTION_TOPICS, OUT, Commands, Publications
 from rtcp.ros.ros2_types import CANCEL, FOLLOW, encode, make
-from rtcp.ros.state import Diagnostics, RobotStatus
+from rtcp.ros.state import ChannelSample, Diagnostics, RobotStatus
 from tests.ros.test_commands import FakeArm
 
 from .node import CONFIG, SAMPLE, arrive, trajectory, until
@@ -56,7 +56,12 @@ def test_every_topic_is_published(wire: Kept, publications: Publications) -> Non
     publications.joints(JOINTS, SAMPLE)
     publications.status(RobotStatus(1, RobotMode.AUTO, error_code=7, speed_override=0.5))
     publications.diagnostics(Diagnostics(1, 2, "fault", (("state", "fault"),)))
+    publications.channels(ChannelSample(1, {"valves": {"current": 12.5, "open": 1.0}, "io": {"part": 0.0}}))
     assert wire.messages.keys() == OUT.keys()
+    shown = wire.messages["gpio_controller/gpio_states"]
+    assert shown.interface_groups == ["valves", "io"]
+    assert [one.values.tolist() for one in shown.interface_values] == [[12.5, 1.0], [0.0]]
+    assert shown.interface_values[0].interface_names == ["current", "open"]
     status = wire.messages["robot_status"]
     assert (status.mode.val, status.e_stopped.val, status.error_codes.tolist()) == (2, -1, [7])
     [entry] = wire.messages["diagnostics"].status

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -14,25 +15,32 @@ import pytest
 
 pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed: pip install 'rtcp[zenoh]'")
 
-from rtcp.ros.ros2_types import decode, make
+from rtcp.ros.ros2_types import GROUP_VALUES, decode, encode, make, type_hash
 from rtcp.ros.ros2_zenoh import open_session
 from tests.e2e.conftest import Platform
+from tests.e2e.test_standard_drives import add_valves
 
-from .node import free_port, point, until
-from .zenoh_client import JOINT_STATES, Router, call
+from .node import free_port, outputs, point, until
+from .zenoh_client import GID, JOINT_STATES, Router, call
 
 pytestmark = pytest.mark.alone
 THERE = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1]
 
 
 @pytest.fixture
-def platform() -> Iterator[Platform]:
-    """A started platform, which forgives what a shared host does."""
+def prepared() -> Iterator[Platform]:
+    """A platform that forgives what a shared host does, not yet started."""
     made = Platform()
     made.be_patient(2000)
-    made.rtcp("start", "--detach")
     yield made
     made.end()
+
+
+@pytest.fixture
+def platform(prepared: Platform) -> Platform:
+    """A started platform."""
+    prepared.rtcp("start", "--detach")
+    return prepared
 
 
 def test_the_arm_is_enabled_moved_and_seen_over_zenoh(platform: Platform) -> None:
@@ -59,6 +67,47 @@ def test_the_arm_is_enabled_moved_and_seen_over_zenoh(platform: Platform) -> Non
     node.send_signal(signal.SIGINT)
     _, log = node.communicate()
     assert node.returncode == 0, log
+    router.close()
+
+
+def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_everywhere(prepared: Platform) -> None:
+    platform, router = prepared, Router()
+    add_valves(platform.directory / "config")
+    platform.rtcp("start", "--detach")
+    node = platform.background("ros", "--zenoh", "--router", router.address, "--name", "arm")
+    kind = f"control_msgs::msg::dds_::DynamicInterfaceGroupValues_/{type_hash(GROUP_VALUES)}"
+    received: list[Any] = []
+
+    def latest() -> dict[str, Any]:
+        if not received:
+            return {}
+        message = decode(GROUP_VALUES, received[-1].payload.to_bytes())
+        values = zip(message.interface_groups, message.interface_values, strict=True)
+        return {slave: dict(zip(one.interface_names, one.values.tolist(), strict=True)) for slave, one in values}
+
+    with open_session(router.address) as session:
+        subscriber = session.declare_subscriber(f"0/gpio_controller/gpio_states/{kind}", received.append)
+        until(lambda: latest().get("valves", {}).get("current") == 4.0, "the safe value")
+        assert {"emergency_stop", "gripper"} <= latest()["io"].keys()
+        platform.rtcp("segment", "set", "8", "0x6000:1", "350")
+        until(lambda: latest()["valves"]["pressure"] == pytest.approx(2.5), "the pressure")
+
+        def set_current(value: float) -> None:
+            command = encode(GROUP_VALUES, outputs({"valves": {"current": value}}))
+            attachment = struct.pack("<qqB16s", 1, time.time_ns(), 16, GID)
+            session.put(f"0/gpio_controller/commands/{kind}", command, attachment=attachment)
+
+        set_current(12.5)
+        until(lambda: latest()["valves"]["current"] == 12.5, "the output")
+        assert "12500" in platform.rtcp("segment", "get", "8", "0x7000:1").stdout
+        set_current(21.0)
+        assert node.stderr is not None
+        refused = until(node.stderr.readline, "the refusal")
+        assert "gpio_controller/commands: valves.current: 21 cannot be set: allowed is 4 to 20" in refused
+        assert latest()["valves"]["current"] == 12.5
+        subscriber.undeclare()
+    node.send_signal(signal.SIGINT)
+    node.communicate()
     router.close()
 
 

@@ -15,11 +15,11 @@ pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'rt
 
 from rtcp.ros.ros2_node import IN, OUT, Commands, Publications
 from rtcp.ros.ros2_types import FOLLOW
-from rtcp.ros.state import Diagnostics, RobotStatus
+from rtcp.ros.state import ChannelSample, Diagnostics, RobotStatus
 from tests.ros.test_commands import HERE, NAMES, FakeArm
 
 from . import rclpy_stand_in
-from .node import CONFIG, OPTIONS, SAMPLE, arrive, commanded, until
+from .node import CONFIG, OPTIONS, SAMPLE, arrive, commanded, outputs, until
 
 TIMEOUT_S = 100.0
 
@@ -97,6 +97,7 @@ def test_every_topic_is_published(ros: Ros) -> None:
         ros.publications.joints(tuple("abcdef"), SAMPLE)
         ros.publications.status(RobotStatus(1, error_code=3, speed_override=0.5))
         ros.publications.diagnostics(Diagnostics(1, 2, "fault"))
+        ros.publications.channels(ChannelSample(1, {"valves": {"current": 12.5}}))
         return all(received.values())
 
     until(publish, "each topic")
@@ -104,6 +105,7 @@ def test_every_topic_is_published(ros: Ros) -> None:
     assert list(received["robot_status"][0].error_codes) == [3]
     assert received["speed_override_state"][0].data == 0.5
     assert received["diagnostics"][0].status[0].level == b"\2"
+    assert list(received["gpio_controller/gpio_states"][0].interface_values[0].values) == [12.5]
 
 
 def test_a_late_subscriber_receives_the_robot_description(ros: Ros) -> None:
@@ -124,6 +126,7 @@ def test_commands_reach_the_arm(ros: Ros, arm: FakeArm, topic: str, quality: str
     message, expected = {
         "joint_command": (trajectory.points[0], HERE),
         "speed_override": (ros.make(IN["speed_override"], data=0.5), 0.5),
+        "gpio_controller/commands": (outputs({"valves": {"current": 12.5}}, ros.make), 12.5),
     }.get(topic, (trajectory, [list(HERE), [0.0, 0.0, 0.0]]))
 
     def publish() -> list[Any]:
