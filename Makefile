@@ -65,5 +65,5 @@ format: setup ## put imports and layout in order
 	@$(BIN)/ruff format .
 
 clean: ## remove .venv and all else that can be made again
-	rm -rf .venv .venv-egm-peers build dist kinematics/_fast .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-egm-peers .venv-foreign build dist kinematics/_fast .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -158,11 +158,13 @@ def _read_object(sdo: SdoClient, index: int) -> model.DictionaryObject | None:
 
 
 def read_entry(sdo: SdoClient, index: int, sub_index: int) -> model.ObjectEntry | None:
-    """Return the description of an entry; None: the answer holds none. Raises BusError."""
+    """Return the description of an entry; None: the answer holds none, or that of a gap. Raises BusError."""
     data = finish(sdo.information(_ENTRY, struct.pack("<HBB", index, sub_index, 0)))
     if len(data) < _ENTRY_DESCRIPTION.size:
         return None
     _, _, _, kind, bits, access = _ENTRY_DESCRIPTION.unpack_from(data)
+    if not kind and not bits:
+        return None
     return model.ObjectEntry(
         sub_index,
         _text(data[_ENTRY_DESCRIPTION.size :]),

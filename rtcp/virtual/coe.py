@@ -509,6 +509,9 @@ class SdoInformation:
         if len(request) < _ENTRY_REQUEST.size:
             raise SdoAbort(AbortCode.LENGTH)
         index, subindex, asked = _ENTRY_REQUEST.unpack_from(request)
+        if 0 < subindex < self._objects.object(index).highest_subindex and (index, subindex) not in self._objects:
+            # A gap in a record has no type, no bits and no rights: masters read on, where an abort is a fault to them.
+            return _ENTRY.pack(index, subindex, asked & _ALWAYS_REPORTED, 0, 0, 0)
         entry = self._objects[index, subindex]
         reported, limits = _limits(entry, ValueInfo(asked & 0x7F))
         head = _ENTRY.pack(index, subindex, reported, entry.data_type, entry.bit_length, entry.access)

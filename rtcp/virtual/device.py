@@ -229,7 +229,7 @@ class DeviceModel:
     def _define_identity(self) -> None:
         objects, identity, text = self.objects, self.identity, DataType.VISIBLE_STRING
         unsigned = DataType.UNSIGNED32
-        objects.variable(0x1000, "DeviceModel type", unsigned, self.device_type)
+        objects.variable(0x1000, "Device type", unsigned, self.device_type)
         objects.variable(0x1001, "Error register", DataType.UNSIGNED8)
         objects.variable(0x1008, "Manufacturer device name", text, identity.name.encode())
         objects.variable(0x1009, "Manufacturer hardware version", text, b"1.0")

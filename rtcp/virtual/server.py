@@ -122,7 +122,7 @@ class Server:
             if size:
                 if frame[12] != ETHERTYPE >> 8 or frame[13] != ETHERTYPE & 0xFF:
                     continue
-                arrived = _arrival(ancillary)
+                arrived = arrival(ancillary, arrived)
                 if frames.active or _tagged(ancillary):
                     self._answer_slowly(frame, size, arrived, ancillary)
                 elif segment.process(frame, size, arrived):
@@ -206,14 +206,17 @@ def _complain(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)
 
 
-def _arrival(ancillary: Ancillary) -> int:
-    """The instant (CLOCK_MONOTONIC, ns) at which a frame arrived, by the kernel's receive time stamp."""
+def arrival(ancillary: Ancillary, previous: int) -> int:
+    """The instant (CLOCK_MONOTONIC, ns) at which a frame arrived, by the kernel's receive time stamp.
+
+    Never before that of the frame before it: a process that stalls between its two clocks finds an instant too early.
+    """
     now = time.monotonic_ns()
     if ancillary:
         seconds, nanoseconds = TIMESPEC.unpack_from(ancillary[0][2])
         age: int = time.time_ns() - seconds * 1_000_000_000 - nanoseconds
         if 0 <= age < OLDEST:
-            return now - age
+            return max(previous, now - age)
     return now
 
 

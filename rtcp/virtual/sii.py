@@ -238,6 +238,8 @@ def _dc(strings: _Strings) -> bytes:
 
 READ_8_BYTES = 0x0040
 TWO_ADDRESS_BYTES = 0x0080
+LARGEST_OF_ONE_ADDRESS_BYTE = 2048
+"""Bytes of an EEPROM of 16 kbit; larger ones take addresses of two bytes (ETG.1000.4, 0x0502 bit 7)."""
 WRITE_ENABLE = 0x0001
 COMMAND_MASK = 0x0700
 READ = 0x0100
@@ -330,5 +332,7 @@ class EepromInterface:
         self._memory[Register.ALIAS : Register.ALIAS + 2] = self.image[2 * ALIAS_WORD : 2 * ALIAS_WORD + 2]
 
     def _store_status(self) -> None:
-        status = READ_8_BYTES | TWO_ADDRESS_BYTES | self._errors
+        status = READ_8_BYTES | self._errors
+        if len(self.image) > LARGEST_OF_ONE_ADDRESS_BYTE:
+            status |= TWO_ADDRESS_BYTES
         self._memory[Register.EEPROM_CONTROL : Register.EEPROM_CONTROL + 2] = status.to_bytes(2, "little")

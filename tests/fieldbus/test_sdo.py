@@ -7,6 +7,7 @@ import threading
 import pytest
 
 from rtcp.fieldbus import BusError, SdoAborted
+from rtcp.fieldbus.describe import read_entry
 from rtcp.fieldbus.mailbox import SdoClient
 
 EMERGENCY = bytes.fromhex("0010 1186 21 0102030405")
@@ -159,3 +160,8 @@ def test_an_emergency_before_the_answer_is_passed_on(client_of, other):
 def test_a_slave_without_mailbox_is_told_to_have_none(client_of):
     with pytest.raises(BusError, match="no CoE mailbox"):
         client_of(None).read(0x6041, 0)
+
+
+def test_a_gap_in_a_record_is_no_entry(client_of):
+    script = Script(("0080 05 00 0000 321c 07 00", "0080 06 00 0000 321c 07 00 0000 0000 0000"))
+    assert read_entry(client_of(script), 0x1C32, 7) is None

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from rtcp.virtual.server import SO_TIMESTAMPNS, TIMESPEC, arrival
+
 pytestmark = pytest.mark.alone
 
 ROOT = Path(__file__).parents[2]
@@ -289,6 +291,15 @@ def test_no_frame_is_lost_back_to_back_nor_while_polling(
 ) -> None:
     with running(config, *options) as (_, facts):
         assert raw_master(facts, frames, period_us)["lost"] == 0
+
+
+def test_a_frame_arrives_by_the_kernels_stamp_and_never_before_the_frame_before_it() -> None:
+    before = time.monotonic_ns()
+    stamp = TIMESPEC.pack(*divmod(time.time_ns() - 5_000_000, 1_000_000_000))
+    ancillary = [(socket.SOL_SOCKET, SO_TIMESTAMPNS, stamp)]
+    now = time.monotonic_ns()
+    assert arrival(ancillary, now) == now
+    assert 0 < arrival(ancillary, 0) < before
 
 
 def test_a_frame_with_a_vlan_tag_is_answered_with_its_tag(config: Path) -> None:
