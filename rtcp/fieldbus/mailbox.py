@@ -293,6 +293,9 @@ def abort_meaning(code: int) -> str:
 
 
 _SM0_STATUS, _SM1_STATUS, _FULL = Register.SYNC_MANAGER + 5, Register.SYNC_MANAGER + 13, 0x08
+_SM1_ACTIVATE, _SM1_PDI_CONTROL, _REPEAT = Register.SYNC_MANAGER + 14, Register.SYNC_MANAGER + 15, 0x02
+"""Repeat request and, toggled by the slave, its acknowledgement (ETG.1000.4, 6.7.1)."""
+_LOOKS = 20
 _HEADER = struct.Struct("<HHBB")
 
 
@@ -377,7 +380,7 @@ class Mailbox:
         if not self._is_full(_SM1_STATUS):
             return None
         # Once only: the mailbox is empty after its last byte was read.
-        message = self._port.read(self._station, self._info.send_start, self._info.send_size, tries=1)
+        message = self._read() or self._read_again()
         if message is None:
             raise BusError("its message got lost")
         length, _, _, kind = _HEADER.unpack_from(message)
@@ -386,6 +389,25 @@ class Mailbox:
             code = int.from_bytes(content[2:4], "little")
             raise BusError(f"mailbox error {code}: {_ERRORS.get(code, 'not in the standard')}")
         return _TYPES.get(kind & 0x0F), content
+
+    def _read(self) -> bytes | None:
+        return self._port.read(self._station, self._info.send_start, self._info.send_size, tries=1)
+
+    def _read_again(self) -> bytes | None:
+        """Return a message whose frame got lost: it is there still, or the slave repeats it; None: it does not."""
+        if not self._is_full(_SM1_STATUS):
+            control = self._port.read(self._station, _SM1_ACTIVATE, 1)
+            if control is None:
+                return None
+            toggled = bytes((control[0] ^ _REPEAT,))
+            if not self._port.write(self._station, _SM1_ACTIVATE, toggled):
+                return None
+            looks = (self._port.read(self._station, _SM1_PDI_CONTROL, 1) for _ in range(_LOOKS))
+            if not any(one is not None and not (one[0] ^ toggled[0]) & _REPEAT for one in looks):
+                return None
+            if not self._is_full(_SM1_STATUS):
+                return None
+        return self._read()
 
     def _is_full(self, register: int) -> bool:
         status = self._port.read(self._station, register, 1)

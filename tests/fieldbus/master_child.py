@@ -332,6 +332,30 @@ def terminals(bus: SoemBus, count: int, kinds: list[str]) -> Any:
     }  # fmt: skip
 
 
+def repeated(bus: SoemBus, count: int) -> Any:
+    """An answer gets lost on its way back: what comes in the end, and how many requests it took."""
+    bus.scan()
+    info = bus._infos[0]
+    assert info is not None
+    port, requests, answers = bus.port, [], []
+    read, exchange = port.read, port.exchange
+
+    def losing(station: int, address: int, size: int, **more: Any) -> bytes | None:
+        data = read(station, address, size, **more)
+        if address == info.send_start:
+            answers.append(data)
+            return None if len(answers) == 1 else data
+        return data
+
+    def counting(command: Any, station: int, address: int, *more: Any, **others: Any) -> Any:
+        requests.append(address == info.receive_start)
+        return exchange(command, station, address, *more, **others)
+
+    port.read, port.exchange = losing, counting  # type: ignore[method-assign]
+    value = bus.sdo_read(1, 0x1008, 0).decode()
+    return {"value": value, "requests": sum(requests), "answers": len(answers), "same": len(set(answers)) == 1}
+
+
 def described(bus: SoemBus, count: int, file: str) -> Any:
     """Set a slave up by its device's file; return what its start-up SDOs have written."""
     bus.configure([SlaveConfig("aio", load_device(Path(file)), file)], 1_000_000)
@@ -450,6 +474,7 @@ SCENARIOS = {
         outputs,
         terminals,
         files,
+        repeated,
         described,
         contradicted,
         eeprom,

@@ -99,3 +99,9 @@ def test_a_terminal_whose_eeprom_maps_other_objects_than_its_file_is_refused(sta
         "slave 2 (t2): the PDOs in its EEPROM differ from the device's file (key `rpdo`): expected 4 bits (0x1601: "
         "0x7000:9/4), found 4 bits (0x1601: 0x7000:1/4); `rtcp device new --from-bus` describes it as it is"
     ]
+
+
+@pytest.mark.interpreted
+def test_an_answer_that_got_lost_is_repeated_by_the_slave_and_not_asked_for_again(start_segment):
+    result = start_segment(("analog.xml",)).master("repeated")["result"]
+    assert result == {"value": "Analog terminal", "requests": 1, "answers": 2, "same": True}
