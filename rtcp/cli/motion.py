@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from rtcp.api import Arrival, State
+from rtcp.api.results import Channel
 from rtcp.cli.arguments import (
     NUMBERS_AS_WRITTEN,
     POSE,
@@ -188,25 +189,31 @@ def _io(
             report(f"{name} is {value}")
             return
         found = robot.read_io()
-    rows = [
-        (one, direction, "on" if high else "off", "")
+    rows: list[tuple[str, str, str | float, str, str]] = [
+        (one, direction, "on" if high else "off", "", "")
         for direction, levels in (("input", found.inputs), ("output", found.outputs))
         for one, high in levels.items()
     ]
     rows += [
-        (one.name, "output" if one.is_output else "input", f"{one.value:.6g}", one.unit)
+        (one.name, "output" if one.is_output else "input", one.value, one.unit, _range_text(one))
         for one in found.channels.values()
     ]
     rows = [row for row in rows if name in (None, row[0])]
     if not rows:
         raise CommandError(f"there is no input, output or channel {name}: see `rtcp io`")
     if as_json:
-        emit_json({one: {"direction": which, "value": shown, "unit": unit} for one, which, shown, unit in rows})
+        emit_json({one: {"direction": which, "value": shown, "unit": unit} for one, which, shown, unit, _ in rows})
         return
-    listed = table(("name", "direction", "value", "unit"), ("name", "direction", "unit"))
-    for row in rows:
-        listed.add_row(*row)
+    listed = table(
+        ("name", "direction", "value", "unit", "may be set to"), ("name", "direction", "unit", "may be set to")
+    )
+    for one, which, shown, unit, allowed in rows:
+        listed.add_row(one, which, shown if isinstance(shown, str) else f"{shown:.6g}", unit, allowed)
     show(listed)
+
+
+def _range_text(channel: Channel) -> str:
+    return "{:.6g} to {:.6g}".format(*channel.range) if channel.settable else ""
 
 
 @commands.command("gripper")

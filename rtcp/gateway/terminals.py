@@ -59,9 +59,13 @@ class Terminals:
 
     async def write(self, caller: Caller, name: str, value: float) -> Json:
         """Set an output; one with two levels to 0 or 1, one with a number not by a truth value."""
-        numbers = () if isinstance(value, bool) else self._numbers
-        one = _find([one for one in (*self._terminals, *numbers) if one.is_output], name)
+        outputs: list[Terminal | NumberChannel] = [*self._terminals, *self._numbers]
+        one = _find([one for one in outputs if one.is_output], name)
         if isinstance(one, NumberChannel):
+            if isinstance(value, bool):
+                low, high = one.entry.range
+                text = f"value: found {'on' if value else 'off'}, allowed is {low:g} to {high:g} for {one.name}"
+                raise RtcpError("invalid", text, "wrong_level", {"name": name, "value": value})
             return await self._send(caller, one, value)
         if value not in (0.0, 1.0):
             text = f"value: found {value:g}, allowed is 0 or 1 for {one.name}, which has two levels"

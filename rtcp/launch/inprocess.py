@@ -105,18 +105,18 @@ class InProcessSlave:
         self._bus.segment.settle(self._bus.now_ns)
         return written
 
-    def reading(self, index: int, subindex: int) -> Steps[bytes]:
+    def reading(self, index: int, subindex: int, complete: bool = False) -> Steps[bytes]:
         """Read an object; raises SdoAborted, or BusError in INIT."""
         try:
-            return coe.read(self.device.objects, index, subindex, False, self._mailbox_state())
+            return coe.read(self.device.objects, index, subindex, complete, self._mailbox_state())
         except SdoAbort as abort:
             raise self._aborted("read", index, subindex, abort) from abort
         yield
 
-    def writing(self, index: int, subindex: int, data: bytes) -> Steps[None]:
+    def writing(self, index: int, subindex: int, data: bytes, complete: bool = False) -> Steps[None]:
         """Write an object; raises as `reading`."""
         try:
-            coe.write(self.device.objects, index, subindex, False, self._mailbox_state(), data)
+            coe.write(self.device.objects, index, subindex, complete, self._mailbox_state(), data)
         except SdoAbort as abort:
             raise self._aborted("write", index, subindex, abort) from abort
         return

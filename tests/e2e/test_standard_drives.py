@@ -100,7 +100,7 @@ def test_an_arm_of_two_axis_drives_moves_is_recovered_and_its_channels_are_read_
         assert (refused.value.reason, refused.value.fields["highest"]) == ("channel_out_of_range", 20.0)
         assert "12500" in started.rtcp("segment", "get", "5", "0x7000:1").stdout
         shown = json.loads(started.rtcp("io", "valves.current", "--json").stdout)
-        assert shown == {"valves.current": {"direction": "output", "value": "12.5", "unit": "mA"}}
+        assert shown == {"valves.current": {"direction": "output", "value": 12.5, "unit": "mA"}}
         robot.disable()
     started.rtcp("io", "valves.current", "7.5")
     assert "7500" in started.rtcp("segment", "get", "5", "0x7000:1").stdout

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.config.model import GripperConfig, Joint, Range
+from rtcp.config.model import LARGEST, GripperConfig, Joint, Range
 from rtcp.config.zero import read_zeros, state_directory, zero_file
 from rtcp.ipc.commands import (
     Disable,
@@ -188,7 +188,7 @@ def test_channels_of_a_slave_are_read_and_set_by_name_and_those_of_one_bit_are_t
         still = {"value": 0.0, "unit": "m"}
         assert found["channels"] == [
             {"name": "valves.depth", **still, "is_output": False, "settable": False, "range": None},
-            {"name": "valves.level", **still, "is_output": True, "settable": True, "range": [0.5, None]},
+            {"name": "valves.level", **still, "is_output": True, "settable": True, "range": [0.5, LARGEST["float32"]]},
         ]
         arm.ask("write_io", name="valves.open", value=True)
         arm.ask("set_channel", name="valves.level", value=1.25)
@@ -198,7 +198,7 @@ def test_channels_of_a_slave_are_read_and_set_by_name_and_those_of_one_bit_are_t
         arm.ask("set_channel", name="io.gripper", value=0)
         assert arm.loop.commands[2:] == [SetChannel(8, 0, 1.0), SetOutput(4, False, 0)]
         assert arm.error("set_channel", name="valves.open", value=0.5).reason == "wrong_level"
-        assert arm.error("write_io", name="valves.level", value=True).reason == "unknown_terminal"
+        assert arm.error("write_io", name="valves.level", value=True).reason == "wrong_level"
         error = arm.error("set_channel", name="valves.closed", value=1.0)
         assert (error.reason, error.fields["allowed"][-2:]) == ("unknown_terminal", ["valves.open", "valves.level"])
 
