@@ -154,6 +154,12 @@ def _check(
             f"slave {slave['position']} ({slave['name']}): "
             + ("as the file says" if not found else "\n  ".join(["", *found]).strip("\n"))
         )
+        if described.rpdo and slave["watchdog_off"]:
+            managers = " and ".join(str(number) for number in slave["watchdog_off"])
+            emit(
+                f"  watchdog: its EEPROM leaves the process-data watchdog of sync manager {managers} off; it is "
+                "switched on at the start"
+            )
     if differences:
         raise CommandError(f"{differences} differences", ExitCode.FAULT)
 

@@ -192,6 +192,11 @@ def _lines(device: Device, kind: str) -> Iterator[str]:
         "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
     )
     yield f"watchdog_ms: {watchdog}             # ms; {note}"
+    for n in sorted({pdo.sync_manager or 0 for pdo in assigned(device, outputs=True)}):
+        manager = device.sync_managers[n] if n < len(device.sync_managers) else None
+        if manager is not None and manager.lacks_watchdog:
+            off = f"control byte 0x{manager.control:02X}"
+            yield f"# Sync manager {n} leaves the watchdog off ({off}): switched on at the start."
     coe = device.coe
     if coe is None:
         yield "coe: false                  # it has no object dictionary: its mapping is that of its EEPROM"

@@ -94,6 +94,11 @@ class SyncManager:
     op_only: bool = False
     """It is enabled in OP only."""
 
+    @property
+    def lacks_watchdog(self) -> bool:
+        """Whether it carries outputs that do not trigger the process-data watchdog."""
+        return self.type is SyncManagerType.OUTPUTS and not self.virtual and not self.control & 0x40
+
 
 @dataclass(frozen=True, slots=True)
 class PdoEntry:

@@ -126,6 +126,8 @@ class SlaveInfo:
     """Port of that slave at which it hangs."""
     port_errors: PortErrors
     """Error counters of its ports since its power-on, each up to 255."""
+    watchdog_off: tuple[int, ...] = ()
+    """Sync managers whose outputs do not trigger the process-data watchdog by its EEPROM; `configure` lets them."""
 
 
 @dataclass(frozen=True)

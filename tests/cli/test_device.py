@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from rtcp.config.device_file import file_text, kind_of
 from rtcp.config.loader import load_device
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
+from tests.fieldbus.terminals import write_segment
 
 FILES = Path(__file__).parents[1] / "esi" / "files"
 DRIVE, AXES, TERMINALS = FILES / "drive.xml", FILES / "axes.xml", FILES / "terminals.xml"
@@ -94,6 +96,26 @@ def test_the_kind_follows_from_the_default_process_data() -> None:
     kinds = {device.name: kind_of(device) for device in read_esi(TERMINALS).devices}
     assert kinds["2 digital outputs"] == "generic"
     assert kinds["End cover"] == "coupler"
+
+
+def test_a_watchdog_that_the_eeprom_leaves_off_is_named_in_the_file_and_by_its_comparison_with_the_bus(
+    rtcp: Callable[..., Any], tmp_path: Path
+) -> None:
+    config, out = tmp_path / "config", tmp_path / "areas.yaml"
+    shutil.copytree(default_config().parent, config)
+    write_segment(config / "segment.yaml", "areas", "bits4")
+    image = config / "areas.bin"
+    rtcp("device", "new", "--sii", str(image), "--out", str(out))
+    for number in (2, 3, 4):
+        sentence = f"# Sync manager {number} leaves the watchdog off (control byte 0x24): switched on at the start."
+        assert sentence in out.read_text()
+    rtcp("device", "new", "--sii", str(config / "bits4.bin"), "--out", str(tmp_path / "bits4.yaml"))
+    assert "leaves the watchdog off" not in (tmp_path / "bits4.yaml").read_text()
+    arm = str(config / default_config().name)
+    done = rtcp("device", "check", str(out), "--bus", "virtual", "--config", arm)
+    assert "slave 1 (Terminal 30): " in done.out
+    said = "watchdog: its EEPROM leaves the process-data watchdog of sync manager 2 and 3 and 4 off; it is switched on"
+    assert said in " ".join(done.out.split())
 
 
 def test_a_device_file_is_checked_alone(rtcp: Callable[..., Any], tmp_path: Path) -> None:

@@ -331,6 +331,20 @@ def terminals(bus: SoemBus, count: int, kinds: list[str]) -> Any:
     }  # fmt: skip
 
 
+def dies(bus: SoemBus, count: int, kinds: list[str]) -> Any:
+    """Bring slaves of `terminals` to OP, set all bits of their outputs, and die."""
+    slaves = [slave(f"t{n}", kind) for n, kind in enumerate(kinds)]
+    data = bus.configure(slaves, 1_000_000)
+    cycle = Cycle(data, 1_000_000)
+    to_op(bus, cycle)
+    for index, one in enumerate(slaves):
+        image = layout(one.device.rpdo)
+        data.set_output(index, ((1 << image.bits) - 1).to_bytes(image.bytes, "little"))
+    cycle.for_cycles(40)
+    print(json.dumps([state.words() for state in cycle.run(bus.read_states)]), flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def files(bus: SoemBus, count: int) -> Any:
     """Files written and read, also in BOOT, and what the slave refuses."""
     bus.scan()
@@ -434,6 +448,7 @@ SCENARIOS = {
         beside,
         outputs,
         terminals,
+        dies,
         files,
         eeprom,
         emergency,
