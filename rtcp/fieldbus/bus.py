@@ -9,6 +9,7 @@ from typing import Protocol
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.al_state import AlState, code_meaning, code_remedy, state_name
 from rtcp.fieldbus.emergency import Emergency
+from rtcp.fieldbus.topology import PortState
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,8 @@ class SlaveInfo:
     """Whether it has a distributed clock."""
     delay_ns: int
     """Propagation delay from the reference clock, as measured."""
-    ports: tuple[str, ...]
-    """Ports 0 to 3: `open` (a neighbour answers there), `closed`, `no link`."""
+    ports: tuple[PortState, ...]
+    """Ports 0 to 3."""
     parent: int
     """Position of the slave before it; 0: the master."""
     parent_port: int

@@ -17,7 +17,7 @@ from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, reading_assignment
 from rtcp.fieldbus.port_errors import ERROR_COUNTERS_SIZE, read_port_errors
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, finish
-from rtcp.fieldbus.topology import port_words
+from rtcp.fieldbus.topology import port_states
 
 _DEVICE_NAME = 0x1008
 _SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
@@ -171,7 +171,7 @@ def describe(
         fmmus=register(Register.FMMU_COUNT, 1),
         dc=dc,
         delay_ns=register(Register.DC_DELAY, 4) if dc else 0,
-        ports=port_words(register(Register.DL_STATUS, 2)),
+        ports=port_states(register(Register.DL_STATUS, 2)),
         parent=0,
         parent_port=0,
         port_errors=read_port_errors(counters),

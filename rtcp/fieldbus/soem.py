@@ -50,7 +50,7 @@ from rtcp.fieldbus.slave_setup import (
     trigger_watchdog,
 )
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
-from rtcp.fieldbus.topology import Topology, port_words
+from rtcp.fieldbus.topology import Topology, port_states
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
 _BELOW_SAFEOP = 0x03
@@ -212,7 +212,7 @@ class SoemBus:
 
     def _read_topology(self) -> Topology:
         status = [self.port.read(station, Register.DL_STATUS, 2) for station in self._stations(None)]
-        return Topology.of([port_words(int.from_bytes(one or b"", "little")) for one in status])
+        return Topology.of([port_states(int.from_bytes(one or b"", "little")) for one in status])
 
     def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int, failures: Sequence[int]) -> None:
         """Bring the slaves from INIT to PRE-OP, each set up as configured; raises BusError.
