@@ -158,8 +158,7 @@ def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, 
 
 def assigned(device: Device, outputs: bool) -> tuple[Pdo, ...]:
     """Return the PDOs of a direction that are assigned by default, in the order of the process image."""
-    pdos = [pdo for pdo in (device.rx_pdos if outputs else device.tx_pdos) if pdo.sync_manager is not None]
-    return tuple(sorted((pdo for pdo in pdos if not pdo.virtual), key=lambda pdo: pdo.sync_manager or 0))
+    return device.assigned(outputs)
 
 
 def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:

@@ -329,6 +329,12 @@ class Device:
     unread: Mapping[str, int] = field(default_factory=dict)
     """Parts of the description that were not understood, by name, with how often; they are warned of."""
 
+    def assigned(self, outputs: bool) -> tuple[Pdo, ...]:
+        """Return the PDOs of a direction that are assigned by default, in the order of the process image."""
+        pdos = self.rx_pdos if outputs else self.tx_pdos
+        there = [pdo for pdo in pdos if pdo.sync_manager is not None and not pdo.virtual]
+        return tuple(sorted(there, key=lambda pdo: pdo.sync_manager or 0))
+
     @property
     def coe(self) -> Coe | None:
         """What it can do over CoE; None: it has none."""
