@@ -33,7 +33,7 @@ _CONTROL, _ACTIVATE = 4, 6
 """Bytes of a sync manager's registers (ETG.1000.4, 6.7.2)."""
 _MODE, _MAILBOX = 0x03, 0x02
 """Mode of a sync manager in its control register, and that of a mailbox (ETG.1000.4, 6.7.2)."""
-_DIRECTION, _MASTER_WRITES, WATCHDOG_TRIGGER = 0x0C, 0x04, 0x40
+_DIRECTION, _MASTER_WRITES, _WATCHDOG_TRIGGER = 0x0C, 0x04, 0x40
 """Bits of a sync manager's control register (ETG.1000.4, 6.7.2)."""
 _SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
 """Word addresses in the EEPROM (ETG.2010, table 2)."""
@@ -417,7 +417,7 @@ def trigger_watchdog(port: RegisterPort, position: int, config: SlaveConfig, mai
         control, active = managers[at + _CONTROL], managers[at + _ACTIVATE]
         if not active & 1 or control & _DIRECTION != _MASTER_WRITES:
             continue
-        wanted, triggered = control | WATCHDOG_TRIGGER, True
+        wanted, triggered = control | _WATCHDOG_TRIGGER, True
         if control == wanted:
             continue
         address = Register.SYNC_MANAGER + at
