@@ -63,7 +63,7 @@ def _list(
 
 
 def _facts(device: Device) -> dict[str, Any]:
-    from rtcp.config.device_file import assigned, kind_of
+    from rtcp.config.device_file import kind_of
 
     mailbox = device.mailbox
     protocols = () if mailbox is None else ("coe", "foe", "eoe", "aoe", "soe", "voe")
@@ -72,8 +72,8 @@ def _facts(device: Device) -> dict[str, Any]:
         "revision": device.identity.revision,
         "name": device.name,
         "kind": kind_of(device),
-        "output_bits": sum(pdo.bits for pdo in assigned(device, outputs=True)),
-        "input_bits": sum(pdo.bits for pdo in assigned(device, outputs=False)),
+        "output_bits": sum(pdo.bits for pdo in device.assigned(outputs=True)),
+        "input_bits": sum(pdo.bits for pdo in device.assigned(outputs=False)),
         "mailbox": " ".join(name for name in protocols if getattr(mailbox, name)),
         "dc": bool(device.dc_modes),
         "slots": len(device.slots),
@@ -172,6 +172,12 @@ def _check(
             f"slave {slave['position']} ({slave['name']}): "
             + ("as the file says" if not found else "\n  ".join(["", *found]).strip("\n"))
         )
+        if described.rpdo and slave["watchdog_off"]:
+            managers = " and ".join(str(number) for number in slave["watchdog_off"])
+            emit(
+                f"  watchdog: its EEPROM leaves the process-data watchdog of sync manager {managers} off; it is "
+                "switched on at the start"
+            )
     if differences:
         raise CommandError(f"{differences} differences", ExitCode.FAULT)
 
@@ -273,10 +279,11 @@ def _read(file: Path) -> DeviceFile:
 
 
 def _of_image(file: Path) -> Device:
-    """Read an EEPROM image, say what is wrong in it; raises CommandError where it is none."""
+    """Read an EEPROM image, say what is wrong in it; raises CommandError where it is none, EsiError."""
     from rtcp.esi import sii
+    from rtcp.esi.xml_tree import read_file
 
-    image = file.read_bytes()
+    image = read_file(file, sii.MAX_BYTES)
     if len(image) < sii.HEADER_BYTES or sii.crc(image[:14]) != image[14]:
         raise CommandError(f"{file}: it is no EEPROM image: too short, or the checksum of its first 14 bytes is wrong")
     for sentence in sii.check_sii(image):

@@ -189,8 +189,7 @@ def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, 
 
 def assigned(device: Device, outputs: bool) -> tuple[Pdo, ...]:
     """Return the PDOs of a direction that are assigned by default, in the order of the process image."""
-    pdos = [pdo for pdo in (device.rx_pdos if outputs else device.tx_pdos) if pdo.sync_manager is not None]
-    return tuple(sorted((pdo for pdo in pdos if not pdo.virtual), key=lambda pdo: pdo.sync_manager or 0))
+    return device.assigned(outputs)
 
 
 def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:
@@ -218,6 +217,11 @@ def _lines(device: Device, kind: str, has_mode: bool) -> Iterator[str]:
         "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
     )
     yield f"watchdog_ms: {watchdog}             # ms; {note}"
+    for n in sorted({pdo.sync_manager or 0 for pdo in assigned(device, outputs=True)}):
+        manager = device.sync_managers[n] if n < len(device.sync_managers) else None
+        if manager is not None and manager.lacks_watchdog:
+            off = f"control byte 0x{manager.control:02X}"
+            yield f"# Sync manager {n} leaves the watchdog off ({off}): switched on at the start."
     coe = device.coe
     if coe is None:
         yield "coe: false                  # it has no object dictionary: its mapping is that of its EEPROM"

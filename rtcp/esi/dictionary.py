@@ -32,9 +32,9 @@ CONFIGURABLE_ENTRIES = 32
 def default_assignment(device: Device) -> dict[int, tuple[Pdo, ...]]:
     """Return the PDOs that each sync manager carries by default, by its number, in the order of the description."""
     assignment: dict[int, tuple[Pdo, ...]] = {}
-    for pdo in (*device.rx_pdos, *device.tx_pdos):
-        if pdo.sync_manager is not None:
-            assignment[pdo.sync_manager] = (*assignment.get(pdo.sync_manager, ()), pdo)
+    for pdo in (*device.assigned(outputs=True), *device.assigned(outputs=False)):
+        number = pdo.sync_manager or 0
+        assignment[number] = (*assignment.get(number, ()), pdo)
     return assignment
 
 

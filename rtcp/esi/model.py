@@ -94,6 +94,11 @@ class SyncManager:
     op_only: bool = False
     """It is enabled in OP only."""
 
+    @property
+    def lacks_watchdog(self) -> bool:
+        """Whether it carries outputs that do not trigger the process-data watchdog."""
+        return self.type is SyncManagerType.OUTPUTS and not self.virtual and not self.control & 0x40
+
 
 @dataclass(frozen=True, slots=True)
 class PdoEntry:
@@ -327,6 +332,12 @@ class Device:
     """A tool offers it no more: a later revision takes its place."""
     unread: Mapping[str, int] = field(default_factory=dict)
     """Parts of the description that were not understood, by name, with how often; they are warned of."""
+
+    def assigned(self, outputs: bool) -> tuple[Pdo, ...]:
+        """Return the PDOs of a direction that are assigned by default, in the order of the process image."""
+        pdos = self.rx_pdos if outputs else self.tx_pdos
+        there = [pdo for pdo in pdos if pdo.sync_manager is not None and not pdo.virtual]
+        return tuple(sorted(there, key=lambda pdo: pdo.sync_manager or 0))
 
     @property
     def coe(self) -> Coe | None:

@@ -32,8 +32,8 @@ MAX_BYTES = 1 << 17
 SOEM_BYTES = 4096
 """What SOEM and IgH read of an image."""
 
-_STRINGS, _GENERAL, _FMMU, _SYNC_MANAGER, _TX_PDO, _RX_PDO, _DC, _END = 10, 30, 40, 41, 50, 51, 60, 0xFFFF
-_ORDER = (_STRINGS, _GENERAL, _FMMU, _SYNC_MANAGER, _TX_PDO, _RX_PDO, _DC)
+_STRINGS, _GENERAL, _FMMU, SYNC_MANAGERS, _TX_PDO, _RX_PDO, _DC, END = 10, 30, 40, 41, 50, 51, 60, 0xFFFF
+_ORDER = (_STRINGS, _GENERAL, _FMMU, SYNC_MANAGERS, _TX_PDO, _RX_PDO, _DC)
 _SYNC_MANAGER_ENTRY = struct.Struct("<HHBBBB")
 _PDO_HEADER = struct.Struct("<HBBBBH")
 _PDO_ENTRY = struct.Struct("<HBBBBH")
@@ -192,7 +192,7 @@ def _categories(device: Device, pdos: bool, entry_names: bool) -> bytes:
         _STRINGS: texts.data(),
         _GENERAL: general,
         _FMMU: bytes(use or 0xFF for use in device.fmmus),
-        _SYNC_MANAGER: sync_managers,
+        SYNC_MANAGERS: sync_managers,
         _TX_PDO: tx_pdos,
         _RX_PDO: rx_pdos,
         _DC: dc,
@@ -202,7 +202,7 @@ def _categories(device: Device, pdos: bool, entry_names: bool) -> bytes:
         body = data[number] + (b"\xff" if number == _FMMU else b"\0") * (len(data[number]) % 2)
         if body:
             image += struct.pack("<HH", number, len(body) // 2) + body
-    return image + struct.pack("<H", _END)
+    return image + struct.pack("<H", END)
 
 
 def write_sii(device: Device, alias: int | None = None) -> bytes:
@@ -236,8 +236,8 @@ def _split(image: bytes) -> Iterator[tuple[int, bytes, bool]]:
     position = HEADER_BYTES
     while position + 2 <= len(image):
         number = int.from_bytes(image[position : position + 2], "little")
-        if number == _END:
-            yield _END, b"", True
+        if number == END:
+            yield END, b"", True
             return
         if position + 4 > len(image):
             yield number, b"", False
@@ -296,7 +296,8 @@ def _read_pdos(data: bytes, texts: dict[int, str]) -> tuple[Pdo, ...]:
     return tuple(pdos)
 
 
-def _read_sync_managers(data: bytes) -> tuple[SyncManager, ...]:
+def read_sync_managers(data: bytes) -> tuple[SyncManager, ...]:
+    """Return the sync managers of a category."""
     return tuple(
         SyncManager(
             start=start,
@@ -323,7 +324,7 @@ def read_sii(image: bytes, origin: str = "SII image") -> Device:
     for number, data, _ in _split(image):
         if number in _ORDER:  # several of a number, as some tools write them, are one
             categories[number] = categories.get(number, b"") + data
-        elif number != _END:
+        elif number != END:
             unread[f"category {number}"] += 1
     texts = dict(enumerate(_read_texts(categories.get(_STRINGS, b""))))
     general = categories.get(_GENERAL, b"").ljust(32, b"\0")
@@ -352,7 +353,7 @@ def read_sii(image: bytes, origin: str = "SII image") -> Device:
         group=texts.get(group, ""),
         group_name=texts.get(group_name, ""),
         physics="".join(_PORT_LETTERS.get(ports >> 4 * port & 15, " ") for port in range(4)).rstrip(),
-        sync_managers=_read_sync_managers(categories.get(_SYNC_MANAGER, b"")),
+        sync_managers=read_sync_managers(categories.get(SYNC_MANAGERS, b"")),
         fmmus=fmmus,
         rx_pdos=_read_pdos(categories.get(_RX_PDO, b""), texts),
         tx_pdos=_read_pdos(categories.get(_TX_PDO, b""), texts),
@@ -396,7 +397,7 @@ def check_sii(image: bytes) -> tuple[str, ...]:
     categories = list(_split(image))
     numbers = [number for number, *_ in categories]
     found += [f"Category {number} is longer than the image." for number, _, whole in categories if not whole]
-    if _END not in numbers:
+    if END not in numbers:
         found.append("The end mark 0xFFFF is missing: IgH drops all categories.")
     found += [
         f"Category {number} occurs {count} times: SOEM reads the first only."
@@ -408,10 +409,10 @@ def check_sii(image: bytes) -> tuple[str, ...]:
         found.append("Category 30 (general) is missing: SOEM uses no complete access, IgH no names.")
     elif len(data[_GENERAL]) != 32:
         found.append(f"Category 30 (general) has {len(data[_GENERAL])} bytes, not 32: IgH refuses it.")
-    if len(data.get(_SYNC_MANAGER, b"")) % 8:
-        found.append(f"Category 41 (sync managers) has {len(data[_SYNC_MANAGER])} bytes, no multiple of 8.")
+    if len(data.get(SYNC_MANAGERS, b"")) % 8:
+        found.append(f"Category 41 (sync managers) has {len(data[SYNC_MANAGERS])} bytes, no multiple of 8.")
     pdos = [numbers.index(number) for number in (_TX_PDO, _RX_PDO) if number in numbers]
-    if pdos and _SYNC_MANAGER in numbers and numbers.index(_SYNC_MANAGER) > min(pdos):
+    if pdos and SYNC_MANAGERS in numbers and numbers.index(SYNC_MANAGERS) > min(pdos):
         found.append("Category 41 (sync managers) stands behind the PDOs: IgH cannot assign them.")
     used = HEADER_BYTES + sum(4 + len(body) for _, body, _ in categories)
     if used > SOEM_BYTES:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import re
+import stat
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -222,15 +223,27 @@ def _encoding(data: bytes, path: str, warnings: Warnings) -> str:
     return declared
 
 
-def read_trees(path: Path, collect: Callable[[Node], None], warnings: Warnings) -> str:
-    """Hand out each vendor, group, device and module of a file as a tree; return the root's name. Raises EsiError."""
+def read_file(path: Path, most: int) -> bytes:
+    """Return the content of a regular file, up to `most` bytes: opening a pipe waits for its other end.
+
+    Raises:
+        EsiError: it cannot be read, is longer, or no regular file.
+    """
     try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise EsiError(str(path), "this is no regular file")
         with path.open("rb") as file:
-            data = file.read(FILE_LIMIT + 1)
+            data = file.read(most + 1)
     except OSError as error:
         raise EsiError(str(path), f"cannot be read: {error.strerror}") from None
-    if len(data) > FILE_LIMIT:
-        raise EsiError(str(path), f"more than {FILE_LIMIT >> 20} MiB")
+    if len(data) > most:
+        raise EsiError(str(path), f"more than {most >> 10} KiB: no description is so long")
+    return data
+
+
+def read_trees(path: Path, collect: Callable[[Node], None], warnings: Warnings) -> str:
+    """Hand out each vendor, group, device and module of a file as a tree; return the root's name. Raises EsiError."""
+    data = read_file(path, FILE_LIMIT)
     decoder = codecs.getincrementaldecoder(_encoding(data, str(path), warnings))()
     parser = expat.ParserCreate("utf-8")
     parser.buffer_text = True

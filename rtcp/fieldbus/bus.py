@@ -9,6 +9,7 @@ from typing import Protocol
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.al_state import AlState, code_meaning, code_remedy, state_name
 from rtcp.fieldbus.emergency import Emergency
+from rtcp.fieldbus.topology import PortState
 
 
 @dataclass(frozen=True)
@@ -118,14 +119,16 @@ class SlaveInfo:
     """Whether it has a distributed clock."""
     delay_ns: int
     """Propagation delay from the reference clock, as measured."""
-    ports: tuple[str, ...]
-    """Ports 0 to 3: `open` (a neighbour answers there), `closed`, `no link`."""
+    ports: tuple[PortState, ...]
+    """Ports 0 to 3."""
     parent: int
     """Position of the slave before it; 0: the master."""
     parent_port: int
     """Port of that slave at which it hangs."""
     port_errors: PortErrors
     """Error counters of its ports since its power-on, each up to 255."""
+    watchdog_off: tuple[int, ...] = ()
+    """Sync managers whose outputs do not trigger the process-data watchdog by its EEPROM; `configure` lets them."""
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,12 @@ _COUNT = 0
 def pdos_of_eeprom(device: model.Device) -> tuple[tuple[PdoInfo, ...], tuple[PdoInfo, ...]]:
     """Return the outputs and the inputs that an EEPROM assigns to sync managers by itself."""
 
-    def assigned(pdos: Sequence[model.Pdo]) -> tuple[PdoInfo, ...]:
-        return tuple(
-            PdoInfo(pdo.index, tuple(PdoEntryInfo(e.index, e.sub_index, e.bits, e.name) for e in pdo.entries))
-            for pdo in pdos
-            if pdo.sync_manager is not None
-        )
+    def info(pdo: model.Pdo) -> PdoInfo:
+        entries = (PdoEntryInfo(entry.index, entry.sub_index, entry.bits, entry.name) for entry in pdo.entries)
+        return PdoInfo(pdo.index, tuple(entries))
 
-    return assigned(device.rx_pdos), assigned(device.tx_pdos)
+    outputs, inputs = (tuple(map(info, device.assigned(outputs))) for outputs in (True, False))
+    return outputs, inputs
 
 
 def describe_device(sdo: SdoClient, has_coe: bool, eeprom: bytes, origin: str, progress: Progress) -> model.Device:

@@ -12,7 +12,7 @@ from rtcp.fieldbus.bus import SlaveState, slave_label, station_of
 from rtcp.fieldbus.errors import BusError, ForeignSlave
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, Steps
 from rtcp.fieldbus.slave_setup import SlaveRestorer, provisional_of
-from rtcp.fieldbus.topology import OPEN, Topology, port_words
+from rtcp.fieldbus.topology import PortState, Topology, port_states
 
 LONG_AGO = float("-inf")
 REPORT_INTERVAL_S = 10.0
@@ -290,8 +290,8 @@ class SlaveRecovery:
             return False
         station = provisional_of(parent) if before.state is AlState.NONE else before.station
         status = self._port.read(station, Register.DL_STATUS, 2, tries=1)
-        ports = port_words(int.from_bytes(status or b"", "little"))
-        return ports[self._topology.port(slave.position)] == OPEN
+        ports = port_states(int.from_bytes(status or b"", "little"))
+        return ports[self._topology.port(slave.position)] is PortState.OPEN
 
     def _start_restoration(self, slave: MonitoredSlave, place: int | None) -> None:
         slave.asked = None

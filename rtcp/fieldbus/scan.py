@@ -7,15 +7,17 @@ import struct
 from dataclasses import replace
 from typing import Any
 
+from rtcp.esi.sii import END, HEADER_BYTES, SYNC_MANAGERS, read_sync_managers
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, code_meaning, read_al, state_name
 from rtcp.fieldbus.bus import MailboxInfo, PdoInfo, SlaveInfo, SyncManagerInfo
 from rtcp.fieldbus.describe import read_entry
+from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, reading_assignment
 from rtcp.fieldbus.port_errors import ERROR_COUNTERS_SIZE, read_port_errors
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, finish
-from rtcp.fieldbus.topology import port_words
+from rtcp.fieldbus.topology import port_states
 
 _DEVICE_NAME = 0x1008
 _SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
@@ -26,6 +28,8 @@ _SMALLEST_MAILBOX = 16
 _PROTOCOLS = ("AoE", "EoE", "CoE", "FoE", "SoE", "VoE")
 """Bits 0 to 5 of SII word 0x1C (ETG.2010, table 4)."""
 _SYNC_MANAGER = struct.Struct("<HHBBBB")
+_MOST_CATEGORIES, _SYNC_MANAGERS_WORDS = 64, 32
+"""How many categories of an EEPROM are passed; words of eight sync managers in it."""
 
 
 def read_mailbox(slave: Any) -> MailboxInfo | None:
@@ -86,6 +90,31 @@ def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, .
     return tuple(found)
 
 
+def _watchdog_off(port: RegisterPort, station: int) -> list[int]:
+    """Return the sync managers whose outputs do not trigger the watchdog by the EEPROM; none where it is unreadable."""
+
+    def read(word: int) -> bytes:
+        return finish(reading_words(port, station, word, ""))[:4]
+
+    word = HEADER_BYTES // 2
+    eeprom_to_master(port, station)
+    try:
+        for _ in range(_MOST_CATEGORIES):
+            number, words = struct.unpack("<HH", read(word))
+            word += 2
+            if number == END:
+                break
+            if number == SYNC_MANAGERS:
+                content = b"".join(read(at) for at in range(word, word + min(words, _SYNC_MANAGERS_WORDS), 2))
+                return [n for n, manager in enumerate(read_sync_managers(content)) if manager.lacks_watchdog]
+            word += words
+    except BusError:
+        pass
+    finally:
+        eeprom_to_device(port, station)
+    return []
+
+
 def describe(
     slave: Any, sdo: SdoClient, port: RegisterPort, station: int, mailbox: MailboxInfo | None, serial: int
 ) -> SlaveInfo:
@@ -142,8 +171,9 @@ def describe(
         fmmus=register(Register.FMMU_COUNT, 1),
         dc=dc,
         delay_ns=register(Register.DC_DELAY, 4) if dc else 0,
-        ports=port_words(register(Register.DL_STATUS, 2)),
+        ports=port_states(register(Register.DL_STATUS, 2)),
         parent=0,
         parent_port=0,
         port_errors=read_port_errors(counters),
+        watchdog_off=tuple(_watchdog_off(port, station)),
     )

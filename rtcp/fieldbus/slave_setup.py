@@ -29,8 +29,12 @@ from rtcp.fieldbus.scan import name_of
 
 _FMMUS_SIZE = 0x80
 _SYNC_MANAGER_SIZE, _SYNC_MANAGER_COUNT = 8, 8
+_CONTROL, _ACTIVATE = 4, 6
+"""Bytes of a sync manager's registers (ETG.1000.4, 6.7.2)."""
 _MODE, _MAILBOX = 0x03, 0x02
 """Mode of a sync manager in its control register, and that of a mailbox (ETG.1000.4, 6.7.2)."""
+_DIRECTION, _MASTER_WRITES, _WATCHDOG_TRIGGER = 0x0C, 0x04, 0x40
+"""Bits of a sync manager's control register (ETG.1000.4, 6.7.2)."""
 _SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
 """Word addresses in the EEPROM (ETG.2010, table 2)."""
 _STATE_S = 3.0
@@ -63,10 +67,10 @@ def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> Sl
     own = [managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE)]
     return SlaveSetup(
         fmmus,
-        tuple(one[:5] + bytes((0, one[6] & 1, 0)) for one in own),
+        tuple(one[:5] + bytes((0, one[_ACTIVATE] & 1, 0)) for one in own),
         port.read(station, Register.DC_DELAY, 4) if features[0] & FEATURE_DC else None,
         serial,
-        sum(one[4] & _MODE == _MAILBOX for one in own[:2]),
+        sum(one[_CONTROL] & _MODE == _MAILBOX for one in own[:2]),
     )
 
 
@@ -193,11 +197,15 @@ class SlaveRestorer:
             raise BusError(f"{self._label(position)} does not keep its station address")
 
     def _write_sync_managers(self, position: int, numbers: range) -> None:
+        port, station, label = self._port, station_of(position), self._label(position)
         for number in numbers:
             setting = self._set_ups[position - 1].sync_managers[number]
             if any(setting):
                 address = Register.SYNC_MANAGER + number * _SYNC_MANAGER_SIZE
-                self._port.put(station_of(position), address, setting, self._label(position))
+                port.put(station, address, setting, label)
+                # The control byte holds the trigger of the process-data watchdog.
+                if port.read(station, address, _CONTROL + 1) != setting[: _CONTROL + 1]:
+                    raise BusError(f"{label} does not keep sync manager {number} (register 0x{address:04X})")
 
     def _change_state(self, position: int, state: AlState) -> Steps[None]:
         """Request `state`, which acknowledges an error, and wait for it; raises BusError where that fails."""
@@ -389,6 +397,55 @@ def write_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> S
             return [f"{where} has no interpolation time (0x{index:04X})"]
         raise
     return []
+
+
+def trigger_watchdog(port: RegisterPort, position: int, config: SlaveConfig, mailboxes: int) -> list[str]:
+    """Let every sync manager of outputs trigger the process-data watchdog (ETG.1000.4, 6.7.2: control bit 6).
+
+    SOEM writes the control byte as the EEPROM has it. Many EEPROMs leave the bit off: the slave then keeps its last
+    outputs when the master dies.
+
+    Args:
+        port: the port for registers; the slave is mapped and not yet in SAFE-OP.
+        position: its position on the cable, from 1.
+        config: the slave.
+        mailboxes: how many sync managers, from 0 on, are mailboxes.
+
+    Returns:
+        A sentence for each sync manager that does not keep the bit.
+
+    Raises:
+        BusError: as that, of a drive; or the slave stopped answering.
+    """
+    station, label = station_of(position), slave_label(position, config.name)
+    managers = port.read(station, Register.SYNC_MANAGER, _SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT)
+    if managers is None:
+        raise BusError(f"{label} stopped answering while its process-data watchdog was switched on")
+    faults, triggered = [], not config.device.rpdo
+    for number in range(mailboxes, _SYNC_MANAGER_COUNT):
+        at = number * _SYNC_MANAGER_SIZE
+        control, active = managers[at + _CONTROL], managers[at + _ACTIVATE]
+        if not active & 1 or control & _DIRECTION != _MASTER_WRITES:
+            continue
+        wanted, triggered = control | _WATCHDOG_TRIGGER, True
+        if control == wanted:
+            continue
+        address = Register.SYNC_MANAGER + at
+        # An ESC takes the control byte only while the sync manager is off.
+        for offset, value in ((_ACTIVATE, 0), (_CONTROL, wanted), (_ACTIVATE, active)):
+            port.put(station, address + offset, bytes((value,)), label)
+        kept = port.read(station, address + _CONTROL, 1)
+        if kept != bytes((wanted,)):
+            found = "nothing" if kept is None else f"0x{kept[0]:02X}"
+            faults.append(
+                f"{label}: the control byte of sync manager {number} was set to 0x{wanted:02X} and reads back as "
+                f"{found}: its outputs do not trigger the process-data watchdog"
+            )
+    if not triggered:
+        faults.append(f"{label}: no sync manager carries its outputs: nothing triggers the process-data watchdog")
+    if faults and config.device.kind == "cia402":
+        raise BusError(*(f"{fault}, and a drive without it keeps moving when the master dies" for fault in faults))
+    return [f"{fault}; they stay as they are when the master dies" for fault in faults]
 
 
 def set_watchdog(port: RegisterPort, station: int, label: str, device: DeviceDescription) -> None:

@@ -47,9 +47,10 @@ from rtcp.fieldbus.slave_setup import (
     configure_slave,
     identity_faults,
     read_set_up,
+    trigger_watchdog,
 )
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
-from rtcp.fieldbus.topology import Topology, port_words
+from rtcp.fieldbus.topology import Topology, port_states
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
 _BELOW_SAFEOP = 0x03
@@ -57,8 +58,8 @@ _BELOW_SAFEOP = 0x03
 _MAP_ATTEMPTS = 8
 _DISCOVERY_ATTEMPTS = 4
 """Each takes `_PATIENCE_US`: a host that runs master and slaves may stand still for longer than one."""
-_MAILBOXES_SIZE = 16
-"""Bytes of the registers of sync managers 0 and 1 (ETG.1000.4, 6.7)."""
+_MAILBOXES, _MAILBOXES_SIZE = 2, 16
+"""Sync managers of a slave's mailboxes, and the bytes of their registers (ETG.1000.4, 6.7)."""
 
 
 _SOEM_LAST_INDEX = 15
@@ -190,6 +191,7 @@ class SoemBus:
             for position in misread:
                 failures[position - 1] += 1
         places = read_places(self.port, slaves)
+        self._trigger_watchdogs(slaves)
         start_clocks(self._master, self.port, slaves, period_ns)
         data = self._process_data(places, period_ns)
         # Valid outputs, all zero, are in the slaves' buffers before any of them may use them.
@@ -210,7 +212,7 @@ class SoemBus:
 
     def _read_topology(self) -> Topology:
         status = [self.port.read(station, Register.DL_STATUS, 2) for station in self._stations(None)]
-        return Topology.of([port_words(int.from_bytes(one or b"", "little")) for one in status])
+        return Topology.of([port_states(int.from_bytes(one or b"", "little")) for one in status])
 
     def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int, failures: Sequence[int]) -> None:
         """Bring the slaves from INIT to PRE-OP, each set up as configured; raises BusError.
@@ -368,6 +370,16 @@ class SoemBus:
                         + (f" ({causes})" if causes else "")
                     )
         return faults
+
+    def _trigger_watchdogs(self, slaves: Sequence[SlaveConfig]) -> None:
+        faults: list[str] = []
+        for position, (config, mailbox) in enumerate(zip(slaves, self._infos, strict=True), 1):
+            try:
+                self.notes += trigger_watchdog(self.port, position, config, 0 if mailbox is None else _MAILBOXES)
+            except BusError as error:
+                faults += error.sentences
+        if faults:
+            raise BusError(*faults)
 
     def _process_data(self, places: Sequence[Places], period_ns: int) -> SoemProcessData:
         assert self._socket is not None

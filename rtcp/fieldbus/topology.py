@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
+from enum import Enum
 from typing import NamedTuple
 
-OPEN = "open"
-"""A port behind which a neighbour answers."""
+
+class PortState(str, Enum):
+    """State of a port, in the words of a scan."""
+
+    OPEN = "open"
+    """A neighbour answers behind it."""
+    CLOSED = "closed"
+    """It has a link, and nobody answers."""
+    NO_LINK = "no link"
+
+
 BRANCHES = (3, 1, 2)
 """Ports in the order in which a frame that came in at port 0 passes them."""
 
 
-def port_words(dl_status: int) -> tuple[str, ...]:
-    """Return the state of ports 0 to 3 in words: `open` (a neighbour answers there), `closed`, `no link`.
+def port_states(dl_status: int) -> tuple[PortState, ...]:
+    """Return the states of ports 0 to 3.
 
     DL status (ETG.1000.4, table 34): bit 4 + n: link; bits 8 + 2n, 9 + 2n: loop closed, communication established.
     """
-    words = []
+    states = []
     for port in range(4):
         link, loop, talks = dl_status >> 4 + port & 1, dl_status >> 8 + 2 * port & 1, dl_status >> 9 + 2 * port & 1
-        words.append(OPEN if talks and not loop else "closed" if link else "no link")
-    return tuple(words)
+        states.append(PortState.OPEN if talks and not loop else PortState.CLOSED if link else PortState.NO_LINK)
+    return tuple(states)
 
 
 class Connection(NamedTuple):
@@ -43,7 +53,7 @@ class Topology:
         return cls([Connection(position, 1 if position else 0) for position in range(count)])
 
     @classmethod
-    def of(cls, ports: Sequence[Sequence[str]]) -> Topology:
+    def of(cls, ports: Sequence[Sequence[PortState]]) -> Topology:
         """Return the tree that the ports of the slaves show; a slave with too few open ones hangs at the one before."""
         connections: list[Connection] = []
         free: list[tuple[int, list[int]]] = []  # position, ports still without a child; innermost last
@@ -54,8 +64,8 @@ class Topology:
                 connections.append(Connection(free[-1][0], free[-1][1].pop(0)))
             else:
                 connections.append(Connection(position - 1, 1 if position > 1 else 0))
-            branches = [port for port in BRANCHES if own[port] == OPEN]
-            free.append((position, branches if own[0] == OPEN else branches[1:]))
+            branches = [port for port in BRANCHES if own[port] is PortState.OPEN]
+            free.append((position, branches if own[0] is PortState.OPEN else branches[1:]))
         return cls(connections)
 
     def __len__(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import stat
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -13,13 +12,11 @@ from rtcp.config.segment import SegmentSlave
 from rtcp.esi.model import Device, DeviceFile, EsiError
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
-from rtcp.esi.sii import read_sii, write_sii
+from rtcp.esi.sii import MAX_BYTES, read_sii, write_sii
+from rtcp.esi.xml_tree import read_file
 from rtcp.virtual.behaviour import find_behaviour
 from rtcp.virtual.described import DescribedDevice, with_alias
 from rtcp.virtual.device import DeviceModel, OptionError, create
-
-LARGEST_IMAGE = 1 << 17
-"""Bytes of an SII image: its categories are addressed in words of 16 bits."""
 
 
 class Descriptions:
@@ -51,7 +48,7 @@ class Descriptions:
             if name not in self._files:
                 self._files[name] = read_esi(self._folder / name)
             file = self._files[name]
-        except (EsiError, OSError) as error:
+        except EsiError as error:
             raise _mistake("esi", error) from error
         try:
             device = find_device(file, product=slave.product, revision=slave.revision)
@@ -72,21 +69,13 @@ class Descriptions:
         assert slave.sii is not None
         path = self._folder / slave.sii
         try:
-            # Opening a pipe would wait for its other end.
-            if not stat.S_ISREG(path.stat().st_mode):
-                raise EsiError(str(path), "this is no regular file")
-            with path.open("rb") as file:
-                image = file.read(LARGEST_IMAGE + 1)
-            if len(image) > LARGEST_IMAGE:
-                raise EsiError(str(path), f"more than {LARGEST_IMAGE} bytes; no SII image is longer")
+            image = read_file(path, MAX_BYTES)
             device = read_sii(image, str(path))
-        except (EsiError, OSError) as error:
+        except EsiError as error:
             raise _mistake("sii", error) from error
         return device, partial(with_alias, image)
 
 
-def _mistake(key: str, error: Exception) -> OptionError:
+def _mistake(key: str, error: EsiError) -> OptionError:
     where: KeyPath = (key,)
-    if isinstance(error, OSError):
-        return OptionError((where, f"{error.filename}: {error.strerror or error}"))
     return OptionError((where, str(error)))

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Iterable
 from enum import IntEnum, IntFlag
 
+from rtcp.esi.sii import crc
 from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.objects import Access, ObjectDictionary
 from rtcp.virtual.pdo import (
@@ -107,16 +108,6 @@ class _Strings:
         return bytes((len(self._numbers),)) + b"".join(parts)
 
 
-def crc8(data: bytes) -> int:
-    """Return the checksum of the configuration area: polynomial x^8 + x^2 + x + 1, start value 0xFF (ETG.2010)."""
-    crc = 0xFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ (0x07 if crc & 0x80 else 0)) & 0xFF
-    return crc
-
-
 def build_sii(device: DeviceModel, layout: SyncManagerLayout, alias: int) -> bytes:
     """Return the whole EEPROM image of `device`, a power of two of bytes; words are little endian.
 
@@ -145,7 +136,7 @@ def _head(device: DeviceModel, layout: SyncManagerLayout, alias: int, kbit: int)
     # The bootstrap mailboxes are 0: there is no BOOT state.
     head = (
         configuration
-        + struct.pack("<H", crc8(configuration))
+        + struct.pack("<H", crc(configuration))
         + _IDENTITY.pack(identity.vendor_id, identity.product_code, identity.revision, identity.serial)
         + _MAILBOXES.pack(0, 0, 0, 0, receive.start, receive.length, send.start, send.length, protocols)
     )
@@ -325,7 +316,7 @@ class EepromInterface:
     def _reload(self) -> None:
         """Load PDI control and station alias from the EEPROM, if its checksum is right."""
         self._errors = 0
-        if len(self.image) < 16 or self.image[CONFIGURATION_BYTES] != crc8(bytes(self.image[:CONFIGURATION_BYTES])):
+        if len(self.image) < 16 or self.image[CONFIGURATION_BYTES] != crc(bytes(self.image[:CONFIGURATION_BYTES])):
             self._errors = CHECKSUM_ERROR
             return
         self._memory[Register.PDI_CONTROL : Register.PDI_CONTROL + 2] = self.image[0:2]

@@ -62,6 +62,7 @@ SLAVE = {
     "parent": 0,
     "parent_port": 0,
     "port_errors": {"rx": [0, 3, 0, 0], "forwarded": [0, 0, 0, 0], "links": [0, 1, 0, 0]},
+    "watchdog_off": [],
 }
 
 

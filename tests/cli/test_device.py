@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from rtcp.config.model import PdoEntry
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
 from tests.drive_esi import write_esi
+from tests.fieldbus.terminals import write_segment
 
 FILES = Path(__file__).parents[1] / "esi" / "files"
 DRIVE, AXES, TERMINALS, ANALOG = (FILES / f"{name}.xml" for name in ("drive", "axes", "terminals", "analog"))
@@ -149,6 +151,26 @@ def test_names_that_mean_something_to_others_are_names_here(rtcp: Callable[..., 
     assert (listed.code, "[/bold]" in listed.out) == (0, True), listed.trouble
     refused = rtcp("device", "new", "--esi", str(DRIVE), "--kind", "nosuch", "--out", str(tmp_path / "x.yaml"))
     assert (refused.code, (tmp_path / "x.yaml").exists()) == (2, False)
+
+
+def test_a_watchdog_that_the_eeprom_leaves_off_is_named_in_the_file_and_by_its_comparison_with_the_bus(
+    rtcp: Callable[..., Any], tmp_path: Path
+) -> None:
+    config, out = tmp_path / "config", tmp_path / "areas.yaml"
+    shutil.copytree(default_config().parent, config)
+    write_segment(config / "segment.yaml", "areas", "bits4")
+    image = config / "areas.bin"
+    rtcp("device", "new", "--sii", str(image), "--out", str(out))
+    for number in (2, 3, 4):
+        sentence = f"# Sync manager {number} leaves the watchdog off (control byte 0x24): switched on at the start."
+        assert sentence in out.read_text()
+    rtcp("device", "new", "--sii", str(config / "bits4.bin"), "--out", str(tmp_path / "bits4.yaml"))
+    assert "leaves the watchdog off" not in (tmp_path / "bits4.yaml").read_text()
+    arm = str(config / default_config().name)
+    done = rtcp("device", "check", str(out), "--bus", "virtual", "--config", arm)
+    assert "slave 1 (Terminal 30): " in done.out
+    said = "watchdog: its EEPROM leaves the process-data watchdog of sync manager 2 and 3 and 4 off; it is switched on"
+    assert said in " ".join(done.out.split())
 
 
 def test_a_device_file_is_checked_alone(rtcp: Callable[..., Any], tmp_path: Path) -> None:

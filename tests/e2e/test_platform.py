@@ -17,7 +17,8 @@ from rtcp.config.find import default_config
 from rtcp.ipc.errors import Refused
 from rtcp.ipc.jsonrpc import INTERNAL_ERROR
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.runtime_directory import blackboard_file, segment_control
+from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import CUBEMARS, FULL_CIA402, PERIOD_US, SLAVES, Platform
 from tests.e2e.wire import COUNTS_PER_RAD, outputs
 
@@ -258,3 +259,27 @@ def test_every_target_on_the_wire_is_inside_limits_and_every_step_inside_the_spe
         before = [drive.position for drive in drives]
     assert seen > 1000
     assert moved > 4 * 10_000 * sum(abs(q) for q in Q) * 0.99
+
+
+@CUBEMARS
+def test_drives_that_are_swapped_on_the_cable_are_found_by_their_aliases_and_each_turns_its_own_joint(
+    platform: Platform,
+) -> None:
+    platform.be_patient(2000)
+    folder = platform.directory / "config"
+    arm, segment = (yaml.safe_load((folder / file).read_text()) for file in ("assistive_arm.yaml", "segment.yaml"))
+    for slave, alias in zip(arm["slaves"][1:3], (7, 9), strict=True):
+        slave["alias"] = alias
+    for slave, alias in zip(segment["slaves"][1:3], (9, 7), strict=True):
+        slave["alias"] = alias
+    # The arm on the segment is that of the order on the cable.
+    del segment["arm"]
+    for file, data in (("assistive_arm.yaml", arm), ("segment.yaml", segment)):
+        (folder / file).write_text(yaml.safe_dump(data, sort_keys=False))
+    platform.rtcp("start", "--detach")
+    assert [slave["name"] for slave in platform.status()["slaves"][:4]] == ["io", "drive2", "drive1", "drive3"]
+    platform.call("enable")
+    platform.call("move_joints", q=[0.3, *ZERO[1:]])
+    with SegmentClient(segment_control(platform.directory)) as client:
+        turned = [slave["position_rad"] for slave in client.truth()["slaves"][1:4]]
+    assert turned == pytest.approx([0.0, 0.3, 0.0], abs=5e-3)

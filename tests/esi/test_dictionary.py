@@ -37,6 +37,23 @@ def test_the_default_assignment_is_that_of_the_pdos(drive: Device) -> None:
     }
 
 
+def test_pdos_are_assigned_in_the_order_of_their_sync_managers_and_those_of_no_process_data_are_not(
+    drive: Device,
+) -> None:
+    pdo = replace(drive.tx_pdos[0], excludes=frozenset())
+    made = replace(
+        drive,
+        tx_pdos=(
+            replace(pdo, index=0x1A01, sync_manager=5),
+            replace(pdo, index=0x1A02, sync_manager=3),
+            replace(pdo, index=0x1A03, sync_manager=None),
+            replace(pdo, index=0x1A04, sync_manager=3, virtual=True),
+        ),
+    )
+    assert [one.index for one in made.assigned(outputs=False)] == [0x1A02, 0x1A01]
+    assert {number: len(pdos) for number, pdos in default_assignment(made).items()} == {2: 1, 3: 1, 5: 1}
+
+
 def test_identity_and_sync_managers_have_objects(drive: Device) -> None:
     found = objects(drive)
     assert numbers(found[0x1000]) == [0x00020192]

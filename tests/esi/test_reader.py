@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -324,12 +325,17 @@ def test_what_is_no_description_or_too_large_is_refused_with_its_place(
     assert error.value.origin.startswith(f"{tmp_path}/device.xml")
 
 
-def test_a_file_that_is_not_there_or_too_long_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_no_file_or_too_long_is_refused(tmp_path: Path) -> None:
+    # Opening it would wait for somebody who writes.
+    os.mkfifo(tmp_path / "pipe.xml")
+    for none in (tmp_path / "pipe.xml", tmp_path):
+        with pytest.raises(EsiError, match="this is no regular file"):
+            read_esi(none)
     with pytest.raises(EsiError, match="cannot be read: No such file"):
         read_esi(tmp_path / "none.xml")
     with (tmp_path / "long.xml").open("wb") as file:
         file.truncate(xml_tree.FILE_LIMIT + 1)
-    with pytest.raises(EsiError, match="more than 64 MiB"):
+    with pytest.raises(EsiError, match="more than 65536 KiB"):
         read_esi(tmp_path / "long.xml")
 
 

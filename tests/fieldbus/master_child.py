@@ -370,6 +370,20 @@ def contradicted(bus: SoemBus, count: int) -> None:
     bus.configure([slaves[0], with_device(slaves[1], rpdo=(other,))], 1_000_000)
 
 
+def dies(bus: SoemBus, count: int, kinds: list[str]) -> Any:
+    """Bring slaves of `terminals` to OP, set all bits of their outputs, and die."""
+    slaves = [slave(f"t{n}", kind) for n, kind in enumerate(kinds)]
+    data = bus.configure(slaves, 1_000_000)
+    cycle = Cycle(data, 1_000_000)
+    to_op(bus, cycle)
+    for index, one in enumerate(slaves):
+        image = layout(one.device.rpdo)
+        data.set_output(index, ((1 << image.bits) - 1).to_bytes(image.bytes, "little"))
+    cycle.for_cycles(40)
+    print(json.dumps([state.words() for state in cycle.run(bus.read_states)]), flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def files(bus: SoemBus, count: int) -> Any:
     """Files written and read, also in BOOT, and what the slave refuses."""
     bus.scan()
@@ -473,6 +487,7 @@ SCENARIOS = {
         beside,
         outputs,
         terminals,
+        dies,
         files,
         repeated,
         described,

@@ -56,15 +56,16 @@ def _type(bits: int) -> str:
 
 
 def device(
-    product: int, outputs: Areas, inputs: Areas, *, mailbox: bool = False, modes: Sequence[model.DcMode] = ()
-) -> model.Device:
-    """Return a device with one PDO of one entry for each area."""
+    product: int, outputs: Areas, inputs: Areas, *, mailbox: bool = False, modes: Sequence[model.DcMode] = (),
+    control: int = 0x64,
+) -> model.Device:  # fmt: skip
+    """Return a device with one PDO of one entry for each area; `control`: of the sync managers of outputs."""
     managers = dict(enumerate(MAILBOX if mailbox else ()))
     pdos: list[list[model.Pdo]] = [[], []]
     for direction, (areas, first, index) in enumerate(((outputs, 0x1600, OUT), (inputs, 0x1A00, IN))):
         for n, (number, start, bits) in enumerate(areas, 1):
             kind = (model.SyncManagerType.OUTPUTS, model.SyncManagerType.INPUTS)[direction]
-            managers[number] = model.SyncManager(start, (bits + 7) // 8, (0x64, 0x20)[direction], kind)
+            managers[number] = model.SyncManager(start, (bits + 7) // 8, (control, 0x20)[direction], kind)
             entry = model.PdoEntry(index, n, bits, f"value {n}", _type(bits))
             pdos[direction].append(model.Pdo(first + n, f"PDO {n}", (entry,), number, fixed=True))
     uses = [model.FmmuUse.OUTPUTS] * len(outputs) + [model.FmmuUse.INPUTS] * len(inputs)
@@ -96,8 +97,10 @@ DEVICES = {
     "emulated": replace(bits(19, 4), config_data=bytes((0x05, 0x01))),
     "input": device(20, [], [(0, 0x1000, 3)]),
     "output": device(21, [(0, 0x0F00, 16)], []),
-    # Three areas of outputs with gaps between them: SOEM's own FMMUs are wrong.
-    "areas": device(30, [(2, 0x1100, 8), (3, 0x1200, 32), (4, 0x1300, 8)], [(5, 0x1800, 16)], mailbox=True),
+    # Three areas of outputs with gaps between them: SOEM's own FMMUs are wrong. None triggers the watchdog.
+    "areas": device(
+        30, [(2, 0x1100, 8), (3, 0x1200, 32), (4, 0x1300, 8)], [(5, 0x1800, 16)], mailbox=True, control=0x24
+    ),
     "files": replace(
         device(40, [(2, 0x1200, 16)], [(3, 0x1300, 16)], mailbox=True),
         mailbox=model.Mailbox(model.Coe(sdo_information=True), foe=True),

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from rtcp.config.device_file import file_text
 from rtcp.esi.reader import find_device, read_esi
 from rtcp.esi.sii import write_sii
+from rtcp.virtual.faults.control import SegmentClient
 from tests.fieldbus.conftest import WATCHER
-from tests.fieldbus.terminals import DEVICES, ESI_FILES
+from tests.fieldbus.terminals import DEVICES, ESI_FILES, OUT
 
 pytestmark = pytest.mark.alone
 
@@ -51,12 +54,29 @@ def test_a_slave_on_one_branch_is_set_up_again_while_another_branch_is_lost(star
     assert result["acted"] == ["OP", "no answer", "no answer", "OP", "OP"]
     assert result["states"] == ["OP"] * 5
     assert result["after"] == result["before"]
+    # The three sync managers of outputs that trigger the watchdog against the EEPROM.
+    managers = bytes.fromhex(result["after"][3]["managers"])
+    assert [managers[8 * n + 4] for n in (2, 3, 4)] == [0x64] * 3
     assert result["whole"]
     told = "\n".join(result["said"])
     assert "slave 2 (t2) to slave 3 (t3) left OP: none of them answers" in told
     assert "between slave 1 (t1) and slave 2 (t2)" in told
     assert "slave 4 (t4) to slave 5 (t5) left OP" in told
     assert "between slave 1 (t1) and slave 4 (t4)" in told
+
+
+def test_outputs_become_safe_when_the_master_dies_also_where_the_eeprom_leaves_the_watchdog_off(start_segment):
+    kinds = ("areas", "bits4", "output")
+    segment = start_segment(kinds)
+    assert segment.master("dies", kinds=kinds) == ["OP"] * 3
+    with SegmentClient(segment.control) as client:
+        end = time.monotonic() + 5.0
+        while (states := [one["al"] for one in client.truth()["slaves"]]) != ["SAFE-OP"] * 3:
+            assert time.monotonic() < end, states
+        held = [
+            one["value"] for slave in (1, 2, 3) for one in client.get(slave) if one["index"] == OUT
+        ]  # fmt: skip
+    assert held == [0] * 5
 
 
 def test_files_are_written_and_read_over_foe_and_firmware_in_boot(start_segment):

@@ -10,7 +10,7 @@ from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.image import limit_faults
 from rtcp.fieldbus.pdo import layout, mapping_of, mapping_text
 from rtcp.fieldbus.slave_setup import by_alias, identity_faults, interpolation_time
-from rtcp.fieldbus.topology import Topology
+from rtcp.fieldbus.topology import PortState, Topology
 
 
 def slave(name: str, vendor: int = 1, product: int = 2, entries=("uint16",)) -> SlaveConfig:
@@ -94,7 +94,7 @@ def test_what_soem_has_no_room_for_is_told_before_it_maps(slaves, said):
     assert "\n".join(limit_faults(slaves)).count(said) == 1 if said else not limit_faults(slaves)
 
 
-OPEN, NONE = "open", "no link"
+OPEN, NONE = PortState.OPEN, PortState.NO_LINK
 END, MIDDLE = (OPEN, NONE, NONE, NONE), (OPEN, OPEN, NONE, NONE)
 
 
