@@ -359,8 +359,8 @@ def _check_image(image: bytes, before: bytes, other_device: bool, size: int) -> 
     size = size or (size_of(before) if sound else SOEM_BYTES)
     if not HEADER_BYTES <= len(image) <= size or len(image) % 2:
         raise CommandError(
-            f"the image has {len(image)} bytes; allowed is an even number from {HEADER_BYTES} to {size}, which the "
-            f"EEPROM {'has' if sound else 'has at least, as most do'}; --size gives its size"
+            f"the image has {len(image)} bytes; allowed is an even number from {HEADER_BYTES} to {size}, which "
+            f"{'the EEPROM has' if sound else 'counts under a wrong checksum'}; --size gives its size"
         )
     try:
         read_sii(image, "the image")
