@@ -16,7 +16,7 @@ from rtcp.api import NotRunning, Robot
 from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, BusName, ConfigFile, as_written, option
 from rtcp.cli.output import CommandError, emit, facts, interruptible, report, table
 from rtcp.cli.platform import connect, refuse_second_platform
-from rtcp.config.model import VIRTUAL, integer_range
+from rtcp.config.model import BITS, VIRTUAL, integer_range
 from rtcp.config.numbers import plain_number
 from rtcp.launch import offline
 
@@ -24,14 +24,8 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-STRUCTS = {
-    name: struct.Struct(f"<{code}")
-    for name, code in {
-        "bool": "?", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i",
-        "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
-    }.items()
-}  # fmt: skip
-TYPES = (*STRUCTS, "string", "bytes")
+FLOATS = {"float32": struct.Struct("<f"), "float64": struct.Struct("<d")}
+TYPES = (*BITS, "string", "bytes")
 _OBJECT = re.compile(r"(?:0x(?P<prefixed>[0-9a-f]+)|(?P<suffixed>[0-9][0-9a-f]*)h)(?::(?P<sub>\w+))?", re.IGNORECASE)
 
 SlaveName = Annotated[str, as_written("SLAVE", "Position on the cable, from 1, or the configured name.")]
@@ -54,7 +48,7 @@ def _sdo_read(
     index, subindex = parse_object(where)
     known = None if type_name is None else _checked_type(type_name)
     with open_bus("sdo read", bus, config) as asked:
-        data = asked.access.sdo_read(asked.position(slave), index, subindex)
+        data = asked.access.sdo_read(asked.slave(slave), index, subindex)
     emit(interpretations(data) if known is None else decode(data, known))
 
 
@@ -73,29 +67,31 @@ def _sdo_write(
     index, subindex = parse_object(where)
     data = encode(value[0], _checked_type(type_name))
     with open_bus("sdo write", bus, config) as asked:
-        position = asked.position(slave)
-        asked.access.sdo_write(position, index, subindex, data)
-    report(f"slave {position}, 0x{index:04X}:{subindex}: {data.hex(' ') or '(empty)'} written")
+        asked.access.sdo_write(asked.slave(slave), index, subindex, data)
+    report(f"slave {slave}, 0x{index:04X}:{subindex}: {data.hex(' ') or '(empty)'} written")
 
 
 # -- access ---------------------------------------------------------------------------------------------------------
 
 
 class Bus(NamedTuple):
-    """A bus that can be asked: its name, the position of each slave by configured name, and who asks it."""
+    """A bus that can be asked: its name, the slaves by configured name as `access` takes them, and who asks it."""
 
     name: str
-    positions: dict[str, int]
+    slaves: Mapping[str, int | str]
     access: Robot | offline.OfflineBus
 
-    def position(self, slave: str) -> int:
-        """Return the position of a slave given by position or configured name; raises CommandError."""
+    def slave(self, slave: str) -> Any:
+        """Return a slave given by position or configured name as `access` takes it; raises CommandError.
+
+        A running platform has compared its slaves with their names, and takes positions; an offline bus finds them.
+        """
         if slave.isdecimal() and len(slave) < 6 and int(slave) > 0:
             return int(slave)
-        if slave not in self.positions:
-            known = ", ".join(self.positions) or "none"
+        if slave not in self.slaves:
+            known = ", ".join(self.slaves) or "none"
             raise CommandError(f"no slave is called {slave!r}: a position from 1, or one of {known}")
-        return self.positions[slave]
+        return self.slaves[slave]
 
 
 @contextmanager
@@ -132,7 +128,7 @@ def offline_bus(name: str | None, config: Path | None) -> Bus:
     name = arm.bus.interface if name is None else name
     if name == VIRTUAL:
         check_segment(segment_path(arm))
-    return Bus(name, {slave.name: at for at, slave in enumerate(arm.slaves, 1)}, offline.OfflineBus(name, config))
+    return Bus(name, {slave.name: slave.name for slave in arm.slaves}, offline.OfflineBus(name, config))
 
 
 # -- objects as text (little endian on the wire) --------------------------------------------------------------------
@@ -172,13 +168,14 @@ def encode(text: str, type_name: str) -> bytes:
     if type_name == "bool":
         if text.lower() not in ("0", "1", "true", "false"):
             raise CommandError(f"{text!r} does not fit bool: 0, 1, true or false")
-        return STRUCTS[type_name].pack(text.lower() in ("1", "true"))
+        return bytes([text.lower() in ("1", "true")])
     try:
-        return STRUCTS[type_name].pack(
-            _finite(text, type_name) if "float" in type_name else parse_integer(text, type_name)
-        )
-    except (struct.error, OverflowError) as error:
-        span = "" if "float" in type_name else ": {} to {}".format(*integer_range(type_name))
+        if type_name in FLOATS:
+            return FLOATS[type_name].pack(_finite(text, type_name))
+        number = parse_integer(text, type_name)
+        return number.to_bytes(BITS[type_name] // 8, "little", signed=type_name.startswith("int"))
+    except OverflowError as error:
+        span = "" if type_name in FLOATS else ": {} to {}".format(*integer_range(type_name))
         raise CommandError(f"{text} does not fit {type_name}{span}") from error
 
 
@@ -188,23 +185,24 @@ def decode(data: bytes, type_name: str) -> str:
         return data.rstrip(b"\0").decode(errors="replace")
     if type_name == "bytes":
         return data.hex()
-    if len(data) != (size := STRUCTS[type_name].size):
+    if len(data) != (size := -(-BITS[type_name] // 8)):
         raise CommandError(
             f"the object has {len(data)} bytes ({data.hex() or 'none'}), {type_name} has {size}: choose another --type"
         )
-    return repr(*STRUCTS[type_name].unpack(data)).lower()
+    if type_name in FLOATS:
+        return repr(*FLOATS[type_name].unpack(data))
+    number = int.from_bytes(data, "little", signed=type_name.startswith("int"))
+    return str(bool(number)).lower() if type_name == "bool" else str(number)
 
 
 def interpretations(data: bytes) -> str:
     """Return the bytes in hex, as integers of that size, and as text where all of it is printable."""
     parts = [data.hex(" ") or "(empty)"]
-    for name, packing in STRUCTS.items():
-        if "int" in name and packing.size == len(data):
-            (number,) = packing.unpack(data)
-            if name.startswith("u"):
-                parts.append(f"{name} {number} (0x{number:0{2 * len(data)}X})")
-            elif number < 0:
-                parts.append(f"{name} {number}")
+    if f"uint{8 * len(data)}" in BITS:
+        unsigned, signed = (int.from_bytes(data, "little", signed=signed) for signed in (False, True))
+        parts.append(f"uint{8 * len(data)} {unsigned} (0x{unsigned:0{2 * len(data)}X})")
+        if signed < 0:
+            parts.append(f"int{8 * len(data)} {signed}")
     text = data.rstrip(b"\0")
     if len(text) > 1 and all(0x20 <= byte < 0x7F for byte in text):
         parts.append(f"string {text.decode()!r}")

@@ -13,7 +13,7 @@ import typer
 
 from rtcp.cli.arguments import AsJson, BusName, ConfigFile, option
 from rtcp.cli.bus import open_bus, parse_integer
-from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table, transfer
+from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, new_file, report, show, table, transfer
 from rtcp.cli.slaves import own_bus
 from rtcp.launch.offline import OfflineBus
 
@@ -106,26 +106,26 @@ def _new(
         raise CommandError(f"found {' and '.join(sources) or 'no source'}; give one of --esi, --sii, --from-bus")
     if (slave is None) is not (from_bus is None):
         raise CommandError("--from-bus and --slave belong together: which bus, and which position on its cable")
+    if slave is not None and slave < 1:
+        raise CommandError(f"--slave {slave} is not allowed: a position on the cable, from 1")
     chosen = _slots(module or ())
-    if esi is not None:
-        content = _read(esi)
-        bare = find_device(content, product=_number("--product", product), revision=_number("--revision", revision))
-        made = assemble(bare, content.modules, chosen) if bare.slots or chosen else bare
-    elif chosen:
-        raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
-    else:
-        made = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
-    text = file_text(made, kind, mode)
-    try:
-        with out.open("x") as file:
-            file.write(text)
-    except FileExistsError:
-        raise CommandError(f"{out}: there is such a file; it is not overwritten") from None
-    try:
-        load_device(out)
-    except ConfigError:
-        out.unlink()
-        raise
+    with new_file(out) as file:
+        if esi is not None:
+            content = _read(esi)
+            bare = find_device(content, product=_number("--product", product), revision=_number("--revision", revision))
+            made = assemble(bare, content.modules, chosen) if bare.slots or chosen else bare
+        elif chosen:
+            raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
+        else:
+            made = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
+        text = file_text(made, kind, mode)
+        file.write(text.encode())
+        file.flush()
+        try:
+            load_device(out)
+        except ConfigError:
+            file.truncate(0)  # and with that no file is left
+            raise
     marks = text.count("CHECK:")
     report(f"{out}: {made.name}" + (f"; lines marked CHECK, {marks} of them, need a person" if marks else ""))
 

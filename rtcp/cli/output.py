@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
+from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import typer
 
@@ -187,6 +188,28 @@ def transfer(what: str, total: float | None = None, *, quiet: bool = False) -> I
     with Bar(console=console(), transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[BinaryIO]:
+    """Yield a new file to write, made before what fills it begins; an error leaves no empty file.
+
+    Raises:
+        CommandError: there is one already, or none can be made there.
+    """
+    try:
+        file = path.open("xb")
+    except FileExistsError:
+        raise CommandError(f"{path}: there is such a file; it is not overwritten: give another name") from None
+    except OSError as error:
+        raise CommandError(f"{path}: {error.strerror}; no file can be made there") from error
+    try:
+        with file:
+            yield file
+    except BaseException:
+        if path.stat().st_size == 0:
+            path.unlink()
+        raise
 
 
 def _line_reporter() -> ShowProgress:

@@ -13,7 +13,19 @@ import typer
 from rtcp.api import NotRunning
 from rtcp.cli.arguments import AsJson, BusName, ConfigFile, as_written, option, positive
 from rtcp.cli.bus import Bus, SlaveName, offline_bus, open_bus, parse_integer, scan_tables
-from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, facts, interruptible, report, show, table, transfer
+from rtcp.cli.output import (
+    CommandError,
+    ExitCode,
+    emit,
+    emit_json,
+    facts,
+    interruptible,
+    new_file,
+    report,
+    show,
+    table,
+    transfer,
+)
 from rtcp.cli.platform import connect, loop_process, refuse_second_platform
 from rtcp.esi.model import EsiError
 from rtcp.launch.offline import OfflineBus
@@ -34,6 +46,10 @@ for _group in (foe, eeprom, alias):
 FileName = Annotated[str, as_written("NAME", "Name of the file in the slave.")]
 Password = Annotated[str, option("--password", "N", "Password of the file, a number.")]
 Boot = Annotated[bool, option("--boot", "In BOOT, as most slaves want it for their firmware.")]
+EepromSize = Annotated[
+    str | None,
+    option("--size", "BYTES", "Size of the EEPROM. Default: as it says, at most 4096 under a wrong checksum."),
+]
 LocalFile = Annotated[Path, typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="File to write.")]
 STATES = ("INIT", "PREOP", "BOOT", "SAFEOP")
 
@@ -68,11 +84,13 @@ def _foe_read(
     config: ConfigFile = None,
 ) -> None:
     """Read a file of a slave."""
-    number = parse_integer(password, "--password")
-    with own_bus("foe read", bus, config) as (asked, access), transfer(f"reading {name}") as progress:
-        data = access.foe_read(asked.position(slave), name, number, boot, progress)
-    out.write_bytes(data)
-    report(f"{len(data)} bytes written to {out}")
+    number = _password(password)
+    _check_name(name)
+    with new_file(out) as file, own_bus("foe read", bus, config) as (asked, access):
+        with transfer(f"reading {name}") as progress:
+            data = access.foe_read(asked.slave(slave), name, number, boot, progress)
+        file.write(data)
+    report(f"{access.label}: {len(data)} bytes written to {out}")
 
 
 @foe.command("write")
@@ -86,25 +104,30 @@ def _foe_write(
     config: ConfigFile = None,
 ) -> None:
     """Write a file to a slave."""
-    number, data, name = parse_integer(password, "--password"), file.read_bytes(), name or file.name
-    with own_bus("foe write", bus, config) as (asked, access), transfer(f"writing {name}", len(data)) as progress:
-        position = asked.position(slave)
-        access.foe_write(position, name, data, number, boot, progress)
-    report(f"slave {position}: {len(data)} bytes written to its file {name}")
+    number, data, name = _password(password), file.read_bytes(), name or file.name
+    _check_name(name)
+    with own_bus("foe write", bus, config) as (asked, access):
+        target = asked.slave(slave)
+        half = f"slave {slave} may have half of its file {name}: write it again before it is switched off"
+        with interruptible(f"interrupted: {half}"), transfer(f"writing {name}", len(data)) as progress:
+            access.foe_write(target, name, data, number, boot, progress)
+    report(f"{access.label}: {len(data)} bytes written to its file {name}")
 
 
 @eeprom.command("read")
 def _eeprom_read(
     slave: SlaveName,
     out: Annotated[Path, option("--out", "FILE", "Where to put the image.")],
+    size: EepromSize = None,
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
     """Read the whole EEPROM into a file."""
-    with own_bus("eeprom read", bus, config) as (asked, access), transfer("reading", 1.0) as progress:
-        image = access.eeprom_read(asked.position(slave), progress=progress)
-    out.write_bytes(image)
-    report(f"{len(image)} bytes written to {out}")
+    with new_file(out) as file, own_bus("eeprom read", bus, config) as (asked, access):
+        with transfer("reading", 1.0) as progress:
+            image = access.eeprom_read(asked.slave(slave), _size(size), progress)
+        file.write(image)
+    report(f"{access.label}: {len(image)} bytes written to {out}")
 
 
 @eeprom.command("dump")
@@ -113,9 +136,8 @@ def _eeprom_dump(slave: SlaveName, bus: BusName = None, config: ConfigFile = Non
     from rtcp.esi.sii import check_sii, read_sii
 
     with own_bus("eeprom dump", bus, config) as (asked, access), transfer("reading", 1.0) as progress:
-        position = asked.position(slave)
-        image = access.eeprom_read(position, progress=progress)
-    show(*_description(read_sii(image, f"slave {position}"), len(image)))
+        image = access.eeprom_read(asked.slave(slave), progress=progress)
+    show(*_description(read_sii(image, access.label), len(image)))
     for sentence in check_sii(image):
         emit(sentence)
 
@@ -126,45 +148,69 @@ def _eeprom_write(
     file: LocalFile,
     yes: Annotated[bool, option("--yes", "Do not ask.")] = False,
     other_device: Annotated[bool, option("--other-device", "Also an image of another vendor or product.")] = False,
+    verbatim: Annotated[
+        bool, option("--verbatim", "Also the image's serial number and alias. Default: the slave keeps its own.")
+    ] = False,
+    size: EepromSize = None,
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
     """Write an image into the EEPROM, word by word, each read back. A wrong image makes a slave useless."""
-    image = file.read_bytes()
+    from rtcp.esi.sii import HEADER_BYTES
+
+    image, room = file.read_bytes(), _size(size)
     with own_bus("eeprom write", bus, config) as (asked, access):
-        position = asked.position(slave)
-        with transfer("reading", 1.0) as progress:
-            before = access.eeprom_read(position, progress=progress)
-        for finding in _check_image(image, before, other_device):
+        target = asked.slave(slave)
+        before = access.eeprom_read(target, HEADER_BYTES)
+        findings = _check_image(image, before, other_device, room)
+        if not verbatim:
+            image, kept = _keep_identity(image, before)
+            report(kept)
+        for finding in findings:
             report(finding)
         if not yes:
-            typer.confirm(f"Write {len(image)} bytes into the EEPROM of slave {position}?", abort=True)
-        with transfer("writing", 1.0) as progress:
-            written = access.eeprom_write(position, 0, image, progress)
-    report(f"slave {position}: {written} words written and read back; switch it off and on to have it load them")
+            typer.confirm(f"Write {len(image)} bytes into the EEPROM of {access.label}?", abort=True)
+        with _interruptible_write(access), transfer("writing", 1.0) as progress:
+            written = access.eeprom_write(target, before, image, progress)
+    report(f"{access.label}: {written} words written and read back; switch it off and on to have it load them")
 
 
 @alias.command("set")
 def _alias_set(
     slave: SlaveName,
     number: Annotated[str, as_written("ALIAS", "0 for none, to 65535.")],
+    yes: Annotated[bool, option("--yes", "Do not ask.")] = False,
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
-    """Write the station alias of a slave into its EEPROM."""
-    from rtcp.esi.sii import crc
-    from rtcp.fieldbus.eeprom import ALIAS_WORD, CHECKSUM_WORD
+    """Write the station alias of a slave into its EEPROM; no two slaves may have the same."""
+    from rtcp.fieldbus.eeprom import alias_of, is_sound, with_alias
 
     value = parse_integer(number, "ALIAS")
     if not 0 <= value <= 0xFFFF:
         raise CommandError(f"alias {value} is not allowed: 0 to 65535")
     with own_bus("alias set", bus, config) as (asked, access):
-        position = asked.position(slave)
-        image = bytearray(access.eeprom_read(position, 2 * (CHECKSUM_WORD + 1)))
-        image[2 * ALIAS_WORD : 2 * ALIAS_WORD + 2] = value.to_bytes(2, "little")
-        image[2 * CHECKSUM_WORD] = crc(bytes(image[: 2 * CHECKSUM_WORD]))
-        access.eeprom_write(position, 0, bytes(image))
-    report(f"slave {position}: alias {value} written; switch it off and on to have it load it")
+        target = asked.slave(slave)
+        beginnings = access.eeprom_beginnings(target)
+        before = beginnings[access.position - 1]
+        if not is_sound(before):
+            raise CommandError(
+                f"{access.label}: the checksum in word 7 of its EEPROM is wrong, and an alias would make it right over "
+                "damaged content: write its image first, `rtcp eeprom write`",
+                ExitCode.REFUSED,
+            )
+        for position, other in enumerate(beginnings, 1):
+            if value and position != access.position and is_sound(other) and alias_of(other) == value:
+                raise CommandError(
+                    f"slave {position} has the station alias {value} already, and two of one alias are refused at the "
+                    f"start: give {access.label} another one, or slave {position} first",
+                    ExitCode.REFUSED,
+                )
+        if not yes:
+            typer.confirm(f"Write alias {value} in place of {alias_of(before)} into {access.label}?", abort=True)
+        with _interruptible_write(access):
+            access.eeprom_write(target, before, with_alias(before, value))
+    report(f"{access.label}: alias {value} written; switch it off and on to have it load it")
 
 
 @commands.command("state")
@@ -175,13 +221,12 @@ def _state(
     config: ConfigFile = None,
 ) -> None:
     """Bring a slave to an AL state and leave it there; OP needs a cycle: `rtcp start`."""
-    wanted = state.upper().replace("-", "")
-    if wanted not in STATES:
+    name = state.upper().replace("-", "")
+    if name not in STATES:
         raise CommandError(f"state {state!r} is not known: {', '.join(STATES)}; OP needs a cycle: `rtcp start`")
     with own_bus("state", bus, config) as (asked, access):
-        position = asked.position(slave)
-        found = access.state(position, wanted)
-    report(f"slave {position}: {found}")
+        reached = access.state(asked.slave(slave), name)
+    report(f"{access.label}: {reached}")
 
 
 @commands.command("capture")
@@ -196,7 +241,7 @@ def _capture(
 
     positive("--seconds", seconds, "s")
     interface, pid = place_of_bus(bus, config)
-    with Capture(interface, pid, out) as capture:
+    with new_file(out) as file, Capture(interface, pid, file) as capture:
         report(f"capturing on {interface}; Ctrl-C ends it")
         counted = capture.wait(seconds)
     lost = f", {counted.lost} lost: the host was too slow" if counted.lost else ""
@@ -209,7 +254,7 @@ def _describe(slave: str, bus: str | None, config: Path | None, as_json: bool) -
         own_bus("scan --describe", bus, config) as (asked, access),
         transfer("reading", 1.0, quiet=as_json) as progress,
     ):
-        device = access.describe(asked.position(slave), progress)
+        device = access.describe(asked.slave(slave), progress)
     if as_json:
         emit_json(device)
         return
@@ -261,28 +306,102 @@ def own_bus(command: str, name: str | None, config: Path | None) -> Iterator[tup
         yield asked, asked.access
 
 
-def _check_image(image: bytes, before: bytes, other_device: bool) -> tuple[str, ...]:
-    """Return what is odd about an image; raises CommandError where it must not be written."""
-    from rtcp.esi.sii import check_sii, crc, read_sii
+@contextmanager
+def _interruptible_write(access: OfflineBus) -> Iterator[None]:
+    """Turn a signal during a write of an EEPROM into a CommandError that says what it may have left."""
+    left = f"the EEPROM of {access.label} may be half written, under a wrong checksum; `rtcp eeprom write` repairs it"
+    with interruptible(f"interrupted: {left}"):
+        yield
 
-    if len(image) > len(before) or len(image) % 2:
-        raise CommandError(f"the image has {len(image)} bytes, the EEPROM has {len(before)}; an even number that fits")
+
+def _password(text: str) -> int:
+    number = parse_integer(text, "--password")
+    if not 0 <= number <= 0xFFFFFFFF:
+        raise CommandError(f"--password {number} is not allowed: 0 to {0xFFFFFFFF}")
+    return number
+
+
+def _check_name(name: str) -> None:
+    """Refuse the name of a file that no message can carry; raises CommandError."""
     try:
-        new, old = read_sii(image, "the image").identity, read_sii(before, "the EEPROM").identity
+        name.encode()
+    except UnicodeEncodeError as error:
+        raise CommandError(f"the name {name!r} is not UTF-8; `--as` gives it another one in the slave") from error
+
+
+def _size(text: str | None) -> int:
+    """Return the size of an EEPROM, 0 where none was given; raises CommandError."""
+    from rtcp.esi.sii import HEADER_BYTES, MAX_BYTES
+
+    size = 0 if text is None else parse_integer(text, "--size")
+    if text is not None and (size % 2 or not HEADER_BYTES <= size <= MAX_BYTES):
+        raise CommandError(f"--size {size} is not allowed: an even number of bytes, {HEADER_BYTES} to {MAX_BYTES}")
+    return size
+
+
+def _check_image(image: bytes, before: bytes, other_device: bool, size: int) -> tuple[str, ...]:
+    """Return what is odd about an image.
+
+    Args:
+        image: the image.
+        before: the first 128 bytes of the EEPROM.
+        other_device: whether the image may be of another device.
+        size: bytes of the EEPROM; 0: as many as it says itself.
+
+    Raises:
+        CommandError: the image must not be written.
+    """
+    from rtcp.esi.sii import HEADER_BYTES, SOEM_BYTES, check_sii, crc, read_sii
+    from rtcp.fieldbus.eeprom import is_sound, size_of
+
+    sound = is_sound(before)
+    # One that is not sound says nothing of its size that counts.
+    size = size or (size_of(before) if sound else SOEM_BYTES)
+    if not HEADER_BYTES <= len(image) <= size or len(image) % 2:
+        raise CommandError(
+            f"the image has {len(image)} bytes; allowed is an even number from {HEADER_BYTES} to {size}, which "
+            f"{'the EEPROM has' if sound else 'counts under a wrong checksum'}; --size gives its size"
+        )
+    try:
+        read_sii(image, "the image")
     except EsiError as error:
         raise CommandError(str(error)) from error
     if image[14] != (expected := crc(image[:14])):
         raise CommandError(
             f"the checksum in word 7 of the image is 0x{image[14]:02X}, of its content 0x{expected:02X}: it is damaged"
         )
-    found, wanted = ((one.vendor_id, one.product_code) for one in (old, new))
-    if found != wanted and not other_device:
+    old, new = before[_DEVICE], image[_DEVICE]
+    if old != new and not other_device and not _is_blank(old):
+        texts = [f"vendor 0x{one[3::-1].hex().upper()}, product 0x{one[7:3:-1].hex().upper()}" for one in (new, old)]
         raise CommandError(
-            f"the image is of vendor 0x{wanted[0]:08X}, product 0x{wanted[1]:08X}, the slave of vendor "
-            f"0x{found[0]:08X}, product 0x{found[1]:08X}; --other-device writes it all the same",
+            f"the image is of {texts[0]}, the slave of {texts[1]}; --other-device writes it all the same",
             ExitCode.REFUSED,
         )
     return check_sii(image)
+
+
+_DEVICE, _SERIAL = slice(0x10, 0x18), slice(0x1C, 0x20)
+"""Bytes of vendor and product, and of the serial number (ETG.1000.6, table 16)."""
+
+
+def _is_blank(data: bytes) -> bool:
+    return set(data) <= {0x00} or set(data) <= {0xFF}
+
+
+def _keep_identity(image: bytes, before: bytes) -> tuple[bytes, str]:
+    """Return the image with the serial number and the alias of the EEPROM, as far as it has any, and what was kept."""
+    from rtcp.fieldbus.eeprom import alias_of, is_sound, with_alias
+
+    kept = []
+    if before[_DEVICE] == image[_DEVICE] and not set(before[_SERIAL]) <= {0xFF}:
+        image = image[: _SERIAL.start] + before[_SERIAL] + image[_SERIAL.stop :]
+        kept.append(f"serial number {int.from_bytes(before[_SERIAL], 'little')}")
+    if is_sound(before):
+        image = with_alias(image, alias_of(before))
+        kept.append(f"alias {alias_of(before)}")
+    if len(kept) < 2:
+        return image, f"kept: {kept[0] if kept else 'nothing'}; the rest is the image's, the EEPROM has none to keep"
+    return image, f"kept: {' and '.join(kept)}; --verbatim writes those of the image"
 
 
 def _description(device: Device, size: int) -> list[RenderableType]:

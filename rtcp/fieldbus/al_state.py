@@ -33,19 +33,6 @@ STATE_NAMES = {
     AlState.OP: "OP",
 }
 
-_WAYS = {
-    "INIT": (AlState.INIT,),
-    "PREOP": (AlState.INIT, AlState.PREOP),
-    "BOOT": (AlState.INIT, AlState.BOOT),
-    "SAFEOP": (AlState.INIT, AlState.PREOP, AlState.SAFEOP),
-}
-
-
-def way_to(name: str) -> tuple[AlState, ...]:
-    """Return the states from INIT to the one of this name; raises KeyError."""
-    return _WAYS[name]
-
-
 # code: (meaning, what to do about it; empty where the meaning says it all)
 AL_STATUS_CODES: dict[int, tuple[str, str]] = {
     0x0000: ("no error", ""),

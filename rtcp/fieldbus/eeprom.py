@@ -6,6 +6,7 @@ import struct
 import time
 from collections.abc import Callable
 
+from rtcp.esi.sii import HEADER_BYTES, MAX_BYTES, SOEM_BYTES, crc
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Register, RegisterPort, Steps, finish, pause
 
@@ -79,45 +80,89 @@ def _command(port: RegisterPort, station: int, command: int, word: int, label: s
         yield
 
 
+def is_sound(header: bytes) -> bool:
+    """Return whether the checksum in word 7 is that of the words before it; `header`: 16 bytes or more."""
+    return header[2 * CHECKSUM_WORD] == crc(header[: 2 * CHECKSUM_WORD])
+
+
+def alias_of(header: bytes) -> int:
+    """Return the station alias."""
+    return int.from_bytes(word_of(header, ALIAS_WORD), "little")
+
+
+def with_alias(image: bytes, alias: int) -> bytes:
+    """Return an image, or its first 16 bytes, with another station alias and the checksum for it."""
+    at, check = 2 * ALIAS_WORD, 2 * CHECKSUM_WORD
+    covered = image[:at] + alias.to_bytes(2, "little") + image[at + 2 : check]
+    return covered + bytes((crc(covered),)) + image[check + 1 :]
+
+
+def size_of(header: bytes) -> int:
+    """Return the bytes that an EEPROM says it has; of one that is not sound at most what masters read of any.
+
+    Args:
+        header: its first 128 bytes.
+    """
+    size = 128 * (int.from_bytes(word_of(header, SIZE_WORD), "little") + 1)
+    return min(size, MAX_BYTES if is_sound(header) else SOEM_BYTES)
+
+
 def read_eeprom(port: RegisterPort, station: int, label: str, progress: Progress, size: int | None = None) -> bytes:
-    """Return `size` bytes of a slave's EEPROM, None: all that it says it has; raises BusError."""
+    """Return `size` bytes of a slave's EEPROM, None: as many as `size_of` says; raises BusError."""
     _take(port, station, label)
     try:
         if size is None:
-            size = 128 * (int.from_bytes(finish(reading_words(port, station, SIZE_WORD, label))[:2], "little") + 1)
-        image = bytearray()
-        while len(image) < size:
-            image += finish(reading_words(port, station, len(image) // 2, label))
-            progress(min(len(image) / size, 1.0))
-        return bytes(image[:size])
+            size = size_of(_read(port, station, label, HEADER_BYTES, lambda part: None))
+        return _read(port, station, label, size, progress)
     finally:
         eeprom_to_device(port, station)
 
 
-def write_eeprom(
-    port: RegisterPort, station: int, label: str, image: bytes, progress: Progress, first: int = 0
-) -> int:  # fmt: skip
-    """Write `image` from word `first` on, as far as it differs, each word read back; return how many were written.
+def write_eeprom(port: RegisterPort, station: int, label: str, image: bytes, progress: Progress) -> int:
+    """Write `image` from word 0 on, as far as it differs, each word read back; return how many words differed.
+
+    The checksum is wrong from the first word written to the last: nobody takes a half-written EEPROM for a sound one.
+
+    Args:
+        port: the port to write through.
+        station: the slave's configured address.
+        label: the slave as messages name it.
+        image: 16 bytes or more, under a right checksum.
+        progress: receives how much is done, 0 to 1.
 
     Raises:
         BusError: a word is not kept, or the slave stopped answering; what was written before stays.
     """
     _take(port, station, label)
-    written = 0
     try:
-        at = 0
-        while at < len(image):
-            there = finish(reading_words(port, station, first + at // 2, label))
-            wanted = image[at : at + len(there)]
-            for i in range(0, len(wanted), 2):
-                if wanted[i : i + 2] != there[i : i + 2]:
-                    finish(writing_word(port, station, first + (at + i) // 2, wanted[i : i + 2], label))
-                    written += 1
-            at += len(there)
-            progress(min(at / len(image), 1.0))
-        return written
+        before = _read(port, station, label, len(image), lambda part: progress(part / 2))
+        words = [word for word in range(len(image) // 2) if word_of(image, word) != word_of(before, word)]
+        if not words:
+            progress(1.0)
+            return 0
+        rights = (crc(before[: 2 * CHECKSUM_WORD]), image[2 * CHECKSUM_WORD])
+        wrong = next(value for value in range(3) if value not in rights)
+        finish(writing_word(port, station, CHECKSUM_WORD, bytes((wrong, 0)), label))
+        others = [word for word in reversed(words) if word != CHECKSUM_WORD]
+        for count, word in enumerate((*others, CHECKSUM_WORD), 1):
+            finish(writing_word(port, station, word, word_of(image, word), label))
+            progress(0.5 + 0.5 * count / (len(others) + 1))
+        return len(words)
     finally:
         eeprom_to_device(port, station)
+
+
+def word_of(image: bytes, word: int) -> bytes:
+    """Return the two bytes of a word."""
+    return image[2 * word : 2 * word + 2]
+
+
+def _read(port: RegisterPort, station: int, label: str, size: int, progress: Progress) -> bytes:
+    image = bytearray()
+    while len(image) < size:
+        image += finish(reading_words(port, station, len(image) // 2, label))
+        progress(min(len(image) / size, 1.0))
+    return bytes(image[:size])
 
 
 def _take(port: RegisterPort, station: int, label: str) -> None:

@@ -73,18 +73,27 @@ class FoeClient:
             FoeRefused: the slave refused.
             BusError: it did not answer.
         """
-        return self._transfer(f"read of file {name!r}", lambda box: self._reading(box, name, password, progress))
+        request = _HEADER.pack(_READ, password) + name.encode()
+        return self._transfer(f"read of file {name!r}", request, lambda box: self._reading(box, request, progress))
 
     def write(self, name: str, data: bytes, password: int, progress: Callable[[int], None]) -> None:
         """Write a file; `progress` receives how many bytes were taken. Raises as `read`."""
+        request = _HEADER.pack(_WRITE, password) + name.encode()
         return self._transfer(
             f"write of {len(data)} bytes to file {name!r}",
-            lambda box: self._writing(box, name, data, password, progress),
+            request,
+            lambda box: self._writing(box, request, data, progress),
         )
 
-    def _transfer(self, what: str, service: Callable[[Mailbox], Steps[T]]) -> T:
+    def _transfer(self, what: str, request: bytes, service: Callable[[Mailbox], Steps[T]]) -> T:
         if self._mailbox is None:
             raise BusError(f"{self._label}: {what} is not possible, its EEPROM lists no FoE mailbox")
+        if len(request) > self._mailbox.room:
+            room = self._mailbox.room - _HEADER.size
+            raise BusError(
+                f"{self._label}: {what} is not possible, the name has {len(request) - _HEADER.size} bytes, its mailbox "
+                f"takes {room}: give a shorter name"
+            )
         if not self._lock.acquire(timeout=PATIENCE_S):
             raise BusError(f"{self._label}, {what}: its mailbox is in use by others")
         try:
@@ -101,12 +110,11 @@ class FoeClient:
         finally:
             self._lock.release()
 
-    def _reading(self, box: Mailbox, name: str, password: int, progress: Callable[[int], None]) -> Steps[bytes]:
+    def _reading(self, box: Mailbox, request: bytes, progress: Callable[[int], None]) -> Steps[bytes]:
         data = bytearray()
-        request = _HEADER.pack(_READ, password) + name.encode()
         number = 1
         while True:
-            answer = yield from self._exchange(box, request, _DATA, number)
+            answer = yield from self._exchange(box, request, _DATA, number, progress, len(data))
             data += answer
             progress(len(data))
             request = _HEADER.pack(_ACKNOWLEDGE, number)
@@ -115,14 +123,13 @@ class FoeClient:
                 return bytes(data)
             number += 1
 
-    def _writing(
-        self, box: Mailbox, name: str, data: bytes, password: int, progress: Callable[[int], None]
-    ) -> Steps[None]:
-        yield from self._exchange(box, _HEADER.pack(_WRITE, password) + name.encode(), _ACKNOWLEDGE, 0)
+    def _writing(self, box: Mailbox, request: bytes, data: bytes, progress: Callable[[int], None]) -> Steps[None]:
+        yield from self._exchange(box, request, _ACKNOWLEDGE, 0, progress, 0)
         size = box.room - _HEADER.size
         # A packet that is not full is the last one, where need be an empty one.
         for number, at in enumerate(range(0, len(data) + 1, size), 1):
-            yield from self._exchange(box, _HEADER.pack(_DATA, number) + data[at : at + size], _ACKNOWLEDGE, number)
+            packet = _HEADER.pack(_DATA, number) + data[at : at + size]
+            yield from self._exchange(box, packet, _ACKNOWLEDGE, number, progress, at)
             progress(min(at + size, len(data)))
 
     def _send(self, box: Mailbox, request: bytes) -> Steps[None]:
@@ -131,8 +138,19 @@ class FoeClient:
             check_time(deadline, "its mailbox stays full")
             yield
 
-    def _exchange(self, box: Mailbox, request: bytes, expected: int, number: int) -> Steps[bytes]:
-        """Send a packet, again while the slave is busy, and return the data behind its answer."""
+    def _exchange(
+        self, box: Mailbox, request: bytes, expected: int, number: int, progress: Callable[[int], None], done: int
+    ) -> Steps[bytes]:
+        """Send a packet, again while the slave is busy, and return the data behind its answer.
+
+        Args:
+            box: the slave's mailbox.
+            request: the packet.
+            expected: operation code of its answer.
+            number: packet number of its answer.
+            progress: receives `done` at each answer that says busy, for whom silence is the end of the slave.
+            done: bytes that are through already.
+        """
         patience = time.monotonic() + _BUSY_S
         while True:
             yield from self._send(box, request)
@@ -144,6 +162,7 @@ class FoeClient:
                 raise FoeRefused(f"error 0x{value:04X}, {meaning}" + (f" ({text})" if text else ""), value)
             if operation == _BUSY:
                 check_time(patience, f"it stays busy for {_BUSY_S:g} s")
+                progress(done)
                 yield from pause(_PAUSE_S)
                 continue
             if (operation, value) != (expected, number):

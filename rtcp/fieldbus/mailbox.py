@@ -353,8 +353,10 @@ class Mailbox:
             kind: its protocol.
 
         Raises:
-            BusError: the slave does not answer.
+            BusError: the slave does not answer, or its mailbox has no room for so much.
         """
+        if len(content) > self.room:
+            raise BusError(f"a message of {len(content)} bytes does not fit into its mailbox: at most {self.room}")
         if self._is_full(_SM0_STATUS):
             return False
         # Counter 0 is not checked by slaves; SOEM counts its own messages 1 to 7, unknown to us (ETG.1000.4, table 29).

@@ -158,13 +158,16 @@ class SoemBus:
         self._discover()
         self._to_preop()
         self._master.config_dc()
-        found = [
-            describe(slave, self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), self._infos[i], self._serials[i])
-            for i, slave in enumerate(self._master.slaves)
-        ]
+        found = self._describe()
         tree = Topology.of([info.ports for info in found])
         return tuple(
             replace(info, parent=tree.parent(info.position), parent_port=tree.port(info.position)) for info in found
+        )
+
+    def _describe(self) -> tuple[SlaveInfo, ...]:
+        return tuple(
+            describe(slave, self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), self._infos[i], self._serials[i])
+            for i, slave in enumerate(self._master.slaves)
         )
 
     def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> SoemProcessData:
@@ -432,10 +435,45 @@ class SoemBus:
         """Return SDO access to a slave, also in steps; raises BusError where there is no such slave."""
         return self._mailboxes.sdo(position)
 
-    def discover(self) -> int:
-        """Find the slaves, bring them to INIT with their mailboxes programmed; return how many there are."""
+    def discover(self) -> tuple[SlaveInfo, ...]:
+        """Find the slaves, bring them to INIT with their mailboxes programmed; return what is known of each there.
+
+        Raises:
+            BusError: no slave answers.
+        """
         self._discover()
-        return len(self._names)
+        return self._describe()
+
+    def position_of(self, name: str, slaves: Sequence[SlaveConfig], found: Sequence[SlaveInfo]) -> int:
+        """Return the position of the slave that the configuration calls `name`.
+
+        With a station alias it may hang anywhere; without one the whole bus has to be as the configuration says.
+
+        Args:
+            name: a name in `slaves`.
+            slaves: the slaves of the configuration.
+            found: the slaves on the bus.
+
+        Raises:
+            BusError: it is not there, or another device is in its place.
+        """
+        wanted = next(slave for slave in slaves if slave.name == name)
+        if not wanted.alias:
+            ordered = by_alias(slaves, found)
+            if faults := identity_faults(self._master.slaves, ordered):
+                remedy = f"which slave is {name} is not certain without a station alias: give its position instead"
+                raise BusError(*faults, remedy)
+            return ordered.index(wanted) + 1
+        by_alias([wanted], found)
+        position = next(info.position for info in found if info.alias == wanted.alias)
+        info, device = found[position - 1], wanted.device
+        if (info.vendor_id, info.product_code) != (device.vendor_id, device.product_id):
+            raise BusError(
+                f"{slave_label(position, info.name)} has the station alias {wanted.alias} of {name}, but is vendor "
+                f"0x{info.vendor_id:08X}, product 0x{info.product_code:08X}; expected {device.name} (vendor "
+                f"0x{device.vendor_id:08X}, product 0x{device.product_id:08X}): give its position to reach it"
+            )
+        return position
 
     def boot(self, position: int) -> None:
         """Bring a slave to BOOT, where its firmware is written; `foe` then speaks to the mailboxes that it has there.
@@ -488,10 +526,10 @@ class SoemBus:
         label = slave_label(position, self._names[position - 1])
         return read_eeprom(self.port, station_of(position), label, progress, size)
 
-    def write_eeprom(self, position: int, image: bytes, progress: Progress, first: int = 0) -> int:
-        """Write into the EEPROM of a slave from word `first` on; return how many words differed; raises BusError."""
+    def write_eeprom(self, position: int, image: bytes, progress: Progress) -> int:
+        """Write into the EEPROM of a slave from word 0 on; return how many words differed; raises BusError."""
         label = slave_label(position, self._names[position - 1])
-        return write_eeprom(self.port, station_of(position), label, image, progress, first)
+        return write_eeprom(self.port, station_of(position), label, image, progress)
 
     def release(self) -> None:
         """Close everything and leave the slaves in their states."""

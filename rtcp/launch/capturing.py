@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
-import signal
 import socket
 import struct
 import subprocess
 import sys
 import time
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import BinaryIO, NamedTuple
 
 from rtcp.config.model import VIRTUAL
@@ -37,7 +37,7 @@ _PACKET_STATISTICS = 6
 _SOL_PACKET = 263
 _BUFFER_BYTES = 1 << 24
 _TIME = struct.Struct("@ll")
-_POLL_S = 0.2
+_FRAMES_AT_ONCE = 1000
 
 
 class Counted(NamedTuple):
@@ -100,26 +100,41 @@ def place_of_bus(bus: str | None, config: Path | None) -> tuple[str, int | None]
 class Capture:
     """A capture in a child process: only a process of one thread may join another's namespace."""
 
-    def __init__(self, interface: str, pid: int | None, out: Path) -> None:
-        """Start it.
+    def __init__(self, interface: str, pid: int | None, file: BinaryIO) -> None:
+        """Start it; it ends when its standard input does, also where this process is killed.
+
+        Args:
+            interface: the interface.
+            pid: a process in whose network namespace it is, None: in this one's.
+            file: receives the frames.
 
         Raises:
             RtcpError: there is no such interface, or no right to see its frames.
         """
-        question = json.dumps({"interface": interface, "pid": pid, "out": str(out)})
+        self._file = file
+        question = json.dumps({"interface": interface, "pid": pid, "file": file.fileno()})
         with defer_signals():
             self._child = subprocess.Popen(
                 [sys.executable, "-m", "rtcp.launch.capturing", question],
+                stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
+                pass_fds=(file.fileno(),),
                 start_new_session=True,
             )
+        try:
+            self._answer()
+        except BaseException:
+            self._end()
+            raise
+
+    def _answer(self) -> dict[str, int]:
+        """Return the next answer of the child; raises RtcpError where it failed."""
         assert self._child.stdout is not None
-        first = self._child.stdout.readline()
-        answer = json.loads(first) if first else {"error": "the capture ended before it began"}
+        line = self._child.stdout.readline()
+        answer = json.loads(line) if line else {"error": f"its process ended with exit code {self._child.wait()}"}
         if "error" in answer:
-            self._child.wait()
-            self._child.stdout.close()
-            raise RtcpError("fault", str(answer["error"]))
+            raise RtcpError("fault", f"capturing into {self._file.name}: {answer['error']}")
+        return dict(answer)
 
     def __enter__(self) -> Capture:
         return self
@@ -127,39 +142,34 @@ class Capture:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:  # fmt: skip
+        self._end()
+
+    def _end(self) -> None:
         if self._child.poll() is None:
             self._child.kill()
             self._child.wait()
-        if self._child.stdout is not None:
-            self._child.stdout.close()
+        for pipe in (self._child.stdin, self._child.stdout):
+            if pipe is not None:
+                pipe.close()
 
     def wait(self, seconds: float | None) -> Counted:
-        """Let it run for a time, None: until Ctrl-C; end it and return what it has written."""
-        try:
+        """Let it run for a time, None: until Ctrl-C; end it and return what it has written.
+
+        Raises:
+            RtcpError: a frame could not be written or received.
+        """
+        assert self._child.stdin is not None
+        with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
             self._child.wait(seconds)
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
-            self._child.terminate()
-        assert self._child.stdout is not None
-        last = self._child.stdout.readline()
-        self._child.wait()
-        if not last:
-            raise RtcpError("fault", f"the capture ended with exit code {self._child.returncode}")
-        return Counted(**json.loads(last))
+        self._child.stdin.close()
+        return Counted(**self._answer())
 
 
 def main() -> int:
-    """Capture until SIGTERM: the child's side."""
+    """Capture until standard input ends: the child's side."""
     question = json.loads(sys.argv[1])
-    ended = False
-
-    def end(number: int, frame: FrameType | None) -> None:
-        nonlocal ended
-        ended = True
-
-    signal.signal(signal.SIGTERM, end)
     try:
-        # Before the namespace is joined, in which this user is somebody else.
-        with open(question["out"], "wb") as file:
+        with open(question["file"], "wb") as file:
             if question["pid"] is not None:
                 enter(question["pid"])
             check_interface(question["interface"])
@@ -168,14 +178,15 @@ def main() -> int:
                 _tell({})
                 frames = 0
                 writer = PcapngFile(file, question["interface"])
-                while not ended:
+                while sys.stdin not in select.select([port, sys.stdin], [], [])[0]:
                     frames += _write_waiting(port, writer)
+                frames += _write_waiting(port, writer)
                 lost = struct.unpack("=II", port.getsockopt(_SOL_PACKET, _PACKET_STATISTICS, 8))[1]
     except PermissionError as error:
         _tell({"error": f"capturing on {question['interface']} needs the capability CAP_NET_RAW (or root): {error}"})
         return 1
     except (OSError, BusError) as error:
-        _tell({"error": str(error)})
+        _tell({"error": getattr(error, "strerror", None) or str(error)})
         return 1
     _tell({"frames": frames, "lost": lost})
     return 0
@@ -189,11 +200,8 @@ def _prepare(port: socket.socket, interface: str) -> None:
 
 
 def _write_waiting(port: socket.socket, writer: PcapngFile) -> int:
-    """Write the frames that wait, at most for a while; return how many there were."""
-    if not select.select([port], [], [], _POLL_S)[0]:
-        return 0
-    count = 0
-    while True:
+    """Write the frames that wait, so many at most; return how many there were."""
+    for count in range(_FRAMES_AT_ONCE):
         try:
             frame, extras, _, address = port.recvmsg(_LARGEST_FRAME, socket.CMSG_SPACE(_TIME.size))
         except BlockingIOError:
@@ -204,7 +212,7 @@ def _write_waiting(port: socket.socket, writer: PcapngFile) -> int:
                 seconds, part = _TIME.unpack(data)
                 time_ns = seconds * 1_000_000_000 + part
         writer.write(frame, time_ns, address[2] == socket.PACKET_OUTGOING)
-        count += 1
+    return _FRAMES_AT_ONCE
 
 
 def _tell(answer: dict[str, object]) -> None:

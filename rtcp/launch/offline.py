@@ -58,6 +58,9 @@ def ignore(done: float) -> None:
 class OfflineBus:
     """A bus that is opened for each question and closed again; methods as those of `rtcp.api.Robot`.
 
+    `slave` is a position from 1, or a name of the arm's file: the slave then is found by its station alias, or by its
+    place in the file, and has to be the device that the file says.
+
     Each raises RtcpError where the segment or the bus cannot be opened or does not answer, with a slave's abort code in
     words, and ConfigError where the configuration of the virtual segment has mistakes.
 
@@ -69,54 +72,73 @@ class OfflineBus:
     def __init__(self, bus: str, config: Path | None) -> None:
         self._bus = bus
         self._config = config
+        self.position = 0
+        """Position of the slave that answered last."""
+        self.label = ""
+        """That slave as messages name it: position, device, serial number."""
 
     def scan(self) -> list[dict[str, Any]]:
         """Return what each slave reports of itself, as `rtcp.fieldbus.bus.SlaveInfo` has it, bytes as hex."""
         return list(self._ask("scan")["slaves"])
 
-    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
-        """Return the object's bytes as they came over the wire; `slave` counts from 1."""
+    def sdo_read(self, slave: int | str, index: int, subindex: int) -> bytes:
+        """Return the object's bytes as they came over the wire."""
         return bytes.fromhex(self._ask("sdo_read", slave=slave, index=index, subindex=subindex)["hex"])
 
-    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
-        """Write the object; `slave` counts from 1."""
+    def sdo_write(self, slave: int | str, index: int, subindex: int, data: bytes) -> None:
+        """Write the object."""
         self._ask("sdo_write", slave=slave, index=index, subindex=subindex, hex=data.hex())
 
     def object_lengths(self, slave: int, objects: Sequence[tuple[int, int]]) -> list[int | None]:
         """Return the bytes that objects, by index and subindex, have; -1: there is none; None: it cannot be read."""
         return list(self._ask("object_lengths", slave=slave, objects=[list(one) for one in objects])["lengths"])
 
-    def describe(self, slave: int, progress: Progress = ignore) -> dict[str, Any]:
+    def describe(self, slave: int | str, progress: Progress = ignore) -> dict[str, Any]:
         """Return the description of a slave: the fields of `rtcp.esi.model.Device`, bytes as hex."""
         return dict(self._ask("describe", progress, slave=slave)["device"])
 
-    def foe_read(self, slave: int, name: str, password: int, boot: bool, progress: Progress = ignore) -> bytes:
+    def foe_read(self, slave: int | str, name: str, password: int, boot: bool, progress: Progress = ignore) -> bytes:
         """Return a file of a slave; `progress` receives bytes."""
         answer = self._ask("foe_read", progress, slave=slave, name=name, password=password, boot=boot)
         return bytes.fromhex(answer["hex"])
 
     def foe_write(
-        self, slave: int, name: str, data: bytes, password: int, boot: bool, progress: Progress = ignore
+        self, slave: int | str, name: str, data: bytes, password: int, boot: bool, progress: Progress = ignore
     ) -> None:  # fmt: skip
         """Write a file of a slave; `progress` receives bytes."""
         self._ask("foe_write", progress, slave=slave, name=name, hex=data.hex(), password=password, boot=boot)
 
-    def eeprom_read(self, slave: int, size: int = 0, progress: Progress = ignore) -> bytes:
-        """Return the first `size` bytes of a slave's EEPROM; 0: all of it."""
+    def eeprom_read(self, slave: int | str, size: int = 0, progress: Progress = ignore) -> bytes:
+        """Return the first `size` bytes of a slave's EEPROM; 0: as many as it says it has."""
         return bytes.fromhex(self._ask("eeprom_read", progress, slave=slave, size=size)["hex"])
 
-    def eeprom_write(self, slave: int, first: int, image: bytes, progress: Progress = ignore) -> int:
-        """Write into the EEPROM of a slave from word `first` on; return how many words differed."""
-        return int(self._ask("eeprom_write", progress, slave=slave, first=first, hex=image.hex())["written"])
+    def eeprom_write(self, slave: int | str, before: bytes, image: bytes, progress: Progress = ignore) -> int:
+        """Write into the EEPROM of a slave from word 0 on; return how many words differed.
 
-    def state(self, slave: int, state: str) -> str:
+        Args:
+            slave: the slave.
+            before: with what its EEPROM begins, as it was read; nothing is written where it begins otherwise.
+            image: the image.
+            progress: receives how much is done, 0 to 1.
+        """
+        question = {"slave": slave, "before": before.hex(), "hex": image.hex()}
+        return int(self._ask("eeprom_write", progress, **question)["written"])
+
+    def eeprom_beginnings(self, slave: int | str) -> list[bytes]:
+        """Return the first 16 bytes of the EEPROM of every slave, in the order of the cable; `slave` is found, too."""
+        return [bytes.fromhex(one) for one in self._ask("eeprom_beginnings", slave=slave)["beginnings"]]
+
+    def state(self, slave: int | str, state: str) -> str:
         """Bring a slave to an AL state through those before it and leave it there; return its state in words."""
         return str(self._ask("state", slave=slave, state=state)["state"])
 
     def _ask(
         self, do: str, progress: Progress = ignore, **arguments: int | str | bool | list[list[int]]
     ) -> dict[str, Any]:
-        return _ask(self._bus, self._config, {"do": do, **arguments}, progress)
+        config = None if self._config is None else str(self._config)
+        answered = _ask(self._bus, self._config, {"do": do, "config": config, **arguments}, progress)
+        self.position, self.label = answered.get("position", 0), answered.get("label", "")
+        return answered
 
 
 def _ask(bus: str, config: Path | None, question: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
@@ -228,33 +250,36 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
     """Open the bus, ask, close it.
 
     Args:
-        question: `interface`, `namespace_pid` (None: the caller's namespaces), `do` and its arguments.
+        question: `interface`, `namespace_pid` (None: the caller's namespaces), `do` and its arguments; `config`, the
+            arm's file, where `slave` is a name in it.
 
     Returns:
-        `slaves`, `hex` or whatever was asked for; or `error`, a sentence, and its `kind`.
+        `slaves`, `hex` or whatever was asked for, with `position` and `label` of the slave; or `error`, a sentence, and
+        its `kind`.
 
     Raises:
         BusError: as the bus raises it.
     """
     from rtcp.fieldbus.soem import SoemBus  # here: the command itself does without SOEM
 
+    slave = question.get("slave")
+    # Before the namespace is joined, in which this user is somebody else.
+    named = configuration(Path(question["config"]) if question["config"] else None) if isinstance(slave, str) else None
     bus = SoemBus(question["interface"], namespace_pid=question["namespace_pid"])
     bus.open()
     try:
         do = question["do"]
         # What concerns the EEPROM or a state needs no slave in PRE-OP, which a wrong EEPROM may keep it from.
-        if do in ("eeprom_read", "eeprom_write", "state"):
-            count = bus.discover()
-        else:
-            slaves = bus.scan()
-            count = len(slaves)
-            if do == "scan":
-                return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(slave)) for slave in slaves]}
-        position = question["slave"]
-        if not 1 <= position <= count:
-            missing = f"no slave at position {position}: the bus {question['interface']} has {count}"
+        found = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
+        if do == "scan":
+            return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(one)) for one in found]}
+        position = int(question["slave"]) if named is None else bus.position_of(str(slave), named.slaves, found)
+        if not 1 <= position <= len(found):
+            missing = f"no slave at position {position}: the bus {question['interface']} has {len(found)}"
             return {"error": missing, "kind": "invalid"}
-        return _ANSWERS[do](bus, position, question)
+        device = found[position - 1]
+        label = f"slave {position} ({device.name}, serial {device.serial})"
+        return {"position": position, "label": label, **_ANSWERS[do](bus, position, question)}
     finally:
         bus.close()
 
@@ -313,14 +338,23 @@ def _eeprom_read(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[
 
 
 def _eeprom_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
-    image = bytes.fromhex(question["hex"])
-    return {"written": bus.write_eeprom(position, image, _tell_part, question["first"])}
+    image, before = bytes.fromhex(question["hex"]), bytes.fromhex(question["before"])
+    if bus.read_eeprom(position, ignore, len(before)) != before:
+        changed = f"the EEPROM of slave {position} is not the one that was read; nothing was written: begin again"
+        return {"error": changed, "kind": "refused"}
+    return {"written": bus.write_eeprom(position, image, _tell_part)}
+
+
+def _eeprom_beginnings(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
+    return {"beginnings": [bus.read_eeprom(one.position, ignore, 16).hex() for one in bus.read_states()]}
 
 
 def _state(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
-    from rtcp.fieldbus.al_state import way_to
+    from rtcp.fieldbus.al_state import AlState
 
-    for state in way_to(question["state"]):
+    requested = AlState[question["state"]]
+    between = [AlState.PREOP] if requested is AlState.SAFEOP else []
+    for state in dict.fromkeys((AlState.INIT, *between, requested)):
         bus.request_state(state, [position])
         if refused := bus.wait_for_state(state, STATE_TIMEOUT_S, [position]):
             return {"error": "\n".join(refused), "kind": "refused"}
@@ -338,6 +372,7 @@ _ANSWERS: dict[str, Callable[[SoemBus, int, dict[str, Any]], dict[str, Any]]] = 
     "foe_write": _foe_write,
     "eeprom_read": _eeprom_read,
     "eeprom_write": _eeprom_write,
+    "eeprom_beginnings": _eeprom_beginnings,
     "state": _state,
 }
 

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.cli.bus import STRUCTS, _branches, decode, encode, parse_object
+from rtcp.cli.bus import _branches, decode, encode, parse_object
 from rtcp.cli.output import CommandError
+from rtcp.config.model import BITS
 
 
 def test_a_scan_shows_identity_state_pdo_map_clock_and_delay(platform: Any, rtcp: Callable[..., Any]) -> None:
@@ -72,7 +73,8 @@ def test_a_read_without_a_type_shows_hex_and_what_it_may_mean(platform: Any, rtc
     [
         ("-5", "int8", b"\xfb"), ("0x10", "uint16", b"\x10\x00"), ("-1", "INT32", b"\xff\xff\xff\xff"),
         ("-0.5", "float32", b"\x00\x00\x00\xbf"), ("-2e0", "float64", b"\0\0\0\0\0\0\0\xc0"), ("true", "bool", b"\x01"),
-        ("arm", "string", b"arm"), ("01ff", "bytes", b"\x01\xff"), ("18446744073709551615", "uint64", b"\xff" * 8),
+        ("arm", "string", b"arm"), ("01ff", "bytes", b"\x01\xff"), ("-2", "int24", b"\xfe\xff\xff"),
+        ("18446744073709551615", "uint64", b"\xff" * 8),
     ],
 )  # fmt: skip
 def test_a_write_carries_the_bytes_of_its_type(
@@ -89,7 +91,7 @@ def test_a_write_carries_the_bytes_of_its_type(
         ("128", "int8", "128 does not fit int8: -128 to 127"), ("-1", "uint16", "-1 does not fit uint16: 0 to 65535"),
         ("1.5", "int16", "'1.5' is not a whole number"), ("-nan", "float32", "not finite"), ("1e39", "float32", "fit"),
         ("0xzz", "uint8", "whole number"), ("2", "bool", "does not fit bool"), ("0x0g", "bytes", "hex"),
-        ("1", "uint24", "uint24"),
+        ("1", "uint12", "uint12"), ("0x1000000", "uint24", "0 to 16777215"), ("-1", "uint40", "0 to 1099511627775"),
     ],
 )  # fmt: skip
 def test_a_value_that_does_not_fit_its_type_is_refused(
@@ -130,9 +132,9 @@ def test_an_object_is_written_in_hex_with_its_subindex(text: str, found: tuple[i
     assert parse_object(text) == found
 
 
-@given(type_name=st.sampled_from([name for name in STRUCTS if "int" in name]), number=st.integers(-(1 << 64), 1 << 65))
+@given(type_name=st.sampled_from([name for name in BITS if "int" in name]), number=st.integers(-(1 << 64), 1 << 65))
 def test_an_integer_comes_back_as_it_was_or_is_refused(type_name: str, number: int) -> None:
-    size, signed = STRUCTS[type_name].size, type_name.startswith("int")
+    size, signed = BITS[type_name] // 8, type_name.startswith("int")
     fits = -(1 << 8 * size - 1) <= number < 1 << 8 * size - 1 if signed else 0 <= number < 1 << 8 * size
     if fits:
         assert decode(encode(str(number), type_name), type_name) == str(number)

@@ -18,6 +18,7 @@ from rtcp.config.loader import load_device
 from rtcp.config.model import PdoEntry
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
+from rtcp.launch import offline
 from tests.drive_esi import write_esi
 from tests.fieldbus.terminals import write_segment
 
@@ -70,6 +71,7 @@ def test_modules_are_put_into_slots_and_a_wrong_one_is_named_with_those_allowed(
         ((), "give one of --esi, --sii, --from-bus"),
         (("--esi", str(DRIVE), "--sii", "x.bin"), "found --esi and --sii"),
         (("--from-bus", "virtual"), "--from-bus and --slave belong together"),
+        (("--from-bus", "virtual", "--slave", "-1"), "--slave -1 is not allowed: a position on the cable, from 1"),
         (("--esi", str(TERMINALS)), "3 devices fit without a choice"),
         (("--esi", str(TERMINALS), "--product", "0x99"), "no devices fit product 0x00000099"),
         (("--esi", str(TERMINALS), "--product", "x"), "'x' is not a whole number (--product)"),
@@ -179,3 +181,39 @@ def test_a_device_file_is_checked_alone(rtcp: Callable[..., Any], tmp_path: Path
     broken = tmp_path / "broken.yaml"
     broken.write_text(sound.read_text().replace("name: statusword", "name: statusw0rd"))
     assert rtcp("device", "check", str(broken)).code == 2
+
+
+@pytest.mark.alone
+def test_a_slave_that_is_there_becomes_a_file_and_each_difference_from_it_is_named(
+    rtcp: Callable[..., Any], arm: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(offline, "SEGMENT_TIMEOUT_S", 120.0)  # for a host that is busy
+    segment = arm.parent / "segment.yaml"
+    segment.write_text("slaves:\n- model: diewu-io\n- model: cubemars-orh70\n")
+    out, config = arm.parent / "devices" / "drive.yaml", ("--config", str(arm))
+    done = rtcp("device", "new", "--from-bus", "virtual", "--slave", "2", "--out", str(out), *config)
+    assert done.code == 0, done.trouble
+    shipped, made = load_device(arm.parent / "devices" / "cubemars-orh.yaml"), load_device(out)
+    assert (made.kind, made.vendor_id, made.product_id, made.coe) == (
+        "cia402",
+        shipped.vendor_id,
+        shipped.product_id,
+        True,
+    )
+    for direction in ("outputs", "inputs"):
+        assert [(one.index, one.sub_index, one.length) for one in getattr(made, direction)] == [
+            (one.index, one.sub_index, one.length) for one in getattr(shipped, direction)
+        ]
+    same = rtcp("device", "check", str(out), "--bus", "virtual", *config)
+    assert (same.code, "slave 2 (Cubemars ORH70): as the file says" in same.out) == (0, True), same.out + same.trouble
+    text = out.read_text()
+    other = arm.parent / "devices" / "other.yaml"
+    (line,) = [line for line in text.splitlines() if "0x60ff" in line.lower()]
+    other.write_text(text.replace(line + "\n", ""))
+    differs = rtcp("device", "check", str(other), "--bus", "virtual", *config)
+    assert (differs.code, differs.trouble) == (5, "rtcp: 1 differences")
+    assert "rpdo: the file has 0x6040:0/16, 0x607A:0/32, 0x6071:0/32, 0x6060:0/8" in " ".join(differs.out.split())
+    assert "the slave has 0x6040:0/16, 0x607A:0/32, 0x60FF:0/32" in " ".join(differs.out.split())
+    segment.write_text("slaves:\n- model: diewu-io\n")
+    absent = rtcp("device", "check", str(out), "--bus", "virtual", *config)
+    assert (absent.code, "virtual: no slave has vendor" in absent.trouble) == (5, True)

@@ -6,7 +6,9 @@ import json
 import os
 import socket
 import stat
+import struct
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from rtcp.ipc.runtime_directory import blackboard_file, segment_control
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import CUBEMARS, FULL_CIA402, PERIOD_US, SLAVES, Platform
 from tests.e2e.wire import COUNTS_PER_RAD, outputs
+from tests.fieldbus.test_capture import OUTBOUND, PACKET, blocks
 
 pytestmark = pytest.mark.alone
 
@@ -70,6 +73,19 @@ def test_the_mapping_that_was_written_is_read_back_over_sdo(shared: Platform) ->
     assert entries("2", "0x1C12", "uint16", 1) == [0x1600]
     assert entries("2", "0x1600", "uint32", 5) == [0x60400010, 0x607A0020, 0x60FF0020, 0x60710020, 0x60600008]
     assert entries("drive6", "0x1A00", "uint32", 5) == [0x60410010, 0x60640020, 0x606C0020, 0x60770020, 0x60610008]
+
+
+def test_a_capture_beside_the_cycle_holds_its_frames_and_does_not_disturb_it(shared: Platform, tmp_path: Path) -> None:
+    out, before = tmp_path / "cycle.pcapng", shared.status()
+    reported = shared.rtcp("capture", "--out", str(out), "--seconds", "2").stdout
+    after = shared.status()
+    assert (after["state"], "lost" in reported) == (before["state"], False)
+    packets = [content for kind, content in blocks(out) if kind == PACKET]
+    assert f"{len(packets)} frames written to {out}" in reported
+    # Process data: LRD, LWR or LRW, ETG.1000.4, table 14; behind the header of the packet.
+    cyclic = [content for content in packets if content[20 + 16] in (10, 11, 12)]
+    sent = sum(struct.unpack_from("<I", content, len(content) - 8)[0] == OUTBOUND for content in cyclic)
+    assert 200 < sent <= after["cycles"] - before["cycles"]
 
 
 def test_an_sdo_that_the_slave_refuses_is_a_sentence(shared: Platform) -> None:

@@ -5,6 +5,7 @@ Takes a scenario and its arguments as JSON in its first argument, writes what ca
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dataclasses
 import fcntl
@@ -26,6 +27,7 @@ from rtcp.config.model import Pdo, PdoEntry, SlaveConfig, StartupSdo
 from rtcp.devices import Cia402Drive, TargetState
 from rtcp.fieldbus import AlState, BusError, SdoAborted
 from rtcp.fieldbus.bus import ProcessData, station_of
+from rtcp.fieldbus.eeprom import is_sound, with_alias
 from rtcp.fieldbus.interface import enter
 from rtcp.fieldbus.pdo import layout
 from rtcp.fieldbus.registers import RegisterPort
@@ -395,7 +397,8 @@ def files(bus: SoemBus, count: int) -> Any:
         if foe.read("settings", 0, lambda count: None) != data:
             refused.append(f"{size} bytes came back differently")
     for attempt in (lambda: foe.read("nothing", 0, done.append), lambda: foe.write("firmware", b"x", 0, done.append),
-                    lambda: bus.foe(2).read("settings", 0, done.append), lambda: bus.boot(2)):  # fmt: skip
+                    lambda: bus.foe(2).read("settings", 0, done.append), lambda: bus.boot(2),
+                    lambda: foe.read("n" * 300, 0, done.append)):  # fmt: skip
         try:
             attempt()
         except BusError as error:
@@ -409,15 +412,31 @@ def files(bus: SoemBus, count: int) -> Any:
 
 
 def eeprom(bus: SoemBus, count: int) -> Any:
-    """Read an EEPROM, write it with one word changed, and the alias."""
+    """Read an EEPROM, write it with one word changed, and break writes off after each word."""
     bus.discover()
     parts: list[float] = []
     before = bus.read_eeprom(1, parts.append)
     changed = before[:0x1C] + b"\x07\x00" + before[0x1E:]
     written = [bus.write_eeprom(1, changed, parts.append) for _ in range(2)]
     after = bus.read_eeprom(1, parts.append)
+    # Words 0x20 and 0x3F, and the alias with its checksum.
+    other = bytearray(with_alias(before, 7))
+    other[0x40:0x42] = other[0x7E:0x80] = b"\x55\xaa"
+    sound = []
+    for last in (0.6, 0.7, 0.8, 1.0):
+
+        def breaks_off(part: float, last: float = last) -> None:
+            if part > last:
+                raise TimeoutError
+
+        bus.write_eeprom(1, before, parts.append)
+        with contextlib.suppress(TimeoutError):
+            bus.write_eeprom(1, bytes(other), breaks_off)
+        sound.append(is_sound(bus.read_eeprom(1, parts.append, 16)))
+    whole = bus.read_eeprom(1, parts.append) == other
     bus.release()
-    return {"before": before.hex(), "written": written, "same": after == changed, "parts": [parts[0], parts[-1]]}
+    return {"before": before.hex(), "written": written, "same": after == changed, "parts": [parts[0], parts[-1]],
+            "sound": sound, "whole": whole}  # fmt: skip
 
 
 def emergency(bus: SoemBus, count: int) -> Any:

@@ -88,9 +88,12 @@ def test_files_are_written_and_read_over_foe_and_firmware_in_boot(start_segment)
         "(go to BOOT first)",
         "slave 2 (Terminal 14): read of file 'settings' is not possible, its EEPROM lists no FoE mailbox",
         "slave 2 (Terminal 14): its EEPROM lists no mailboxes for BOOT (words 0x14 to 0x17)",
+        f"slave 1 (Terminal 40): read of file '{'n' * 300}' is not possible, the name has 300 bytes, its mailbox takes "
+        "116: give a shorter name",
     ]
     assert (result["in_boot"], result["kept"]) == ("BOOT", True)
-    assert result["done"][-1] == 2000
+    # It is busy three times before it takes the last packet, and is heard of each time.
+    assert result["done"][-5:] == [1952] * 4 + [2000]
 
 
 def test_an_eeprom_is_read_and_written_word_by_word_and_only_where_it_differs(start_segment):
@@ -125,3 +128,8 @@ def test_a_terminal_whose_eeprom_maps_other_objects_than_its_file_is_refused(sta
 def test_an_answer_that_got_lost_is_repeated_by_the_slave_and_not_asked_for_again(start_segment):
     result = start_segment(("analog.xml",)).master("repeated")["result"]
     assert result == {"value": "Analog terminal", "requests": 1, "answers": 2, "same": True}
+
+
+def test_an_eeprom_that_is_half_written_has_a_wrong_checksum_whenever_it_is_broken_off(start_segment):
+    result = start_segment(("files",)).master("eeprom")["result"]
+    assert (result["sound"], result["whole"]) == ([False, False, False, True], True)

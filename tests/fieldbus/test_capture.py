@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import select
 import struct
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,7 +36,7 @@ def blocks(file: Path) -> Iterator[tuple[int, bytes]]:
 def test_every_frame_of_a_scan_is_in_the_file_with_its_time_and_direction(segment, tmp_path):
     out = tmp_path / "scan.pcapng"
     began = time.time_ns()
-    with Capture("ecat0", segment.pid, out) as capture:
+    with out.open("xb") as file, Capture("ecat0", segment.pid, file) as capture:
         assert len(segment.master("scan")["result"]) == 3
         counted = capture.wait(0.5)
     (first, section), (second, interface), *packets = blocks(out)
@@ -54,5 +58,32 @@ def test_every_frame_of_a_scan_is_in_the_file_with_its_time_and_direction(segmen
 
 
 def test_an_interface_that_does_not_exist_is_told(tmp_path):
-    with pytest.raises(RtcpError, match="there is no network interface rtcp-none0"):
-        Capture("rtcp-none0", None, tmp_path / "x.pcapng")
+    with (
+        (tmp_path / "x.pcapng").open("xb") as file,
+        pytest.raises(RtcpError, match="there is no network interface rtcp-none0"),
+    ):
+        Capture("rtcp-none0", None, file)
+
+
+def test_a_disk_that_is_full_ends_the_capture_in_a_sentence(segment):
+    with Path("/dev/full").open("wb") as file, Capture("ecat0", segment.pid, file) as capture:
+        segment.master("scan")
+        with pytest.raises(RtcpError, match="capturing into /dev/full: No space left on device"):
+            capture.wait(None)
+
+
+def test_a_capture_ends_with_the_command_that_is_killed(segment, tmp_path):
+    program = (
+        "import sys, time; from rtcp.launch.capturing import Capture\n"
+        "capture = Capture('ecat0', int(sys.argv[1]), open(sys.argv[2], 'xb'))\n"
+        "print(capture._child.pid, flush=True); time.sleep(600)"
+    )
+    out = tmp_path / "x.pcapng"
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(segment.pid), str(out)], stdout=subprocess.PIPE, text=True
+    ) as command:
+        child = os.pidfd_open(int(command.stdout.readline()))
+        command.kill()
+    select.select([child], [], [])
+    os.close(child)
+    assert [kind for kind, _ in blocks(out)] == [SECTION, INTERFACE]
