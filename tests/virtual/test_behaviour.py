@@ -20,10 +20,11 @@ from rtcp.virtual.behaviour import EXIT_HANGING, FileBusy, FileRefused
 from rtcp.virtual.coe import read, write
 from rtcp.virtual.mailbox import Mailbox
 from rtcp.virtual.objects import SdoAbort
-from rtcp.virtual.protocol import MailboxType
+from rtcp.virtual.protocol import ERROR_FLAG, MailboxType
 from rtcp.virtual.segment import make_segment
 from tests.virtual import behaviours
 from tests.virtual.conftest import ROOT, described
+from tests.virtual.line import INIT, MS, Line, TinyDevice
 from tests.virtual.test_described import DRIVE, OP, OUTPUTS, TWO, device
 
 PRE_OP, BOOT = 2, 3
@@ -162,9 +163,9 @@ class Mute(Exception):
 
 RUBBISH: list[Callable[[], object]] = [
     raising(FileRefused, -1), raising(FileRefused, 1 << 40), raising(FileRefused, 0x8001, 5),
-    raising(FileBusy, "half", "all"), raising(FileBusy, 0.5, 1.0), raising(FileBusy, 1, 1 << 16),
+    raising(FileBusy, "half", 2), raising(FileBusy, 0.5, 1.0), raising(FileBusy, 1, 1 << 16),
     raising(SdoAbort, -1), raising(SdoAbort, 1 << 40), raising(SdoAbort, "no"), raising(Mute),
-    lambda: "a text", lambda: 10**13, lambda: [1, 2, 300], lambda: float("inf"), lambda: float("nan"),
+    lambda: "a text", lambda: 10**13, lambda: [1, 2], lambda: float("inf"), lambda: float("nan"),
 ]  # fmt: skip
 
 
@@ -178,6 +179,20 @@ def test_rubbish_of_a_hook_is_answered_as_its_failure_and_told_with_file_and_lin
     assert client.read("any") == 0x800B
     assert abort_of(read, client.device.objects, 0x6064, 0, False, PRE_OP) == 0x08000000
     assert [f" failed at {behaviours.__file__}:" in sentence for sentence in said] == [True, True]
+
+
+@pytest.mark.parametrize("taken", ["roles", "step"])
+def test_a_slave_whose_own_code_fails_outside_of_hooks_says_so_and_the_others_go_on(taken: str) -> None:
+    broken = device(DRIVE, behaviours.Talkative)
+    line = Line([broken, TinyDevice()])
+    said: list[str] = []
+    broken.runner.report = said.append
+    setattr(broken, taken, None)
+    line.address()
+    line.request(0, PRE_OP)
+    line.pass_time(5 * MS)
+    assert [": the slave failed at " in sentence for sentence in said] == [True]
+    assert line.request(1, BOOT) == (INIT | ERROR_FLAG, 0x0013)
 
 
 # -- files over EtherCAT --------------------------------------------------------------------------------------------
