@@ -144,7 +144,9 @@ def load_class(entry: EntryPoint, base: type[T]) -> type[T]:
     """
     try:
         found = entry.load()
-    except Exception as error:  # the module of another package: whatever it raises
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # the module of another package: whatever it raises, sys.exit() too
         raise PluginError(entry, f"cannot be loaded: {type(error).__name__}: {error}") from error
     if not (isinstance(found, type) and issubclass(found, base)):
         raise PluginError(entry, f"is not a subclass of {base.__module__}.{base.__name__}")

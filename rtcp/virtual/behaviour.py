@@ -15,9 +15,12 @@ A behaviour is named in the segment's file, as `behaviour: cia402` or `behaviour
 
 from __future__ import annotations
 
+import faulthandler
 import inspect
+import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -25,15 +28,18 @@ from contextlib import contextmanager
 from enum import IntEnum
 from importlib.metadata import EntryPoint
 from types import FrameType, MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
+from rtcp.config.document import shown
 from rtcp.config.find import load_class
 from rtcp.config.model import PluginError
 from rtcp.virtual.device import DeviceModel, Emergency, Option, OptionError
-from rtcp.virtual.objects import Entry, SdoAbort, Value, bounds
+from rtcp.virtual.objects import LARGEST, Entry, SdoAbort, Value, bounds, check_whole
 from rtcp.virtual.protocol import AlState
 
 __all__ = ["Behaviour", "FileBusy", "FileRefused", "FoeError", "Option", "SdoAbort"]
+
+T = TypeVar("T")
 
 BUILT_IN = {
     "cia402": "rtcp.virtual.models.cia402_drive:Cia402Drive",
@@ -66,15 +72,20 @@ class FileRefused(Exception):
     """A file that a behaviour refuses, with an error code and a text for the master."""
 
     def __init__(self, code: int = FoeError.ACCESS_DENIED, text: str = "") -> None:
+        check_whole("code of FileRefused", code, 0xFFFFFFFF)
+        if not isinstance(text, str):
+            raise ValueError(f"text of FileRefused: found {shown(text)}, allowed is a text")
         super().__init__(f"0x{code:04X} {text}")
         self.code = code
         self.text = text
 
 
 class FileBusy(Exception):
-    """A behaviour is not ready: the master asks again; `done` of `entire` is shown to it."""
+    """A behaviour is not ready: the master asks again; `done` of `entire`, 0 to 65535, is shown to it."""
 
     def __init__(self, done: int = 0, entire: int = 0) -> None:
+        check_whole("done of FileBusy", done, 0xFFFF)
+        check_whole("entire of FileBusy", entire, 0xFFFF)
         super().__init__(f"{done} of {entire}")
         self.done = done
         self.entire = entire
@@ -155,7 +166,7 @@ class Behaviour:
 
     def fail(self, code: int = UNSPECIFIED_ERROR) -> None:
         """Leave OP for SAFE-OP with an AL status code."""
-        self.device.failure = code
+        self.device.failure = code & 0xFFFF
 
 
 def set_value(entry: Entry, value: Value) -> None:
@@ -168,53 +179,98 @@ def set_value(entry: Entry, value: Value) -> None:
     if entry.is_bytes:
         if not isinstance(value, bytes) or len(value) > (entry.bit_length + 7) // 8:
             raise ValueError(f"{where} takes up to {(entry.bit_length + 7) // 8} bytes, not {value!r}")
-    elif not isinstance(value, int | float) or (not entry.is_float and int(value) != value):
+    elif not isinstance(value, int | float) or (not entry.is_float and value % 1):  # inf % 1 is NaN: true
         raise ValueError(f"{where} takes {'a number' if entry.is_float else 'a whole number'}, not {value!r}")
-    elif not entry.is_float:
-        low, high = bounds(entry)
+    else:
+        most = LARGEST.get(entry.data_type)
+        low, high = bounds(entry) if most is None else (-most, most)
         if not low <= value <= high:
             raise ValueError(f"{where} takes {low} to {high}, not {value}")
-        value = int(value)
+        value = value if entry.is_float else int(value)
     entry.value = value
 
 
 class HookHangs(BaseException):
     """Raised inside a hook that takes too long; no `except Exception` of the hook catches it."""
 
+    def __init__(self, said: str, where: str) -> None:
+        super().__init__(f"{said}, at {where}")
+        self.said = said
+
+
+class Patience(NamedTuple):
+    """How long a behaviour's code may run."""
+
+    cpu_ns: int
+    """CPU time: a process that waits for the CPU is no fault of the code."""
+    ns: int
+    """Time, for code that waits for something else."""
+
+
+HOOK = Patience(20_000_000, 200_000_000)
+"""Of a hook: it stops all other slaves while it runs."""
+MAKING = Patience(5_000_000_000, 9_000_000_000)
+"""Of a behaviour's module, its `__init__` and its first `on_start`, before the segment runs."""
+EXIT_HANGING = 5
+"""Exit code of a process that a hook keeps, as that of a command that failed."""
+
 
 class HookWatch:
-    """Ends hooks that take too long, by a signal: a hook stops all other slaves while it runs."""
+    """Ends hooks that take too long, by a signal, and where they do not let themselves be ended, the process."""
 
     PERIOD_S = 0.01
-    LONGEST_CPU_NS = 20_000_000
-    """CPU time of a hook; a process that waits for the CPU is no fault of the hook."""
-    LONGEST_NS = 200_000_000
-    """Time of a hook that waits for something else."""
+    MOST_RAISED = 20
+    """How many times `HookHangs` is raised in one call, once a period, before the process ends."""
+    LONGEST_IN_C_S = 3.0
+    """CPU time of one call into C; the process then ends, for Python sees no signal before the call returns."""
 
     def __init__(self) -> None:
-        self.active = False
+        self.patience: Patience | None = None
+        """That with what runs now; None: no code of a behaviour's."""
         self.call = 0
         self._seen = -1
-        self._since = self._since_cpu = 0
+        self._since = self._since_cpu = self._raised = 0
 
-    def start(self) -> None:
-        """Watch from now on, in the main thread of this process."""
-        signal.signal(signal.SIGALRM, self._look)
-        signal.setitimer(signal.ITIMER_REAL, self.PERIOD_S, self.PERIOD_S)
+    @contextmanager
+    def started(self) -> Iterator[None]:
+        """Watch in this block; outside of the main thread, which alone gets signals, do nothing."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        handler = signal.signal(signal.SIGALRM, self._look)
+        faulthandler.register(signal.SIGPROF, 2, all_threads=False, chain=True)
+        timer = signal.setitimer(signal.ITIMER_REAL, self.PERIOD_S, self.PERIOD_S)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, *timer)
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
+            signal.signal(signal.SIGALRM, handler)
+            faulthandler.unregister(signal.SIGPROF)
 
     def _look(self, number: int, frame: FrameType | None) -> None:
-        if not self.active:
+        # What C does not return from in this time ends the process, with the lines that called it.
+        signal.setitimer(signal.ITIMER_PROF, self.LONGEST_IN_C_S)
+        patience = self.patience
+        if patience is None:
             return
         now, cpu = time.monotonic_ns(), time.thread_time_ns()
         if self._seen != self.call:
-            self._seen, self._since, self._since_cpu = self.call, now, cpu
-        elif cpu - self._since_cpu >= self.LONGEST_CPU_NS or now - self._since >= self.LONGEST_NS:
-            self.active = False
-            raise HookHangs(f"it has not returned for {(now - self._since) / 1e6:.0f} ms")
+            self._seen, self._since, self._since_cpu, self._raised = self.call, now, cpu, 0
+        elif cpu - self._since_cpu >= patience.cpu_ns or now - self._since >= patience.ns:
+            said = f"it has not returned for {(now - self._since) / 1e6:.0f} ms"
+            where = "?" if frame is None else f"{frame.f_code.co_filename}:{frame.f_lineno}"
+            self._raised += 1
+            if self._raised > self.MOST_RAISED:
+                caught = "it catches what is raised to end it, as a bare `except:` does"
+                # Not by `print`, which the hook may be in, and past all handlers of exceptions: it has its own.
+                os.write(2, f"a behaviour cannot be ended at {where}: {said}, {caught}; this process ends\n".encode())
+                os._exit(EXIT_HANGING)
+            raise HookHangs(said, where)
 
 
 WATCH = HookWatch()
-"""Of this process; it watches once it was started."""
+"""Of this process; it watches while it is started."""
 
 
 class HookFailed(Exception):
@@ -244,9 +300,17 @@ class Runner:
         if kind is None:
             kind = Behaviour
         try:
+            WATCH.call += 1
+            WATCH.patience = MAKING
             self.behaviour = kind(device)
-        except Exception as error:  # whatever a behaviour raises
-            raise OptionError((("behaviour",), f"{_place_of(error, kind)}: {_said(error)}")) from error
+            self.keeps_outputs = bool(self.behaviour.keeps_outputs)
+            """Whether outputs keep their values when they become invalid."""
+            WATCH.patience = None
+        except BaseException as error:  # whatever a behaviour raises, and HookHangs
+            WATCH.patience = None
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            raise OptionError((("behaviour",), f"{_place_of(error, kind, '__init__')}: {_said(error)}")) from error
         if _overrides(kind, "on_outputs"):
             self._steps = self.behaviour.on_outputs
         for found in device.objects:
@@ -255,17 +319,12 @@ class Runner:
                     entry.on_read = self._read
                 if _overrides(kind, "on_sdo_write") and entry.on_write is None:
                     entry.on_write = self._write
-        self.start()
+        self.start(MAKING)
 
-    @property
-    def keeps_outputs(self) -> bool:
-        """Whether outputs keep their values when they become invalid."""
-        return self.behaviour.keeps_outputs
-
-    def start(self) -> None:
+    def start(self, patience: Patience = HOOK) -> None:
         """Power has come on."""
         self._broken = False
-        self._try("on_start", self.behaviour.on_start)
+        self._try("on_start", self.behaviour.on_start, patience=patience)
 
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass."""
@@ -274,12 +333,12 @@ class Runner:
             return
         try:
             WATCH.call += 1
-            WATCH.active = True
+            WATCH.patience = HOOK
             steps(dt)
+            WATCH.patience = None
         except BaseException as error:  # whatever a behaviour raises, and HookHangs
+            WATCH.patience = None
             self.fail("on_outputs", error)
-        finally:
-            WATCH.active = False
 
     def outputs_valid(self, valid: bool) -> None:
         """Outputs count from now on, or do not; a behaviour that failed is tried again."""
@@ -293,53 +352,60 @@ class Runner:
 
     def on_file(self, name: str, data: bytes) -> None:
         """Hand a file over; raises HookFailed, and what `Behaviour.on_file` may raise."""
-        with self._guarded("on_file", (FileBusy, FileRefused)):
-            self.behaviour.on_file(name, data)
+        self._call("on_file", self.behaviour.on_file, name, data, allowed=(FileBusy, FileRefused))
 
     def read_file(self, name: str) -> bytes | None:
         """Return a file, None where there is none; raises as `on_file`."""
-        with self._guarded("read_file", (FileBusy, FileRefused)):
-            return self.behaviour.read_file(name)
+        return self._call("read_file", self._file, name, allowed=(FileBusy, FileRefused))
 
-    def _try(self, hook: str, call: Callable[..., object], *arguments: object) -> None:
+    def _file(self, name: str) -> bytes | None:
+        data: object = self.behaviour.read_file(name)
+        if data is not None and not isinstance(data, bytes | bytearray):
+            raise TypeError(f"read_file returned {type(data).__name__}, allowed is bytes or None")
+        return None if data is None else bytes(data)
+
+    def _try(self, hook: str, call: Callable[..., object], *arguments: object, patience: Patience = HOOK) -> None:
         """Call a hook whose failure takes the slave out of OP."""
         try:
-            with self._guarded(hook):
-                call(*arguments)
+            self._call(hook, call, *arguments, patience=patience)
         except HookFailed:
             self._device.failure = UNSPECIFIED_ERROR
             self._broken = True
 
     def _read(self, entry: Entry) -> None:
         try:
-            with self._guarded("on_sdo_read", (SdoAbort,)):
-                value = self.behaviour.on_sdo_read(entry.index, entry.subindex)
-                if value is not None:
-                    set_value(entry, value)
+            self._call("on_sdo_read", self._update, entry, allowed=(SdoAbort,))
         except HookFailed:
             raise SdoAbort(GENERAL_ERROR) from None
+
+    def _update(self, entry: Entry) -> None:
+        value = self.behaviour.on_sdo_read(entry.index, entry.subindex)
+        if value is not None:
+            set_value(entry, value)
 
     def _write(self, entry: Entry, value: Value) -> None:
         try:
-            with self._guarded("on_sdo_write", (SdoAbort,)):
-                self.behaviour.on_sdo_write(entry.index, entry.subindex, value)
+            arguments = entry.index, entry.subindex, value
+            self._call("on_sdo_write", self.behaviour.on_sdo_write, *arguments, allowed=(SdoAbort,))
         except HookFailed:
             raise SdoAbort(GENERAL_ERROR) from None
 
-    @contextmanager
-    def _guarded(self, hook: str, allowed: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-        """Let a hook raise what is `allowed`; report anything else and raise HookFailed."""
+    def _call(self, hook: str, call: Callable[..., T], *arguments: object, allowed: tuple[type[Exception], ...] = (),
+              patience: Patience = HOOK) -> T:  # fmt: skip
+        """Call a hook, which may raise what is `allowed`; report anything else and raise HookFailed."""
         try:
             WATCH.call += 1
-            WATCH.active = True
-            yield
-        except allowed:
-            raise
+            WATCH.patience = patience
+            result = call(*arguments)
+            WATCH.patience = None
         except BaseException as error:  # whatever a behaviour raises, and HookHangs
+            # First: between the hook and this line nothing is called, so no signal is looked at.
+            WATCH.patience = None
+            if isinstance(error, allowed):
+                raise
             self._tell(hook, error)
             raise HookFailed from None
-        finally:
-            WATCH.active = False
+        return result
 
     def fail(self, hook: str, error: BaseException) -> None:
         """Take the slave out of OP for a failure, and report that."""
@@ -348,12 +414,15 @@ class Runner:
         self._tell(hook, error)
 
     def _tell(self, hook: str, error: BaseException) -> None:
-        sentence = f"{self.place}: {hook} failed at {_place_of(error, type(self.behaviour))}: {_said(error)}"
+        sentence = f"{self.place}: {hook} failed at {_place_of(error, type(self.behaviour), hook)}: {_said(error)}"
         if sentence not in self._told and len(self._told) < _MOST_SENTENCES:
             self._told.add(sentence)
             self.report(sentence)
 
 
+_SUSPENDED = inspect.CO_GENERATOR | inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR
+"""Of functions whose call runs nothing of them."""
+HOOKS = ("on_start", "on_outputs", "on_sdo_read", "on_sdo_write", "on_state", "on_file", "read_file")
 _MOST_SENTENCES = 20
 """Different failures of a behaviour that are reported."""
 
@@ -364,32 +433,62 @@ def _overrides(kind: type[Behaviour], hook: str) -> bool:
 
 def _said(error: BaseException) -> str:
     if isinstance(error, HookHangs):
-        return str(error)
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        return error.said
+    try:
+        text = str(error)
+    except Exception:  # its class is the behaviour's own
+        text = "its text cannot be made"
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-def _place_of(error: BaseException, kind: type) -> str:
-    """Return file and line of an error: the innermost line of the behaviour's own file, else of all."""
+def _place_of(error: BaseException, kind: type, hook: str) -> str:
+    """Return file and line of an error: the innermost of the behaviour's own file, else where the hook begins."""
     try:
         own = inspect.getsourcefile(kind)
     except TypeError:
         own = None
-    frames = traceback.extract_tb(error.__traceback__)
-    places = [f"{frame.filename}:{frame.lineno}" for frame in frames]
-    return next((place for place in reversed(places) if own and place.startswith(f"{own}:")), (places or ["?"])[-1])
+    places = [f"{frame.filename}:{frame.lineno}" for frame in traceback.extract_tb(error.__traceback__)]
+    inner = next((place for place in reversed(places) if own and place.startswith(f"{own}:")), None)
+    return inner or _beginning(kind, hook) or own or (places or ["?"])[-1]
+
+
+def _beginning(kind: type, hook: str) -> str | None:
+    """Return file and line where a hook begins; None: it is no function of Python's."""
+    code = getattr(getattr(kind, hook, None), "__code__", None)
+    return None if code is None else f"{code.co_filename}:{code.co_firstlineno}"
 
 
 def find_behaviour(name: str) -> type[Behaviour]:
     """Return the behaviour of a name of `BUILT_IN`, or of `module:Class`.
 
     Raises:
-        OptionError: there is none, or it cannot be loaded.
+        OptionError: there is none, it cannot be loaded, its options are none, or a hook of it would never run.
     """
     target = BUILT_IN.get(name, name)
     if ":" not in target:
         text = f'found the text "{name}", allowed is one of {", ".join(BUILT_IN)}, or module:Class'
         raise OptionError((("behaviour",), text))
     try:
-        return load_class(EntryPoint(name, target, "behaviour"), Behaviour)
-    except PluginError as error:
+        WATCH.call += 1
+        WATCH.patience = MAKING
+        found = load_class(EntryPoint(name, target, "behaviour"), Behaviour)
+        WATCH.patience = None
+    except (PluginError, HookHangs) as error:
+        WATCH.patience = None
         raise OptionError((("behaviour",), str(error))) from error
+    _check(found)
+    return found
+
+
+def _check(kind: type[Behaviour]) -> None:
+    where, options = f"{kind.__module__}:{kind.__qualname__}", kind.options
+    given = {"": options} if not isinstance(options, Mapping) else options
+    for name, option in given.items():
+        if not isinstance(option, Option):
+            text = f"found {shown(option)}, allowed is Option(default, low, high, meaning)"
+            raise OptionError((("behaviour",), f"options of {where}{name and f', {name}'}: {text} by its name"))
+    for hook in HOOKS:
+        code = getattr(getattr(kind, hook), "__code__", None)
+        if code is not None and code.co_flags & _SUSPENDED:
+            text = f"{hook} would never run, for it has a `yield` or is `async`"
+            raise OptionError((("behaviour",), f"{_beginning(kind, hook) or where}: {text}"))

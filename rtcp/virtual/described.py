@@ -234,15 +234,21 @@ class DescribedDevice(DeviceModel):
         """Outputs become valid, or invalid: then they are 0."""
         super().set_outputs_valid(valid)
         if not valid and not self.runner.keeps_outputs:
-            for index in self.roles.outputs:
-                image = self.image(index)
-                for entry in () if image is None else image.entries:
-                    entry.value = bytes(len(entry.value)) if isinstance(entry.value, bytes) else 0
+            try:
+                self._clear_outputs()
+            except Exception as error:
+                self.failed(error)
         self.runner.outputs_valid(valid)
 
-    def unpackable(self, error: Exception) -> None:
-        """An error of the behaviour, which has written to an entry past `Behaviour.__setitem__`."""
-        self.runner.fail("on_outputs", error)
+    def _clear_outputs(self) -> None:
+        for index in self.roles.outputs:
+            image = self.image(index)
+            for entry in () if image is None else image.entries:
+                entry.value = bytes(len(entry.value)) if isinstance(entry.value, bytes) else 0
+
+    def failed(self, error: Exception) -> None:
+        """An error of the behaviour, which has changed something past the methods that it has for that."""
+        self.runner.fail("the slave", error)
 
     def open_mailbox(self, receive_size: int, send_size: int) -> None:
         """No transfer of a file is under way."""

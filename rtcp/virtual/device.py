@@ -271,8 +271,8 @@ class DeviceModel:
         """Return its EEPROM image with the station alias; empty: it is made of its objects."""
         return b""
 
-    def unpackable(self, error: Exception) -> None:
-        """Inputs hold what does not fit into the process data: an error of the model."""
+    def failed(self, error: Exception) -> None:
+        """Something of the slave outside of its hooks has failed, as inputs that do not fit: an error of the model."""
         raise error
 
     def open_mailbox(self, receive_size: int, send_size: int) -> None:

@@ -57,7 +57,7 @@ class FoeServer:
             text = refused.text.encode("utf-8", "replace")[: max(0, room - _HEADER.size)]
             answer = _HEADER.pack(Operation.ERROR, refused.code) + text
         except FileBusy as busy:
-            answer = _BUSY.pack(Operation.BUSY, busy.done & 0xFFFF, busy.entire & 0xFFFF)
+            answer = _BUSY.pack(Operation.BUSY, busy.done, busy.entire)
         except HookFailed:
             self._end()
             answer = _HEADER.pack(Operation.ERROR, FoeError.PROGRAM_ERROR)
@@ -90,7 +90,7 @@ class FoeServer:
         found = self._runner.read_file(_name(content))
         if found is None:
             raise FileRefused(FoeError.NOT_FOUND, "file not found")
-        self._rest, self._packet = bytes(found), 1
+        self._rest, self._packet = found, 1
         return _HEADER.pack(Operation.DATA, 1) + self._rest[:most]
 
     def _continue_read(self, number: int, most: int) -> bytes | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
@@ -92,8 +93,15 @@ class SdoAbort(Exception):
     """An SDO service refused with one of the standard's abort codes (ETG.1000.6, table 41)."""
 
     def __init__(self, code: int) -> None:
+        check_whole("code of SdoAbort", code, 0xFFFFFFFF)
         super().__init__(f"SDO abort 0x{code:08X}")
         self.code = code
+
+
+def check_whole(name: str, found: object, most: int) -> None:
+    """Raise ValueError for what is no whole number from 0 to `most`."""
+    if not isinstance(found, int) or not 0 <= found <= most:
+        raise ValueError(f"{name}: found {found!r}, allowed is a whole number from 0 to {most}")
 
 
 Value = int | float | bytes
@@ -128,6 +136,8 @@ SIGNED = frozenset(data_type for data_type, code in STRUCT_CODES.items() if code
     DataType.INTEGER24, DataType.INTEGER40, DataType.INTEGER48, DataType.INTEGER56,
 }  # fmt: skip
 _FLOATS = (DataType.REAL32, DataType.REAL64)
+LARGEST = {DataType.REAL32: (2.0 - 2.0**-23) * 2.0**127, DataType.REAL64: sys.float_info.max}
+"""Largest finite number of the types that have a point."""
 _BYTES = (DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType.UNICODE_STRING, DataType.GUID)
 
 

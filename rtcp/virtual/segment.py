@@ -328,7 +328,10 @@ class Segment:
         if self._attention:
             asking, self._attention = self._attention, []
             for slave in asking:
-                slave.application.attend(t)
+                try:
+                    slave.application.attend(t)
+                except Exception as error:
+                    slave.device.failed(error)
                 if slave.esc.reset_requested:
                     self.topology.restart(slave, t)
                     self.rewire()
@@ -401,7 +404,10 @@ class Segment:
         slave = self._waiting.popleft()
         until, slave.queued_until = slave.queued_until, None
         if until is not None:
-            slave.application.advance(until)
+            try:
+                slave.application.advance(until)
+            except Exception as error:
+                slave.device.failed(error)
         return slave
 
 

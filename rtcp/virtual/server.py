@@ -264,11 +264,13 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
     script = () if script_path is None else load_script(script_path, len(config.slaves))
     if cpu is not None:
         _run_on(cpu)
-    segment = make_segment(config, time.monotonic_ns())
     stop = StopRequest()
-    signal.signal(signal.SIGTERM, stop)
-    signal.signal(signal.SIGINT, stop)
     with ExitStack() as kept:
+        if any(slave.behaviour is not None for slave in config.slaves):
+            kept.enter_context(WATCH.started())
+        segment = make_segment(config, time.monotonic_ns())
+        signal.signal(signal.SIGTERM, stop)
+        signal.signal(signal.SIGINT, stop)
         listener = None if control_path is None else kept.enter_context(control_socket(control_path))
         pair = private_pair() if interface is None else public_pair(interface)
         master_end, segment_end, bring_up = kept.enter_context(pair)
@@ -278,8 +280,6 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
         control = None if listener is None else Control(listener, server.registry, truth)
         if control is not None:
             kept.callback(control.close)
-        if any(slave.behaviour is not None for slave in config.slaves):
-            WATCH.start()
         request_prompt_scheduling()
         # A master that finds its interface up finds the slaves answering.
         bring_up()

@@ -325,7 +325,7 @@ class Application:
                         data.manager.exchanged()
             except (struct.error, ArithmeticError, TypeError, AttributeError) as error:
                 # A behaviour has put something into an object that its bits do not hold.
-                self.device.unpackable(error)
+                self.device.failed(error)
         mailbox = self._mailbox
         if mailbox is not None and mailbox.pending(t):
             mailbox.serve(self.state, t)

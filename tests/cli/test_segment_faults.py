@@ -134,6 +134,9 @@ def test_objects_of_a_described_slave_are_shown_and_set(
     assert rtcp("segment", "get", "box", "0x7010").out.endswith(" Text: 0x0102ff\n")
     for arguments, said in (
         (("set", "2", "0x6000:1", "2"), "value: 0x6000:1 Input takes 0 to 1, not 2"),
+        (("set", "2", "0x6000:1", "1e400"), "value: 0x6000:1 Input takes a whole number, not inf"),
+        (("set", "box", "0x6000:2", "1e400"), "e+38, not inf"),
+        (("get", "nosuch"), 'slave: there is no slave called "nosuch"; give a position from 1 to 2, or a name'),
         (("get", "2", "0x9999"), "2 digital inputs has no object 0x9999:0"),
         (("get", "3"), "slave: there is no slave 3; give a position from 1 to 2, or a name"),
         (("get", "2", "six"), "'six' is no object: write index and subindex, as 0x6000:1"),

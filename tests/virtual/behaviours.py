@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 from rtcp.virtual.behaviour import Behaviour, FileBusy, FileRefused, FoeError, Option, SdoAbort
 
@@ -56,6 +58,45 @@ class Hangs(Behaviour):
                 time.sleep(0)
             except Exception:
                 continue
+
+
+class Swallows(Behaviour):
+    """Never comes back, and catches all."""
+
+    def on_outputs(self, dt: float) -> None:
+        while True:
+            try:
+                time.sleep(0.001)
+            except:  # noqa: E722
+                continue
+
+
+class HangsInC(Behaviour):
+    """Does not come back to Python."""
+
+    def on_outputs(self, dt: float) -> None:
+        sum(range(10**11))
+
+
+class Breaks(Behaviour):
+    """Leaves behind what the slave cannot use."""
+
+    def on_outputs(self, dt: float) -> None:
+        if self.outputs_valid:
+            self.device.objects = None  # type: ignore[assignment]
+            self.fail()
+
+
+class Rubbish(Behaviour):
+    """Returns and raises what a test puts here."""
+
+    act: ClassVar[Callable[[], Any]]
+
+    def read_file(self, name: str) -> Any:
+        return self.act()
+
+    def on_sdo_read(self, index: int, subindex: int) -> Any:
+        return self.act()
 
 
 class FailsEverywhere(Behaviour):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import struct
 import subprocess
 import sys
@@ -12,12 +13,18 @@ from typing import Any
 
 import pytest
 
+from rtcp.config.model import ConfigError
+from rtcp.config.segment import load_segment
+from rtcp.virtual import behaviour as watched
+from rtcp.virtual.behaviour import EXIT_HANGING, FileBusy, FileRefused
 from rtcp.virtual.coe import read, write
 from rtcp.virtual.mailbox import Mailbox
 from rtcp.virtual.objects import SdoAbort
-from rtcp.virtual.protocol import MailboxType
+from rtcp.virtual.protocol import ERROR_FLAG, MailboxType
+from rtcp.virtual.segment import make_segment
 from tests.virtual import behaviours
 from tests.virtual.conftest import ROOT, described
+from tests.virtual.line import INIT, MS, Line, TinyDevice
 from tests.virtual.test_described import DRIVE, OP, OUTPUTS, TWO, device
 
 PRE_OP, BOOT = 2, 3
@@ -26,23 +33,91 @@ Master = Callable[..., dict[str, Any]]
 
 @pytest.mark.alone
 @pytest.mark.parametrize(
-    ("behaviour", "said"),
-    [("Raises", "RuntimeError: out of order"), ("Hangs", "it has not returned for ")],
+    ("behaviour", "part", "said"),
+    [
+        ("Raises", "on_outputs", "RuntimeError: out of order"),
+        ("Hangs", "on_outputs", "it has not returned for "),
+        ("Breaks", "the slave", "'NoneType' object "),
+    ],
 )
-def test_a_hook_that_raises_or_hangs_takes_its_own_slave_out_of_op_with_one_sentence(
-    master: Master, behaviour: str, said: str, capfd: pytest.CaptureFixture[str]
+def test_a_hook_that_raises_or_hangs_or_breaks_its_slave_takes_its_own_slave_out_of_op_with_one_sentence(
+    master: Master, behaviour: str, part: str, said: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     failing = described(TWO, f"behaviour: 'tests.virtual.behaviours:{behaviour}'")
     found = master(described(OUTPUTS), failing, described(DRIVE))
     assert found["safe_op"] == 4
     assert found["codes"] == [[OP, 0], [4 | 0x10, 0x0001], [OP, 0]]
-    sentences = [line for line in capfd.readouterr().err.splitlines() if "on_outputs failed" in line]
+    sentences = [line for line in capfd.readouterr().err.splitlines() if " failed at " in line]
     assert len(sentences) == 1
-    assert ":3: slave 2: on_outputs failed at " in sentences[0]
-    assert f"{Path(behaviours.__file__)}:" in sentences[0]
+    assert f":3: slave 2: {part} failed at {behaviours.__file__}:" in sentences[0]
     assert said in sentences[0]
     # The others answer: what the slave in SAFE-OP lacks is its outputs.
     assert found["counters"][-10:].count(2 + 1 + 3) >= 8
+
+
+def config_of(folder: Path, behaviour: str) -> Path:
+    """Return the file of a segment of one drive."""
+    config = folder / "segment.yaml"
+    entry = described(DRIVE, f"behaviour: '{behaviour}'")
+    config.write_text(f"slaves:\n- {{{entry}}}\n")
+    return config
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize(
+    ("behaviour", "code", "said"),
+    [
+        ("Swallows", EXIT_HANGING, "a behaviour cannot be ended at {}:"),
+        ("HangsInC", -signal.SIGPROF, 'File "{}", line '),
+    ],
+)
+def test_a_hook_that_no_exception_ends_ends_the_process_which_says_where(
+    tmp_path: Path, behaviour: str, code: int, said: str
+) -> None:
+    config = config_of(tmp_path, f"tests.virtual.behaviours:{behaviour}")
+    command = [sys.executable, "-m", "rtcp.virtual", "--config", str(config)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert ended.returncode == code
+    assert said.format(behaviours.__file__) in ended.stderr
+
+
+CLASS = "from rtcp.virtual.behaviour import Behaviour\nclass Any(Behaviour):\n"
+MADE = {
+    "a module that ends the process": ("import sys\nsys.exit(7)", "cannot be loaded: SystemExit: 7"),
+    "a module that hangs": ("while True: pass", "HookHangs: it has not returned for "),
+    "one that ends the process": (CLASS + " def __init__(self, device): exit(3)", "{}:3: SystemExit: 3"),
+    "one that hangs": (CLASS + " def __init__(self, device):\n  while True: pass", "{}:4: it has not returned for "),
+    "options that are a list": (CLASS + " options = [1]", ":Any: found a list, allowed is Option(default, low, "),
+    "an option that is none": (CLASS + " options = {'gain': 5}", ":Any, gain: found 5, allowed is Option("),
+    "a generator": (CLASS + " def on_outputs(self, dt): yield", "{}:3: on_outputs would never run"),
+    "a first hook that hangs": (
+        CLASS + " def on_start(self):\n  while True: pass",
+        "on_start failed at {}:4: it has not returned",
+    ),
+}
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("name", MADE)
+def test_a_behaviour_that_cannot_be_made_is_a_sentence_of_the_segments_file(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(watched, "MAKING", watched.HOOK)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    text, said = MADE[name]
+    module = tmp_path / f"{tmp_path.name}.py"  # a name that no test has imported
+    module.write_text(text)
+    config = config_of(tmp_path, f"{module.stem}:Any")
+    with watched.WATCH.started():
+        try:
+            make_segment(load_segment(config), 0)
+        except ConfigError as error:
+            found = str(error)
+        else:
+            found = capfd.readouterr().err
+    assert said.format(module) in found
+    assert (f"{config}:2: slaves[0].behaviour: " in found) == (name != "a first hook that hangs")
+    assert (signal.getitimer(signal.ITIMER_REAL)[1], *signal.getitimer(signal.ITIMER_PROF)) == (0.0, 0.0, 0.0)
 
 
 def abort_of(call: Callable[..., object], *arguments: object) -> int:
@@ -70,6 +145,54 @@ def test_a_hook_of_a_service_that_fails_aborts_it_and_is_told_of_once() -> None:
         assert abort_of(write, made.objects, 0x607A, 0, False, PRE_OP, bytes(4)) == 0x08000000
     assert [sentence.split(": ")[1].split(" ")[0] for sentence in said] == ["on_sdo_read", "on_sdo_write"]
     assert "0x6041:0 Statusword takes 0 to 65535, not 1048576" in said[1]
+
+
+def raising(error: Callable[..., Exception], *arguments: object) -> Callable[[], None]:
+    def act() -> None:
+        raise error(*arguments)
+
+    return act
+
+
+class Mute(Exception):
+    """Has no text."""
+
+    def __str__(self) -> str:
+        raise RuntimeError
+
+
+RUBBISH: list[Callable[[], object]] = [
+    raising(FileRefused, -1), raising(FileRefused, 1 << 40), raising(FileRefused, 0x8001, 5),
+    raising(FileBusy, "half", 2), raising(FileBusy, 0.5, 1.0), raising(FileBusy, 1, 1 << 16),
+    raising(SdoAbort, -1), raising(SdoAbort, 1 << 40), raising(SdoAbort, "no"), raising(Mute),
+    lambda: "a text", lambda: 10**13, lambda: [1, 2], lambda: float("inf"), lambda: float("nan"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("act", RUBBISH)
+def test_rubbish_of_a_hook_is_answered_as_its_failure_and_told_with_file_and_line(act: Callable[[], object]) -> None:
+    client = FoeClient(
+        type("Any", (behaviours.Rubbish,), {"act": staticmethod(act), "__module__": behaviours.__name__})
+    )
+    said: list[str] = []
+    client.device.runner.report = said.append
+    assert client.read("any") == 0x800B
+    assert abort_of(read, client.device.objects, 0x6064, 0, False, PRE_OP) == 0x08000000
+    assert [f" failed at {behaviours.__file__}:" in sentence for sentence in said] == [True, True]
+
+
+@pytest.mark.parametrize("taken", ["roles", "step"])
+def test_a_slave_whose_own_code_fails_outside_of_hooks_says_so_and_the_others_go_on(taken: str) -> None:
+    broken = device(DRIVE, behaviours.Talkative)
+    line = Line([broken, TinyDevice()])
+    said: list[str] = []
+    broken.runner.report = said.append
+    setattr(broken, taken, None)
+    line.address()
+    line.request(0, PRE_OP)
+    line.pass_time(5 * MS)
+    assert [": the slave failed at " in sentence for sentence in said] == [True]
+    assert line.request(1, BOOT) == (INIT | ERROR_FLAG, 0x0013)
 
 
 # -- files over EtherCAT --------------------------------------------------------------------------------------------

@@ -227,7 +227,8 @@ class GroundTruth:
             return slaves[wanted - 1]
         places = [place for place, label in enumerate(self._models) if label == wanted]
         if len(places) != 1:
-            found = f"{len(places)} slaves are called {wanted}" if places else f"there is no slave {shown(wanted)}"
+            named = f'called "{wanted[:60]}"' if isinstance(wanted, str) else shown(wanted)
+            found = f"{len(places)} slaves are {named}" if places else f"there is no slave {named}"
             raise FaultRefused(f"slave: {found}; give a position from 1 to {len(slaves)}, or a name")
         return slaves[places[0]]
 
