@@ -9,7 +9,8 @@ one that a message names is tried again alone: then the reason counts. Where a m
 Devices without a product code are no slaves; a device that stands in several files counts once.
 
 SOEM's own programs, compiled from its sources, find the same slaves on the same segment without our master (as root):
-slaveinfo reads them and brings them to SAFE-OP, simple_test brings them to OP. FILE receives the reasons as they come;
+slaveinfo reads them and brings them to SAFE-OP (the bits that it finds are compared with those of the default
+assignment), simple_test brings them to OP. FILE receives the reasons as they come;
 where it exists, the run goes on from there.
 """
 
@@ -19,7 +20,9 @@ import argparse
 import gc
 import json
 import multiprocessing
+import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -35,7 +38,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.esi import print_table, read_files, vendor
-from rtcp.config.device_file import file_text
+from rtcp.config.device_file import assigned, file_text
 from rtcp.config.loader import load_device
 from rtcp.config.model import ConfigError, SlaveConfig
 from rtcp.esi.model import EsiError
@@ -47,20 +50,15 @@ from tests.fieldbus.master_child import INTERFACE, Cycle, to_op
 
 PERIOD_NS = 5_000_000
 PATIENCE_S = 60.0
-"""For a batch: then it has failed."""
+"""For a batch, on a machine with nothing else to do: then it has failed."""
 FORK = multiprocessing.get_context("fork")
 _NAMED = re.compile(r"\(s(\d+)\)|slaves\[(\d+)\]|/(\d+)\.yaml")
 """How messages of the master, the segment and the reader of configurations name a device of a batch."""
-_SLAVE = re.compile(r"^Slave:(\d+)\n.*?^ State: (\d+)$", re.MULTILINE | re.DOTALL)
+_SLAVE = re.compile(r"^Slave:(\d+)\n.*?size: (\d+)bits\n.*?size: (\d+)bits\n State: (\d+)$", re.MULTILINE | re.DOTALL)
 _STATE = re.compile(r"^Slave (\d+) State= ?(.*)$", re.MULTILINE)
 _COMPLAINT = re.compile(r"^.*\bslave:(\d+) .*$", re.MULTILINE)
 """What SOEM's programs print of a slave: a summary, a state that is not the one wanted, an error."""
 SAFEOP = "4"
-
-Verdicts = dict[int, str]
-"""By place in a batch: why the device failed, empty where it did not. Of those left out nothing is known."""
-Drive = Callable[[int, Path, int], Verdicts]
-"""Receives the process that holds the segment's network, the folder of the device files and the number of slaves."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +72,14 @@ class Candidate:
     revision: int
     text: str
     """Its device file."""
+    bits: tuple[int, int] = (0, 0)
+    """Outputs and inputs of the default assignment."""
+
+
+Verdicts = dict[int, str]
+"""By place in a batch: why the device failed, empty where it did not. Of those left out nothing is known."""
+Drive = Callable[[int, Path, Sequence[Candidate]], Verdicts]
+"""Receives the process that holds the segment's network, the folder of the device files and the devices."""
 
 
 def candidates(folder: Path, only: str, reasons: dict[str, str]) -> Iterator[Candidate]:
@@ -88,11 +94,15 @@ def candidates(folder: Path, only: str, reasons: dict[str, str]) -> Iterator[Can
                 continue
             seen.add(key)
             try:
-                text = file_text(assemble(device, file.modules) if device.slots else device)
+                whole = assemble(device, file.modules) if device.slots else device
+                text = file_text(whole)
+                outputs, inputs = (sum(pdo.bits for pdo in assigned(whole, out)) for out in (True, False))
             except EsiError as error:
                 reasons[label] = str(error)
-                text = ""
-            yield Candidate(vendor(file), file.path, label, identity.product_code, identity.revision, text)
+                text, outputs, inputs = "", 0, 0
+            yield Candidate(
+                vendor(file), file.path, label, identity.product_code, identity.revision, text, (outputs, inputs)
+            )
 
 
 def try_batch(batch: Sequence[Candidate], drive: Drive) -> Verdicts:
@@ -106,10 +116,15 @@ def try_batch(batch: Sequence[Candidate], drive: Drive) -> Verdicts:
             entries.append(f"  - {{esi: {json.dumps(device.file)}, {chosen}, options: {{sync_error_limit: 0}}}}\n")
         (folder / "segment.yaml").write_text("slaves:\n" + "".join(entries))
         with forked(partial(segment, folder / "segment.yaml")) as ready:
-            answer = ready(PATIENCE_S)
+            answer = ready(patience())
             if not isinstance(answer, int):
                 return read_message(f"segment: {answer}", len(batch))
-            return drive(answer, folder, len(batch))
+            return drive(answer, folder, batch)
+
+
+def patience() -> float:
+    """Return for how many seconds a batch may take while the machine has other work."""
+    return PATIENCE_S * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 @contextmanager
@@ -150,10 +165,10 @@ def read_message(text: str, count: int) -> Verdicts:
     return {int(found[found.lastindex or 0]): text for found in _NAMED.finditer(text)}
 
 
-def by_master(pid: int, folder: Path, count: int) -> Verdicts:
+def by_master(pid: int, folder: Path, batch: Sequence[Candidate]) -> Verdicts:
     """Drive the slaves to OP by our master."""
-    with forked(partial(master, pid, folder, count)) as answer:
-        return read_message(str(answer(PATIENCE_S)), count)
+    with forked(partial(master, pid, folder, len(batch))) as answer:
+        return read_message(str(answer(patience())), len(batch))
 
 
 def master(pid: int, folder: Path, count: int, connection: Connection) -> None:
@@ -176,12 +191,18 @@ def master(pid: int, folder: Path, count: int, connection: Connection) -> None:
     connection.send(message)
 
 
-def by_program(program: Path, read: Callable[[str, int], Verdicts], pid: int, folder: Path, count: int) -> Verdicts:
+def by_program(
+    program: Path,
+    read: Callable[[str, Sequence[Candidate]], Verdicts],
+    pid: int,
+    folder: Path,
+    batch: Sequence[Candidate],
+) -> Verdicts:
     """Let one of SOEM's programs drive the slaves; it is stopped once it begins to exchange process data."""
     command = ["nsenter", "-t", str(pid), "-n", "stdbuf", "-oL", str(program), INTERFACE]
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
     assert running.stdout is not None
-    timer = threading.Timer(PATIENCE_S, running.kill)
+    timer = threading.Timer(patience(), running.kill)
     timer.start()
     lines = []
     for line in running.stdout:
@@ -191,25 +212,32 @@ def by_program(program: Path, read: Callable[[str, int], Verdicts], pid: int, fo
     timer.cancel()
     running.kill()
     running.communicate()
-    return read("".join(lines), count)
+    return read("".join(lines), batch)
 
 
-def read_slaveinfo(text: str, count: int) -> Verdicts:
-    """Return the slaves of which slaveinfo prints an error, or a state that is not SAFE-OP."""
-    states = {int(found[1]) - 1: "" if found[2] == SAFEOP else found[0] for found in _SLAVE.finditer(text)}
+def read_slaveinfo(text: str, batch: Sequence[Candidate]) -> Verdicts:
+    """Return the slaves of which slaveinfo prints an error, another state than SAFE-OP, or other sizes."""
+    verdicts = {}
+    for found in _SLAVE.finditer(text):
+        place, bits = int(found[1]) - 1, (int(found[2]), int(found[3]))
+        verdicts[place] = "" if found[4] == SAFEOP else f"state {found[4]}"
+        if not verdicts[place] and bits != batch[place].bits:
+            verdicts[place] = "bits of outputs and inputs: {}, {} by the default assignment".format(
+                *("{} and {}".format(*pair) for pair in (bits, batch[place].bits))
+            )
     for pattern in (_COMPLAINT, _STATE):
-        states |= {int(found[1]) - 1: found[0].strip() for found in pattern.finditer(text)}
-    return states or read_message(text[-400:].strip() or "it printed nothing", count)
+        verdicts |= {int(found[1]) - 1: found[0].strip() for found in pattern.finditer(text)}
+    return verdicts or read_message(text[-400:].strip() or "it printed nothing", len(batch))
 
 
-def read_simple_test(text: str, count: int) -> Verdicts:
+def read_simple_test(text: str, batch: Sequence[Candidate]) -> Verdicts:
     """Return the slaves that simple_test could not bring to OP."""
     if "Operational state reached" in text:
-        return dict.fromkeys(range(count), "")
+        return dict.fromkeys(range(len(batch)), "")
     failed = {int(found[1]) - 1: found[0].strip() for found in _STATE.finditer(text)}
     if not failed:
-        return read_message(text[-400:].strip() or "it printed nothing", count)
-    return dict.fromkeys(range(count), "") | failed
+        return read_message(text[-400:].strip() or "it printed nothing", len(batch))
+    return dict.fromkeys(range(len(batch)), "") | failed
 
 
 def judge(devices: Sequence[Candidate], size: int, drive: Drive, reasons: dict[str, str]) -> Iterator[int]:
@@ -242,6 +270,8 @@ def main() -> None:
     parser.add_argument("--slaveinfo", type=Path, help="SOEM's slaveinfo, compiled")
     parser.add_argument("--simple-test", type=Path, help="SOEM's simple_test, compiled")
     given = parser.parse_args()
+    # So that the processes of a batch end with this one.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     drives: dict[str, Drive] = {"OP": by_master}
     if given.slaveinfo is not None:
         drives["slaveinfo"] = partial(by_program, given.slaveinfo, read_slaveinfo)

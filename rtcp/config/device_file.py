@@ -159,7 +159,15 @@ def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, 
 def assigned(device: Device, outputs: bool) -> tuple[Pdo, ...]:
     """Return the PDOs of a direction that are assigned by default, in the order of the process image."""
     pdos = [pdo for pdo in (device.rx_pdos if outputs else device.tx_pdos) if pdo.sync_manager is not None]
-    return tuple(sorted((pdo for pdo in pdos if not pdo.virtual), key=lambda pdo: pdo.sync_manager or 0))
+    # Registers as process data: SOEM maps them only where it reads the mapping from the EEPROM.
+    there = (pdo for pdo in pdos if not pdo.virtual or (device.coe is None and _virtual_start(device, pdo)))
+    return tuple(sorted(there, key=lambda pdo: pdo.sync_manager or 0))
+
+
+def _virtual_start(device: Device, pdo: Pdo) -> int:
+    """Return the registers that the virtual sync manager of a PDO stands for; 0: it has a real one."""
+    managers = device.sync_managers[pdo.sync_manager or 0 :]
+    return managers[0].start if managers and managers[0].virtual else 0
 
 
 def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:
@@ -372,6 +380,8 @@ def _pdo_lines(
             yield "    fixed: true"
         if named_managers:
             yield f"    sync_manager: {pdo.sync_manager}"
+        if start := _virtual_start(device, pdo):
+            yield f"    start_address: 0x{start:04X}"
         axis = _axis_of(pdo) if kind == "cia402" else 1
         if axis > 1:
             yield f"    axis: {axis}"
