@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from rtcp.virtual.al_state import HELD, AlStatusCode, SyncMonitor, first_failure, judge
 from rtcp.virtual.device import DeviceModel, SlaveFaults
 from rtcp.virtual.distributed_clock import Clock
-from rtcp.virtual.esc import CONTROL_ECAT_EVENT, DEVICE_EMULATION, IO_SPACE, SM_SIZE, Esc, SyncManager
+from rtcp.virtual.esc import CONTROL_ECAT_EVENT, DEVICE_EMULATION, IO_SPACE, Esc, SyncManager
 from rtcp.virtual.mailbox import MailboxService
 from rtcp.virtual.pdo import PdoImage, SyncManagerLayout
-from rtcp.virtual.protocol import ERROR_FLAG, STATE_MASK, AlState, Register
+from rtcp.virtual.protocol import ERROR_FLAG, SM_SIZE, STATE_MASK, AlState, Register
 from rtcp.virtual.sii import build_sii
 
 OP_TIMEOUT = 1_000_000_000
