@@ -99,7 +99,7 @@ def _in_mode(device: Device, name: str) -> Device:
 
 def kind_of(device: Device) -> str:
     """Return the driver that fits a device by its default process data."""
-    rx, tx = (entries_of(assigned(device, outputs)) for outputs in (True, False))
+    rx, tx = (entries_of(device.assigned(outputs)) for outputs in (True, False))
     if not rx and not tx:
         return "coupler"
     coe = device.coe
@@ -117,7 +117,7 @@ def _counter(device: Device) -> PdoEntry | None:
     """Return the one input that counts turns; None: there is none, or there are several."""
     counters = [
         entry
-        for entry in entries_of(assigned(device, outputs=False))
+        for entry in entries_of(device.assigned(False))
         if entry.bits >= _ANALOG_BITS and _COUNTER.search(entry.name)
     ]
     return counters[0] if len(counters) == 1 else None
@@ -139,10 +139,10 @@ def for_drive(device: Device) -> Device:
 
 def _with_mode_display(device: Device) -> Device:
     """Return a drive whose mode of operation, where it is in an RxPDO, comes back in a TxPDO, if that can be."""
-    rx, tx = ({entry.index for entry in entries_of(assigned(device, outputs))} for outputs in (True, False))
+    rx, tx = ({entry.index for entry in entries_of(device.assigned(outputs))} for outputs in (True, False))
     if _MODE_OBJECT not in rx or _MODE_OBJECT + 1 in tx:
         return device
-    manager, there = _usual_sync_manager(device, outputs=False), {pdo.index for pdo in assigned(device, False)}
+    manager, there = _usual_sync_manager(device, outputs=False), {pdo.index for pdo in device.assigned(False)}
     shown = _object(device, _MODE_OBJECT + 1, 0)
     can_map = device.coe is not None and device.coe.pdo_configuration
     tx_pdos = list(device.tx_pdos)
@@ -166,7 +166,7 @@ def _is_drive(device: Device) -> bool:
 def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, ...] | None:
     """Return `pdos` with one assigned that holds what a drive needs; None: there is none, and none can be made."""
     needed = {*_NEEDED[outputs]}
-    if needed <= {entry.index for entry in entries_of(assigned(device, outputs))}:
+    if needed <= {entry.index for entry in entries_of(device.assigned(outputs))}:
         return pdos
     manager = _usual_sync_manager(device, outputs)
     if fitting := [pdo for pdo in pdos if needed <= {entry.index for entry in pdo.entries} and not pdo.virtual]:
@@ -185,11 +185,6 @@ def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, 
         return None
     made = replace(free, entries=tuple(entries), sync_manager=manager)
     return (made, *(replace(pdo, sync_manager=None) for pdo in pdos if pdo is not free))
-
-
-def assigned(device: Device, outputs: bool) -> tuple[Pdo, ...]:
-    """Return the PDOs of a direction that are assigned by default, in the order of the process image."""
-    return device.assigned(outputs)
 
 
 def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:
@@ -217,7 +212,7 @@ def _lines(device: Device, kind: str, has_mode: bool) -> Iterator[str]:
         "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
     )
     yield f"watchdog_ms: {watchdog}             # ms; {note}"
-    for n in sorted({pdo.sync_manager or 0 for pdo in assigned(device, outputs=True)}):
+    for n in sorted({pdo.sync_manager or 0 for pdo in device.assigned(True)}):
         manager = device.sync_managers[n] if n < len(device.sync_managers) else None
         if manager is not None and manager.lacks_watchdog:
             off = f"control byte 0x{manager.control:02X}"
@@ -236,7 +231,7 @@ def _lines(device: Device, kind: str, has_mode: bool) -> Iterator[str]:
         yield from _scaling_lines(device)
     names: Counter[str] = Counter()
     for key, outputs in (("rpdo", True), ("tpdo", False)):
-        yield from _pdo_lines(device, kind, key, assigned(device, outputs), outputs, names, configurable)
+        yield from _pdo_lines(device, kind, key, device.assigned(outputs), outputs, names, configurable)
         yield from _others(device, key, outputs)
 
 
@@ -283,7 +278,7 @@ def _mode_text(mode: DcMode) -> str:
 
 def _calls_inputs_outputs(device: Device) -> bool:
     """Whether a PDO has an index of the other direction: its mapping is left alone."""
-    return any(pdo.index in MAPPINGS[not outputs] for outputs in (True, False) for pdo in assigned(device, outputs))
+    return any(pdo.index in MAPPINGS[not outputs] for outputs in (True, False) for pdo in device.assigned(outputs))
 
 
 def _startup_lines(device: Device, kind: str) -> Iterator[str]:
@@ -311,7 +306,7 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
             + (f", name: {_quoted(name)}" if name else "")
             + "}"
         )
-    mapped = {entry.index for entry in entries_of(assigned(device, True))}
+    mapped = {entry.index for entry in entries_of(device.assigned(True))}
     shown = {axis for axis in _axes(device) if _shows_mode(device, axis)}
     for axis in (_axes(device) or (1,)) if kind == "cia402" else ():
         index = _MODE_OBJECT + (axis - 1) * OBJECTS_PER_AXIS
@@ -375,7 +370,7 @@ def _velocity_lines(device: Device, index: int) -> Iterator[str]:
 
 def _shows_mode(device: Device, axis: int) -> bool:
     index = _MODE_OBJECT + 1 + (axis - 1) * OBJECTS_PER_AXIS
-    return any(entry.index == index for entry in entries_of(assigned(device, outputs=False)))
+    return any(entry.index == index for entry in entries_of(device.assigned(False)))
 
 
 def _ratio(device: Device, index: int, otherwise: float) -> tuple[float, str]:
@@ -400,7 +395,7 @@ def _axes(device: Device) -> tuple[int, ...]:
     there = {
         (entry.index, outputs)
         for outputs in (True, False)
-        for entry in entries_of(assigned(device, outputs))
+        for entry in entries_of(device.assigned(outputs))
         if entry.bits >= _WORD and not entry.sub_index
     }
     bases = range(0, _MOST_AXES * OBJECTS_PER_AXIS, OBJECTS_PER_AXIS)
@@ -436,6 +431,8 @@ def _pdo_lines(
             yield "    fixed: true"
         if named_managers:
             yield f"    sync_manager: {pdo.sync_manager}"
+        if start := device.registers_of(pdo):
+            yield f"    start_address: 0x{start:04X}"
         axis = _axis_of(pdo) if kind == "cia402" else 1
         if axis > 1:
             yield f"    axis: {axis}"
@@ -510,7 +507,7 @@ def _range_text(entry: ObjectEntry) -> list[str]:
 
 def _others(device: Device, key: str, outputs: bool) -> Iterator[str]:
     """Name the PDOs that can be assigned instead."""
-    there = {pdo.index for pdo in assigned(device, outputs)}
+    there = {pdo.index for pdo in device.assigned(outputs)}
     others = [pdo for pdo in (device.rx_pdos if outputs else device.tx_pdos) if pdo.index not in there]
     if others:
         listed = "; ".join(f"0x{pdo.index:04X} {_clean(pdo.name)} ({pdo.bits} bits)" for pdo in others)

@@ -176,6 +176,8 @@ class Pdo:
     """Sync manager, assigned through 0x1C10 + its number; none: the device's only one of that direction."""
     fixed: bool = False
     """True: its entries are fixed in the device; only its assignment is written."""
+    start_address: U16 = 0
+    """First register that it carries, where its sync manager is a virtual one; 0: it is a real one."""
     axis: AxisNumber = 1
     """Axis of a drive with several that the channels belong to."""
 

@@ -10,6 +10,7 @@ from rtcp.esi.model import (
     Coe,
     Device,
     DictionaryObject,
+    InitCommand,
     Mailbox,
     ObjectCode,
     ObjectEntry,
@@ -49,6 +50,9 @@ def complete(device: Device) -> Device:
         objects[made.index] = _merged(objects.get(made.index), made, values_of_made=True)
     for made in _mapped_objects(device):
         objects[made.index] = _merged(objects.get(made.index), made, values_of_made=False)
+    for command in device.init_commands:
+        if command.index not in MAPPINGS and command.data and not command.complete_access:
+            objects[command.index] = _commanded(objects.get(command.index), command)
     return replace(device, objects=tuple(_counted(objects[index]) for index in sorted(objects)))
 
 
@@ -73,6 +77,24 @@ def _merged(given: DictionaryObject | None, made: DictionaryObject, values_of_ma
     if code is ObjectCode.VARIABLE and len(entries) > 1:
         code = made.code
     return replace(given, code=code, entries=tuple(entries[number] for number in sorted(entries)))
+
+
+_OF_LENGTH = {1: "USINT", 2: "UINT", 4: "UDINT", 8: "ULINT"}
+
+
+def _commanded(given: DictionaryObject | None, command: InitCommand) -> DictionaryObject:
+    """Return the object that the description itself writes at the start: it is there, and takes the value."""
+    size, number = len(command.data), command.sub_index
+    made = ObjectEntry(number, command.comment, _OF_LENGTH.get(size, "OCTET_STRING"), 8 * size, default=bytes(size))
+    if given is None:
+        code = ObjectCode.RECORD if number else ObjectCode.VARIABLE
+        given = DictionaryObject(command.index, command.comment, code, ())
+    entries = {entry.sub_index: entry for entry in given.entries}
+    if given.code is not ObjectCode.VARIABLE:
+        entries.setdefault(0, ObjectEntry(0, "SubIndex 000", "USINT", 8))
+    entry = entries.get(number, made)
+    entries[number] = entry if entry.writable else replace(entry, writable=True, write_states="")
+    return replace(given, entries=tuple(entries[number] for number in sorted(entries)))
 
 
 def _counted(item: DictionaryObject) -> DictionaryObject:

@@ -334,10 +334,18 @@ class Device:
     """Parts of the description that were not understood, by name, with how often; they are warned of."""
 
     def assigned(self, outputs: bool) -> tuple[Pdo, ...]:
-        """Return the PDOs of a direction that are assigned by default, in the order of the process image."""
-        pdos = self.rx_pdos if outputs else self.tx_pdos
-        there = [pdo for pdo in pdos if pdo.sync_manager is not None and not pdo.virtual]
-        return tuple(sorted(there, key=lambda pdo: pdo.sync_manager or 0))
+        """Return the PDOs of a direction that are assigned by default, in the order of the process image.
+
+        Registers as process data are among them only without CoE: a master maps them by the EEPROM alone.
+        """
+        pdos = [pdo for pdo in (self.rx_pdos if outputs else self.tx_pdos) if pdo.sync_manager is not None]
+        mapped = (pdo for pdo in pdos if not pdo.virtual or (self.coe is None and self.registers_of(pdo)))
+        return tuple(sorted(mapped, key=lambda pdo: pdo.sync_manager or 0))
+
+    def registers_of(self, pdo: Pdo) -> int:
+        """Return the registers that the virtual sync manager of a PDO stands for; 0: it has a real one, or none."""
+        managers = () if pdo.sync_manager is None else self.sync_managers[pdo.sync_manager :]
+        return managers[0].start if managers and managers[0].virtual else 0
 
     @property
     def coe(self) -> Coe | None:

@@ -142,7 +142,7 @@ def _read_places(port: RegisterPort, position: int, slave: SlaveConfig) -> Place
         at = first // 8
         for number, group in groups.items() if len(groups) > 1 else ():
             length = (_bits(group) + 7) // 8
-            wanted.append(_Fmmu(at, length, areas[number][0], kind))
+            wanted.append(_Fmmu(at, length, group[0].start_address or areas[number][0], kind))
             at += length
         if len(groups) == 1:
             wanted += [fmmu for fmmu in found if fmmu.kind == kind]

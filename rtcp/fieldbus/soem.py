@@ -243,7 +243,8 @@ class SoemBus:
         for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
             device = config.device
             first = first_of.setdefault((slave.man, slave.id, slave.rev, device.rpdo, device.tpdo), i)
-            if failures[i] <= failures[first] and i != first:
+            # Without CoE SOEM would ask over SoE, where it takes an error reply for none: 11 s for a slave.
+            if not device.coe or (failures[i] <= failures[first] and i != first):
                 self._hide_mailbox(slave, i + 1)
             elif failures[i] % 2 or not device.complete_access:
                 slave._disable_complete_access()

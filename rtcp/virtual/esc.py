@@ -86,7 +86,7 @@ class SyncManager:
 
     __slots__ = (
         "_memory", "_open", "_writable", "base", "buffer", "control", "enabled", "end", "index", "length", "locked",
-        "on_event", "process_data", "start",
+        "on_event", "process_data", "start", "virtual",
     )  # fmt: skip
 
     def __init__(self, index: int, memory: bytearray, writable: bytearray) -> None:
@@ -101,6 +101,8 @@ class SyncManager:
         """Called when the event of a sync manager with `ecat_event` may have changed."""
         self.process_data = False
         """Whether the device has process data here, with one buffer (as a mailbox) or three."""
+        self.virtual = False
+        """Whether it has no registers: an FMMU maps the device's own ones without it."""
         self.start = self.end = self.length = self.control = 0
         self.enabled = False
         self.locked = False
@@ -159,7 +161,8 @@ class SyncManager:
         self.enabled = bool(memory[base + ACTIVATION] & ACTIVATE) and self.length > 0
         self.locked = bool(memory[base + PDI] & PDI_DEACTIVATE)
         # Start, length and control are open only while the sync manager is off (ETG.1000.4, table 58).
-        self._writable[base : base + 5] = bytes(5) if memory[base + ACTIVATION] & ACTIVATE else b"\x01" * 5
+        closed = self.virtual or memory[base + ACTIVATION] & ACTIVATE
+        self._writable[base : base + 5] = bytes(5) if closed else b"\x01" * 5
         self._writable[base + STATUS] = self._writable[base + PDI] = 0
         if self.length != length:
             self.buffer = memoryview(bytearray(self.length))

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from rtcp.virtual.al_state import HELD, AlStatusCode, SyncMonitor, first_failure, judge
 from rtcp.virtual.device import DeviceModel, SlaveFaults
 from rtcp.virtual.distributed_clock import Clock
-from rtcp.virtual.esc import CONTROL_ECAT_EVENT, DEVICE_EMULATION, Esc, SyncManager
+from rtcp.virtual.esc import CONTROL_ECAT_EVENT, DEVICE_EMULATION, IO_SPACE, Esc, SyncManager
 from rtcp.virtual.mailbox import MailboxService
 from rtcp.virtual.pdo import PdoImage, SyncManagerLayout
-from rtcp.virtual.protocol import ERROR_FLAG, STATE_MASK, AlState, Register
+from rtcp.virtual.protocol import ERROR_FLAG, SM_SIZE, STATE_MASK, AlState, Register
 from rtcp.virtual.sii import build_sii
 
 OP_TIMEOUT = 1_000_000_000
@@ -80,6 +80,10 @@ class Application:
         esc.on_outputs = self.outputs_written
         for data in self._outputs + self._inputs:
             data.manager.process_data = True
+        for manager, layout in zip(esc.sync_managers, device.sync_managers, strict=False):
+            if 0 < layout.start < IO_SPACE:
+                manager.virtual = True
+                esc.writable[manager.base : manager.base + SM_SIZE] = bytes(SM_SIZE)
         if self._emulated:
             self._lay_out()
         else:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.esi.dictionary import complete, default_assignment
-from rtcp.esi.model import Device, DictionaryObject, ObjectCode, ObjectEntry, PdoEntry
+from rtcp.esi.model import Device, DictionaryObject, InitCommand, ObjectCode, ObjectEntry, PdoEntry
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
 
@@ -88,6 +88,16 @@ def test_mapped_objects_that_the_file_lacks_are_made_with_their_types_and_rights
         (2, "BIT3", 3, False),
     ]
     assert numbers(encoder)[0] == 2
+
+
+def test_what_the_file_writes_at_the_start_is_there_and_takes_the_value(drive: Device) -> None:
+    locked = DictionaryObject(0x2200, "Locked", ObjectCode.VARIABLE, (ObjectEntry(0, "Locked", "INT", 16),))
+    commands = (InitCommand(("PS",), 0xF810, 2, bytes(4)), InitCommand(("PS",), 0x2200, 0, bytes(2)))
+    found = objects(replace(drive, objects=(*drive.objects, locked), init_commands=commands))
+    made = found[0xF810].entries
+    assert [(entry.sub_index, entry.bits, entry.writable) for entry in made] == [(0, 8, False), (2, 32, True)]
+    assert numbers(found[0xF810]) == [2, 0]
+    assert [(entry.name, entry.type, entry.writable) for entry in found[0x2200].entries] == [("Locked", "INT", True)]
 
 
 def test_objects_of_the_file_keep_their_values_and_a_count_is_filled_in(drive: Device) -> None:

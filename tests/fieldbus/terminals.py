@@ -65,9 +65,11 @@ def device(
     for direction, (areas, first, index) in enumerate(((outputs, 0x1600, OUT), (inputs, 0x1A00, IN))):
         for n, (number, start, bits) in enumerate(areas, 1):
             kind = (model.SyncManagerType.OUTPUTS, model.SyncManagerType.INPUTS)[direction]
-            managers[number] = model.SyncManager(start, (bits + 7) // 8, (control, 0x20)[direction], kind)
+            # Below the RAM and its digital outputs stand registers, for which there is no sync manager.
+            virtual, byte = start < 0x0F00, (control, 0x20)[direction]
+            managers[number] = model.SyncManager(start, (bits + 7) // 8, byte, kind, virtual=virtual)
             entry = model.PdoEntry(index, n, bits, f"value {n}", _type(bits))
-            pdos[direction].append(model.Pdo(first + n, f"PDO {n}", (entry,), number, fixed=True))
+            pdos[direction].append(model.Pdo(first + n, f"PDO {n}", (entry,), number, fixed=True, virtual=virtual))
     uses = [model.FmmuUse.OUTPUTS] * len(outputs) + [model.FmmuUse.INPUTS] * len(inputs)
     return model.Device(
         identity=model.Identity(VENDOR, product, 1, product + 100),
@@ -106,6 +108,7 @@ DEVICES = {
         mailbox=model.Mailbox(model.Coe(sdo_information=True), foe=True),
         bootstrap=struct.pack("<4H", 0x1000, 256, 0x1400, 256),
     ),
+    "clock": device(22, [], [(0, 0x1000, 3), (1, 0x0910, 32)], modes=[model.DcMode("DC", 0)]),
     "pairs": device(
         31, [(2, 0x1100, 16), (4, 0x1300, 24)], [(3, 0x1200, 16), (5, 0x1800, 24)], mailbox=True,
         modes=[model.DcMode("DC", 0x0730)],
@@ -122,7 +125,8 @@ def slave(name: str, kind: str, alias: int = 0) -> SlaveConfig:
             (entry,) = pdo.entries
             kind, length = ("bits", entry.bits) if entry.bits < 8 else (f"uint{entry.bits}", None)
             channel = PdoEntry(entry.index, entry.sub_index, kind, entry.name, bits=length)  # type: ignore[arg-type]
-            yield Pdo(pdo.index, (channel,), pdo.sync_manager if several else None)
+            start = made.sync_managers[pdo.sync_manager or 0].start if pdo.virtual else 0
+            yield Pdo(pdo.index, (channel,), pdo.sync_manager if several else None, start_address=start)
 
     several = max(len(made.rx_pdos), len(made.tx_pdos)) > 1
     return SlaveConfig(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import pytest
 
@@ -45,6 +46,14 @@ def test_several_sync_managers_of_a_direction_each_get_their_fmmu(start_segment)
         assert received[1:] == sent[1:]
     assert "".join(result["objects"]) == result["patterns"][-1][0][0]
     assert result["sync"] == "3007"
+
+
+def test_registers_that_a_virtual_sync_manager_stands_for_are_process_data(start_segment):
+    result = start_segment(("clock", "bits3")).master("terminals", kinds=("clock", "bits3"))["result"]
+    assert result["states"] == ["OP"] * 2
+    times = [int.from_bytes(bytes.fromhex(received[0])[1:], "little") for _, received in result["patterns"]]
+    assert all(0 < later - time & 0xFFFFFFFF < 2_000_000_000 for time, later in pairwise(times))
+    assert [received[1] for _, received in result["patterns"]] == [sent[1] for sent, _ in result["patterns"]]
 
 
 def test_a_slave_on_one_branch_is_set_up_again_while_another_branch_is_lost(start_segment):
