@@ -114,7 +114,7 @@ def _ratio(sdo: SdoClient, index: int) -> Steps[Value | None]:
 def _counts(count: float) -> Reading:
     def read(sdo: SdoClient, index: int) -> Steps[Value | None]:
         counts = yield from _reading(sdo, index, 0)
-        return None if counts is None else counts * count
+        return counts * count if counts else None  # 0: nobody has told the drive
 
     return read
 

@@ -51,6 +51,7 @@ def test_a_drive_that_counts_as_its_file_says_starts_and_what_it_lacks_is_noted(
     everything = replace(AGREES, feed_constant=36000.0, rated_torque=1.2346, rated_current=4.5, velocity_unit="mrpm")
     held = (0x6092, (72000, 2)), (0x6076, (1235,)), (0x6075, (4500,)), (0x60A9, (0xFDB44700,))
     assert notes((everything,), *held) == []
+    assert "0x6076 (rated_torque)" in notes((everything,), *held[:1], (0x6076, (0,)), *held[2:])[0]
     assert notes((replace(everything, rated_torque_unit="uNm"),), *held[:1], (0x6076, (1234600,)), *held[2:]) == []
 
 
