@@ -210,7 +210,7 @@ FAULTS = (
     Case("position jumps while enabling", PositionJumped, 1,
          ("joint2", "jumped from 0 to 0.1 rad", "5 cycles (supervision in assistive_arm.yaml)", "`rtcp reset`"),
          position_jumps, inputs_are_true),
-    Case("driver raises", DriverFailed, 1, ("slave 1 (io)", "raised an error", "outputs are 0", "`rtcp reset`"),
+    Case("driver raises", DriverFailed, 1, ("slave 1 (io)", "raised an error", "outputs are safe", "`rtcp reset`"),
          box_cannot_be_read, inputs_are_true),
     Case("trajectory generator fails", GeneratorFailed, -1, ("trajectory generator", "`rtcp reset`"),
          generator_fails, generator_works),
