@@ -84,7 +84,7 @@ def test_wiresharks_dissector_finds_no_fault_in_what_master_and_slaves_exchange(
         (("files", "bits4"), {"files": {}}),
     ):
         segment, out = start_segment(slaves), tmp_path / "frames.pcapng"
-        with Capture("ecat0", segment.pid, out) as capture:
+        with out.open("wb") as file, Capture("ecat0", segment.pid, file) as capture:
             for scenario, arguments in scenarios.items():
                 assert "result" in segment.master(scenario, receive_fraction=0.5, **arguments)
             assert capture.wait(0.5).lost == 0

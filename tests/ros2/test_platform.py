@@ -102,7 +102,8 @@ def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_every
         assert "12500" in platform.rtcp("segment", "get", "8", "0x7000:1").stdout
         set_current(21.0)
         assert node.stderr is not None
-        refused = until(node.stderr.readline, "the refusal")
+        log = iter(node.stderr.readline, "")
+        refused = next((line for line in log if "cannot be set" in line), "")
         assert "gpio_controller/commands: valves.current: 21 cannot be set: allowed is 4 to 20" in refused
         assert latest()["valves"]["current"] == 12.5
         subscriber.undeclare()
