@@ -158,8 +158,8 @@ def _check(
         for slave in same:
             # A running platform has written and read all of them at its start.
             if isinstance(asked.access, OfflineBus) and described.coe and slave["has_coe"]:
-                places = [(one.index, one.sub_index) for one in objects]
-                lengths[slave["position"]] = asked.access.object_lengths(slave["position"], places)
+                addresses = [(item.index, item.sub_index) for item in objects]
+                lengths[slave["position"]] = asked.access.object_lengths(slave["position"], addresses)
     if not same:
         there = "; ".join(f"{slave['position']}: {slave['name']} {_identity_text(slave)}" for slave in slaves) or "none"
         raise CommandError(f"{asked.name}: no slave has {_identity_text(described)}; found are {there}", ExitCode.FAULT)
@@ -217,19 +217,19 @@ class _Object:
 
 def _objects(described: DeviceDescription) -> list[_Object]:
     """Return what the start writes or maps: start-up SDOs, PDOs, and what is mapped into them."""
-    found = [
-        _Object(f"sdo: {_object_text(one)}", one.index, one.sub_index, None if one.type == "bytes" else one.length)
-        for one in described.sdo
-        if not one.optional
+    objects = [
+        _Object(f"sdo: {_object_text(sdo)}", sdo.index, sdo.sub_index, None if sdo.type == "bytes" else sdo.length)
+        for sdo in described.sdo
+        if not sdo.optional
     ]
     for key, pdos in _images(described):
         for pdo in pdos:
-            found.append(_Object(f"{key}: PDO 0x{pdo.index:04X}", pdo.index, 0, 1))
-            for one in pdo.channels:
-                length = None if one.length % 8 else one.length // 8
-                if one.index:
-                    found.append(_Object(f"{key}: {_object_text(one)}", one.index, one.sub_index, length))
-    return found
+            objects.append(_Object(f"{key}: PDO 0x{pdo.index:04X}", pdo.index, 0, 1))
+            for entry in pdo.channels:
+                length = None if entry.length % 8 else entry.length // 8
+                if entry.index:
+                    objects.append(_Object(f"{key}: {_object_text(entry)}", entry.index, entry.sub_index, length))
+    return objects
 
 
 def _object_text(of: PdoEntry | StartupSdo) -> str:
@@ -239,11 +239,11 @@ def _object_text(of: PdoEntry | StartupSdo) -> str:
 def _lacking(objects: Sequence[_Object], lengths: Sequence[int | None]) -> list[str]:
     """Return a sentence for each object that a slave lacks, or has in another length."""
     sentences = []
-    for one, length in zip(objects, lengths, strict=False):
+    for item, length in zip(objects, lengths, strict=False):
         if length == -1:
-            sentences.append(f"{one.where}: the slave has no such object")
-        elif None not in (length, one.length) and length != one.length:
-            sentences.append(f"{one.where}: the file says {one.length} bytes, the slave has {length}")
+            sentences.append(f"{item.where}: the slave has no such object")
+        elif None not in (length, item.length) and length != item.length:
+            sentences.append(f"{item.where}: the file says {item.length} bytes, the slave has {length}")
     return sentences
 
 

@@ -372,9 +372,9 @@ def _check_image(image: bytes, before: bytes, other_device: bool, size: int) -> 
         )
     old, new = before[_DEVICE], image[_DEVICE]
     if old != new and not other_device and not _is_blank(old):
-        texts = [f"vendor 0x{one[3::-1].hex().upper()}, product 0x{one[7:3:-1].hex().upper()}" for one in (new, old)]
         raise CommandError(
-            f"the image is of {texts[0]}, the slave of {texts[1]}; --other-device writes it all the same",
+            f"the image is of {_device_text(new)}, the slave of {_device_text(old)}; --other-device writes it "
+            "all the same",
             ExitCode.REFUSED,
         )
     return check_sii(image)
@@ -382,6 +382,10 @@ def _check_image(image: bytes, before: bytes, other_device: bool, size: int) -> 
 
 _DEVICE, _SERIAL = slice(0x10, 0x18), slice(0x1C, 0x20)
 """Bytes of vendor and product, and of the serial number (ETG.1000.6, table 16)."""
+
+
+def _device_text(identity: bytes) -> str:
+    return f"vendor 0x{identity[3::-1].hex().upper()}, product 0x{identity[7:3:-1].hex().upper()}"
 
 
 def _is_blank(data: bytes) -> bool:

@@ -10,7 +10,14 @@ from dataclasses import replace
 from math import isclose
 
 from rtcp.config.model import BITS
-from rtcp.config.scaling import BOUNDING_OBJECTS, OBJECTS_PER_AXIS, TORQUE_UNITS, VELOCITY_UNITS, TorqueUnit
+from rtcp.config.scaling import (
+    BOUNDING_OBJECTS,
+    OBJECTS_PER_AXIS,
+    QUICK_STOP_OPTION,
+    TORQUE_UNITS,
+    VELOCITY_UNITS,
+    TorqueUnit,
+)
 from rtcp.esi import units
 from rtcp.esi.dictionary import complete
 from rtcp.esi.model import DcMode, Device, EsiError, ObjectEntry, Pdo, PdoEntry, SyncManagerType
@@ -48,7 +55,8 @@ _NEEDED = {True: (0x6040, 0x607A), False: (0x6041, 0x6064)}
 _MODE_OBJECT, _CSP = 0x6060, 8
 _MOST_SPEED, _RATED = 0x6080, 1000
 """Of the objects that bound a drive: the one that is no torque; the rated torque, in the unit of the others."""
-_QUICK_STOP_OPTION, _RAMP_AND_HOLD = 0x605A, 6
+_RAMP_AND_HOLD = 6
+"""Quick stop option code."""
 _SYNC0 = 0x0200
 """Bit of AssignActivate that activates SYNC0."""
 _DRIVE_WATCHDOG_MS, _WATCHDOG_MS = 20, 100
@@ -76,24 +84,24 @@ def file_text(device: Device, kind: str | None = None, mode: str | None = None) 
 
 def _in_mode(device: Device, name: str) -> Device:
     """Return a device with one clock mode before the others, and the PDOs assigned that this mode assigns."""
-    mode = next((one for one in device.dc_modes if one.name == name), None)
+    mode = next((mode for mode in device.dc_modes if mode.name == name), None)
     if mode is None:
-        there = ", ".join(one.name for one in device.dc_modes) or "none"
-        raise EsiError(device.origin, f"it has no clock mode {name!r}; there are: {there}")
+        names = ", ".join(mode.name for mode in device.dc_modes) or "none"
+        raise EsiError(device.origin, f"it has no clock mode {name!r}; there are: {names}")
     if mode.oversamples:
         raise EsiError(device.origin, f"clock mode {name} takes several values a cycle, which is not supported")
-    places = {index: manager for manager, indices in mode.pdos for index in indices}
+    manager_of = {index: manager for manager, indices in mode.pdos for index in indices}
     managers = {manager for manager, _ in mode.pdos}
 
     def assigned_by(pdos: tuple[Pdo, ...]) -> tuple[Pdo, ...]:
         return tuple(
-            replace(pdo, sync_manager=places.get(pdo.index))
-            if pdo.index in places or pdo.sync_manager in managers
+            replace(pdo, sync_manager=manager_of.get(pdo.index))
+            if pdo.index in manager_of or pdo.sync_manager in managers
             else pdo
             for pdo in pdos
         )
 
-    modes = (mode, *(one for one in device.dc_modes if one is not mode))
+    modes = (mode, *(other for other in device.dc_modes if other is not mode))
     return replace(device, dc_modes=modes, rx_pdos=assigned_by(device.rx_pdos), tx_pdos=assigned_by(device.tx_pdos))
 
 
@@ -308,7 +316,8 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
         )
     mapped = {entry.index for entry in entries_of(device.assigned(True))}
     shown = {axis for axis in _axes(device) if _shows_mode(device, axis)}
-    for axis in (_axes(device) or (1,)) if kind == "cia402" else ():
+    axes = (_axes(device) or (1,)) if kind == "cia402" else ()
+    for axis in axes:
         index = _MODE_OBJECT + (axis - 1) * OBJECTS_PER_AXIS
         if index not in mapped or axis not in shown:
             written.append(
@@ -316,8 +325,8 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
                 "   # CSP"
             )
     set_by_file = {command.index for command in device.init_commands}
-    for axis in (_axes(device) or (1,)) if kind == "cia402" else ():
-        index = _QUICK_STOP_OPTION + (axis - 1) * OBJECTS_PER_AXIS
+    for axis in axes:
+        index = QUICK_STOP_OPTION + (axis - 1) * OBJECTS_PER_AXIS
         if index not in set_by_file and _object(device, index, 0) is not None:
             written.append(
                 f"  - {{index: 0x{index:04X}, sub_index: 0, type: int16, value: {_RAMP_AND_HOLD}, "
@@ -562,12 +571,8 @@ def _unique(name: str, names: Counter[str], key: str, axis: int) -> str:
 def _quoted(text: str) -> str:
     """Return a YAML scalar."""
     clean = _clean(text)[:64]
-    is_word = clean.lower() not in ("null", "true", "false")
-    return (
-        clean
-        if is_word and re.fullmatch(r"[A-Za-z][A-Za-z0-9 ._/()+-]*[A-Za-z0-9.)]|[A-Za-z]", clean)
-        else f'"{clean}"'
-    )
+    plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9 ._/()+-]*[A-Za-z0-9.)]|[A-Za-z]", clean)
+    return clean if plain and clean.lower() not in ("null", "true", "false") else f'"{clean}"'
 
 
 def _file_name(origin: str) -> str:

@@ -160,6 +160,15 @@ class PdoEntry:
         )
 
     @property
+    def counts_range(self) -> tuple[float, float]:
+        """`range` in counts; that of the type alone where the factor is 0."""
+        least, most = type_range(self.type, self.length)
+        if not self.factor:
+            return least, most
+        low, high = sorted((end - self.offset) / self.factor for end in self.range)
+        return max(low, least), min(high, most)
+
+    @property
     def length(self) -> int:
         """Length in bits."""
         return BITS.get(self.type) or self.bits or 0
@@ -274,9 +283,10 @@ class DeviceDescription:
     @property
     def is_box(self) -> bool:
         """Whether inputs and outputs with a function may hang on it: it maps channels of these names."""
+        if self.kind in ("io", "cia402") or self.has_channels:
+            return self.kind == "io"
         mapped = [{entry.name for pdo in pdos for entry in pdo.channels} for pdos in (self.rpdo, self.tpdo)]
-        other = self.kind not in CHANNEL_KINDS and self.kind != "cia402"
-        return self.kind == "io" or (other and "outputs" in mapped[0] and "inputs" in mapped[1])
+        return "outputs" in mapped[0] and "inputs" in mapped[1]
 
     @property
     def axes(self) -> tuple[int, ...]:

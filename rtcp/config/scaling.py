@@ -26,7 +26,7 @@ TORQUE_UNITS: dict[TorqueUnit, float] = {"mNm": 1e-3, "uNm": 1e-6}
 """Nm per count of 0x6076."""
 PER_MILLE = 1e-3
 FACTOR_TOLERANCE = 1e-6
-"""Up to which two factors of the same quantity are the same."""
+"""Relative difference up to which two factors, or what a drive holds and its file, are the same."""
 
 QUANTITIES: dict[str, str] = {
     "target_position": "position",
@@ -40,6 +40,8 @@ QUANTITIES: dict[str, str] = {
     "torque_offset": "torque",
 }
 """Channels of a CiA 402 drive whose factors follow from the scaling."""
+QUICK_STOP_OPTION = 0x605A
+"""Object of the first axis: what the drive does at a quick stop."""
 BOUNDING_OBJECTS = {
     0x6072: "max torque", 0x6080: "max motor speed",
     0x60E0: "positive torque limit", 0x60E1: "negative torque limit",

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from mypy_extensions import mypyc_attr
 
 from rtcp.config.find import load_class, registered
-from rtcp.config.model import LARGEST, SlaveConfig, type_range
+from rtcp.config.model import LARGEST, SlaveConfig
 from rtcp.fieldbus.pdo import STRUCT_CODES, Channel, ImageLayout, layout
 from rtcp.ipc.commands import Command
 from rtcp.ipc.events import Event
@@ -147,13 +147,13 @@ class Driver:
             return 0
         if channel.type == "bytes":
             return int.from_bytes(self.array_targets[channel.name][: channel.bits // 8], "little")
-        value, (low, high) = self.targets[channel.name], channel.range
-        # What a process sets is bounded as what a command sets; what is no number is no reason to end the cycle.
-        value = min(max(value, low), high) if isfinite(value) else self.safe_values[channel.name]
-        counts = (value - channel.offset) / channel.factor
-        low, high = type_range(channel.type, channel.bits)
-        bounded = min(max(counts, low), high)
-        return bounded if channel.type in LARGEST else round(bounded)
+        value = self.targets[channel.name]
+        if not isfinite(value):
+            value = self.safe_values[channel.name]  # what is no number is no reason to end the cycle
+        # What a process sets is bounded as what a command sets.
+        low, high = channel.limits
+        counts = min(max((value - channel.offset) / channel.factor, low), high)
+        return counts if channel.type in LARGEST else round(counts)
 
 
 class Counter:

@@ -295,7 +295,8 @@ def abort_meaning(code: int) -> str:
 _SM0_STATUS, _SM1_STATUS, _FULL = Register.SYNC_MANAGER + 5, Register.SYNC_MANAGER + 13, 0x08
 _SM1_ACTIVATE, _SM1_PDI_CONTROL, _REPEAT = Register.SYNC_MANAGER + 14, Register.SYNC_MANAGER + 15, 0x02
 """Repeat request and, toggled by the slave, its acknowledgement (ETG.1000.4, 6.7.1)."""
-_LOOKS = 20
+_MOST_READS = 20
+"""How often the acknowledgement is read."""
 _HEADER = struct.Struct("<HHBB")
 
 
@@ -404,8 +405,8 @@ class Mailbox:
             toggled = bytes((control[0] ^ _REPEAT,))
             if not self._port.write(self._station, _SM1_ACTIVATE, toggled):
                 return None
-            looks = (self._port.read(self._station, _SM1_PDI_CONTROL, 1) for _ in range(_LOOKS))
-            if not any(one is not None and not (one[0] ^ toggled[0]) & _REPEAT for one in looks):
+            states = (self._port.read(self._station, _SM1_PDI_CONTROL, 1) for _ in range(_MOST_READS))
+            if not any(state is not None and not (state[0] ^ toggled[0]) & _REPEAT for state in states):
                 return None
             if not self._is_full(_SM1_STATUS):
                 return None

@@ -42,8 +42,8 @@ class Channel:
     unit: str = ""
     offset: float = 0.0
     """SI value at 0 counts."""
-    range: tuple[float, float] = (-inf, inf)
-    """Of an output: smallest and largest value that is sent, SI."""
+    limits: tuple[float, float] = (-inf, inf)
+    """Of an output: fewest and most counts that are sent."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def layout(pdos: Sequence[Pdo]) -> ImageLayout:
             channels.append(
                 Channel(
                     entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, entry.length,
-                    entry.unit, entry.offset, entry.range if entry.is_number else Channel.range,
+                    entry.unit, entry.offset, entry.counts_range if entry.is_number else Channel.limits,
                 )
             )  # fmt: skip
             offset += entry.length

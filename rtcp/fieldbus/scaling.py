@@ -11,7 +11,14 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 from rtcp.config.model import SlaveConfig
-from rtcp.config.scaling import OBJECTS_PER_AXIS, TORQUE_UNITS, VELOCITY_UNITS, DriveScaling
+from rtcp.config.scaling import (
+    FACTOR_TOLERANCE,
+    OBJECTS_PER_AXIS,
+    QUICK_STOP_OPTION,
+    TORQUE_UNITS,
+    VELOCITY_UNITS,
+    DriveScaling,
+)
 from rtcp.fieldbus.bus import slave_label
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
@@ -20,9 +27,7 @@ from rtcp.fieldbus.registers import Steps
 _ENCODER, _GEAR, _FEED = 0x608F, 0x6091, 0x6092
 """Ratios: subindex 1 by subindex 2."""
 _RATED_CURRENT, _RATED_TORQUE, _VELOCITY_UNIT = 0x6075, 0x6076, 0x60A9
-_TOLERANCE: Final = 1e-6
 _AMPERE_PER_COUNT: Final = 1e-3
-_QUICK_STOP_OPTION: Final = 0x605A
 _HOLDING: Final = range(5, 9)
 """Quick stop option codes after which the drive stays in quick stop active, with torque."""
 _WRITE_ONLY: Final = 0x06010001
@@ -42,7 +47,7 @@ def compare_scaling(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
         scaling = device.scaling_of(axis)
         if scaling is None:
             continue
-        where = slave_label(sdo.position, sdo.name) + ("" if device.axes == (1,) else f", axis {axis}")
+        where = _axis_label(sdo, config, axis)
         lacking: list[str] = []
         for index, key, wanted, reading, unit in _compared(scaling, (axis - 1) * OBJECTS_PER_AXIS):
             held = yield from reading(sdo, index)
@@ -61,6 +66,10 @@ def compare_scaling(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
     if faults:
         raise BusError(*faults)
     return notes
+
+
+def _axis_label(sdo: SdoClient, config: SlaveConfig, axis: int) -> str:
+    return slave_label(sdo.position, sdo.name) + ("" if config.device.axes == (1,) else f", axis {axis}")
 
 
 Value = float | str
@@ -87,7 +96,7 @@ def _compared(scaling: DriveScaling, shift: int) -> Iterator[tuple[int, str, Val
 def _equal(held: Value, wanted: Value) -> bool:
     if isinstance(held, str) or isinstance(wanted, str):
         return held == wanted
-    return math.isclose(held, wanted, rel_tol=_TOLERANCE)
+    return math.isclose(held, wanted, rel_tol=FACTOR_TOLERANCE)
 
 
 def _shown(value: Value) -> str:
@@ -129,14 +138,12 @@ def check_quick_stop(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
     """Read what each axis of a drive does at a quick stop; return a sentence for each that then drops the torque."""
     notes = []
     for axis in config.device.axes:
-        index = _QUICK_STOP_OPTION + (axis - 1) * OBJECTS_PER_AXIS
+        index = QUICK_STOP_OPTION + (axis - 1) * OBJECTS_PER_AXIS
         option = yield from _reading(sdo, index, 0)
         if option is not None and option not in _HOLDING:
             signed = option - (1 << 16) if option >> 15 else option
-            where = slave_label(sdo.position, sdo.name) + ("" if config.device.axes == (1,) else f", axis {axis}")
-            file = config.file or "its device file"
             notes.append(
-                f"{where}: after a quick stop it does not hold (0x{index:04X} is {signed}; 5 to 8 hold): write it "
-                f"among the start-up SDOs of {file}"
+                f"{_axis_label(sdo, config, axis)}: after a quick stop it does not hold (0x{index:04X} is {signed}; "
+                f"5 to 8 hold): write it among the start-up SDOs of {config.file or 'its device file'}"
             )
     return notes

@@ -90,7 +90,7 @@ def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, .
     return tuple(found)
 
 
-def _watchdog_off(port: RegisterPort, station: int) -> list[int]:
+def watchdog_off(port: RegisterPort, station: int) -> tuple[int, ...]:
     """Return the sync managers whose outputs do not trigger the watchdog by the EEPROM; none where it is unreadable."""
 
     def read(word: int) -> bytes:
@@ -106,13 +106,13 @@ def _watchdog_off(port: RegisterPort, station: int) -> list[int]:
                 break
             if number == SYNC_MANAGERS:
                 content = b"".join(read(at) for at in range(word, word + min(words, _SYNC_MANAGERS_WORDS), 2))
-                return [n for n, manager in enumerate(read_sync_managers(content)) if manager.lacks_watchdog]
+                return tuple(n for n, manager in enumerate(read_sync_managers(content)) if manager.lacks_watchdog)
             word += words
     except BusError:
         pass
     finally:
         eeprom_to_device(port, station)
-    return []
+    return ()
 
 
 def describe(
@@ -175,5 +175,4 @@ def describe(
         parent=0,
         parent_port=0,
         port_errors=read_port_errors(counters),
-        watchdog_off=tuple(_watchdog_off(port, station)),
     )

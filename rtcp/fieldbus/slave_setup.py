@@ -328,13 +328,14 @@ def configure_slave(
 
 def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     """Write a start-up SDO and read it back; return a note where the device lacks it and may."""
-    value = 0 if startup.value is None else startup.value
     if startup.type == "bytes":
         data = bytes.fromhex(startup.data)
+    elif startup.value is None:
+        raise BusError(f"{slave_label(sdo.position, sdo.name)}: start-up SDO 0x{startup.index:04X} has no value")
     elif startup.type.startswith("float"):
-        data = struct.Struct("<" + STRUCT_CODES[startup.type]).pack(value)
+        data = struct.Struct("<" + STRUCT_CODES[startup.type]).pack(startup.value)
     else:
-        data = int(value).to_bytes(startup.length, "little", signed=startup.type.startswith("int"))
+        data = int(startup.value).to_bytes(startup.length, "little", signed=startup.type.startswith("int"))
     what = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
     try:
         yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, startup.type, startup.complete)

@@ -40,7 +40,7 @@ from rtcp.fieldbus.master import Master
 from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, entries_of, layout, mapping_of, mapping_text
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
-from rtcp.fieldbus.scan import describe, name_of, read_mailbox, read_serial
+from rtcp.fieldbus.scan import describe, name_of, read_mailbox, read_serial, watchdog_off
 from rtcp.fieldbus.slave_setup import (
     SlaveRestorer,
     by_alias,
@@ -161,7 +161,13 @@ class SoemBus:
         found = self._describe()
         tree = Topology.of([info.ports for info in found])
         return tuple(
-            replace(info, parent=tree.parent(info.position), parent_port=tree.port(info.position)) for info in found
+            replace(
+                info,
+                parent=tree.parent(info.position),
+                parent_port=tree.port(info.position),
+                watchdog_off=watchdog_off(self.port, station_of(info.position)),
+            )
+            for info in found
         )
 
     def _describe(self) -> tuple[SlaveInfo, ...]:

@@ -200,7 +200,7 @@ def _prepare(port: socket.socket, interface: str) -> None:
 
 
 def _write_waiting(port: socket.socket, writer: PcapngFile) -> int:
-    """Write the frames that wait, so many at most; return how many there were."""
+    """Write the waiting frames, at most `_FRAMES_AT_ONCE`; return how many were written."""
     for count in range(_FRAMES_AT_ONCE):
         try:
             frame, extras, _, address = port.recvmsg(_LARGEST_FRAME, socket.CMSG_SPACE(_TIME.size))
