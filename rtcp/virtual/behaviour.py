@@ -248,6 +248,19 @@ class HookWatch:
             signal.signal(signal.SIGALRM, handler)
             faulthandler.unregister(signal.SIGPROF)
 
+    def run(self, patience: Patience, call: Callable[..., T], *arguments: object) -> T:
+        """Call code of a behaviour's, for as long as `patience` allows; raises HookHangs, and what the code raises."""
+        try:
+            self.call += 1
+            self.patience = patience
+            result = call(*arguments)
+            self.patience = None
+        except BaseException:
+            # First: between the code and this line nothing is called, so no signal is looked at.
+            self.patience = None
+            raise
+        return result
+
     def _look(self, number: int, frame: FrameType | None) -> None:
         # What C does not return from in this time ends the process, with the lines that called it.
         signal.setitimer(signal.ITIMER_PROF, self.LONGEST_IN_C_S)
@@ -300,16 +313,12 @@ class Runner:
         if kind is None:
             kind = Behaviour
         try:
-            WATCH.call += 1
-            WATCH.patience = MAKING
-            self.behaviour = kind(device)
-            self.keeps_outputs = bool(self.behaviour.keeps_outputs)
+            self.behaviour = WATCH.run(MAKING, kind, device)
+            self.keeps_outputs = WATCH.run(MAKING, lambda: bool(self.behaviour.keeps_outputs))
             """Whether outputs keep their values when they become invalid."""
-            WATCH.patience = None
+        except KeyboardInterrupt:
+            raise
         except BaseException as error:  # whatever a behaviour raises, and HookHangs
-            WATCH.patience = None
-            if isinstance(error, KeyboardInterrupt):
-                raise
             raise OptionError((("behaviour",), f"{_place_of(error, kind, '__init__')}: {_said(error)}")) from error
         if _overrides(kind, "on_outputs"):
             self._steps = self.behaviour.on_outputs
@@ -394,18 +403,12 @@ class Runner:
               patience: Patience = HOOK) -> T:  # fmt: skip
         """Call a hook, which may raise what is `allowed`; report anything else and raise HookFailed."""
         try:
-            WATCH.call += 1
-            WATCH.patience = patience
-            result = call(*arguments)
-            WATCH.patience = None
+            return WATCH.run(patience, call, *arguments)
         except BaseException as error:  # whatever a behaviour raises, and HookHangs
-            # First: between the hook and this line nothing is called, so no signal is looked at.
-            WATCH.patience = None
             if isinstance(error, allowed):
                 raise
             self._tell(hook, error)
             raise HookFailed from None
-        return result
 
     def fail(self, hook: str, error: BaseException) -> None:
         """Take the slave out of OP for a failure, and report that."""
@@ -469,12 +472,8 @@ def find_behaviour(name: str) -> type[Behaviour]:
         text = f'found the text "{name}", allowed is one of {", ".join(BUILT_IN)}, or module:Class'
         raise OptionError((("behaviour",), text))
     try:
-        WATCH.call += 1
-        WATCH.patience = MAKING
-        found = load_class(EntryPoint(name, target, "behaviour"), Behaviour)
-        WATCH.patience = None
+        found = WATCH.run(MAKING, load_class, EntryPoint(name, target, "behaviour"), Behaviour)
     except (PluginError, HookHangs) as error:
-        WATCH.patience = None
         raise OptionError((("behaviour",), str(error))) from error
     _check(found)
     return found
