@@ -35,6 +35,7 @@ COMPILED = (
     "rtcp/virtual/esc.py",
     "rtcp/virtual/fmmu.py",
     "rtcp/virtual/mailbox.py",
+    "rtcp/virtual/objects.py",
     "rtcp/virtual/pdo.py",
     "rtcp/virtual/segment.py",
     "rtcp/virtual/slave.py",
@@ -42,6 +43,10 @@ COMPILED = (
     "rtcp/virtual/models/cyclic_modes.py",
     "rtcp/virtual/models/mechanics.py",
     "rtcp/virtual/models/profile_modes.py",
+    "rtcp/virtual/models/protection.py",
+    "rtcp/virtual/models/servo.py",
+    "rtcp/virtual/models/units.py",
+    "rtcp/testing/bus.py",
 )
 INTERPRETED = (
     "kinematics/c_source.py",

@@ -30,13 +30,14 @@ from rich.table import Table
 
 from kinematics.compiled import BUILD
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import Enable, MotionCommand, MoveJoints, RunLines
+from rtcp.config.model import Stop
+from rtcp.ipc.commands import MotionCommand, MoveJoints, RunLines
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Simulation
 from rtcp.motion.limits import Limits
-from rtcp.motion.planning.lines import Stop, plan_lines
+from rtcp.motion.planning.lines import plan_lines
 from rtcp.realtime.discipline import Discipline
 from rtcp.telemetry.square import SPEED_M_S, place
+from rtcp.testing.simulation import Simulation
 
 PERIOD_US = 500.0
 NEUTRAL, TOGGLE = 0x3F, 0x100
@@ -97,11 +98,7 @@ def activity(name: str) -> Iterator[Activity]:
     if name == "joystick":
         config = replace(config, control_mode="joystick")
     with Simulation(config, 1, positions=START if name == "joint" else square.start) as simulation:
-        assert simulation.until(lambda: simulation.state is State.READY, 3.0)
-        simulation.run(0.1)
-        simulation.acquire()
-        assert simulation.send(Enable()).refusal is None
-        assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+        simulation.hold()
         if name == "joint":
             step = _pairs(simulation, MoveJoints(TARGET, 0.4, True), MoveJoints(START, 0.4, True))
         elif name == "cartesian":
@@ -185,7 +182,7 @@ def compute_ns(activity: Activity, cycles: int, least: Step | None) -> tuple[lis
 
     def timed_receive() -> int:
         nonlocal answered
-        wkc = receive()
+        wkc: int = receive()
         answered = perf_counter_ns()
         return wkc
 

@@ -16,9 +16,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import Enable, MoveJoints
-from rtcp.ipc.states import State
-from rtcp.launch.simulation import Simulation
+from rtcp.ipc.commands import MoveJoints
+from rtcp.testing.simulation import Simulation
 
 START = [0.3, 0.2, 0.9, 0.2, 0.6, 0.1]
 TARGET = (1.3, -0.4, 1.5, 1.2, -0.4, 1.1)
@@ -45,10 +44,7 @@ def moving(period_us: int) -> Simulation:
     simulation = Simulation(config, 1, positions=START)
     if simulation.box is not None:
         simulation.box.inputs = INPUTS
-    simulation.acquire()
-    assert simulation.until(lambda: simulation.state is State.READY, 3.0)
-    assert simulation.send(Enable()).refusal is None
-    assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+    simulation.hold()
     refusal = simulation.send(MoveJoints(TARGET, 0.1, True)).refusal
     assert refusal is None, refusal
     return simulation

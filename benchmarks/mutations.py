@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.malformed import mutated_answers, mutated_frames, mutated_loop
 from tests.malformed.cable import answerer, master, report_of
-from tests.malformed.mutated_frames import Found
+from tests.malformed.mutated_frames import Outcome
 
 A_JOB = 50_000
 MOST_OBJECTS, MOST_KB = 20_000, 30_000
@@ -33,26 +33,26 @@ EXCHANGES = 1.8
 """Exchanges for a mutated answer: every second one is, and the fence's frames beside them."""
 
 
-def exchange(count: int, seed: int) -> Found:
+def exchange(count: int, seed: int) -> Outcome:
     """Mutated answers over a real socket into SOEM; the last exchanges must be right again."""
-    found = Found("master, SOEM on a socket")
+    outcome = Outcome("master, SOEM on a socket")
     with answerer(seed) as pid:
         done = master(pid, "exchange", round(EXCHANGES * count))
     try:
         said = report_of(done)
     except AssertionError as failure:
-        found.failures.append(str(failure))
-        return found
-    found.frames, found.seconds, found.kilobytes = said["mutated"], said["seconds"], said["kilobytes"]
-    found.starts = int(said["recovered"])
-    found.kinds.update(said["counters"])
-    return found
+        outcome.failures.append(str(failure))
+        return outcome
+    outcome.frames, outcome.seconds, outcome.kilobytes = said["mutated"], said["seconds"], said["kilobytes"]
+    outcome.starts = int(said["recovered"])
+    outcome.kinds.update(said["counters"])
+    return outcome
 
 
 class Part(NamedTuple):
     """What is played, which share of the frames it gets, and how many of them at a time."""
 
-    play: Callable[[int, int], Found]
+    play: Callable[[int, int], Outcome]
     share: float
     job: int
 
@@ -73,15 +73,15 @@ class Job(NamedTuple):
     seed: int
 
 
-def run(job: Job) -> tuple[Job, Found]:
+def run(job: Job) -> tuple[Job, Outcome]:
     """Play a job; what it has grown by or did not recover from is a failure like an exception."""
     os.nice(5)
-    found = PARTS[job.part].play(job.count, job.seed)
-    if not found.starts:
-        found.failures.append("it did not recover")
-    if found.objects > MOST_OBJECTS or found.kilobytes > MOST_KB:
-        found.failures.append(f"it has grown by {found.objects} objects and {found.kilobytes} kB")
-    return job, found
+    outcome = PARTS[job.part].play(job.count, job.seed)
+    if not outcome.starts:
+        outcome.failures.append("it did not recover")
+    if outcome.objects > MOST_OBJECTS or outcome.kilobytes > MOST_KB:
+        outcome.failures.append(f"it has grown by {outcome.objects} objects and {outcome.kilobytes} kB")
+    return job, outcome
 
 
 def jobs_of(names: list[str], frames: int, seed: int) -> list[Job]:
@@ -103,20 +103,20 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     given = parser.parse_args()
     began = time.monotonic()
-    totals = {name: Found(name) for name in ([given.part] if given.part else PARTS)}
+    totals = {name: Outcome(name) for name in ([given.part] if given.part else PARTS)}
     jobs = jobs_of(list(totals), given.frames, given.seed)
     # Each job has a process of its own: joining the answerer's namespace cannot be undone, and memory is told apart.
     with multiprocessing.get_context("spawn").Pool(given.processes, maxtasksperchild=1) as pool:
-        for number, (job, found) in enumerate(pool.imap_unordered(run, jobs), 1):
+        for number, (job, outcome) in enumerate(pool.imap_unordered(run, jobs), 1):
             total = totals[job.part]
-            total.name = found.name
-            total.frames += found.frames
-            total.seconds += found.seconds
-            total.starts += found.starts
-            total.kinds += found.kinds
-            total.objects = max(total.objects, found.objects)
-            total.kilobytes = max(total.kilobytes, found.kilobytes)
-            total.failures += [f"{job}: {failure}" for failure in found.failures]
+            total.name = outcome.name
+            total.frames += outcome.frames
+            total.seconds += outcome.seconds
+            total.starts += outcome.starts
+            total.kinds += outcome.kinds
+            total.objects = max(total.objects, outcome.objects)
+            total.kilobytes = max(total.kilobytes, outcome.kilobytes)
+            total.failures += [f"{job}: {failure}" for failure in outcome.failures]
             print(f"... {number} of {len(jobs)} jobs", file=sys.stderr, flush=True)
     print(
         "part                      mutated frames  wall s  failures  objects  memory kB  recovered  what came of them"

@@ -30,14 +30,14 @@ from kinematics.forward import forward, forward_batch, frames
 from rtcp.config.find import default_config
 from rtcp.config.loader import load
 from rtcp.config.model import ArmConfig, Stop
-from rtcp.ipc.commands import Enable, Halt, RunTrajectory
+from rtcp.ipc.commands import Halt, RunTrajectory
 from rtcp.ipc.states import State
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning import preview
 from rtcp.motion.planning.path import plan_path
 from rtcp.motion.planning.plan import ACCELERATIONS, POSITIONS, VELOCITIES, Plan, PlanRefused
-from tests.sessions.driver import Driver
+from tests.sessions.oracle import commander_of
 
 HERE = (0.0, -0.2, 2.0, 0.0, 1.0, 0.0)
 
@@ -105,16 +105,15 @@ def run_programs(config: ArmConfig, count: int, seed: int, minutes: float) -> No
     """Run random programs, one of ten with a halt under way, and print what the frames showed."""
     assert config.arm is not None
     random, ends_at = Random(seed), time.monotonic() + 60.0 * minutes
-    driver = Driver(config, seed, HERE)
-    simulation, limits, refused = driver.simulation, Limits(config), Counter[str]()
+    commander = commander_of(config, seed, HERE)
+    simulation, limits, refused = commander.simulation, Limits(config), Counter[str]()
     zones = Zones(config.arm, limits, config.cartesian.clearance)
     arm = config.arm
 
     def zone_at(q: Sequence[float]) -> str | None:
         return "a box or itself" if zones.distance(frames(arm, q))[0] < 0.0 else None
 
-    assert simulation.send(Enable()).refusal is None
-    assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+    simulation.hold()
     done = halted = 0
     for number in range(count):
         if time.monotonic() > ends_at:
@@ -140,16 +139,16 @@ def run_programs(config: ArmConfig, count: int, seed: int, minutes: float) -> No
             simulation.run(random.uniform(0.0, plan.duration_s))
             simulation.send(Halt())
             halted += 1
-        assert simulation.until(lambda: simulation.state is State.HOLDING, plan.duration_s + 5.0), simulation.state
-        if driver.checker.violations:
+        simulation.bring_to(State.HOLDING, plan.duration_s + 5.0)
+        if commander.checker.violations:
             break
         done += 1
-    checker = driver.checker
+    checker = commander.checker
     print(f"{done} programs run, {halted} of them halted under way; {sum(refused.values())} refused before the start")
     print(f"{checker.frames} frames decoded, {len(checker.violations)} violations {checker.violations[:3]}")
     step, acceleration = checker.largest_step, checker.largest_acceleration
     print(f"largest step {step:.4f}, largest acceleration {acceleration:.4f} of the limits")
-    driver.close()
+    commander.close()
 
 
 def plan_programs(config: ArmConfig, count: int, seed: int, minutes: float) -> None:

@@ -113,7 +113,7 @@ def main() -> None:
                 with SegmentClient(Path(control)) as faults:
                     faults.fault({"fault": "sdo_late", "slave": 2, "ms": int(delay)})
             if client == "own":
-                return bus.sdo_read(2, *NAMED)
+                return bus.sdo(2).read(*NAMED)
             return bus._master.slaves[1].sdo_read(*NAMED, release_gil=True)
 
         print(

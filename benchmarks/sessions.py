@@ -38,7 +38,7 @@ def show(outcome: Outcome, wall_s: float) -> None:
     print(f"simulated           {outcome.simulated_s:.0f} s in {wall_s:.0f} s")
     table("commands taken     ", outcome.taken)
     table("commands refused   ", outcome.refused)
-    table("happenings         ", outcome.happenings)
+    table("faults             ", outcome.faults)
     table("seen in states     ", outcome.states)
     print(f"largest step        {outcome.step:.4f} of what is allowed")
     print(f"largest acceleration {outcome.acceleration:.4f} of what is allowed")

@@ -271,7 +271,8 @@ def end_errors(numbers: Iterable[int], seed: int) -> tuple[list[float], list[flo
 
     The first is wrong by 15 %, the second by its formula with 18 W/m K and 1.5 times flux by rise.
     """
-    drawn, formula = [], []
+    drawn: list[float] = []
+    formula: list[float] = []
     for number in numbers:
         rod, wrong = draw_rod(seed, number), Random(f"{seed} {number} ends")
         rise, hot = TARGET_C - _ROOM_C, np.array([TARGET_C])

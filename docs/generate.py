@@ -111,8 +111,8 @@ def machine(part: str) -> str:
         return f"```mermaid\n{machine_page.diagram()}\n```"
     if part == "reactions":
         return machine_page.reactions(load(default_config()))
-    made: str = getattr(machine_page, part)()
-    return made
+    markdown: str = getattr(machine_page, part)()
+    return markdown
 
 
 def methods(part: str) -> str:
@@ -121,8 +121,12 @@ def methods(part: str) -> str:
         from rtcp.gateway.methods import documented
 
         rows = [
-            [f"`{one.name}`", ", ".join(_parameter(*found) for found in _parameters(one.parameters)), _line(one.about)]
-            for one in documented()
+            [
+                f"`{method.name}`{' *' * method.at_once}",
+                ", ".join(_parameter(*parameter) for parameter in _parameters(method.parameters)),
+                _line(method.about),
+            ]
+            for method in documented()
         ]
         return table(["method", "parameters", "what it does"], rows)
     from rtcp.ipc.events import EVENTS
@@ -165,9 +169,9 @@ PARTS: dict[str, Callable[..., str]] = {
 def generated(text: str) -> str:
     """Return a page with its generated parts as they have to be."""
 
-    def part(found: re.Match[str]) -> str:
-        name, *arguments = found[2].split()
-        return f"{found[1]}\n{PARTS[name](*arguments).strip()}\n\n{found[3]}"
+    def part(match: re.Match[str]) -> str:
+        name, *arguments = match[2].split()
+        return f"{match[1]}\n{PARTS[name](*arguments).strip()}\n\n{match[3]}"
 
     return _PART.sub(part, text)
 

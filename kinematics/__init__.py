@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import kinematics.compiled  # noqa: F401  first: it says whether the others are imported compiled
+import kinematics.compiled  # noqa: F401  first: it decides whether the others are imported compiled
 from kinematics.capsules import Placed, capsules, distance, self_pairs
 from kinematics.damped_least_squares import NumericResult, solve_numeric
 from kinematics.forward import forward, forward_batch, frames, twist_batch

@@ -19,7 +19,7 @@ from kinematics.position_ik import PlanarArm
 from kinematics.spherical import SphericalArm, has_spherical_wrist
 
 VERSION: Final = "1"
-"""Of the interface and the results; a change of either changes it."""
+"""Version of the C interface and its results; it changes with either."""
 
 _HERE: Final = Path(__file__).parent
 _NUMBERS: Final = "/* numbers */\n"
@@ -72,12 +72,12 @@ def to_c(model: ArmModel) -> CSource:
 
 def c_name(name: str) -> str:
     """A name as C and ROS packages allow it: lower case, digits and single underscores, a letter first."""
-    found = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-    return found if found[:1].isalpha() else f"arm_{found}".rstrip("_")
+    identifier = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    return identifier if identifier[:1].isalpha() else f"arm_{identifier}".rstrip("_")
 
 
 def numbers_digest(model: ArmModel) -> str:
-    """SHA-256 of what the results depend on: rows, limits, tool and joint names."""
+    """SHA-256, hexadecimal, of everything on which the results depend: version, rows, limits, tool and joint names."""
     limits = [(limit.lower, limit.upper, limit.velocity) for limit in model.limits]
     rows = [(row.alpha, row.a, row.d, row.offset) for row in model.rows]
     content = [VERSION, rows, limits, model.tool, model.joint_names]
@@ -116,4 +116,4 @@ def _value(value: float | Sequence[object]) -> str:
 
 def _string(text: str) -> str:
     """A string literal of C: UTF-8, all but plain characters as octal escapes."""
-    return '"' + _UNSAFE.sub(lambda found: "".join(f"\\{byte:03o}" for byte in found[0].encode()), text) + '"'
+    return '"' + _UNSAFE.sub(lambda match: "".join(f"\\{byte:03o}" for byte in match[0].encode()), text) + '"'

@@ -19,8 +19,8 @@ from kinematics.pose import IDENTITY, Pose, Vector, applied
 SLIM: Final = 0.03
 THICK: Final = 0.045
 JOINT_LENGTH: Final = 2.5
-"""Radii of the bodies that stand in for unknown links and joints, relative to `extent`, and the length of a joint's
-cylinder, relative to its radius."""
+"""Radii of the default bodies of links and of joints, relative to `extent`; length of a joint's cylinder, relative to
+its radius."""
 _PARALLEL: Final = 1e-14
 """Squared sine of the angle of two axes below which they count as parallel."""
 
@@ -45,10 +45,11 @@ def rods(model: ArmModel) -> tuple[tuple[int, Vector, Vector], ...]:
 
 
 def capsules(model: ArmModel) -> tuple[Capsule, ...]:
-    """The bodies of an arm: those that it names, else one around each rod, which hold all that `to_urdf` draws.
+    """The bodies of an arm: `model.bodies`, or by default one capsule around each of its `rods`.
 
-    A joint's cylinder sits where a rod ends; its circumscribed sphere is the end of that rod's capsule. Those that the
-    tool names come last, in the place of the rod from the flange to the tool.
+    The default capsules contain everything that `to_urdf` draws: the end of a rod's capsule is the circumscribed sphere
+    of the joint's cylinder there. The bodies of the tool, if known, come last and replace the rod from the flange to
+    the tool.
     """
     tool = model.tool_bodies
     if model.bodies:
@@ -59,7 +60,7 @@ def capsules(model: ArmModel) -> tuple[Capsule, ...]:
 
 
 def with_every_tool(models: Sequence[ArmModel]) -> ArmModel:
-    """The first of the models of one arm, with the bodies of the tools of all: what others must keep away from."""
+    """The first model with the tool bodies of all `models`, one for each tool of an arm: the shape to keep clear of."""
     first = models[0]
     if len(models) == 1:
         return first
@@ -70,9 +71,9 @@ def with_every_tool(models: Sequence[ArmModel]) -> ArmModel:
 def self_pairs(model: ArmModel) -> tuple[tuple[int, int], ...]:
     """Pairs of `capsules(model)` that may collide with each other.
 
-    Left out are bodies of one link and of neighbours, those that overlap whatever the joints between them do (they meet
-    there), and, of derived bodies, those that overlap at home (all joints at 0, or as near as their ranges allow): such
-    bodies are too thick for this arm, and only named ones can guard that pair.
+    Pairs of one link and of neighbouring links are left out, and pairs that overlap in every configuration. Pairs of
+    default bodies are also left out if they overlap with all joints at 0, or as near as their ranges allow: these
+    bodies are too thick for the arm, and only `model.bodies` can guard such a pair.
     """
     bodies = capsules(model)
     derived = 0 if model.bodies else len(bodies) - len(model.tool_bodies or ())
@@ -108,7 +109,7 @@ def _from_axis(point: Vector, body: Capsule) -> float:
 
 
 class Placed:
-    """The capsules of an arm where they are in the world: made once, placed as often as wanted.
+    """The capsules of an arm at their places in the world; created once, updated by `place`.
 
     Args:
         bodies: the capsules, as `capsules` returns them.
@@ -125,11 +126,11 @@ class Placed:
         """Start of each axis, x, y, z, and from there to its end, m: six numbers a capsule."""
 
     def place(self, poses: Sequence[Pose], base: Pose = IDENTITY) -> None:
-        """Put the capsules where the arm is.
+        """Update the axes of the capsules.
 
         Args:
-            poses: `frames` of its configuration.
-            base: its base in the world.
+            poses: `frames` of the arm's configuration.
+            base: pose of the arm's base in the world.
         """
         axes, at = self.axes, 0
         moved = base is not IDENTITY
@@ -155,12 +156,12 @@ class Placed:
 
 
 def distance(a: Placed, b: Placed, pairs: Iterable[tuple[int, int]] | None = None) -> tuple[float, int, int]:
-    """Return the least distance of two arms' bodies, m, and which they are; infinite and -1 where there are none.
+    """Return the least distance between bodies of two arms, m, and the indices of the two; inf, -1, -1 without pairs.
 
     Args:
-        a: one arm.
-        b: the other one, or the same.
-        pairs: of a body of `a` and one of `b`, which are looked at; None: all of them.
+        a: the bodies of one arm.
+        b: the bodies of the other arm, or of the same.
+        pairs: indices in `a` and `b` of the bodies to compare; None: all pairs.
     """
     least, first, second = inf, -1, -1
     p, q, p_radii, q_radii, p_halves, q_halves = a.axes, b.axes, a.radii, b.radii, a.halves, b.halves
@@ -171,7 +172,7 @@ def distance(a: Placed, b: Placed, pairs: Iterable[tuple[int, int]] | None = Non
         z = p[m + 2] - q[n + 2] + 0.5 * (p[m + 5] - q[n + 5])
         radii = p_radii[i] + q_radii[j]
         bound = least + radii + p_halves[i] + q_halves[j]
-        # balls around both bodies are no nearer than what was found
+        # the bounding spheres are at least as far apart as the nearest pair until now
         if x * x + y * y + z * z >= bound * bound:
             continue
         apart = sqrt(between_axes(p, m, q, n)[0]) - radii
@@ -181,15 +182,16 @@ def distance(a: Placed, b: Placed, pairs: Iterable[tuple[int, int]] | None = Non
 
 
 def between_axes(p: Sequence[float], m: int, q: Sequence[float], n: int) -> tuple[float, float, float]:
-    """Return the squared distance of two segments, m^2, and where on each (0 to 1) its nearest point is.
+    """Return the squared distance of two segments, m^2, and the place of the nearest point on each, 0 to 1.
 
     Args:
-        p: holds the start of one segment and the vector to its end, six numbers from `m` on.
-        m: where they begin.
-        q: holds the other one.
-        n: where it begins.
+        p: start of the first segment and vector to its end, m: six numbers from index `m` on.
+        m: index in `p`.
+        q: the second segment, likewise.
+        n: index in `q`.
 
-    Source: Ericson, Real-Time Collision Detection, section 5.1.9. Points and parallel segments are among them.
+    Segments without length and parallel ones are covered. Source: Ericson, Real-Time Collision Detection, section
+    5.1.9.
     """
     ux, uy, uz = p[m + 3], p[m + 4], p[m + 5]
     vx, vy, vz = q[n + 3], q[n + 4], q[n + 5]
@@ -217,15 +219,15 @@ def between_axes(p: Sequence[float], m: int, q: Sequence[float], n: int) -> tupl
 
 
 def from_box(placed: Placed, which: int, box: Sequence[float], within: float = inf) -> tuple[float, float]:
-    """Return the distance of a body from a box, m, and where on its axis (0 to 1) the nearest point is.
+    """Return the signed distance of a body from a box, m, and the place of the nearest point on its axis, 0 to 1.
 
-    Exact: the signed distance from a box is a convex function of a point, and so it is along the axis.
+    The result is exact: the signed distance from a box is a convex function of a point, thus also along an axis.
 
     Args:
         placed: the bodies.
-        which: one of them.
+        which: index of the body.
         box: x, y, z of the lower corner, then of the upper one, m.
-        within: of a body that is farther, m, a lower bound is enough.
+        within: for a body farther than this, m, a lower bound on its distance may be returned.
     """
     axes, at, radius = placed.axes, 6 * which, placed.radii[which]
     ball = outside(*point_at(axes, at, 0.5), box) - placed.halves[which] - radius
@@ -286,7 +288,7 @@ def _slope(axes: Sequence[float], at: int, box: Sequence[float], part: float) ->
 
 
 def _deepest(axes: Sequence[float], at: int, box: Sequence[float]) -> tuple[float, float]:
-    """How deep an axis is in a box that it meets, m (negative), and where.
+    """Signed distance of an axis that meets a box, m (negative), and the place on the axis, 0 to 1.
 
     The depth is the greatest of six linear functions: it is least at an end or where two of them are equal.
     """

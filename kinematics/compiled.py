@@ -1,7 +1,7 @@
 """Which modules run compiled. `make fast` compiles them with mypyc; RTCP_PURE=1 runs the source all the same.
 
-The extension modules and a digest of the sources that they were made of lie in `_fast`. They are used only where all
-of these sources are still the same: an edit of one makes all of them run as source.
+The folder `_fast` holds the extension modules and a digest of the sources that they were made from. They are used only
+while all of these sources are unchanged: after an edit of one, all modules run as source.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from types import ModuleType
 MANIFEST = "manifest.json"
 PURE = "RTCP_PURE"
 """Environment variable; anything but empty and 0 runs the source."""
-_FOLDERS = ("config", "control", "devices", "fieldbus", "ipc", "motion", "realtime", "virtual")
+_FOLDERS = ("config", "control", "devices", "fieldbus", "ipc", "motion", "realtime", "testing", "virtual")
 DEPENDS_ON = ("kinematics/*.py", *(f"rtcp/{folder}/**/*.py" for folder in _FOLDERS))
-"""What a change of makes the compiled code stale: its types are fixed in it, those of interpreted modules too."""
+"""Files whose change makes the compiled code stale: it has their types built in, also those of interpreted modules."""
 ABI = EXTENSION_SUFFIXES[0]
-"""What the files of extension modules for this interpreter end with."""
+"""File name suffix of extension modules for this interpreter."""
 
 
 @dataclass(frozen=True)
 class Build:
-    """What there is of compiled modules."""
+    """State of the compiled modules in this process."""
 
     is_used: bool
     reason: str
-    """Why they are not used; empty where they are."""
+    """Why they are not used; empty if they are."""
     is_stale: bool = False
-    """They were made of other sources or for another interpreter."""
+    """Whether they were made from other sources, for another interpreter, or are damaged."""
 
 
 def sources_digest(root: Path) -> str:
-    """Return the digest of all sources that the compiled code was made of, or relies on the types of."""
-    found = hashlib.sha256()
+    """Return the digest of the sources on which the compiled code depends."""
+    digest = hashlib.sha256()
     for pattern in DEPENDS_ON:
         for path in sorted(root.glob(pattern)):
-            found.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return found.hexdigest()
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
 
 
 class _Finder(MetaPathFinder):
@@ -70,7 +70,7 @@ def is_pure() -> bool:
 
 
 def use(folder: Path) -> Build:
-    """Let the modules compiled into a folder be imported where they are those of the sources beside it."""
+    """Import the compiled modules in `folder` from now on, if they were made from the present sources."""
     if is_pure():
         return Build(False, f"{PURE} is set")
     try:
@@ -100,4 +100,4 @@ def use(folder: Path) -> Build:
 
 
 BUILD = use(Path(__file__).parent / "_fast")
-"""What this process runs."""
+"""State of the compiled modules in this process."""

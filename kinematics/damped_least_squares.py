@@ -36,10 +36,10 @@ _UNBOUNDED: _Bounds = ((-inf, inf),) * 6
 
 
 class NumericResult(NamedTuple):
-    """The configuration found, and the errors of its tool pose.
+    """Result of `solve_numeric`: a configuration, and the errors of its tool pose.
 
-    q: six rad. converged: both errors below 1e-9. position_error: m. rotation_error: rad, 0 to pi. iterations: total
-    of all starts.
+    q: six angles, rad. converged: both errors below 1e-9. position_error: m. rotation_error: rad, 0 to pi. iterations:
+    total of all starts.
     """
 
     q: Six
@@ -75,10 +75,10 @@ def pose_error(wanted: Pose, actual: Pose) -> list[float]:
 def damped_least_squares(model: ArmModel, pose: Pose, q_near: Sequence[float]) -> Six | None:
     """The configuration at `pose` reached from `q_near` (rad) by the smallest joint steps, or None; 0.1 ms a step.
 
-    For poses a small step away, where singularities meet. The closed form finds the joints one after the other: its
-    choice at one singularity (a free joint), or the bend of a stretched arm (known to 1e-8 only), becomes a jump of
-    the later joints beside a second singularity. Least squares move all joints at once. The damping falls with every
-    step; gives up when the first three steps do not come much nearer.
+    For poses a small step away, where singularities meet. The closed form solves the joints one after the other. At one
+    singularity it chooses the angle of a free joint, and it knows the bend of a stretched arm to 1e-8 only; beside a
+    second singularity this makes the later joints jump. Least squares move all joints at once. The damping decreases
+    with every step; None also when three steps have not reduced the squared error to 1e-4 of its initial value.
     """
     q = list(q_near)
     damping = _DAMPING
@@ -151,9 +151,9 @@ def _errors(point: _Point, length: float) -> tuple[float, float]:
     return length * hypot(*point.error[:3]), hypot(*point.error[3:])
 
 
-def _nearer(first: _Point, other: _Point) -> _Point:
+def _nearer(first: _Point, second: _Point) -> _Point:
     """The better of two; of equals the first, which is nearer to the start of the search."""
-    return other if other.cost < _EQUAL * first.cost else first
+    return second if second.cost < _EQUAL * first.cost else first
 
 
 def _inside(q: Iterable[float], bounds: _Bounds) -> list[float]:
@@ -193,7 +193,7 @@ def _descend(
 
 
 def _step(point: _Point, bounds: _Bounds, damping: float, length: float) -> list[float] | None:
-    """(J^T J + damping)^-1 J^T error over the joints that no bound holds; None when it cannot be solved."""
+    """(J^T J + damping)^-1 J^T error over the joints that no bound stops; None when it has no solution."""
     columns = [
         (vx / length, vy / length, vz / length, wx, wy, wz) for vx, vy, vz, wx, wy, wz in jacobian_columns(point.poses)
     ]

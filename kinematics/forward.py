@@ -19,8 +19,9 @@ _BLOCK: Final = 2048  # configurations: the arrays of a block stay in a second-l
 def forward(model: ArmModel, q: Sequence[float]) -> Pose:
     """The tool's pose in the base frame for six joint angles `q`, rad.
 
-    The product of T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d) over the rows, then the tool. Raises ValueError
-    for a count other than six, and for an angle that is NaN or infinite, naming the joint.
+    The product of T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d) over the rows, then the tool (Craig, Introduction to
+    Robotics, section 3.4). Raises ValueError for a count other than six, and for an angle that is NaN or infinite,
+    naming the joint.
     """
     q = _checked(model, q)
     xx = yy = zz = 1.0
@@ -61,7 +62,7 @@ def forward_batch(model: ArmModel, q: npt.ArrayLike) -> tuple[npt.NDArray[np.flo
     """Tool poses of N configurations: positions (N, 3), m, and rotations (N, 3, 3), base <- tool.
 
     `q` has the shape (N, 6), rad. Agrees with `forward` to round-off (1e-14 of the reach). Raises ValueError for
-    another shape, and for a value that is not finite, naming its place.
+    another shape, and for a value that is not finite, naming its row and column.
     """
     import numpy as np  # here, because the loop's process imports this module and must not load numpy
 
@@ -95,18 +96,18 @@ def twist_batch(model: ArmModel, q: npt.ArrayLike, velocity: npt.ArrayLike) -> n
     twists = np.empty((len(angles), JOINTS))
     for start in range(0, len(angles), _BLOCK):
         block = slice(start, start + _BLOCK)
-        turn, moment = np.zeros((3, len(angles[block]))), np.zeros((3, len(angles[block])))
+        rotation, moment = np.zeros((3, len(angles[block]))), np.zeros((3, len(angles[block])))
         for rate, frame in zip(rates[block].T, _frames_batch(model, angles[block]), strict=True):
             x, y, z, origin = frame
-            turn += rate * z
+            rotation += rate * z
             moment += _cross(rate * z, origin)
         tool = sum((length * axis for length, axis in zip(model.tool.position, (x, y, z), strict=True)), origin)
-        twists[block, :3], twists[block, 3:] = (_cross(turn, tool) - moment).T, turn.T
+        twists[block, :3], twists[block, 3:] = (_cross(rotation, tool) - moment).T, rotation.T
     return twists
 
 
 def _cross(one: Any, other: Any) -> npt.NDArray[np.float64]:
-    """The vector product of arrays (3, n); `numpy.cross` takes longer than all else here."""
+    """The vector product of arrays (3, n); `numpy.cross` would take longer than the rest of `twist_batch`."""
     import numpy as np
 
     (a, b, c), (x, y, z) = one, other

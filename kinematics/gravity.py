@@ -24,7 +24,7 @@ def gravity_torques(
     `gravity`: acceleration of free fall, m/s^2, in the base frame. `payload`: a mass whose centre is given in the
     tool frame. Raises ValueError when the model has no link masses, and for a value that is not finite, naming it.
 
-    Joint i carries the moment of all weights beyond it: -z_i . (sum over j >= i of (c_j - p_i) x m_j g).
+    Statics: joint i carries the moment of the weights of links i to 6, -z_i . (sum over j >= i of (c_j - p_i) x m_j g).
     """
     if not model.links:
         raise ValueError(f"arm {model.name!r} has no link masses; gravity torques need `links`")

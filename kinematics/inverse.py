@@ -19,8 +19,8 @@ from kinematics.pose import Pose, Rotation, Vector, as_floats, require_finite
 from kinematics.solution import SINGULARITIES, AngleWrap, Near, Singularity, Solution, Solutions, nearest_turn
 from kinematics.spherical import ObliqueWrist, SphericalArm, has_spherical_wrist
 
-# A joint that moves by less than this, rad, and by less than this many times the tool's move, in m and rad, does not
-# jump.
+# A solution is a jump if a joint moves by more than NO_JUMP, rad, plus JUMP_RATIO times the tool's motion, the largest
+# component of its displacement (m) and rotation (rad).
 _NO_JUMP: Final = 1e-4
 _JUMP_RATIO: Final = 4.0
 _BESIDE: Final = 1e-4  # |sin theta5| below which the round-off of joints 1 to 3 could make joint 4 jump
@@ -50,8 +50,8 @@ class InverseKinematics:
         """All configurations that bring the tool to `pose` (base frame), each confirmed by forward kinematics.
 
         Joint limits are reported, not enforced. On a singularity the free joint stays at `q_near` (six rad; default:
-        zero, or the limit nearest to it). The numeric method gives one solution, found from there, inside the limits
-        if possible. Raises ValueError for a value that is not finite, naming it, and for an invalid rotation.
+        zero, or the limit nearest to it). The numeric method gives one solution, computed from `q_near`, inside the
+        limits if possible. Raises ValueError for a value that is not finite, naming it, and for an invalid rotation.
         """
         near = self._home if q_near is None else as_floats(q_near)
         _require_finite(self.model, pose, near)
@@ -66,9 +66,9 @@ class InverseKinematics:
     def solve_near(self, pose: Pose, q_near: Sequence[float]) -> Near:
         """The solution inside the joint limits that is nearest to `q_near` (six rad), or why there is none.
 
-        Nearest means the smallest largest joint motion, multiples of 2 pi considered: along a continuous motion this
-        is the branch that continues. It may be far away when no near one exists; the caller bounds the step. A joint
-        that is free on a singularity keeps its position. Raises ValueError as `solve`.
+        The nearest solution is the one whose largest joint motion is smallest, over all multiples of 2 pi: along a
+        continuous motion this is the branch that continues. It may be far away when no near one exists; the caller
+        bounds the step. A joint that is free on a singularity keeps its position. Raises ValueError as `solve`.
         """
         q_near = as_floats(q_near)
         _require_finite(self.model, pose, q_near)
@@ -107,8 +107,8 @@ def _require_finite(model: ArmModel, pose: Pose, q_near: Sequence[float]) -> Non
         raise ValueError(f"q_near has {len(q_near)} joint angles; {JOINTS} are required")
     (x, y, z), (a, b, c, d, e, f, g, h, i) = pose
     q1, q2, q3, q4, q5, q6 = q_near
-    rest = x + y + z + a + b + c + d + e + f + g + h + i + q1 + q2 + q3 + q4 + q5 + q6
-    if rest - rest != 0.0:
+    total = x + y + z + a + b + c + d + e + f + g + h + i + q1 + q2 + q3 + q4 + q5 + q6
+    if total - total != 0.0:
         Pose(*pose).require_finite()
         require_finite(q_near, (f"{name} of q_near" for name in model.joint_names))
 
@@ -168,8 +168,8 @@ def _solve_near(arm: SphericalArm, pose: Pose, q_near: Sequence[float]) -> Near:
 
 def _compare_all(arm: SphericalArm, pose: Pose, point: Vector, rotation: Rotation, q_near: Sequence[float]) -> Near:
     """The nearest of all solutions, at all multiples of 2 pi that the limits allow."""
-    held = [min(max(near, lower), upper) for near, (lower, upper) in zip(q_near, arm.wrap.limits, strict=True)]
-    solutions = arm.solve(point, rotation, held)
+    clamped = [min(max(near, lower), upper) for near, (lower, upper) in zip(q_near, arm.wrap.limits, strict=True)]
+    solutions = arm.solve(point, rotation, clamped)
     if not solutions:
         return _no_near(arm, pose)
     candidates = solutions + _with_joint_6_at_its_limit(arm, point, rotation, solutions, q_near)
@@ -192,7 +192,7 @@ def _is_beside_singularity(arm: SphericalArm, solution: Solution) -> bool:
 def _by_least_squares(
     arm: SphericalArm, pose: Pose, q_near: Sequence[float], least: float, solutions: list[Solution]
 ) -> Near | None:
-    """A solution by damped least squares, if the closed form's best move `least` is a jump and this one is smaller."""
+    """A solution by damped least squares, if the closed form's smallest move `least` is a jump and this is smaller."""
     if least <= _NO_JUMP + _JUMP_RATIO * max(map(abs, pose_error(pose, forward(arm.model, q_near)))):
         return None
     q = damped_least_squares(arm.model, pose, q_near)
@@ -216,15 +216,15 @@ def _with_joint_6_at_its_limit(
 ) -> list[Solution]:
     """Solutions on a wrist singularity with joint 6 at the limit that it would exceed, compensated by joint 4."""
     lower, upper = arm.wrap.limits[5]
-    found = []
+    at_limit = []
     for solution in solutions:
         if Singularity.WRIST in solution.singularity:
             wanted = nearest_turn(solution.q[5], q_near[5])
-            rest = wanted - min(max(wanted, lower), upper)
-            if rest != 0.0:
-                for held4 in (solution.q[3] + rest, solution.q[3] - rest):
-                    found += arm.solve(point, rotation, (*solution.q[:3], held4, 0.0, 0.0))
-    return found
+            excess = wanted - min(max(wanted, lower), upper)
+            if excess != 0.0:
+                for held4 in (solution.q[3] + excess, solution.q[3] - excess):
+                    at_limit += arm.solve(point, rotation, (*solution.q[:3], held4, 0.0, 0.0))
+    return at_limit
 
 
 def _beyond_limit(arm: SphericalArm, solutions: list[Solution], q_near: Sequence[float]) -> Near:

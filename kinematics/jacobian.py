@@ -85,7 +85,7 @@ def jacobian_columns(poses: Sequence[Pose]) -> list[Row]:
 def manipulability(model: ArmModel, q: Sequence[float]) -> float:
     """|det J|, m^3, which is sqrt(det(J J^T)) for six joints; zero on a singularity, the same in every frame.
 
-    Yoshikawa, Manipulability of robotic mechanisms, 1985.
+    `q` and errors as in `jacobian`. Source: Yoshikawa, Manipulability of robotic mechanisms, 1985.
     """
     return fabs(determinant(jacobian(model, q)))
 
@@ -107,10 +107,10 @@ def scaled_rows(rows: Rows, weight: float) -> Rows:
 
 
 def singularity_distances(model: ArmModel, q: Sequence[float]) -> SingularityDistances:
-    """Distances of a configuration (six rad) from the singularities; about 0.3 ms, too slow for the loop.
+    """Distances of a configuration (six angles, rad) from the singularities; about 0.3 ms, too slow for the loop.
 
     With axes 2 and 3 parallel and a spherical wrist, the determinant of the Jacobian is a product of three factors,
-    one for each singularity. The distances are these factors without their constants.
+    one for each singularity. The distances are these factors without their constants. Errors as in `jacobian`.
     """
     poses = frames(model, q)
     smallest = min(singular_values(scaled_rows(_rows(poses), 1.0 / characteristic_length(model))))
@@ -193,7 +193,7 @@ def gram(rows: _Matrix) -> list[list[float]]:
 
 
 def determinant(matrix: _Matrix) -> float:
-    """By elimination with the largest pivot of each column."""
+    """The determinant of a square matrix, by Gaussian elimination with partial pivoting."""
     rows = [list(row) for row in matrix]
     value = 1.0
     while rows:
@@ -208,13 +208,13 @@ def determinant(matrix: _Matrix) -> float:
 
 
 def solve_positive(matrix: _Matrix, right: Sequence[float]) -> list[float] | None:
-    """Solve a symmetric positive definite system of any size; None when the matrix is not positive definite."""
+    """Solve a symmetric positive definite system of any size by Cholesky; None when it is not positive definite."""
     lower = _cholesky(matrix)
     return None if lower is None else _substitute(lower, right)
 
 
 def singular_values(matrix: _Matrix) -> list[float]:
-    """Unsorted, by one-sided Jacobi rotations (Hestenes 1958), which make all rows orthogonal.
+    """The singular values of a square matrix, unsorted, by one-sided Jacobi rotations of its rows (Hestenes 1958).
 
     Small singular values keep a better relative accuracy than through the eigenvalues of the Gram matrix.
     """

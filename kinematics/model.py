@@ -53,7 +53,10 @@ class JointLimit:
 
 @dataclass(frozen=True)
 class LinkMass:
-    """Mass, kg, and centre of mass, m in the joint's frame, of a link; raises ValueError for impossible values."""
+    """Mass, kg, and centre of mass, m in the joint's frame, of a link.
+
+    Raises ValueError for a centre of other than three numbers, a value that is not finite, and a negative mass.
+    """
 
     mass: float
     centre: Vector
@@ -70,8 +73,8 @@ class LinkMass:
 class Capsule:
     """A body: all that is nearer than `radius` to the segment from `start` to `end`, m in the frame of its link.
 
-    Link 0 is the base, link i moves with frame i. Raises ValueError for a link that no arm has, a point that is not
-    three finite numbers and a radius that is not positive.
+    Link 0 is the base, link i moves with frame i. Raises ValueError for a link other than 0 to 6, a point that is not
+    three finite numbers and a radius that is not positive and finite.
     """
 
     link: int
@@ -95,11 +98,12 @@ class Capsule:
 class ArmModel:
     """A six-joint arm, base to tool.
 
-    `rows` and `limits` have six entries; `links` has six, or none when the masses are unknown; `tool` is the transform
-    from frame 6 (the flange) to the tool, whose mass the last of `links` includes; `bodies` are its shape, none when it
-    is unknown, and `tool_bodies` that of the tool, None when it is unknown or among `bodies` (`kinematics.capsules`).
-    Raises ValueError for a wrong count, a value that is not finite, a tool without a proper rotation, and joint names
-    that are empty or repeated.
+    rows, limits, joint_names: six entries each. links: six, or none when the masses are unknown; the last one includes
+    the mass of the tool. tool: transform from frame 6 (the flange) to the tool. bodies: shape of the arm; empty:
+    unknown. tool_bodies: shape of the tool; None: unknown, or part of `bodies` (`kinematics.capsules`).
+
+    Raises ValueError for a wrong count, a tool pose that is not finite or whose rotation is not orthonormal, and joint
+    names that are empty or repeated.
     """
 
     name: str
@@ -113,10 +117,10 @@ class ArmModel:
     tool_bodies: tuple[Capsule, ...] | None = None
 
     def __post_init__(self) -> None:
-        for what in ("rows", "limits", "joint_names"):
-            count = len(getattr(self, what))
+        for field in ("rows", "limits", "joint_names"):
+            count = len(getattr(self, field))
             if count != JOINTS:
-                raise ValueError(f"{what} has {count} entries; {JOINTS} are required")
+                raise ValueError(f"{field} has {count} entries; {JOINTS} are required")
         if len(self.links) not in (0, JOINTS):
             raise ValueError(f"links has {len(self.links)} entries; {JOINTS} or none are required")
         if not all(self.joint_names) or len(set(self.joint_names)) != JOINTS:

@@ -21,7 +21,7 @@ _SINGULAR_COSINE: Final = 1e-12
 
 
 def as_floats(values: Sequence[float]) -> Sequence[float]:
-    """Return the values as compiled code takes them; a list or tuple, of float or int, is returned unchanged."""
+    """Return the values as compiled code accepts them: a list or tuple unchanged, others as a list of floats."""
     return values if type(values) is list or type(values) is tuple else [float(value) for value in values]
 
 
@@ -137,13 +137,13 @@ class Pose(NamedTuple):
         return rpy_from_rotation(self.rotation)
 
     def __matmul__(self, other: Pose) -> Pose:
-        """A <- C from A <- B and B <- C."""
+        """Compose two transforms: A <- C from A <- B (this one) and B <- C (`other`)."""
         x, y, z = applied(self.rotation, other.position)
         px, py, pz = self.position
         return Pose((px + x, py + y, pz + z), times(self.rotation, other.rotation))
 
     def inverse(self) -> Pose:
-        """B <- A from A <- B."""
+        """The inverse transform: B <- A from A <- B."""
         back = transposed(self.rotation)
         x, y, z = applied(back, self.position)
         return Pose((-x, -y, -z), back)

@@ -121,7 +121,7 @@ class PlanarArm:
     def confirm(
         self, theta1: float, theta2: float, theta3: float, point: Vector, rotation: Rotation
     ) -> Rotation | None:
-        """`rotation` relative to the forearm at these angles; None when they do not reach `point`."""
+        """`rotation` relative to the forearm at these angles (rad); None when they do not reach `point` (m)."""
         sine, cosine = sin(theta2), cos(theta2)
         theta23 = theta2 + self._sign * theta3
         sb, cb = sin(theta23), cos(theta23)

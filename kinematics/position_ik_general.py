@@ -27,19 +27,19 @@ Linear: TypeAlias = tuple[float, float, float]
 # constant, factors of cos x, sin x, cos 2x, sin 2x
 Quadratic: TypeAlias = tuple[float, ...]
 
-# m, or a sine. A value of a1 or sin(alpha1) below SMALL brings roots of the quartic so close together that round-off
-# may hide them: the roots of the equation without it are then tried too. Below ZERO it counts as zero.
+# a1 (m) or sin(alpha1): below SMALL, roots of the quartic lie so close together that round-off may hide them, and the
+# roots of the equation that neglects the value are tried too. Below ZERO the value counts as zero.
 _SMALL: Final = 1e-4
 _ZERO: Final = 1e-12
-_LOOSE: Final = 10.0  # relative tolerance of those roots, in units of the value that is left out
-_SAME: Final = 1e-7  # rad; nearer solutions are one, on a singularity
-_REGULAR: Final = (
-    1e-6  # largest determinant, in units of the size cubed, below which an arm moves in two directions only
-)
-_FLAT: Final = 1e-12  # determinant, in units of the size cubed, below which Newton's method has no step
+_LOOSE: Final = 10.0  # relative tolerance of those roots, per unit of the neglected value
+_SAME: Final = 1e-7  # rad; solutions nearer than that are the same, on a singularity
+# Determinants of the wrist centre's Jacobian, in units of size^3: below REGULAR everywhere, the arm moves it in two
+# directions only; below FLAT, Newton's method has no step.
+_REGULAR: Final = 1e-6
+_FLAT: Final = 1e-12
 _NEWTON_STEPS: Final = 20  # limit; near a double root each step only halves the error
 _ROOT_STEPS: Final = 200  # limit; about ten are usual
-# Relative to the largest factor: an extremum this near to zero counts as a root, since round-off may have removed it.
+# Relative to the terms of the polynomial: an extremum this near to zero is a root that round-off may have removed.
 # A false root is rejected by the check of the wrist centre.
 _NEARLY: Final = 1e-7
 
@@ -72,7 +72,7 @@ class GeneralArm:
 
     def solve(self, wx: float, wy: float, wz: float, near1: float, near2: float) -> list[Angles]:
         """As `PlanarArm.solve`."""
-        found: list[Angles] = []
+        solutions: list[Angles] = []
         for angle, f1, f2 in self._planes(wx, wy, wz):
             g1, g2, g3 = self._wrist(angle)
             theta2 = near2 if hypot(g1, g2) < SLACK else atan2(f2, f1) - atan2(g2, g1)
@@ -82,15 +82,15 @@ class GeneralArm:
             else:
                 theta1 = atan2(wy, wx) - atan2(self._c1 * f2 - self._s1 * g3, self._a1 + f1)
             theta1, theta2, theta3 = angles = self._polish((theta1, theta2, angle), (wx, wy, wz))
-            if not self._reaches(angles, (wx, wy, wz)) or any(_same(angles, known[:3]) for known in found):
+            if not self._reaches(angles, (wx, wy, wz)) or any(_same(angles, known[:3]) for known in solutions):
                 continue
             x = self._point(0.0, theta2, theta3)[0]
             determinant = self._determinant(theta2, theta3)
             if abs(determinant) < _SAME * self._size**3 and not singular:
                 singular = ELBOW
             down = determinant < 0.0 if self._c2 >= 0.0 else determinant > 0.0
-            found.append((theta1, theta2, theta3, (BACK if x < 0.0 else 0) | (DOWN if down else 0), singular))
-        return found
+            solutions.append((theta1, theta2, theta3, (BACK if x < 0.0 else 0) | (DOWN if down else 0), singular))
+        return solutions
 
     def confirm(
         self, theta1: float, theta2: float, theta3: float, point: Vector, rotation: Rotation
@@ -116,48 +116,51 @@ class GeneralArm:
         return smallest_of_turn(of_plane)
 
     def _planes(self, wx: float, wy: float, wz: float) -> list[tuple[float, float, float]]:
-        """All (theta3, f1, f2) at the height of the point and at its distance from the origin."""
+        """Return all (theta3, f1, f2) that satisfy the equations of the module for z = wz and R = |w|."""
         a1, s1, c1 = self._a1, self._s1, self._c1
         constant, along, across = self._square
         # R^2 - a1^2 - g^2 and z - cos(alpha1) g3
         far = (wx * wx + wy * wy + wz * wz - a1 * a1 - constant, -along, -across)
         high = (wz - c1 * self._g3[0], -c1 * self._g3[1], -c1 * self._g3[2])
-        found = []
+        planes = []
         if abs(a1) < _SMALL <= abs(s1):
-            found = [
+            planes = [
                 (theta3, f1, f2)
                 for theta3 in _starts(far, a1)
                 for f2 in (_at(high, theta3) / s1,)
                 for f1 in self._other(theta3, f2, a1)
             ]
         elif abs(s1) < _SMALL <= abs(a1):
-            found = [
+            planes = [
                 (theta3, f1, f2)
                 for theta3 in _starts(high, s1)
                 for f1 in (_at(far, theta3) / (2.0 * a1),)
                 for f2 in self._other(theta3, f1, s1)
             ]
         if min(abs(a1), abs(s1)) < _ZERO:
-            return found
+            return planes
         # sin(alpha1)^2 far^2 + 4 a1^2 high^2 = 4 a1^2 sin(alpha1)^2 (g^2 - g3^2)
         scale = 4.0 * a1 * a1 * s1 * s1
         linear = (scale * constant, scale * along, scale * across, 0.0, 0.0)
         terms = zip(product(far, far), product(high, high), product(self._g3, self._g3), linear, strict=True)
         equation = tuple(s1 * s1 * f + 4.0 * a1 * a1 * h + scale * g - k for f, h, g, k in terms)
-        return found + [
+        return planes + [
             (theta3, _at(far, theta3) / (2.0 * a1), _at(high, theta3) / s1) for theta3 in solve_quadratic(equation)
         ]
 
     def _other(self, theta3: float, one: float, left_out: float) -> list[float]:
-        """The other of f1 and f2, both signs; `left_out` is the value that the equation neglects."""
+        """Return f2 for f1, or f1 for f2, with both signs.
+
+        `left_out`: the neglected value; `one` is scaled down by the tolerance, so that a double root is not missed.
+        """
         g1, g2, _ = self._wrist(theta3)
         size = hypot(g1, g2)
         if abs(left_out) > _ZERO:
             one *= 1.0 - _LOOSE * abs(left_out)
         if abs(one) > size + SLACK:
             return []
-        rest = sqrt(max(0.0, (size - one) * (size + one)))
-        return [rest, -rest]
+        root = sqrt(max(0.0, (size - one) * (size + one)))
+        return [root, -root]
 
     def _wrist(self, theta3: float) -> Vector:
         s, c = sin(theta3), cos(theta3)
@@ -218,7 +221,8 @@ class GeneralArm:
 
 
 def _starts(form: Vector, left_out: float) -> list[float]:
-    """Roots of the form, and those of a looser form when a value is left out of it."""
+    """Return the roots of a form. If it neglects a value, `left_out`, also those with a constant reduced by the
+    tolerance, so that a double root is not missed."""
     angles = solve_linear(form)
     if abs(left_out) > _ZERO:
         angles += solve_linear((form[0] * (1.0 - _LOOSE * abs(left_out)), form[1], form[2]))
@@ -262,7 +266,7 @@ def solve_quadratic(form: Quadratic) -> list[float]:
     constant, c1, s1, c2, s2 = form
     if not max(map(abs, form)) > 0.0:
         return []
-    # tan(x / 2) is infinite at x = pi: count x from the angle half a turn from which the form is largest
+    # tan(x / 2) is infinite at x = pi: x counts from the angle opposite to which the form is largest
     start, largest = 0.0, -1.0
     for eighth in range(8):
         angle = 0.25 * pi * eighth

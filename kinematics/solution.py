@@ -14,13 +14,13 @@ Six: TypeAlias = tuple[float, float, float, float, float, float]
 
 
 def six(values: Iterable[float]) -> Six:
-    """Exactly six numbers as a tuple."""
+    """Six numbers as a tuple; raises ValueError for another count."""
     q1, q2, q3, q4, q5, q6 = values
     return q1, q2, q3, q4, q5, q6
 
 
 class Branch(NamedTuple):
-    """Which of the up to eight solutions one is. Each word changes only at the singularity of the same name.
+    """Name of one of the up to eight solutions of a pose. Each word changes only at the singularity of the same name.
 
     shoulder: "front" where the wrist centre has x >= 0 in frame 1, "back" where x < 0.
     elbow: "up" where cos(alpha_2) det J >= 0, else "down"; J is the derivative of the wrist centre by joints 1 to 3.
@@ -30,7 +30,7 @@ class Branch(NamedTuple):
     wrist: "no-flip" where sin(q5 + offset) >= 0, "flip" where it is negative.
 
     Where axes 2 and 3 are not parallel two solutions may have the same name, and "front" may become "back" without a
-    singularity: there the words are only the signs above.
+    singularity: there the words state the signs above and nothing else.
     """
 
     shoulder: Literal["front", "back"]
@@ -58,8 +58,8 @@ class Singularity(enum.Flag):
 class Solution(NamedTuple):
     """One configuration that reaches the pose.
 
-    q: rad, each joint inside its limits where a multiple of 2 pi brings it there, else in (-pi, pi]. branch: None for
-    an arm without a spherical wrist. outside: the joints, counted from 0, outside their limits.
+    q: six angles, rad, each inside its limits if a multiple of 2 pi brings it there, else in (-pi, pi]. branch: None
+    for an arm without a spherical wrist. outside: the joints, counted from 0, outside their limits.
     """
 
     q: Six
@@ -79,9 +79,9 @@ class Solutions(NamedTuple):
 class Near(NamedTuple):
     """The solution that continues a motion, or why there is none.
 
-    q: rad, inside the limits, or None. reason: a sentence, empty when q was found. out_of_reach: m from the wanted
-    wrist centre to the nearest point within reach, 0 when it is in reach. limited: the joint, counted from 0, whose
-    limit prevents a solution, else -1.
+    q: six angles, rad, inside the limits; None: no solution. reason: why there is none, a sentence; empty when there is
+    one. out_of_reach: distance, m, from the wanted wrist centre to the nearest point within reach; 0: within reach.
+    limited: the joint, counted from 0, whose limit prevents a solution, else -1.
     """
 
     q: Six | None
@@ -114,8 +114,8 @@ CONFIRMED = (5e-10) ** 2  # m^2: largest squared error of the wrist centre of a 
 class AngleWrap:
     """Brings angles, which are defined up to multiples of 2 pi, into the joint limits of an arm.
 
-    A joint that round-off has moved beyond its limit is set to the limit: by 1e-10 rad at most, and less for an arm
-    whose reach amplifies that to more than 1e-10 m.
+    A joint that round-off has moved beyond its limit is set to the limit: by 1e-10 rad at most, and by less if the
+    reach of the arm exceeds 1 m, so that the tool moves by 1e-10 m at most.
     """
 
     def __init__(self, model: ArmModel) -> None:
@@ -126,9 +126,9 @@ class AngleWrap:
         self.slack = 1e-10 / max(1.0, reach)
 
     def into_limits(self, joint: int, one: float, two: float, three: float) -> tuple[Vector, tuple[int, ...]]:
-        """Wrap the angles of `joint` (0 or 3) and the two after it into their limits, else into (-pi, pi].
+        """Wrap three angles, rad, of `joint` (0 or 3) and the two after it, into their limits, else into (-pi, pi].
 
-        Also returns the joints that are outside their limits.
+        Also return the joints, counted from 0, that are outside their limits.
         """
         (l1, u1), (l2, u2), (l3, u3) = self._triples[joint]
         q1, q2, q3 = remainder(one, tau), remainder(two, tau), remainder(three, tau)
@@ -146,7 +146,7 @@ class AngleWrap:
         return all(lower <= angle <= upper for angle, (lower, upper) in zip(q, self.limits, strict=True))
 
     def nearest(self, q: Six, near: Sequence[float]) -> Six:
-        """Wrap each angle to the value nearest to `near` inside the limits; one that has none there keeps its value."""
+        """Wrap each angle (rad) to the value nearest to `near` inside its limits, else to the nearest one outside."""
         return six(
             angle if lower <= angle <= upper else self._shifted(angle, lower, upper)
             for angle, (lower, upper) in zip(map(nearest_turn, q, near), self.limits, strict=True)
@@ -161,7 +161,7 @@ class AngleWrap:
         return (pi if angle == -pi else angle), (*outside, joint)
 
     def _shifted(self, angle: float, lower: float, upper: float) -> float:
-        """An angle outside its limits, shifted by the fewest turns that bring it back inside, else as it is."""
+        """An angle outside its limits, shifted inside by the fewest multiples of 2 pi, else unchanged."""
         slack = self.slack
         if angle > upper:
             shifted = angle - tau * ceil((angle - upper - slack) / tau)

@@ -30,7 +30,7 @@ _EDGE: Final = 1e-14  # rad: an orientation nearer to the edge of what an obliqu
 
 
 def has_spherical_wrist(model: ArmModel) -> bool:
-    """Whether axes 4, 5 and 6 meet in one point, exactly, and none is parallel to the next."""
+    """Whether axes 4, 5 and 6 meet in one point, to 1e-12 m, and none is parallel to the next."""
     five, six = model.rows[4], model.rows[5]
     sines = (model.constants[4][0], model.constants[5][0])
     return max(abs(five.a), abs(five.d), abs(six.a)) < _ZERO and min(map(abs, sines)) > _PARALLEL
@@ -67,7 +67,7 @@ class SphericalArm:
             self.wrist = RightAngledWrist(turn4[0], turn5[0], 0.8 * accuracy)
 
     def numbers(self) -> dict[str, float | tuple[float, ...]]:
-        """The constants by their names in `solver.c`, less those of joints 1 to 3."""
+        """The constants by their names in `solver.c`, without those of joints 1 to 3."""
         return {
             "A0": self._a0, "D1": self._d1, "BASE_INVERSE": self._base, "TOOL_INVERSE": self._tool,
             "LEVER": self._lever, "CONFIRMED": self.confirmed, "LIMIT_SLACK": self.wrap.slack,
@@ -96,12 +96,15 @@ class SphericalArm:
         return x - dx, y - dy, z - dz
 
     def solve(self, point: Vector, rotation: Rotation, near: Sequence[float]) -> list[Solution]:
-        """All solutions for a `target`, each confirmed by forward kinematics; a free joint stays at `near` (rad)."""
+        """All solutions for the wrist centre `point` (m) and `rotation` of `target`, confirmed by forward kinematics.
+
+        A free joint stays at `near` (six angles, rad).
+        """
         o1, o2, o3, o4, o5, o6 = self.offsets
         near4 = near[3] + o4
         confirm, into_limits = self.arm.confirm, self.wrap.into_limits
         wrist, error, confirmed = self.wrist.solve, self.wrist.error, self.confirmed
-        found = []
+        solutions = []
         for theta1, theta2, theta3, arm_bits, arm_singular in self.arm.solve(*point, near[0] + o1, near[1] + o2):
             inner = confirm(theta1, theta2, theta3, point, rotation)
             if inner is None:
@@ -112,8 +115,8 @@ class SphericalArm:
                     hand, outside = into_limits(3, theta4 - o4, theta5 - o5, theta6 - o6)
                     outside = arm_outside + outside
                     branch, singularity = BRANCHES[arm_bits | bits], SINGULARITIES[arm_singular | singular]
-                    found.append(Solution((*arm, *hand), branch, not outside, outside, singularity))
-        return found
+                    solutions.append(Solution((*arm, *hand), branch, not outside, outside, singularity))
+        return solutions
 
 
 class RightAngledWrist:
@@ -137,10 +140,10 @@ class RightAngledWrist:
         theta4 = atan2(ny, nx)
         theta5 = atan2(self._sine5 * sine, -both * nz)
         theta6 = atan2(both * (ny * m00 - nx * m10), both * (ny * m01 - nx * m11))
-        other = (theta4 + pi, -theta5, theta6 + pi)
+        flipped = (theta4 + pi, -theta5, theta6 + pi)
         if self._sine5 > 0.0:
-            return ((theta4, theta5, theta6, 0, 0), (*other, FLIP, 0))
-        return ((*other, 0, 0), (theta4, theta5, theta6, FLIP, 0))
+            return ((theta4, theta5, theta6, 0, 0), (*flipped, FLIP, 0))
+        return ((*flipped, 0, 0), (theta4, theta5, theta6, FLIP, 0))
 
     def error(self, theta4: float, theta5: float, theta6: float, rotation: Rotation) -> float:
         """Sum of squares of the entries by which the rotation of these angles differs: 2 angle^2 if small."""
@@ -206,13 +209,13 @@ class ObliqueWrist:
         else:
             theta5 = 2.0 * atan2(sqrt(max(less, 0.0)), sqrt(max(more, 0.0)))
             angles = [theta5, -theta5]
-        found = []
+        solutions = []
         around = atan2(ny, nx)
         for theta5 in angles:
             theta4 = around - atan2(-self._c4 * cos(theta5) * self._s5 - self._s4 * self._c5, sin(theta5) * self._s5)
             theta6 = self._last(sin(theta4), cos(theta4), rotation)
-            found.append((theta4, theta5, theta6, FLIP if theta5 < 0.0 else 0, singular))
-        return tuple(found)
+            solutions.append((theta4, theta5, theta6, FLIP if theta5 < 0.0 else 0, singular))
+        return tuple(solutions)
 
     def shortfall(self, rotation: Rotation) -> float:
         """Angle, rad, from the wanted axis 6 to the nearest one within reach; 0 when it is in reach."""
@@ -228,11 +231,12 @@ class ObliqueWrist:
         return sum((is_at - wanted) ** 2 for is_at, wanted in zip(actual, rotation, strict=True))
 
     def _last(self, s4: float, c4: float, rotation: Rotation) -> float:
+        """Angle theta6, rad, for sine and cosine of theta4."""
         m00, m01, _, m10, m11, _, m20, m21, _ = rotation
         x, y, z = self._s4 * s4, -self._s4 * c4, self._c4
         return atan2((x * m00 + y * m10 + z * m20) / self._s5, (x * m01 + y * m11 + z * m21) / self._s5)
 
 
-def _cosine_difference(one: float, other: float) -> float:
-    """cos(one) - cos(other), exact also where they are nearly equal."""
-    return -2.0 * sin(0.5 * (one + other)) * sin(0.5 * (one - other))
+def _cosine_difference(a: float, b: float) -> float:
+    """cos(a) - cos(b), without cancellation where they are nearly equal."""
+    return -2.0 * sin(0.5 * (a + b)) * sin(0.5 * (a - b))

@@ -1,4 +1,4 @@
-"""Where the arm's points are, from the table of the facts alone: plain 4x4 matrices, nothing of `kinematics`."""
+"""Points of the arm, from the table of the facts alone: plain 4x4 matrices, nothing of `kinematics`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TABLE = (
 RADIUS = 0.045 * (L1 + L2 + L3 + L4 + L5) * hypot(1.0, 1.25)
 """m, of all bodies: the circumscribed sphere of a joint's cylinder in the arm's URDF."""
 CLEARANCE = 0.01
-"""`cartesian.clearance` where the file does not say otherwise, m."""
+"""Default of `cartesian.clearance`, m."""
 Point = tuple[float, float, float]
 Matrix = list[list[float]]
 
@@ -41,7 +41,7 @@ def points(q: Sequence[float]) -> tuple[Point, Point, Point]:
 
 
 def depth(point: Point, box: Sequence[float]) -> float:
-    """Return how deep, m, a point is inside a box (lower corner, upper corner); negative: outside."""
+    """Return the depth, m, of a point inside a box (lower corner, upper corner); negative: outside."""
     return min(min(x - a, b - x) for x, a, b in zip(point, box[:3], box[3:], strict=True))
 
 
@@ -53,15 +53,15 @@ def axes(q: Sequence[float]) -> tuple[tuple[Point, Point], ...]:
 
 
 def own_gap(q: Sequence[float]) -> float:
-    """Return how far the arm's bodies are from each other at least, beyond their clearance, m."""
+    """Return the least distance of the arm's bodies from each other, beyond their clearance, m."""
     base, upper, forearm, hand = axes(q)
     pairs = (base, forearm), (base, hand), (upper, hand)
-    found = min(_least(lambda u, a=a, b=b: _from_segment(_along(a, u), b)) for a, b in pairs)  # type: ignore[misc]
-    return found - 2.0 * RADIUS - CLEARANCE
+    distance = min(_least(lambda u, a=a, b=b: _from_segment(_along(a, u), b)) for a, b in pairs)  # type: ignore[misc]
+    return distance - 2.0 * RADIUS - CLEARANCE
 
 
 def box_gaps(q: Sequence[float], box: Sequence[float]) -> list[float]:
-    """Return how far upper arm, forearm and hand are from a box, beyond their clearance, m; negative: too near."""
+    """Return the distances of upper arm, forearm and hand from a box, beyond their clearance, m; negative: too near."""
     return [_least(lambda u, a=axis: _outside(_along(a, u), box)) - RADIUS - CLEARANCE for axis in axes(q)[1:]]  # type: ignore[misc]
 
 
@@ -69,17 +69,17 @@ def _least(of: Callable[[float], float]) -> float:
     """The least value of a convex function between 0 and 1, by golden section."""
     part = 0.5 * (sqrt(5.0) - 1.0)
     low, high = 0.0, 1.0
-    one, other = high - part, low + part
-    a, b = of(one), of(other)
+    left, right = high - part, low + part
+    a, b = of(left), of(right)
     for _ in range(45):
         if a < b:
-            high, other, b = other, one, a
-            one = high - part * (high - low)
-            a = of(one)
+            high, right, b = right, left, a
+            left = high - part * (high - low)
+            a = of(left)
         else:
-            low, one, a = one, other, b
-            other = low + part * (high - low)
-            b = of(other)
+            low, left, a = left, right, b
+            right = low + part * (high - low)
+            b = of(right)
     return min(a, b, of(0.0), of(1.0))
 
 
@@ -90,7 +90,7 @@ def _along(axis: tuple[Point, Point], u: float) -> Point:
 
 def _outside(point: Point, box: Sequence[float]) -> float:
     beyond = [max(a - x, x - b) for x, a, b in zip(point, box[:3], box[3:], strict=True)]
-    return hypot(*(max(one, 0.0) for one in beyond)) if max(beyond) > 0.0 else max(beyond)
+    return hypot(*(max(part, 0.0) for part in beyond)) if max(beyond) > 0.0 else max(beyond)
 
 
 def _from_segment(point: Point, axis: tuple[Point, Point]) -> float:

@@ -1,7 +1,7 @@
-"""What the hot functions return for random inputs, as digests: `python -m tests.compiled_results SAMPLES`.
+"""Digests of what the hot functions return for random inputs: `python -m tests.compiled_results SAMPLES`.
 
-Run once as it is and once with RTCP_PURE=1: the digests must be the same, bit for bit. Among the inputs are values that
-are no numbers, infinite, the largest, the smallest, zeros of both signs, and integers beyond 64 bits.
+Run once as it is and once with RTCP_PURE=1: the digests must be the same, bit for bit. The inputs include NaN,
+infinities, the largest and smallest floats, zeros of both signs, and integers beyond 64 bits.
 """
 
 # ruff: noqa: B023  each call is made before the next inputs are drawn
@@ -22,9 +22,11 @@ from kinematics.compiled import BUILD
 from kinematics.forward import forward, frames
 from kinematics.gravity import gravity_torques
 from kinematics.jacobian import jacobian, joint_velocity
+from kinematics.solution import six
 from rtcp.config import default_config, load
 from rtcp.control.cycle import make_drives
 from rtcp.control.part import make_devices
+from rtcp.devices.cia402 import Cia402Drive
 from rtcp.devices.drive import TargetState
 from rtcp.devices.io_box import IoBox
 from rtcp.motion.controllers.jog import ScaledTwist, TwistRamp
@@ -49,7 +51,6 @@ SPECIAL_INTS = (0, 1, -1, 2**31 - 1, -(2**31), 2**62 - 1, 2**62, -(2**62) - 1, 2
 DT = 0.0005
 CONFIG = load(default_config())
 ARM = CONFIG.arm
-assert ARM is not None
 
 
 class Inputs:
@@ -75,29 +76,29 @@ class Inputs:
         return self.number(1.0), self.number(1.0), self.number(1.0)
 
 
-def flat(found: Any) -> Iterator[float | int | str]:
+def flat(result: Any) -> Iterator[float | int | str]:
     """Every number of a result."""
-    if found is None:
+    if result is None:
         yield "None"
-    elif isinstance(found, (bool, int, float, str)):
-        yield found
-    elif isinstance(found, bytes):
-        yield found.hex()
-    elif isinstance(found, (list, tuple)):
-        for one in found:
-            yield from flat(one)
+    elif isinstance(result, (bool, int, float, str)):
+        yield result
+    elif isinstance(result, bytes):
+        yield result.hex()
+    elif isinstance(result, (list, tuple)):
+        for part in result:
+            yield from flat(part)
     else:
-        yield repr(found)
+        yield repr(result)
 
 
-def packed(found: Any) -> bytes:
-    """A result, bit for bit; one value that is no number is as another."""
+def packed(result: Any) -> bytes:
+    """A result, bit for bit; all NaN are the same."""
     parts = []
-    for one in flat(found):
-        if isinstance(one, float):
-            parts.append(b"nan" if math.isnan(one) else struct.pack("<d", one))
+    for number in flat(result):
+        if isinstance(number, float):
+            parts.append(b"nan" if math.isnan(number) else struct.pack("<d", number))
         else:
-            parts.append(f"{type(one).__name__} {one}".encode())
+            parts.append(f"{type(number).__name__} {number}".encode())
     return b"|".join(parts)
 
 
@@ -138,7 +139,7 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
     while True:
         a, b, c = inputs.number(3.0), inputs.number(1.0), abs(inputs.number(0.01))
         q, v, tau = inputs.six(2.0), inputs.six(0.6), inputs.six(20.0)
-        box = tuple(inputs.number(0.5) for _ in range(6))
+        box = six(inputs.number(0.5) for _ in range(6))
         yield "fastest_stoppable", lambda: fastest_stoppable(a, b, c)
         yield "travel", lambda: travel(v, limits.acceleration, zones.reach, DT)
         yield "from_box", lambda: [from_box(zones.before, body, box) for body in range(4)]
@@ -150,11 +151,11 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
             target.position = [x + y * DT for x, y in zip(state.commanded, v, strict=True)]
             target.velocity = v
             result = guard.apply(state, target, a > 0.0)
-            found = int(result), state.commanded, state.commanded_velocity, state.commanded_acceleration, guard.held
+            shown = int(result), state.commanded, state.commanded_velocity, state.commanded_acceleration, guard.held
             if not all(abs(x) < 3.0 for x in state.commanded):
                 state.commanded[:] = [0.1] * 6
                 guard.latch(state)
-            return found
+            return shown
 
         yield "trajectory_guard", guarded
 
@@ -162,7 +163,9 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
             for i, drive in enumerate(drives):
                 drive.target_position, drive.target_velocity, drive.target_torque = q[i], v[i], tau[i]
             limiter.check(drives)
-            return limiter.held, [(one.target_position, one.target_velocity, one.target_torque) for one in drives]
+            return limiter.held, [
+                (drive.target_position, drive.target_velocity, drive.target_torque) for drive in drives
+            ]
 
         yield "output_limiter", limited
 
@@ -175,13 +178,13 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
         def written() -> Any:
             for writer in writers:
                 writer.update(q, v, drives)
-            return [(one.target_position, one.target_velocity, one.target_torque) for one in drives]
+            return [(drive.target_position, drive.target_velocity, drive.target_torque) for drive in drives]
 
         yield "drive_writers", written
 
         def ramped() -> Any:
             ramp.step(v, DT)
-            if not all(abs(one) < 10.0 for one in ramp.velocity):
+            if not all(abs(speed) < 10.0 for speed in ramp.velocity):
                 ramp.begin([0.0] * 6)
             return ramp.velocity, ramp.acceleration
 
@@ -200,8 +203,8 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def devices(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
-    drives = [drive for _, drive in make_drives(CONFIG)]
-    box = next(one.driver for one in make_devices(CONFIG) if isinstance(one.driver, IoBox))
+    drives = [drive for _, drive in make_drives(CONFIG) if isinstance(drive, Cia402Drive)]
+    box = next(device.driver for device in make_devices(CONFIG) if isinstance(device.driver, IoBox))
     discipline = Discipline(500_000, 250_000)
     targets = tuple(TargetState)
     planned = sent = 10**15
@@ -244,9 +247,9 @@ def devices(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
             if drift % 50 == 0:
                 discipline.holdover()
             planned = discipline.next_wakeup(planned)
-            found = planned, discipline.raw_ns, discipline.filtered_ns, discipline.locked, discipline.aligned
+            clock = planned, discipline.raw_ns, discipline.filtered_ns, discipline.locked, discipline.aligned
             planned = sent
-            return found
+            return clock
 
         yield "discipline", disciplined
 
@@ -260,12 +263,12 @@ def main() -> int:
         counts: dict[str, int] = {}
         for name, call in source(Inputs(1)):
             try:
-                found = packed(call())
+                digest = packed(call())
             except (ArithmeticError, ValueError, struct.error) as error:
-                # No TypeError: it would be compiled code that refuses what the source takes.
-                found = type(error).__name__.encode()
+                # A TypeError ends the run: compiled code would refuse what interpreted code accepts.
+                digest = type(error).__name__.encode()
                 errors[name] = errors.get(name, 0) + 1
-            running.setdefault(name, hashlib.sha256()).update(found)
+            running.setdefault(name, hashlib.sha256()).update(digest)
             counts[name] = counts.get(name, 0) + 1
             if counts[name] % BLOCK == 0 or counts[name] == samples:
                 digests.setdefault(name, []).append(running[name].hexdigest()[:16])

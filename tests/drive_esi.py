@@ -1,4 +1,4 @@
-"""An ESI file of a drive, of its master's description: for a slave of the segment that it can be used with."""
+"""Writes the ESI file of a drive from its device description, for a slave of the segment."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _RATIO = """<DataType><Name>RATIO</Name><BitSize>80</BitSize>
 Objects = Mapping[int, tuple[str, int] | tuple[int, int]]
 """By index: type and value of a variable, or the two parts of a ratio."""
 TWO_AXIS: Objects = {
-    index + shift: held
+    index + shift: entry
     for shift in (0, 0x800)
-    for index, held in (
+    for index, entry in (
         (0x603F, ("UINT", 0)), (0x6076, ("UDINT", 40_000)), (0x608F, (131072, 1)), (0x6091, (50, 1)),
         (0x6098, ("SINT", 37)),
     )
@@ -30,7 +30,7 @@ SYNAPTICON: Objects = {
     0x603F: ("UINT", 0), 0x6076: ("UDINT", 640), 0x6091: (100, 1), 0x6098: ("SINT", 37),
     0x60A9: ("UDINT", 0x00B44700),
 }  # fmt: skip
-ARMS: dict[str, tuple[str, Objects, dict[str, float]]] = {
+ARMS: dict[str, tuple[str, Objects, dict[str, object]]] = {
     "two-axis": ("two-axis-drive", TWO_AXIS, {"rated_torque": 40.0, "torque_ratio": 1.0}),
     "myactuator": ("myactuator-x6-60", {}, {"rated_torque": 9.5 * 2.1, "counts_per_turn": 131072.0}),
     "synapticon": ("synapticon-somanet", SYNAPTICON, {"counts_per_turn": 524288.0 * 100}),
@@ -40,9 +40,9 @@ ARMS: dict[str, tuple[str, Objects, dict[str, float]]] = {
 
 def write_esi(path: Path, device: DeviceDescription, objects: Objects) -> None:
     """Write the file; mapped objects need not be among `objects`, start-up SDOs are added."""
-    held = {sdo.index: (_TYPES[sdo.type], 0) for sdo in device.sdo if not sdo.sub_index} | dict(objects)
+    entries = {sdo.index: (_TYPES[sdo.type], 0) for sdo in device.sdo if not sdo.sub_index} | dict(objects)
     mapped = {entry.index for pdo in (*device.rpdo, *device.tpdo) for entry in pdo.channels}
-    listed = "".join(_object(index, held[index]) for index in sorted(held) if index not in mapped)
+    listed = "".join(_object(index, entries[index]) for index in sorted(entries) if index not in mapped)
     path.write_text(f"""<?xml version="1.0"?>
 <EtherCATInfo><Vendor><Id>{device.vendor_id}</Id><Name>Vendor</Name></Vendor>
 <Descriptions><Devices><Device Physics="YY">
@@ -60,8 +60,8 @@ def write_esi(path: Path, device: DeviceDescription, objects: Objects) -> None:
 """)
 
 
-def _object(index: int, held: tuple[str, int] | tuple[int, int]) -> str:
-    kind, value = held
+def _object(index: int, entry: tuple[str, int] | tuple[int, int]) -> str:
+    kind, value = entry
     if isinstance(kind, int):
         parts = "".join(
             f"<SubItem><Name>{name}</Name><Info><DefaultData>{data.hex()}</DefaultData></Info></SubItem>"

@@ -1,4 +1,4 @@
-"""Cycle records that tests make: the numbers of a record by the names of its fields."""
+"""Cycle records of tests: the numbers of a record by the names of its fields."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rtcp.ipc.schema import RecordSchema
 
 
 def numbers(schema: RecordSchema, **given: Any) -> list[Any]:
-    """Return what `Blackboard.publish` takes; fields that are not given are 0, one number stands for a whole vector."""
+    """Return the numbers for `Blackboard.publish`; missing fields are 0, one number fills a whole vector."""
     flat: list[Any] = []
     for field in schema.fields[1:]:
         value = given.pop(field.name, 0)

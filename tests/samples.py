@@ -1,4 +1,4 @@
-"""How many samples of a property run by default; `RTCP_SLOW=1` runs all of them."""
+"""Numbers of samples of a property by default; `RTCP_SLOW=1` runs all of them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ SLOW = "RTCP_SLOW" in os.environ
 
 
 def examples(full: int) -> int:
-    """How many examples of a property run."""
+    """Return the number of examples of a property."""
     return full if SLOW else max(full // 6, 5)
 
 
 def some(cases: Iterable[Case], every: int = 3) -> list[Case]:
-    """Every third of the cases, or all."""
-    found = list(cases)
-    return found if SLOW else found[::every]
+    """Return every third of the cases, or all."""
+    full = list(cases)
+    return full if SLOW else full[::every]

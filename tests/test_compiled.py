@@ -1,4 +1,4 @@
-"""Whether compiled modules are used: never any that are not of the sources beside them."""
+"""Compiled modules are used only if they are of the sources beside them."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ def test_modules_of_these_very_sources_are_used(folder: Path) -> None:
 def test_others_are_not_and_the_reason_says_what_to_do(folder: Path, change: Any, reason: str) -> None:
     before = len(sys.meta_path)
     change(folder)
-    found = use(folder)
-    assert not found.is_used
-    assert reason in found.reason
+    result = use(folder)
+    assert not result.is_used
+    assert reason in result.reason
     assert len(sys.meta_path) == before
 
 

@@ -1,4 +1,4 @@
-"""Who may import whom (design: "The house"), read from the sources; and what the loop's process really loads."""
+"""The order of imports (design: "The house"), read from the sources, and the modules that the loop's process loads."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 ORDER = (
     ("kinematics",), ("esi",), ("config",), ("virtual",), ("ipc",), ("fieldbus",), ("devices",), ("api",), ("motion",),
-    ("realtime",), ("control",), ("processes",), ("gateway",), ("launch",), ("telemetry",), ("panel", "ros"), ("cli",),
+    ("realtime",), ("control",), ("processes",), ("gateway",), ("launch", "testing"), ("telemetry", "gym"),
+    ("panel", "ros"), ("cli",),
 )  # fmt: skip
-"""The folders from the top of the list down; each imports itself and what stands above it, and not its neighbour."""
+"""Folders from top to bottom; each imports itself and those above, not those beside it."""
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 """(file, module) -> why it may import what stands below it or beside it. """
-NEVER_IN_THE_LOOP = {"pydantic", "pydantic_core", "typer", "rich", "pyroute2", "yaml", "ruamel", "mcap", "matplotlib"}
+NEVER_IN_THE_LOOP = {"pydantic", "pydantic_core", "typer", "rich", "pyroute2", "yaml", "ruamel", "mcap", "foxglove",
+                     "matplotlib"}  # fmt: skip
 IN_THE_LOOP = {"annotated_types", "mypy_extensions", "pysoem", "ruckig"}
 """Third-party modules of the loop's process. numpy may be among them by the design, but its threads would keep the
 process from joining the virtual segment's user namespace, so it is not."""
@@ -47,6 +49,12 @@ ROS_2 = {
 ABB = {"rtcp/virtual/irc5/messages.py": {"google"}, "rtcp/fieldbus/egm.py": {"google"}}
 """Modules of the optional dependency `abb`, by the files that import them."""
 
+CLUSTER = {"rtcp/testing/sessions/cluster.py": {"dask", "distributed", "pyarrow"}}
+"""Modules of the optional dependency `cluster`, by the files that import them."""
+
+GYM = {"rtcp/gym/__init__.py": {"gymnasium"}, "rtcp/gym/environment.py": {"gymnasium"}}
+"""Modules of the optional dependency `gym`, by the files that import them."""
+
 PACKAGES = {
     "foxglove": "foxglove_sdk",
     "yaml": "pyyaml",
@@ -58,7 +66,7 @@ PACKAGES = {
 
 
 class Import(NamedTuple):
-    """One module that a file names in an import, wherever in the file it stands."""
+    """One module that a file imports, at any place in the file."""
 
     file: str
     line: int
@@ -81,51 +89,54 @@ def place_of(module: str) -> str:
     return parts[1]
 
 
-def modules_named(node: ast.AST, package: str) -> list[str]:
-    """The absolute names of the modules that an import statement of a file in `package` names; none for other nodes."""
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    if not isinstance(node, ast.ImportFrom):
-        return []
-    module = node.module or ""
-    if node.level:
-        parts = package.split(".")[: len(package.split(".")) - node.level + 1]
+def modules_named(statement: ast.Import | ast.ImportFrom, package: str) -> list[str]:
+    """The absolute names of the modules that an import statement of a file in `package` names."""
+    if isinstance(statement, ast.Import):
+        return [alias.name for alias in statement.names]
+    module = statement.module or ""
+    if statement.level:
+        parts = package.split(".")[: len(package.split(".")) - statement.level + 1]
         module = ".".join([*parts, module] if module else parts)
     # `from rtcp import cli` names a module behind the word import, `from rtcp import __version__` does not.
-    behind = [alias.name for alias in node.names if module == "rtcp" and not alias.name.startswith("__")]
+    behind = [alias.name for alias in statement.names if module == "rtcp" and not alias.name.startswith("__")]
     return [module, *(f"{module}.{name}" for name in behind)]
+
+
+def statements(path: Path) -> Iterator[ast.Import | ast.ImportFrom]:
+    nodes = ast.walk(ast.parse(path.read_text(), str(path)))
+    return (node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom))
 
 
 def imports_of(root: Path) -> Iterator[Import]:
     for path in sorted([*root.glob("rtcp/**/*.py"), *root.glob("kinematics/**/*.py")]):
         file = path.relative_to(root)
-        for node in ast.walk(ast.parse(path.read_text(), str(file))):
-            for module in modules_named(node, ".".join(file.parent.parts)):
-                yield Import(str(file), node.lineno, module)
+        for statement in statements(path):
+            for module in modules_named(statement, ".".join(file.parent.parts)):
+                yield Import(str(file), statement.lineno, module)
 
 
-def is_ours(found: Import) -> bool:
-    return found.module.partition(".")[0] in ("rtcp", "kinematics")
+def is_ours(statement: Import) -> bool:
+    return statement.module.partition(".")[0] in ("rtcp", "kinematics")
 
 
-def breaks_the_order(found: Import) -> bool:
-    """Whether it names a folder that stands below the importer's in the list, or beside it, or not in it at all."""
+def breaks_the_order(statement: Import) -> bool:
+    """Whether it names a folder below or beside the importer's, or one that is not in the list."""
     rank = {folder: at for at, folders in enumerate(ORDER) for folder in folders}
-    if found.imported in (found.importer, "rtcp") or (found.importer, found.imported) in (
+    if statement.imported in (statement.importer, "rtcp") or (statement.importer, statement.imported) in (
         ("rtcp", "api"),
         ("rtcp", "kinematics"),
     ):
         return False
-    if found.importer not in rank or found.imported not in rank:
+    if statement.importer not in rank or statement.imported not in rank:
         return True
-    return rank[found.imported] >= rank[found.importer]
+    return rank[statement.imported] >= rank[statement.importer]
 
 
 IMPORTS = list(imports_of(ROOT))
 
 
-def told(breaches: list[Import]) -> list[str]:
-    return [f"{found.file}:{found.line} imports {found.module}" for found in breaches]
+def sentences(breaches: list[Import]) -> list[str]:
+    return [f"{breach.file}:{breach.line} imports {breach.module}" for breach in breaches]
 
 
 # -- what the sources say -------------------------------------------------------------------------------------------
@@ -133,8 +144,8 @@ def told(breaches: list[Import]) -> list[str]:
 
 def test_every_folder_of_the_house_stands_in_the_list() -> None:
     listed = {folder for folders in ORDER for folder in folders}
-    found = {path.name for path in (ROOT / "rtcp").iterdir() if (path / "__init__.py").exists()}
-    assert found <= listed
+    present = {path.name for path in (ROOT / "rtcp").iterdir() if (path / "__init__.py").exists()}
+    assert present <= listed
 
 
 def test_every_module_but_the_packages_own_lies_in_a_folder() -> None:
@@ -143,33 +154,35 @@ def test_every_module_but_the_packages_own_lies_in_a_folder() -> None:
 
 def test_a_folder_imports_only_folders_above_it() -> None:
     breaches = [
-        found
-        for found in IMPORTS
-        if is_ours(found) and breaks_the_order(found) and (found.file, found.module) not in EXCEPTIONS
+        imported
+        for imported in IMPORTS
+        if is_ours(imported) and breaks_the_order(imported) and (imported.file, imported.module) not in EXCEPTIONS
     ]
-    assert told(breaches) == []
+    assert sentences(breaches) == []
 
 
 def test_no_file_imports_itself_by_way_of_others() -> None:
-    paths = {path for found in IMPORTS if (path := ROOT / found.file).name != "__init__.py"}
+    paths = {path for imported in IMPORTS if (path := ROOT / imported.file).name != "__init__.py"}
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in paths}
     graph: dict[Path, set[Path]] = {}
     for path in paths:
-        for node in ast.walk(ast.parse(path.read_text())):
-            named = modules_named(node, "")
-            if isinstance(node, ast.ImportFrom):
-                named += [f"{node.module}.{alias.name}" for alias in node.names]
+        for statement in statements(path):
+            named = modules_named(statement, "")
+            if isinstance(statement, ast.ImportFrom):
+                named += [f"{statement.module}.{alias.name}" for alias in statement.names]
             graph.setdefault(path, set()).update(modules[name] for name in named if name in modules)
     TopologicalSorter(graph).prepare()  # CycleError names the files
 
 
 def test_every_exception_is_still_needed() -> None:
-    breaches = {(found.file, found.module) for found in IMPORTS if is_ours(found) and breaks_the_order(found)}
+    breaches = {
+        (imported.file, imported.module) for imported in IMPORTS if is_ours(imported) and breaks_the_order(imported)
+    }
     assert set(EXCEPTIONS) <= breaches
 
 
 def test_the_package_itself_names_the_api_and_loads_no_more_than_kinematics() -> None:
-    named = {found.module for found in IMPORTS if found.file == "rtcp/__init__.py" and is_ours(found)}
+    named = {imported.module for imported in IMPORTS if imported.file == "rtcp/__init__.py" and is_ours(imported)}
     assert named == {"rtcp.api", "kinematics.compiled"}
     program = "import sys, rtcp; print([name for name in sys.modules if name.startswith('rtcp.')])"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -177,7 +190,7 @@ def test_the_package_itself_names_the_api_and_loads_no_more_than_kinematics() ->
 
 
 def test_nothing_imports_cli() -> None:
-    assert told([found for found in IMPORTS if found.imported == "cli" and found.importer != "cli"]) == []
+    assert sentences([each for each in IMPORTS if each.imported == "cli" and each.importer != "cli"]) == []
 
 
 @pytest.mark.parametrize(
@@ -185,33 +198,33 @@ def test_nothing_imports_cli() -> None:
     [("virtual", "fieldbus"), ("virtual", "devices"), ("fieldbus", "virtual"), ("devices", "virtual")],
 )
 def test_the_two_sides_of_the_wire_share_no_code(importer: str, imported: str) -> None:
-    assert told([found for found in IMPORTS if (found.importer, found.imported) == (importer, imported)]) == []
+    assert sentences([each for each in IMPORTS if (each.importer, each.imported) == (importer, imported)]) == []
 
 
 def test_virtual_imports_nothing_of_ours_but_config_esi_and_kinematics() -> None:
     allowed = {"rtcp", "virtual", "config", "esi", "kinematics"}
-    found = [found for found in IMPORTS if found.importer == "virtual" and is_ours(found)]
-    assert told([each for each in found if each.imported not in allowed]) == []
+    imported = [each for each in IMPORTS if each.importer == "virtual" and is_ours(each)]
+    assert sentences([each for each in imported if each.imported not in allowed]) == []
 
 
 def test_the_loops_side_does_not_import_virtual() -> None:
     sides = ("fieldbus", "devices", "ipc", "motion", "realtime", "control", "gateway")
-    assert told([found for found in IMPORTS if found.imported == "virtual" and found.importer in sides]) == []
+    assert sentences([each for each in IMPORTS if each.imported == "virtual" and each.importer in sides]) == []
 
 
 def test_devices_and_kinematics_know_nothing_of_motion() -> None:
-    assert told([f for f in IMPORTS if f.imported == "motion" and f.importer in ("devices", "kinematics")]) == []
+    assert sentences([f for f in IMPORTS if f.imported == "motion" and f.importer in ("devices", "kinematics")]) == []
 
 
 def test_motion_knows_nothing_of_bytes() -> None:
     forbidden = ("fieldbus", "devices", "virtual", "struct")
-    assert told([found for found in IMPORTS if found.importer == "motion" and found.imported in forbidden]) == []
+    assert sentences([each for each in IMPORTS if each.importer == "motion" and each.imported in forbidden]) == []
 
 
 def test_kinematics_imports_only_the_standard_library_numpy_and_itself() -> None:
     allowed = {*sys.stdlib_module_names, "numpy", "kinematics"}
-    found = [found for found in IMPORTS if found.importer == "kinematics"]
-    assert told([each for each in found if each.module.partition(".")[0] not in allowed]) == []
+    imported = [each for each in IMPORTS if each.importer == "kinematics"]
+    assert sentences([each for each in imported if each.module.partition(".")[0] not in allowed]) == []
 
 
 def declared(key: str) -> set[str]:
@@ -224,9 +237,9 @@ def declared(key: str) -> set[str]:
 def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
     # typing_extensions is imported for the type checker alone.
     ours = {"rtcp", "kinematics", "typing_extensions", *sys.stdlib_module_names}
-    optional = ABB | ROS_2 | dict.fromkeys(ROS_FILES, ROS)
-    imports = [found for found in IMPORTS if found.module.partition(".")[0] not in optional.get(found.file, ())]
-    outside = [(found.importer, found.module.partition(".")[0]) for found in imports]
+    optional = ABB | CLUSTER | GYM | ROS_2 | dict.fromkeys(ROS_FILES, ROS)
+    imports = [each for each in IMPORTS if each.module.partition(".")[0] not in optional.get(each.file, ())]
+    outside = [(each.importer, each.module.partition(".")[0]) for each in imports]
     names = {(importer == "panel", PACKAGES.get(name, name)) for importer, name in outside if name not in ours}
     assert {name for of_panel, name in names if not of_panel} - declared("dependencies") == set()
     assert {name for of_panel, name in names if of_panel} - declared("dependencies") - declared("panel") == set()
@@ -237,7 +250,7 @@ def test_ros_is_a_client_of_the_api() -> None:
 
     The messages of Simple Message are the bus's, which speaks it to controllers.
     """
-    imported = {found.module for found in IMPORTS if found.importer == "ros" and is_ours(found)} - {"rtcp"}
+    imported = {each.module for each in IMPORTS if each.importer == "ros" and is_ours(each)} - {"rtcp"}
     messages = "rtcp.fieldbus.simple_message"
     allowed = ("rtcp.ros", "rtcp.api", "rtcp.config", "kinematics", "rtcp.ipc.runtime_directory", messages)
     others = {module for module in imported if not module.startswith(allowed)}
@@ -246,7 +259,7 @@ def test_ros_is_a_client_of_the_api() -> None:
 
 def test_the_panel_is_a_client_of_the_api() -> None:
     """What it reads besides are files: configuration and geometry."""
-    imported = {found.imported for found in IMPORTS if found.importer == "panel" and is_ours(found)}
+    imported = {each.imported for each in IMPORTS if each.importer == "panel" and is_ours(each)}
     assert imported == {"panel", "api", "config", "kinematics"}
 
 
@@ -284,7 +297,7 @@ def test_modules_are_imported_by_a_name_made_at_run_time_in_one_place_only() -> 
 def test_a_breach_is_seen_however_it_is_written(tmp_path: Path, file: str, line: str, breaches: list[str]) -> None:
     (tmp_path / file).parent.mkdir(parents=True)
     (tmp_path / file).write_text(line + "\n")
-    seen = [found.module for found in imports_of(tmp_path) if is_ours(found) and breaks_the_order(found)]
+    seen = [each.module for each in imports_of(tmp_path) if is_ours(each) and breaks_the_order(each)]
     assert seen == breaches
 
 

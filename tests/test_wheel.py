@@ -27,7 +27,7 @@ def built(directory: Path, *, pure: bool) -> Path:
     """Build the wheel from a copy, so that the checkout may be read-only."""
     source = directory / "source"
     source.mkdir()
-    for name in ("rtcp", "kinematics", "config", "moveit", "systemd"):
+    for name in ("rtcp", "kinematics", "config", "moveit", "systemd", "tests"):
         shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "_fast"))
     for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py"):
         shutil.copy(REPOSITORY / name, source)
@@ -99,13 +99,21 @@ def test_the_command_of_an_installed_wheel_starts(installed: Path) -> None:
 
 
 def test_an_installed_wheel_brings_the_service_along(installed: Path, tmp_path: Path) -> None:
-    command = [installed.parent / "rtcp", "service", "install", "--root", tmp_path, "--program", "/usr/bin/env"]
+    command = [
+        str(installed.parent / "rtcp"),
+        "service",
+        "install",
+        "--root",
+        str(tmp_path),
+        "--program",
+        "/usr/bin/env",
+    ]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=installed.parent)
     assert "ExecStart=/usr/bin/env start" in (tmp_path / "etc/systemd/system/rtcp@.service").read_text()
 
 
 def test_an_installed_wheel_exports_the_package_for_moveit(installed: Path, tmp_path: Path) -> None:
-    command = [installed.parent / "rtcp", "arm", "export-moveit", "--arm", "abb_irb120", "--out", tmp_path]
+    command = [str(installed.parent / "rtcp"), "arm", "export-moveit", "--arm", "abb_irb120", "--out", str(tmp_path)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=installed.parent)
     assert (tmp_path / "abb_irb120_moveit_config" / "src" / "abb_irb120_kinematics.c").is_file()
     assert (tmp_path / "abb_irb120_moveit_config" / "src" / "kinematics_plugin.cpp").is_file()
@@ -115,7 +123,7 @@ def test_the_demo_of_an_installed_wheel_runs(installed: Path, tmp_path: Path) ->
     directory = tempfile.mkdtemp(prefix="rtcp-wheel-", dir="/tmp")
     environment = {name: value for name, value in os.environ.items() if name not in ("RTCP_CONFIG", "PYTHONPATH")}
     environment["RTCP_RUNTIME_DIR"] = directory
-    command = [installed.parent / "rtcp", "demo", "--seconds", "1"]
+    command = [str(installed.parent / "rtcp"), "demo", "--seconds", "1"]
     try:
         # A shared host may take the CPU away for longer than the shipped 20 ms: that is a fault, and said so.
         for _ in range(3):

@@ -10,9 +10,10 @@ from typing import Any
 
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
+from websockets import Subprotocol
 from websockets.sync.client import connect
 
-SUBPROTOCOL = "foxglove.sdk.v1"
+SUBPROTOCOL = Subprotocol("foxglove.sdk.v1")
 MESSAGE_DATA = 1
 
 
@@ -59,7 +60,7 @@ class Viewer:
         assert isinstance(data, bytes), data
         code, number, _ = struct.unpack_from("<BIQ", data)
         assert code == MESSAGE_DATA
-        channel = next(one for one in self.channels.values() if one["id"] == number)
+        channel = next(channel for channel in self.channels.values() if channel["id"] == number)
         if channel["encoding"] == "json":
             return channel["topic"], json.loads(data[13:])
         schema = Schema(number, channel["schema"].encode(), channel["schemaEncoding"], channel["schemaName"])
@@ -70,6 +71,6 @@ class Viewer:
     def first(self, topic: str) -> Any:
         """Return the next message of a topic; pass over others."""
         while True:
-            found, message = self.read()
-            if found == topic:
+            channel, message = self.read()
+            if channel == topic:
                 return message

@@ -21,20 +21,20 @@ from rtcp.ipc.states import State
 
 T = TypeVar("T")
 _REPLY_LIMIT = 1 << 24
-"""Bytes of an answer."""
+"""Largest reply, bytes."""
 
 
 class AsyncRobot(Methods):
     """A connection to the running platform: `async with rtcp.connect_async() as robot: await robot.enable()`.
 
     A call that is cancelled ends its motion. Motions of one connection wait for each other; `halt`, `disable`, `status`
-    and `events` do not wait. Leaving the block stops what it moves.
+    and `events` do not wait. Leaving the block stops its motions.
 
     Args:
-        name: who commands, as others are told when they are refused; empty: this process.
+        name: of this commander, shown to others that are refused; empty: this process.
         path: the control socket; None: that of the runtime directory.
-        disable_when_lost: where the connection ends without `close`, as with the end of this process, the drives are
-            disabled after the stop, unless another commands the arm.
+        disable_when_lost: disable the drives after the stop where the connection ends without `close`, as at the
+            end of this process, unless another client commands the arm.
     """
 
     def __init__(self, name: str = "", path: Path | None = None, disable_when_lost: bool = False) -> None:
@@ -79,7 +79,7 @@ class AsyncRobot(Methods):
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection stands."""
+        """Whether the connection is open."""
         return self._writer is not None and not self._writer.is_closing()
 
     async def state(self) -> State:
@@ -138,7 +138,7 @@ class AsyncRobot(Methods):
                     if pending is not None:
                         pending.receive(progress, reply)
         finally:
-            # Whatever ends it closes the connection too, and so what it moves.
+            # Any end of the reader closes the connection too, and with it ends its motions.
             for pending in self._pending.values():
                 pending.lose()
             if self._writer is not None:
@@ -150,6 +150,7 @@ class _InThread(Robot):
 
     def __init__(self, robot: AsyncRobot, loop: asyncio.AbstractEventLoop) -> None:
         self._robot = robot
+        self.directory = robot._path.parent
         self._loop = loop
         self._ended = False
         self._under_way: Future[Any] | None = None
@@ -173,31 +174,31 @@ class _InThread(Robot):
 
 
 class _Pending:
-    """A request whose answer has not come."""
+    """A request that is not answered yet."""
 
     def __init__(self, call: Call[Any]) -> None:
         self._call = call
-        self._was_heard = False
+        self._has_progress = False
         self.answer: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
         # A cancelled call never retrieves the error: without this asyncio logs it.
         self.answer.add_done_callback(lambda answer: answer.cancelled() or answer.exception())
         self.is_open = True
-        """The platform has not answered and may yet."""
+        """The answer may still come."""
 
     async def reply(self) -> Mapping[str, Any]:
-        """Return the answer; raises TimedOut after one to two `ANSWER_TIMEOUT_S` without a word on it."""
+        """Return the answer; raises TimedOut after one to two `ANSWER_TIMEOUT_S` without answer or progress."""
         while not self.answer.done():
-            self._was_heard = False
-            # Not `wait_for`, which takes an answer that comes with a cancellation and forgets the cancellation.
+            self._has_progress = False
+            # Not `wait_for`: it takes an answer that comes with a cancellation, and loses the cancellation.
             await asyncio.wait([self.answer], timeout=ANSWER_TIMEOUT_S)
-            if not self.answer.done() and not self._was_heard:
+            if not self.answer.done() and not self._has_progress:
                 message = f"the platform has not answered {self._call.method!r} for {ANSWER_TIMEOUT_S:g} s"
                 raise RtcpError("timeout", message)
         return self.answer.result()
 
     def receive(self, progress: Mapping[str, Any] | None, reply: Mapping[str, Any]) -> None:
         """Pass progress on, or keep the answer."""
-        self._was_heard = True
+        self._has_progress = True
         self.is_open = progress is not None
         if self.answer.done():
             return

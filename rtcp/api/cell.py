@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 _LEAD_S, _LONGEST_LEAD_S = 0.25, 9.0
-"""From the commands of a motion in step to its beginning: every arm has checked it by then, and allows 10 s."""
+"""Bounds of the time from the command of a motion in step to its start, s: arms check it meanwhile, and allow 10 s."""
 _INTERRUPT_S: Final = 3.0
-"""Longest wait for a halt, and for what it ends, after an interrupt, s."""
+"""Longest wait after an interrupt for a halt and for the calls that it ends, s."""
 _LEAD_SHARE: Final = 3.0
-"""Of the time that planning took: checking takes about as long."""
+"""Lead per planning time: checking takes about as long as planning."""
 _SAYS_LESS = {"partner_stopped": 2, "partner_not_ready": 2, "partner_left": 1, "partner_silent": 1}
-"""Why an arm ends a motion in step on account of another, whose own reason says more: the greater, the less."""
+"""Reasons that only point to another arm, whose own reason tells more -> rank, the higher the less telling."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +48,18 @@ class StepPlan:
     lead_s: float
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any], asked_ns: int) -> StepPlan:
+    def from_json(cls, answer: Mapping[str, Any], asked_ns: int) -> StepPlan:
         """Read the answer of the method `plan_in_step`, asked for at `asked_ns`, CLOCK_MONOTONIC."""
-        arms = {one["arm"]: one["points"] for one in found["arms"]}
+        arms = {arm["arm"]: arm["points"] for arm in answer["arms"]}
         took_s = 1e-9 * (time.monotonic_ns() - asked_ns)
         lead_s = min(max(_LEAD_S, _LEAD_SHARE * took_s), _LONGEST_LEAD_S)
-        return cls(arms, found["duration_s"], found["brakes"], found["brake_step_s"], lead_s)
+        return cls(arms, answer["duration_s"], answer["brakes"], answer["brake_step_s"], lead_s)
 
     def fields_of(self, arm: str, motion: int) -> dict[str, Any]:
         """Return the parameters of `run_in_step` for an arm; `motion`: when it was commanded, CLOCK_MONOTONIC, ns."""
         return {
-            "points": [{key: value for key, value in one.items() if value is not None} for one in self.arms[arm]],
-            "partners": [other for other in self.arms if other != arm],
+            "points": [{key: value for key, value in point.items() if value is not None} for point in self.arms[arm]],
+            "partners": [partner for partner in self.arms if partner != arm],
             "motion": motion,
             "start_ns": motion + round(self.lead_s * 1e9),
             "brakes": list(self.brakes),
@@ -84,11 +84,11 @@ def find_cell(name: str = "", directory: Path | None = None) -> CellConfig:
         NotRunning: there is none.
         Refused: there are several, and none is named.
     """
-    found = find_cells(name, directory)
-    if len(found) > 1:
-        listed = ", ".join(f"{cell.name} of {cell.source}" for cell in found)
+    cells = find_cells(name, directory)
+    if len(cells) > 1:
+        listed = ", ".join(f"{cell.name} of {cell.source}" for cell in cells)
         raise RtcpError("refused", f"several cells run, {listed}: name one (`rtcp cell --cell NAME`), or stop one")
-    return found[0]
+    return cells[0]
 
 
 def find_cells(name: str = "", directory: Path | None = None) -> list[CellConfig]:
@@ -98,33 +98,33 @@ def find_cells(name: str = "", directory: Path | None = None) -> list[CellConfig
         NotRunning: there is none.
     """
     root = runtime_directory("") if directory is None else directory
-    found: dict[int, CellConfig] = {}
+    cells: dict[int, CellConfig] = {}
     for path in sorted(root.glob("*/session.json")):
         with contextlib.suppress(SessionError):
             cell = read_session(path.parent).cell
             if cell is not None and name in ("", cell.name) and control_socket(path.parent).exists():
-                found[cell.digest] = cell
-    if found:
-        return list(found.values())
-    what = f"the cell {name}" if name else "a cell"
-    raise NotRunning("not running", f"no arm of {what} is running (runtime directory {root}): `rtcp cell start`")
+                cells[cell.digest] = cell
+    if cells:
+        return list(cells.values())
+    description = f"the cell {name}" if name else "a cell"
+    raise NotRunning("not running", f"no arm of {description} is running (runtime directory {root}): `rtcp cell start`")
 
 
 def cell_of_this_arm() -> tuple[CellConfig, Member] | None:
     """Return the cell of the platform that this environment names, and its arm; None: it is in none.
 
-    While the platform itself does not run, its partners that do are asked.
+    While the platform itself does not run, the sessions of its partners are read.
     """
     own, root = runtime_directory().absolute(), runtime_directory("").absolute()
     if own == root:
         return None
-    others = (path.parent for path in sorted(root.glob("*/session.json")) if path.parent != own)
-    for directory in (own, *others):
+    partners = (path.parent for path in sorted(root.glob("*/session.json")) if path.parent != own)
+    for directory in (own, *partners):
         if not control_socket(directory).exists():
             continue
         with contextlib.suppress(SessionError):
             cell = read_session(directory).cell
-            member = None if cell is None else next((one for one in cell.members if one.directory == own), None)
+            member = None if cell is None else next((arm for arm in cell.members if arm.directory == own), None)
             if cell is not None and member is not None:
                 return cell, member
             if directory == own:
@@ -133,7 +133,7 @@ def cell_of_this_arm() -> tuple[CellConfig, Member] | None:
 
 
 class CellStream:
-    """Setpoints of several arms in step: what ends the stream of one ends that of all.
+    """Setpoints of several arms in step: the end of one stream ends all of them.
 
     Args:
         streams: of the arms, by their names.
@@ -172,11 +172,11 @@ class CellStream:
             as `Stream.send`; and Invalid where an arm is missing.
         """
         if q.keys() != self.streams.keys():
-            found, allowed = ", ".join(q), ", ".join(self.streams)
-            raise RtcpError("invalid", f"q: found the arms {found or 'none'}, allowed are all of {allowed}")
+            names, allowed = ", ".join(q), ", ".join(self.streams)
+            raise RtcpError("invalid", f"q: found the arms {names or 'none'}, allowed are all of {allowed}")
         if velocity is not None and velocity.keys() != self.streams.keys():
-            found, allowed = ", ".join(velocity), ", ".join(self.streams)
-            raise RtcpError("invalid", f"velocity: found the arms {found or 'none'}, allowed are all of {allowed}")
+            names, allowed = ", ".join(velocity), ", ".join(self.streams)
+            raise RtcpError("invalid", f"velocity: found the arms {names or 'none'}, allowed are all of {allowed}")
         stamp = time.monotonic_ns() * 1e-9 if t is None else t
         for name, stream in self.streams.items():
             stream.send(q[name], None if velocity is None else velocity[name], t=stamp)
@@ -188,10 +188,10 @@ class CellStream:
 
 
 class Cell:
-    """The arms of a running cell. Closing it stops what it moves.
+    """The arms of a running cell. Closing it stops its motions.
 
     Args:
-        name: who commands, as others are told when they are refused; empty: this process.
+        name: of this commander, shown to others that are refused; empty: this process.
         cell: name of the cell; empty: the one that runs.
         directory: the runtime directory that holds those of the arms; None: that of the environment.
 
@@ -210,8 +210,8 @@ class Cell:
         self.processes: dict[str, Robot] = {}
         try:
             for members, robots in ((self.config.arms, self.arms), (self.config.processes, self.processes)):
-                for one in members:
-                    robots[one.name] = Robot(name, control_socket(one.directory))
+                for member in members:
+                    robots[member.name] = Robot(name, control_socket(member.directory))
         except RtcpError:
             self.close()
             raise
@@ -240,7 +240,7 @@ class Cell:
         return self._each(Robot.status)
 
     def enable(self) -> None:
-        """Enable all arms; where one cannot be enabled, those that this call has enabled are disabled again."""
+        """Enable all arms; where one cannot be enabled, disable those that this call has enabled."""
         enabled: list[str] = []
 
         def enable(name: str, robot: Robot) -> None:
@@ -268,7 +268,7 @@ class Cell:
         self._each(Robot.reset)
 
     def stop(self) -> dict[str, tuple[str, ...]]:
-        """End the platforms of all arms; return what could not be left in order."""
+        """End the platforms of all arms; return the steps that failed."""
         return self._apart(Robot.stop)
 
     # -- motions in step ----------------------------------------------------------------------------------------------
@@ -284,7 +284,7 @@ class Cell:
             Refused: a target outside the limits, the wrong state, an arm that does not run: then no arm moves.
             Faulted: it ended before all arrived; all have stopped.
         """
-        return self.run(self.plan([{"arm": name, "q": list(one)} for name, one in q.items()], speed))
+        return self.run(self.plan([{"arm": name, "q": list(joints)} for name, joints in q.items()], speed))
 
     def run_trajectory(self, points: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Arrival]:
         """Run trajectories of several arms in step: points as of `Robot.run_trajectory`, the first at time 0.
@@ -292,14 +292,14 @@ class Cell:
         Raises:
             as `move_joints`.
         """
-        targets = [{"arm": name, "points": [dict(point) for point in some]} for name, some in points.items()]
+        targets = [{"arm": name, "points": [dict(point) for point in waypoints]} for name, waypoints in points.items()]
         return self.run(self.plan(targets))
 
     def plan(self, targets: Sequence[Mapping[str, Any]], speed: float | None = None) -> StepPlan:
         """Plan a motion in step and move nothing; targets with `arm` and `q` or `points`."""
         robot, asked_ns = next(iter(self.arms.values())), time.monotonic_ns()
-        found = robot.command("plan_in_step", targets=[dict(one) for one in targets], speed=speed)
-        return StepPlan.from_json(found, asked_ns)
+        answer = robot.command("plan_in_step", targets=[dict(target) for target in targets], speed=speed)
+        return StepPlan.from_json(answer, asked_ns)
 
     def run(self, plan: StepPlan) -> dict[str, Arrival]:
         """Run a planned motion; return when all arms are there."""
@@ -314,7 +314,7 @@ class Cell:
         """Begin a stream of setpoints for several arms in step, all of them where none is named; leave it to end it.
 
         Raises:
-            Refused: what would refuse any motion, or an arm that does not run.
+            Refused: as any motion, or an arm that does not run.
         """
         from rtcp.api.stream import Stream  # here: numpy loads slowly, and a command has no use for it
 
@@ -325,7 +325,7 @@ class Cell:
         motion = time.monotonic_ns()
 
         def open_one(name: str, robot: Robot) -> Stream:
-            partners = [other for other in names if other != name]
+            partners = [partner for partner in names if partner != name]
             return Stream.from_json(robot.command("open_stream", motion=motion, partners=partners))
 
         opened: dict[str, Stream] = {}
@@ -351,7 +351,7 @@ class Cell:
         return self._all(lambda name, robot: call(robot))
 
     def _apart(self, call: Callable[[Robot], T]) -> dict[str, T]:
-        """Call a method of every arm over connections of their own: those of this cell may be waiting."""
+        """Call a method of every arm over new connections: those of this cell may be waiting."""
 
         def on_its_own(name: str, robot: Robot) -> T:
             path = control_socket(self.config.member(name).directory)
@@ -361,7 +361,7 @@ class Cell:
         return self._all(on_its_own)
 
     def _all(self, call: Callable[[str, Robot], T], names: Mapping[str, object] | None = None) -> dict[str, T]:
-        """Call a function for several members at once; raise the error that says most, when all have returned."""
+        """Call a function for several members at once; raise the most telling error when all have returned."""
         members = self._members
         chosen = [name for name in members if names is None or name in names]
         if not chosen:
@@ -378,7 +378,7 @@ class Cell:
         try:
             errors = {name: future.exception() for name, future in futures.items()}
         except BaseException:
-            # Not for longer: a gateway that is frozen does not keep an interrupt from its end.
+            # Bounded: a frozen gateway must not block the interrupt.
             until = time.monotonic() + _INTERRUPT_S
             for thread in (begin_thread(self._halt_quietly), *threads):
                 thread.join(max(0.0, until - time.monotonic()))
@@ -390,14 +390,14 @@ class Cell:
 
 
 def begin_thread(call: Callable[..., None], *arguments: Any) -> Thread:
-    """Start a thread that does not keep the process from its end."""
+    """Start a thread that does not keep the process alive."""
     thread = Thread(target=call, args=arguments, daemon=True)
     thread.start()
     return thread
 
 
 def most_telling(failed: Mapping[str, BaseException]) -> BaseException:
-    """Return of the errors of several arms, at least one, that which says why; with its arm's name."""
+    """Return the most telling of the errors of several arms, at least one, with its arm's name."""
     first = min(failed, key=lambda name: _SAYS_LESS.get(getattr(failed[name], "reason", ""), 0))
     error = failed[first]
     if isinstance(error, RtcpError):

@@ -1,4 +1,4 @@
-"""What a running loop publishes: each cycle record, event and message once, read from shared memory."""
+"""What a running loop publishes: each cycle record and event once, read from shared memory."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import numpy.typing as npt
 from rtcp.config.find import load_messages
 from rtcp.config.model import PluginError
 from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.events import ServiceEvent
 from rtcp.ipc.names import Names
-from rtcp.ipc.observer import BlackboardError, Observer
-from rtcp.ipc.recording import ERROR, INFORMATION, WARNING
+from rtcp.ipc.observer import ERROR, INFORMATION, WARNING, BlackboardError, Observer
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.ipc.session import SessionError, read_session
 from rtcp.ipc.terminals import named, terminals_of
@@ -28,6 +28,8 @@ Records: TypeAlias = npt.NDArray[np.void]
 """Cycle records, oldest first: a structured array with a field a signal (`docs/recording.md`)."""
 LogLine = tuple[int, str, int]
 """Instant (CLOCK_MONOTONIC, ns), text and level of `foxglove.Log`."""
+_RECENT = 32
+"""Events among which `last_event` finds one: notes of slaves may follow it."""
 
 
 class Feed:
@@ -37,11 +39,11 @@ class Feed:
         directory: the runtime directory; None: that of this process' environment.
 
     Attributes:
-        config: what was started.
+        config: configuration of the running platform.
         period_ns: of a cycle.
         schema: of the records: name, type, unit and meaning of each field; those of the tool (`rtcp.ipc.tool_motion`)
             are computed here.
-        channels: what programs know by a name: terminals of IO boxes, and channels of other slaves.
+        channels: named terminals of IO boxes, and channels of other slaves.
 
     Raises:
         NotRunning: no platform runs there.
@@ -71,13 +73,11 @@ class Feed:
             load_messages()
         self._names = Names(self.config, session.partners)
         self._at, self._event = self._observer.head, self._observer.last_event
-        self._texts_read_ns = time.monotonic_ns()
-        self._text = max((text.number for text in self._observer.texts_since(0)), default=0)
         self._gaps: list[LogLine] = []
         self._due_ns = 0
 
     def close(self) -> None:
-        """Let go of the ring."""
+        """Release the shared memory."""
         os.close(self._process)
         self._observer.close()
 
@@ -93,16 +93,16 @@ class Feed:
     def wait(self, timeout_s: float) -> bool:
         """Wait for the next cycle record; return whether there is one. It costs the loop nothing.
 
-        The next record is looked for when it is due; a loop that has ended is noticed by `ended`.
+        Sleeps until the next record is due. The end of the loop is detected by `ended`.
         """
         until = time.monotonic() + timeout_s
         rest_s = max(self.period_ns * 0.1e-9, 20e-6)
         while self._observer.head == self._at:
-            left = until - time.monotonic()
-            if left <= 0.0:
+            remaining = until - time.monotonic()
+            if remaining <= 0.0:
                 return False
             due = self._due_ns * 1e-9 - time.monotonic()
-            time.sleep(min(max(due, rest_s), left))
+            time.sleep(min(max(due, rest_s), remaining))
         self._due_ns = time.monotonic_ns() + self.period_ns - round(rest_s * 1e9)
         return True
 
@@ -121,36 +121,30 @@ class Feed:
         return None if latest is None else self._tool.add(latest)
 
     def last_event(self) -> str:
-        """Return the newest event in words, also one from before; empty before the first."""
-        events = self._observer.events_since(self._observer.last_event - 1)
-        return self._names.message(events[-1].event) if events else ""
+        """Return the newest event in words, also one from before; empty before the first. Of slaves, problems only."""
+        for record in reversed(self._observer.events_since(self._observer.last_event - _RECENT)):
+            if not isinstance(record.event, ServiceEvent) or record.event.is_problem:
+                return self._names.message(record.event)
+        return ""
 
     def messages(self) -> Iterator[LogLine]:
-        """Yield new events and sentences, and a warning for all that was overwritten before it was read."""
+        """Yield new events, and a warning for all that was overwritten before it was read."""
         gaps, self._gaps = self._gaps, []
         yield from gaps
         for event in self._observer.events_since(self._event):
             if lost := event.number - self._event - 1:
                 yield _gap("events", self._event + 1, event.number - 1, lost, event.monotonic_ns)
             self._event = event.number
-            level = ERROR if type(event.event) in self._names.faults else INFORMATION
+            is_problem = isinstance(event.event, ServiceEvent) and event.event.is_problem
+            level = WARNING if is_problem else INFORMATION
+            level = ERROR if type(event.event) in self._names.faults else level
             yield event.monotonic_ns, self._names.message(event.event), level
-        now_ns = time.monotonic_ns()
-        ahead_ns = time.time_ns() - now_ns
-        for text in self._observer.texts_since(self._text):
-            # Its time is CLOCK_REALTIME, which may have been set since; it came after the last reading and before now.
-            instant = min(max(text.time_ns - ahead_ns, self._texts_read_ns), now_ns)
-            if lost := text.number - self._text - 1:
-                yield _gap("messages", self._text + 1, text.number - 1, lost, instant)
-            self._text = text.number
-            yield instant, text.sentence, WARNING if text.is_problem else INFORMATION
-        self._texts_read_ns = now_ns
 
 
 def _not_running(directory: Path, why: str) -> RtcpError:
     return RtcpError("not running", f"no platform runs in {directory} ({why}): start one with `rtcp start`")
 
 
-def _gap(what: str, first: int, last: int, count: int, monotonic_ns: int) -> LogLine:
-    text = f"{count} of the {what} from {first} to {last} are missing: they were not read in time"
+def _gap(kind: str, first: int, last: int, count: int, monotonic_ns: int) -> LogLine:
+    text = f"{count} of the {kind} from {first} to {last} are missing: they were not read in time"
     return monotonic_ns, text, WARNING

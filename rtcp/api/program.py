@@ -22,24 +22,25 @@ _PLANNED_TIMES: Final = 2
 _MOST_PLANNED: Final = 10_000
 _SAME_RAD: Final = 1e-3
 _WAIT_S: Final = 0.1
-"""Between two looks at what ends a program while a step waits for a time."""
+"""Interval between checks for the end of a program while a step waits for a time, s."""
 _ENDS: Final = frozenset({
     "halted_at_rest", "disabled", "torque_removed", "stopped_by_limit", "limit_stop_reset", "reset_done",
     "control_mode_changed",
 })  # fmt: skip
-"""Events that end a program, beside faults and emergency stops: whoever enables the arm again expects no motion."""
+"""Events that end a program, beside faults and emergency stops: after them nobody expects the arm to continue."""
 _FAULTS: Final = ("fault", "emergency_stop")
-_THERE: Final = "AlreadyThere"
-"""Reason of a motion that is refused because the arm is where it leads."""
+_ALREADY_THERE: Final = "AlreadyThere"
+"""Reason of a refused motion whose target is where the arm is."""
 Where = tuple[str | int, ...]
 """Keys to a step in its file."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Motions of one or more steps that go over into each other: what `Robot.run_path` takes.
+    """Motions of one or more steps, blended into one path.
 
-    number: of the first step in the program. where: that step. stops: of the path.
+    number: of the first step in the program, from 0. where: keys to that step in the file. stops: the argument of
+    `Robot.run_path`.
     """
 
     number: int
@@ -58,7 +59,7 @@ class Action:
 
 @dataclass(frozen=True)
 class Begun:
-    """What a program begins to do: `text`, of the step that stands in this line of the file.
+    """The start of a step: `text` describes it, `line` is its line in the file.
 
     number: of the step in the program, from 0; of a part that runs, the step that runs it.
     """
@@ -78,9 +79,9 @@ class PlannedMotion:
 
 @dataclass
 class _Expected:
-    """Where a program has left the arm."""
+    """The state in which a program left the arm."""
 
-    here: Sequence[float]
+    positions: Sequence[float]
     """Commanded joint positions, rad."""
     tool: str
     event: int
@@ -124,7 +125,7 @@ class Program:
         A part that runs several times is planned twice.
 
         Args:
-            robot: that plans.
+            robot: plans the motions.
             start: step to begin with, from 0.
             end: step before which to end; None: behind the last.
 
@@ -136,26 +137,26 @@ class Program:
         places = self._places(robot)
         q: Sequence[float] = robot.status().commanded_positions
         with_tool: dict[str, Any] = {}
-        found: list[PlannedMotion] = []
-        for number, one in enumerate(self._units(places, _PLANNED_TIMES, start, end)):
+        planned: list[PlannedMotion] = []
+        for number, unit in enumerate(self._units(places, _PLANNED_TIMES, start, end)):
             if number == _MOST_PLANNED:
                 raise RtcpError("refused", f"{self.file}: it has more than {_MOST_PLANNED} steps", "program")
-            if isinstance(one, Action):
-                if one.step.tool is not None:
-                    with_tool["tool"] = one.step.tool
+            if isinstance(unit, Action):
+                if unit.step.tool is not None:
+                    with_tool["tool"] = unit.step.tool
                 continue
-            line = self.line_of(one.where)
+            line = self.line_of(unit.where)
             try:
-                plan = robot.preview(stops=one.stops, start=q, speed=self._motion.speed, **with_tool)
+                plan = robot.preview(stops=unit.stops, start=q, speed=self._motion.speed, **with_tool)
             except RtcpError as error:
-                if error.reason == _THERE:
+                if error.reason == _ALREADY_THERE:
                     continue
                 raise RtcpError(
                     error.kind, f"{self.file}:{line}: {error.message}", error.reason, error.fields
                 ) from None
-            found.append(PlannedMotion(line, plan))
+            planned.append(PlannedMotion(line, plan))
             q = plan.path[-1]
-        return found
+        return planned
 
     def run(
         self,
@@ -166,20 +167,20 @@ class Program:
         end: int | None = None,
         between: Callable[[], None] = lambda: None,
     ) -> None:
-        """Carry out the program; what ends it early stops the arm.
+        """Carry out the program; an early end stops the arm.
 
         Args:
             robot: enabled, in control mode `joint` or `cartesian`.
-            say: called with what begins.
+            say: called at the start of each step.
             check: plan all of it first.
             start: step to begin with, from 0, from wherever the arm is.
             end: step before which to end; None: behind the last.
-            between: called before each step, and again and again while one waits for a time: the program goes on when
-                it returns, and ends by what it raises; a wait also ends as a step does.
+            between: called before each step, and every 0.1 s while a step waits for a time: the program continues when
+                it returns, and ends with the exception that it raises.
 
         Raises:
             Refused: as `check`; or a step is refused.
-            RtcpError: what ended it.
+            RtcpError: the cause of an early end.
         """
         status = robot.status()
         newest = max((event.number for event in robot.events()), default=0)
@@ -189,24 +190,24 @@ class Program:
         else:
             self._check_tool(robot, start)
             self._check_terminals(robot, start, end)
-        for one in self._units(self._places(robot), None, start, end):
+        for unit in self._units(self._places(robot), None, start, end):
             between()
-            line = self.line_of(one.where)
+            line = self.line_of(unit.where)
             self._check_undisturbed(robot, line, expected)
-            if isinstance(one, Motion):
-                text = f"{len(one.stops)} motions in one" if len(one.stops) > 1 else "motion"
-                say(Begun(one.number, line, text))
-                _carry_out(robot, one.stops, self._motion.speed)
-                expected.here = robot.status().commanded_positions
+            if isinstance(unit, Motion):
+                text = f"{len(unit.stops)} motions in one" if len(unit.stops) > 1 else "motion"
+                say(Begun(unit.number, line, text))
+                _carry_out(robot, unit.stops, self._motion.speed)
+                expected.positions = robot.status().commanded_positions
             else:
-                say(Begun(one.number, line, _described(one.step)))
-                if one.step.wait_s is not None:
-                    self._wait(one.step.wait_s, between, partial(self._check_undisturbed, robot, line, expected))
-                _act(robot, one.step)
-                expected.tool = one.step.tool or expected.tool
+                say(Begun(unit.number, line, _described(unit.step)))
+                if unit.step.wait_s is not None:
+                    self._wait(unit.step.wait_s, between, partial(self._check_undisturbed, robot, line, expected))
+                _act(robot, unit.step)
+                expected.tool = unit.step.tool or expected.tool
 
     def step_back(self, robot: Robot, number: int) -> None:
-        """Move back to where step `number`, from 0, began: over a line or an arc on it, else by the joints.
+        """Move back to where step `number`, from 0, began: along its line or arc, else by the joints.
 
         A step that is no motion is not undone.
 
@@ -214,13 +215,13 @@ class Program:
             Refused: reason `no_way_back`: no motion stands before it, or it is, or follows, an arc with an angle.
         """
         if not 0 <= number < len(self.steps):
-            found = f"{self.file}: found step {number + 1}, allowed is 1 to {len(self.steps)}"
-            raise RtcpError("invalid", found, "no_such_step")
+            message = f"{self.file}: found step {number + 1}, allowed is 1 to {len(self.steps)}"
+            raise RtcpError("invalid", message, "no_such_step")
         step, line = self._motion.program[number], self.line_of(("program", number))
         if step.run is None and _target(step) is None:
             return
-        done = [one for _, _, one in self._steps(0, number, 1) if one is not None]
-        before = [at for at, one in enumerate(done) if _target(one) is not None]
+        done = [previous for _, _, previous in self._steps(0, number, 1) if previous is not None]
+        before = [at for at, previous in enumerate(done) if _target(previous) is not None]
         why = ""
         if not before:
             why = "no motion stands before it"
@@ -246,8 +247,9 @@ class Program:
         _carry_out(robot, [stop], self._motion.speed)
 
     def _check_tool(self, robot: Robot, number: int) -> None:
-        """Raise where the steps before have chosen another tool than the one in use: poses are those of a tool."""
-        chosen = [one.tool for _, _, one in self._steps(0, number, 1) if one is not None and one.tool is not None]
+        """Raise where the steps before have chosen another tool than the one in use: poses hold for one tool."""
+        steps = (step for _, _, step in self._steps(0, number, 1))
+        chosen = [step.tool for step in steps if step is not None and step.tool is not None]
         if chosen and (in_use := robot.status().tool) != chosen[-1]:
             text = f"the program uses the tool {chosen[-1]} there, in use is {in_use}: choose it first"
             raise RtcpError("refused", f"{self.file}:{self.line_of(('program', number))}: {text}", "another_tool")
@@ -259,7 +261,7 @@ class Program:
             return
         terminals = robot.read_io()
         inputs, outputs = terminals.inputs, terminals.outputs
-        # The names, then the places that name each terminal too.
+        # The names, then `box.number`, which every terminal has too.
         settable = dict.fromkeys(
             name for name in (*outputs, *outputs.places.values()) if not outputs.has_function(name)
         )
@@ -277,10 +279,10 @@ class Program:
 
     @staticmethod
     def _wait(seconds: float, between: Callable[[], None], check: Callable[[], None]) -> None:
-        """Wait, and end by what disturbs the program meanwhile."""
+        """Wait; raise at once where the program is disturbed."""
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            time.sleep(min(left, _WAIT_S))
+        while (remaining := end - time.monotonic()) > 0.0:
+            time.sleep(min(remaining, _WAIT_S))
             between()
             check()
 
@@ -291,7 +293,7 @@ class Program:
         if status.tool != expected.tool:
             text = f"{self.file}:{line}: somebody else has chosen the tool {status.tool} meanwhile: the program ends"
             raise RtcpError("refused", text, "another_tool")
-        if max((abs(a - b) for a, b in zip(now, expected.here, strict=True)), default=0.0) > _SAME_RAD:
+        if max((abs(a - b) for a, b in zip(now, expected.positions, strict=True)), default=0.0) > _SAME_RAD:
             text = f"{self.file}:{line}: the arm was moved by somebody else meanwhile: the program ends"
             raise RtcpError("refused", text, "moved_meanwhile")
         events = robot.events(expected.event)
@@ -310,12 +312,12 @@ class Program:
     def _places(self, robot: Robot) -> dict[str, list[float]]:
         """Return x, y, z of the poses through which arcs lead."""
         steps = [*self._motion.program, *(step for part in self._motion.parts for step in part.steps)]
-        found: dict[str, list[float]] = {}
+        places: dict[str, list[float]] = {}
         for name in {step.via for step in steps if step.via is not None}:
             pose = self._poses[name]
-            whole = pose.pose if pose.pose is not None else robot.fk(pose.q or ())
-            found[name] = list(whole[:3])
-        return found
+            values = pose.pose if pose.pose is not None else robot.fk(pose.q or ())
+            places[name] = list(values[:3])
+        return places
 
     def _units(
         self, places: dict[str, list[float]], most: int | None, start: int, end: int | None
@@ -324,7 +326,7 @@ class Program:
         first: tuple[int, Where] | None = None
         stops: list[dict[str, Any]] = []
         for number, where, step in self._steps(start, end, most):
-            # A part that runs again begins a motion of its own: what is planned for twice holds for any number.
+            # A part that runs again begins a new motion, so that the plan of two runs holds for any number of them.
             stop = None if step is None else self._stop(step, places)
             if stop is not None:
                 first = first or (number, where)
@@ -340,7 +342,7 @@ class Program:
     def _steps(self, start: int, end: int | None, most: int | None) -> Iterator[tuple[int, Where, Step | None]]:
         """Yield number in the program, place and step; None behind each run of a part that runs several times."""
         for number, step in list(enumerate(self._motion.program))[start:end]:
-            for where, inner in self._inner((("program", number)), step, most):
+            for where, inner in self._inner(("program", number), step, most):
                 yield number, where, inner
 
     def _inner(self, where: Where, step: Step, most: int | None) -> Iterator[tuple[Where, Step | None]]:
@@ -358,18 +360,18 @@ class Program:
                 yield where, None
 
     def _stop(self, step: Step, places: dict[str, list[float]]) -> dict[str, Any] | None:
-        """Return the stop of a motion; None: the step is none."""
+        """Return the stop of a motion; None: the step is no motion."""
         name = _target(step)
         if name is None:
             return None
         pose = self._poses[name]
-        made: dict[str, Any] = {"pose": list(pose.pose)} if pose.pose is not None else {"q": list(pose.q or ())}
-        made |= {"blend": step.blend, "by_joints": step.move is not None}
+        stop: dict[str, Any] = {"pose": list(pose.pose)} if pose.pose is not None else {"q": list(pose.q or ())}
+        stop |= {"blend": step.blend, "by_joints": step.move is not None}
         if step.speed is not None:
-            made["speed"] = step.speed
+            stop["speed"] = step.speed
         if step.via is not None:
-            made |= {"via": places[step.via], "angle": step.angle}
-        return made
+            stop |= {"via": places[step.via], "angle": step.angle}
+        return stop
 
 
 def _target(step: Step) -> str | None:
@@ -381,7 +383,7 @@ def _carry_out(robot: Robot, stops: Sequence[dict[str, Any]], speed: float | Non
     try:
         robot.run_path(stops, speed)
     except RtcpError as error:
-        if error.reason != _THERE:
+        if error.reason != _ALREADY_THERE:
             raise
 
 

@@ -1,4 +1,4 @@
-"""What the platform answers, as frozen dataclasses. SI units; one number a joint, base to tool."""
+"""Answers of the platform as frozen dataclasses. SI units; one number a joint, base to tool."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Pose = tuple[float, ...]
 """Six numbers: x y z, m, rx ry rz, rad, R = Rx Ry Rz; or their velocities."""
 
 
-def result(kind: type[T], found: Mapping[str, Any]) -> T:
+def result(kind: type[T], answer: Mapping[str, Any]) -> T:
     """Return a result of this type from an answer's keys: lists as tuples, a state by its name."""
     values: dict[str, Any] = {}
-    for name in (one.name for one in fields(kind)):  # type: ignore[arg-type]
-        if name in found:
-            value = found[name]
+    for name in (item.name for item in fields(kind)):  # type: ignore[arg-type]
+        if name in answer:
+            value = answer[name]
             values[name] = (
                 tuple(value) if isinstance(value, list) else State[value.upper()] if name == "state" else value
             )
@@ -31,7 +31,7 @@ def result(kind: type[T], found: Mapping[str, Any]) -> T:
 
 @dataclass(frozen=True)
 class Payload:
-    """What the tool holds."""
+    """The load in the tool."""
 
     mass: float = 0.0
     """kg"""
@@ -45,7 +45,7 @@ class Status:
 
     state: State
     message: str
-    """What happened last; in a fault: why."""
+    """The last event in words; in a fault: its cause."""
     drive_mode: DriveMode | None
     """None: the drives show another mode than those the cycle uses."""
     control_mode: ControlMode | None
@@ -60,7 +60,7 @@ class Status:
     commanded_positions: Positions
     """Setpoints of the controller, rad."""
     sent_positions: Positions
-    """Target positions in the frame, rad: what left on the wire."""
+    """Target positions in the frame as sent, rad."""
     goal: Positions | None
     """Joint positions at the end of the motion under way, rad; None: nothing moves, the arm stops, or the motion has no
     known end (jog, stream, a package's own command)."""
@@ -79,35 +79,35 @@ class Status:
     tool: str
     """Name of the tool in use."""
     payload: Payload
-    """What it holds."""
+    """The load in the tool."""
     raw: Mapping[str, Any]
     """Everything that `rtcp status --json` prints."""
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Status:
+    def from_json(cls, answer: Mapping[str, Any]) -> Status:
         """Read the answer of the method `status`."""
-        joints, tool = found["joints"], found["tool"] or {}
+        joints, tool = answer["joints"], answer["tool"] or {}
         return cls(
-            state=State[found["state"].upper()],
-            message=found["message"],
-            drive_mode=_mode(DriveMode, found["drive_mode"]),
-            control_mode=_mode(ControlMode, found["control_mode"]),
-            joint_names=tuple(found["joint_names"]),
+            state=State[answer["state"].upper()],
+            message=answer["message"],
+            drive_mode=_mode(DriveMode, answer["drive_mode"]),
+            control_mode=_mode(ControlMode, answer["control_mode"]),
+            joint_names=tuple(answer["joint_names"]),
             positions=tuple(joints["actual_position"]),
             velocities=tuple(joints["actual_velocity"]),
             torques=tuple(joints["actual_torque"]),
             commanded_positions=tuple(joints["commanded_position"]),
             sent_positions=tuple(joints["sent_position"]),
-            goal=_tuple(found["goal"]),
+            goal=_tuple(answer["goal"]),
             pose=_tuple(tool.get("pose")),
             tool_velocity=_tuple(tool.get("velocity")),
             commanded_pose=_tuple(tool.get("commanded_pose")),
-            robot=RobotStatus(**found["robot"]),
-            holder=found["lease"]["holder"],
-            speed_override=found["speed_override"],
-            tool=found["tool_name"],
-            payload=result(Payload, found["payload"]),
-            raw=found,
+            robot=RobotStatus(**answer["robot"]),
+            holder=answer["lease"]["holder"],
+            speed_override=answer["speed_override"],
+            tool=answer["tool_name"],
+            payload=result(Payload, answer["payload"]),
+            raw=answer,
         )
 
 
@@ -158,12 +158,12 @@ class Arrival:
     length_m: float | None = None
     """Length of the path of the tool."""
     slowed: float | None = None
-    """Fraction of the wanted speed that the joints' limits allowed."""
+    """Fraction of the requested speed that the joints' limits allowed."""
 
 
 @dataclass(frozen=True)
 class Buffered:
-    """What an open trajectory still has."""
+    """State of an open trajectory."""
 
     room: int
     """Points that can be appended now."""
@@ -173,7 +173,7 @@ class Buffered:
 
 @dataclass(frozen=True)
 class Preview:
-    """The way of a motion that has not begun."""
+    """The planned path of a motion that has not begun."""
 
     path: tuple[Positions, ...]
     """Configurations along it, rad, from its begin to its end."""
@@ -181,7 +181,7 @@ class Preview:
     length_m: float | None = None
     """Length of the path of the tool along lines."""
     slowed: float | None = None
-    """Fraction of the wanted speed that the joints' limits allow."""
+    """Fraction of the requested speed that the joints' limits allow."""
 
 
 @dataclass(frozen=True)
@@ -197,9 +197,9 @@ class Levels(Mapping[str, bool]):
     """Levels of inputs or outputs by name, True: high; also by `box.number` where a terminal has another name."""
 
     def __init__(self, terminals: Sequence[Mapping[str, Any]]) -> None:
-        self._levels = {one["name"]: bool(one["value"]) for one in terminals}
-        self._names = {f"{one['box']}.{one['number']}": one["name"] for one in terminals}
-        self._functions = {one["name"] for one in terminals if one["has_function"]}
+        self._levels = {terminal["name"]: bool(terminal["value"]) for terminal in terminals}
+        self._names = {f"{terminal['box']}.{terminal['number']}": terminal["name"] for terminal in terminals}
+        self._functions = {terminal["name"] for terminal in terminals if terminal["has_function"]}
 
     def __getitem__(self, name: str) -> bool:
         if name not in self._levels and name not in self._names:
@@ -227,7 +227,7 @@ class Levels(Mapping[str, bool]):
 
 @dataclass(frozen=True)
 class Channel:
-    """A channel with a number, of a slave of which nothing but its channels is known."""
+    """A numeric channel of an analog, encoder or generic slave."""
 
     name: str
     """slave.channel"""
@@ -240,12 +240,12 @@ class Channel:
     """Smallest and largest value that may be set."""
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Channel:
+    def from_json(cls, entry: Mapping[str, Any]) -> Channel:
         """Read an entry of the answer of the method `read_io`."""
-        low, high = found["range"] or (None, None)
+        low, high = entry["range"] or (None, None)
         ends = -math.inf if low is None else low, math.inf if high is None else high
-        value = math.nan if found["value"] is None else found["value"]
-        return cls(**{**found, "range": ends, "value": value})
+        value = math.nan if entry["value"] is None else entry["value"]
+        return cls(**{**entry, "range": ends, "value": value})
 
 
 @dataclass(frozen=True)
@@ -255,13 +255,13 @@ class Terminals:
     inputs: Levels
     outputs: Levels
     channels: Mapping[str, Channel] = field(default_factory=dict)
-    """Channels with a number, by their names."""
+    """Numeric channels, by name."""
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Terminals:
+    def from_json(cls, answer: Mapping[str, Any]) -> Terminals:
         """Read the answer of the method `read_io`."""
-        channels = {one["name"]: Channel.from_json(one) for one in found["channels"]}
-        return cls(Levels(found["inputs"]), Levels(found["outputs"]), channels)
+        channels = {entry["name"]: Channel.from_json(entry) for entry in answer["channels"]}
+        return cls(Levels(answer["inputs"]), Levels(answer["outputs"]), channels)
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ class GripperRest:
     position: float | None = None
     """rad"""
     holds: bool | None = None
-    """Something keeps it from its end position."""
+    """Whether an object keeps it from its end position."""
 
 
 @dataclass(frozen=True)
@@ -282,12 +282,12 @@ class Zero:
     offset: float
     before: float
     file: str
-    """Where it is kept."""
+    """File in which it is kept."""
 
 
 @dataclass(frozen=True)
 class RecorderStatus:
-    """What a recorder has written up to now, or had written when it ended."""
+    """Files and counts of a recorder; final once it has ended."""
 
     pid: int
     """Of its process."""
@@ -317,4 +317,4 @@ class EventRecord:
     fields: Mapping[str, Any]
     message: str
     severity: str = "note"
-    """What it asks of a person: `emergency_stop`, `fault`, `limit` (reset, and move away), `warning`, `note`."""
+    """What a person has to do: `emergency_stop`, `fault`, `limit` (reset, and move away), `warning`, `note`."""

@@ -1,6 +1,6 @@
-"""A robot, commanded by blocking calls; and every method of a robot, once: what it sends, what becomes of the answer.
+"""A robot, commanded by blocking calls; and every method of a robot: its request, and the result made of the answer.
 
-Each method raises `RtcpError` as described there; what a method raises in particular stands in its docstring.
+Each method raises `RtcpError` as described there; its docstring lists only its own cases.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from rtcp.api.results import (
     result,
 )
 from rtcp.ipc.client import ControlClient
+from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 T = TypeVar("T")
-OnProgress = Callable[[Progress], None]
+OnProgress = Callable[[Progress], object]
 Json = dict[str, Any]
 
 
@@ -66,7 +67,7 @@ class _Awaited(Protocol):
 
 
 class Method(Generic[P, T]):
-    """A method by the `Call` that it makes, which its users never see: a robot returns the result, or awaits it."""
+    """A method, described by the `Call` that it makes; a robot returns the result of the call, or awaits it."""
 
     def __init__(self, describe: Callable[Concatenate[Any, P], Call[T]]) -> None:
         self.describe = describe
@@ -81,7 +82,7 @@ class Method(Generic[P, T]):
     def __get__(self, robot: _Awaited, kind: object) -> Callable[P, Coroutine[Any, Any, T]]: ...
 
     def __get__(self, robot: Any, kind: object) -> Any:
-        """Return the description, to `help` and the like: a robot has functions in the place of its methods."""
+        """Return the description, for `help` and the like: on a robot, functions replace the methods."""
         return self.describe
 
     def function(self, awaited: bool) -> object:
@@ -96,12 +97,12 @@ class Method(Generic[P, T]):
         async def call_awaited(self: Any, /, *args: Any, **kwargs: Any) -> Any:
             return await self._carry_out(describe(self, *args, **kwargs))
 
-        found = inspect.signature(describe)
-        made: Any = call_awaited if awaited else call
-        made.__signature__ = found.replace(
-            return_annotation=str(found.return_annotation).removeprefix("Call[").removesuffix("]")
+        signature = inspect.signature(describe)
+        wrapper: Any = call_awaited if awaited else call
+        wrapper.__signature__ = signature.replace(
+            return_annotation=str(signature.return_annotation).removeprefix("Call[").removesuffix("]")
         )
-        return made
+        return wrapper
 
 
 def _nothing(answer: Json) -> None:
@@ -114,18 +115,18 @@ def _as_is(answer: Json) -> Json:
 
 def _joint_limits(answer: Json) -> tuple[JointLimits, ...]:
     limits = answer["limits"]
-    keys = [one.name for one in dataclasses.fields(JointLimits)][1:]
+    keys = [item.name for item in dataclasses.fields(JointLimits)][1:]
     return tuple(JointLimits(name, *(limits[key][i] for key in keys)) for i, name in enumerate(answer["joint_names"]))
 
 
 def _recordings(answer: Json) -> list[RecorderStatus]:
-    return [result(RecorderStatus, one) for one in answer["recordings"]]
+    return [result(RecorderStatus, recording) for recording in answer["recordings"]]
 
 
 _arrival, _streamed, _buffered = partial(result, Arrival), partial(result, Streamed), partial(result, Buffered)
 
 
-def _held(hold_s: float, sent_s: float | None) -> Json:
+def _expiry(hold_s: float, sent_s: float | None) -> Json:
     return {"hold_s": hold_s, "sent_s": time.monotonic() if sent_s is None else sent_s}
 
 
@@ -151,7 +152,7 @@ class Methods:
     @Method
     def events(self, since: int = 0) -> Call[list[EventRecord]]:
         """Return the events after the number `since`, oldest first; the last 256 are kept."""
-        return Call("events", {"since": since}, lambda answer: [result(EventRecord, one) for one in answer["events"]])
+        return Call("events", {"since": since}, lambda answer: [result(EventRecord, e) for e in answer["events"]])
 
     @Method
     def scan(self) -> Call[list[Json]]:
@@ -160,7 +161,7 @@ class Methods:
 
     @Method
     def enable(self) -> Call[None]:
-        """Enable all drives; return when the arm holds where it stands."""
+        """Enable all drives; return when the arm holds."""
         return Call("enable", {}, _nothing)
 
     @Method
@@ -168,7 +169,7 @@ class Methods:
         """Stop, remove the torque and return when the drives show that it is gone. Needs no lease.
 
         Returns:
-            drives that were told to, and that no record shows: a gripper's during a fault.
+            drives that were commanded off and that no record shows: a gripper's during a fault.
         """
         return Call("disable", {}, lambda answer: tuple(answer["unconfirmed"]))
 
@@ -193,7 +194,7 @@ class Methods:
 
     @Method
     def set_speed_override(self, fraction: float) -> Call[None]:
-        """Move at a fraction of the speed from now on, also what is under way; streams and torques are not slowed.
+        """Set the fraction of its speed at which the arm moves, also now; streams and torques are not slowed.
 
         Args:
             fraction: 0.01 to 1. Anyone may lower it; raising it takes the lease for a moment.
@@ -208,10 +209,10 @@ class Methods:
     def pause(self) -> Call[None]:
         """Bring the motion under way, whoever began it, to rest on its path; `resume` continues it. Needs no lease.
 
-        Its call goes on waiting. A halt, or the end of its commander, ends it also while it is paused.
+        Its call keeps waiting. A halt, or the end of its commander, also ends a paused motion.
 
         Raises:
-            Refused: nothing moves, or what moves cannot be paused (jog, stream, torque, a motion in step).
+            Refused: nothing moves, or the motion cannot be paused (jog, stream, torque, a motion in step).
         """
         return Call("pause", {}, _nothing)
 
@@ -228,7 +229,7 @@ class Methods:
     def set_tool(self, name: str) -> Call[None]:
         """Use another tool of the arm's file (`kinematics.tools`); at rest, in state ready or holding.
 
-        Poses, lines, jogs, boxes, collisions and gravity are those of this tool from then on. It holds nothing yet:
+        Poses, lines, jogs, boxes, collisions and gravity are those of this tool from then on. Its payload is 0:
         see `set_payload`. After each start of the loop the first tool of the file is in use.
 
         Raises:
@@ -240,7 +241,7 @@ class Methods:
 
     @Method
     def set_payload(self, mass: float, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Call[None]:
-        """Carry the weight of what the tool holds, in control mode torque; at rest. Choosing another tool sets it to 0.
+        """Set the payload of the tool, whose weight control mode torque carries; at rest. `set_tool` sets it to 0.
 
         Args:
             mass: kg, at most `payload.max_mass` of the arm's file.
@@ -256,7 +257,7 @@ class Methods:
         """End the platform: stop the arm, disable the drives, leave the bus.
 
         Returns:
-            what could not be left in order, a sentence each.
+            the steps that failed, a sentence each.
         """
         return Call("stop", {}, lambda answer: tuple(answer["problems"]))
 
@@ -278,8 +279,8 @@ class Methods:
             speed: of the fastest joint, rad/s; None: its limit.
             synchronized: all joints arrive together; else each as soon as it can.
             progress: called about ten times a second meanwhile.
-            replace: a motion of this connection that is under way (`AsyncRobot`) goes over into this one without a
-                stop, under the limits; where this one is refused, that goes on.
+            replace: blend a motion of this connection that is under way (`AsyncRobot`) into this one without a stop,
+                under the limits; a refusal of this one leaves that under way.
 
         Raises:
             Refused: a target outside the limits, the wrong state, another commander.
@@ -354,7 +355,7 @@ class Methods:
         Args:
             via: x y z, m; also longer: of a pose the first three count.
             pose: x y z, m, and rx ry rz, rad: its end.
-            angle: rad; the tool travels so far on the circle through here, `via` and `pose`, and keeps its orientation:
+            angle: rad, travelled on the circle through the present place, `via` and `pose`, at constant orientation;
                 `2 * pi` is the whole circle. None: up to the pose.
             speed: m/s; None: its limit.
             progress: called about ten times a second meanwhile.
@@ -405,18 +406,18 @@ class Methods:
     ) -> Call[Arrival]:
         """Run a trajectory through points `{"t": s, "q": [rad]}`; `approach`: the joints first move to the first point.
 
-        A point may also have velocities `v` and accelerations `a`. With `replace` as `move_joints`: a first point at
-        time 0 is left out while the arm moves, and what follows is as much later as the way to the next one demands.
+        A point may also have velocities `v` and accelerations `a`. With `replace` as `move_joints`: while the arm moves
+        a first point at time 0 is left out, and the others are delayed by what the way to the next one demands.
 
         Args:
-            points: times rise from 0 on, or from later: then the arm is led to the first.
+            points: times rise, from 0 on or later; where the first is later, the arm first moves to it.
             approach: see above.
             progress: called about ten times a second meanwhile.
             replace: see above.
-            start_tolerance: rad; a first point at time 0 that is so near to where the arm is commanded counts as there.
-            path_tolerance: of the measured from the commanded position, rad, one a joint, 0: none; where it is not kept
+            start_tolerance: rad; a first point at time 0 this near to the commanded position counts as reached.
+            path_tolerance: largest distance of measured and commanded position, rad, one a joint, 0: none; beyond it
                 the arm brakes on its path.
-            goal_tolerance: of the measured position from the last point, rad, one a joint, 0: none.
+            goal_tolerance: largest distance of the measured position from the last point, rad, one a joint, 0: none.
             goal_time_s: how much later than planned the arm may be inside `goal_tolerance`, s; None: 3.
 
         Raises:
@@ -436,7 +437,7 @@ class Methods:
 
     @Method
     def open_trajectory(self, points: Sequence[Mapping[str, Any]], replace: bool = False) -> Call[Buffered]:
-        """Begin a trajectory that is open at its end: `append` more points, and `finish_trajectory`; points as there.
+        """Begin an open-ended trajectory: `append` points, then `finish_trajectory`; points as of `run_trajectory`.
 
         Returns when it is accepted. Points with positions only get velocities that pass no point. Where none is
         appended in time, the arm comes to rest at the last point or, with velocities given, brakes, and the trajectory
@@ -451,11 +452,11 @@ class Methods:
 
     @Method
     def append(self, points: Sequence[Mapping[str, Any]]) -> Call[Buffered]:
-        """Append points to the open trajectory; of points that are refused none is taken, and it goes on.
+        """Append points to the open trajectory, all or none; a refusal leaves it running.
 
         Raises:
-            Refused: `not_open`, `no_room_for_points`, or what is wrong with a point.
-            Faulted: it has ended: `reason` says why.
+            Refused: `not_open`, `no_room_for_points`, or a mistake in a point.
+            Faulted: it has ended; `reason` is the cause.
         """
         return Call("append", {"points": [dict(point) for point in points]}, _buffered)
 
@@ -501,7 +502,7 @@ class Methods:
         in use.
 
         Raises:
-            Refused: what the motion would be refused with, or that its way leads through a box.
+            Refused: as the motion would be, or because its path leads through a box.
             Invalid: not exactly one of `q`, `pose`, `file` and `stops`, or one with mistakes.
         """
         params: dict[str, Any] = {
@@ -528,7 +529,7 @@ class Methods:
         hold_s: float = 0.25,
         sent_s: float | None = None,
     ) -> Call[Streamed]:
-        """Move with a velocity for `hold_s`; call it again meanwhile to go on. The arm stops by itself.
+        """Move with a velocity for `hold_s`; call it again in time to continue. Else the arm stops by itself.
 
         Args:
             velocity: of the tool along and about the axes of `frame`, 6 numbers, m/s and rad/s; of the joints, rad/s.
@@ -537,17 +538,17 @@ class Methods:
             sent_s: CLOCK_MONOTONIC, s, of the operator's input; a command older than `hold_s` has no effect. None: now.
 
         Raises:
-            TimedOut: it came later than `hold_s` after `sent_s`.
+            TimedOut: it was received later than `hold_s` after `sent_s`.
         """
         name = frame if isinstance(frame, str) else frame.name.lower()
-        return Call("jog", {"velocity": list(velocity), "frame": name, **_held(hold_s, sent_s)}, _streamed)
+        return Call("jog", {"velocity": list(velocity), "frame": name, **_expiry(hold_s, sent_s)}, _streamed)
 
     @Method
     def move_at_velocity(
         self, velocity: Sequence[float], hold_s: float = 0.25, sent_s: float | None = None
     ) -> Call[Streamed]:
         """Move the joints with velocities, rad/s, in control mode `velocity`; `hold_s` and `sent_s` as for `jog`."""
-        return Call("move_at_velocity", {"velocity": list(velocity), **_held(hold_s, sent_s)}, _streamed)
+        return Call("move_at_velocity", {"velocity": list(velocity), **_expiry(hold_s, sent_s)}, _streamed)
 
     @Method
     def apply_torque(
@@ -558,7 +559,7 @@ class Methods:
         hold_s: float = 0.25,
         sent_s: float | None = None,
     ) -> Call[Streamed]:
-        """Add joint torques, Nm, to what carries the weight of the arm, in control mode `torque`.
+        """Add joint torques, Nm, to the gravity compensation, in control mode `torque`.
 
         Args:
             torque: Nm, one a joint.
@@ -567,25 +568,25 @@ class Methods:
             hold_s: as for `jog`.
             sent_s: as for `jog`.
         """
-        params = {"torque": list(torque), "stiffness": stiffness, "damping": damping, **_held(hold_s, sent_s)}
+        params = {"torque": list(torque), "stiffness": stiffness, "damping": damping, **_expiry(hold_s, sent_s)}
         return Call("apply_torque", params, _streamed)
 
     @Method
     def guide(self, duration_s: float = 0.0, progress: OnProgress | None = None) -> Call[str]:
-        """Let the arm be guided by hand, in control mode `torque`; the mode before comes back.
+        """Let a person guide the arm by hand, in control mode `torque`; then return to the mode before.
 
         Args:
             duration_s: how long, s; 0: until a halt, the release of the enabling switch, or 3600 s.
-            progress: called with what is under way.
+            progress: called meanwhile.
 
         Returns:
             Why it ended: `done`, `halted` or `released` (the enabling switch).
         """
-        return Call("guide", {"duration_s": duration_s}, lambda found: str(found["ended"]), progress)
+        return Call("guide", {"duration_s": duration_s}, lambda answer: str(answer["ended"]), progress)
 
     @Method
     def stream(self, q: Sequence[float], t: float) -> Call[Streamed]:
-        """Send the next position of a stream, rad, with the sender's time stamp, s; it ends when no more come."""
+        """Send the next position of a stream, rad, with the sender's time stamp, s; the stream ends by itself."""
         return Call("stream_position", {"q": list(q), "stamp_s": t}, _streamed)
 
     @Method
@@ -593,7 +594,7 @@ class Methods:
         """Begin a stream of setpoints, sent without waiting for answers: 1 kHz and more; leave its block to end it.
 
         Raises:
-            Refused: what would refuse any motion.
+            Refused: as any motion.
         """
         from rtcp.api.stream import Stream  # here: numpy loads slowly, and a command has no use for it
 
@@ -604,7 +605,7 @@ class Methods:
     @Method
     def fk(self, q: Sequence[float]) -> Call[Pose]:
         """Return the pose of the tool, x y z, m, rx ry rz, rad, at joint positions, rad, within their limits or not."""
-        return Call("fk", {"q": list(q)}, lambda found: tuple(found["pose"]))
+        return Call("fk", {"q": list(q)}, lambda answer: tuple(answer["pose"]))
 
     @Method
     def ik(self, pose: Sequence[float], near: Sequence[float] | None = None) -> Call[Positions]:
@@ -619,7 +620,7 @@ class Methods:
                 `in_box` (`box`: which, in words), `no_geometry`.
         """
         params = {"pose": list(pose), "near": None if near is None else list(near)}
-        return Call("ik", params, lambda found: tuple(found["q"]))
+        return Call("ik", params, lambda answer: tuple(answer["q"]))
 
     # -- inputs, outputs, limits, zero, objects -----------------------------------------------------------------------
 
@@ -661,10 +662,8 @@ class Methods:
 
     @Method
     def gripper(self, open: bool) -> Call[GripperRest]:
-        """Open or close the gripper; one with a drive has come to rest when this returns."""
-        return Call(
-            "move_gripper", {"open": open}, lambda found: GripperRest(found.get("position"), found.get("holds"))
-        )
+        """Open or close the gripper; return when one with a drive is at rest."""
+        return Call("move_gripper", {"open": open}, lambda end: GripperRest(end.get("position"), end.get("holds")))
 
     @Method
     def limits(self) -> Call[Json]:
@@ -698,13 +697,13 @@ class Methods:
     @Method
     def home(self, joint: str, progress: OnProgress | None = None) -> Call[float]:
         """Run the homing of a joint's drive; return its position afterwards, rad."""
-        return Call("home", {"joint": joint}, lambda found: float(found["position"]), progress)
+        return Call("home", {"joint": joint}, lambda answer: float(answer["position"]), progress)
 
     @Method
     def sdo_read(self, slave: int, index: int, subindex: int = 0) -> Call[bytes]:
         """Read an object of the slave at position `slave`, from 1."""
         params = {"slave": slave, "index": index, "subindex": subindex}
-        return Call("sdo_read", params, lambda found: bytes.fromhex(found["hex"]))
+        return Call("sdo_read", params, lambda answer: bytes.fromhex(answer["hex"]))
 
     @Method
     def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> Call[None]:
@@ -724,7 +723,7 @@ class Methods:
             hold_s: s
             sent_s: as for `jog`.
         """
-        return Call("joystick", {"pressed": list(pressed), "byte": byte, **_held(hold_s, sent_s)}, _nothing)
+        return Call("joystick", {"pressed": list(pressed), "byte": byte, **_expiry(hold_s, sent_s)}, _nothing)
 
     # -- recordings ---------------------------------------------------------------------------------------------------
 
@@ -746,7 +745,7 @@ class Methods:
         Args:
             out: directory, or a file that ends in the name of its only format; None: the platform's own place.
             formats: `mcap`, `csv`, or both; none: the ending of `out`, or mcap.
-            signals: names of fields of a cycle record or patterns (`*_position`); none: all, or for CSV the source's.
+            signals: names of fields of a cycle record or patterns (`*_position`); none: all, or as CSV the thesis'.
             every: N: every Nth cycle.
             seconds: how long; None: until `record_stop`.
             max_file_mb: size of a file at which the next one begins, MB.
@@ -774,7 +773,7 @@ class Methods:
 
     @Method
     def record_stop(self, pid: int | None = None) -> Call[list[RecorderStatus]]:
-        """End all recordings, or the one of the process `pid`; return what they have written."""
+        """End all recordings, or the one of the process `pid`; return their results."""
         return Call("record_stop", {"pid": pid}, _recordings)
 
     @Method
@@ -800,10 +799,10 @@ class Methods:
 class Robot(Methods):
     """A connection to the running platform; one call at a time, from one thread.
 
-    Closing it stops what it moves: its lease ends, and the arm comes to a controlled stop.
+    Closing it stops its motions: its lease ends, and the arm comes to a controlled stop.
 
     Args:
-        name: who commands, as others are told when they are refused; empty: this process.
+        name: of this commander, shown to others that are refused; empty: this process.
         path: the control socket; None: that of the runtime directory.
 
     Raises:
@@ -813,6 +812,8 @@ class Robot(Methods):
 
     def __init__(self, name: str = "", path: Path | None = None) -> None:
         self._client = ControlClient(name, path)
+        self.directory = runtime_directory() if path is None else path.parent
+        """Runtime directory of its platform."""
 
     def __enter__(self) -> Robot:
         return self
@@ -854,8 +855,8 @@ class Robot(Methods):
     @property
     def processes(self) -> dict[str, Process]:
         """The processes beside motion, by their names."""
-        found = self.status().raw["processes"]
-        return {name: Process(self, name, one["kind"], tuple(one["commands"])) for name, one in found.items()}
+        processes = self.status().raw["processes"]
+        return {name: Process(self, name, entry["kind"], tuple(entry["commands"])) for name, entry in processes.items()}
 
     def _carry_out(self, call: Call[T]) -> T:
         return call.result(self._client.call(call.method, call.params, _reader(call)))
@@ -925,23 +926,23 @@ class Process:
 
     @property
     def fields(self) -> Mapping[str, Any]:
-        """What it publishes in the newest cycle record, in the units of `rtcp status --json`."""
+        """Its fields in the newest cycle record, in the units of `rtcp status --json`."""
         published = self._robot.status().raw["devices"].get(self.name, {})
-        return {name: shown["value"] for name, shown in published.items()}
+        return {name: field["value"] for name, field in published.items()}
 
     def command(self, name: str, **fields: Any) -> Any:
-        """Send one of its commands; one that lasts returns when the process has finished.
+        """Send one of its commands; return when it is carried out, of a lasting one when the process has finished.
 
         Raises:
             Refused: the process does not accept it now.
-            Faulted: it ended early; `reason` and `fields` say by what.
+            Faulted: it ended early; `reason` and `fields` are the cause.
         """
         return self._robot.command(name, **fields)
 
 
-def _reader(call: Call[Any]) -> Callable[[Mapping[str, Any]], None] | None:
+def _reader(call: Call[Any]) -> Callable[[Mapping[str, Any]], object] | None:
     report = call.progress
-    return None if report is None else lambda found: report(result(Progress, found))
+    return None if report is None else lambda update: report(result(Progress, update))
 
 
 def connect(name: str = "", path: Path | None = None) -> Robot:

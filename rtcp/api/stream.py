@@ -46,7 +46,7 @@ class Stream:
         config = session.config
         self._names = Names(config, session.partners)
         self._count = len(config.joints)
-        self._rest = (0.0,) * (MOST_AXES - self._count)
+        self._padding = (0.0,) * (MOST_AXES - self._count)
         self._stream, self._lease, self._since = stream, lease, since
         self._renew_ns = round(config.lease_s * 0.2e9)
         self._renewed_ns = time.monotonic_ns()
@@ -56,9 +56,9 @@ class Stream:
         """How many setpoints were sent."""
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Stream:
+    def from_json(cls, answer: Mapping[str, Any]) -> Stream:
         """Read the answer of the method `open_stream`."""
-        return cls(Path(found["directory"]), found["stream"], found["lease"], found["since"])
+        return cls(Path(answer["directory"]), answer["stream"], answer["lease"], answer["since"])
 
     def __enter__(self) -> Stream:
         return self
@@ -95,28 +95,28 @@ class Stream:
 
         Raises:
             Invalid: not a number a joint, an acceleration without a velocity, or the stream was closed.
-            Faulted: the stream has ended, and `reason` and `fields` say by what; or the loop has ended: a platform that
+            Faulted: the stream has ended, `reason` and `fields` are the cause; or the loop has ended: a platform that
                 was started since needs another stream.
         """
         if self._is_closed:
             raise RtcpError("invalid", "the stream is closed: open another one")
         if self._loop.poll(0):
             raise self._loop_has_ended()
-        bits, n, rest = 0, self._count, self._rest
-        given: Any
-        for name, given, bit in (
+        bits, n, padding = 0, self._count, self._padding
+        values: Any
+        for name, values, bit in (
             ("q", q, 0),
             ("velocity", velocity, SETPOINT_HAS_VELOCITY),
             ("acceleration", acceleration, SETPOINT_HAS_ACCELERATION),
         ):
-            if given is None and bit:
+            if values is None and bit:
                 continue
             bits |= bit
             try:
-                count = len(given)
+                count = len(values)
             except TypeError:
                 raise RtcpError(
-                    "invalid", f"{name}: found {given!r:.40}, allowed are {n} numbers: one a joint"
+                    "invalid", f"{name}: found {values!r:.40}, allowed are {n} numbers: one a joint"
                 ) from None
             if count != n:
                 raise RtcpError("invalid", f"{name}: found {count} numbers, allowed are {n}: one a joint")
@@ -124,7 +124,7 @@ class Stream:
             raise RtcpError("invalid", "velocity: it is missing, and an acceleration is given")
         zero = _NOTHING[:n]
         v, a = zero if velocity is None else velocity, zero if acceleration is None else acceleration
-        self._put(bits, time.monotonic_ns() * 1e-9 if t is None else t, (*q, *rest, *v, *rest, *a, *rest))
+        self._put(bits, time.monotonic_ns() * 1e-9 if t is None else t, (*q, *padding, *v, *padding, *a, *padding))
         self.sent += 1
 
     def _put(self, bits: int, t: float, numbers: Sequence[float]) -> None:
@@ -146,26 +146,26 @@ class Stream:
         return RtcpError("fault", f"{loop} has ended: start the platform, then open another stream")
 
     def _ended(self) -> RtcpError:
-        """Return the error for what has ended the stream."""
-        found: Event | None = None
+        """Return the error for the end of the stream."""
+        cause: Event | None = None
         for event in (record.event for record in self._observer.events_since(self._since)):
-            # That the arm has stopped says why only where nothing else does.
+            # A stop is the reason only where there is no other event.
             if (
                 isinstance(event, _ENDS)
                 or type(event) in self._names.faults
-                or (found is None and type(event) is Stopped)
+                or (cause is None and type(event) is Stopped)
             ):
-                found = event
-        if found is None:
+                cause = event
+        if cause is None:
             return RtcpError("fault", "the stream has ended")
-        return RtcpError("fault", f"the stream has ended: {self._names.message(found)}", found.name, found.as_json())
+        return RtcpError("fault", f"the stream has ended: {self._names.message(cause)}", cause.name, cause.as_json())
 
     def close(self) -> None:
         """Bring the arm to rest and end the stream; a second time is harmless. It waits for nothing."""
         if not self._is_closed:
             self._taken = self.taken
             self._is_closed = True
-            with contextlib.suppress(BlackboardError):  # of a loop that hangs, and takes nothing
+            with contextlib.suppress(BlackboardError):  # of a loop that hangs, and reads nothing
                 self._observer.setpoint(self._stream, SETPOINT_ENDS, 0.0, _NOTHING)
             os.close(self._process)
             self._observer.close()

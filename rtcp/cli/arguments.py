@@ -1,4 +1,4 @@
-"""What several commands take: shared options, and numbers among options, also negative ones."""
+"""Options and arguments that several commands share, and parsing of numbers, also negative ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def option(name: str, metavar_or_help: str = "", help: str = "") -> Any:
 
 
 def choose_platform(name: str | None) -> None:
-    """Let this process start or reach the platform with this name; None: as the environment says.
+    """Let this process start or reach the platform with this name; None: the one of the environment.
 
     Raises:
         CommandError: no platform may have this name.
@@ -121,7 +121,7 @@ def number(value: str, name: str, unit: str = "") -> float:
     """Return a finite number.
 
     Raises:
-        CommandError: names what the number is for and its unit.
+        CommandError: names the value's meaning and unit.
     """
     return _numbers([value], [(name, unit)])[0]
 
@@ -130,13 +130,13 @@ def _numbers(values: Sequence[str], names: Sequence[tuple[str, str]]) -> list[fl
     numbers, wrong = [], []
     for value, (name, unit) in zip(values, names, strict=True):
         try:
-            found = plain_number(angle(value) if unit == "rad" else value)
+            parsed = plain_number(angle(value) if unit == "rad" else value)
         except ValueError:
             wrong.append(f"{name}: {value!r} is not a number" + (f" ({unit})" if unit else ""))
             continue
-        if not math.isfinite(found):
+        if not math.isfinite(parsed):
             wrong.append(f"{name}: {value} is not finite; a finite number{f' of {unit}' if unit else ''} is needed")
-        numbers.append(found)
+        numbers.append(parsed)
     if wrong:
         raise CommandError("\n".join(wrong))
     return numbers

@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from rtcp.cli.arguments import (
-    JOINTS,
-    NUMBERS_AS_WRITTEN,
-    PICTURES,
-    AsJson,
-    as_written,
-    check_picture,
-    joint_values,
-    option,
-    pose_values,
-)
+from rtcp.cli import arguments
 from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table
 from rtcp.config.model import UNLIMITED_TORQUE
 
@@ -30,20 +20,20 @@ if TYPE_CHECKING:
 
 _Exported = TypeVar("_Exported")
 SINGULAR = 1e-9
-"""m or rad; a configuration nearer than this is on the singularity."""
+"""Distance below which a configuration counts as singular, m or rad."""
 
 ArmFile = Annotated[
     str | None,
-    option("--arm", "FILE", "File of an arm, or name of a packaged one. Default: the platform's."),
+    arguments.option("--arm", "FILE", "File of an arm, or name of a packaged one. Default: the platform's."),
 ]
-Positions = Annotated[list[str], as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool.")]
+Positions = Annotated[list[str], arguments.as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool.")]
 
 HELP = "Compute with an arm: forward and inverse kinematics, picture, exports as URDF, C and MoveIt."
 commands = typer.Typer(name="arm", help=HELP, no_args_is_help=True)
 
 
-@commands.command("fk", context_settings=NUMBERS_AS_WRITTEN)
-def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> None:
+@commands.command("fk", context_settings=arguments.NUMBERS_AS_WRITTEN)
+def _fk(positions: Positions, arm: ArmFile = None, as_json: arguments.AsJson = False) -> None:
     """Show the pose of the tool and of every frame at joint positions."""
     q = _joints(positions)
     model = _model(arm)
@@ -57,48 +47,50 @@ def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> N
     show(*_forward_tables(model, q))
 
 
-@commands.command("ik", context_settings=NUMBERS_AS_WRITTEN)
+@commands.command("ik", context_settings=arguments.NUMBERS_AS_WRITTEN)
 def _ik(
     pose: Annotated[
         list[str],
-        as_written("X Y Z RX RY RZ", "Tool pose: m, and rad (or as -pi/2) of R = Rx(rx) Ry(ry) Rz(rz)."),
+        arguments.as_written("X Y Z RX RY RZ", "Tool pose: m, and rad (or as -pi/2) of R = Rx(rx) Ry(ry) Rz(rz)."),
     ],
     near: Annotated[
         tuple[str, str, str, str, str, str] | None,
-        option("--near", "Q1..Q6", "Joint positions, rad, for joints that a singularity frees."),
+        arguments.option("--near", "Q1..Q6", "Joint positions, rad, for joints that a singularity frees."),
     ] = None,
     arm: ArmFile = None,
-    as_json: AsJson = False,
+    as_json: arguments.AsJson = False,
 ) -> None:
     """Show all joint positions that reach a pose; exit code 3 where there are none."""
-    wanted = pose_values(pose)
-    q_near = None if near is None else joint_values(near, "--near, ")
+    target = arguments.pose_values(pose)
+    q_near = None if near is None else arguments.joint_values(near, "--near, ")
     model = _model(arm)
     from kinematics.inverse import InverseKinematics
     from kinematics.pose import Pose
 
-    found = InverseKinematics(model).solve(Pose.from_xyzrpy(*wanted), q_near)
+    result = InverseKinematics(model).solve(Pose.from_xyzrpy(*target), q_near)
     if as_json:
         solutions = [
-            {"q": list(one.q), "branch": one.branch and str(one.branch), "within_limits": one.within_limits}
-            for one in found.solutions
+            {"q": list(entry.q), "branch": entry.branch and str(entry.branch), "within_limits": entry.within_limits}
+            for entry in result.solutions
         ]
-        emit_json({"solutions": solutions, "reason": found.reason})
-    if not found.solutions:
-        raise CommandError(found.reason or "there is no solution", ExitCode.REFUSED)
+        emit_json({"solutions": solutions, "reason": result.reason})
+    if not result.solutions:
+        raise CommandError(result.reason or "there is no solution", ExitCode.REFUSED)
     if not as_json:
-        show(*_inverse_tables(model, found.solutions))
+        show(*_inverse_tables(model, result.solutions))
 
 
-@commands.command("plot", context_settings=NUMBERS_AS_WRITTEN)
+@commands.command("plot", context_settings=arguments.NUMBERS_AS_WRITTEN)
 def _plot(
     positions: Positions,
-    out: Annotated[Path, option("--out", "FILE", f"Picture: {', '.join(PICTURES)}.")] = (Path("arm.png")),
+    out: Annotated[Path, arguments.option("--out", "FILE", f"Picture: {', '.join(arguments.PICTURES)}.")] = (
+        Path("arm.png")
+    ),
     arm: ArmFile = None,
 ) -> None:
     """Draw the arm and its frames."""
     q = _joints(positions)
-    check_picture("--out", out)
+    arguments.check_picture("--out", out)
     model = _model(arm)
     from rtcp.cli.arm_plot import draw
 
@@ -107,7 +99,7 @@ def _plot(
 
 @commands.command("urdf")
 def _urdf(
-    out: Annotated[Path | None, option("--out", "FILE", "File to write. Default: standard output.")] = None,
+    out: Annotated[Path | None, arguments.option("--out", "FILE", "File to write. Default: standard output.")] = None,
     arm: ArmFile = None,
 ) -> None:
     """Export the arm as URDF, for viewers, simulators and planners."""
@@ -127,7 +119,9 @@ def _urdf(
 
 @commands.command("export-c")
 def _export_c(
-    out: Annotated[Path, option("--out", "DIR", "Folder to write to; it is made where it is missing.")] = Path(),
+    out: Annotated[
+        Path, arguments.option("--out", "DIR", "Folder to write to; it is made where it is missing.")
+    ] = Path(),
     arm: ArmFile = None,
 ) -> None:
     """Export forward and inverse kinematics as a C file and its header, which need no Python."""
@@ -139,7 +133,9 @@ def _export_c(
 
 @commands.command("export-moveit")
 def _export_moveit(
-    out: Annotated[Path, option("--out", "DIR", "Folder for the package, as the src of a workspace.")] = Path(),
+    out: Annotated[
+        Path, arguments.option("--out", "DIR", "Folder for the package, as the src of a workspace.")
+    ] = Path(),
     arm: ArmFile = None,
 ) -> None:
     """Export a ROS package for MoveIt: analytic kinematics, URDF, SRDF, limits, controllers."""
@@ -160,13 +156,15 @@ def _model(arm: str | None) -> ArmModel:
 
 
 def _joints(positions: Sequence[str]) -> list[float]:
-    if len(positions) != JOINTS:
-        raise CommandError(f"{len(positions)} positions for an arm of {JOINTS} joints: give {JOINTS} numbers, rad")
-    return joint_values(positions)
+    if len(positions) != arguments.JOINTS:
+        raise CommandError(
+            f"{len(positions)} positions for an arm of {arguments.JOINTS} joints: give {arguments.JOINTS} numbers, rad"
+        )
+    return arguments.joint_values(positions)
 
 
 def _covered(export: Callable[[], _Exported]) -> _Exported:
-    """Return what is exported; an arm that cannot be is refused with the reason."""
+    """Run an export; raises CommandError with the reason for an arm that it does not support."""
     try:
         return export()
     except ValueError as error:
@@ -194,7 +192,7 @@ def _write(out: Path, write: Callable[[], object]) -> None:
 
 
 def _forward_tables(model: ArmModel, q: Sequence[float]) -> list[RenderableType]:
-    """Return the frames at joint positions `q`, rad, and what limits and singularities mean for them."""
+    """Return the frames at joint positions `q`, rad, their limits and their distances to singularities."""
     from rich.text import Text
 
     from kinematics.forward import frames
@@ -238,22 +236,22 @@ def _inverse_tables(model: ArmModel, solutions: Sequence[Solution]) -> list[Rend
     )
     for column in (1, 6):
         distances.columns[column].no_wrap = False
-    for number, one in enumerate(solutions, 1):
+    for number, entry in enumerate(solutions, 1):
         joints.add_row(
             str(number),
-            str(one.branch or "-"),
-            *(Text(_zero(f"{q:.4f}"), "red" if joint in one.outside else "") for joint, q in enumerate(one.q)),
-            "inside" if one.within_limits else "outside",
-            style="" if one.within_limits else "dim",
+            str(entry.branch or "-"),
+            *(Text(_zero(f"{q:.4f}"), "red" if joint in entry.outside else "") for joint, q in enumerate(entry.q)),
+            "inside" if entry.within_limits else "outside",
+            style="" if entry.within_limits else "dim",
         )
         distances.add_row(
             str(number),
-            ", ".join(f"q{joint + 1}" for joint in one.outside) or "-",
-            *("-" if value is None else _small(value) for value in singularity_distances(model, one.q)),
-            ", ".join(flag.name.lower() for flag in Singularity if flag in one.singularity and flag.name) or "-",
+            ", ".join(f"q{joint + 1}" for joint in entry.outside) or "-",
+            *("-" if value is None else _small(value) for value in singularity_distances(model, entry.q)),
+            ", ".join(flag.name.lower() for flag in Singularity if flag in entry.singularity and flag.name) or "-",
         )
     parts: list[RenderableType] = [joints, Text(""), distances]
-    if not any(one.within_limits for one in solutions):
+    if not any(solution.within_limits for solution in solutions):
         parts.append(Text(" no solution is inside the joints' limits"))
     return parts
 

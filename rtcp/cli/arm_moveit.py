@@ -24,9 +24,9 @@ from rtcp.config.model import UNLIMITED_TORQUE
 GROUP = "manipulator"
 """Planning group, named as ROS-Industrial does."""
 _SAMPLES = 1000
-"""Random configurations in which links are looked at."""
+"""Number of random configurations in which links are checked for overlap."""
 _BALLS = 8
-"""By which a cylinder is filled."""
+"""Number of balls that fill a cylinder."""
 
 Array = npt.NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def moveit_package(arm: Path) -> MoveItPackage:
 def _touching(model: ArmModel, urdf: ET.Element, home: list[float]) -> list[tuple[str, str, str]]:
     """Return links that are no neighbours and overlap in every configuration (Always) or at home (Default).
 
-    MoveIt would find every plan in collision with them. Pairs that never touch are looked at by MoveIt all the same.
+    MoveIt would reject every plan because of them. It still checks pairs that never touch.
     """
     names = [link.get("name", "") for link in urdf.findall("link")]
     balls = [_balls(link) for link in urdf.findall("link")]
@@ -128,7 +128,7 @@ def _balls(link: ET.Element) -> Array:
 
 
 def _rendered(values: dict[str, Any]) -> dict[str, str]:
-    """Return the templates with the values in them, by their paths."""
+    """Return the rendered templates by their paths."""
     here = Path(__file__).resolve().parent
     shipped = here / "moveit"  # in a wheel; a checkout has the folder at its top
     folder = shipped if shipped.is_dir() else here.parents[1] / "moveit"

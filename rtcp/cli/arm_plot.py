@@ -30,7 +30,7 @@ _SIDES, _SAME = 28, 1e-6
 
 
 def draw(model: ArmModel, q: Sequence[float], out: Path, paths: Sequence[Sequence[Sequence[float]]] = ()) -> None:
-    """Draw the arm at `q` (six rad) into a file, and the way of the tool on paths of the joints.
+    """Draw the arm at `q` (six rad) into a file, and the path of the tool along paths of the joints.
 
     The file's ending chooses the format.
 
@@ -40,17 +40,17 @@ def draw(model: ArmModel, q: Sequence[float], out: Path, paths: Sequence[Sequenc
     """
     poses = (IDENTITY, *frames(model, q))
     size = sum(abs(row.a) + abs(row.d) for row in model.rows) + float(np.linalg.norm(model.tool.position)) or 1.0
-    way = np.array(_corners(model, poses))
-    centre, half = _room(way, size)
+    corners = np.array(_corners(model, poses))
+    centre, half = _room(corners, size)
     figure = Figure(figsize=(11.0, 7.2))
     space = figure.add_axes((0.0, 0.0, 0.68, 0.90), projection="3d")
-    _in_space(space, way, poses, size, centre, half)
-    tools = [np.array([forward(model, one).position for one in path]) for path in paths]
+    _in_space(space, corners, poses, size, centre, half)
+    tools = [np.array([forward(model, joints).position for joints in path]) for path in paths]
     for tool in tools:
         space.plot(*tool.T, color=TOOL, lw=1.5, zorder=4)
     for bottom, plane, title in ((0.53, (0, 2), "from the side"), (0.07, (0, 1), "from above")):
         axes = figure.add_axes((0.74, bottom, 0.24, 0.36), title=title)
-        _outline(axes, way, poses, plane, centre, half)
+        _outline(axes, corners, poses, plane, centre, half)
         for tool in tools:
             axes.plot(*tool[:, plane].T, color=TOOL, lw=1.2)
     joints = ", ".join(f"{value:.4g}" for value in q)
@@ -68,15 +68,15 @@ def _tool(pose: Pose) -> str:
 
 
 def _corners(model: ArmModel, poses: Sequence[Pose]) -> list[Array]:
-    """Return the way from the base to the tool: along a on each frame's x, along d on the next one's z."""
-    way = [np.zeros(3)]
+    """Return the corners of the line from base to tool: along a on each frame's x, along d on the next frame's z."""
+    corners = [np.zeros(3)]
     for row, before, pose in zip(model.rows, poses, poses[1:], strict=False):
-        way += [_origin(before) + row.a * _axes(before)[0], _origin(pose)]
-    way.append(_origin(poses[-1]))
-    return [point for i, point in enumerate(way) if i == 0 or float(np.linalg.norm(point - way[i - 1])) > _SAME]
+        corners += [_origin(before) + row.a * _axes(before)[0], _origin(pose)]
+    corners.append(_origin(poses[-1]))
+    return [point for i, point in enumerate(corners) if i == 0 or float(np.linalg.norm(point - corners[i - 1])) > _SAME]
 
 
-def _in_space(axes: Any, way: Array, poses: Sequence[Pose], size: float, centre: Array, half: float) -> None:
+def _in_space(axes: Any, line: Array, poses: Sequence[Pose], size: float, centre: Array, half: float) -> None:
     axes.computed_zorder = False
     for axis, middle in zip("xyz", centre, strict=True):
         getattr(axes, f"set_{axis}lim")(middle - half, middle + half, auto=False)
@@ -85,9 +85,9 @@ def _in_space(axes: Any, way: Array, poses: Sequence[Pose], size: float, centre:
     axes.view_init(elev=22, azim=-58)
     facets: list[Array] = []
     colours: list[Any] = []
-    for start, end in pairwise(way):
+    for start, end in pairwise(line):
         _add(facets, colours, _tube(start, end, 0.020 * size), LINK)
-    for corner in way[1:-1]:
+    for corner in line[1:-1]:
         _add(facets, colours, _ball(corner, 0.020 * size), LINK)
     for pose in poses[1:6]:
         along = 0.045 * size * _axes(pose)[2]
@@ -98,12 +98,12 @@ def _in_space(axes: Any, way: Array, poses: Sequence[Pose], size: float, centre:
     _add(facets, colours, _ball(_origin(tool), 0.020 * size), TOOL)
     _add(facets, colours, _tube(np.array((0, 0, -0.012 * size)), np.zeros(3), 0.09 * size, closed=True), LINK)
     axes.add_collection3d(Poly3DCollection(facets, facecolors=colours, edgecolors=colours, linewidths=0.2, zorder=2))
-    axes.plot(way[:, 0], way[:, 1], 0 * way[:, 2], color="black", alpha=0.12, lw=6, solid_capstyle="round", zorder=1)
+    axes.plot(line[:, 0], line[:, 1], 0 * line[:, 2], color="black", alpha=0.12, lw=6, solid_capstyle="round", zorder=1)
     _triads(axes, poses, size)
 
 
 def _triads(axes: Any, poses: Sequence[Pose], size: float) -> None:
-    """Draw every frame; names of frames that share an origin stand together."""
+    """Draw every frame; frames that share an origin share a label."""
     places: list[tuple[Array, list[str]]] = []
     for name, pose in zip(["base", *"123456", "tool"], poses, strict=True):
         origin, directions = _origin(pose), _axes(pose)
@@ -122,9 +122,9 @@ def _triads(axes: Any, poses: Sequence[Pose], size: float) -> None:
         axes.text(*(where + aside), ", ".join(names), fontsize=9, zorder=4)
 
 
-def _room(way: Array, size: float) -> tuple[Array, float]:
-    """Return the middle and half the side of the cube that holds the arm and the ground under it."""
-    low, high = way.min(axis=0), way.max(axis=0)
+def _room(corners: Array, size: float) -> tuple[Array, float]:
+    """Return the centre and half the side of the cube that holds the arm and the ground under it."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
     low[2] = min(low[2], 0.0)
     centre, half = (low + high) / 2, max(float((high - low).max()) / 2, 0.3 * size) * 1.1
     if low[2] == 0.0:
@@ -132,12 +132,12 @@ def _room(way: Array, size: float) -> tuple[Array, float]:
     return centre, half
 
 
-def _outline(axes: Any, way: Array, poses: Sequence[Pose], plane: tuple[int, int], centre: Array, half: float) -> None:
+def _outline(axes: Any, line: Array, poses: Sequence[Pose], plane: tuple[int, int], centre: Array, half: float) -> None:
     across, up = plane
-    axes.plot(way[:, across], way[:, up], color=LINK, lw=6, solid_capstyle="round", solid_joinstyle="round")
+    axes.plot(line[:, across], line[:, up], color=LINK, lw=6, solid_capstyle="round", solid_joinstyle="round")
     origins = np.array([_origin(pose) for pose in poses[1:7]])
     axes.plot(origins[:, across], origins[:, up], "o", color=JOINT, ms=8)
-    axes.plot(*way[-1][[across, up]], "o", color=TOOL, ms=7)
+    axes.plot(*line[-1][[across, up]], "o", color=TOOL, ms=7)
     axes.plot(0, 0, marker="s", color="black", ms=10, zorder=0)
     axes.set(xlabel="xyz"[across] + ", m", ylabel="xyz"[up] + ", m", aspect="equal")
     axes.set_xlim(centre[across] - half, centre[across] + half)
@@ -149,23 +149,23 @@ def _tube(start: Array, end: Array, radius: float, *, closed: bool = False) -> I
     """Yield the facets, (4, 3), of a cylinder from `start` to `end`, in rings short enough to be sorted by depth."""
     along = end - start
     length = float(np.linalg.norm(along))
-    one, two = _across(along / length)
-    turn = np.linspace(0.0, 2 * np.pi, _SIDES + 1)
-    circle = radius * (np.outer(np.cos(turn), one) + np.outer(np.sin(turn), two))
+    u, v = _across(along / length)
+    angles = np.linspace(0.0, 2 * np.pi, _SIDES + 1)
+    circle = radius * (np.outer(np.cos(angles), u) + np.outer(np.sin(angles), v))
     rings = max(1, round(length / (2 * radius)))
     for step in range(rings):
         below, above = start + along * step / rings + circle, start + along * (step + 1) / rings + circle
         yield from (np.array((below[i], below[i + 1], above[i + 1], above[i])) for i in range(_SIDES))
     if closed:
-        # Four corners as all facets have: others would be filled up with corners that are nowhere.
+        # Four corners, as all facets have: shorter ones would be padded with undefined corners.
         for centre, rim in ((end, circle), (start, circle[::-1])):
             yield from (centre + np.array((0 * along, *rim[i : i + 3])) for i in range(0, _SIDES, 2))
 
 
 def _ball(centre: Array, radius: float) -> Iterator[Array]:
-    heights, turn = np.linspace(-np.pi / 2, np.pi / 2, 9), np.linspace(0.0, 2 * np.pi, 17)
+    heights, angles = np.linspace(-np.pi / 2, np.pi / 2, 9), np.linspace(0.0, 2 * np.pi, 17)
     for low, high in pairwise(heights):
-        for left, right in pairwise(turn):
+        for left, right in pairwise(angles):
             corners = ((left, low), (right, low), (right, high), (left, high))
             yield centre + radius * np.array(
                 [(np.cos(t) * np.cos(h), np.sin(t) * np.cos(h), np.sin(h)) for t, h in corners]
@@ -173,11 +173,11 @@ def _ball(centre: Array, radius: float) -> Iterator[Array]:
 
 
 def _across(direction: Array) -> tuple[Array, Array]:
-    """Return two directions that stand on one and on each other, right-handed."""
+    """Return two directions perpendicular to `direction` and to each other, right-handed."""
     aside = np.array((1.0, 0.0, 0.0)) if abs(direction[0]) < 0.9 else np.array((0.0, 1.0, 0.0))
-    one: Array = np.cross(direction, aside)
-    one /= np.linalg.norm(one)
-    return one, np.cross(direction, one)
+    normal: Array = np.cross(direction, aside)
+    normal /= np.linalg.norm(normal)
+    return normal, np.cross(direction, normal)
 
 
 def _add(facets: list[Array], colours: list[Any], shape: Iterator[Array], colour: str) -> None:

@@ -47,8 +47,8 @@ def _sdo_read(
     """Read an object; without --type its bytes in hex and as each type of that size."""
     index, subindex = parse_object(where)
     known = None if type_name is None else _checked_type(type_name)
-    with open_bus("sdo read", bus, config) as asked:
-        data = asked.access.sdo_read(asked.slave(slave), index, subindex)
+    with open_bus("sdo read", bus, config) as opened:
+        data = opened.access.sdo_read(opened.slave(slave), index, subindex)
     emit(interpretations(data) if known is None else decode(data, known))
 
 
@@ -66,8 +66,8 @@ def _sdo_write(
         raise CommandError(f"found {len(value)} values: {' '.join(value)}; give one (quote a string)")
     index, subindex = parse_object(where)
     data = encode(value[0], _checked_type(type_name))
-    with open_bus("sdo write", bus, config) as asked:
-        asked.access.sdo_write(asked.slave(slave), index, subindex, data)
+    with open_bus("sdo write", bus, config) as opened:
+        opened.access.sdo_write(opened.slave(slave), index, subindex, data)
     report(f"slave {slave}, 0x{index:04X}:{subindex}: {data.hex(' ') or '(empty)'} written")
 
 
@@ -75,16 +75,16 @@ def _sdo_write(
 
 
 class Bus(NamedTuple):
-    """A bus that can be asked: its name, the slaves by configured name as `access` takes them, and who asks it."""
+    """An open bus: its name, its slaves by configured name (as `access` takes them), and its access."""
 
     name: str
     slaves: Mapping[str, int | str]
     access: Robot | offline.OfflineBus
 
     def slave(self, slave: str) -> Any:
-        """Return a slave given by position or configured name as `access` takes it; raises CommandError.
+        """Return a slave, by position or configured name, as `access` takes it; raises CommandError.
 
-        A running platform has compared its slaves with their names, and takes positions; an offline bus finds them.
+        A running platform has matched slaves and names, and takes positions; an offline bus looks the names up.
         """
         if slave.isdecimal() and len(slave) < 6 and int(slave) > 0:
             return int(slave)
@@ -136,15 +136,15 @@ def offline_bus(name: str | None, config: Path | None) -> Bus:
 
 def parse_object(text: str) -> tuple[int, int]:
     """Return index and subindex of `0x6041`, `6041h`, `0x1018:1` or `0x1018:0x01`; raises CommandError."""
-    found = _OBJECT.fullmatch(text)
-    if not found:
+    match = _OBJECT.fullmatch(text)
+    if not match:
         raise CommandError(
             f"{text!r} is not an object: write the index in hex, as 0x6041 or 6041h, and 0x1018:1 for a subindex"
         )
-    index = int(found["prefixed"] or found["suffixed"], 16)
+    index = int(match["prefixed"] or match["suffixed"], 16)
     if index > 0xFFFF:
         raise CommandError(f"index 0x{index:X} is too large: at most 0xFFFF")
-    subindex = parse_integer(found["sub"] or "0", "subindex")
+    subindex = parse_integer(match["sub"] or "0", "subindex")
     if not 0 <= subindex <= 0xFF:
         raise CommandError(f"subindex {subindex} is not allowed: 0 to 255")
     return index, subindex
@@ -180,7 +180,7 @@ def encode(text: str, type_name: str) -> bytes:
 
 
 def decode(data: bytes, type_name: str) -> str:
-    """Return the value of the bytes as text; raises CommandError where their number is not the type's."""
+    """Return the value of the bytes as text; raises CommandError where the type has another size."""
     if type_name == "string":
         return data.rstrip(b"\0").decode(errors="replace")
     if type_name == "bytes":
@@ -196,7 +196,7 @@ def decode(data: bytes, type_name: str) -> str:
 
 
 def interpretations(data: bytes) -> str:
-    """Return the bytes in hex, as integers of that size, and as text where all of it is printable."""
+    """Return the bytes in hex, as integers of that size, and, if all of it is printable, as text."""
     parts = [data.hex(" ") or "(empty)"]
     if f"uint{8 * len(data)}" in BITS:
         unsigned, signed = (int.from_bytes(data, "little", signed=signed) for signed in (False, True))
@@ -219,14 +219,14 @@ def _finite(text: str, type_name: str) -> float:
     return number
 
 
-def parse_integer(text: str, what: str) -> int:
+def parse_integer(text: str, name: str) -> int:
     """Return a whole number written in decimal or, after 0x, in hex; raises CommandError."""
     try:
         if "_" in text or not text.isascii():
             raise ValueError
         return int(text, 16) if text.lower().lstrip("+-").startswith("0x") else int(text)
     except ValueError as error:
-        raise CommandError(f"{text!r} is not a whole number ({what})") from error
+        raise CommandError(f"{text!r} is not a whole number ({name})") from error
 
 
 # -- tables of a scan -----------------------------------------------------------------------------------------------
@@ -255,12 +255,12 @@ def scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[Renderabl
             str(sum(slave["port_errors"]["rx"]) + sum(slave["port_errors"]["links"])),
         )
         parts += [Text(""), Text(f"{slave['position']}  {slave['name']}", "bold")]
-        parts += [Padding(one, (0, 0, 0, 3)) for one in (_slave_facts(slave), _pdo_map(slave)) if one.row_count]
+        parts += [Padding(facts, (0, 0, 0, 3)) for facts in (_slave_facts(slave), _pdo_map(slave)) if facts.row_count]
     return parts
 
 
 def _branches(slaves: Sequence[Mapping[str, Any]]) -> list[int]:
-    """Return of each slave how many branches lead to it: a junction's last one goes on where it stands."""
+    """Return the number of branches that lead to each slave; a junction's last branch adds none."""
     last = {slave["parent"]: slave["position"] for slave in slaves}
     levels: dict[int, int] = {0: 0}
     for slave in slaves:
@@ -272,8 +272,8 @@ def _branches(slaves: Sequence[Mapping[str, Any]]) -> list[int]:
 def _port(slave: Mapping[str, Any], port: int) -> str:
     errors = slave["port_errors"]
     counted = [
-        f"{count} {one if count == 1 else several}"
-        for count, one, several in (
+        f"{count} {singular if count == 1 else plural}"
+        for count, singular, plural in (
             (errors["rx"][port], "damaged frame", "damaged frames"),
             (errors["forwarded"][port], "forwarded error", "forwarded errors"),
             (errors["links"][port], "lost link", "lost links"),

@@ -70,16 +70,16 @@ def _start(
 def _to_start(cell: CellConfig) -> list[str]:
     """Return the arms that do not run yet; raises CommandError where one runs outside this cell, or all run."""
     names = []
-    for one in cell.members:
-        directory = runtime_directory(one.name)
+    for arm in cell.members:
+        directory = runtime_directory(arm.name)
         if not control_socket(directory).exists():
-            names.append(one.name)
+            names.append(arm.name)
             continue
         with contextlib.suppress(SessionError):
-            other = read_session(directory).cell
-            if other is None or other.digest != cell.digest:
-                what = "no cell" if other is None else f"{other.name} of {other.source}, in another state of its files"
-                raise CommandError(f"{one.name} runs already, as part of {what}: `rtcp --name {one.name} stop` first")
+            live = read_session(directory).cell
+            if live is None or live.digest != cell.digest:
+                owner = "no cell" if live is None else f"{live.name} of {live.source}, in another state of its files"
+                raise CommandError(f"{arm.name} runs already, as part of {owner}: `rtcp --name {arm.name} stop` first")
     if not names:
         raise CommandError(f"the cell {cell.name} runs already: `rtcp cell status`")
     return names
@@ -90,7 +90,7 @@ def _command(path: Path, name: str, *more: str) -> list[str]:
 
 
 def _detached(cell: CellConfig, path: Path, names: Sequence[str]) -> int:
-    """Start these arms and return; where one does not start, stop what was started."""
+    """Start these arms and return; where one does not start, stop those that were started."""
     children = {name: _spawn(_command(path, name, "--detach")) for name in names}
     threads = [_forward(name, child) for name, child in children.items()]
     codes = {name: child.wait() for name, child in children.items()}
@@ -98,7 +98,7 @@ def _detached(cell: CellConfig, path: Path, names: Sequence[str]) -> int:
         thread.join()
     if any(codes.values()):
         for name in codes:
-            # Also one that runs, but was not ready in time.
+            # Also an arm that runs, but was not ready in time.
             if control_socket(runtime_directory(name)).exists():
                 subprocess.run([sys.executable, "-m", "rtcp.cli", "--name", name, "stop"], check=False)
         raise CommandError("the cell was not started: " + ", ".join(n for n, c in codes.items() if c), ExitCode.FAULT)
@@ -155,7 +155,7 @@ def _spawn(command: list[str]) -> subprocess.Popen[str]:
 
 
 def _forward(name: str, child: subprocess.Popen[str]) -> threading.Thread:
-    """Print what a child prints, with the arm's name before each line."""
+    """Print the output of a child, with the arm's name before each line."""
 
     def copy() -> None:
         assert child.stdout is not None
@@ -171,7 +171,7 @@ def _forward(name: str, child: subprocess.Popen[str]) -> threading.Thread:
 def _stop() -> None:
     """Stop the platforms of all arms: drives disabled, processes ended."""
     cells = find_cells(_chosen.name)
-    running = [one.name for cell in cells for one in cell.members if control_socket(one.directory).exists()]
+    running = [member.name for cell in cells for member in cell.members if control_socket(member.directory).exists()]
     children = {name: _spawn([sys.executable, "-m", "rtcp.cli", "--name", name, "stop"]) for name in running}
     threads = [_forward(name, child) for name, child in children.items()]
     codes = [child.wait() for child in children.values()]
@@ -197,21 +197,21 @@ def _connected(command: str) -> Iterator[Cell]:
 @_cell.command("status")
 def _status(as_json: Annotated[bool, option("--json", "One JSON object: the status of each arm.")] = False) -> None:
     """Show the state of every arm."""
-    found: dict[str, Any] = {}
-    for one in (one for cell in find_cells(_chosen.name) for one in cell.members):
+    statuses: dict[str, Any] = {}
+    for member in (member for cell in find_cells(_chosen.name) for member in cell.members):
         try:
-            with Robot("rtcp cell status", control_socket(one.directory)) as robot:
-                found[one.name] = robot.status().raw
+            with Robot("rtcp cell status", control_socket(member.directory)) as robot:
+                statuses[member.name] = robot.status().raw
         except RtcpError as error:
-            found[one.name] = {"state": "not running", "message": error.message}
+            statuses[member.name] = {"state": "not running", "message": error.message}
     if as_json:
-        emit_json(found)
+        emit_json(statuses)
         return
-    shown = table(("arm", "state", "bus", "joints, rad", "message"), ("arm", "state", "bus"), fill="message")
-    for name, status in found.items():
-        joints = " ".join(f"{one:.3f}" for one in status.get("joints", {}).get("actual_position", ()))
-        shown.add_row(name, status["state"].replace("_", " "), status.get("bus", "-"), joints, status["message"])
-    show(shown)
+    rows = table(("arm", "state", "bus", "joints, rad", "message"), ("arm", "state", "bus"), fill="message")
+    for name, status in statuses.items():
+        joints = " ".join(f"{position:.3f}" for position in status.get("joints", {}).get("actual_position", ()))
+        rows.add_row(name, status["state"].replace("_", " "), status.get("bus", "-"), joints, status["message"])
+    show(rows)
 
 
 def _simple(name: str, words: str, call: Callable[[Cell], object]) -> None:
@@ -242,7 +242,7 @@ def _stop_all(method: str, words: str) -> None:
     outcomes: dict[str, Any] = {}
     for config in find_cells(_chosen.name):
         cell = AsyncCell(config, f"rtcp cell {method} (pid {os.getpid()})")
-        outcomes |= asyncio.run(cell.attempt({one.name: call for one in config.members}))
+        outcomes |= asyncio.run(cell.attempt({member.name: call for member in config.members}))
     failed = [f"{name}: {error}" for name, error in outcomes.items() if isinstance(error, BaseException)]
     if failed:
         raise CommandError("\n".join(failed), ExitCode.FAULT)
@@ -251,13 +251,13 @@ def _stop_all(method: str, words: str) -> None:
 
 @_cell.command("halt")
 def _halt() -> None:
-    """Stop every motion of every arm, whoever began it; one that does not answer keeps none from stopping."""
+    """Stop every motion of every arm, whoever began it; an arm that does not answer does not delay the others."""
     _stop_all("halt", "all arms hold")
 
 
 @_cell.command("disable")
 def _disable() -> None:
-    """Stop all arms and remove their torque; one that does not answer keeps none from stopping."""
+    """Stop all arms and remove their torque; an arm that does not answer does not delay the others."""
     _stop_all("disable", "no arm has torque")
 
 
@@ -297,7 +297,7 @@ def _run(
         points[name] = [_without_none(point) for point in motion.trajectory]
     with _connected("run") as cell:
         if approach:
-            cell.move_joints({name: some[0]["q"] for name, some in points.items()})
+            cell.move_joints({name: waypoints[0]["q"] for name, waypoints in points.items()})
         arrived = cell.run_trajectory(points)
     _show_arrivals(arrived)
 
@@ -307,8 +307,8 @@ def _without_none(point: Point) -> dict[str, Any]:
 
 
 def _show_arrivals(arrived: Mapping[str, Arrival]) -> None:
-    for name, one in arrived.items():
-        emit(f"{name}: arrived, {1000 * one.error:.2f} mrad from the target")
+    for name, end in arrived.items():
+        emit(f"{name}: arrived, {1000 * end.error:.2f} mrad from the target")
 
 
 def _target(text: str) -> tuple[str, list[float]]:
@@ -316,6 +316,6 @@ def _target(text: str) -> tuple[str, list[float]]:
     try:
         if not (name and equals):
             raise ValueError
-        return name, [plain_number(angle(one.strip())) for one in numbers.split(",")]
+        return name, [plain_number(angle(value.strip())) for value in numbers.split(",")]
     except ValueError:
         raise CommandError(f'found "{text}", allowed is ARM=Q1,..,QN: an arm and its joint positions, rad') from None

@@ -47,7 +47,7 @@ def settle(cpu: int | None) -> None:
 def connected(client: Callable[[Path], _Client], path: Path | None, usual: Path, device: str) -> Iterator[_Client]:
     """Connect to the device at `path`, or to the running one of those at `usual` and beside it.
 
-    `device` names it in sentences; its option is called as the file `usual`.
+    `device` names it in messages; its option has the name of the file `usual`.
 
     Raises:
         CommandError: none runs, several run, or the device refuses.
@@ -65,9 +65,9 @@ def connected(client: Callable[[Path], _Client], path: Path | None, usual: Path,
 
 def _running(usual: Path, device: str) -> Path:
     beside = sorted(usual.parent.glob(f"{usual.stem}-*.sock"))
-    found = [path for path in (usual, *beside) if is_listening(path)]
-    if not found:
+    paths = [path for path in (usual, *beside) if is_listening(path)]
+    if not paths:
         raise CommandError(f"no {device} is running: nothing listens at {usual}", ExitCode.NOT_RUNNING)
-    if len(found) > 1:
-        raise CommandError(f"several are running: choose by --{usual.stem} {' or '.join(map(str, found))}")
-    return found[0]
+    if len(paths) > 1:
+        raise CommandError(f"several are running: choose by --{usual.stem} {' or '.join(map(str, paths))}")
+    return paths[0]

@@ -1,4 +1,4 @@
-"""`rtcp device`: what an ESI file holds, a device's file made of it, and that file compared with the bus."""
+"""`rtcp device`: list an ESI file, write a device's file from it, and compare that file with the bus."""
 
 from __future__ import annotations
 
@@ -113,12 +113,12 @@ def _new(
         if esi is not None:
             content = _read(esi)
             bare = find_device(content, product=_number("--product", product), revision=_number("--revision", revision))
-            made = assemble(bare, content.modules, chosen) if bare.slots or chosen else bare
+            result = assemble(bare, content.modules, chosen) if bare.slots or chosen else bare
         elif chosen:
             raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
         else:
-            made = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
-        text = file_text(made, kind, mode)
+            result = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
+        text = file_text(result, kind, mode)
         file.write(text.encode())
         file.flush()
         try:
@@ -127,7 +127,7 @@ def _new(
             file.truncate(0)  # and with that no file is left
             raise
     marks = text.count("CHECK:")
-    report(f"{out}: {made.name}" + (f"; lines marked CHECK, {marks} of them, need a person" if marks else ""))
+    report(f"{out}: {result.name}" + (f"; lines marked CHECK, {marks} of them, need a person" if marks else ""))
 
 
 @device.command("check")
@@ -152,25 +152,25 @@ def _check(
         return
     objects = _objects(described)
     lengths: dict[int, list[int | None]] = {}
-    with open_bus("device check", bus, config) as asked:
-        slaves = asked.access.scan()
+    with open_bus("device check", bus, config) as link:
+        slaves = link.access.scan()
         same = [slave for slave in slaves if (slave["vendor_id"], slave["product_code"]) == _identity(described)]
         for slave in same:
             # A running platform has written and read all of them at its start.
-            if isinstance(asked.access, OfflineBus) and described.coe and slave["has_coe"]:
+            if isinstance(link.access, OfflineBus) and described.coe and slave["has_coe"]:
                 addresses = [(item.index, item.sub_index) for item in objects]
-                lengths[slave["position"]] = asked.access.object_lengths(slave["position"], addresses)
+                lengths[slave["position"]] = link.access.object_lengths(slave["position"], addresses)
     if not same:
         there = "; ".join(f"{slave['position']}: {slave['name']} {_identity_text(slave)}" for slave in slaves) or "none"
-        raise CommandError(f"{asked.name}: no slave has {_identity_text(described)}; found are {there}", ExitCode.FAULT)
+        raise CommandError(f"{link.name}: no slave has {_identity_text(described)}; found are {there}", ExitCode.FAULT)
     differences = 0
     for slave in same:
-        found = _differences(described, slave)
-        found += _lacking(objects, lengths.get(slave["position"], []))
-        differences += len(found)
+        findings = _differences(described, slave)
+        findings += _lacking(objects, lengths.get(slave["position"], []))
+        differences += len(findings)
         emit(
             f"slave {slave['position']} ({slave['name']}): "
-            + ("as the file says" if not found else "\n  ".join(["", *found]).strip("\n"))
+            + ("as the file says" if not findings else "\n  ".join(["", *findings]).strip("\n"))
         )
         if described.rpdo and slave["watchdog_off"]:
             managers = " and ".join(str(number) for number in slave["watchdog_off"])
@@ -183,7 +183,7 @@ def _check(
 
 
 def _differences(described: DeviceDescription, slave: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each thing in which a slave that answered a scan differs from a device's file."""
+    """Return a sentence for each difference between a scanned slave and a device's file."""
     differences = []
     if described.coe is not bool(slave["has_coe"]):
         differences.append(
@@ -197,9 +197,9 @@ def _differences(described: DeviceDescription, slave: Mapping[str, Any]) -> list
         file_entries = [(e.index, e.sub_index if e.index else 0, e.length) for pdo in pdos for e in pdo.channels]
         bus_entries = [(e["index"], e["sub_index"], e["bits"]) for pdo in slave[direction] for e in pdo["entries"]]
         if (described.coe or bus_entries) and file_entries != bus_entries:
-            said = "will be written" if described.coe and described.configurable_pdos else "cannot be written"
-            found = f"the file has {_entries(file_entries)}; the slave has {_entries(bus_entries)}"
-            differences.append(f"{key}: {found}; the mapping {said}")
+            remark = "will be written" if described.coe and described.configurable_pdos else "cannot be written"
+            comparison = f"the file has {_entries(file_entries)}; the slave has {_entries(bus_entries)}"
+            differences.append(f"{key}: {comparison}; the mapping {remark}")
     return differences
 
 
@@ -212,11 +212,11 @@ class _Object:
     index: int
     sub_index: int
     length: int | None
-    """In bytes; None: any."""
+    """Length in bytes; None: any."""
 
 
 def _objects(described: DeviceDescription) -> list[_Object]:
-    """Return what the start writes or maps: start-up SDOs, PDOs, and what is mapped into them."""
+    """Return the objects that the start writes or maps: start-up SDOs, PDOs, and their entries."""
     objects = [
         _Object(f"sdo: {_object_text(sdo)}", sdo.index, sdo.sub_index, None if sdo.type == "bytes" else sdo.length)
         for sdo in described.sdo
@@ -269,7 +269,7 @@ def _identity_text(of: DeviceDescription | Mapping[str, Any]) -> str:
 
 
 def _read(file: Path) -> DeviceFile:
-    """Read an ESI file, say what was accepted of it with a warning; raises EsiError."""
+    """Read an ESI file and report what was accepted of it with a warning; raises EsiError."""
     from rtcp.esi.reader import read_esi
 
     content = read_esi(file)
@@ -279,7 +279,7 @@ def _read(file: Path) -> DeviceFile:
 
 
 def _of_image(file: Path) -> Device:
-    """Read an EEPROM image, say what is wrong in it; raises CommandError where it is none, EsiError."""
+    """Read an EEPROM image and print its mistakes; raises EsiError, CommandError if the file is not an image."""
     from rtcp.esi import sii
     from rtcp.esi.xml_tree import read_file
 
@@ -292,21 +292,21 @@ def _of_image(file: Path) -> Device:
 
 
 def _of_bus(bus: str, slave: int, config: Path | None) -> Device:
-    """Ask a slave what it is; raises as `own_bus`."""
+    """Read a slave's description from the bus; raises as `own_bus`."""
     from pydantic import ConfigDict, TypeAdapter
 
     from rtcp.esi import model
 
     with own_bus("device new", bus, config) as (_, access), transfer("reading", 1.0) as progress:
         answer = access.describe(slave, progress)
-    # Of a list: settings of an adapter do not reach a dataclass that is its own type.
+    # In a list: the settings of an adapter do not apply to a dataclass that is its own type.
     adapter = TypeAdapter(list[model.Device], config=ConfigDict(val_json_bytes="hex"))
     return adapter.validate_json(json.dumps([answer]))[0]
 
 
-def _slots(given: Sequence[str]) -> dict[int, int]:
+def _slots(texts: Sequence[str]) -> dict[int, int]:
     chosen: dict[int, int] = {}
-    for text in given:
+    for text in texts:
         match = _SLOT.fullmatch(text)
         if match is None:
             raise CommandError(f"--module: found {text!r}, allowed is SLOT=IDENT, as 0=0x00009800")

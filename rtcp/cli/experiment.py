@@ -1,4 +1,4 @@
-"""`rtcp experiment` and `rtcp report`: the source's figures repeated, and one page of all of them."""
+"""`rtcp experiment` and `rtcp report`: experiments of the thesis repeated, and one page of all their figures."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _experiment(
         Path | None, option("--out", "DIR", "New folder for the results. Default: NAME and the time.")
     ] = None,
 ) -> None:
-    """Repeat an experiment of the source documents: a table, pictures, recordings, and for all a page.
+    """Repeat an experiment of the thesis: a table, pictures, recordings, and for all a page.
 
     Each starts a platform of its own and stops it. Exit code 1: a figure misses its aim.
     """
@@ -53,8 +53,8 @@ def _experiment(
     refuse_second_platform()
     arm = offline.configuration(config)  # its mistakes are named before anything begins
     if bus is None and arm.bus.interface != VIRTUAL:
-        found = arm.bus.interface
-        raise CommandError(f"the bus of {arm.name} is {found}: a real arm would move. Give --bus {found} where it may")
+        nic = arm.bus.interface
+        raise CommandError(f"the bus of {arm.name} is {nic}: a real arm would move. Give --bus {nic} where it may")
     folder = Path(f"{name}-{time.strftime('%Y-%m-%dT%H-%M-%S')}") if out is None else out
     try:
         folder.mkdir(parents=True)
@@ -62,9 +62,9 @@ def _experiment(
         raise CommandError(f"the folder {folder} cannot be made: {error.strerror}") from error
     results, failed = [], []
     with interruptible("interrupted: the platform has been stopped", *SUSPENDING):
-        for one in NAMES if name == ALL else (name,):
+        for entry in NAMES if name == ALL else (name,):
             try:
-                results.append(_carry_out(one, plane, config, bus, folder / one if name == ALL else folder))
+                results.append(_carry_out(entry, plane, config, bus, folder / entry if name == ALL else folder))
                 show(result_table(results[-1]))
             except RtcpError as error:
                 if name != ALL:
@@ -87,8 +87,8 @@ def _carry_out(name: str, plane: str | None, config: Path | None, bus: str | Non
     from rtcp.telemetry.experiments.motions import SquareExperiment
 
     folder.mkdir(exist_ok=True)
-    given = [*(["--config", str(config)] if config else []), *(["--bus", bus] if bus else [])]
-    command = shlex.join(["rtcp", "experiment", name, *([plane] if plane else []), *given])
+    options = [*(["--config", str(config)] if config else []), *(["--bus", bus] if bus else [])]
+    command = shlex.join(["rtcp", "experiment", name, *([plane] if plane else []), *options])
     experiment = SquareExperiment((plane,)) if plane else EXPERIMENTS[name]()
     report(f"{name}: {EXPERIMENTS[name].title}")
     try:

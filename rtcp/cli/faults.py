@@ -35,18 +35,20 @@ def _list(context: typer.Context, as_json: AsJson = False) -> None:
     from rtcp.ipc.recording import faults_directory, listed
 
     with _readable():
-        found = listed(faults_directory())
+        faults = listed(faults_directory())
     if as_json:
-        emit_json({"faults": [_row(one) for one in found]})
-    elif found:
-        show(*_list_table(found))
+        emit_json({"faults": [_row(fault) for fault in faults]})
+    elif faults:
+        show(*_list_table(faults))
     else:
         report(f"no fault has been recorded in {faults_directory()}{_service_hint()}")
 
 
 @commands.command("show")
 def _show(
-    number: Annotated[int, typer.Argument(metavar="N", help="Number of a fault, as `rtcp faults` lists it.")],
+    which: Annotated[
+        str, typer.Argument(metavar="N|FILE", help="Number of a fault, as `rtcp faults` lists it, or its file.")
+    ],
     plot: Annotated[
         Path | None,
         option("--plot", "FILE", "Picture: .png, .svg or .pdf. Default: a .png beside the recording."),
@@ -56,7 +58,9 @@ def _show(
     """Show one fault: what happened when, where the joints were, and a picture of it."""
     if plot is not None:
         check_picture("--plot", plot)
-    path = _recording(number)
+    path = _recording(int(which)) if which.isdecimal() else Path(which)
+    if not path.exists():
+        raise CommandError(f"{which}: no such file: give a number of `rtcp faults`, or a recording (.mcap)")
     from rtcp.ipc.recording import read
     from rtcp.telemetry.fault_report import draw, summary
 
@@ -101,7 +105,7 @@ def _recording(number: int) -> Path:
 
 
 def _service_hint() -> str:
-    """Return where the service records, for a user whose own list is empty."""
+    """Return a hint at the recordings of the service, for a user whose own list is empty."""
     from rtcp.ipc.recording import faults_directory
 
     if faults_directory() == SERVICE_FAULTS or not os.path.isdir(SERVICE_FAULTS):
@@ -126,46 +130,46 @@ def _picture_file(recording: Path) -> Path:
     return beside if os.access(beside.parent, os.W_OK) else Path(beside.name)
 
 
-def _row(one: Listed) -> dict[str, Any]:
-    if one.about is None:
-        return {"number": one.number, "file": str(one.path), "error": one.trouble}
+def _row(fault: Listed) -> dict[str, Any]:
+    if fault.about is None:
+        return {"number": fault.number, "file": str(fault.path), "error": fault.trouble}
     return {
-        "number": one.number,
-        "time": one.about.when.isoformat(timespec="milliseconds"),
-        "what": one.about.what,
-        "before": one.about.before,
-        "seconds": round(one.seconds, 4),
-        "notes": list(one.about.notes),
-        "file": str(one.path),
+        "number": fault.number,
+        "time": fault.about.when.isoformat(timespec="milliseconds"),
+        "what": fault.about.what,
+        "before": fault.about.before,
+        "seconds": round(fault.seconds, 4),
+        "notes": list(fault.about.notes),
+        "file": str(fault.path),
     }
 
 
-def _list_table(found: Sequence[Listed]) -> list[RenderableType]:
-    """Return the list; what a recording lacks follows below it."""
+def _list_table(faults: Sequence[Listed]) -> list[RenderableType]:
+    """Return the list; problems of recordings follow below it."""
     from rich.text import Text
 
     rows = table(("#", "time", "what", "before", "recorded"), ("time", "before"), expand=True, fill="what")
     notes: list[RenderableType] = []
-    for one in found:
-        if one.about is None:
-            rows.add_row(str(one.number), "-", Text("unreadable", "red"), "-", "-")
-            notes.append(Text(f"{one.number}: {one.trouble}", "red"))
+    for fault in faults:
+        if fault.about is None:
+            rows.add_row(str(fault.number), "-", Text("unreadable", "red"), "-", "-")
+            notes.append(Text(f"{fault.number}: {fault.trouble}", "red"))
             continue
-        what = Text(one.about.what.partition(";")[0])
-        rows.add_row(
-            str(one.number), f"{one.about.when:%Y-%m-%d %H:%M:%S}", what, one.about.before, f"{one.seconds:.1f} s"
-        )
-        notes += [Text(f"{one.number}: {note}") for note in one.about.notes]
+        event = Text(fault.about.what.partition(";")[0])
+        when = f"{fault.about.when:%Y-%m-%d %H:%M:%S}"
+        rows.add_row(str(fault.number), when, event, fault.about.before, f"{fault.seconds:.1f} s")
+        notes += [Text(f"{fault.number}: {note}") for note in fault.about.notes]
     return [rows, *([Text()] if notes else []), *notes]
 
 
 def _fault_tables(fault: dict[str, Any]) -> list[RenderableType]:
-    """Return everything about one fault, from its summary."""
+    """Return the tables of a fault, from its summary."""
     from rich import box
     from rich.panel import Panel
     from rich.text import Text
 
-    head = Text.assemble((f"FAULT {fault['number']}", "bold red"), f"   {fault['time'].replace('T', ' ')}   ")
+    title = (f"FAULT {fault['number']}", "bold red") if fault["number"] else ("SESSION", "bold")
+    head = Text.assemble(title, f"   {fault['time'].replace('T', ' ')}   ")
     head.append(f"{fault['arm']} on {fault['bus']}, every {fault['cycle_ns'] / 1000:g} us\n")
     head.append(fault["what"], "red")
     versions = ", ".join(f"{name} {version}" for name, version in fault["versions"].items())

@@ -109,7 +109,7 @@ def _status(as_json: AsJson = False, irc5: ControlPath = None) -> None:
 
 @dataclass(frozen=True)
 class _Verb:
-    """What an operator does: its help, and the keys of its request with their arguments or options."""
+    """An operator's action: its help, and the keys of its request with their arguments or options."""
 
     says: str
     keys: dict[str, tuple[Any, Any]] = field(default_factory=dict)
@@ -144,12 +144,12 @@ _VERBS = {
     ),
     "clear": _Verb("End the faults that last.", {"unit": _UNIT}),
 }
-"""Command -> what it does; the request has its name, with _ for -."""
+"""Command -> action; the request has the command's name, with _ for -."""
 
 
 def _add(name: str, verb: _Verb) -> None:
-    def operate(irc5: Path | None, **given: str | float | None) -> None:
-        keys = {key: value for key, value in given.items() if value is not None}
+    def operate(irc5: Path | None, **values: str | float | None) -> None:
+        keys = {key: value for key, value in values.items() if value is not None}
         with _client(irc5) as client:
             client.ask({"do": name.replace("-", "_"), **keys})
             status = client.ask({"do": "status"})

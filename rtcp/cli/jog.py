@@ -18,7 +18,7 @@ from typing import Annotated
 
 import typer
 
-from rtcp.api import Robot, Status
+from rtcp.api import ControlMode, Robot, State, Status
 from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, POSE, as_written, number, option, positive, refuse_old_name
 from rtcp.cli.output import SUSPENDING, CommandError, ExitCode, emit, interruptible, report
 from rtcp.cli.platform import connect, stoppable
@@ -26,16 +26,18 @@ from rtcp.cli.platform import connect, stoppable
 JOG_INTERVAL_S, JOG_HOLD_S = 0.05, 0.25
 """Interval of jog commands, and how long one is valid: a client that stalls moves the arm no longer than that."""
 JOYSTICK_INTERVAL_S, JOYSTICK_HOLD_S = 0.08, 0.4
-"""The same of forced joystick inputs."""
+"""The same for forced joystick inputs."""
 PADDLE_S = 0.15
 """Length of a tap on a paddle: longer than its debounce time."""
 LONGEST_JOG_S, LONGEST_JOYSTICK_S = 60.0, 3600.0
+LONGEST_STOP_S = 10.0
+"""Longest wait for an arm that the joystick moved, s."""
 SHOW_INTERVAL_S = 0.25
 BACKWARD = ("down", "left", "-")
 _JOINT = re.compile(r"joint([1-9]\d?)")
 _BYTE = re.compile(r"[0-9]{1,5}")
 Jog = Callable[[float, float], None]
-"""Sends a jog: its direction, and the instant at which it was wanted, s of CLOCK_MONOTONIC."""
+"""Sends a jog command: direction, 1 or -1, and the instant of the key or renewal, s of CLOCK_MONOTONIC."""
 
 INPUTS = {
     "forward": "forward",
@@ -111,7 +113,7 @@ class Keyboard:
         return first.decode("latin-1")
 
     def drain(self) -> set[str]:
-        """Return the keys typed and not read so far: those pressed before a stall are ignored."""
+        """Read and return all pending keys: those pressed during a stall, which the caller ignores."""
         typed = set()
         while key := self.read(0.0):
             typed.add(key)
@@ -121,7 +123,7 @@ class Keyboard:
 class HeldKey:
     """Detects by its repetition that a key is held.
 
-    Until its first repetition a key does not count: a tap must not move the arm until the keyboard would repeat.
+    A key counts as held from its first repetition on. Otherwise a tap would move the arm until that is due, up to 1 s.
     """
 
     def __init__(self) -> None:
@@ -222,10 +224,10 @@ def _axis(axis: str) -> tuple[int, bool]:
     name = axis.lower()
     if name in POSE:
         return POSE.index(name), False
-    found = _JOINT.fullmatch(name)
-    if found is None:
+    match = _JOINT.fullmatch(name)
+    if match is None:
         raise CommandError(f"{axis!r} is not an axis: {', '.join(POSE)}, or joint1 to joint6")
-    return int(found[1]) - 1, True
+    return int(match[1]) - 1, True
 
 
 def _jog_for(robot: Robot, jog: Jog, seconds: float) -> None:
@@ -238,18 +240,18 @@ def _jog_for(robot: Robot, jog: Jog, seconds: float) -> None:
     robot.halt()
 
 
-def _renewals(what: str, interval_s: float, hold_s: float, seconds: float, lapsed: str) -> Iterator[float]:
+def _renewals(command: str, interval_s: float, hold_s: float, seconds: float, lapsed: str) -> Iterator[float]:
     """Yield the instants, s of CLOCK_MONOTONIC, at which a command is renewed.
 
     Raises:
-        CommandError: a renewal came too late; `lapsed` says what has become of the command.
+        CommandError: a renewal came too late; the message ends with `lapsed`, the state of the arm or joystick since.
     """
     until = time.monotonic() + seconds
     renewal = RenewalCheck(hold_s)
     while True:
         now = time.monotonic()
         if late_s := renewal.overdue(now):
-            raise CommandError(f"the {what} was not renewed for {late_s:.1f} s: {lapsed}", ExitCode.FAULT)
+            raise CommandError(f"the {command} was not renewed for {late_s:.1f} s: {lapsed}", ExitCode.FAULT)
         if now >= until:
             break
         yield now
@@ -275,14 +277,14 @@ def _jog_by_keys(robot: Robot, jog: Jog) -> None:
             if now < due:
                 continue
             due = now + JOG_INTERVAL_S
-            if held := key.held(now):
-                jog(-1.0 if held in BACKWARD else 1.0, now)
+            if held_key := key.held(now):
+                jog(-1.0 if held_key in BACKWARD else 1.0, now)
                 moving = True
                 continue
             if moving:
                 robot.halt()
                 moving = False
-                renewal.overdue(time.monotonic())  # the halt's wait is not a stall
+                renewal.overdue(time.monotonic())  # counts from here: the wait for the halt is not a stall
             elif not late_s:
                 continue
             # A key that was pressed during the stall or the halt must not move the arm now.
@@ -322,7 +324,17 @@ def _joystick(
             robot.joystick()
         else:
             _force_for(robot, pressed, byte, seconds)
+        _await_rest(robot)
     report("the joystick is released")
+
+
+def _await_rest(robot: Robot) -> None:
+    """Wait until the arm that the joystick moved is at rest: the next command may need that."""
+    until = time.monotonic() + LONGEST_STOP_S
+    while (status := robot.status()).control_mode is ControlMode.JOYSTICK and status.state is State.MOVING:
+        if time.monotonic() > until:
+            return
+        time.sleep(0.05)
 
 
 def _position(words: Sequence[str]) -> tuple[list[str], int | None]:
@@ -377,8 +389,8 @@ def _force_by_keys(robot: Robot) -> None:
             if now < due:
                 continue
             due = now + JOYSTICK_INTERVAL_S
-            held = key.held(now)
-            inputs = [*([paddle] if now < paddle_until else [ARROWS[held]] if held else []), *sorted(switched)]
+            held_key = key.held(now)
+            inputs = [*([paddle] if now < paddle_until else [ARROWS[held_key]] if held_key else []), *sorted(switched)]
             _force(robot, inputs, None, now)
             if now - shown_at > SHOW_INTERVAL_S:
                 shown_at = now

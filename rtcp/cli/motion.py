@@ -61,9 +61,9 @@ def _disable() -> None:
     with connect("disable") as robot:
         unconfirmed = robot.disable()
         by_controller = "power" in robot.status().raw["lacks"]
-    others = f"; also disabled, but not observed in the cycle: {', '.join(unconfirmed)}" if unconfirmed else ""
+    unobserved = f"; also disabled, but not observed in the cycle: {', '.join(unconfirmed)}" if unconfirmed else ""
     stands = "the arm stands, held by its robot controller with the motors on"
-    report(f"disabled: {stands if by_controller else 'the drives are without torque'}{others}")
+    report(f"disabled: {stands if by_controller else 'the drives are without torque'}{unobserved}")
 
 
 @commands.command("reset")
@@ -139,7 +139,7 @@ def _tool(
         in_use = robot.status().tool
     listed = table(("", "tool", "x y z, m", "rx ry rz, rad"), ("", "tool"))
     for model in read_session(runtime_directory()).config.models:
-        numbers = (" ".join(f"{one:g}" for one in three) for three in (model.tool.position, model.tool.rpy))
+        numbers = (" ".join(f"{value:g}" for value in vector) for vector in (model.tool.position, model.tool.rpy))
         listed.add_row("*" if model.tool_name == in_use else "", model.tool_name, *numbers)
     show(listed)
 
@@ -152,7 +152,7 @@ def _payload(
         typer.Option("--centre", metavar="X Y Z", help="Its centre of mass in the frame of the tool, m."),
     ] = (0.0, 0.0, 0.0),
 ) -> None:
-    """Say what the tool holds, at rest: in control mode torque its weight is carried."""
+    """Set the payload of the tool, at rest; control mode torque carries its weight."""
     with connect("payload") as robot:
         robot.set_payload(mass, centre)
         report(f"the payload of {robot.status().tool} is {mass:g} kg")
@@ -188,27 +188,27 @@ def _io(
             robot.set_output(name, number(value, name) if level is None else level)
             report(f"{name} is {value}")
             return
-        found = robot.read_io()
+        signals = robot.read_io()
     rows: list[tuple[str, str, str | float, str, str]] = [
-        (one, direction, "on" if high else "off", "", "")
-        for direction, levels in (("input", found.inputs), ("output", found.outputs))
-        for one, high in levels.items()
+        (signal, direction, "on" if high else "off", "", "")
+        for direction, levels in (("input", signals.inputs), ("output", signals.outputs))
+        for signal, high in levels.items()
     ]
     rows += [
-        (one.name, "output" if one.is_output else "input", one.value, one.unit, _range_text(one))
-        for one in found.channels.values()
+        (channel.name, "output" if channel.is_output else "input", channel.value, channel.unit, _range_text(channel))
+        for channel in signals.channels.values()
     ]
     rows = [row for row in rows if name in (None, row[0])]
     if not rows:
         raise CommandError(f"there is no input, output or channel {name}: see `rtcp io`")
     if as_json:
-        emit_json({one: {"direction": which, "value": shown, "unit": unit} for one, which, shown, unit, _ in rows})
+        emit_json({signal: {"direction": kind, "value": value, "unit": unit} for signal, kind, value, unit, _ in rows})
         return
     listed = table(
         ("name", "direction", "value", "unit", "may be set to"), ("name", "direction", "unit", "may be set to")
     )
-    for one, which, shown, unit, allowed in rows:
-        listed.add_row(one, which, shown if isinstance(shown, str) else f"{shown:.6g}", unit, allowed)
+    for signal, direction, reading, unit, allowed in rows:
+        listed.add_row(signal, direction, reading if isinstance(reading, str) else f"{reading:.6g}", unit, allowed)
     show(listed)
 
 
@@ -282,13 +282,13 @@ def _move(
     if home == bool(numbers) or (home and (pose or unsynchronized)):
         raise CommandError("give joint positions, or --pose X Y Z RX RY RZ, or --home alone")
     target = pose_values(numbers or ()) if pose else joint_values(numbers or ())
-    with stoppable("move") as robot, progress() as shown:
+    with stoppable("move") as robot, progress() as show_progress:
         if home:
-            arrived = robot.move_home(speed, shown)
+            arrived = robot.move_home(speed, show_progress)
         elif pose:
-            arrived = robot.move_pose(target, speed, line, shown)
+            arrived = robot.move_pose(target, speed, line, show_progress)
         else:
-            arrived = robot.move_joints(target, speed, not unsynchronized, shown)
+            arrived = robot.move_joints(target, speed, not unsynchronized, show_progress)
     report(arrival(arrived))
 
 
@@ -306,7 +306,7 @@ def _step(
     positive("--speed", speed, "rad/s" if by_joint else "m/s")
     unit = "m" if axis in POSE[:3] else "rad"
     size = _amount(amount, unit)
-    with stoppable("step") as robot, progress() as shown:
+    with stoppable("step") as robot, progress() as show_progress:
         names = robot.status().joint_names
         known = [*POSE] if not by_joint else [*names, *(str(number) for number in range(1, len(names) + 1))]
         if axis not in known:
@@ -314,7 +314,7 @@ def _step(
         count = len(names) if by_joint else len(POSE)
         offset = [size if at == known.index(axis) % count else 0.0 for at in range(count)]
         frame = "joints" if by_joint else "tool" if tool else "base"
-        arrived = robot.move_by(offset, frame, speed, shown)
+        arrived = robot.move_by(offset, frame, speed, show_progress)
     report(arrival(arrived))
 
 
@@ -352,9 +352,9 @@ def _arc(
 ) -> None:
     """Move the tool on an arc, or a circle; returns on arrival. Ctrl-C stops the arm."""
     positive("--speed", speed, "m/s")
-    turn = None if angle is None else number(angle, "--angle", "rad")
-    with stoppable("arc") as robot, progress() as shown:
-        arrived = robot.move_arc(via, pose_values(pose), turn, speed, shown)
+    angle_rad = None if angle is None else number(angle, "--angle", "rad")
+    with stoppable("arc") as robot, progress() as show_progress:
+        arrived = robot.move_arc(via, pose_values(pose), angle_rad, speed, show_progress)
     report(arrival(arrived))
 
 
@@ -398,8 +398,8 @@ def _run(
             program.run(robot, lambda begun: report(f"{file}:{begun.line}: {begun.text}"), start=first - 1)
         report("the program is complete")
     else:
-        with stoppable("run") as robot, progress() as shown:
-            arrived = robot.run(str(file.absolute()), approach, shown)
+        with stoppable("run") as robot, progress() as show_progress:
+            arrived = robot.run(str(file.absolute()), approach, show_progress)
         report(arrival(arrived))
 
 
@@ -410,7 +410,7 @@ def _dry(file: Path, is_program: bool, approach: bool, picture: Path | None, sta
         if is_program:
             from rtcp.api.program import Program
 
-            planned = [(one.line, one.plan) for one in Program(file).check(robot, start)]
+            planned = [(step.line, step.plan) for step in Program(file).check(robot, start)]
         else:
             planned = [(1, robot.preview(file=str(file.absolute()), approach=approach))]
     listed = table(("line", "duration, s", "length, m", "part of the speed"))
@@ -485,11 +485,11 @@ def arrival(arrived: Arrival) -> str:
 def _show(as_json: AsJson = False) -> None:
     """Show the limits of joints, tool and boxes; a star marks a changed value."""
     with connect("limits show") as robot:
-        found = robot.limits()
+        answer = robot.limits()
     if as_json:
-        emit_json(found)
+        emit_json(answer)
     else:
-        show(*_tables(found))
+        show(*_tables(answer))
 
 
 @limits.command("set", context_settings=NUMBERS_AS_WRITTEN)
@@ -506,9 +506,9 @@ def _set(
     """Change limits within the configured ones; refused as a whole where the arm would be outside."""
     changes = _changes(pairs)
     with connect("limits set") as robot:
-        found = robot.set_limits(changes)
+        answer = robot.set_limits(changes)
     if as_json:
-        emit_json(found)
+        emit_json(answer)
     else:
         report(f"{len(changes)} {'limit is' if len(changes) == 1 else 'limits are'} changed until `rtcp stop`")
 
@@ -530,12 +530,12 @@ def _changes(pairs: Sequence[str]) -> dict[str, float]:
     return changes
 
 
-def _tables(found: Mapping[str, Any]) -> list[Any]:
+def _tables(answer: Mapping[str, Any]) -> list[Any]:
     from rich.table import Table
 
-    now, configured = found["limits"], found["configured"]
+    now, configured = answer["limits"], answer["configured"]
     joints = table(("joint", *(f"{name}\n{unit}" for name, unit in COLUMNS)), ("joint",))
-    for at, joint in enumerate(found["joint_names"]):
+    for at, joint in enumerate(answer["joint_names"]):
         joints.add_row(joint, *(_marked(now[name][at], configured[name][at]) for name, _ in COLUMNS))
     boxes = table(("box", "x m", "y m", "z m"), ("box",))
     rows = [("tool inside", now["box"], configured["box"])]
@@ -547,8 +547,8 @@ def _tables(found: Mapping[str, Any]) -> list[Any]:
             boxes.add_row(name, *(f"{_marked(low, was)} to {_marked(high, had)}" for low, high, was, had in spans))
     tool = Table.grid(padding=(0, 2))
     for name, unit in UNITS.items():
-        tool.add_row(f"tool: {name.replace('_', ' ')}", f"{found['cartesian'][name]:g} {unit}")
-    for name, value in found["cartesian"]["singularity"].items():
+        tool.add_row(f"tool: {name.replace('_', ' ')}", f"{answer['cartesian'][name]:g} {unit}")
+    for name, value in answer["cartesian"]["singularity"].items():
         tool.add_row(f"singularity: {name}", f"{value:g} {'m' if name == 'shoulder' else 'rad'}")
     return [joints, "", boxes, "", tool]
 

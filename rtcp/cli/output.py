@@ -1,4 +1,4 @@
-"""What commands print, how far a motion is, and how a command ends: exit codes, errors, signals."""
+"""Output of commands: tables, progress, and how a command ends (exit codes, errors, signals)."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ PIPED_WIDTH = 80
 """Columns of a table that goes to a file or a pipe."""
 ABSENT = "-"
 _CONTROLS = {code: "?" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\r\t"}
-"""What a name in a file could do to a terminal."""
+"""Control characters: a name in a file must not control the terminal."""
 _LONG_S = 2.0
-"""Time after which the progress of a transfer is of interest, s."""
+"""Duration of a transfer from which on its progress is printed, s."""
 
 
 def emit(text: str) -> None:
@@ -109,18 +109,18 @@ def table(
     from rich import box
     from rich.table import Table
 
-    made = Table(
+    grid = Table(
         box=box.SIMPLE_HEAD, title=title, title_justify="left", show_edge=False, expand=expand, padding=(0, padding)
     )
     for heading in headings:
         wraps = heading == fill and heading != ""
-        made.add_column(
+        grid.add_column(
             heading,
             justify="left" if heading in left or wraps else "right",
             no_wrap=not wraps and "\n" not in heading,
             ratio=1 if wraps else None,
         )
-    return made
+    return grid
 
 
 def facts() -> Table:
@@ -163,22 +163,22 @@ def progress() -> Iterator[ShowProgress]:
 
 
 @contextmanager
-def transfer(what: str, total: float | None = None, *, quiet: bool = False) -> Iterator[Callable[[float], None]]:
-    """Yield a function that shows how far a transfer is: a bar on a terminal, else a line every 10 % of a long one.
+def transfer(label: str, total: float | None = None, *, quiet: bool = False) -> Iterator[Callable[[float], None]]:
+    """Yield a function that shows the progress of a transfer: a bar on a terminal, else a line each 10 % of a long one.
 
     Args:
-        what: what is done.
-        total: the whole; None: it is not known, no lines then.
+        label: text before the progress.
+        total: end of the progress; None: unknown, then no lines are printed.
         quiet: nothing but the bar, where the output is for programs.
     """
-    shown, began = 0, 0.0
+    reported, began = 0, 0.0
 
     def line(done: float) -> None:
-        nonlocal shown, began
+        nonlocal reported, began
         began = began or time.monotonic()
-        if total and not quiet and time.monotonic() - began > _LONG_S and (tenth := int(10 * done / total)) > shown:
-            shown = tenth
-            report(f"{what}: {10 * tenth} %")
+        if total and not quiet and time.monotonic() - began > _LONG_S and (tenth := int(10 * done / total)) > reported:
+            reported = tenth
+            report(f"{label}: {10 * tenth} %")
 
     if not sys.stdout.isatty():
         yield line
@@ -186,13 +186,13 @@ def transfer(what: str, total: float | None = None, *, quiet: bool = False) -> I
     from rich.progress import Progress as Bar
 
     with Bar(console=console(), transient=True) as bar:
-        task = bar.add_task(what, total=total)
+        task = bar.add_task(label, total=total)
         yield lambda done: bar.update(task, completed=done)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield a new file to write, made before what fills it begins; an error leaves no empty file.
+    """Yield a new file, created before its data is read; an error leaves no empty file.
 
     Raises:
         CommandError: there is one already, or none can be made there.
@@ -213,13 +213,13 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def _line_reporter() -> ShowProgress:
-    shown = -1
+    reported = -1
 
     def line(update: Progress) -> None:
-        nonlocal shown
+        nonlocal reported
         tenth = int(update.fraction * 10)
-        if _has_begun(update) and tenth > shown:
-            shown = tenth
+        if _has_begun(update) and tenth > reported:
+            reported = tenth
             report(f"moving: {update.fraction:4.0%}{_left(update)}")
 
     return line

@@ -80,12 +80,12 @@ def _start(
         require_panel()
     from rtcp.launch.launcher import StartOptions
 
-    found = None
+    cell_config = None
     if cell is not None:
         from rtcp.config.cell_file import load_cell
 
-        found = load_cell(cell)
-    options = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll, cell=found)
+        cell_config = load_cell(cell)
+    options = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll, cell=cell_config)
     if detach:
         launch(options)  # the processes have sessions of their own and outlive this command
         message, ready = _wait_ready("`rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop`")
@@ -105,7 +105,7 @@ def _start(
 
 @contextmanager
 def _panel(port: int) -> Iterator[None]:
-    """Serve the panel in a process of its own meanwhile; raises Exit where it cannot, as at a busy port."""
+    """Serve the panel in a process of its own while inside; raises Exit where it cannot, as at a busy port."""
     screen = ["--open"] if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") else []
     command = [sys.executable, "-m", "rtcp.cli", "panel", "--port", str(port), *screen]
     serving = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -113,7 +113,7 @@ def _panel(port: int) -> Iterator[None]:
     try:
         address = serving.stdout.readline().rstrip()
         if not address:
-            raise typer.Exit(serving.wait())  # it has said why
+            raise typer.Exit(serving.wait())  # it has printed the reason
         report(address)
         yield
     finally:
@@ -260,8 +260,8 @@ def stoppable(
         except KeyboardInterrupt as interruption:
             robot.close()
             code = interruption_code(interruption)
-            what = "ended, not suspended" if code - 128 in SUSPENDING else "interrupted"
-            raise CommandError(f"{what}: {ends}", code) from None
+            outcome = "ended, not suspended" if code - 128 in SUSPENDING else "interrupted"
+            raise CommandError(f"{outcome}: {ends}", code) from None
 
 
 def _replace_gateway(directory: Path, error: RtcpError) -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from enum import IntEnum
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import typer
 
@@ -29,39 +28,39 @@ def _process(
     if not command:
         _show(name)
         return
-    given = dict(map(_pair, fields or []))
+    values = dict(map(_pair, fields or []))
     ends = f"the connection is closed, {name} ends what it has begun"
     with stoppable(f"process {name}", ends) as robot:
         if name not in robot.processes:
             raise RtcpError("refused", _unknown(name, list(robot.processes)), "no_process")
         if command not in (allowed := robot.processes[name].commands):
             raise CommandError(f"{command!r} is not a command of {name}: {', '.join(allowed)}")
-        robot.processes[name].command(command, **given)
+        robot.processes[name].command(command, **values)
         report(f"{command}: done; {name} is {robot.processes[name].state or 'without a state'}")
 
 
 def _show(name: str) -> None:
     with connect("process") as robot:
-        states = {one: process.state for one, process in robot.processes.items()}
+        states = {key: process.state for key, process in robot.processes.items()}
         published = robot.processes[name].fields if name in states else {}
     if name and name not in states:
         raise RtcpError("refused", _unknown(name, list(states)), "no_process")
-    configs = {one.name: one for one in read_session(runtime_directory()).config.processes}
+    configs = {config.name: config for config in read_session(runtime_directory()).config.processes}
     if not name:
         listed = table(("process", "kind", "state", "commands"), ("process", "kind", "state"), fill="commands")
-        for one, state in states.items():
-            listed.add_row(one, configs[one].kind, state, ", ".join(kind.name for kind in configs[one].COMMANDS))
+        for key, state in states.items():
+            listed.add_row(key, configs[key].kind, state, ", ".join(kind.name for kind in configs[key].COMMANDS))
         show(listed)
         return
-    found = facts()
-    found.add_row("state", states[name])
+    rows = facts()
+    rows.add_row("state", states[name])
     for field, value in published.items():
         if field != "state":
-            found.add_row(field.replace("_", " "), f"{value:g}" if isinstance(value, float) else str(value))
+            rows.add_row(field.replace("_", " "), f"{value:g}" if isinstance(value, float) else str(value))
     listed = table(("command", "fields"), ("command",), fill="fields")
     for kind in configs[name].COMMANDS:
         listed.add_row(kind.name, ", ".join(_described(kind)))
-    show(found, "", listed)
+    show(rows, "", listed)
 
 
 def _unknown(name: str, allowed: list[str]) -> str:
@@ -69,14 +68,13 @@ def _unknown(name: str, allowed: list[str]) -> str:
 
 
 def _described(kind: type[Any]) -> list[str]:
-    """Return what each field of a command takes."""
-    hints = get_type_hints(kind)
-    return [f"{one.name}: {_allowed(hints[one.name])}" for one in dataclasses.fields(kind)]
+    """Return the allowed values of each field of a command."""
+    return [f"{name}: {_allowed(hint)}" for name, hint in kind.field_types.items()]
 
 
 def _allowed(hint: Any) -> str:
     if isinstance(hint, type) and issubclass(hint, IntEnum):
-        return " | ".join(one.name.lower() for one in hint)
+        return " | ".join(member.name.lower() for member in hint)
     return _TYPES.get(hint, "value")
 
 

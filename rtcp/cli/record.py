@@ -41,10 +41,10 @@ def _start(
 ) -> None:
     """Start a recording; it goes on when this command has ended."""
     with connect("record") as robot:
-        made = robot.record_start(
+        recording = robot.record_start(
             out, _listed(format), _listed(signals), every, seconds, max_file_mb, max_file_seconds, keep, reserve_mb
         )
-    for file in made.files:
+    for file in recording.files:
         report(f"recording to {file}")
 
 
@@ -54,12 +54,12 @@ def _stop(as_json: AsJson = False) -> None:
     with connect("record") as robot:
         ended = robot.record_stop()
     if as_json:
-        emit_json({"recordings": [dataclasses.asdict(one) for one in ended]})
+        emit_json({"recordings": [dataclasses.asdict(recording) for recording in ended]})
     elif ended:
         _table(ended)
     else:
         report("nothing is being recorded")
-    if any(one.problem for one in ended):
+    if any(recording.problem for recording in ended):
         raise typer.Exit(ExitCode.FAULT)
 
 
@@ -67,26 +67,26 @@ def _stop(as_json: AsJson = False) -> None:
 def _status(as_json: AsJson = False) -> None:
     """Show the recordings that run, and those that have ended since the platform was started."""
     with connect("record") as robot:
-        found = robot.record_status()
+        recordings = robot.record_status()
     if as_json:
-        emit_json({"recordings": [dataclasses.asdict(one) for one in found]})
-    elif found:
-        _table(found)
+        emit_json({"recordings": [dataclasses.asdict(recording) for recording in recordings]})
+    elif recordings:
+        _table(recordings)
     else:
         report("nothing has been recorded since the platform was started")
 
 
 def _listed(text: str) -> list[str]:
-    return [one.strip() for one in text.split(",") if one.strip()]
+    return [item.strip() for item in text.split(",") if item.strip()]
 
 
 def _table(recordings: Sequence[RecorderStatus]) -> None:
     rows = table(("", "s", "cycles", "missing", "MB"), ("",))
-    for one in recordings:
-        state = "recording" if one.running else "ended early" if one.problem else "ended"
-        rows.add_row(state, f"{one.seconds:.1f}", str(one.records), str(one.missing), f"{one.bytes / 1e6:.1f}")
+    for entry in recordings:
+        state = "recording" if entry.running else "ended early" if entry.problem else "ended"
+        rows.add_row(state, f"{entry.seconds:.1f}", str(entry.records), str(entry.missing), f"{entry.bytes / 1e6:.1f}")
     show(rows)
     # Below the table, because a path is longer than what a column has.
-    for one in recordings:
-        for line in (*one.files, *([one.problem] if one.problem else [])):
+    for entry in recordings:
+        for line in (*entry.files, *([entry.problem] if entry.problem else [])):
             report(line)

@@ -1,4 +1,4 @@
-"""`rtcp export`, `rtcp plot`, `rtcp replay`: what becomes of a recording. The first two need no platform."""
+"""`rtcp export`, `rtcp plot`, `rtcp replay`: use of a recording. The first two need no platform."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 FORMATS = ("csv", "mcap", "npz")
 _SLOWEST = 0.1
-"""Of its recorded speed a smoothed motion is replayed at least."""
+"""Least speed of a smoothed replay, as a share of the recorded speed."""
 File = Annotated[Path, typer.Argument(metavar="FILE", help="A recording: .mcap or .csv; a fault of the black box.")]
 Signals = Annotated[str, option("--signals", "NAMES", "Fields of a record or patterns (*_position), by commas.")]
 Start = Annotated[float | None, typer.Option("--start", help="Begin, s from the first record.")]
@@ -112,7 +112,7 @@ def _replay(
         apart = None if smooth is None else deviation(recorded, smooth)
     if recorded.truncated or recorded.missing:
         complain(f"{file}: {recorded.missing} records are missing{', and its end' if recorded.truncated else ''}")
-    with stoppable("replay") as robot, progress() as shown:
+    with stoppable("replay") as robot, progress() as show_progress:
         joints, wanted = recorded.joints, robot.status().joint_names
         if (count := len(points[0]["q"])) != len(wanted) or joints not in ((), wanted):
             has = f"{count} joints {', '.join(joints)}".rstrip()
@@ -122,7 +122,7 @@ def _replay(
         while True:
             report(f"{len(points)} points, {points[-1]['t']:.1f} s, after a move to the first")
             try:
-                arrived = robot.run_trajectory(points, True, shown)
+                arrived = robot.run_trajectory(points, True, show_progress)
                 break
             except RtcpError as error:
                 if error.reason != "PlanTooFast":
@@ -138,7 +138,7 @@ def _replay(
 
 
 def _names(text: str) -> list[str]:
-    return [one.strip() for one in text.split(",") if one.strip()]
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _complain_of(reader: Reader) -> None:

@@ -78,7 +78,7 @@ def _ros(
     wires = [wire for wire, chosen in (("zenoh", zenoh), ("dds", dds), ("ros2", ros2)) if chosen]
     if len(wires) + simple_message > 1:
         raise CommandError("choose one of --zenoh, --dds, --ros2, --simple-message", ExitCode.USAGE)
-    from rtcp.ros.commands import CommandOptions  # here: it loads slowly, as what follows
+    from rtcp.ros.commands import CommandOptions  # here: it loads slowly, as do the imports below
 
     options = CommandOptions(enable, partial, buffer)
     # The name of a platform is its namespace; the group has that of no arm.
@@ -100,7 +100,7 @@ def _ros(
 
         _run_ros2(wires[0], router, Ros2Options(name, rate, domain, options, remappings or (), group, space))
     else:
-        spaces = [f"__ns:=/{space}"] if space and not any(one.startswith("__ns:=") for one in remappings or ()) else []
+        spaces = [f"__ns:=/{space}"] if space and not any(arg.startswith("__ns:=") for arg in remappings or ()) else []
         _run_node(name, rate, [*(remappings or ()), *spaces], tf, options, group)
 
 

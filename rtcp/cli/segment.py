@@ -58,9 +58,9 @@ def _segment(
     script: Annotated[Path | None, option("--faults", "SCRIPT", "Faults with their times, s after the start.")] = None,
 ) -> None:
     """Run a segment of software slaves until stopped, or inject faults into a running one."""
-    given = {"--config": config, "--interface": interface, "--poll": poll or None, "--cpu": cpu, "--faults": script}
+    options = {"--config": config, "--interface": interface, "--poll": poll or None, "--cpu": cpu, "--faults": script}
     if context.invoked_subcommand is not None:
-        if wrong := [option for option, value in given.items() if value is not None]:
+        if wrong := [option for option, value in options.items() if value is not None]:
             raise CommandError(f"{wrong[0]} is an option of a segment that starts, not of {context.invoked_subcommand}")
         return
     if config is None:
@@ -112,11 +112,11 @@ def _fault(
     segment: ControlPath = None,
 ) -> None:
     """Inject a fault into the running segment."""
-    from rtcp.virtual.faults.registry import parse, sentence_of
+    from rtcp.virtual.faults.registry import parse
 
     planned, findings = parse(_mapping(name, pairs or [], lasts))
     if planned is None:
-        raise CommandError("\n".join(map(sentence_of, findings)))
+        raise CommandError("\n".join(map(str, findings)))
     if planned.at:
         raise CommandError("at: a fault of the command line begins at once; only a script has times")
     with _client(segment) as client:
@@ -171,9 +171,9 @@ def _faults(as_json: AsJson = False, segment: ControlPath = None) -> None:
         emit_json(active)
         return
     for fault in active:
-        left = "until it is cleared" if fault["left_s"] is None else f"{fault['left_s']:.1f} s left"
-        counts = "".join(f", {count} {what.replace('_', ' ')}" for what, count in fault["counts"].items())
-        emit(f"fault {fault['id']}: {_named(fault['fault'])}, for {fault['since_s']:.1f} s, {left}{counts}")
+        remaining = "until it is cleared" if fault["left_s"] is None else f"{fault['left_s']:.1f} s left"
+        counts = "".join(f", {count} {effect.replace('_', ' ')}" for effect, count in fault["counts"].items())
+        emit(f"fault {fault['id']}: {_named(fault['fault'])}, for {fault['since_s']:.1f} s, {remaining}{counts}")
     if not active:
         emit("no fault is active")
 
@@ -221,10 +221,10 @@ def _object(written: str) -> tuple[int, int]:
     """Return index and subindex of an object, as 0x6000:1 or 0x6040; raises CommandError."""
     index, _, subindex = written.partition(":")
     try:
-        found = int(index, 0), int(subindex or "0", 0)
+        parsed = int(index, 0), int(subindex or "0", 0)
     except ValueError:
         raise CommandError(f"{written!r} is no object: write index and subindex, as 0x6000:1") from None
-    return found
+    return parsed
 
 
 @commands.command("kinds")
@@ -242,7 +242,7 @@ def _kinds(as_json: AsJson = False) -> None:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of fault: what it is, and the allowed values of each key."""
+    """A kind of fault: its description, and the allowed values of each key."""
 
     name: str
     says: str

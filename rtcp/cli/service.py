@@ -45,8 +45,8 @@ HELP = "Run the platform under systemd: rtcp@eth0, rtcp@virtual."
 commands = typer.Typer(name="service", help=HELP, no_args_is_help=True)
 
 
-class Found(Enum):
-    """What exists at the path of a service file."""
+class FileState(Enum):
+    """State of the path of a service file."""
 
     NOTHING = "nothing"
     CURRENT = "up to date"
@@ -61,18 +61,18 @@ class ServiceFile:
     path: Path
     text: str
 
-    def found(self) -> Found:
+    def state(self) -> FileState:
         """Compare with the file that exists; raises CommandError where it cannot be read."""
         if not os.path.lexists(self.path):
-            return Found.NOTHING
+            return FileState.NOTHING
         try:
             existing = self.path.read_text(errors="replace")
         except OSError as error:
             raise CommandError(f"{self.path} cannot be read: {error.strerror}", ExitCode.REFUSED) from error
         if existing == self.text:
-            return Found.CURRENT
+            return FileState.CURRENT
         first, _, rest = existing.partition("\n")
-        return Found.EARLIER if first == _mark(rest) else Found.FOREIGN
+        return FileState.EARLIER if first == _mark(rest) else FileState.FOREIGN
 
     def write(self) -> None:
         """Write the file atomically."""
@@ -93,13 +93,13 @@ def service_files(root: Path, program: Path) -> list[ServiceFile]:
     package = Path(__file__).resolve().parent
     shipped = package / "systemd"  # in a wheel; a checkout has the folder at its top
     folder = shipped if shipped.is_dir() else package.parents[1] / "systemd"
-    made = []
+    files = []
     for name, place in PLACES.items():
         text = (folder / name).read_text()
         if name.endswith(".service"):
             text = text.replace(_PROGRAM, f"ExecStart={_quoted(program)} ")
-        made.append(ServiceFile(root / place, f"{_mark(text)}\n{text}"))
-    return made
+        files.append(ServiceFile(root / place, f"{_mark(text)}\n{text}"))
+    return files
 
 
 @commands.command("install")
@@ -110,20 +110,20 @@ def _install(
 ) -> None:
     """Write the units of platform and panel, sysusers, tmpfiles and sysctl files; start and enable nothing."""
     files = service_files(root.absolute(), _checked(program))
-    found = {file: file.found() for file in files}
-    foreign = [str(file.path) for file in files if found[file] is Found.FOREIGN]
+    states = {file: file.state() for file in files}
+    foreign = [str(file.path) for file in files if states[file] is FileState.FOREIGN]
     if foreign:
         raise CommandError(
-            f"{', '.join(foreign)}: {Found.FOREIGN.value}; nothing was written. Move it away, and keep changes in a "
-            "drop-in (`systemctl edit rtcp@.service`)",
+            f"{', '.join(foreign)}: {FileState.FOREIGN.value}; nothing was written. Move it away, and keep changes in "
+            "a drop-in (`systemctl edit rtcp@.service`)",
             ExitCode.REFUSED,
         )
-    outdated = [file for file in files if found[file] is not Found.CURRENT]
+    outdated = [file for file in files if states[file] is not FileState.CURRENT]
     if not dry_run:
         _require_rights(outdated)
     for file in files:
         if file not in outdated:
-            emit(f"{file.path}: {Found.CURRENT.value}")
+            emit(f"{file.path}: {FileState.CURRENT.value}")
         elif dry_run:
             emit(f"would write {file.path}:\n{file.text}")
         else:
@@ -138,8 +138,8 @@ def _uninstall(root: Root = Path("/"), dry_run: DryRun = False) -> None:
     """Remove what `install` wrote and nobody edited; list what stays."""
     root = root.absolute()
     files = service_files(root, _default_program())
-    found = {file: file.found() for file in files}
-    ours = [file for file in files if found[file] in (Found.CURRENT, Found.EARLIER)]
+    states = {file: file.state() for file in files}
+    ours = [file for file in files if states[file] in (FileState.CURRENT, FileState.EARLIER)]
     if not dry_run:
         _require_rights(ours)
     for file in ours:
@@ -149,8 +149,8 @@ def _uninstall(root: Root = Path("/"), dry_run: DryRun = False) -> None:
     if not ours:
         emit("no file of `rtcp service install` exists")
     for file in files:
-        if found[file] is Found.FOREIGN:
-            emit(f"left {file.path}: {Found.FOREIGN.value}")
+        if states[file] is FileState.FOREIGN:
+            emit(f"left {file.path}: {FileState.FOREIGN.value}")
     units = root / "etc/systemd/system"
     own = [*sorted(units.glob("*.wants/rtcp@*.service")), *sorted(units.glob("rtcp@*.service.d"))]
     for path in [*own, *(root / place for place in ("etc/rtcp", "var/lib/rtcp", "run/rtcp"))]:
@@ -167,15 +167,15 @@ def _default_program() -> Path:
     return Path(sys.executable).parent / "rtcp"
 
 
-def _checked(given: Path | None) -> Path:
+def _checked(chosen: Path | None) -> Path:
     """Return the program for the unit; raises CommandError where the service could not start it."""
-    program = _default_program() if given is None else given
+    program = _default_program() if chosen is None else chosen
     if not program.is_absolute():
         raise CommandError(f"--program {program}: systemd needs an absolute path")
-    if given is None and not os.access(program, os.X_OK):
+    if chosen is None and not os.access(program, os.X_OK):
         raise CommandError(f"there is no program {program}: install the package, or name it with --program")
-    seen = [str(program), os.path.realpath(program), *_interpreter(program)]
-    if hidden := next((folder for folder in _HIDDEN if any(path.startswith(f"{folder}/") for path in seen)), ""):
+    paths = [str(program), os.path.realpath(program), *_interpreter(program)]
+    if hidden := next((folder for folder in _HIDDEN if any(path.startswith(f"{folder}/") for path in paths)), ""):
         raise CommandError(
             f"{program} or its interpreter is in {hidden}, which the service cannot see: install the package "
             "elsewhere (`/usr/bin/python3 -m venv /opt/rtcp`, then /opt/rtcp/bin/pip install) and use its rtcp, or "

@@ -43,11 +43,11 @@ def _shape_set(
     if not folder.name:
         raise CommandError(f'--out: found "{folder}", allowed is the name of a new folder')
 
-    def confirm(what: str) -> None:
+    def confirm(question: str) -> None:
         if yes:
-            report(f"{what}: taken as done (--yes)")
+            report(f"{question}: taken as done (--yes)")
             return
-        report(f"{what}; then press Enter")
+        report(f"{question}; then press Enter")
         try:
             input()
         except (EOFError, RuntimeError, UnicodeDecodeError):
@@ -91,7 +91,7 @@ def _shape_set(
 
 
 def _heat(is_off: bool, middle_c: float | None) -> str:
-    """Return what is known of the heat after a run that ended early."""
+    """Return the known temperature and state of the heat after a run that ended early."""
     rod = "" if middle_c is None else f"; the rod may have {middle_c:.0f} C in the middle: do not touch it"
     if is_off:
         return f"relay and gate of the heater are off, as measured, and no current flows{rod}"

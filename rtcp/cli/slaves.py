@@ -65,12 +65,12 @@ def _scan(
     if describe is not None:
         _describe(describe, bus, config, as_json)
         return
-    with open_bus("scan", bus, config) as asked:
-        slaves = asked.access.scan()
+    with open_bus("scan", bus, config) as opened:
+        slaves = opened.access.scan()
     if as_json:
         emit_json(slaves)
     else:
-        show(*scan_tables(asked.name, slaves))
+        show(*scan_tables(opened.name, slaves))
 
 
 @foe.command("read")
@@ -86,9 +86,9 @@ def _foe_read(
     """Read a file of a slave."""
     number = _password(password)
     _check_name(name)
-    with new_file(out) as file, own_bus("foe read", bus, config) as (asked, access):
+    with new_file(out) as file, own_bus("foe read", bus, config) as (opened, access):
         with transfer(f"reading {name}") as progress:
-            data = access.foe_read(asked.slave(slave), name, number, boot, progress)
+            data = access.foe_read(opened.slave(slave), name, number, boot, progress)
         file.write(data)
     report(f"{access.label}: {len(data)} bytes written to {out}")
 
@@ -106,8 +106,8 @@ def _foe_write(
     """Write a file to a slave."""
     number, data, name = _password(password), file.read_bytes(), name or file.name
     _check_name(name)
-    with own_bus("foe write", bus, config) as (asked, access):
-        target = asked.slave(slave)
+    with own_bus("foe write", bus, config) as (opened, access):
+        target = opened.slave(slave)
         half = f"slave {slave} may have half of its file {name}: write it again before it is switched off"
         with interruptible(f"interrupted: {half}"), transfer(f"writing {name}", len(data)) as progress:
             access.foe_write(target, name, data, number, boot, progress)
@@ -123,9 +123,9 @@ def _eeprom_read(
     config: ConfigFile = None,
 ) -> None:
     """Read the whole EEPROM into a file."""
-    with new_file(out) as file, own_bus("eeprom read", bus, config) as (asked, access):
+    with new_file(out) as file, own_bus("eeprom read", bus, config) as (opened, access):
         with transfer("reading", 1.0) as progress:
-            image = access.eeprom_read(asked.slave(slave), _size(size), progress)
+            image = access.eeprom_read(opened.slave(slave), _size(size), progress)
         file.write(image)
     report(f"{access.label}: {len(image)} bytes written to {out}")
 
@@ -135,8 +135,8 @@ def _eeprom_dump(slave: SlaveName, bus: BusName = None, config: ConfigFile = Non
     """Show what the EEPROM says, and what is wrong in it."""
     from rtcp.esi.sii import check_sii, read_sii
 
-    with own_bus("eeprom dump", bus, config) as (asked, access), transfer("reading", 1.0) as progress:
-        image = access.eeprom_read(asked.slave(slave), progress=progress)
+    with own_bus("eeprom dump", bus, config) as (opened, access), transfer("reading", 1.0) as progress:
+        image = access.eeprom_read(opened.slave(slave), progress=progress)
     show(*_description(read_sii(image, access.label), len(image)))
     for sentence in check_sii(image):
         emit(sentence)
@@ -159,8 +159,8 @@ def _eeprom_write(
     from rtcp.esi.sii import HEADER_BYTES
 
     image, room = file.read_bytes(), _size(size)
-    with own_bus("eeprom write", bus, config) as (asked, access):
-        target = asked.slave(slave)
+    with own_bus("eeprom write", bus, config) as (opened, access):
+        target = opened.slave(slave)
         before = access.eeprom_read(target, HEADER_BYTES)
         findings = _check_image(image, before, other_device, room)
         if not verbatim:
@@ -189,8 +189,8 @@ def _alias_set(
     value = parse_integer(number, "ALIAS")
     if not 0 <= value <= 0xFFFF:
         raise CommandError(f"alias {value} is not allowed: 0 to 65535")
-    with own_bus("alias set", bus, config) as (asked, access):
-        target = asked.slave(slave)
+    with own_bus("alias set", bus, config) as (opened, access):
+        target = opened.slave(slave)
         beginnings = access.eeprom_beginnings(target)
         before = beginnings[access.position - 1]
         if not is_sound(before):
@@ -199,8 +199,8 @@ def _alias_set(
                 "damaged content: write its image first, `rtcp eeprom write`",
                 ExitCode.REFUSED,
             )
-        for position, other in enumerate(beginnings, 1):
-            if value and position != access.position and is_sound(other) and alias_of(other) == value:
+        for position, beginning in enumerate(beginnings, 1):
+            if value and position != access.position and is_sound(beginning) and alias_of(beginning) == value:
                 raise CommandError(
                     f"slave {position} has the station alias {value} already, and two of one alias are refused at the "
                     f"start: give {access.label} another one, or slave {position} first",
@@ -224,8 +224,8 @@ def _state(
     name = state.upper().replace("-", "")
     if name not in STATES:
         raise CommandError(f"state {state!r} is not known: {', '.join(STATES)}; OP needs a cycle: `rtcp start`")
-    with own_bus("state", bus, config) as (asked, access):
-        reached = access.state(asked.slave(slave), name)
+    with own_bus("state", bus, config) as (opened, access):
+        reached = access.state(opened.slave(slave), name)
     report(f"{access.label}: {reached}")
 
 
@@ -249,12 +249,12 @@ def _capture(
 
 
 def _describe(slave: str, bus: str | None, config: Path | None, as_json: bool) -> None:
-    """Show what a slave tells of itself: identity, PDOs as they are assigned, object dictionary."""
+    """Show a slave's description of itself: identity, assigned PDOs, object dictionary."""
     with (
-        own_bus("scan --describe", bus, config) as (asked, access),
+        own_bus("scan --describe", bus, config) as (opened, access),
         transfer("reading", 1.0, quiet=as_json) as progress,
     ):
-        device = access.describe(asked.slave(slave), progress)
+        device = access.describe(opened.slave(slave), progress)
     if as_json:
         emit_json(device)
         return
@@ -262,21 +262,21 @@ def _describe(slave: str, bus: str | None, config: Path | None, as_json: bool) -
     emit(f"{device['name']}: vendor 0x{identity['vendor_id']:08X}, product 0x{identity['product_code']:08X}")
     headings = ("object", "bits", "type", "access", "name")
     objects = table(headings, headings[2:], fill="name", expand=True)
-    for one in device["objects"]:
-        for entry in one["entries"]:
+    for item in device["objects"]:
+        for entry in item["entries"]:
             access_rights = "r" * entry["readable"] + "w" * entry["writable"]
             objects.add_row(
-                f"0x{one['index']:04X}:{entry['sub_index']}",
+                f"0x{item['index']:04X}:{entry['sub_index']}",
                 str(entry["bits"]),
                 entry["type"],
                 access_rights + (f" in {entry['write_states']}" if entry["write_states"] else ""),
-                _plain(entry["name"] if entry["name"] in ("", one["name"]) else f"{one['name']}: {entry['name']}"),
+                _plain(entry["name"] if entry["name"] in ("", item["name"]) else f"{item['name']}: {entry['name']}"),
             )
-    show(*[one for one in (_pdo_table(device), objects) if one.row_count])
+    show(*[rows for rows in (_pdo_table(device), objects) if rows.row_count])
 
 
 def _plain(text: str) -> str:
-    """Return a slave's text, of which nothing is taken for markup."""
+    """Return a slave's text with nothing in it read as markup."""
     from rich.markup import escape
 
     return escape(text)
@@ -292,25 +292,25 @@ def own_bus(command: str, name: str | None, config: Path | None) -> Iterator[tup
     with interruptible("interrupted: nothing is left running"):
         try:
             with connect(command) as robot:
-                held = robot.status().raw["bus"]
-            if name in (None, held):
+                label = robot.status().raw["bus"]
+            if name in (None, label):
                 raise CommandError(
-                    f"the running platform (loop process {loop_process()}) holds the bus {held}, and `rtcp {command}` "
+                    f"the running platform (loop process {loop_process()}) holds the bus {label}, and `rtcp {command}` "
                     "would take its slaves from it: `rtcp stop` ends it",
                     ExitCode.REFUSED,
                 )
         except NotRunning:
             refuse_second_platform()
-        asked = offline_bus(name, config)
-        assert isinstance(asked.access, OfflineBus)
-        yield asked, asked.access
+        opened = offline_bus(name, config)
+        assert isinstance(opened.access, OfflineBus)
+        yield opened, opened.access
 
 
 @contextmanager
 def _interruptible_write(access: OfflineBus) -> Iterator[None]:
-    """Turn a signal during a write of an EEPROM into a CommandError that says what it may have left."""
-    left = f"the EEPROM of {access.label} may be half written, under a wrong checksum; `rtcp eeprom write` repairs it"
-    with interruptible(f"interrupted: {left}"):
+    """Turn a signal during a write of an EEPROM into a CommandError about the state of the EEPROM."""
+    state = f"the EEPROM of {access.label} may be half written, under a wrong checksum; `rtcp eeprom write` repairs it"
+    with interruptible(f"interrupted: {state}"):
         yield
 
 
@@ -340,7 +340,7 @@ def _size(text: str | None) -> int:
 
 
 def _check_image(image: bytes, before: bytes, other_device: bool, size: int) -> tuple[str, ...]:
-    """Return what is odd about an image.
+    """Return warnings about an image.
 
     Args:
         image: the image.
@@ -355,7 +355,7 @@ def _check_image(image: bytes, before: bytes, other_device: bool, size: int) -> 
     from rtcp.fieldbus.eeprom import is_sound, size_of
 
     sound = is_sound(before)
-    # One that is not sound says nothing of its size that counts.
+    # The size in an image that is not sound is not reliable.
     size = size or (size_of(before) if sound else SOEM_BYTES)
     if not HEADER_BYTES <= len(image) <= size or len(image) % 2:
         raise CommandError(
@@ -393,7 +393,7 @@ def _is_blank(data: bytes) -> bool:
 
 
 def _keep_identity(image: bytes, before: bytes) -> tuple[bytes, str]:
-    """Return the image with the serial number and the alias of the EEPROM, as far as it has any, and what was kept."""
+    """Return the image with serial number and alias of the EEPROM, where it has them, and a report on that."""
     from rtcp.fieldbus.eeprom import alias_of, is_sound, with_alias
 
     kept = []
@@ -431,12 +431,12 @@ def _description(device: Device, size: int) -> list[RenderableType]:
     rows.add_row("FMMUs", ", ".join(use.name.lower().replace("_", " ") for use in device.fmmus) or "none")
     for mode in device.dc_modes:
         rows.add_row("DC mode", _plain(f"{mode.name}: AssignActivate 0x{mode.assign_activate:04X}"))
-    made = _pdo_table(asdict(device))
-    return [rows, made] if made.row_count else [rows]
+    pdos = _pdo_table(asdict(device))
+    return [rows, pdos] if pdos.row_count else [rows]
 
 
 def _pdo_table(device: Mapping[str, Any]) -> Table:
-    made = table(("PDO", "SM", "object", "bits", "type", "name"), ("PDO", "object", "type", "name"))
+    rows = table(("PDO", "SM", "object", "bits", "type", "name"), ("PDO", "object", "type", "name"))
     for title, pdos in (("RxPDO", device["rx_pdos"]), ("TxPDO", device["tx_pdos"])):
         for pdo in pdos:
             label = f"{title} 0x{pdo['index']:04X}"
@@ -444,6 +444,6 @@ def _pdo_table(device: Mapping[str, Any]) -> Table:
             for entry in pdo["entries"]:
                 kind, name = (entry["type"], _plain(entry["name"])) if entry["index"] else ("", "(padding)")
                 at = f"0x{entry['index']:04X}:{entry['sub_index']}"
-                made.add_row(label, manager, at, str(entry["bits"]), kind, name)
+                rows.add_row(label, manager, at, str(entry["bits"]), kind, name)
                 label = manager = ""
-    return made
+    return rows

@@ -1,43 +1,95 @@
-"""`rtcp soak`: the platform on its virtual segment, with random faults, for a long time."""
+"""`rtcp soak`: random faults for a long time, on a platform and its virtual segment or on a cluster of simulations."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rtcp.cli.arguments import AsJson, ConfigFile, option, positive
-from rtcp.cli.output import CommandError, ExitCode, emit, interruption_code, report, show, signals_raise, table
+from rtcp.cli.output import (
+    CommandError,
+    ExitCode,
+    complain,
+    emit,
+    emit_json,
+    interruption_code,
+    report,
+    show,
+    signals_raise,
+    table,
+    transfer,
+)
 from rtcp.cli.platform import launch, refuse_second_platform
 from rtcp.config.model import VIRTUAL
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from rtcp.config.model import ArmConfig
+    from rtcp.config.segment import SegmentConfig
     from rtcp.telemetry.soak import Summary
+    from rtcp.testing.sessions.cluster import SessionSummary
+    from rtcp.testing.sessions.session import Result
 
 LONGEST_MIN = 10_080.0
+LONGEST_SESSION_S = 3600.0
+MOST_SESSIONS = 1_000_000_000
+SHOWN_WORKERS = 10
+LARGEST_SEED = 2**63 - 1 - MOST_SESSIONS
 
 commands = typer.Typer()
 
 
 @commands.command("soak")
 def _soak(
-    minutes: Annotated[float, option("--minutes", "N", "Duration.")] = 60.0,
-    seed: Annotated[int, option("--seed", "N", "Seed of all random choices.")] = 1,
+    minutes: Annotated[float | None, option("--minutes", "N", "Duration on a platform. Default: 60.")] = None,
+    seed: Annotated[int, option("--seed", "N", "Seed of all random choices; of sessions that of the first.")] = 1,
+    simulated: Annotated[
+        bool, option("--simulated", "Run sessions in simulated time, on all CPUs or a cluster.")
+    ] = False,
+    sessions: Annotated[int | None, option("--sessions", "N", "Number of simulated sessions. Default: 1000.")] = None,
+    seconds: Annotated[float | None, option("--seconds", "S", "Simulated time of a session, s. Default: 2.")] = None,
+    scheduler: Annotated[
+        str | None,
+        option("--scheduler", "ADDRESS", "Dask scheduler, as tcp://HOST:8786. Default: this machine's CPUs."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        option("--out", "DIR", "Folder of the results, new or of the same sessions. Default: soak-SEED-SESSIONS."),
+    ] = None,
+    keep: Annotated[
+        Path | None, option("--keep", "FILE", "Run one session here and write its black box (.mcap).")
+    ] = None,
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Run the arm on its virtual segment with random faults; show the result of each kind of fault.
+    """Run the arm with random faults, on its virtual segment or in simulated sessions; show the result.
 
     Exit code 5 for any violation: a target outside its limits, an arm that does not recover, a torn record, a process
     that grows.
     """
+    if not 0 <= seed <= LARGEST_SEED:
+        raise CommandError(f"--seed {seed} is not allowed: 0 to {LARGEST_SEED}")
+    only_simulated = {"--sessions": sessions, "--seconds": seconds, "--scheduler": scheduler, "--out": out,
+                      "--keep": keep}  # fmt: skip
+    if simulated:
+        if minutes is not None:
+            raise CommandError("--minutes has no meaning with --simulated: give --sessions and --seconds")
+        _run_sessions(config, seed, sessions, seconds, scheduler, out, keep, as_json)
+        return
+    for name, value in only_simulated.items():
+        if value is not None:
+            raise CommandError(f"{name} needs --simulated")
+    _run_platform(60.0 if minutes is None else minutes, seed, config, as_json)
+
+
+def _run_platform(minutes: float, seed: int, config: Path | None, as_json: bool) -> None:
     positive("--minutes", minutes, "min", LONGEST_MIN)
-    if seed < 0:
-        raise CommandError(f"--seed {seed} is not allowed: 0 or more")
     refuse_second_platform()
     from rtcp.ipc.runtime_directory import runtime_directory
     from rtcp.ipc.session import read_processes, read_session
@@ -51,8 +103,8 @@ def _soak(
         running = launch(StartOptions(config=config, bus=VIRTUAL, mode="joint"), log)
         try:
             directory = runtime_directory()
-            found = read_processes(directory)
-            pids = {"loop": found.loop, "gateway": found.gateway, "segment": found.segment}
+            processes = read_processes(directory)
+            pids = {"loop": processes.loop, "gateway": processes.gateway, "segment": processes.segment}
             with Harness(directory, read_session(directory).config) as harness:
                 soak = Soak(harness, pids, seed, log)
                 try:
@@ -78,11 +130,11 @@ def _soak(
 def _fault_table(summary: Summary) -> Table:
     counts = ("injected", "noticed", "continued", "stopped", "recovered")
     rows = table(("fault", *counts), ("fault",), title=f"{summary.minutes:.1f} min, seed {summary.seed}")
-    for kind, found in sorted(summary.counts.items()):
-        rows.add_row(kind, *(str(getattr(found, count)) for count in counts))
+    for kind, results in sorted(summary.counts.items()):
+        rows.add_row(kind, *(str(getattr(results, count)) for count in counts))
     rows.add_section()
     found_all = summary.counts.values()
-    rows.add_row("all", *(str(sum(getattr(found, count) for found in found_all)) for count in counts))
+    rows.add_row("all", *(str(sum(getattr(results, count) for results in found_all)) for count in counts))
     return rows
 
 
@@ -102,3 +154,158 @@ def _process_table(summary: Summary) -> Table:
             f"{first.files} -> {last.files}",
         )
     return rows
+
+
+# -- sessions in simulated time -------------------------------------------------------------------------------------
+
+
+def _run_sessions(
+    config: Path | None,
+    seed: int,
+    sessions: int | None,
+    seconds: float | None,
+    scheduler: str | None,
+    out: Path | None,
+    keep: Path | None,
+    as_json: bool,
+) -> None:
+    count = sessions if sessions is not None else 1 if keep is not None else 1000
+    if not 1 <= count <= MOST_SESSIONS:
+        raise CommandError(f"--sessions {count} is not allowed: 1 to {MOST_SESSIONS}")
+    positive("--seconds", seconds, "s", LONGEST_SESSION_S)
+    arm, segment = _simulated_arm(config)
+    duration = 2.0 if seconds is None else seconds
+    if keep is not None:
+        if count != 1 or scheduler is not None or out is not None:
+            raise CommandError("--keep runs one session in this process: leave out --scheduler, --out, and --sessions")
+        _replay(arm, segment, seed, duration, keep, as_json)
+        return
+    try:
+        from rtcp.testing.sessions.cluster import Parts, SessionPlan, SessionRun, SoakError, cluster
+    except ImportError as error:
+        raise CommandError(f"--simulated needs a package ({error}): pip install 'rtcp[cluster]'") from error
+    plan = SessionPlan(arm, segment, seed, count, duration)
+    folder = Path(f"soak-{seed}-{count}") if out is None else out
+    ended: CommandError | None = None
+    try:
+        with signals_raise(), cluster(scheduler) as client, transfer("sessions", count, quiet=as_json) as shown:
+            run = SessionRun(client, plan, Parts(folder, plan), lambda summary: shown(summary.sessions))
+            try:
+                run.run()
+            except KeyboardInterrupt as interruption:
+                code = interruption_code(interruption)
+                ended = CommandError(f"interrupted after {run.summary.sessions} sessions", code)
+            except SoakError as error:
+                ended = CommandError(f"{error}; {run.summary.sessions} sessions are known", ExitCode.FAULT)
+    except SoakError as error:
+        raise CommandError(str(error)) from error
+    _show_sessions(run.summary, folder, config, as_json)
+    if ended is not None:
+        raise ended
+    _keep_failures(arm, segment, run.summary, folder)
+    if run.summary.failed:
+        raise typer.Exit(ExitCode.FAULT)
+    if not run.summary.largest_speed:
+        message = "no session moved the arm: `rtcp soak --simulated --keep FILE` and `rtcp faults show FILE` show why"
+        raise CommandError(message, ExitCode.FAULT)
+
+
+def _simulated_arm(config: Path | None) -> tuple[ArmConfig, SegmentConfig]:
+    """Load the arm and its segment; raises CommandError where its frames cannot be read."""
+    from rtcp.config.segment import load_segment
+    from rtcp.fieldbus.errors import BusError
+    from rtcp.launch.offline import configuration
+    from rtcp.testing import Simulation
+    from rtcp.testing.sessions.checker import reading_of
+
+    arm = configuration(config)
+    try:
+        reading_of(arm)
+    except ValueError as error:
+        raise CommandError(f"--simulated is for arms of CiA 402 drives: {error}") from error
+    segment = load_segment(arm.source.parent / arm.bus.segment)
+    try:
+        Simulation(arm, segment=segment).close()
+    except BusError as error:
+        raise CommandError(str(error)) from error
+    return arm, segment
+
+
+def _replay(arm: ArmConfig, segment: SegmentConfig, seed: int, seconds: float, file: Path, as_json: bool) -> None:
+    from rtcp.ipc.recording import RecordingError
+    from rtcp.testing.sessions.black_box import replay
+
+    try:
+        result, done = replay(seed, arm, seconds, file, segment)
+    except RecordingError as error:
+        raise CommandError(f"--keep {error}") from error
+    if as_json:
+        emit_json({**dataclasses.asdict(result), "file": str(file), "done": done})
+    else:
+        report("\n".join(done))
+        report(f"seed {seed}: {_outcome(result)}\nblack box: {file} (`rtcp faults show {shlex.quote(str(file))}`)")
+    if result.outcome != "passed":
+        raise typer.Exit(ExitCode.FAULT)
+
+
+def _keep_failures(arm: ArmConfig, segment: SegmentConfig, summary: SessionSummary, folder: Path) -> None:
+    """Run the first failed sessions again in this process and write their black boxes."""
+    from rtcp.ipc.recording import RecordingError
+    from rtcp.testing.sessions.black_box import replay
+
+    for result in summary.failures:
+        if result.outcome == "worker_died":
+            continue  # it would end this process, or hang
+        try:
+            again, _ = replay(result.seed, arm, summary.seconds, _black_box(folder, result), segment)
+        except RecordingError as error:
+            complain(str(error))
+            continue
+        if (again.outcome, again.violation) != (result.outcome, result.violation):
+            complain(f"seed {result.seed}: repeated on this machine: {_outcome(again)}")
+
+
+def _black_box(folder: Path, result: Result) -> Path:
+    return folder / f"seed-{result.seed}.mcap"
+
+
+def _outcome(result: Result) -> str:
+    return f"{result.outcome.replace('_', ' ')} {result.violation}".rstrip()
+
+
+def _show_sessions(summary: SessionSummary, folder: Path, config: Path | None, as_json: bool) -> None:
+    option = "" if config is None else f" --config {shlex.quote(str(config))}"
+    repeat = f"rtcp soak --simulated{option} --seconds {summary.seconds:g}"
+    failures = [
+        {
+            **dataclasses.asdict(result),
+            "black_box": "" if result.outcome == "worker_died" else str(_black_box(folder, result)),
+            "replay": f"{repeat} --seed {result.seed} --keep seed-{result.seed}.mcap",
+        }
+        for result in summary.failures
+    ]
+    if as_json:
+        shown = dataclasses.asdict(summary)
+        emit_json({**shown, "sessions": summary.sessions, "results": str(folder), "failures": failures})
+        return
+    rows = table(("outcome", "sessions"), ("outcome",))
+    for outcome, count in sorted(summary.outcomes.items()):
+        rows.add_row(outcome.replace("_", " "), str(count))
+    show(rows)
+    report(
+        f"\nsessions: {summary.sessions}, from seed {summary.seed} on, of {summary.seconds:g} s and a little more\n"
+        f"simulated: {summary.simulated_s:.0f} s, {summary.cycles} cycles in {summary.wall_s:.0f} s; CPU time of a "
+        f"session: {summary.cpu_s / max(summary.sessions, 1):.2f} s\n"
+        f"largest step: {summary.largest_step:.3f} of the speed limit's; acceleration: "
+        f"{summary.largest_acceleration:.3f} of its limit; speed: {summary.largest_speed:.3f} rad/s\n"
+        f"configuration {summary.digest}; results: {folder}"
+    )
+    for worker, memory in sorted(summary.workers.items())[:SHOWN_WORKERS]:
+        report(
+            f"worker {worker}: {memory.sessions} sessions, {memory.first / 2**20:.1f} -> {memory.last / 2**20:.1f} MiB"
+        )
+    for result, failure in zip(summary.failures, failures, strict=False):
+        report(f"seed {result.seed}: {_outcome(result)}")
+        if failure["black_box"]:
+            report(f"  black box: rtcp faults show {shlex.quote(str(failure['black_box']))}")
+        report(f"  replay: {failure['replay']}")

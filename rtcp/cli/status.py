@@ -1,4 +1,4 @@
-"""`rtcp status`: what the platform does, for people and for programs, once or continuously.
+"""`rtcp status`: the state of the platform, for people and for programs, once or continuously.
 
 The picture fits 80 columns and reads without colour.
 """
@@ -41,11 +41,11 @@ STATE_STYLES = {
 CYCLE_TIMES = (("wake-up", "wakeup_us"), ("exchange", "exchange_us"), ("compute", "compute_us"))
 QUANTILES = ("p50", "p99", "max")
 _STALE_S = 0.1
-"""Joint values older than this are marked."""
+"""Age from which on joint values are marked as stale, s."""
 _LOST_SHARE = 0.01
 """Share of unanswered or incomplete cycles from which on they are highlighted."""
 _DIFFERENT_RAD = 1e-6
-"""Commanded positions are shown where a limiter changed them by more."""
+"""Least change of a commanded position by a limiter that is shown, rad."""
 _MESSAGES = 5
 """Number of recent messages."""
 
@@ -167,7 +167,7 @@ def _joints(status: Json) -> Table:
 
 
 def _slaves(status: Json) -> Table:
-    """Return the slaves in the order of the cable: down the first column, then the second; in one with their errors."""
+    """Return the slaves in the order of the cable: down the first column, then the second; one column with errors."""
     from rich.text import Text
 
     slaves = status["slaves"]
@@ -188,13 +188,13 @@ def _slaves(status: Json) -> Table:
 
 
 def _error_counts(slave: Json) -> str:
-    """Return how often the slave left OP, damaged frames at its ports and lost links; empty where all are 0."""
+    """Return counts of a slave: exits from OP, damaged frames at its ports, lost links; empty where all are 0."""
     counts = [slave["lost"], sum(slave["errors"]["rx"]), sum(slave["errors"]["links"])]
     return "/".join(map(str, counts)) if any(counts) else ""
 
 
 def _times(status: Json) -> Table:
-    rows = table(("time of a cycle", *(f"{one} us" for one in QUANTILES)), ("time of a cycle",), expand=True)
+    rows = table(("time of a cycle", *(f"{quantile} us" for quantile in QUANTILES)), ("time of a cycle",), expand=True)
     for label, key in CYCLE_TIMES:
         rows.add_row(label, *quantiles(status[key]))
     return rows
@@ -223,8 +223,8 @@ def _facts(status: Json) -> Table:
     for name, process in status["processes"].items():
         rows.add_row(Text(name), Text(process["state"] or process["kind"]))
     for device, fields in status["devices"].items():
-        for name, shown in fields.items():
-            rows.add_row(Text(f"{device} {name}"), Text(_value(name, **shown)))
+        for name, field in fields.items():
+            rows.add_row(Text(f"{device} {name}"), Text(_value(name, **field)))
     rows.add_row("real time", realtime_line(status["realtime"]))
     if problems := _host_problems(status):
         rows.add_row("host", Text(f"{', '.join(problems)}: see `rtcp doctor`", "yellow"))
@@ -243,12 +243,12 @@ def _drives(status: Json) -> str:
 
 
 def _tool(status: Json) -> str:
-    """Return the name of the tool, what it holds, its measured pose and how fast it moves."""
+    """Return the name of the tool, its payload, its measured pose and its speeds."""
     tool, mass = status["tool"], status["payload"]["mass"]
     name = f"{status['tool_name']} with {mass:.3g} kg" if mass else status["tool_name"]
-    position, angles = (" ".join(f"{one:+.4f}" for one in tool["pose"][at : at + 3]) for at in (0, 3))
-    speed, turn = (math.hypot(*tool["velocity"][at : at + 3]) for at in (0, 3))
-    return f"{name}: {position} m, {angles} rad, {speed:.3f} m/s, {turn:.3f} rad/s"
+    position, angles = (" ".join(f"{value:+.4f}" for value in tool["pose"][at : at + 3]) for at in (0, 3))
+    speed, turn_rate = (math.hypot(*tool["velocity"][at : at + 3]) for at in (0, 3))
+    return f"{name}: {position} m, {angles} rad, {speed:.3f} m/s, {turn_rate:.3f} rad/s"
 
 
 def _value(name: str, value: Any, unit: str) -> str:
@@ -260,7 +260,7 @@ def _value(name: str, value: Any, unit: str) -> str:
 
 
 def _frames(status: Json) -> Text:
-    """Return the working counter of the last answer, and how many cycles of the last second were not answered."""
+    """Return the working counter of the last answer, and the number of unanswered cycles of the last second."""
     from rich.text import Text
 
     expected, actual, second = status["wkc"]["expected"], status["wkc"]["actual"], status["last_second"]
@@ -268,10 +268,10 @@ def _frames(status: Json) -> Text:
         return Text(f"no answer in the last second, {expected} expected", "bold red")
     counter = f"working counter {actual} of {expected}" if status["slaves"] else "answered"
     line = Text(counter, "" if actual == expected else "bold red")
-    for what in ("unanswered", "incomplete"):
-        if second[what]:
-            style = "yellow" if second[what] > _LOST_SHARE * second["cycles"] else ""
-            line.append(f", {second[what]} of {second['cycles']} cycles {what}", style)
+    for kind in ("unanswered", "incomplete"):
+        if second[kind]:
+            style = "yellow" if second[kind] > _LOST_SHARE * second["cycles"] else ""
+            line.append(f", {second[kind]} of {second['cycles']} cycles {kind}", style)
     return line
 
 
@@ -282,16 +282,16 @@ def _clocks(status: Json) -> Text:
     clocks, second = status["dc"], status["last_second"]
     if status["wkc"]["actual"] <= 0:
         return Text("not tracked: no answer", "yellow")
-    shown = clock_state(clocks)
+    text = clock_state(clocks)
     if second["tracked"] < second["cycles"]:
-        shown = f"locked in {second['tracked']} of {second['cycles']} cycles"
-    line = Text(shown, "" if clocks["locked"] else "yellow")
+        text = f"locked in {second['tracked']} of {second['cycles']} cycles"
+    line = Text(text, "" if clocks["locked"] else "yellow")
     line.append(f", offset {clocks['offset_ns'] / 1000:+.1f} us, filtered {clocks['filtered_ns'] / 1000:+.1f} us")
     return line
 
 
 def _host_problems(status: Json) -> list[str]:
-    """Return what of the host stands in the way of real time, a few words each; `rtcp doctor` explains them."""
+    """Return the obstacles to real time on the host, a few words each; `rtcp doctor` explains them."""
     refused, skipped = len(status["realtime"].get("notes", ())), status.get("skipped_ticks")
     problems = [f"{refused} setting{'s' * (refused > 1)} refused"] if refused else []
     return problems + ([f"{100 * skipped['share']:.2g} % of the ticks skipped"] if skipped else [])

@@ -1,6 +1,6 @@
 """The configuration: `find_config()` names the file, `load()` checks it whole, `rtcp.config.model` is the result.
 
-What needs the validator is imported on first use: the loop's process holds the model's objects and never the validator.
+Modules that need the validator are imported on first use: the loop's process never loads it.
 """
 
 from __future__ import annotations

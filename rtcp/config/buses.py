@@ -1,7 +1,7 @@
-"""The kinds of bus beside EtherCAT: their keys under `bus`, and what the platform finds on them.
+"""The kinds of bus beside EtherCAT: their keys under `bus`, and their nodes.
 
 A robot controller has no slaves. Its joints, and the mechanical unit as a whole, are nodes with process images of their
-own, laid out as the PDOs of a slave: the loop needs no second way for them. Packages add kinds by the entry point
+own, laid out as the PDOs of a slave: the loop handles both alike. Packages add kinds by the entry point
 `rtcp.buses` (docs/extending.md).
 """
 
@@ -15,6 +15,7 @@ from typing import Annotated, ClassVar
 from annotated_types import Ge, Gt, Le
 
 from rtcp.config.find import class_of_kind
+from rtcp.config.findings import Finding
 from rtcp.config.model import (
     VIRTUAL,
     ArmFile,
@@ -38,7 +39,7 @@ JOINT_OUTPUTS: Rows = (
     ("target_velocity", "float64", "rad/s"),
     ("command", "uint8", ""),
 )
-"""`command`: 0 stand still, 1 follow the targets, 2 stop and forget what was accepted."""
+"""`command`: 0 stand still, 1 follow the targets, 2 stop and discard accepted targets."""
 JOINT_INPUTS: Rows = (
     ("position", "float64", "rad"),
     ("state", "uint8", ""),
@@ -50,8 +51,8 @@ _CONTROLLERS_OWN: Mapping[Capability, str] = {
     "sdo": "a robot controller has no SDO: its parameters are set at its display",
     "states": "a robot controller has no AL states: `rtcp status` shows its motors and its program",
     "clocks": "a robot controller has no distributed clocks: its messages set the pace",
-    "torque": "the robot controller takes no torque and measures none for others",
-    "homing": "the robot controller knows where its joints are: calibrate them there",
+    "torque": "the robot controller takes no torque and reports none",
+    "homing": "the robot controller keeps the zero positions of its joints: calibrate them there",
     "power": "only people at the robot controller switch its motors on and start its program",
 }
 
@@ -62,7 +63,7 @@ def bus_class(kind: str) -> type[BusConfig]:
 
 
 def node(name: str, kind: str, outputs: Rows, inputs: Rows, watchdog_s: float) -> SlaveConfig:
-    """Return a node with these channels, which stops by itself after `watchdog_s` without a message."""
+    """Return a node with these channels, which stops by itself `watchdog_s` after the last message."""
 
     def pdos(index: int, rows: Rows) -> tuple[Pdo, ...]:
         entries = tuple(PdoEntry(0x2000, i, kind, name, unit=unit) for i, (name, kind, unit) in enumerate(rows, 1))
@@ -76,7 +77,7 @@ def node(name: str, kind: str, outputs: Rows, inputs: Rows, watchdog_s: float) -
 
 @dataclass(frozen=True)
 class ControllerBus(BusConfig):
-    """What all buses to a robot controller have in common."""
+    """Base of all buses to a robot controller."""
 
     LACKS: ClassVar[Mapping[Capability, str]] = _CONTROLLERS_OWN
     VIRTUAL_PROCESS: ClassVar[tuple[str, ...]] = ("rtcp.virtual.irc5", "--private")
@@ -84,24 +85,23 @@ class ControllerBus(BusConfig):
 
     @staticmethod
     def joints_and_unit(joints: Sequence[str], inputs: Rows, unit: SlaveConfig) -> tuple[SlaveConfig, ...]:
-        """Return a node a joint with these inputs, then the mechanical unit, which has their watchdog."""
+        """Return one node for each joint, with these inputs and the unit's watchdog, then the mechanical unit."""
         watchdog_s = 1e-3 * unit.device.watchdog_ms
         return (*(node(name, "joint", JOINT_OUTPUTS, inputs, watchdog_s) for name in joints), unit)
 
-    def findings(self, arm: ArmFile) -> Iterator[tuple[tuple[str | int, ...], str]]:
-        """Yield what needs a capability that the bus lacks, and an invalid address."""
+    def findings(self, arm: ArmFile) -> Iterator[Finding]:
+        """Yield the keys that need a capability which the bus lacks, and an invalid address."""
         name = self.interface
         if name != VIRTUAL and not _ADDRESS.fullmatch(name):
-            yield ("bus", "interface"), f'found the text "{name}", allowed is {VIRTUAL}, or an IPv4 address'
+            yield Finding(("bus", "interface"), "interface", found=name, allowed=f"{VIRTUAL}, or an IPv4 address")
         if arm.drive_mode == "cst" or arm.control_mode == "torque":
-            key, found = ("drive_mode", arm.drive_mode) if arm.drive_mode == "cst" else ("control_mode", "torque")
-            yield (key,), f'found the text "{found}" on a bus of kind {self.kind}: {self.LACKS["torque"]}'
+            key, mode = ("drive_mode", arm.drive_mode) if arm.drive_mode == "cst" else ("control_mode", "torque")
+            yield Finding((key,), "torque_on_bus", found=mode, bus=self.kind, lack=self.LACKS["torque"])
         for key, reaction in vars(arm.stops).items():
             if reaction == "torque_off":
-                text = f'found the text "torque_off" on a bus of kind {self.kind}, which cannot switch motors off'
-                yield ("stops", key), f"{text}; allowed are the others"
+                yield Finding(("stops", key), "torque_off_on_bus", found=reaction, bus=self.kind)
         if arm.gripper is not None and arm.gripper.joint is not None:
-            yield ("gripper", "joint"), f"found a drive on a bus of kind {self.kind}: it has those of the arm alone"
+            yield Finding(("gripper", "joint"), "drive_on_bus", bus=self.kind)
 
 
 @dataclass(frozen=True)
@@ -110,17 +110,17 @@ class EgmBus(ControllerBus):
 
     kind: Name = "egm"
     interface: Name = VIRTUAL
-    """`virtual`, or the own IPv4 address to which the controller sends; `0.0.0.0`: any."""
+    """`virtual`, or the IPv4 address of this host to which the controller sends; `0.0.0.0`: any."""
     segment: str = "irc5.yaml"
     """File of the virtual controller, relative to the arm's file."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 10
-    """Messages that did not come, which are a fault: in a row, or more than those that did."""
+    """Number of missing messages that is a fault: in a row, or in excess of those received."""
     timeout_scale: Annotated[float, Ge(1), Le(100)] = 4.5
-    """Factor on limits that a slow host exceeds, on the virtual bus alone: [real time](realtime.md)."""
+    """Factor on time limits on the virtual bus, where the host may be slow: [real time](realtime.md)."""
     port: Annotated[int, Ge(1), Le(65535)] = 6511
     """UDP port: that of the unit's UdpUc device, one for each mechanical unit."""
     controller: str = ""
-    """IPv4 address of the controller; none: whoever speaks first is it until it falls silent."""
+    """IPv4 address of the controller; none: the first sender, until it falls silent."""
     unit: Name = "robot"
     """Name of the mechanical unit in records and status."""
     comm_timeout_s: Annotated[float, Gt(0), Le(1)] = 0.2
@@ -147,7 +147,7 @@ class EgmBus(ControllerBus):
         *((f"path_deviation_{axis}", "float64", "m") for axis in "xyz"),
     )
     """Numbers of `motors`, `rapid` and `mci` are EGM's (docs/abb.md). `path_deviation`: the flange as measured minus as
-    planned by the controller. Counted are messages, since the start."""
+    planned by the controller. Counters count messages since the start."""
 
     def nodes(self, joints: Sequence[str], period_us: float) -> tuple[SlaveConfig, ...]:
         """Return the joints and the mechanical unit."""
@@ -155,18 +155,18 @@ class EgmBus(ControllerBus):
         unit = node(self.unit, "generic", (), self.UNIT_INPUTS, self.comm_timeout_s)
         return self.joints_and_unit(joints, inputs, unit)
 
-    def findings(self, arm: ArmFile) -> Iterator[tuple[tuple[str | int, ...], str]]:
-        """Yield what does not suit EGM."""
+    def findings(self, arm: ArmFile) -> Iterator[Finding]:
+        """Yield the values that EGM does not support."""
         yield from super().findings(arm)
         if len(arm.joints) not in (6, 7):
-            yield ("joints",), f"found {len(arm.joints)} joints, allowed by EGM are 6, or 7 with the external one third"
+            yield Finding(("joints",), "joints_of_egm", found=len(arm.joints))
         if (lost_s := self.lost_cycles * arm.cycle.period_us * 1e-6) > self.comm_timeout_s:
-            text = f"found {self.lost_cycles} cycles, {lost_s:g} s, allowed is at most bus.comm_timeout_s"
-            yield ("bus", "lost_cycles"), f"{text}, {self.comm_timeout_s:g} s: the controller stops by itself then"
+            wanted = f"at most bus.comm_timeout_s, {self.comm_timeout_s:g} s: the controller stops by itself then"
+            unit = f" cycles, {lost_s:g} s"
+            yield Finding(("bus", "lost_cycles"), "lost_cycles", found=self.lost_cycles, unit=unit, allowed=wanted)
         period, rest = arm.cycle.period_us, arm.cycle.period_us % EGM_PERIOD_US
         if min(rest, EGM_PERIOD_US - rest) > 0.02 * EGM_PERIOD_US or period < 0.9 * EGM_PERIOD_US:
-            text = f"found {period:g} us, allowed by EGM is {EGM_PERIOD_US:g} or a multiple: what \\SampleRate sets"
-            yield ("cycle", "period_us"), text
+            yield Finding(("cycle", "period_us"), "period_of_egm", found=period, period_us=EGM_PERIOD_US)
 
 
 EGM_PERIOD_US = 4032.0
@@ -183,9 +183,9 @@ class RapidBus(ControllerBus):
     segment: str = "irc5_rapid.yaml"
     """File of the virtual controller, relative to the arm's file."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 10
-    """Cycles without a state message, which are a fault: in a row, or more than those with one."""
+    """Number of cycles without a state message that is a fault: in a row, or in excess of those with one."""
     timeout_scale: Annotated[float, Ge(1), Le(100)] = 3.0
-    """Factor on limits that a slow host exceeds, on the virtual bus alone: [real time](realtime.md)."""
+    """Factor on time limits on the virtual bus, where the host may be slow: [real time](realtime.md)."""
     motion_port: Annotated[int, Ge(1), Le(65535)] = 11000
     """TCP port of the motion server."""
     state_port: Annotated[int, Ge(1), Le(65535)] = 11002
@@ -193,7 +193,7 @@ class RapidBus(ControllerBus):
     unit: Name = "robot"
     """Name of the mechanical unit in records and status."""
     state_period_s: Positive = 0.05
-    """Longest interval between two state messages, s: a cycle after a longer one is lost."""
+    """Longest interval between two state messages, s; later cycles count as lost until the next message."""
     answer_timeout_s: Positive = 1.0
     """Time without acceptance of a point after which the connection counts as lost, s."""
 

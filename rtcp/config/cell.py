@@ -1,4 +1,4 @@
-"""A cell: several arms on one host, where they stand, and what they share. Its file is read by `cell_file`."""
+"""A cell: several arms on one host, the places of their bases, and shared settings. `cell_file` reads its file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}", re.ASCII)
 
 @dataclass(frozen=True)
 class Base:
-    """Where the base of an arm stands in the world."""
+    """Pose of an arm's base in the world."""
 
     position: Vector = (0.0, 0.0, 0.0)
     """x, y, z, m."""
@@ -36,7 +36,7 @@ class CellArm:
     name: Name
     """Name of the platform: `rtcp --name NAME status`."""
     config: Name
-    """File of the arm, from this file's directory on."""
+    """File of the arm, relative to this file."""
     base: Base = field(default_factory=Base)
 
 
@@ -47,12 +47,12 @@ class CellProcess:
     name: Name
     """Name of the platform."""
     config: Name
-    """Its file, from this file's directory on."""
+    """Its file, relative to this file."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """What the arms have in common."""
+    """Settings that the arms share."""
 
     emergency_stop: bool = True
     """Whether the emergency stop of one arm is that of all."""
@@ -60,13 +60,13 @@ class Share:
 
 @dataclass(frozen=True)
 class CellSettings:
-    """What the file of a cell and what a loop is given of it have in common."""
+    """Settings both of a cell's file and of the configuration that its loops receive."""
 
     name: Name
     """Name of the cell."""
     share: Share = field(default_factory=Share)
     silence_s: Annotated[float, Gt(0), Le(0.5)] | None = None
-    """How old the newest record of a partner may be in a motion in step, s; left out: two cycles of the slowest arm."""
+    """Largest age of a partner's newest record in a motion in step, s; left out: two cycles of the slowest arm."""
     clearance: Annotated[float, Ge(0), Le(1)] = 0.02
     """Distance that bodies of two arms keep, m."""
 
@@ -93,41 +93,42 @@ class CellConfig(CellSettings):
 
     @property
     def members(self) -> tuple[Member, ...]:
-        """All platforms: the arms, then the others."""
+        """All platforms: the arms, then those of processes."""
         return self.arms + self.processes
 
     def member(self, name: str) -> Member:
         """Return the platform with this name; raises ConfigError."""
-        for one in self.members:
-            if one.name == name:
-                return one
-        names = ", ".join(one.name for one in self.members)
-        raise ConfigError([f'{self.source}: found no arm with the name "{name}", allowed is one of {names}'])
+        for member in self.members:
+            if member.name == name:
+                return member
+        names = ", ".join(member.name for member in self.members)
+        text = f'{self.source}: found no arm with the name "{name}", allowed is one of {names}'
+        raise ConfigError([text], "choice")
 
     @property
     def slowest_s(self) -> float:
         """Longest cycle among the arms, s."""
-        return 1e-6 * max(one.config.cycle.period_us for one in self.arms)
+        return 1e-6 * max(arm.config.cycle.period_us for arm in self.arms)
 
     @property
     def digest(self) -> int:
-        """64 bits that differ for another cell, or another state of its files; not of where they stand."""
+        """64-bit hash of the content of the cell and its files, without their paths."""
         text = json.dumps(_without_paths(to_json(self)), sort_keys=True)
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
 
     @property
     def longest_silence_s(self) -> float:
-        """How old the newest record of a partner may be, s."""
+        """Largest age of a partner's newest record, s."""
         return 2.0 * self.slowest_s if self.silence_s is None else self.silence_s
 
 
 def _without_paths(value: Any) -> Any:
-    """Return a JSON value without what says where files were found, and what was noticed in them."""
+    """Return a JSON value without the paths and warnings of files."""
     if isinstance(value, dict):
-        return {key: _without_paths(one) for key, one in value.items() if key not in _PATHS}
-    return [_without_paths(one) for one in value] if isinstance(value, list) else value
+        return {key: _without_paths(item) for key, item in value.items() if key not in _PATHS}
+    return [_without_paths(item) for item in value] if isinstance(value, list) else value
 
 
 def is_platform_name(name: str) -> bool:
-    """Return whether a platform may have this name: it becomes a directory, beside `lock`, and a namespace of ROS."""
+    """Return whether a platform may have this name: it names a directory, beside `lock`, and a namespace of ROS."""
     return _NAME.fullmatch(name) is not None and name != "lock"

@@ -1,4 +1,4 @@
-"""The file of a cell (`config/cell.yaml`), checked whole together with those of its arms."""
+"""The file of a cell (`config/cell.yaml`), checked together with those of its arms."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Annotated
 from annotated_types import MaxLen, MinLen
 
 from rtcp.config.cell import Base, CellArm, CellConfig, CellProcess, CellSettings, Member, is_platform_name
-from rtcp.config.document import Finding, read
+from rtcp.config.document import read
+from rtcp.config.findings import Finding
 from rtcp.config.loader import load
 from rtcp.config.model import ConfigError
-from rtcp.config.validation import Checker, rule
+from rtcp.config.validation import Checker, repeated, rule
 
 MOST_ARMS = 8
 
@@ -26,14 +27,13 @@ class _CellFile(CellSettings):
 
 @rule(_CellFile, "arms", "processes")
 def _names(cell: _CellFile) -> Iterator[Finding]:
-    first: dict[str, str] = {}
     members: dict[str, Sequence[CellArm | CellProcess]] = {"arms": cell.arms, "processes": cell.processes}
-    for key, i, name in ((key, i, one.name) for key, group in members.items() for i, one in enumerate(group)):
+    names = [((key, i, "name"), member.name) for key, group in members.items() for i, member in enumerate(group)]
+    for where, name in names:
         if not is_platform_name(name):
             allowed = "a letter, then letters, digits, - and _, at most 32"
-            yield (key, i, "name"), f'found the text "{name}", allowed is {allowed}'
-        elif first.setdefault(name, f"{key}[{i}]") != f"{key}[{i}]":
-            yield (key, i, "name"), f'found "{name}", the name of {first[name]}; each needs its own'
+            yield Finding(where, "platform_name", found=name, allowed=allowed)
+    yield from repeated(names, "name")
 
 
 _CELL = Checker(_CellFile)
@@ -45,22 +45,23 @@ def load_cell(path: Path) -> CellConfig:
     Raises:
         ConfigError: with one sentence for every mistake.
     """
-    found = _CELL.read(read(path))
-    mistakes: list[str] = []
+    file = _CELL.read(read(path))
+    mistakes: list[Finding] = []
 
     def members(kind: str, entries: Sequence[CellArm | CellProcess]) -> Iterator[Member]:
-        for one in entries:
+        for entry in entries:
             try:
-                config = load(path.parent / one.config)
+                config = load(path.parent / entry.config)
             except ConfigError as error:
-                mistakes.extend(f"{path}: {kind} {one.name}: {sentence}" for sentence in str(error).splitlines())
+                mistakes.extend(finding.within(f"{path}: {kind} {entry.name}: ") for finding in error.findings)
                 continue
             if (kind == "arm") != bool(config.joints):
                 has = "joints: it belongs under arms" if config.joints else "no joints: it belongs under processes"
-                mistakes.append(f"{path}: {kind} {one.name}: {one.config} has {has}")
-            yield Member(one.name, config, one.base if isinstance(one, CellArm) else Base())
+                wrong = Finding((), "wrong_group", file=entry.config, has=has)
+                mistakes.append(wrong.within(f"{path}: {kind} {entry.name}: "))
+            yield Member(entry.name, config, entry.base if isinstance(entry, CellArm) else Base())
 
-    arms, processes = tuple(members("arm", found.arms)), tuple(members("process", found.processes))
+    arms, processes = tuple(members("arm", file.arms)), tuple(members("process", file.processes))
     if mistakes:
         raise ConfigError(mistakes)
-    return CellConfig(found.name, found.share, found.silence_s, found.clearance, arms, path, processes)
+    return CellConfig(file.name, file.share, file.silence_s, file.clearance, arms, path, processes)

@@ -1,4 +1,4 @@
-"""A device's file (`config/devices/NAME.yaml`) made of its description, with comments for the person who uses it."""
+"""A device's file (`config/devices/NAME.yaml`) made of its description, with comments for its user."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MAPPED_OBJECTS = {
     True: (0x6040, 0x607A, 0x60FF, 0x6071, 0x6060),
     False: (0x6041, 0x6064, 0x606C, 0x6077, 0x6061),
 }
-"""Objects of a drive that are mapped where they can be, by whether they are outputs."""
+"""Objects of a drive that are mapped if the device allows it, by whether they are outputs."""
 _DRIVE_CHANNELS = {
     (0x6040, 0): "controlword",
     (0x6041, 0): "statusword",
@@ -51,12 +51,12 @@ _DRIVE_CHANNELS = {
 }
 """Channel names of a drive's objects (IEC 61800-7-201), those of the first axis."""
 _NEEDED = {True: (0x6040, 0x607A), False: (0x6041, 0x6064)}
-"""Objects that the driver of a drive cannot do without, by whether they are outputs."""
+"""Objects that the driver of a drive needs, by whether they are outputs."""
 _MODE_OBJECT, _CSP = 0x6060, 8
 _MOST_SPEED, _RATED = 0x6080, 1000
-"""Of the objects that bound a drive: the one that is no torque; the rated torque, in the unit of the others."""
+"""The limit of a drive that is a speed (all others are torques), and the rated torque in the unit of a torque limit."""
 _RAMP_AND_HOLD = 6
-"""Quick stop option code."""
+"""Value of the quick stop option code, 0x605A."""
 _SYNC0 = 0x0200
 """Bit of AssignActivate that activates SYNC0."""
 _DRIVE_WATCHDOG_MS, _WATCHDOG_MS = 20, 100
@@ -78,12 +78,12 @@ def file_text(device: Device, kind: str | None = None, mode: str | None = None) 
     Raises:
         EsiError: it has no such mode, or one that assigns a PDO several times over.
     """
-    made = complete(for_drive(device if mode is None else _in_mode(device, mode)))
-    return "\n".join(_lines(made, kind or kind_of(made), mode is not None)) + "\n"
+    completed = complete(for_drive(device if mode is None else _in_mode(device, mode)))
+    return "\n".join(_lines(completed, kind or kind_of(completed), mode is not None)) + "\n"
 
 
 def _in_mode(device: Device, name: str) -> Device:
-    """Return a device with one clock mode before the others, and the PDOs assigned that this mode assigns."""
+    """Return a device with one clock mode first, and the PDOs assigned that this mode assigns."""
     mode = next((mode for mode in device.dc_modes if mode.name == name), None)
     if mode is None:
         names = ", ".join(mode.name for mode in device.dc_modes) or "none"
@@ -101,7 +101,7 @@ def _in_mode(device: Device, name: str) -> Device:
             for pdo in pdos
         )
 
-    modes = (mode, *(other for other in device.dc_modes if other is not mode))
+    modes = (mode, *(following for following in device.dc_modes if following is not mode))
     return replace(device, dc_modes=modes, rx_pdos=assigned_by(device.rx_pdos), tx_pdos=assigned_by(device.tx_pdos))
 
 
@@ -132,10 +132,10 @@ def _counter(device: Device) -> PdoEntry | None:
 
 
 def for_drive(device: Device) -> Device:
-    """Return a drive with PDOs assigned that its driver can work with, where the default assignment lacks an object.
+    """Return a drive with PDOs assigned that its driver supports, if the default assignment lacks an object.
 
-    Other PDOs of the description are taken where some have the objects, else one PDO is mapped of the objects that may
-    be mapped. A device that has neither is returned as it is.
+    These are other PDOs of the description that have the objects, else one PDO is mapped from the objects that may be
+    mapped. A device that has neither is returned unchanged.
     """
     if not _is_drive(device):
         return device
@@ -146,12 +146,12 @@ def for_drive(device: Device) -> Device:
 
 
 def _with_mode_display(device: Device) -> Device:
-    """Return a drive whose mode of operation, where it is in an RxPDO, comes back in a TxPDO, if that can be."""
+    """Return a drive with the mode of operation display in a TxPDO, if its mode is in an RxPDO and this is possible."""
     rx, tx = ({entry.index for entry in entries_of(device.assigned(outputs))} for outputs in (True, False))
     if _MODE_OBJECT not in rx or _MODE_OBJECT + 1 in tx:
         return device
     manager, there = _usual_sync_manager(device, outputs=False), {pdo.index for pdo in device.assigned(False)}
-    shown = _object(device, _MODE_OBJECT + 1, 0)
+    display = _object(device, _MODE_OBJECT + 1, 0)
     can_map = device.coe is not None and device.coe.pdo_configuration
     tx_pdos = list(device.tx_pdos)
     for at, pdo in enumerate(tx_pdos):
@@ -159,8 +159,8 @@ def _with_mode_display(device: Device) -> Device:
             tx_pdos[at] = replace(pdo, sync_manager=manager)
             return replace(device, tx_pdos=tuple(tx_pdos))
     for at, pdo in enumerate(tx_pdos):
-        if pdo.index in there and not pdo.fixed and can_map and shown is not None:
-            entry = PdoEntry(_MODE_OBJECT + 1, 0, shown.bits, shown.name, shown.type)
+        if pdo.index in there and not pdo.fixed and can_map and display is not None:
+            entry = PdoEntry(_MODE_OBJECT + 1, 0, display.bits, display.name, display.type)
             tx_pdos[at] = replace(pdo, entries=(*pdo.entries, entry))
             break
     return replace(device, tx_pdos=tuple(tx_pdos))
@@ -172,7 +172,7 @@ def _is_drive(device: Device) -> bool:
 
 
 def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, ...] | None:
-    """Return `pdos` with one assigned that holds what a drive needs; None: there is none, and none can be made."""
+    """Return `pdos` with one assigned that has the objects a drive needs; None: none can be assigned or mapped."""
     needed = {*_NEEDED[outputs]}
     if needed <= {entry.index for entry in entries_of(device.assigned(outputs))}:
         return pdos
@@ -191,8 +191,8 @@ def _chosen(device: Device, pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, 
     free = next((pdo for pdo in pdos if not pdo.fixed), Pdo(0x1600 if outputs else 0x1A00, "", ()))
     if not needed <= {entry.index for entry in entries}:
         return None
-    made = replace(free, entries=tuple(entries), sync_manager=manager)
-    return (made, *(replace(pdo, sync_manager=None) for pdo in pdos if pdo is not free))
+    mapped = replace(free, entries=tuple(entries), sync_manager=manager)
+    return (mapped, *(replace(pdo, sync_manager=None) for pdo in pdos if pdo is not free))
 
 
 def entries_of(pdos: Sequence[Pdo]) -> list[PdoEntry]:
@@ -285,7 +285,7 @@ def _mode_text(mode: DcMode) -> str:
 
 
 def _calls_inputs_outputs(device: Device) -> bool:
-    """Whether a PDO has an index of the other direction: its mapping is left alone."""
+    """Whether a PDO has an index of the other direction: its mapping is not changed."""
     return any(pdo.index in MAPPINGS[not outputs] for outputs in (True, False) for pdo in device.assigned(outputs))
 
 
@@ -294,7 +294,7 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
     mapping = {pdo.index for pdo in (*device.rx_pdos, *device.tx_pdos)}
     for command in device.init_commands:
         if command.index in mapping or 0x1C10 <= command.index <= 0x1C2F:
-            continue  # what the mapping below says
+            continue  # the mapping below sets it
         if not command.data:
             continue
         if kind == "cia402" and command.index % OBJECTS_PER_AXIS == _MODE_OBJECT % OBJECTS_PER_AXIS:
@@ -305,21 +305,21 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
         signed = kept is not None and kept.kind is Kind.SIGNED
         as_bytes = kept is not None and kept.kind in (Kind.TEXT, Kind.BYTES)
         if command.complete_access or as_bytes or len(command.data) not in (1, 2, 4, 8):
-            what = f'type: bytes, data: "{command.data.hex(" ")}"' + ", complete: true" * command.complete_access
+            content = f'type: bytes, data: "{command.data.hex(" ")}"' + ", complete: true" * command.complete_access
         else:
             number = int.from_bytes(command.data, "little", signed=signed)
-            what = f"type: {'int' if signed else 'uint'}{8 * len(command.data)}, value: {number}"
+            content = f"type: {'int' if signed else 'uint'}{8 * len(command.data)}, value: {number}"
         written.append(
-            f"  - {{index: 0x{command.index:04X}, sub_index: {command.sub_index}, {what}"
+            f"  - {{index: 0x{command.index:04X}, sub_index: {command.sub_index}, {content}"
             + (f", name: {_quoted(name)}" if name else "")
             + "}"
         )
     mapped = {entry.index for entry in entries_of(device.assigned(True))}
-    shown = {axis for axis in _axes(device) if _shows_mode(device, axis)}
+    displayed = {axis for axis in _axes(device) if _shows_mode(device, axis)}
     axes = (_axes(device) or (1,)) if kind == "cia402" else ()
     for axis in axes:
         index = _MODE_OBJECT + (axis - 1) * OBJECTS_PER_AXIS
-        if index not in mapped or axis not in shown:
+        if index not in mapped or axis not in displayed:
             written.append(
                 f"  - {{index: 0x{index:04X}, sub_index: 0, type: int8, value: {_CSP}, name: modes of operation}}"
                 "   # CSP"
@@ -383,7 +383,7 @@ def _shows_mode(device: Device, axis: int) -> bool:
 
 
 def _ratio(device: Device, index: int, otherwise: float) -> tuple[float, str]:
-    """Return the default of a ratio, subindex 1 by 2, and where it is from; `otherwise` where there is none."""
+    """Return the default of a ratio, subindex 1 by 2, and its origin; `otherwise` if there is none."""
     above, below = _default(device, index, 1), _default(device, index, 2)
     if not above:
         mark = "" if otherwise == 1 else "CHECK: "
@@ -400,7 +400,7 @@ def _default(device: Device, index: int, sub: int) -> float | None:
 
 
 def _axes(device: Device) -> tuple[int, ...]:
-    """Return the axes of a drive for which all that its driver needs is assigned."""
+    """Return the axes of a drive whose needed objects are all assigned."""
     there = {
         (entry.index, outputs)
         for outputs in (True, False)
@@ -489,13 +489,13 @@ def _channel_lines(
 
 
 def _widest(entry: PdoEntry, axis: int) -> int:
-    """Return what bounds a drive least: its rated torque, or the largest speed that the object can hold."""
+    """Return the widest limit of a drive: its rated torque, or the largest speed that the object can hold."""
     is_speed = entry.index - (axis - 1) * OBJECTS_PER_AXIS == _MOST_SPEED
     return (1 << entry.bits - 1) - 1 if is_speed else _RATED
 
 
 def prefix_of(pdo: Pdo) -> str:
-    """Return what tells a PDO's channels from those of another: `channel 2`, else its name."""
+    """Return the prefix of a PDO's channels: `channel 2`, else its name."""
     channel = _CHANNEL.search(pdo.name)
     return f"channel {channel[1]}" if channel else pdo.name or f"x{pdo.index:04x}"
 
@@ -515,7 +515,7 @@ def _range_text(entry: ObjectEntry) -> list[str]:
 
 
 def _others(device: Device, key: str, outputs: bool) -> Iterator[str]:
-    """Name the PDOs that can be assigned instead."""
+    """Yield comments on the PDOs that can be assigned instead."""
     there = {pdo.index for pdo in device.assigned(outputs)}
     others = [pdo for pdo in (device.rx_pdos if outputs else device.tx_pdos) if pdo.index not in there]
     if others:
@@ -538,8 +538,8 @@ def _object(device: Device, index: int, sub: int) -> ObjectEntry | None:
 
 
 def _axis_of(pdo: Pdo) -> int:
-    found = Counter((entry.index - 0x6000) // OBJECTS_PER_AXIS + 1 for entry in pdo.entries if entry.index in _AXES)
-    return found.most_common(1)[0][0] if found else 1
+    axes = Counter((entry.index - 0x6000) // OBJECTS_PER_AXIS + 1 for entry in pdo.entries if entry.index in _AXES)
+    return axes.most_common(1)[0][0] if axes else 1
 
 
 def _type_keys(name: str, bits: int) -> str:

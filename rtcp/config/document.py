@@ -27,17 +27,13 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.reader import ReaderError
 
+from rtcp.config.findings import Finding, KeyPath
 from rtcp.config.model import ConfigError
 
-KeyPath = tuple[str | int, ...]
-"""Keys and list positions from the top of a file to a value."""
-Finding = tuple[KeyPath, str]
-"""A mistake: where it is and the rest of its sentence."""
-
 _LARGEST, _MOST_VALUES, _DEEPEST = 1 << 20, 20_000, 50
-"""Limits of a file, in bytes or characters, values and levels: an alias counts as everything that it stands for."""
+"""Limits of a file, in bytes or characters, values and levels: an alias counts as all of its content."""
 _LONGEST_NUMBER = 100
-"""Characters of an integer; Python refuses to convert some thousand."""
+"""Most characters of an integer; Python refuses to convert some thousand."""
 _KINDS = {
     stat.S_IFDIR: "a directory", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
@@ -68,38 +64,10 @@ class Document:
             where = where[:-1]
         return self.lines.get(where, 1)
 
-    def sentences(self, findings: Iterable[Finding]) -> list[str]:
-        """Return one sentence per finding, `file:line: key: text`, in the order of the lines."""
-        return [
-            f"{self.path}:{self.line(finding[0])}: {sentence(finding)}"
-            for finding in sorted(findings, key=lambda finding: self.line(finding[0]))
-        ]
-
-
-def dotted(where: KeyPath) -> str:
-    """Return a key path as people write it: `joints[2].velocity`."""
-    return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in where).removeprefix(".")
-
-
-def sentence(finding: Finding) -> str:
-    """Return a finding as text, its key first."""
-    where, text = finding
-    return f"{dotted(where)}: {text}" if where else text
-
-
-def shown(found: object) -> str:
-    """Return a value as a sentence names it."""
-    if isinstance(found, bool):
-        return "true" if found else "false"
-    if found is None:
-        return "nothing"
-    if isinstance(found, str):
-        return f'the text "{found if len(found) <= 60 else found[:57] + "..."}"'
-    if isinstance(found, dict):
-        return "a mapping"
-    if isinstance(found, list):
-        return "an empty list" if not found else "a list"
-    return str(found)
+    def placed(self, findings: Iterable[Finding]) -> list[Finding]:
+        """Return the findings with file and line, in the order of the lines."""
+        placed = [finding.at(self.path, self.line(finding.where)) for finding in findings]
+        return sorted(placed, key=lambda finding: finding.line or 0)
 
 
 def read(path: Path) -> Document:
@@ -112,7 +80,7 @@ def read(path: Path) -> Document:
 
 
 def parse(text: str, path: Path) -> Document:
-    """Return the document of a YAML text; `path` stands in the sentences.
+    """Return the document of a YAML text; `path` is named in the findings.
 
     Raises:
         ConfigError: it is no YAML, empty, no mapping, larger than any configuration, or repeats keys.
@@ -123,23 +91,20 @@ def parse(text: str, path: Path) -> Document:
         document.data = builder.document()
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        place = f"{mark.line + 1}:{mark.column + 1}: " if mark else " "
-        raise ConfigError([f"{path}:{place}this is not valid YAML: {_reason(error)}"]) from error
+        place = (mark.line + 1, mark.column + 1) if mark else ()
+        raise ConfigError([Finding((), "not_yaml", reason=_reason(error)).at(path, *place)]) from error
     except ReaderError as error:
-        line = text.count("\n", 0, error.position) + 1
-        found = f"{ord(text[error.position]):#04x}"
-        raise ConfigError(
-            [f"{path}:{line}: this is not a text file: it holds the control character {found}"]
-        ) from error
+        finding = Finding((), "control_character", found=ord(text[error.position]))
+        raise ConfigError([finding.at(path, text.count("\n", 0, error.position) + 1)]) from error
     except _TooMuch as error:
-        raise ConfigError([f"{path}: {error}"]) from error
+        raise ConfigError([error.finding.at(path)]) from error
     if document.data is None and not builder.findings:
-        raise ConfigError([f"{path}: the file is empty; a mapping of keys to values is expected"])
+        raise _unusable(path, "empty_file", need="a mapping of keys to values is")
     if not isinstance(document.data, dict):
         kind = "a list" if isinstance(document.data, list) else "a single value"
-        raise ConfigError([f"{path}:1: the file holds {kind}; a mapping of keys to values (`key: value`) is expected"])
+        raise ConfigError([Finding((), "no_mapping", found=kind).at(path, 1)])
     if builder.findings:
-        raise ConfigError(document.sentences(builder.findings))
+        raise ConfigError(document.placed(builder.findings))
     return document
 
 
@@ -153,20 +118,22 @@ def text_of(path: Path) -> str:
         kind = stat.S_IFMT(path.stat().st_mode)
         # Checked before the file is opened: opening a pipe waits for its other end.
         if kind != stat.S_IFREG:
-            raise ConfigError([f"{path}: this is {_KINDS.get(kind, 'something else')}; a regular file is expected"])
+            raise _unusable(path, "no_regular_file", found=_KINDS.get(kind, "something else"))
         with path.open("rb") as file:
             content = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
-            raise ConfigError([f"{path}: the file holds more than {_LARGEST} bytes, the limit of a configuration"])
+            raise _unusable(path, "too_large", limit=_LARGEST, what="bytes")
         return content.decode("utf-8-sig")
     except FileNotFoundError as error:
-        raise ConfigError([f"{path}: there is no such file"]) from error
+        raise _unusable(path, "no_file") from error
     except OSError as error:
-        raise ConfigError([f"{path}: the file cannot be read: {error.strerror}"]) from error
+        raise _unusable(path, "unreadable", reason=error.strerror) from error
     except UnicodeDecodeError as error:
-        byte = error.object[error.start]
-        text = f"{path}: this is not a text file: byte {error.start} is {byte:#04x}, which is not UTF-8"
-        raise ConfigError([text]) from error
+        raise _unusable(path, "not_utf8", found=error.object[error.start], byte=error.start) from error
+
+
+def _unusable(path: Path, code: str, **fields: object) -> ConfigError:
+    return ConfigError([Finding((), code, **fields).at(path)])
 
 
 def _reason(error: MarkedYAMLError) -> str:
@@ -177,11 +144,14 @@ def _reason(error: MarkedYAMLError) -> str:
 
 
 class _TooMuch(Exception):
-    """The file is larger than any configuration, or unfolds to more: the rest of a sentence."""
+    """The file, or its content with aliases expanded, is larger than any configuration."""
+
+    def __init__(self, code: str, **fields: object) -> None:
+        self.finding = Finding((), code, **fields)
 
 
 class _Builder:
-    """Turns YAML's events into values, noting lines and what is not allowed."""
+    """Turns YAML's events into values, with their lines and findings."""
 
     def __init__(self, text: str, lines: dict[KeyPath, int]) -> None:
         self.findings: list[Finding] = []
@@ -204,18 +174,18 @@ class _Builder:
         return value
 
     def _count(self, text: str = "") -> None:
-        """Add a value, or the text of one, to what the file holds."""
+        """Count a value, or the characters of its text; raises _TooMuch beyond a limit."""
         self._values += not text
         self._characters += len(text)
-        for found, limit, what in (
+        for used, limit, unit in (
             (self._values, _MOST_VALUES, "values"),
             (self._characters, _LARGEST, "characters"),
         ):
-            if found > limit:
-                text = f"the file holds more than {limit} {what}, the limit of a configuration"
-                raise _TooMuch(f"{text}; an alias counts as everything that it stands for")
+            if used > limit:
+                hint = "; an alias counts as everything that it stands for"
+                raise _TooMuch("too_large", limit=limit, what=unit, hint=hint)
         if self._depth >= _DEEPEST:
-            raise _TooMuch("the lists and mappings are nested too deeply")
+            raise _TooMuch("too_deep")
 
     def _value(self, event: Any, where: KeyPath) -> object:
         self._lines.setdefault(where, event.start_mark.line + 1)
@@ -225,7 +195,7 @@ class _Builder:
             self._anchors[event.anchor] = _OPEN
         self._count()
         if event.tag is not None:
-            self.findings.append((where, f"the tag {event.tag} is not allowed; write a plain value"))
+            self.findings.append(Finding(where, "tag", found=event.tag))
         self._depth += 1
         value: object
         if isinstance(event, MappingStartEvent):
@@ -244,7 +214,7 @@ class _Builder:
             raise MarkedYAMLError(problem=f"found undefined alias {event.anchor!r}", problem_mark=event.start_mark)
         value = self._anchors[event.anchor]
         if value is _OPEN:
-            self.findings.append((where, "this alias contains itself"))
+            self.findings.append(Finding(where, "endless_alias"))
             return None
         self._count_again(value)
         return value
@@ -272,14 +242,13 @@ class _Builder:
             key = self._value(event, (*where, "?"))
             self._lines.pop((*where, "?"))
             if not isinstance(key, str):
-                found = event.value if isinstance(event, ScalarEvent) else "a list or mapping"
-                self.findings.append((where, f"found the key {found} in line {line}; a key must be a text"))
+                text = event.value if isinstance(event, ScalarEvent) else "a list or mapping"
+                self.findings.append(Finding(where, "key_no_text", found=text, at=line))
                 self._value(next(self._events), where)
                 continue
             inner = (*where, key)
             if key in values:
-                text = f"this key occurs twice, in lines {self._lines[inner]} and {line}; keep one of them"
-                self.findings.append((inner, text))
+                self.findings.append(Finding(inner, "key_twice", first=self._lines[inner], at=line))
                 self._value(next(self._events), inner)
                 continue
             self._lines[inner] = line
@@ -290,7 +259,7 @@ class _Builder:
         text = str(event.value)
         self._count(text)
         if lone := _SURROGATE.search(text):
-            self.findings.append((where, f"this text holds U+{ord(lone[0]):04X}, half of a character"))
+            self.findings.append(Finding(where, "half_character", found=ord(lone[0])))
             return ""
         if event.tag is not None or not event.implicit[0]:
             return text
@@ -298,7 +267,7 @@ class _Builder:
             return _CONSTANTS[text]
         if _INTEGER.fullmatch(text):
             if len(text) > _LONGEST_NUMBER:
-                self.findings.append((where, f"this number has {len(text)} digits; the limit is {_LONGEST_NUMBER}"))
+                self.findings.append(Finding(where, "long_number", found=len(text), limit=_LONGEST_NUMBER))
                 return None
             return int(text) if text.lstrip("+-").isdigit() else int(text, 0)
         return float(text.lower().replace(".inf", "inf").replace(".nan", "nan")) if _FLOAT.fullmatch(text) else text

@@ -1,4 +1,4 @@
-"""Finds what a configuration names: the arm's file, and the classes of installed packages, this one among them."""
+"""Finds the arm's file, and the classes that installed packages, this one among them, register."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from typing import TypeVar
 
+from rtcp.config.findings import Finding
 from rtcp.config.model import ConfigError, PluginError
 
 T = TypeVar("T")
@@ -19,14 +20,14 @@ ENVIRONMENT = "RTCP_CONFIG"
 """The environment variable that names the arm's file."""
 
 
-def find_config(given: Path | None = None) -> Path:
-    """Return the arm's file: the one given, else $RTCP_CONFIG, else /etc/rtcp/assistive_arm.yaml, else the default.
+def find_config(path: Path | None = None) -> Path:
+    """Return the arm's file: `path`, else $RTCP_CONFIG, else /etc/rtcp/assistive_arm.yaml, else the default.
 
     Raises:
-        ConfigError: a file that was asked for does not exist, or the package has lost its default.
+        ConfigError: the requested file does not exist, or the package lacks its default.
     """
-    if given is not None:
-        return _there(given, "--config")
+    if path is not None:
+        return _there(path, "--config")
     if named := os.environ.get(ENVIRONMENT):
         return _there(Path(named), ENVIRONMENT)
     if exists(SYSTEM):
@@ -34,25 +35,26 @@ def find_config(given: Path | None = None) -> Path:
     return default_config()
 
 
-def find_arm(given: str | None = None) -> Path:
+def find_arm(arm: str | None = None) -> Path:
     """Return the file of an arm to compute with: a path, or the bare name of a file beside the default configuration.
 
-    None: the arm's file as `find_config` finds it.
+    None: the arm's file of `find_config`.
 
     Raises:
-        ConfigError: there is no such file; for a bare name the arms that there are come with it.
+        ConfigError: there is no such file; for a bare name the message lists the arms.
     """
-    if given is None:
+    if arm is None:
         return find_config()
-    path = Path(given)
-    if exists(path) or path.name != given or path.suffix:
+    path = Path(arm)
+    if exists(path) or path.name != arm or path.suffix:
         return _there(path, "--arm")
     folder = default_config().parent
-    named = folder / f"{given}.yaml"
+    named = folder / f"{arm}.yaml"
     if exists(named):
         return named
     known = sorted(file.stem for file in folder.glob("*.yaml") if "\nkinematics:" in file.read_text(encoding="utf-8"))
-    raise ConfigError([f"--arm {given}: there is no such file, and no arm of this name; known are {', '.join(known)}"])
+    text = f"--arm {arm}: there is no such file, and no arm of this name; known are {', '.join(known)}"
+    raise ConfigError([text], "no_file")
 
 
 def default_config() -> Path:
@@ -66,11 +68,13 @@ def default_config() -> Path:
     for place in places:
         if place.is_file():
             return place
-    raise ConfigError([f"the default configuration is missing; it belongs at {' or '.join(map(str, places))}"])
+    raise ConfigError(
+        [f"the default configuration is missing; it belongs at {' or '.join(map(str, places))}"], "no_default"
+    )
 
 
 def exists(path: Path) -> bool:
-    """Return whether there is such a file, also where it may not be looked at: reading it then says why."""
+    """Return whether there is such a file, also if it cannot be read: reading it then says why."""
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -82,33 +86,37 @@ def exists(path: Path) -> bool:
 
 def _there(path: Path, asked_by: str) -> Path:
     if os.path.isdir(path):
-        raise ConfigError([f"{path}, named by {asked_by}, is a directory; name the arm's file in it"])
+        raise ConfigError(
+            [f"{path}, named by {asked_by}, is a directory; name the arm's file in it"], "no_regular_file"
+        )
     if not exists(path):
-        raise ConfigError([f"{path}, named by {asked_by}, does not exist; name the arm's file"])
+        raise ConfigError([f"{path}, named by {asked_by}, does not exist; name the arm's file"], "no_file")
     return path
 
 
 @cache
 def installed(group: str) -> EntryPoints:
-    """Return the entry points of a group, found once: each time the metadata of every installed package are read."""
+    """Return the entry points of a group, cached: a lookup reads the metadata of every installed package."""
     return entry_points(group=group)
 
 
 def registered(group: str) -> dict[str, EntryPoint]:
-    """Return what installed packages registered in a group of entry points, by name.
+    """Return the entry points that installed packages registered in a group, by name.
 
     Raises:
         PluginError: two packages use the same name.
-        ConfigError: there is none, not even of this package.
+        ConfigError: there is none, although this package registers some.
     """
-    found: dict[str, EntryPoint] = {}
+    entries: dict[str, EntryPoint] = {}
     for entry in sorted(installed(group)):
-        other = found.setdefault(entry.name, entry)
-        if other.value != entry.value:
-            raise PluginError(entry, f"has the name of {other.value}: rename one, or uninstall its package")
-    if not found:
-        raise ConfigError([f"no entry points {group}: the package is older than its metadata; run `make setup`"])
-    return found
+        first = entries.setdefault(entry.name, entry)
+        if first.value != entry.value:
+            raise PluginError(entry, f"has the name of {first.value}: rename one, or uninstall its package")
+    if not entries:
+        raise ConfigError(
+            [f"no entry points {group}: the package is older than its metadata; run `make setup`"], "no_plugins"
+        )
+    return entries
 
 
 def class_of_kind(base: type[T], group: str, kind: str) -> type[T]:
@@ -116,11 +124,11 @@ def class_of_kind(base: type[T], group: str, kind: str) -> type[T]:
 
     Raises:
         ConfigError: no installed package has this kind.
-        PluginError: what is registered does not extend `base`.
+        PluginError: the registered class does not extend `base`.
     """
     kinds = registered(group)
     if kind not in kinds:
-        raise ConfigError([f'kind: found the text "{kind}", allowed is one of {", ".join(sorted(kinds))}'])
+        raise ConfigError([Finding(("kind",), "choice", found=kind, allowed=f"one of {', '.join(sorted(kinds))}")])
     return load_class(kinds[kind], base)
 
 
@@ -143,11 +151,11 @@ def load_class(entry: EntryPoint, base: type[T]) -> type[T]:
         PluginError: it cannot be imported, or does not extend `base`.
     """
     try:
-        found = entry.load()
+        loaded = entry.load()
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # the module of another package: whatever it raises, sys.exit() too
         raise PluginError(entry, f"cannot be loaded: {type(error).__name__}: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, base)):
+    if not (isinstance(loaded, type) and issubclass(loaded, base)):
         raise PluginError(entry, f"is not a subclass of {base.__module__}.{base.__name__}")
-    return found
+    return loaded

@@ -1,4 +1,4 @@
-"""Reads the arm's file and the device files that it names into one frozen `ArmConfig`, or names every mistake."""
+"""Reads the arm's file and its device files into one frozen `ArmConfig`, or lists every mistake."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from kinematics.model import ArmModel, Capsule, DhRow, JointLimit, LinkMass
 from kinematics.pose import Pose
 from rtcp.config import rules
 from rtcp.config.buses import bus_class
-from rtcp.config.document import Document, Finding, KeyPath, read, sentence, shown
+from rtcp.config.document import Document, read
 from rtcp.config.find import class_of_kind, exists
+from rtcp.config.findings import Finding, KeyPath
 from rtcp.config.model import (
     JOINTS,
     MOST_AXES,
@@ -56,7 +57,7 @@ _LONGEST_WATCHDOG_MS = 6000.0
 
 @dataclass(frozen=True)
 class KinematicsFile:
-    """An arm that is only computed with: no slaves, no drives."""
+    """An arm for computation alone: no slaves, no drives."""
 
     name: Name
     kinematics: Kinematics
@@ -66,26 +67,27 @@ class KinematicsFile:
 def _limits(file: KinematicsFile) -> Iterator[Finding]:
     if file.kinematics.limits is None:
         wanted = f"a list of {JOINTS} mappings with the keys {', '.join(keys(MechanicalLimit))}"
-        yield ("kinematics",), f"the key limits is missing; in a file without joints it must be {wanted}"
+        need = f"in a file without joints it must be {wanted}"
+        yield Finding(("kinematics",), "missing", key="limits", need=need)
 
 
 @cache
 def _arm_checker(bus: Any) -> Checker[ArmFile]:
-    """Return what checks the file of an arm on this kind of bus."""
+    """Return the checker of an arm's file on this kind of bus."""
     keys_of_bus = [("bus", bus, field(default_factory=bus))]
     return Checker(make_dataclass(ArmFile.__name__, keys_of_bus, bases=(ArmFile,), frozen=True), RENAMED)
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """The first word of `bus`, which decides what its other keys are."""
+    """The key of `bus` that determines its other keys."""
 
     kind: Name = "ethercat"
 
 
 @dataclass(frozen=True)
 class _NamedKind:
-    """The first word of a process."""
+    """The key of a process that determines its other keys."""
 
     kind: Name
 
@@ -107,18 +109,18 @@ def load(path: Path) -> ArmConfig:
     nodes = _nodes(document.data, bus, cycle)
     missing += _complete(document.data, bus, nodes)
     devices = {slave.device.name: slave.device for slave in nodes}
-    in_devices: list[str] = []
+    in_devices: list[Finding] = []
     for key, where in _devices_named(document.data):
         file = device_path(path, key)
         if key in devices:
             continue
         if not exists(file):
-            missing.append((where, _no_device(key, file)))
+            missing.append(_no_device(where, key, file))
             continue
         try:
             devices[key] = load_device(file, cycle.period_us if cycle else None)
         except ConfigError as error:
-            in_devices += error.problems
+            in_devices += error.findings
     drives = FileRule(("slaves", "joints", "gripper"), partial(rules.drive_findings, devices=devices))
     terminals = FileRule(("slaves", "inputs", "outputs", "gripper"), partial(rules.terminal_findings, devices=devices))
     suits = FileRule((EVERY_KEY,), lambda arm: arm.bus.findings(arm))
@@ -129,21 +131,22 @@ def load(path: Path) -> ArmConfig:
     findings += missing + wrong
     if "joints" not in data and not document.data.get("processes"):
         wanted = f"a list of 1 to {MOST_AXES} mappings with the keys {', '.join(keys(Joint))}"
-        findings.append(((), f"the key joints is missing; it must be {wanted}; a platform of processes has none"))
+        need = f"it must be {wanted}; a platform of processes has none"
+        findings.append(Finding((), "missing", key="joints", need=need))
     elif data.get("joints") == [] and not document.data.get("processes"):
-        findings.append((("joints",), f"found a list of 0, allowed are 1 to {MOST_AXES} joints"))
+        findings.append(Finding(("joints",), "size", found=0, allowed=f"1 to {MOST_AXES} joints"))
     if arm is not None:
         described = {slave.name: slave.device for slave in nodes} or {
             slave.name: devices[slave.device] for slave in arm.slaves if slave.device in devices
         }
         findings += [
-            (("processes", number, *where), text)
+            finding.below("processes", number)
             for number, process in enumerate(processes)
-            for where, text in process.findings(described)
+            for finding in process.findings(described)
         ]
         findings += _shared_channels(processes)
     if findings or in_devices or arm is None:
-        raise ConfigError(document.sentences(findings) + in_devices)
+        raise ConfigError(document.placed(findings) + in_devices)
     models = () if arm.kinematics is None else _arm_models(document, arm.name, arm.kinematics, arm.joints)
     return ArmConfig(
         **{entry.name: getattr(arm, entry.name) for entry in fields(ArmSettings) if entry.name != "processes"},
@@ -156,40 +159,41 @@ def load(path: Path) -> ArmConfig:
         arm=models[0] if models else None,
         other_tools=models[1:],
         source=path,
-        warnings=tuple(document.sentences(rules.implausible(arm))),
+        warnings=tuple(map(str, document.placed(rules.implausible(arm)))),
     )
 
 
 def _bus_of(document: Document) -> tuple[type[BusConfig], BusConfig, list[Finding]]:
-    """Return the kind of bus that a file names, its keys where they are valid, and what is wrong with the kind."""
+    """Return a file's kind of bus, its keys if they are valid, and the findings of the kind."""
     data = document.data.get("bus", {})
     kind: type[BusConfig] = EthercatBus
     findings: list[Finding] = []
     if isinstance(data, dict) and "kind" in data:
         named, findings = Checker(_Kind).check({"kind": data["kind"]})
-        findings = [(("bus", *where), text) for where, text in findings]
+        findings = [finding.below("bus") for finding in findings]
         if named is not None:
             try:
                 kind = bus_class(named.kind)
             except PluginError:
                 raise
             except ConfigError as error:
-                findings = [(("bus", "kind"), error.problems[0].partition(": ")[2])]
+                findings = [finding.below("bus") for finding in error.findings]
     bus, _ = Checker(kind).check(data)
     return kind, bus or kind(), findings
 
 
 def _processes_of(document: Document) -> tuple[tuple[ProcessConfig, ...], list[Finding]]:
-    """Return the processes of a file, where they are valid, and what is wrong with them."""
+    """Return the valid processes of a file, and the findings of the others."""
     entries = document.data.get("processes", [])
     if not isinstance(entries, list):
-        return (), [(("processes",), f"found {shown(entries)}, allowed is a list of mappings with the key kind")]
-    made: list[ProcessConfig] = []
+        wanted = "a list of mappings with the key kind"
+        return (), [Finding(("processes",), "type", found=entries, allowed=wanted)]
+    processes: list[ProcessConfig] = []
     findings: list[Finding] = []
     for number, entry in enumerate(entries):
         where = ("processes", number)
         named, wrong = _NAMED_KIND.check({"kind": entry.get("kind")} if isinstance(entry, dict) else entry)
-        findings += [((*where, *at), text) for at, text in wrong]
+        findings += [finding.below(*where) for finding in wrong]
         if named is None:
             continue
         try:
@@ -197,29 +201,29 @@ def _processes_of(document: Document) -> tuple[tuple[ProcessConfig, ...], list[F
         except PluginError:
             raise
         except ConfigError as error:
-            findings.append(((*where, "kind"), error.problems[0].partition(": ")[2]))
+            findings += [finding.below(*where) for finding in error.findings]
             continue
         process, wrong = Checker(kind).check(entry)
-        findings += [((*where, *at), text) for at, text in wrong]
+        findings += [finding.below(*where) for finding in wrong]
         if process is not None:
-            if process.name in [other.name for other in made]:
-                findings.append(((*where, "name"), f'found the text "{process.name}" twice, allowed is a name each'))
-            made.append(process)
-    return tuple(made), findings
+            if process.name in [earlier.name for earlier in processes]:
+                findings.append(
+                    Finding((*where, "name"), "twice", found=process.name, unit=" twice", allowed="a name each")
+                )
+            processes.append(process)
+    return tuple(processes), findings
 
 
 def _shared_channels(processes: Sequence[ProcessConfig]) -> Iterator[Finding]:
-    """Yield what two processes would write, and a second one of a kind: its commands would be the first one's."""
+    """Yield channels that two processes would write, and a second process of a kind, whose commands collide."""
     written: dict[str, int] = {}
     kinds: dict[str, int] = {}
     for number, process in enumerate(processes):
         if (first := kinds.setdefault(process.kind, number)) != number:
-            text = f'found the text "{process.kind}", the kind of processes[{first}]; allowed is one of a kind'
-            yield ("processes", number, "kind"), text
+            yield Finding(("processes", number, "kind"), "kind_twice", found=process.kind, of=f"processes[{first}]")
         for key, image, channel in process.channels():
             if image == "rpdo" and (first := written.setdefault(channel, number)) != number:
-                text = f'found the text "{channel}", which processes[{first}] writes; allowed is a channel each'
-                yield ("processes", number, key), text
+                yield Finding(("processes", number, key), "channel_written", found=channel, of=f"processes[{first}]")
 
 
 def _nodes(data: Any, bus: BusConfig, cycle: CycleConfig | None) -> tuple[SlaveConfig, ...]:
@@ -230,21 +234,21 @@ def _nodes(data: Any, bus: BusConfig, cycle: CycleConfig | None) -> tuple[SlaveC
 
 
 def _complete(data: Any, bus: BusConfig, nodes: Sequence[SlaveConfig]) -> list[Finding]:
-    """Add to the file of an arm on a bus without slaves what its bus says: slaves, and which of them moves a joint."""
+    """Add slaves, and the one of each joint, to the file of an arm on a bus without slaves; return its findings."""
     if not nodes:
         return []
     findings: list[Finding] = []
     if "slaves" in data:
-        findings.append((("slaves",), f"a bus of kind {bus.kind} has no slaves: leave it out"))
+        findings.append(Finding(("slaves",), "bus_without_slaves", bus=bus.kind))
     data["slaves"] = [{"name": slave.name, "device": slave.device.name} for slave in nodes]
     for i, joint in enumerate(data["joints"] if isinstance(data.get("joints"), list) else ()):
         if isinstance(joint, dict):
             if "slave" in joint:
-                findings.append((("joints", i, "slave"), f"a bus of kind {bus.kind} has no slaves: leave it out"))
+                findings.append(Finding(("joints", i, "slave"), "bus_without_slaves", bus=bus.kind))
             joint["slave"] = joint.get("name")
             if "torque" in bus.LACKS:
                 if "torque" in joint:
-                    findings.append((("joints", i, "torque"), f"{bus.LACKS['torque']}: leave it out"))
+                    findings.append(Finding(("joints", i, "torque"), "bus_without_torque", lack=bus.LACKS["torque"]))
                 joint["torque"] = UNLIMITED_TORQUE
     return findings
 
@@ -261,18 +265,18 @@ def load_device(path: Path, period_us: float | None = None) -> DeviceDescription
     document.data, missing = _with_factors(document.data)
     device, findings = _DEVICE.check(document.data, *more)
     if device is None or missing:
-        raise ConfigError(document.sentences(findings + missing))
+        raise ConfigError(document.placed(findings + missing))
     return device
 
 
 def _with_factors(data: Any) -> tuple[Any, list[Finding]]:
-    """Return a device's file with the factors that follow from its scaling, and what the scaling says too little for.
+    """Return a device's file with the factors that follow from its scaling, and findings where they cannot.
 
-    A factor that is written must be the same. What is no valid scaling is left to the checker.
+    A factor in the file must be the same. An invalid scaling is left to the checker.
     """
     written = data.get("scaling")
-    made = [_SCALING.check(entry)[0] for entry in written] if isinstance(written, list) else []
-    if not made or None in made:
+    scalings = [_SCALING.check(entry)[0] for entry in written] if isinstance(written, list) else []
+    if not scalings or None in scalings:
         return data, []
     findings: list[Finding] = []
     images: dict[str, Any] = {}
@@ -290,20 +294,21 @@ def _with_factors(data: Any) -> tuple[Any, list[Finding]]:
                 if quantity is None:
                     continue
                 axis = channel.get("axis") or pdo.get("axis", 1)
-                scaling = made[0] if len(made) == 1 else made[axis - 1] if axis in range(1, len(made) + 1) else None
+                number = 1 if len(scalings) == 1 else axis
+                scaling = scalings[number - 1] if number in range(1, len(scalings) + 1) else None
                 factor = None if scaling is None else scaling.factor(quantity)
                 if "factor" in channel:
-                    found = channel["factor"]
-                    if factor is None or not isinstance(found, int | float):
+                    stated = channel["factor"]
+                    if factor is None or not isinstance(stated, int | float):
                         continue
-                    if not math.isclose(found, factor, rel_tol=FACTOR_TOLERANCE):
-                        text = f"found {found:.10g}, but from scaling follows {factor:.10g}: leave it out"
-                        findings.append(((image, i, "channels", j, "factor"), text))
+                    if not math.isclose(stated, factor, rel_tol=FACTOR_TOLERANCE):
+                        where = (image, i, "channels", j, "factor")
+                        findings.append(Finding(where, "unlike_scaling", found=stated, scaled=factor))
                 elif factor is not None:
                     images[image][-1]["channels"][-1] = {**channel, "factor": factor}
                 elif scaling is not None:
-                    text = "the key factor is missing; without it scaling needs rated_torque, or rated_current and "
-                    findings.append(((image, i, "channels", j), f"{text}torque_constant"))
+                    need = "without it scaling needs rated_torque, or rated_current and torque_constant"
+                    findings.append(Finding((image, i, "channels", j), "missing", key="factor", need=need))
     return {**data, **{image: pdos for image, pdos in images.items() if image in data}}, findings
 
 
@@ -320,8 +325,8 @@ def load_kinematics(path: Path) -> ArmModel:
     if _is_whole_arm(document):
         arm = load(path).arm
         if arm is None:
-            finding = f"the key kinematics is missing; it must be {allowed(Kinematics)}"
-            raise ConfigError(document.sentences([((), finding)]))
+            finding = Finding((), "missing", key="kinematics", need=f"it must be {allowed(Kinematics)}")
+            raise ConfigError(document.placed([finding]))
         return arm
     file = _KINEMATICS.read(document)
     return _arm_models(document, file.name, file.kinematics, ())[0]
@@ -348,14 +353,14 @@ def joints_of(path: Path) -> tuple[Joint, ...]:
 
 
 def device_path(arm: Path, key: str) -> Path:
-    """Return the file of a device: `devices/<key>.yaml` beside the arm's file, or the path that the key is."""
+    """Return the file of a device: `devices/<key>.yaml` beside the arm's file, or `key` as a path."""
     if "/" in key or key.endswith((".yaml", ".yml")):
         return arm.parent / key
     return arm.parent / "devices" / f"{key}.yaml"
 
 
 def segment_path(config: ArmConfig) -> Path:
-    """Return the file of the virtual segment's slaves, which the arm's file names."""
+    """Return the file of the virtual segment that the arm's file names."""
     return config.source.parent / config.bus.segment
 
 
@@ -367,9 +372,9 @@ def with_period(config: ArmConfig, period_us: float) -> ArmConfig:
     """
     cycle, findings = _CYCLE.check({**asdict(config.cycle), "period_us": period_us})
     if cycle is None:
-        raise ConfigError(f"cycle.{sentence(finding)}" for finding in findings)
+        raise ConfigError(finding.below("cycle") for finding in findings)
     problems = [
-        f"{device.name}: {sentence(finding)}"
+        finding.within(f"{device.name}: ")
         for device in {slave.device.name: slave.device for slave in config.slaves}.values()
         for finding in rules.period_findings(device, period_us)
     ]
@@ -382,22 +387,22 @@ def with_control_mode(config: ArmConfig, control_mode: ControlModeName) -> ArmCo
     """Return the same arm with another control mode at its start, as `rtcp start --mode` asks for.
 
     Raises:
-        ConfigError: the arm lacks what this mode needs: its geometry, a joystick.
+        ConfigError: the arm lacks the geometry or joystick that this mode needs.
     """
     geometry, joystick = config.arm is not None, config.inputs.joystick is not None
-    if finding := rules.missing_for(control_mode, geometry=geometry, joystick=joystick):
-        raise ConfigError([f"control_mode: {finding}"])
+    if lacking := [*rules.missing_for(control_mode, geometry=geometry, joystick=joystick)]:
+        raise ConfigError(lacking)
     return replace(config, control_mode=control_mode)
 
 
 def widen(config: ArmConfig) -> ArmConfig:
     """Return the configuration with `bus.timeout_scale` applied: only where its bus is `virtual`.
 
-    Master and virtual slaves are processes of one host: where it takes the CPU away for 30 ms, as virtual machines do,
-    both stand still, and a limit that suits a cable would end every second run. Multiplied are `bus.lost_cycles`,
+    Master and virtual slaves are processes of one host: when it takes the CPU away for 30 ms, as virtual machines do,
+    both stand still, and a limit that suits a cable would end every second run. The scale multiplies `bus.lost_cycles`,
     `watchdog_ms` of every device, up to 3 s `lease_s`, up to 5 s `bus.clock_lost_s`. The sync error counter limit among
-    its start-up SDOs (0x10F1:02, ETG.1020) becomes 0, which disables that check: a missed SYNC0 counts 3 and one that
-    is met takes 1 away, so that a host which loses a quarter of its ticks exceeds any limit in the end.
+    the start-up SDOs (0x10F1:02, ETG.1020) becomes 0, which disables that check: the counter rises by 3 at a missed
+    SYNC0 and falls by 1 at any other, so that a host which misses a quarter of its ticks exceeds any limit in the end.
     """
     scale = config.bus.timeout_scale
     if config.bus.interface != VIRTUAL or scale == 1:
@@ -426,7 +431,7 @@ def _is_whole_arm(document: Document) -> bool:
 
 
 def _devices_named(data: Any) -> Iterator[tuple[str, KeyPath]]:
-    """Yield the devices that an arm's file names, each with its first place, whatever else is wrong with the file."""
+    """Yield the devices that an arm's file names, each with its first place; works on files with mistakes."""
     slaves = data.get("slaves")
     named: set[str] = set()
     for i, slave in enumerate(slaves if isinstance(slaves, list) else ()):
@@ -437,9 +442,9 @@ def _devices_named(data: Any) -> Iterator[tuple[str, KeyPath]]:
 
 
 def _arm_models(document: Document, name: str, part: Kinematics, joints: Sequence[Joint]) -> tuple[ArmModel, ...]:
-    """Return the model of an arm with each tool; where it has `joints`, their names, ranges and speeds are its own."""
+    """Return the model of an arm with each tool; names, ranges and speeds are those of `joints`, if it has any."""
     try:
-        limits = tuple(JointLimit(one.position.min, one.position.max, one.velocity) for one in joints)
+        limits = tuple(JointLimit(joint.position.min, joint.position.max, joint.velocity) for joint in joints)
         bare = ArmModel(
             name=name,
             rows=tuple(DhRow(row.alpha, row.a, row.d, row.offset) for row in part.dh),
@@ -452,7 +457,7 @@ def _arm_models(document: Document, name: str, part: Kinematics, joints: Sequenc
         )
         return tuple(_with_tool(bare, tool) for tool in part.every_tool)
     except ValueError as error:
-        raise ConfigError(document.sentences([(("kinematics",), str(error))])) from error
+        raise ConfigError(document.placed([Finding(("kinematics",), "no_arm_model", text=str(error))])) from error
 
 
 def _with_tool(bare: ArmModel, tool: NamedTool) -> ArmModel:
@@ -482,10 +487,10 @@ def _point(vector: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _mechanical(limits: Sequence[MechanicalLimit]) -> tuple[JointLimit, ...]:
-    return tuple(JointLimit(one.min, one.max, one.velocity or math.inf) for one in limits)
+    return tuple(JointLimit(limit.min, limit.max, limit.velocity or math.inf) for limit in limits)
 
 
-def _no_device(key: str, file: Path) -> str:
-    there = sorted(other.stem for other in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
+def _no_device(where: KeyPath, key: str, file: Path) -> Finding:
+    there = sorted(device.stem for device in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
     listed = f"in {file.parent} are {', '.join(there)}" if there else f"{file.parent} holds no device files"
-    return f'found the text "{key}", but there is no file {file}; {listed}'
+    return Finding(where, "no_device", found=key, file=file, there=listed)

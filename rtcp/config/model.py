@@ -1,8 +1,8 @@
 """The model of every configuration file: frozen dataclasses with their ranges, SI units throughout.
 
 This module imports nothing heavy: the loop's process holds these objects and no validator. `rtcp.config.validation`
-checks the ranges, `rtcp.config.rules` what concerns more than one value. The tables in docs/configuration.md are made
-of the attribute docstrings here.
+checks the ranges, `rtcp.config.rules` relations between values. The tables in docs/configuration.md are made of the
+attribute docstrings here.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args, get_ty
 from annotated_types import Ge, Gt, Le, MaxLen, MinLen
 
 from kinematics.model import ArmModel
+from rtcp.config.findings import Finding
 from rtcp.config.numbers import (
     U8,
     U16,
@@ -41,7 +42,7 @@ from rtcp.config.scaling import OBJECTS_PER_AXIS, DriveScaling
 
 
 class HasBox(Protocol):
-    """What hangs on an IO box."""
+    """A part of the configuration that is connected to an IO box."""
 
     @property
     def box(self) -> str | None:
@@ -49,7 +50,7 @@ class HasBox(Protocol):
 
 
 CHANNEL_KINDS = frozenset({"analog", "encoder", "coupler", "generic"})
-"""Kinds of device of which nothing is known but their channels."""
+"""Kinds of device that have channels without a function."""
 PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator", "tool"})
 """Parts of the cycle that are no devices: their fields have names of their own."""
 VIRTUAL = "virtual"
@@ -57,13 +58,13 @@ VIRTUAL = "virtual"
 JOINTS = 6
 """Joints of an arm that has `kinematics`."""
 MOST_AXES = 10
-"""Joints, a gripper's among them: as many as commands, plans and recordings have room for."""
+"""Most joints, a gripper's among them, that commands, plans and recordings can hold."""
 UNLIMITED_TORQUE = 1e9
-"""Nm; the limit of joints whose torque nobody measures."""
+"""Limit of joints whose torque is not measured, Nm."""
 MOST_TOOLS = 16
-"""Tools of an arm."""
+"""Most tools of an arm."""
 MOST_POINTS = 4096
-"""Points or poses of a motion file."""
+"""Most points or poses of a motion file."""
 
 NumberTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int24", "uint24", "int32", "uint32",
                          "int40", "uint40", "int48", "uint48", "int56", "uint56", "int64", "uint64",
@@ -74,32 +75,34 @@ BITS: dict[str, int] = {
     "int40": 40, "uint40": 40, "int48": 48, "uint48": 48, "int56": 56, "uint56": 56, "int64": 64, "uint64": 64,
     "float32": 32, "float64": 64,
 }  # fmt: skip
-"""Lengths of the types that have one; `bits` and `bytes` are as long as their entry says."""
+"""Lengths of the types in bits; the entry sets that of `bits` and `bytes`."""
 LARGEST = {"float32": (2.0 - 2.0**-23) * 2.0**127, "float64": sys.float_info.max}
 """Largest finite values of the types that are no integers."""
 AxisNumber = Annotated[int, Ge(1), Le(8)]
-"""Axis of a drive, from 1: its objects stand 0x800 above those of the one before (CiA 402)."""
+"""Axis of a drive, from 1: its objects are 0x800 above those of the axis before (CiA 402)."""
 DriveModeName = Literal["csp", "csv", "cst"]
 MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "csp": ((), ()),
     "csv": (("target_velocity", "modes_of_operation"), ("velocity",)),
     "cst": (("target_torque", "modes_of_operation"), ("velocity", "torque")),
 }
-"""Channels of rpdo and of tpdo that a drive mode needs beside those that every CiA 402 drive needs."""
+"""Channels of rpdo and of tpdo that a drive mode needs beside those of every CiA 402 drive."""
 ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
 FrameName = Literal["base", "tool"]
 Level = Literal["high", "low"]
 RecordingFormat = Literal["mcap", "csv"]
 HardStop = Literal["quick_stop", "torque_off"]
-"""Reactions where setpoints cannot be executed or trusted: the drives stop by themselves."""
+"""Reactions when setpoints cannot be executed or trusted: the drives stop by themselves."""
 AnyStop = Literal["controlled_stop", "quick_stop", "torque_off"]
 
 
 class ConfigError(Exception):
-    """A configuration that cannot be used; `problems` holds one sentence per mistake, all of them at once."""
+    """A configuration that cannot be used: `findings` holds every mistake, `problems` one sentence for each."""
 
-    def __init__(self, problems: Iterable[str]) -> None:
-        self.problems = list(problems)
+    def __init__(self, mistakes: Iterable[Finding | str], code: str = "other") -> None:
+        """Take findings, or sentences, which get this code."""
+        self.findings = [Finding((), code, text=error) if isinstance(error, str) else error for error in mistakes]
+        self.problems = [str(finding) for finding in self.findings]
         super().__init__("\n".join(self.problems))
 
 
@@ -107,7 +110,7 @@ class PluginError(ConfigError):
     """A class that an installed package registered cannot be used."""
 
     def __init__(self, entry: EntryPoint, problem: str) -> None:
-        super().__init__([f"entry point {entry.name} = {entry.value} of {entry.group} {problem}"])
+        super().__init__([f"entry point {entry.name} = {entry.value} of {entry.group} {problem}"], "plugin")
 
 
 # -- devices: config/devices/*.yaml ------------------------------------------------------------------------------------
@@ -151,7 +154,7 @@ class PdoEntry:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Smallest and largest value that it is given, SI: of `min` and `max`, and of the type."""
+        """Smallest and largest value that is sent, SI: by `min` and `max`, and by the type."""
         ends = sorted(end * self.factor + self.offset for end in type_range(self.type, self.length))
         low, high = max(ends[0], -LARGEST["float64"]), min(ends[1], LARGEST["float64"])
         return (
@@ -186,7 +189,7 @@ class Pdo:
     fixed: bool = False
     """True: its entries are fixed in the device; only its assignment is written."""
     start_address: U16 = 0
-    """First register that it carries, where its sync manager is a virtual one; 0: it is a real one."""
+    """First register that it carries, if its sync manager is a virtual one; 0: it is a real one."""
     axis: AxisNumber = 1
     """Axis of a drive with several that the channels belong to."""
 
@@ -282,7 +285,7 @@ class DeviceDescription:
 
     @property
     def is_box(self) -> bool:
-        """Whether inputs and outputs with a function may hang on it: it maps channels of these names."""
+        """Whether inputs and outputs with a function may be on it: it maps channels of these names."""
         if self.kind in ("io", "cia402") or self.has_channels:
             return self.kind == "io"
         mapped = [{entry.name for pdo in pdos for entry in pdo.channels} for pdos in (self.rpdo, self.tpdo)]
@@ -291,8 +294,8 @@ class DeviceDescription:
     @property
     def axes(self) -> tuple[int, ...]:
         """The axes that its channels belong to."""
-        found = {pdo.axis_of(entry) for pdo in (*self.rpdo, *self.tpdo) for entry in pdo.channels if entry.index}
-        return tuple(sorted(found)) or (1,)
+        axes = {pdo.axis_of(entry) for pdo in (*self.rpdo, *self.tpdo) for entry in pdo.channels if entry.index}
+        return tuple(sorted(axes)) or (1,)
 
     def of_axis(self, axis: int) -> DeviceDescription:
         """Return the description with the channels of the other axes as padding."""
@@ -301,18 +304,18 @@ class DeviceDescription:
         return replace(self, rpdo=_of_axis(self.rpdo, axis), tpdo=_of_axis(self.tpdo, axis))
 
     def scaling_of(self, axis: int) -> DriveScaling | None:
-        """Return what an axis counts in; None: only the factors say it."""
+        """Return the scaling of an axis; None: its channels have factors alone."""
         if len(self.scaling) == 1:
             return self.scaling[0]
         return self.scaling[axis - 1] if axis <= len(self.scaling) else None
 
     def startup(self, index: int, axis: int = 1) -> float | None:
-        """Return what the start-up SDOs write to an object (subindex 0) of an axis; `index`: that of the first axis."""
+        """Return the start-up SDO's value of an object (subindex 0) of an axis; `index`: that of the first axis."""
         index += (axis - 1) * OBJECTS_PER_AXIS
         return next((sdo.value for sdo in reversed(self.sdo) if (sdo.index, sdo.sub_index) == (index, 0)), None)
 
     def wire_range(self, channel: str) -> tuple[float, float]:
-        """Return the range of a channel to the device, SI; infinite where it does not exist."""
+        """Return the range of a channel to the device, SI; infinite if it does not exist."""
         for entry in (entry for pdo in self.rpdo for entry in pdo.channels):
             if entry.name == channel:
                 return entry.range
@@ -356,7 +359,7 @@ class SlaveEntry:
     device: Name
     """Device file: `devices/NAME.yaml` beside the arm's file, or a path that ends in .yaml."""
     alias: U16 = 0
-    """Station alias by which the slave is found wherever it hangs; 0: by its place among those without."""
+    """Station alias, which identifies the slave at any place; 0: identified by its place among slaves without."""
 
 
 @dataclass(frozen=True)
@@ -368,7 +371,7 @@ class SlaveConfig:
     file: str = ""
     """Path of the device's file; empty: made by a program."""
     alias: int = 0
-    """Station alias by which it is found; 0: by its place."""
+    """Station alias; 0: the slave is identified by its place."""
 
 
 @dataclass(frozen=True)
@@ -411,7 +414,7 @@ class Joint:
 
     @property
     def place(self) -> str:
-        """The drive that moves it, in words: slave, and axis beyond the first."""
+        """The drive that moves it, in words: slave, and axis if it is not the first."""
         return self.slave if self.axis == 1 else f"{self.slave}, axis {self.axis}"
 
 
@@ -448,8 +451,8 @@ class CycleConfig:
 
 
 Capability = Literal["sdo", "states", "clocks", "torque", "homing", "power"]
-"""What a bus may offer beside process data: SDO, supervision of slaves by AL states, distributed clocks; and what its
-drives may: torque targets and measured torque, homing, switching their power on."""
+"""Capabilities of a bus beside process data: SDO, supervision of slaves by AL states, distributed clocks; and of its
+drives: torque targets and measured torque, homing, switching their power on."""
 
 
 @dataclass(frozen=True)
@@ -465,21 +468,21 @@ class BusConfig:
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
     """Lost cycles (wrong working counter) that are a fault: in a row, or more than good ones."""
     timeout_scale: Annotated[float, Ge(1), Le(100)] = 100.0
-    """Factor on limits that a slow host exceeds, on the virtual bus alone: [real time](realtime.md)."""
+    """Factor on time limits on the virtual bus, where the host may be slow: [real time](realtime.md)."""
     op_timeout_s: Positive = 5.0
     """Timeout for all slaves from INIT to OP, s."""
 
     MASTER: ClassVar[str] = ""
-    """Class of the loop's side, `module:name`; see `rtcp.fieldbus.master.Master`."""
+    """Class of the loop's end, `module:name`; see `rtcp.fieldbus.master.Master`."""
     VIRTUAL_PROCESS: ClassVar[tuple[str, ...]] = ()
-    """Module and options of the process that is the other side where `interface` is `virtual`."""
+    """Module and options of the process at the other end if `interface` is `virtual`."""
     VIRTUAL_CONTROL: ClassVar[str] = "segment"
     """Name of that process's control socket: `segment` or `irc5`."""
     LACKS: ClassVar[Mapping[Capability, str]] = {}
-    """Why the bus does not offer something, a sentence each."""
+    """Capabilities that the bus lacks, with a sentence why."""
 
     def nodes(self, joints: Sequence[str], period_us: float) -> tuple[SlaveConfig, ...]:
-        """Return what is on a bus that has no slaves: each joint by its name, then others; none: the file lists slaves.
+        """Return the nodes of a bus without slaves: each joint by its name, then others; none: the file lists slaves.
 
         Args:
             joints: names of the joints.
@@ -487,8 +490,8 @@ class BusConfig:
         """
         return ()
 
-    def findings(self, arm: ArmFile) -> Iterator[tuple[tuple[str | int, ...], str]]:
-        """Yield what of a whole file does not suit this bus: key path and the rest of the sentence."""
+    def findings(self, arm: ArmFile) -> Iterator[Finding]:
+        """Yield the values of a whole file that this bus does not support."""
         yield from ()
 
 
@@ -621,15 +624,15 @@ class StopsConfig:
     drive_fault: HardStop = "quick_stop"
     """A drive is in fault or has left Operation Enabled by itself: the reaction of all others."""
     clock_lost: AnyStop = "quick_stop"
-    """The cycle has not followed the reference clock for `bus.clock_lost_s`."""
+    """The cycle was not locked to the reference clock for `bus.clock_lost_s`."""
     emergency_stop: HardStop = "quick_stop"
-    """The emergency stop input is active: torque goes off at standstill (category 1), or at once (category 0)."""
+    """The emergency stop input is active: torque goes off at standstill (category 1) or at once (category 0)."""
     supervision: HardStop = "quick_stop"
-    """A measured value exceeds a limit of `supervision`; categories as for the emergency stop."""
+    """Speed, torque or following error exceeded its limit for `supervision.cycles`: category 1 or 0 likewise."""
     lease_ended: AnyStop = "controlled_stop"
-    """The commander of a motion was silent for `lease_s`, or its connection closed."""
+    """The commander of a motion was silent for `lease_s`, released its lease, or its connection closed."""
     enabling_switch: AnyStop = "controlled_stop"
-    """The enabling switch was released during a motion."""
+    """The enabling switch was released while something moves."""
 
 
 @dataclass(frozen=True)
@@ -723,7 +726,7 @@ class OutputsConfig:
 
 @dataclass(frozen=True)
 class RecordingConfig:
-    """What is recorded and where to; as `recording` in the arm's file it starts with the platform."""
+    """Content and place of a recording; as `recording` in the arm's file it starts with the platform."""
 
     out: str | None = None
     """Absolute path of a directory, or of a file; none: `recordings/` in the platform's state directory."""
@@ -750,20 +753,20 @@ class SimpleMessageConfig:
     """Where Simple Message is served; see [Simple Message](simple_message.md)."""
 
     bind: str = "127.0.0.1"
-    """Address; whoever reaches it can move the arm."""
+    """Address that it listens at; any client that reaches it can move the arm."""
     motion_port: Annotated[int, Ge(0), Le(65535)] = 11000
     """TCP port; 0: a free one, which the log names."""
     state_port: Annotated[int, Ge(0), Le(65535)] = 11002
     """TCP port; 0: a free one, which the log names."""
     byte_order: Literal["auto", "little", "big"] = "auto"
-    """Of the clients; auto: as they speak, else little."""
+    """Byte order of the clients; auto: that of their messages, else little."""
     joint_feedback: bool = False
     """Whether velocities are sent too, which the reference client complains of."""
 
 
 @dataclass(frozen=True)
 class RosConfig:
-    """What serves ROS as long as the platform runs."""
+    """Services for ROS that run as long as the platform."""
 
     simple_message: SimpleMessageConfig = field(default_factory=SimpleMessageConfig)
 
@@ -787,7 +790,7 @@ class MechanicalLimit:
     """Mechanical range and speed of a joint."""
 
     min: Angle
-    """Lower mechanical end, rad; `limits` left out: those of `joints`."""
+    """Lower mechanical end, rad; without `limits`: the ranges of `joints`."""
     max: Angle
     """Upper mechanical end, rad; greater than `min`."""
     velocity: Speed | None = None
@@ -859,7 +862,7 @@ class NamedTool:
 
 @dataclass(frozen=True)
 class PayloadConfig:
-    """What the tool may hold."""
+    """Limits of the payload."""
 
     max_mass: NotNegative = 0.0
     """Largest mass that `rtcp payload` accepts, kg; 0: none."""
@@ -878,7 +881,7 @@ class Kinematics:
 
     @property
     def every_tool(self) -> tuple[NamedTool, ...]:
-        """The tools; where none is named, the only one."""
+        """The tools; if none is named, the only one."""
         return self.tools or (NamedTool(ArmModel.tool_name, self.tool.position, self.tool.rpy),)
 
 
@@ -903,25 +906,22 @@ class ProcessConfig:
     COMMANDS: ClassVar[tuple[type[Any], ...]] = ()
     """Commands (`rtcp.ipc.commands.Command`) that it accepts; no other part of the platform does."""
     STATES: ClassVar[type[IntEnum] | None] = None
-    """Meaning of its field `state`, where it has one; for status and panel."""
+    """States of its field `state`, if it has one; for status and panel."""
     LAMPS: ClassVar[Mapping[str, str]] = {}
-    """Lamps on the panel: by their colour the key of the channel that each shows."""
+    """Lamps on the panel: colour -> key of the displayed channel."""
     PLOT: ClassVar[tuple[str, ...]] = ()
     """Fields that the panel draws over time."""
 
-    def findings(self, devices: Mapping[str, DeviceDescription]) -> Iterator[tuple[tuple[str | int, ...], str]]:
-        """Yield what does not suit the slaves, by name: key path and the rest of the sentence."""
+    def findings(self, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
+        """Yield the channels that the slaves, by name, lack or that cannot be used."""
         used: dict[str, str] = {}
         for key, image, text in self.channels():
             slave, _, channel = text.partition(".")
             if slave in devices and all(
-                channel in (entry.name for pdo in getattr(devices[slave], one) for entry in pdo.channels)
-                for one in ("rpdo", "tpdo")
+                channel in (entry.name for pdo in getattr(devices[slave], direction) for entry in pdo.channels)
+                for direction in ("rpdo", "tpdo")
             ):
-                yield (
-                    (key,),
-                    f'found the text "{text}", a channel that {slave} both sends and receives: rename one of them',
-                )
+                yield Finding((key,), "channel_of_both", found=text, of=slave)
             mapped = [
                 entry.name
                 for pdo in (getattr(devices[slave], image) if slave in devices else ())
@@ -929,17 +929,13 @@ class ProcessConfig:
                 if entry.index
             ]
             if slave not in devices:
-                yield (key,), f'found the text "{text}", allowed is SLAVE.CHANNEL with one of {", ".join(devices)}'
+                yield Finding((key,), "channel", found=text, allowed=f"SLAVE.CHANNEL with one of {', '.join(devices)}")
             elif devices[slave].is_box:
-                yield (
-                    (key,),
-                    f'found the text "{text}", of an IO box: its terminals are those of `inputs` and `outputs`',
-                )
+                yield Finding((key,), "channel_of_box", found=text)
             elif channel not in mapped:
-                known = ", ".join(mapped) or "none"
-                yield (key,), f'found the text "{text}", allowed are the channels in `{image}` of {slave}: {known}'
+                yield Finding((key,), "no_channel", found=text, image=image, of=slave, allowed=mapped or "none")
             elif image == "rpdo" and text in used:
-                yield (key,), f'found the text "{text}", which {used[text]} writes already: allowed is a channel each'
+                yield Finding((key,), "channel_written", found=text, of=used[text])
             used[text] = key
 
     def channels(self) -> Iterator[tuple[str, Literal["tpdo", "rpdo"], str]]:
@@ -953,7 +949,7 @@ class ProcessConfig:
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """What the arm's file and the configuration made of it have in common."""
+    """Settings both of the arm's file and of the configuration made of it."""
 
     name: Name
     """Name of the arm, also of its file of zero offsets."""
@@ -963,7 +959,7 @@ class ArmSettings:
     drive_mode: DriveModeName = "csp"
     """Drive mode at the start: cyclic synchronous position, velocity or torque; `rtcp mode` changes it."""
     control_mode: ControlModeName = "joint"
-    """Commands that the arm takes at the start; see [control modes](configuration.md#control-modes)."""
+    """Control mode at the start; see [control modes](configuration.md#control-modes)."""
     enable_timeout_s: Positive = 3.0
     """Timeout until all drives are enabled, or without torque, s."""
     lease_s: Positive = 0.5
@@ -986,14 +982,14 @@ class ArmSettings:
 
     @property
     def axes(self) -> tuple[Joint, ...]:
-        """Everything that drives move: the joints, from base to tool, then the gripper's where it has a drive."""
+        """All driven axes: the joints, from base to tool, then the gripper's if it has a drive."""
         driven = self.gripper.joint if self.gripper else None
         return self.joints if driven is None else (*self.joints, driven)
 
 
 @dataclass(frozen=True)
 class ArmFile(ArmSettings):
-    """The arm's file as it is written: its slaves only name their device."""
+    """The content of the arm's file: its slaves only name their device."""
 
     slaves: Annotated[tuple[SlaveEntry, ...], MinLen(1)] = field(kw_only=True)
     kinematics: Kinematics | None = None
@@ -1001,7 +997,7 @@ class ArmFile(ArmSettings):
 
 @dataclass(frozen=True)
 class ArmConfig(ArmSettings):
-    """The whole configuration of an arm: what `config/assistive_arm.yaml` and the files it names say."""
+    """The whole configuration of an arm: `config/assistive_arm.yaml` and the files that it names."""
 
     slaves: tuple[SlaveConfig, ...] = field(kw_only=True)
     arm: ArmModel | None = None
@@ -1009,15 +1005,15 @@ class ArmConfig(ArmSettings):
     other_tools: tuple[ArmModel, ...] = ()
     """The geometry with each of the other tools."""
     zero_offsets: tuple[float, ...] = ()
-    """rad, what each axis' drive shows at the axis' zero, in the order of `axes`; empty: all 0."""
+    """Position of each drive at its axis' zero, rad, in the order of `axes`; empty: all 0."""
     source: Path = Path()
     """The file it was read from."""
     warnings: tuple[str, ...] = ()
-    """Values that are allowed and implausible: file, line, key, value and the likely mistake."""
+    """Values that are allowed but implausible: file, line, key, value and the likely mistake."""
 
     @property
     def models(self) -> tuple[ArmModel, ...]:
-        """The geometry with each tool, by the tools' numbers; empty where it is unknown."""
+        """The geometry with each tool, by the tools' numbers; empty: unknown."""
         return () if self.arm is None else (self.arm, *self.other_tools)
 
     @property
@@ -1040,7 +1036,7 @@ class ArmConfig(ArmSettings):
         return tuple(slave.name for slave in self.slaves if slave.device.is_box)
 
     def box_of(self, user: HasBox | None) -> str:
-        """Return the IO box that an input or output with a function hangs on; empty: there is none."""
+        """Return the IO box of an input or output with a function; empty: there is none."""
         boxes = self.boxes
         named = None if user is None else user.box
         return named if named is not None else boxes[0] if boxes else ""
@@ -1049,7 +1045,7 @@ class ArmConfig(ArmSettings):
     def process_outputs(self) -> frozenset[tuple[str, str]]:
         """Slave and channel of every output that a process writes: no command sets it."""
         written = (
-            text.partition(".") for one in self.processes for _, image, text in one.channels() if image == "rpdo"
+            text.partition(".") for part in self.processes for _, image, text in part.channels() if image == "rpdo"
         )
         return frozenset((slave, channel) for slave, _, channel in written)
 
@@ -1057,17 +1053,17 @@ class ArmConfig(ArmSettings):
         """Return box and number of each terminal that a section names, by its name or the key of its function."""
         if not self.boxes:
             return {}
-        found: dict[str, tuple[str, int]] = {}
+        places: dict[str, tuple[str, int]] = {}
         for key, value in vars(section).items():
             if isinstance(value, int):
-                found[key] = self.box_of(section if isinstance(section, OutputsConfig) else None), value
+                places[key] = self.box_of(section if isinstance(section, OutputsConfig) else None), value
             elif isinstance(value, tuple):
-                found |= {one.name: (self.box_of(one), one.number) for one in value}
+                places |= {named.name: (self.box_of(named), named.number) for named in value}
             elif isinstance(value, InputConfig):
-                found[key] = self.box_of(value), value.number
+                places[key] = self.box_of(value), value.number
             elif isinstance(value, JoystickConfig):
-                found |= {name: (self.box_of(value), one) for name, one in vars(value).items() if isinstance(one, int)}
-        return found
+                places |= {name: (self.box_of(value), pin) for name, pin in vars(value).items() if isinstance(pin, int)}
+        return places
 
 
 # -- motion files ------------------------------------------------------------------------------------------------------
@@ -1115,7 +1111,7 @@ class NamedPose:
     """A place of a program; it has either `pose` or `q`."""
 
     name: Name
-    """By which steps name it."""
+    """Name in the steps of a program."""
     pose: _Coordinates | None = None
     """x, y, z, rx, ry, rz of the tool, m and rad."""
     q: _Coordinates | None = None
@@ -1165,7 +1161,7 @@ class ProgramPart:
     """Steps that are run by name."""
 
     name: Name
-    """By which steps name it."""
+    """Name in the steps of a program."""
     steps: Annotated[tuple[Step, ...], MinLen(1), MaxLen(MOST_POINTS)]
 
 

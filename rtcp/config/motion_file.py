@@ -26,6 +26,7 @@ from typing import Any
 
 import rtcp.config.rules  # noqa: F401 its rules hold for motion files too
 from rtcp.config.document import Document, read, text_of
+from rtcp.config.findings import Finding
 from rtcp.config.model import MOST_POINTS, ConfigError, MotionFile
 from rtcp.config.numbers import plain_number
 from rtcp.config.validation import Checker
@@ -49,59 +50,59 @@ def json_schema() -> dict[str, Any]:
 
 
 def read_document(path: Path) -> tuple[Document, MotionFile]:
-    """Return the document too, which knows the line of every key; raises as `read_motion`."""
+    """Return the motion with its document, for the lines of its keys; raises as `read_motion`."""
     ending = path.suffix.lower()
     if ending not in (".csv", ".yaml", ".yml"):
-        raise ConfigError([f'{path}: the ending "{path.suffix}" selects no form; allowed are .yaml, .yml and .csv'])
+        raise ConfigError([Finding((), "ending", found=path.suffix).at(path)])
     document, problems = _read_csv(path) if ending == ".csv" else (read(path), [])
     return document, check(document, problems)
 
 
-def check(document: Document, problems: Sequence[str] = ()) -> MotionFile:
+def check(document: Document, problems: Sequence[Finding] = ()) -> MotionFile:
     """Return the motion of a document.
 
     Raises:
-        ConfigError: `problems`, and one sentence per mistake in the document, with its line.
+        ConfigError: `problems`, and every mistake in the document, with its line.
     """
     motion, findings = _FILE.check(document.data)
     if motion is None or problems:
-        raise ConfigError([*problems, *document.sentences(findings)])
+        raise ConfigError([*problems, *document.placed(findings)])
     return motion
 
 
-def _read_csv(path: Path) -> tuple[Document, list[str]]:
-    """Return the rows of a file in the form that YAML gives them, and a sentence for each row that is left out."""
+def _read_csv(path: Path) -> tuple[Document, list[Finding]]:
+    """Return the rows of a file in the form of YAML, and a finding for each row that is left out."""
     lines = [(number, line.strip()) for number, line in enumerate(text_of(path).splitlines(), 1)]
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
     if not lines:
-        raise ConfigError([f"{path}: the file is empty; a header and rows of numbers are expected"])
+        raise ConfigError([Finding((), "empty_file", need="a header and rows of numbers are").at(path)])
     (first, head), rows = lines[0], lines[1:]
     header = [name.strip().lower() for name in head.split(",")]
     joints = _joints(header)
     if joints == 0 and header not in (_POSE, [*_POSE, "speed"]):
-        wanted = "t,q1,..,q6 (and v1,..,v6 and a1,..,a6) or x,y,z,rx,ry,rz (and speed)"
-        raise ConfigError([f"{path}:{first}: found the header {_shown(head)}, allowed is {wanted}"])
+        raise ConfigError([Finding((), "header", found=_quoted(head)).at(path, first)])
     if len(rows) > MOST_POINTS:
-        raise ConfigError([f"{path}: the file has {len(rows)} rows, at most {MOST_POINTS} are allowed"])
+        raise ConfigError([Finding((), "too_many_rows", found=len(rows), limit=MOST_POINTS).at(path)])
     if not rows:
-        raise ConfigError([f"{path}:{first}: the file has a header and no rows"])
+        raise ConfigError([Finding((), "no_rows").at(path, first)])
     document = Document(path)
     key = "trajectory" if joints else "path"
-    problems: list[str] = []
+    problems: list[Finding] = []
     entries: list[dict[str, object]] = []
     for number, line in rows:
-        try:
-            entries.append(_entry(_numbers(line, header), joints))
-            document.lines[key, len(entries) - 1] = number
-        except ValueError as error:
-            problems.append(f"{path}:{number}: {error}")
+        row = _numbers(line, header)
+        if isinstance(row, Finding):
+            problems.append(row.at(path, number))
+            continue
+        document.lines[key, len(entries)] = number
+        entries.append(_entry(row, joints))
     if not entries:
         raise ConfigError(problems)
     document.data = {key: entries}
     return document, problems
 
 
-def _shown(text: str) -> str:
+def _quoted(text: str) -> str:
     """Return the start of a text in quotes, without characters that control a terminal."""
     return '"' + "".join(letter if letter.isprintable() else "?" for letter in text[:80]) + '"'
 
@@ -117,18 +118,18 @@ def _joints(header: Sequence[str]) -> int:
     return 0
 
 
-def _numbers(line: str, header: Sequence[str]) -> list[float]:
+def _numbers(line: str, header: Sequence[str]) -> list[float] | Finding:
     cells = [cell.strip() for cell in line.split(",")]
     if len(cells) != len(header):
-        raise ValueError(f"found {len(cells)} columns, the header has {len(header)}")
+        return Finding((), "columns", found=len(cells), allowed=len(header))
     row: list[float] = []
     for name, cell in zip(header, cells, strict=True):
         try:
             row.append(plain_number(cell))
         except ValueError:
-            raise ValueError(f"{name}: found the text {_shown(cell)}, allowed is a number") from None
+            return Finding((name,), "no_number", found=_quoted(cell))
         if not isfinite(row[-1]):
-            raise ValueError(f"{name}: found {cell}, allowed is a finite number")
+            return Finding((name,), "range", found=row[-1], allowed="a finite number")
     return row
 
 

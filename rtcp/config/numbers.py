@@ -14,17 +14,17 @@ _FULL_TURN = 2 * math.pi
 
 
 def angle(written: object) -> object:
-    """Return the number that a fraction of pi stands for (`pi`, `-pi/2`, `11*pi/12`), and anything else unchanged."""
-    found = _FRACTION_OF_PI.fullmatch(written) if isinstance(written, str) else None
-    if found is None:
+    """Return the number of a fraction of pi (`pi`, `-pi/2`, `11*pi/12`), and anything else unchanged."""
+    match = _FRACTION_OF_PI.fullmatch(written) if isinstance(written, str) else None
+    if match is None:
         return written
-    sign, times, parts = found.groups()
+    sign, times, parts = match.groups()
     size = int(times or 1) * math.pi / int(parts or 1)
     return -size if sign == "-" else size
 
 
 def plain_number(written: object) -> float:
-    """Return a number, or the one that a text states in digits, sign, point and exponent.
+    """Return a number, or that of a text of digits, sign, point and exponent.
 
     Python also accepts `0_1` and digits of other scripts: here they are typing errors.
 
@@ -43,7 +43,7 @@ class FractionOfPi:
     """Marks a number that may also be written as a fraction of pi: in a type's `Annotated`, before its bounds."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Return pydantic's schema: only a process that validates gets here, and has loaded pydantic."""
+        """Return pydantic's schema: called only by processes that validate and have loaded pydantic."""
         from pydantic_core import core_schema
 
         return core_schema.no_info_before_validator_function(angle, handler(source))
@@ -60,10 +60,10 @@ Rate = Annotated[float, Ge(0.001)]
 Fraction = Annotated[float, Gt(0), Lt(1)]
 Name = Annotated[str, MinLen(1), MaxLen(64)]
 Length = Annotated[float, Ge(-100), Le(100)]
-"""m; a value beyond 100 m was written in millimeters."""
+"""m; a value beyond 100 m is one in millimeters."""
 Vector = Annotated[tuple[Length, ...], MinLen(3), MaxLen(3)]
 Angle = Annotated[float, FractionOfPi()]
 Turn = Annotated[float, FractionOfPi(), Ge(-_FULL_TURN), Le(_FULL_TURN)]
-"""rad; a value beyond a full turn was written in degrees."""
+"""rad; a value beyond a full turn is one in degrees."""
 Speed = Annotated[float, FractionOfPi(), Gt(0)]
 Milliseconds = Annotated[float, Ge(0), Le(1000)]

@@ -1,6 +1,6 @@
-"""Motion files with a program, as they are taught: each change is checked whole, written at once, and can be undone.
+"""Motion files with a program that is taught: each change is checked whole, written at once, and can be undone.
 
-What a person wrote into the file, comments and layout, stays.
+Comments and layout of the file stay.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from rtcp.config.document import parse, text_of
+from rtcp.config.findings import Finding
 from rtcp.config.model import ConfigError, MotionFile
 from rtcp.config.motion_file import check
 
@@ -28,10 +29,10 @@ _MOST_UNDONE: Final = 100
 
 
 class ProgramFile:
-    """A motion file that is taught; there need not be a file yet.
+    """A motion file that is taught; the file may not exist yet.
 
-    Every method that changes something raises ConfigError, and changes nothing, where the whole would have a mistake,
-    the file cannot be written, or something else has changed it meanwhile (`reload` reads that).
+    Every method that makes a change raises ConfigError, and changes nothing, if the result would have a mistake, the
+    file cannot be written, or another program has changed it meanwhile (`reload` reads it again).
 
     Args:
         path: of the file, in YAML.
@@ -40,16 +41,16 @@ class ProgramFile:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         if self.path.suffix.lower() not in (".yaml", ".yml"):
-            raise ConfigError([f"{self.path}: a program is kept in a file that ends in .yaml or .yml"])
+            raise ConfigError([f"{self.path}: a program is kept in a file that ends in .yaml or .yml"], "ending")
         self._undo: list[str] = []
         """Texts before the last changes; none from before `reload`."""
         self.motion = MotionFile()
-        """What the file holds."""
+        """Content of the file."""
         self._text = ""
         self.reload()
 
     def reload(self) -> None:
-        """Read the file again; raises ConfigError where it has mistakes or holds a trajectory or a path."""
+        """Read the file again; raises ConfigError if it has mistakes or holds a trajectory or a path."""
         text = self._on_disk()
         self.motion = self._checked(text)
         self._text = text
@@ -57,35 +58,35 @@ class ProgramFile:
 
     @property
     def can_undo(self) -> bool:
-        """Whether `undo` has a change to take back."""
+        """Whether there is a change to undo."""
         return bool(self._undo)
 
     def undo(self) -> None:
-        """Take the last change back."""
+        """Undo the last change."""
         if self._undo:
             self._check_unchanged()
             self._write(self._undo[-1])
             self._undo.pop()
 
     def keep(self, name: str, q: Sequence[float] | None = None, pose: Sequence[float] | None = None) -> None:
-        """Keep joint positions, rad, or a pose of the tool, m and rad, under a name; what had it is replaced."""
+        """Keep joint positions, rad, or a pose of the tool, m and rad, under a name; replaces an entry of this name."""
         data = self._data()
         poses = _list_in(data, "poses")
-        made: dict[str, Any] = {"name": name}
-        made |= {
+        entry: dict[str, Any] = {"name": name}
+        entry |= {
             key: [round(float(number), _DIGITS) + 0.0 for number in value]
             for key, value in (("q", q), ("pose", pose))
             if value is not None
         }
-        at = next((at for at, one in enumerate(poses) if one.get("name") == name), None)
+        at = next((at for at, kept in enumerate(poses) if kept.get("name") == name), None)
         if at is None:
-            poses.append(_on_one_line(made))
+            poses.append(_on_one_line(entry))
         else:
-            poses[at] = _on_one_line(made)
+            poses[at] = _on_one_line(entry)
         self._change(data)
 
     def remove_pose(self, name: str) -> None:
-        """Forget a pose that no step names."""
+        """Remove a pose that no step names."""
         data = self._data()
         poses = _list_in(data, "poses")
         del poses[_index(self.path, [pose.get("name") for pose in poses], name, "poses")]
@@ -124,7 +125,7 @@ class ProgramFile:
         self._change(data)
 
     def move(self, at: int, to: int, part: str = "") -> None:
-        """Move a step to where another one is; that and what is between make room."""
+        """Move a step to the place of another; that step and those between shift by one."""
         data = self._data()
         steps = self._steps(data, part)
         step, comment = steps[self._at(steps, at)], steps.ca.items.get(at)
@@ -143,7 +144,7 @@ class ProgramFile:
 
     def _at(self, steps: CommentedSeq, at: int) -> int:
         if not 0 <= at < len(steps):
-            raise ConfigError([f"{self.path}: found step {at + 1}, allowed is 1 to {len(steps)}"])
+            raise ConfigError([Finding((), "no_step", found=at + 1, allowed=f"1 to {len(steps)}").at(self.path)])
         return at
 
     def _on_disk(self) -> str:
@@ -155,12 +156,12 @@ class ProgramFile:
         motion = check(parse(text, self.path))
         if motion.trajectory or motion.path:
             kind = "trajectory" if motion.trajectory else "path"
-            raise ConfigError([f"{self.path}: it holds a {kind}, allowed is a program"])
+            raise ConfigError([f"{self.path}: it holds a {kind}, allowed is a program"], "no_program")
         return motion
 
     def _check_unchanged(self) -> None:
         if self._on_disk() != self._text:
-            raise ConfigError([f"{self.path}: something else has changed the file meanwhile: read it again"])
+            raise ConfigError([f"{self.path}: something else has changed the file meanwhile: read it again"], "changed")
 
     def _data(self) -> CommentedMap:
         self._check_unchanged()
@@ -178,16 +179,16 @@ class ProgramFile:
         """Replace the file as a whole, or not at all."""
         motion = self._checked(text)
         try:
-            # A link stays one: the file that it leads to is replaced.
+            # A symbolic link stays: its target is replaced.
             path = self.path.resolve()
             path.parent.mkdir(parents=True, exist_ok=True)
             with _locked(path.parent):
-                # Looked at again, alone: another process may have written since the change began.
+                # Checked again, under the lock: another process may have written since the change began.
                 self._check_unchanged()
                 self._replace_by(path, text)
         except (OSError, RuntimeError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise ConfigError([f"{self.path}: the file cannot be written: {reason}"]) from error
+            raise ConfigError([f"{self.path}: the file cannot be written: {reason}"], "unwritable") from error
         self.motion, self._text = motion, text
 
     @staticmethod
@@ -211,7 +212,7 @@ class ProgramFile:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes that teach in this folder waiting."""
+    """Hold the lock of a folder: other processes that teach in it wait."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -221,36 +222,37 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _yaml() -> YAML:
-    """Return a reader and writer that keeps comments, with lists set in as in `docs/motion.md`."""
-    made = YAML()
-    made.preserve_quotes = True
-    made.width = _LONGEST_LINE
-    made.indent(mapping=2, sequence=4, offset=2)
-    return made
+    """Return a reader and writer that keeps comments, with lists indented as in `docs/motion.md`."""
+    yaml = YAML()
+    yaml.preserve_quotes = True
+    yaml.width = _LONGEST_LINE
+    yaml.indent(mapping=2, sequence=4, offset=2)
+    return yaml
 
 
 def _list_in(data: CommentedMap, key: str) -> CommentedSeq:
-    """Return the list of a key, made where it is missing."""
+    """Return the list of a key; adds it if it is missing."""
     if data.get(key) is None:
         data[key] = CommentedSeq()
-    found: CommentedSeq = data[key]
-    if not len(found):
-        found.fa.set_block_style()
-    return found
+    entries: CommentedSeq = data[key]
+    if not len(entries):
+        entries.fa.set_block_style()
+    return entries
 
 
 def _on_one_line(entry: Mapping[str, Any]) -> CommentedMap:
-    made = CommentedMap()
+    line = CommentedMap()
     for key, value in entry.items():
         if isinstance(value, list | tuple):
             value = CommentedSeq(value)  # noqa: PLW2901
             value.fa.set_flow_style()
-        made[key] = value
-    made.fa.set_flow_style()
-    return made
+        line[key] = value
+    line.fa.set_flow_style()
+    return line
 
 
 def _index(path: Path, names: Sequence[str], name: str, key: str) -> int:
     if name not in names:
-        raise ConfigError([f'{path}: {key}: found the text "{name}", allowed is one of {", ".join(names) or "none"}'])
+        finding = Finding((key,), "choice", found=name, allowed=f"one of {', '.join(names) or 'none'}")
+        raise ConfigError([finding.at(path)])
     return names.index(name)

@@ -1,18 +1,17 @@
-"""Rules between the values of a file and between files: what no single type can state.
+"""Rules between the values of a file and between files, which no single type can state.
 
-A rule yields findings: the key path below its object and the rest of the sentence. See `validation.rule` for when it
-runs.
+A rule yields findings, with the key path below its object. See `validation.rule` for when it runs.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 
-from rtcp.config.document import Finding, KeyPath, dotted
 from rtcp.config.find import registered
+from rtcp.config.findings import Finding, KeyPath, dotted
 from rtcp.config.model import (
     BITS,
     MODE_CHANNELS,
@@ -46,12 +45,12 @@ from rtcp.config.model import (
     integer_range,
 )
 from rtcp.config.scaling import BOUNDING_OBJECTS, FACTOR_TOLERANCE, OBJECTS_PER_AXIS, QUANTITIES, DriveScaling
-from rtcp.config.validation import EVERY_KEY, rule
+from rtcp.config.validation import EVERY_KEY, Place, repeated, rule
 
 _NUMERIC = tuple(name for name in BITS if name != "bool")
 _INTEGERS = tuple(name for name in _NUMERIC if "int" in name)
 _LONGEST = {"bits": 64, "bytes": 248}
-"""Bits of a channel at most; an entry's length is one byte (ETG.1000.6, 5.6.5)."""
+"""Most bits of a channel; an entry's length is one byte (ETG.1000.6, 5.6.5)."""
 
 # The channels that a driver of each kind reads and writes, and their types. CiA 402-2 fixes 0x6040 and 0x6041 as
 # UINT16, 0x6060 and 0x6061 as INT8; the other widths are the device's own choice.
@@ -79,13 +78,12 @@ OPTIONAL = {
     "target_velocity", "target_torque", "velocity", "torque", "modes_of_operation", "modes_of_operation_display",
     "counter",
 }  # fmt: skip
-"""Channels that only some modes of a drive need (`MODE_CHANNELS`, `_drive_mode`), and only some boxes have."""
+"""Channels that only some modes of a drive need (`MODE_CHANNELS`, `_drive_mode`), or only some boxes have."""
 OTHER_PDOS = {"rpdo": ("tpdo", 0x1A00, 0x1BFF), "tpdo": ("rpdo", 0x1600, 0x17FF)}
 """The other direction and its objects (ETG.1000.6); devices have PDOs outside both ranges too."""
 _OF_OUTPUTS: tuple[str, ...] = ("min", "max", "safe")
 _OF_INPUTS: tuple[str, ...] = ("modulo",)
-_ALL = (*_OF_OUTPUTS, *_OF_INPUTS, "offset")
-"""Keys of a channel that have a meaning in one direction, and all that a channel with a fixed meaning has not."""
+"""Keys of a channel that apply to one direction."""
 MODES_OF_OPERATION, CSP = 0x6060, 8
 """Object of the drive mode and its value for cyclic synchronous position (CiA 402-2, clause 10.1)."""
 JOYSTICK_TERMINALS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
@@ -96,20 +94,16 @@ _ALL_JOINTS = "joints"
 _BASE = (0.0, 0.0, 0.0)
 
 Position = tuple[float, float, float]
-Place = tuple[KeyPath, object]
-"""Where a value is, and the value."""
 
 
-def _repeated(places: Iterable[Place], what: str) -> Iterator[Finding]:
-    first: dict[object, KeyPath] = {}
-    for where, value in places:
-        if (before := first.setdefault(value, where)) != where:
-            found = f'the text "{value}"' if isinstance(value, str) else f"{value}"
-            yield where, f"found {found}, the {what} of {dotted(before)}; each needs its own"
+def _order(low: float, high: float, of: str = "") -> Iterator[Finding]:
+    if not low < high:
+        yield Finding((), "out_of_order", min=low, max=high, of=of)
 
 
-def _min_below_max(low: float, high: float) -> str:
-    return "" if low < high else f"found min {low:g} and max {high:g}; min must be less than max"
+def _within(where: KeyPath, value: float, low: float, high: float, of: str) -> Iterator[Finding]:
+    if not low <= value <= high:
+        yield Finding(where, "outside", found=value, low=low, high=high, of=of)
 
 
 # -- devices -----------------------------------------------------------------------------------------------------------
@@ -118,61 +112,63 @@ def _min_below_max(low: float, high: float) -> str:
 @rule(PdoEntry)
 def _entry(entry: PdoEntry) -> Iterator[Finding]:
     if entry.index and entry.factor == 0:
-        yield ("factor",), "found 0, allowed is any number but 0"
-    if entry.min is not None and entry.max is not None and (text := _min_below_max(entry.min, entry.max)):
-        yield (), text
-    elif entry.factor and entry.is_number and entry.length and not entry.range[0] <= entry.safe <= entry.range[1]:
-        low, high = entry.range
-        yield ("safe",), f"found {entry.safe:g}, allowed is {low:g} to {high:g}, the range of the channel"
+        yield Finding(("factor",), "zero")
+    if entry.min is not None and entry.max is not None and not entry.min < entry.max:
+        yield from _order(entry.min, entry.max)
+    elif entry.factor and entry.is_number and entry.length:
+        yield from _within(("safe",), entry.safe, *entry.range, "the range of the channel")
     if entry.type == "bool" and entry.index and (entry.factor, entry.offset) != (1.0, 0.0):
         key = "factor" if entry.factor != 1 else "offset"
-        yield (key,), f"found {getattr(entry, key):g} with the type bool, allowed is none: it is 0 or 1; leave it out"
+        yield Finding((key,), "bool_scaled", found=getattr(entry, key))
     if entry.modulo and not ("int" in entry.type or entry.type == "bits"):
-        yield ("modulo",), f"found {entry.modulo} with the type {entry.type}, allowed is an integer type"
+        yield Finding(("modulo",), "modulo_of_type", found=entry.modulo, type=entry.type)
     if entry.index and entry.name == PdoEntry.name:
-        yield (), f"the key name is missing; it must be a text of 1 to 64 characters other than {PdoEntry.name}"
+        need = f"it must be a text of 1 to 64 characters other than {PdoEntry.name}"
+        yield Finding((), "missing", key="name", need=need)
     longest = _LONGEST.get(entry.type)
     if longest is None:
         if entry.bits is not None:
-            text = f"found {entry.bits}, but the type {entry.type} has {BITS[entry.type]} bits; leave it out"
-            yield ("bits",), f"{text}, or write the type bits or bytes"
+            yield Finding(("bits",), "bits_fixed", found=entry.bits, type=entry.type, bits=BITS[entry.type])
     elif entry.bits is None:
-        yield (), f"the key bits is missing; the type {entry.type} needs a length of 1 to {longest}"
+        yield Finding((), "missing", key="bits", need=f"the type {entry.type} needs a length of 1 to {longest}")
     elif entry.type == "bytes" and (entry.bits % 8 or entry.bits > longest):
-        yield ("bits",), f"found {entry.bits}, allowed is a multiple of 8 from 8 to {longest} for the type bytes"
+        wanted = f"a multiple of 8 from 8 to {longest} for the type bytes"
+        yield Finding(("bits",), "bits_of_bytes", found=entry.bits, allowed=wanted)
     elif entry.index and entry.bits > longest:
-        yield ("bits",), f"found {entry.bits}, allowed is 1 to {longest} for a channel of the type {entry.type}"
+        wanted = f"1 to {longest} for a channel of the type {entry.type}"
+        yield Finding(("bits",), "too_many_bits", found=entry.bits, allowed=wanted)
 
 
 @rule(StartupSdo)
 def _startup_value(sdo: StartupSdo) -> Iterator[Finding]:
     if sdo.type == "bytes":
         if not re.fullmatch(r"([0-9a-fA-F]{2} ?)+", sdo.data):
-            text = f'found the text "{sdo.data}"' if sdo.data else "the key is missing"
-            yield ("data",), f'{text}, allowed are bytes in hexadecimal, as "54 41 4E 4B", for the type bytes'
+            wanted = 'a text of bytes in hexadecimal, as "54 41 4E 4B", for the type bytes'
+            yield Finding(("data",), "no_bytes", found=sdo.data or None, allowed=wanted)
         if sdo.value is not None:
-            yield ("value",), f"found {sdo.value:g}, allowed is the key data for the type bytes"
+            yield Finding(("value",), "value_of_bytes", found=sdo.value, allowed="the key data for the type bytes")
         if sdo.complete and sdo.sub_index > 1:
-            yield ("sub_index",), f"found {sdo.sub_index}, allowed is 0 or 1 with complete access"
+            yield Finding(("sub_index",), "complete_access", found=sdo.sub_index, allowed="0 or 1 with complete access")
         return
     for key in ("data", "complete"):
         if getattr(sdo, key):
-            yield (key,), f"found with the type {sdo.type}, allowed is the type bytes"
+            yield Finding((key,), "only_for_bytes", type=sdo.type)
     if sdo.value is None:
-        yield (), f"the key value is missing; the type {sdo.type} needs it"
+        yield Finding((), "missing", key="value", need=f"the type {sdo.type} needs it")
     if sdo.value is None or sdo.type.startswith("float"):
         return
     low, high = integer_range(sdo.type)
     if not low <= sdo.value <= high or sdo.value != int(sdo.value):
-        yield ("value",), f"found {sdo.value:g}, allowed is an integer from {low} to {high}, the range of {sdo.type}"
+        wanted = f"an integer from {low} to {high}, the range of {sdo.type}"
+        yield Finding(("value",), "outside_type", found=sdo.value, allowed=wanted)
 
 
 @rule(DeviceDescription, "kind")
 def _kind(device: DeviceDescription) -> Iterator[Finding]:
-    # By name alone: a driver is loaded by the loop, which stands above the configuration.
+    # By name alone: the loop loads the driver, and the configuration must not import it.
     kinds = sorted(registered("rtcp.devices"))
     if device.kind not in kinds:
-        yield ("kind",), f'found the text "{device.kind}", allowed is one of {", ".join(kinds)}'
+        yield Finding(("kind",), "choice", found=device.kind, allowed=f"one of {', '.join(kinds)}")
 
 
 @rule(DeviceDescription, "rpdo", "kind")
@@ -191,28 +187,26 @@ def _one_name(device: DeviceDescription) -> Iterator[Finding]:
     for i, pdo in enumerate(device.tpdo):
         for j, entry in enumerate(pdo.channels):
             if entry.is_number and entry.name in outputs:
-                text = f'found the text "{entry.name}", an output\'s name too; each channel of the device needs its own'
-                yield ("tpdo", i, "channels", j, "name"), text
+                yield Finding(("tpdo", i, "channels", j, "name"), "output_and_input", found=entry.name)
 
 
 @rule(DeviceDescription, "assign_activate")
 def _dc_word(device: DeviceDescription) -> Iterator[Finding]:
     word = device.assign_activate
     if word and word & 0x0300 != 0x0300:
-        wanted = "0 for no distributed clocks, or a word that activates SYNC0, as 0x0300 or 0x0700"
-        yield ("assign_activate",), f"found {word:#06x}, allowed is {wanted}"
+        yield Finding(("assign_activate",), "no_sync0", found=word)
 
 
 @rule(DeviceDescription, "sync0_factor", "sync0_cycle_us")
 def _sync0_cycle(device: DeviceDescription) -> Iterator[Finding]:
     if device.sync0_factor == 0 and device.sync0_cycle_us == 0:
-        yield ("sync0_cycle_us",), "found 0, allowed is a cycle above 0 us where sync0_factor is 0"
+        yield Finding(("sync0_cycle_us",), "no_cycle", found=0, allowed="a cycle above 0 us where sync0_factor is 0")
 
 
 @rule(DeviceDescription, "coe", "sdo")
 def _without_coe(device: DeviceDescription) -> Iterator[Finding]:
     if device.sdo and not device.coe:
-        yield ("sdo",), f"found {len(device.sdo)} entries, but the device has no CoE (coe: false); leave them out"
+        yield Finding(("sdo",), "without_coe", found=len(device.sdo))
 
 
 @rule(DeviceDescription, "rpdo", "tpdo")
@@ -222,51 +216,49 @@ def _sync_managers(device: DeviceDescription) -> Iterator[Finding]:
         for i, pdo in enumerate(pdos):
             where = (direction, i, "sync_manager")
             if (pdo.sync_manager is None) != (pdos[0].sync_manager is None):
-                yield where, f"found it in some PDOs of the {direction} only; give it for all of them, or for none"
+                yield Finding(where, "some_sync_managers", image=direction)
             elif pdo.sync_manager is not None and used.setdefault(pdo.sync_manager, direction) != direction:
-                yield where, f"found {pdo.sync_manager}, a sync manager of the rpdo; each carries one direction"
+                yield Finding(where, "shared_sync_manager", found=pdo.sync_manager)
 
 
 @rule(DeviceDescription, "rpdo", "tpdo", "sdo", "kind")
 def _drive_mode(device: DeviceDescription) -> Iterator[Finding]:
-    """A drive whose PDOs have no mode of operation stays in the one that a start-up SDO sets."""
+    """Without a mode of operation in its PDOs a drive stays in the mode of a start-up SDO, which must be CSP."""
     if device.kind != "cia402":
         return
     for axis in device.axes:
         of = "" if device.axes == (1,) else f" of axis {axis}"
         channels = device.of_axis(axis)
-        sent, shown = (
+        sent, received = (
             {entry.name for pdo in pdos for entry in pdo.channels if entry.index}
             for pdos in (channels.rpdo, channels.tpdo)
         )
         index = MODES_OF_OPERATION + (axis - 1) * OBJECTS_PER_AXIS
-        if len(device.axes) > 1 and not (sent and shown):
-            yield ("tpdo" if sent else "rpdo",), f"found no channels{of}; an axis needs some in both directions"
+        if len(device.axes) > 1 and not (sent and received):
+            yield Finding(("tpdo" if sent else "rpdo",), "one_direction", of=of)
         elif "modes_of_operation" not in sent and device.startup(MODES_OF_OPERATION, axis) != CSP:
-            text = f"found no channel named modes_of_operation{of}; without it the start-up SDO "
-            yield ("rpdo",), f"{text}{{index: {index:#x}, sub_index: 0, type: int8, value: {CSP}}} (CSP) must be in sdo"
-        elif "modes_of_operation" in sent and "modes_of_operation_display" not in shown:
-            text = f"found no channel named modes_of_operation_display{of} beside modes_of_operation in rpdo; "
-            yield ("tpdo",), f"{text}allowed are both, or neither: else it is unknown in which mode the drive is"
+            yield Finding(("rpdo",), "no_csp", of=of, index=index, value=CSP)
+        elif "modes_of_operation" in sent and "modes_of_operation_display" not in received:
+            yield Finding(("tpdo",), "mode_not_shown", of=of)
 
 
 @rule(DeviceDescription, "rpdo", "tpdo", "scaling", "kind")
 def _scaling(device: DeviceDescription) -> Iterator[Finding]:
     scaling, axes = device.scaling, device.axes
     if scaling and device.kind != "cia402":
-        yield ("scaling",), f"found with kind {device.kind}, allowed is kind cia402"
+        yield Finding(("scaling",), "scaling_of_kind", kind=device.kind)
     elif len(scaling) > 1 and len(scaling) != axes[-1]:
-        text = f"found a list of {len(scaling)}, allowed is one for all axes, or one for each of {axes[-1]}"
-        yield ("scaling",), text
+        wanted = f"one for all axes, or one for each of {axes[-1]}"
+        yield Finding(("scaling",), "size", found=len(scaling), allowed=wanted)
     if axes != tuple(range(1, len(axes) + 1)):
-        yield (), f"found channels of axis {' and '.join(map(str, axes))}; axes are counted from 1, without a gap"
+        yield Finding((), "axes_with_gap", axes=" and ".join(map(str, axes)))
     elif len(axes) > 1 and device.kind in CHANNELS and device.kind != "cia402":
-        yield (), f"found channels of {len(axes)} axes, allowed is kind cia402 for a device with several"
+        yield Finding((), "several_axes", axes=len(axes))
 
 
 @rule(DeviceDescription, "rpdo", "tpdo", "kind")
 def _drive_channels(device: DeviceDescription) -> Iterator[Finding]:
-    """What would turn a joint another way than its position shows, or leave an enabled drive without torque."""
+    """Yield factors that turn a joint against its position, and limits that leave an enabled drive without torque."""
     if device.kind != "cia402":
         return
     channels = [
@@ -282,54 +274,53 @@ def _drive_channels(device: DeviceDescription) -> Iterator[Finding]:
     for axis, where, entry in channels:
         bound = BOUNDING_OBJECTS.get(entry.index - (axis - 1) * OBJECTS_PER_AXIS)
         if bound is not None and where[0] == "rpdo" and entry.safe == 0:
-            text = (
-                f"found 0 for {entry.name} ({bound}), which the drive is always sent: enabled it would have no torque, "
-            )
-            yield (*where, "safe"), f"{text}or no motion; allowed is any other value"
+            yield Finding((*where, "safe"), "safe_zero", channel=entry.name, bound=bound)
         quantity = QUANTITIES.get(entry.name)
         if quantity is None or axis not in positions:
             continue
         of, first = positions[axis]
-        said = f"found {entry.factor:.10g} for {entry.name}, and {first.factor:.10g} for {first.name} ({dotted(of)})"
         if quantity == "position" and not math.isclose(entry.factor, first.factor, rel_tol=FACTOR_TOLERANCE):
-            yield (*where, "factor"), f"{said}; all positions of an axis have the same factor"
+            alike = "positions of an axis have the same factor"
         elif (entry.factor < 0) != (first.factor < 0):
-            yield (*where, "factor"), f"{said}; all factors of an axis have the same sign"
+            alike = "factors of an axis have the same sign"
+        else:
+            continue
+        of_first = {"first": first.factor, "of": f"{first.name} ({dotted(of)})"}
+        yield Finding((*where, "factor"), "unlike", found=entry.factor, channel=entry.name, **of_first, alike=alike)
 
 
 @rule(DriveScaling)
 def _of_drive(scaling: DriveScaling) -> Iterator[Finding]:
     if scaling.external_gear_ratio == 0:
-        yield ("external_gear_ratio",), "found 0, allowed is any number but 0"
+        yield Finding(("external_gear_ratio",), "zero")
     if (scaling.rated_current is None) != (scaling.torque_constant is None):
         key = "torque_constant" if scaling.torque_constant is None else "rated_current"
-        yield (), f"the key {key} is missing: rated_current and torque_constant belong together"
+        yield Finding((), "missing", key=key, need="rated_current and torque_constant belong together")
     if scaling.rated_torque is not None and scaling.rated_current is not None:
-        yield ("rated_torque",), "found beside rated_current, allowed is one of them: what torques are thousandths of"
+        yield Finding(("rated_torque",), "two_torques")
 
 
 def _pdos(direction: str, pdos: Sequence[Pdo], device: DeviceDescription) -> Iterator[Finding]:
     kind = device.kind
-    other, low, high = OTHER_PDOS[direction]
+    opposite, low, high = OTHER_PDOS[direction]
     first: dict[int, int] = {}
     axes: dict[int, dict[str, tuple[KeyPath, PdoEntry]]] = {}
     for i, pdo in enumerate(pdos):
         # Some devices with a fixed mapping call their inputs RxPDOs.
         if low <= pdo.index <= high and device.configurable_pdos:
-            text = f"found {pdo.index:#06x}, one of the objects of a {other} ({low:#x} to {high:#x})"
-            yield (direction, i, "index"), f"{text}; allowed is one of a {direction}"
+            of_index = {"other": opposite, "low": low, "high": high, "image": direction}
+            yield Finding((direction, i, "index"), "index_of_other", found=pdo.index, **of_index)
         elif first.setdefault(pdo.index, i) != i:
-            text = f"found {pdo.index:#06x}, the index of {direction}[{first[pdo.index]}]; each needs its own"
-            yield (direction, i, "index"), text
+            of = f"{direction}[{first[pdo.index]}]"
+            yield Finding((direction, i, "index"), "repeated_index", found=pdo.index, of=of)
         for j, entry in enumerate(pdo.channels):
             where = (direction, i, "channels", j)
             names = axes.setdefault(pdo.axis_of(entry), {}) if entry.index else {}
             if entry.index and names.setdefault(entry.name, (where, entry))[1] is not entry:
-                text = f'found the text "{entry.name}" again; each channel of the {direction} needs its own'
-                yield (*where, "name"), text
+                yield Finding((*where, "name"), "repeated_channel", found=entry.name, image=direction)
     needed = CHANNELS.get(kind, {}).get(direction, {})
     if kind == "coupler" and pdos:
-        yield (direction,), "found PDOs; a coupler has no process data: leave it out"
+        yield Finding((direction,), "pdos_of_coupler")
     for i, pdo in enumerate(pdos):
         for j, entry in enumerate(pdo.channels):
             unused = _OF_OUTPUTS if direction == "tpdo" else _OF_INPUTS
@@ -337,38 +328,36 @@ def _pdos(direction: str, pdos: Sequence[Pdo], device: DeviceDescription) -> Ite
                 unused = (*_OF_OUTPUTS, *_OF_INPUTS, "offset")
             for key in unused:
                 if getattr(entry, key) != getattr(PdoEntry, key):
-                    text = (
-                        f"found with {entry.name} in {direction} of kind {kind}, where it has no meaning; leave it out"
-                    )
-                    yield (direction, i, "channels", j, key), text
+                    of_key = {"channel": entry.name, "image": direction, "kind": kind}
+                    yield Finding((direction, i, "channels", j, key), "no_meaning", **of_key)
     for axis, names in (axes or {1: {}}).items():
         if missing := [name for name in needed if name not in names and name not in OPTIONAL]:
             there = f"its channels are {', '.join(names)}" if names else "it has no channels"
             those = f"{'a channel' if len(missing) == 1 else 'channels'} named {', '.join(missing)}"
             of = f" of axis {axis}" if len(axes) > 1 else ""
-            yield (direction,), f"kind {kind} needs {those}{of}; {there}"
+            yield Finding((direction,), "channels_lacking", kind=kind, lacking=f"{those}{of}", there=there)
         for name in needed.keys() & names.keys():
             place, entry = names[name]
             if entry.type not in needed[name]:
                 wanted = "any type but bool" if needed[name] is _NUMERIC else " or ".join(needed[name])
-                yield (*place, "type"), f"found {entry.type} for {name}, allowed is {wanted}"
+                yield Finding((*place, "type"), "type_of_channel", found=entry.type, channel=name, allowed=wanted)
 
 
 def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Finding]:
     """Yield the mistakes of a device under a cycle period, us."""
-    cycles = f"the cycle period is {period_us:g} us"
+    cycles = f"(the cycle period is {period_us:g} us)"
     shortest, watchdog = 2 * period_us / 1000, device.watchdog_ms
     # A drive keeps its last target until the watchdog expires: 100 ms is the ESC's default, 10 cycles for slower buses.
     longest = max(100.0, 10 * period_us / 1000) if device.kind == "cia402" else math.inf
     if watchdog <= shortest:
-        wanted = f"more than 2 cycles, {shortest:g} ms ({cycles}): one late frame must not trip it"
-        yield ("watchdog_ms",), f"found {watchdog:g} ms, allowed is {wanted}"
+        wanted = f"more than 2 cycles, {shortest:g} ms {cycles}: one late frame must not trip it"
+        yield Finding(("watchdog_ms",), "watchdog_too_short", found=watchdog, unit=" ms", allowed=wanted)
     elif watchdog > longest:
-        wanted = f"at most {longest:g} ms ({cycles}): until it expires the drive keeps its last target"
-        yield ("watchdog_ms",), f"found {watchdog:g} ms, allowed is {wanted}"
+        wanted = f"at most {longest:g} ms {cycles}: until it expires the drive keeps its last target"
+        yield Finding(("watchdog_ms",), "watchdog_too_long", found=watchdog, unit=" ms", allowed=wanted)
     if abs(device.sync0_shift_us) >= period_us:
-        wanted = f"less than one cycle in either direction ({cycles})"
-        yield ("sync0_shift_us",), f"found {device.sync0_shift_us:g} us, allowed is {wanted}"
+        wanted = f"less than one cycle in either direction {cycles}"
+        yield Finding(("sync0_shift_us",), "shift_too_long", found=device.sync0_shift_us, unit=" us", allowed=wanted)
 
 
 # -- the arm -----------------------------------------------------------------------------------------------------------
@@ -377,16 +366,14 @@ def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Fin
 @rule(Range)
 @rule(MechanicalLimit)
 def _range(limits: Range | MechanicalLimit) -> Iterator[Finding]:
-    if text := _min_below_max(limits.min, limits.max):
-        yield (), text
+    return _order(limits.min, limits.max)
 
 
 @rule(Box)
 @rule(KeepOut)
 def _corners(box: Box | KeepOut) -> Iterator[Finding]:
     for axis, low, high in zip("xyz", box.min, box.max, strict=True):
-        if text := _min_below_max(low, high):
-            yield (), text.replace(";", f" in {axis};")
+        yield from _order(low, high, f" in {axis}")
 
 
 @rule(GripperConfig)
@@ -394,28 +381,28 @@ def _gripper(gripper: GripperConfig) -> Iterator[Finding]:
     joint = gripper.joint
     ends = (("open_position", gripper.open_position), ("closed_position", gripper.closed_position))
     if (gripper.output is None) == (joint is None):
-        found = "neither output nor joint" if joint is None else "both output and joint"
-        yield (), f"found {found}, allowed is one of them: a digital output, or a drive of its own"
+        keys = "neither output nor joint" if joint is None else "both output and joint"
+        yield Finding((), "one_of_both", found=keys, allowed="one of them: a digital output, or a drive of its own")
         return
     if joint is None:
         for key, end in ends:
             if end is not None:
-                yield (key,), "this key belongs to a gripper with a joint, not to one on an output"
+                yield Finding((key,), "other_gripper", of="with a joint", found="on an output")
         return
     if gripper.closed is not None:
-        yield ("closed",), "this key belongs to a gripper on an output, not to one with a joint"
+        yield Finding(("closed",), "other_gripper", of="on an output", found="with a joint")
     low, high = joint.position.min, joint.position.max
     for key, end in ends:
         if end is None:
-            yield (), f"the key {key} is missing; it must be a number inside gripper.joint.position"
-        elif not low <= end <= high:
-            yield (key,), f"found {end:g}, allowed is {low:g} to {high:g}, gripper.joint.position"
+            yield Finding((), "missing", key=key, need="it must be a number inside gripper.joint.position")
+        else:
+            yield from _within((key,), end, low, high, "gripper.joint.position")
     if gripper.closed_position is not None and gripper.closed_position == gripper.open_position:
-        yield ("closed_position",), f"found {gripper.closed_position:g}, the open_position; the two must differ"
+        yield Finding(("closed_position",), "ends_alike", found=gripper.closed_position)
 
 
 def axes_of(arm: ArmFile | ArmConfig) -> Iterator[tuple[KeyPath, Joint]]:
-    """Yield everything that drives move with its place: the joints, then the gripper's joint where it has one."""
+    """Yield all driven axes with their places: the joints, then the gripper's joint if it has one."""
     yield from ((("joints", i), joint) for i, joint in enumerate(arm.joints))
     if arm.gripper and arm.gripper.joint:
         yield ("gripper", "joint"), arm.gripper.joint
@@ -423,24 +410,24 @@ def axes_of(arm: ArmFile | ArmConfig) -> Iterator[tuple[KeyPath, Joint]]:
 
 @rule(ArmFile, "slaves")
 def _slave_names(arm: ArmFile) -> Iterator[Finding]:
-    yield from _repeated(((("slaves", i, "name"), slave.name) for i, slave in enumerate(arm.slaves)), "name")
+    yield from repeated(((("slaves", i, "name"), slave.name) for i, slave in enumerate(arm.slaves)), "name")
     aliases = ((("slaves", i, "alias"), slave.alias) for i, slave in enumerate(arm.slaves) if slave.alias)
-    yield from _repeated(aliases, "alias")
+    yield from repeated(aliases, "alias")
     for i, slave in enumerate(arm.slaves):
         if slave.name in PLATFORM_PARTS:
-            yield ("slaves", i, "name"), f'found the text "{slave.name}", the name of a part of the platform'
+            yield Finding(("slaves", i, "name"), "name_of_part", found=slave.name)
 
 
 @rule(ArmFile, "joints", "gripper")
 def _axis_names(arm: ArmFile) -> Iterator[Finding]:
     axes = list(axes_of(arm))
-    yield from _repeated((((*where, "name"), joint.name) for where, joint in axes), "name")
-    yield from _repeated((((*where, "slave"), joint.place) for where, joint in axes), "slave")
+    yield from repeated((((*where, "name"), joint.name) for where, joint in axes), "name")
+    yield from repeated((((*where, "slave"), joint.place) for where, joint in axes), "slave")
     if len(axes) > MOST_AXES:
-        yield ("gripper", "joint"), f"found beside {len(axes) - 1} joints, allowed are {MOST_AXES} in all"
+        yield Finding(("gripper", "joint"), "too_many_axes", joints=len(axes) - 1, allowed=f"{MOST_AXES} in all")
     for where, joint in axes:
         if joint.name == _ALL_JOINTS:
-            yield (*where, "name"), f'found the text "{_ALL_JOINTS}", which in the key of a limit means all joints'
+            yield Finding((*where, "name"), "limit_key", found=_ALL_JOINTS, means="all joints")
 
 
 @rule(ArmFile, "bus")
@@ -450,23 +437,22 @@ def _interface(arm: ArmFile) -> Iterator[Finding]:
         return
     if len(name) > LONGEST_INTERFACE or "/" in name or any(map(str.isspace, name)):
         wanted = f"{VIRTUAL}, or a network interface of at most {LONGEST_INTERFACE} characters without spaces and /"
-        yield ("bus", "interface"), f'found the text "{name}", allowed is {wanted}'
+        yield Finding(("bus", "interface"), "interface", found=name, allowed=wanted)
 
 
 @rule(ArmFile, "control_mode", "inputs")
 def _control_mode(arm: ArmFile) -> Iterator[Finding]:
     joystick = arm.inputs.joystick is not None
-    if text := missing_for(arm.control_mode, geometry=arm.kinematics is not None, joystick=joystick):
-        yield ("control_mode",), text
+    yield from missing_for(arm.control_mode, geometry=arm.kinematics is not None, joystick=joystick)
 
 
-def missing_for(control_mode: str, *, geometry: bool, joystick: bool) -> str:
-    """Return the sentence for a control mode whose needs the arm does not meet; empty where it does."""
+def missing_for(control_mode: str, *, geometry: bool, joystick: bool) -> Iterator[Finding]:
+    """Yield the sections that the arm's file lacks for a control mode."""
+    where = ("control_mode",)
     if control_mode in ("cartesian", "joystick") and not geometry:
-        return f'found the text "{control_mode}", which needs the arm\'s geometry: the key kinematics is missing'
-    if control_mode == "joystick" and not joystick:
-        return f'found the text "{control_mode}", which needs a joystick: the key inputs.joystick is missing'
-    return ""
+        yield Finding(where, "needs", found=control_mode, need="the arm's geometry", key="kinematics")
+    elif control_mode == "joystick" and not joystick:
+        yield Finding(where, "needs", found=control_mode, need="a joystick", key="inputs.joystick")
 
 
 @rule(ArmFile, "jog", "cartesian")
@@ -474,7 +460,7 @@ def _jog_speeds(arm: ArmFile) -> Iterator[Finding]:
     for key in ("speed", "angular_speed"):
         speed, most = getattr(arm.jog, key), getattr(arm.cartesian, key)
         if speed > most:
-            yield ("jog", key), f"this is {speed:g}, allowed is at most {most:g}, cartesian.{key}"
+            yield Finding(("jog", key), "above", found=speed, high=most, of=f"cartesian.{key}")
 
 
 @rule(ArmFile, "inputs")
@@ -488,7 +474,7 @@ def _output_terminals(arm: ArmFile) -> Iterator[Finding]:
 
 
 Terminals = Iterator[tuple[KeyPath, HasBox, tuple[Place, ...]]]
-"""What hangs on a box: its section, its key `box`, and its terminals."""
+"""Sections with terminals on a box: keys of the section, the object with the key `box`, and the terminals."""
 
 
 def _inputs(arm: ArmFile) -> Terminals:
@@ -503,8 +489,8 @@ def _inputs(arm: ArmFile) -> Terminals:
 
 def _outputs(arm: ArmFile) -> Terminals:
     lamps = ((("outputs", key), getattr(arm.outputs, key)) for key in ("state_lamp", "motion_lamp", "heartbeat"))
-    if found := tuple((where, number) for where, number in lamps if number is not None):
-        yield ("outputs",), arm.outputs, found
+    if places := tuple((where, number) for where, number in lamps if number is not None):
+        yield ("outputs",), arm.outputs, places
     if arm.gripper and arm.gripper.output is not None:
         yield ("gripper",), arm.gripper, ((("gripper", "output"), arm.gripper.output),)
     yield from _named("outputs", arm.outputs.named)
@@ -519,23 +505,24 @@ def _named(section: str, terminals: Sequence[NamedTerminal]) -> Terminals:
 @rule(ArmFile, "inputs", "outputs")
 def _terminal_names(arm: ArmFile) -> Iterator[Finding]:
     sections = (("inputs", arm.inputs.named), ("outputs", arm.outputs.named))
-    names = [((section, "named", i, "name"), one.name) for section, named in sections for i, one in enumerate(named)]
-    yield from _repeated(names, "name")
-    functions = {one.name for kind in (InputsConfig, OutputsConfig) for one in fields(kind)} | set(JOYSTICK_TERMINALS)
+    names = [((section, "named", i, "name"), item.name) for section, named in sections for i, item in enumerate(named)]
+    yield from repeated(names, "name")
+    functions = {key.name for kind in (InputsConfig, OutputsConfig) for key in fields(kind)} | set(JOYSTICK_TERMINALS)
     for where, name in names:
         if name in functions or "." in name:
-            yield where, f'found the text "{name}", allowed is a name without a dot that is not that of a function'
+            wanted = "a name without a dot that is not that of a function"
+            yield Finding(where, "name_of_function", found=name, allowed=wanted)
 
 
-def _repeated_by_box(terminals: Terminals, what: str) -> Iterator[Finding]:
+def _repeated_by_box(terminals: Terminals, noun: str) -> Iterator[Finding]:
     boxes: dict[str | None, list[Place]] = {}
     users = [(user, places) for _, user, places in terminals]
     named = {user.box for user, _ in users} - {None}
-    only = next(iter(named)) if len(named) == 1 else None  # what names no box hangs on the only one
+    only = next(iter(named)) if len(named) == 1 else None  # terminals without a box are on the only one
     for user, places in users:
         boxes.setdefault(user.box or only, []).extend(places)
     for of_box in boxes.values():
-        yield from _repeated(of_box, what)
+        yield from repeated(of_box, noun)
 
 
 def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
@@ -545,14 +532,13 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
         slave = slaves.get(joint.slave)
         device = devices.get(slave.device) if slave else None
         if slave is None:
-            text = f'found the text "{joint.slave}", which is no slave; allowed are the names under slaves: '
-            yield (*where, "slave"), text + ", ".join(slaves)
+            yield Finding((*where, "slave"), "no_slave", found=joint.slave, allowed=[*slaves])
         elif device is not None and device.kind == "io":
-            text = f'found the text "{joint.slave}", which moves no joint: its device {slave.device} is of kind '
-            yield (*where, "slave"), f"{text}{device.kind}; allowed is kind cia402"
+            of = {"device": slave.device, "kind": device.kind}
+            yield Finding((*where, "slave"), "moves_no_joint", found=joint.slave, **of)
         elif device is not None and joint.axis not in device.axes:
-            text = f"found {joint.axis}, allowed is {' or '.join(map(str, device.axes))}, the axes of {slave.device}"
-            yield (*where, "axis"), text
+            wanted = f"{' or '.join(map(str, device.axes))}, the axes of {slave.device}"
+            yield Finding((*where, "axis"), "axis", found=joint.axis, allowed=wanted)
         elif device is not None:
             device = device.of_axis(joint.axis)
             missing: list[str] = []
@@ -560,33 +546,30 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
                 mapped = {entry.name for pdo in pdos for entry in pdo.channels}
                 missing += [name for name in needed if name not in mapped]
             if missing:
-                text = (
-                    f"its device {slave.device} maps no {', '.join(missing)}, which drive_mode {arm.drive_mode} needs"
-                )
-                yield (*where, "slave"), text
+                of = {"device": slave.device, "drive_mode": arm.drive_mode}
+                yield Finding((*where, "slave"), "not_mapped", lacking=missing, **of)
             yield from _beyond_the_wire(where, joint, device)
 
 
 def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
-    """Yield terminals without an IO box, or without a word on which one; `devices`: the valid ones by name."""
-    found = [devices.get(slave.device) for slave in arm.slaves]
-    if None in found:
+    """Yield terminals without an IO box, or with several to choose from; `devices`: the valid ones by name."""
+    if any(slave.device not in devices for slave in arm.slaves):
         return
     boxes = [slave.name for slave in arm.slaves if devices[slave.device].is_box]
     for kind, terminals in (("input", _inputs(arm)), ("output", _outputs(arm))):
         for where, user, places in terminals:
             if not boxes:
                 for place, number in places:
-                    yield place, f"found {kind} {number}, but no slave is of kind io; leave it out for such an arm"
+                    yield Finding(place, "no_box_at_all", found=number, kind=kind)
             elif user.box is not None and user.box not in boxes:
-                allowed = ", ".join(boxes) or "none: no slave is of kind io"
-                yield (*where, "box"), f'found the text "{user.box}", which is no IO box; allowed is {allowed}'
+                yield Finding((*where, "box"), "no_box", found=user.box, allowed=boxes)
             elif user.box is None and len(boxes) > 1:
-                yield (*where, "box"), f"the key is missing; with several IO boxes it must be one of {', '.join(boxes)}"
+                need = f"with several IO boxes it must be one of {', '.join(boxes)}"
+                yield Finding(where, "missing", key="box", need=need)
 
 
 def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> Iterator[Finding]:
-    """Limits that the drive's process data cannot express: a target near them would wrap around."""
+    """Yield limits that the drive's process data cannot express: a target near them would wrap around."""
     position = joint.position
     limits: tuple[tuple[KeyPath, tuple[float, ...], str], ...] = (
         (("position", "min"), (position.min,), "target_position"),
@@ -598,20 +581,18 @@ def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> 
         low, high = device.wire_range(name)
         if not all(low <= end <= high for end in ends):
             entry = next(entry for pdo in device.rpdo for entry in pdo.channels if entry.name == name)
-            why = f"{name} of {device.name} is {entry.type} with factor {entry.factor:g}"
-            found = f"{'+-' if len(ends) == 2 else ''}{ends[-1]:g}"
-            yield (*axis, *where), f"found {found}, allowed is {low:g} to {high:g}: {why}"
+            of = f"{name} of {device.name} is {entry.type} with factor {entry.factor:g}"
+            sign = "+-" if len(ends) == 2 else ""
+            yield Finding((*axis, *where), "beyond_wire", sign=sign, found=ends[-1], low=low, high=high, of=of)
 
 
 @rule(ArmFile, "home", "joints")
 def _home(arm: ArmFile) -> Iterator[Finding]:
     home, joints = arm.home or (), arm.joints
     if home and len(home) != len(joints):
-        yield ("home",), f"found {len(home)} numbers, allowed are {len(joints)}, one a joint"
+        yield Finding(("home",), "count", found=len(home), allowed=len(joints), of="one a joint")
     for i, (q, joint) in enumerate(zip(home, joints)):  # noqa: B905 the count is checked above
-        low, high = joint.position.min, joint.position.max
-        if not low <= q <= high:
-            yield ("home", i), f"found {q:g}, allowed is {low:g} to {high:g}, the position of {joint.name}"
+        yield from _within(("home", i), q, joint.position.min, joint.position.max, f"the position of {joint.name}")
 
 
 # -- geometry and boxes ------------------------------------------------------------------------------------------------
@@ -623,34 +604,33 @@ def _joints_of_kinematics(arm: ArmFile) -> Iterator[Finding]:
     if part is None:
         return
     if len(arm.joints) != len(part.dh):
-        text = f"found beside {len(arm.joints)} joints, allowed are {len(part.dh)}; leave it out for such an arm"
-        yield ("kinematics",), text
+        wanted = f"{len(part.dh)}; leave it out for such an arm"
+        yield Finding(("kinematics",), "too_many_axes", joints=len(arm.joints), allowed=wanted)
     for i, (joint, limit) in enumerate(zip(arm.joints, part.limits or ())):  # noqa: B905 the count is checked above
-        place = f"kinematics.limits[{i}]"
+        place, where = f"kinematics.limits[{i}]", ("joints", i, "position")
+        end = f"the joint's mechanical end in {place}"
         low, high = joint.position.min, joint.position.max
         if low < limit.min:
-            text = f"found {low:g}, allowed is at least {limit.min:g}, the joint's mechanical end in {place}"
-            yield ("joints", i, "position", "min"), text
+            yield Finding((*where, "min"), "below", found=low, low=limit.min, of=end)
         if high > limit.max:
-            text = f"found {high:g}, allowed is at most {limit.max:g}, the joint's mechanical end in {place}"
-            yield ("joints", i, "position", "max"), text
+            yield Finding((*where, "max"), "above", found=high, high=limit.max, of=end)
         if limit.velocity is not None and joint.velocity > limit.velocity:
-            text = f"found {joint.velocity:g}, allowed is at most {limit.velocity:g}, the velocity in {place}"
-            yield ("joints", i, "velocity"), text
+            most = {"found": joint.velocity, "high": limit.velocity}
+            yield Finding(("joints", i, "velocity"), "above", **most, of=f"the velocity in {place}")
 
 
 @rule(Kinematics)
 def _tools(part: Kinematics) -> Iterator[Finding]:
     tools = part.tools
     if tools and part.tool != Tool():
-        yield ("tool",), "found beside tools: move it into the list, as its first"
-    yield from _repeated(((("tools", i, "name"), tool.name) for i, tool in enumerate(tools)), "name")
+        yield Finding(("tool",), "tool_and_tools")
+    yield from repeated(((("tools", i, "name"), tool.name) for i, tool in enumerate(tools)), "name")
     for i, tool in enumerate(tools):
         if tool.mass and part.links is None:
-            yield ("tools", i, "mass"), f"found {tool.mass:g} beside links of unknown mass: it needs the key links"
+            yield Finding(("tools", i, "mass"), "mass_without_links", found=tool.mass)
         if part.bodies is not None and tool.bodies is None:
-            text = "the key bodies is missing; where the arm's are named, so are the tool's: a list, [] for none"
-            yield ("tools", i), text
+            need = "where the arm's are named, so are the tool's: a list, [] for none"
+            yield Finding(("tools", i), "missing", key="bodies", need=need)
 
 
 @rule(ArmFile, "cartesian", "kinematics")
@@ -660,54 +640,50 @@ def _boxes(arm: ArmFile) -> Iterator[Finding]:
     boxes += [(("cartesian", "keep_out", i), box) for i, box in enumerate(arm.cartesian.keep_out)]
     for where, box in boxes:
         if part is None:
-            yield where, "found a box, which needs the arm's geometry: the key kinematics is missing"
-        elif text := _misplaced(box, part):
-            yield where, text
+            yield Finding(where, "box_needs", need="the arm's geometry", key="kinematics")
+        elif misplaced := _misplaced(where, box, part):
+            yield misplaced
         elif tool and isinstance(box, KeepOut) and _holds(box, tool):
-            yield where, "found a box around all of cartesian.box: the tool has no place left"
+            yield Finding(where, "box_around_box")
 
 
 @rule(ArmFile, "cartesian", "joints", "gripper")
 def _box_names(arm: ArmFile) -> Iterator[Finding]:
-    """Names with which the key of a limit, as joint2.max or user.max.z, has two meanings."""
+    """Yield names that make the key of a limit, as joint2.max or user.max.z, ambiguous."""
     boxes = arm.cartesian.keep_out
-    yield from _repeated(((("cartesian", "keep_out", i, "name"), box.name) for i, box in enumerate(boxes)), "name")
+    yield from repeated(((("cartesian", "keep_out", i, "name"), box.name) for i, box in enumerate(boxes)), "name")
     taken = {"box": "cartesian.box", _ALL_JOINTS: "all joints"}
     taken |= {joint.name: dotted(where) for where, joint in axes_of(arm) if joint.name not in taken}
     for i, box in enumerate(boxes):
         if box.name in taken:
-            text = f'found the text "{box.name}", which in the key of a limit means {taken[box.name]}'
-            yield ("cartesian", "keep_out", i, "name"), text
+            yield Finding(("cartesian", "keep_out", i, "name"), "limit_key", found=box.name, means=taken[box.name])
         elif "." in box.name:
-            text = f'found the text "{box.name}", allowed is one without a dot: dots separate the parts of a key'
-            yield ("cartesian", "keep_out", i, "name"), text
+            wanted = "one without a dot: dots separate the parts of a key"
+            yield Finding(("cartesian", "keep_out", i, "name"), "dot", found=box.name, allowed=wanted)
 
 
 def shoulder_and_reach(part: Kinematics) -> tuple[Position, float]:
-    """Return a point that no joint moves, the origin of frame 1 (m), and how far from it the tool can be at most, m."""
+    """Return the origin of frame 1, m, which no joint moves, and the tool's largest distance from it, m."""
     row = part.dh[0]
     shoulder = (row.a, 0.0 - math.sin(row.alpha) * row.d, math.cos(row.alpha) * row.d)
     longest = max(math.hypot(*tool.position) for tool in part.every_tool)
     return shoulder, sum(math.hypot(row.a, row.d) for row in part.dh[1:]) + longest
 
 
-def _misplaced(box: Box | KeepOut, part: Kinematics) -> str:
+def _misplaced(where: KeyPath, box: Box | KeepOut, part: Kinematics) -> Finding | None:
     shoulder, reach = shoulder_and_reach(part)
     nearest = [min(max(c, low), high) for c, low, high in zip(shoulder, box.min, box.max, strict=True)]
     away = math.dist(shoulder, nearest)
     if away > reach:
-        what = "the arm never meets it" if isinstance(box, KeepOut) else "the tool is never inside"
-        text = f"found a box that begins {away:.3f} m from the shoulder, allowed is at most {reach:.3f} m"
-        return f"{text}, the arm's reach: {what}"
+        reason = "the arm never meets it" if isinstance(box, KeepOut) else "the tool is never inside"
+        return Finding(where, "box_out_of_reach", found=away, high=reach, what=reason)
     if isinstance(box, KeepOut) and _meets(_BASE, shoulder, box):
-        at = ", ".join(f"{coordinate:g}" for coordinate in shoulder)
-        text = "found a box around the arm's base, allowed is one beside it"
-        return f"{text}: the base is at (0, 0, 0), the shoulder at ({at})"
-    return ""
+        return Finding(where, "box_around_base", shoulder=[f"{coordinate:g}" for coordinate in shoulder])
+    return None
 
 
 def _meets(start: Position, end: Position, box: KeepOut) -> bool:
-    """Return whether the straight line between two points meets a box (the method of slabs)."""
+    """Return whether the straight line between two points meets a box (slab method)."""
     enter, leave = 0.0, 1.0
     for begin, finish, low, high in zip(start, end, box.min, box.max, strict=True):
         if begin == finish:
@@ -735,13 +711,8 @@ def implausible(arm: ArmFile) -> Iterator[Finding]:
     """Yield a warning for each value that is allowed, but plausible only in another unit."""
     for where, value, most, unit, (likely, factor) in _magnitudes(arm):
         if abs(value) > most:
-            yield (
-                where,
-                (
-                    f"found {value:g} {unit}, plausible is at most {most:.4g} {unit}: "
-                    f"if this is in {likely}, write {value * factor:.6g}"
-                ),
-            )
+            instead = {"likely": likely, "instead": value * factor}
+            yield Finding(where, "implausible", found=value, high=most, unit=unit, **instead)
 
 
 def _magnitudes(arm: ArmFile) -> Iterator[Magnitude]:
@@ -787,29 +758,33 @@ def _magnitudes(arm: ArmFile) -> Iterator[Magnitude]:
 @rule(Point)
 def _point(point: Point) -> Iterator[Finding]:
     if point.a is not None and point.v is None:
-        yield ("a",), "a needs v beside it"
+        yield Finding(("a",), "needs_beside", found="a", need="v")
 
 
 @rule(Stop)
 def _stop(stop: Stop) -> Iterator[Finding]:
     if (stop.pose is None) == (stop.q is None):
-        yield (), f"found {'neither' if stop.pose is None else 'both'} of pose and q; one of them is needed"
+        yield _pose_or_q(stop)
     if stop.angle is not None and stop.via is None:
-        yield ("angle",), "an angle needs via beside it"
+        yield Finding(("angle",), "needs_beside", found="an angle", need="via")
     if stop.by_joints and stop.via is not None:
-        yield ("by_joints",), "found via beside it, allowed is one of them"
+        yield Finding(("by_joints",), "via_beside")
 
 
 @rule(NamedPose)
 def _named_pose(pose: NamedPose) -> Iterator[Finding]:
     if (pose.pose is None) == (pose.q is None):
-        yield (), f"found {'neither' if pose.pose is None else 'both'} of pose and q; one of them is needed"
+        yield _pose_or_q(pose)
+
+
+def _pose_or_q(entry: Stop | NamedPose) -> Finding:
+    return Finding((), "pose_or_q", found="neither" if entry.pose is None else "both")
 
 
 MOST_PLANNED_STEPS = 10_000
-"""Steps of a program, those of its parts with them."""
+"""Most steps of a program, with those of its parts."""
 _MOST_DEPTH = 50
-"""Parts in parts."""
+"""Most levels of parts in parts."""
 _VERBS = ("move", "line", "arc", "gripper", "output", "wait_for", "wait_s", "tool", "run")
 _OF_VERBS = {
     "via": ("arc",),
@@ -820,30 +795,30 @@ _OF_VERBS = {
     "timeout_s": ("wait_for",),
     "times": ("run",),
 }
-"""Keys of a step, and those of which one has to stand beside each."""
+"""Key of a step -> keys, one of which it needs beside it."""
 
 
 @rule(Step)
 def _step(step: Step) -> Iterator[Finding]:
-    found = [verb for verb in _VERBS if getattr(step, verb) is not None]
-    if len(found) != 1:
-        yield (), f"found {' and '.join(found) or 'none of them'}, allowed is one of {', '.join(_VERBS)}"
+    chosen = [verb for verb in _VERBS if getattr(step, verb) is not None]
+    if len(chosen) != 1:
+        yield Finding((), "one_of_keys", found=" and ".join(chosen) or "none of them", allowed=_VERBS)
         return
     for key, verbs in _OF_VERBS.items():
-        default = next(one.default for one in fields(Step) if one.name == key)
-        if getattr(step, key) != default and found[0] not in verbs:
-            yield (key,), f"found beside {found[0]}, allowed beside {' or '.join(verbs)}"
+        default = next(field.default for field in fields(Step) if field.name == key)
+        if getattr(step, key) != default and chosen[0] not in verbs:
+            yield Finding((key,), "beside", found=chosen[0], allowed=" or ".join(verbs))
     if step.arc is not None and step.via is None:
-        yield ("arc",), "an arc needs via beside it"
+        yield Finding(("arc",), "needs_beside", found="an arc", need="via")
 
 
 @rule(MotionFile, "poses", "program", "parts")
 def _program(motion: MotionFile) -> Iterator[Finding]:
-    poses, parts = [one.name for one in motion.poses], [one.name for one in motion.parts]
+    poses, parts = [pose.name for pose in motion.poses], [part.name for part in motion.parts]
     for key, names in (("poses", poses), ("parts", parts)):
         for at, name in enumerate(names):
             if name in names[:at]:
-                yield (key, at, "name"), f'found "{name}" twice, allowed is once'
+                yield Finding((key, at, "name"), "name_twice", found=name)
     lists: list[tuple[tuple[str | int, ...], tuple[Step, ...]]] = [(("program",), motion.program)]
     lists += [(("parts", at, "steps"), part.steps) for at, part in enumerate(motion.parts)]
     for where, steps in lists:
@@ -851,34 +826,32 @@ def _program(motion: MotionFile) -> Iterator[Finding]:
             for key in ("move", "line", "arc", "via", "run"):
                 name, allowed = getattr(step, key), parts if key == "run" else poses
                 if name is not None and name not in allowed:
-                    yield (*where, at, key), f'found "{name}", allowed is one of {", ".join(allowed) or "none"}'
+                    yield Finding((*where, at, key), "no_name", found=name, allowed=allowed or "none")
     if any(step.tool is not None for _, steps in lists for step in steps):
-        places = {one.name for one in motion.poses if one.pose is None}
+        places = {pose.name for pose in motion.poses if pose.pose is None}
         for where, steps in lists:
             for at, step in enumerate(steps):
                 if step.via in places:
-                    text = f'found "{step.via}", which has q; with several tools allowed is one with pose'
-                    yield (*where, at, "via"), text
+                    yield Finding((*where, at, "via"), "via_has_q", found=step.via)
     calls = {part.name: {step.run for step in part.steps if step.run is not None} for part in motion.parts}
     circles = [at for at, name in enumerate(parts) if name in _reached(calls, name)]
     for at in circles:
-        yield ("parts", at, "steps"), f'the part "{parts[at]}" runs itself; parts may only run others'
+        yield Finding(("parts", at, "steps"), "circle", found=parts[at])
     if circles:
         return
     by_name = {part.name: part.steps for part in motion.parts}
     if (count := _planned_steps(motion.program, by_name)) > MOST_PLANNED_STEPS:
-        text = f"found {'endless' if count == math.inf else f'{count:g}'} steps with those of all parts, a part that"
-        yield ("program",), f"{text} repeats counted twice; allowed are {MOST_PLANNED_STEPS}"
+        number = "endless" if count == math.inf else f"{count:g}"
+        yield Finding(("program",), "too_many_steps", found=number, allowed=MOST_PLANNED_STEPS)
         return
     if any(step.tool is not None for _, steps in lists for step in steps):
         first = next(_tools_and_motions(motion.program, by_name, len(parts)), None)
         if first is not None and first.tool is None:
-            text = "a step chooses a tool, found a motion before the first choice; allowed is a tool before all motions"
-            yield ("program",), text
+            yield Finding(("program",), "motion_before_tool")
 
 
 def _reached(calls: Mapping[str, set[str]], name: str) -> set[str]:
-    """Return the parts that a part runs, and those that they run."""
+    """Return the parts that a part runs, directly or by others."""
     reached, ahead = set[str](), set(calls[name])
     while ahead:
         part = ahead.pop()
@@ -889,7 +862,7 @@ def _reached(calls: Mapping[str, set[str]], name: str) -> set[str]:
 
 
 def _planned_steps(program: Sequence[Step], parts: Mapping[str, tuple[Step, ...]]) -> float:
-    """Return the number of steps that are planned: of a part that repeats twice; infinite: parts are too deep."""
+    """Return the number of planned steps: a repeated part counts twice; infinite: parts are nested too deep."""
     counts: dict[str, float] = {}
 
     def count(steps: Sequence[Step], depth: int) -> float:
@@ -909,7 +882,7 @@ def _planned_steps(program: Sequence[Step], parts: Mapping[str, tuple[Step, ...]
 
 
 def _tools_and_motions(steps: Sequence[Step], parts: Mapping[str, tuple[Step, ...]], depth: int) -> Iterator[Step]:
-    """Yield in their order the steps that move or choose a tool, also of parts; `depth`: of parts in parts, at most."""
+    """Yield in their order the steps that move or choose a tool, also of parts; `depth`: most levels of parts."""
     for step in steps:
         if step.run is not None and depth > 0:
             yield from _tools_and_motions(parts.get(step.run, ()), parts, depth - 1)
@@ -919,17 +892,17 @@ def _tools_and_motions(steps: Sequence[Step], parts: Mapping[str, tuple[Step, ..
 
 @rule(MotionFile, EVERY_KEY)
 def _one_form(motion: MotionFile) -> Iterator[Finding]:
-    found = [key for key in ("trajectory", "path", "program") if getattr(motion, key)]
-    if not (found or motion.poses):
-        yield (), "none of trajectory, path, program and poses has entries; one of them is needed"
-    if len(found) > 1:
-        yield (found[1],), f"a file holds one of trajectory, path and program, found {' and '.join(found)}"
+    forms = [key for key in ("trajectory", "path", "program") if getattr(motion, key)]
+    if not (forms or motion.poses):
+        yield Finding((), "no_motion")
+    if len(forms) > 1:
+        yield Finding((forms[1],), "several_motions", found=" and ".join(forms))
     if motion.parts and not motion.program:
-        yield ("parts",), "found without program, allowed beside it"
+        yield Finding(("parts",), "parts_alone")
     if motion.poses and (motion.trajectory or motion.path):
-        yield ("poses",), "found beside a trajectory or a path, allowed is a program"
+        yield Finding(("poses",), "poses_beside")
     if motion.trajectory and motion.speed is not None:
-        yield ("speed",), "a speed is for a path; a trajectory's follows from its times"
+        yield Finding(("speed",), "speed_of_trajectory")
 
 
 @rule(MotionFile, "trajectory")
@@ -938,11 +911,11 @@ def _points(motion: MotionFile) -> Iterator[Finding]:
     for i, point in enumerate(points):
         where, first, before = ("trajectory", i), points[0], points[max(i - 1, 0)]
         if i and not point.t > before.t:
-            yield (*where, "t"), f"found {point.t:g} after {before.t:g}; times must rise"
+            yield Finding((*where, "t"), "times_fall", found=point.t, before=before.t)
         for key in ("q", "v", "a"):
             numbers, as_first = getattr(point, key), getattr(first, key)
             if numbers is not None and len(numbers) != len(first.q):
-                text = f"found {len(numbers)} numbers, allowed are {len(first.q)}, as the first point has"
-                yield (*where, key), text
+                count = {"found": len(numbers), "allowed": len(first.q), "of": "as the first point has"}
+                yield Finding((*where, key), "count", **count)
             if (numbers is None) != (as_first is None):
-                yield (*where, key), f"{key} must be given for all points or for none"
+                yield Finding((*where, key), "all_or_none", key=key)

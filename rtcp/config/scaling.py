@@ -1,7 +1,7 @@
-"""What a CiA 402 drive counts in: from its encoder, gear and rated torque to the factors of its process data.
+"""Scaling of a CiA 402 drive: the factors of its process data by its encoder, gear and rated torque.
 
-The keys of `scaling` in a device's file are the objects in which the drive itself holds the same values; what it holds
-is compared at the start (`rtcp.fieldbus.scaling`).
+The keys of `scaling` in a device's file correspond to objects of the drive, which are compared with them at the start
+(`rtcp.fieldbus.scaling`).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ VelocityUnit = Literal["counts/s", "rpm", "mrpm", "urpm"]
 VELOCITY_UNITS: dict[int, VelocityUnit] = {
     0x00B44700: "rpm", 0xFDB44700: "mrpm", 0xFAB44700: "urpm", 0x00B50300: "counts/s",
 }  # fmt: skip
-"""Their numbers in 0x60A9: prefix, numerator and denominator in the notation of ETG.1004."""
+"""Velocity units by their numbers in 0x60A9: prefix, numerator and denominator in the notation of ETG.1004."""
 _RPM: dict[VelocityUnit, float] = {"rpm": 1.0, "mrpm": 1e-3, "urpm": 1e-6}
 TorqueUnit = Literal["mNm", "uNm"]
 TORQUE_UNITS: dict[TorqueUnit, float] = {"mNm": 1e-3, "uNm": 1e-6}
 """Nm per count of 0x6076."""
 PER_MILLE = 1e-3
 FACTOR_TOLERANCE = 1e-6
-"""Relative difference up to which two factors, or what a drive holds and its file, are the same."""
+"""Largest relative difference of two equal factors, and of the values in a drive and in its file."""
 
 QUANTITIES: dict[str, str] = {
     "target_position": "position",
@@ -41,25 +41,25 @@ QUANTITIES: dict[str, str] = {
 }
 """Channels of a CiA 402 drive whose factors follow from the scaling."""
 QUICK_STOP_OPTION = 0x605A
-"""Object of the first axis: what the drive does at a quick stop."""
+"""Object of the first axis: quick stop option code."""
 BOUNDING_OBJECTS = {
     0x6072: "max torque", 0x6080: "max motor speed",
     0x60E0: "positive torque limit", 0x60E1: "negative torque limit",
 }  # fmt: skip
-"""Objects of the first axis with which a drive bounds itself: 0 leaves an enabled drive without torque or motion."""
+"""Objects of the first axis that limit the drive: 0 leaves an enabled drive without torque or motion."""
 
 
 @dataclass(frozen=True)
 class DriveScaling:
-    """What one axis of a CiA 402 drive counts in. At the start the drive's own objects are compared with it."""
+    """Scaling of one axis of a CiA 402 drive. At the start the drive's own objects are compared with it."""
 
     encoder_increments: Annotated[float, Gt(0)]
     """Encoder increments per motor revolution (0x608F); of an encoder at the output: per revolution there."""
     gear_ratio: Annotated[float, Gt(0)] = 1.0
     """Motor revolutions per revolution of the drive's output shaft (0x6091)."""
     feed_constant: Annotated[float, Ge(0)] | None = None
-    """Position counts per revolution of the output shaft (0x6092); left out: those of encoder and gear; 0: the drive
-    holds the object and does not count in it."""
+    """Position counts per revolution of the output shaft (0x6092); left out: computed from encoder and gear; 0: the
+    drive has the object but does not use it."""
     external_gear_ratio: float = 1.0
     """Revolutions of the output shaft per revolution of the joint, by a gear that the drive does not know; not 0,
     negative: the joint turns the other way."""
@@ -98,7 +98,7 @@ class DriveScaling:
 
     @property
     def torque(self) -> float | None:
-        """Joint torque per count, Nm, without losses of the gears; None: nothing is said about the torque."""
+        """Joint torque per count, Nm, without losses of the gears; None: unknown."""
         rated = self.rated_torque
         if rated is None and self.rated_current is not None and self.torque_constant is not None:
             rated = self.rated_current * self.torque_constant
@@ -106,5 +106,5 @@ class DriveScaling:
         return None if rated is None else PER_MILLE * rated * turns
 
     def factor(self, quantity: str) -> float | None:
-        """Return the factor of a quantity; None: the keys say nothing about it."""
+        """Return the factor of a quantity; None: unknown."""
         return {"position": self.position, "velocity": self.velocity, "torque": self.torque}[quantity]

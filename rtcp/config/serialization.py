@@ -1,4 +1,4 @@
-"""Frozen dataclasses as JSON values and back, without the validator: how the launcher hands an `ArmConfig` to the loop.
+"""Frozen dataclasses to JSON values and back, without the validator: the launcher passes an `ArmConfig` to the loop so.
 
 Fields keep their names, tuples become lists, paths and enum members their text. Round trips are exact.
 """
@@ -33,15 +33,15 @@ def to_json(value: object) -> Any:
 
 
 def from_json(kind: type[T], data: object) -> T:
-    """Return the object of this type that `to_json` gave this form.
+    """Return the object of this type whose JSON form, by `to_json`, is `data`.
 
     Types are checked, ranges are not: the writer has validated them.
 
     Raises:
         ValueError: a key is missing or unknown, or a value has another type; the message names the key.
     """
-    made: T = _typed(kind, data, kind.__name__)
-    return made
+    value: T = _typed(kind, data, kind.__name__)
+    return value
 
 
 def _typed(kind: Any, data: object, where: str) -> Any:
@@ -63,6 +63,8 @@ def _typed(kind: Any, data: object, where: str) -> Any:
         if len(choices) == len(data):
             entries = zip(choices, data, strict=True)
             return tuple(_typed(choice, entry, f"{where}[{i}]") for i, (choice, entry) in enumerate(entries))
+    elif origin is dict and isinstance(data, Mapping):
+        return {str(key): _typed(choices[1], entry, f"{where}.{key}") for key, entry in data.items()}
     elif origin in (Union, types.UnionType):
         if data is None and type(None) in choices:
             return None
@@ -77,7 +79,7 @@ def _typed(kind: Any, data: object, where: str) -> Any:
     elif isinstance(kind, type) and issubclass(kind, Enum):
         return kind(data)
     elif kind is float:
-        # JSON of other writers has no difference between 1 and 1.0.
+        # JSON of other writers does not distinguish 1 and 1.0.
         if isinstance(data, float | int) and not isinstance(data, bool):
             return float(data)
     elif type(data) is kind:

@@ -1,4 +1,4 @@
-"""Checks plain values against a frozen dataclass: pydantic finds what is wrong, this module says what is allowed.
+"""Checks plain values against a frozen dataclass: pydantic detects the mistakes, this module words them.
 
 Rules between values are attached to the dataclasses with `@rule`; those of the platform's files are in
 `rtcp.config.rules`. Only the launcher, the gateway, the segment and the commands load this module, the loop never.
@@ -18,7 +18,8 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
-from rtcp.config.document import Document, Finding, KeyPath, dotted, shown
+from rtcp.config.document import Document
+from rtcp.config.findings import Finding, KeyPath, dotted
 from rtcp.config.model import ConfigError
 from rtcp.config.numbers import FractionOfPi
 
@@ -45,15 +46,15 @@ _FILE_RULES: dict[type, list[FileRule]] = {}
 def rule(kind: type[T], *needs: str) -> Callable[[R], R]:
     """Attach a rule to a dataclass: it yields the mistakes of an object whose values all have the right types.
 
-    With `needs`, the rule is one of a whole file: it runs where these keys are valid, whatever is wrong with others;
-    `EVERY_KEY`: where all are.
+    With `needs`, the rule is one of a whole file: it runs if these keys are valid, even if others are not; `EVERY_KEY`:
+    if all are.
     """
 
     def attach(check: R) -> R:
         if needs:
             _FILE_RULES.setdefault(kind, []).append(FileRule(needs, check))
         else:
-            # The model cannot name pydantic: the method by which pydantic asks a class for its schema is put in here.
+            # The model must not import pydantic: its hook for a class's own schema is added here.
             setattr(kind, "__get_pydantic_core_schema__", staticmethod(_schema_with(check)))  # noqa: B010
         return check
 
@@ -63,8 +64,8 @@ def rule(kind: type[T], *needs: str) -> Callable[[R], R]:
 def _schema_with(check: Rule[Any]) -> Callable[[Any, Any], Any]:
     def run(value: Any) -> Any:
         wrong: list[InitErrorDetails] = [
-            {"type": PydanticCustomError("rule", "{text}", {"text": text}), "loc": where, "input": None}
-            for where, text in check(value)
+            {"type": PydanticCustomError("rule", "rule", {"finding": finding}), "loc": finding.where, "input": None}
+            for finding in check(value)
         ]
         if wrong:
             raise ValidationError.from_exception_data("rules", wrong)
@@ -72,14 +73,14 @@ def _schema_with(check: Rule[Any]) -> Callable[[Any, Any], Any]:
 
     def schema(source: Any, handler: Any) -> Any:
         inner = handler(source)
-        # Its name goes to the schema with the rule: by it pydantic finds the schema where the class is used again.
+        # The reference moves to the schema with the rule: pydantic looks it up where the class is used again.
         return core_schema.no_info_after_validator_function(run, inner, ref=inner.pop("ref", None))
 
     return schema
 
 
 class Checker(Generic[T]):
-    """Makes objects of one frozen dataclass out of plain values, or names every mistake in them."""
+    """Makes objects of one frozen dataclass from plain values, or lists every mistake in them."""
 
     def __init__(self, kind: type[T], renamed: Mapping[str, str] | None = None) -> None:
         """Check a `kind`; `renamed` maps the dotted paths of old keys to their new names."""
@@ -95,9 +96,9 @@ class Checker(Generic[T]):
         """Checks the valid part of a file: every key may be left out."""
         hints = get_type_hints(self.kind, include_extras=True)
         required = [
-            (one.name, Union[hints[one.name], None], field(default=None))  # noqa: UP007
-            for one in fields(self.kind)  # type: ignore[arg-type]
-            if one.default is MISSING and one.default_factory is MISSING
+            (key.name, Union[hints[key.name], None], field(default=None))  # noqa: UP007
+            for key in fields(self.kind)  # type: ignore[arg-type]
+            if key.default is MISSING and key.default_factory is MISSING
         ]
         return _adapter_of(make_dataclass(self.kind.__name__, required, bases=(self.kind,), frozen=True, kw_only=True))
 
@@ -105,28 +106,28 @@ class Checker(Generic[T]):
         """Return the object, or None and every mistake; `more` rules are checked with those of the file."""
         findings: list[Finding] = []
         invalid: set[object] = set()
-        made: T | None = None
+        value: T | None = None
         try:
-            made = _validated(self._adapter, data)
+            value = _validated(self._adapter, data)
         except ValidationError as error:
-            # Pydantic counts the valid entries of a list: one with wrong entries is not too short for that reason.
-            found = [
+            # Pydantic counts the valid entries of a list alone: a list with wrong entries may still be long enough.
+            kept = [
                 detail
                 for detail in error.errors(include_url=False)
                 if detail["type"] != "too_short" or len(detail["input"]) < detail["ctx"]["min_length"]
             ]
             findings = [
-                self._finding(detail["type"], detail["loc"][1:], detail["input"], detail["msg"]) for detail in found
+                self._finding(detail["type"], detail["loc"][1:], detail["input"], detail.get("ctx")) for detail in kept
             ]
-            invalid = {detail["loc"][1] for detail in found if len(detail["loc"]) > 1}
-        findings += self._file_findings(made, data, invalid, more)
-        return (None if findings else made), findings
+            invalid = {detail["loc"][1] for detail in kept if len(detail["loc"]) > 1}
+        findings += self._file_findings(value, data, invalid, more)
+        return (None if findings else value), findings
 
     def json_schema(self) -> dict[str, Any]:
         """Return the JSON schema of such a file, for editors; it has no rules between values."""
-        found = self._adapter.json_schema()
-        made: dict[str, Any] = _with_pi({"$defs": found["$defs"], **found["items"]})
-        return {"$schema": "https://json-schema.org/draft/2020-12/schema", **made}
+        adapted = self._adapter.json_schema()
+        schema: dict[str, Any] = _with_pi({"$defs": adapted["$defs"], **adapted["items"]})
+        return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
     def read(self, document: Document, *more: FileRule) -> T:
         """Return the object of a file; `more` rules as of `check`.
@@ -134,41 +135,53 @@ class Checker(Generic[T]):
         Raises:
             ConfigError: with one sentence for every mistake.
         """
-        made, findings = self.check(document.data, *more)
-        if made is None:
-            raise ConfigError(document.sentences(findings))
-        return made
+        value, findings = self.check(document.data, *more)
+        if value is None:
+            raise ConfigError(document.placed(findings))
+        return value
 
     def _file_findings(
-        self, made: T | None, data: object, invalid: set[object], more: Iterable[FileRule]
+        self, value: T | None, data: object, invalid: set[object], more: Iterable[FileRule]
     ) -> Iterator[Finding]:
         rules = [*(rule for kind in self.kind.__mro__ for rule in _FILE_RULES.get(kind, ())), *more]
         if not rules or not isinstance(data, dict):
             return
-        if made is None:
+        if value is None:
             known = set(keys(self.kind)) - invalid
-            made = _validated(self._partial, {key: value for key, value in data.items() if key in known})
-        for one in rules:
-            if not (invalid if EVERY_KEY in one.needs else invalid.intersection(one.needs)):
-                yield from one.check(made)
+            value = _validated(self._partial, {key: entry for key, entry in data.items() if key in known})
+        for rule_ in rules:
+            if not (invalid if EVERY_KEY in rule_.needs else invalid.intersection(rule_.needs)):
+                yield from rule_.check(value)
 
-    def _finding(self, reason: str, where: KeyPath, found: object, message: str) -> Finding:
+    def _finding(self, reason: str, where: KeyPath, value: object, context: Mapping[str, Any] | None) -> Finding:
         if reason == "rule":
-            return where, message
+            of_object: Finding = (context or {})["finding"]
+            return Finding(where, of_object.code, **of_object.fields)
         if reason == "missing":
-            return where[:-1], f"the key {where[-1]} is missing; it must be {allowed(annotation(self.kind, where))}"
+            need = f"it must be {allowed(annotation(self.kind, where))}"
+            return Finding(where[:-1], "missing", key=where[-1], need=need)
         if reason == "unexpected_keyword_argument":
             if new := self._renamed.get(dotted(where)):
-                return where, f"this key is now called {new}; rename it"
-            return where, unknown_key(str(where[-1]), keys(annotation(self.kind, where[:-1])))
+                return Finding(where, "renamed", new=new)
+            return unknown(where, str(where[-1]), keys(annotation(self.kind, where[:-1])))
         wanted = annotation(self.kind, where)
-        if reason in ("too_short", "too_long") and isinstance(found, list) and found:
-            return where, f"found a list of {len(found)}, allowed is {allowed(wanted)}"
-        return where, f"found {shown(found)}, allowed is {allowed(wanted)}{_hint(wanted, found)}"
+        if reason in ("too_short", "too_long") and isinstance(value, list) and value:
+            return Finding(where, "size", found=len(value), allowed=allowed(wanted))
+        return Finding(
+            where, _CODES.get(reason, "type"), found=value, allowed=allowed(wanted), hint=_hint(wanted, value)
+        )
+
+
+_CODES = (
+    {"literal_error": "choice"}
+    | dict.fromkeys(("string_too_short", "string_too_long", "too_short", "too_long"), "length")
+    | dict.fromkeys(("finite_number", "greater_than", "greater_than_equal", "less_than", "less_than_equal"), "range")
+)
+"""Codes of pydantic's reasons; of the others the code is `type`."""
 
 
 def _adapter_of(kind: type) -> TypeAdapter[Any]:
-    # Pydantic takes a configuration for a dataclass only from outside: from the list around it.
+    # Pydantic accepts a configuration for a dataclass only from an outer type: the list around it.
     around: Any = types.GenericAlias(list, (kind,))
     return TypeAdapter(around, config=_STRICT)
 
@@ -176,7 +189,7 @@ def _adapter_of(kind: type) -> TypeAdapter[Any]:
 def _with_pi(schema: Any) -> Any:
     """Return a schema whose numbers may be written with pi."""
     if isinstance(schema, list):
-        return [_with_pi(one) for one in schema]
+        return [_with_pi(part) for part in schema]
     if not isinstance(schema, dict):
         return schema
     if schema.get("type") == "number":
@@ -185,7 +198,7 @@ def _with_pi(schema: Any) -> Any:
 
 
 def _validated(adapter: TypeAdapter[Any], data: object) -> Any:
-    """Return the object; by way of JSON, whose strict reading turns lists into tuples and mappings into dataclasses."""
+    """Return the object, read from JSON: strict mode then turns lists into tuples and mappings into dataclasses."""
     return adapter.validate_json(json.dumps([data]))[0]
 
 
@@ -202,18 +215,30 @@ def annotation(kind: object, where: KeyPath) -> object:
 
 def keys(kind: object) -> list[str]:
     """Return the keys of a dataclass."""
-    return [one.name for one in fields(bare_type(kind))]
+    return [field.name for field in fields(bare_type(kind))]
 
 
-def unknown_key(key: str, known: list[str], what: str = "key") -> str:
-    """Return the sentence for a key, or another name, that does not exist."""
-    close = difflib.get_close_matches(key, known, n=1)
-    guess = f"did you mean {close[0]}? " if close else ""
-    return f"this {what} does not exist; {guess}allowed are {', '.join(known)}"
+def unknown(where: KeyPath, name: str, known: Iterable[str], noun: str = "key") -> Finding:
+    """Return the finding of a key, or another name, that does not exist."""
+    close = difflib.get_close_matches(name, known := list(known), n=1)
+    hint = f"did you mean {close[0]}? " if close else ""
+    return Finding(where, "unknown", what=noun, found=name, allowed=known, hint=hint)
+
+
+Place = tuple[KeyPath, object]
+"""A value and its keys."""
+
+
+def repeated(places: Iterable[Place], noun: str) -> Iterator[Finding]:
+    """Yield each place whose value is also at an earlier one."""
+    first: dict[object, KeyPath] = {}
+    for where, value in places:
+        if (before := first.setdefault(value, where)) != where:
+            yield Finding(where, "repeated", found=value, what=noun, of=dotted(before))
 
 
 def allowed(kind: object) -> str:
-    """Return in words what a type with its bounds allows: `an integer from 0 to 255`."""
+    """Return the values that a type with its bounds allows, in words: `an integer from 0 to 255`."""
     bounds = {type(bound): bound for bound in _bounds(kind)}
     bare = bare_type(kind)
     if get_origin(bare) is Literal:
@@ -269,20 +294,20 @@ def _span(bounds: dict[type, Any]) -> str:
     return " " + " and ".join(limits) if limits else ""
 
 
-def _hint(wanted: object, found: object) -> str:
-    """Return what YAML may have made of a value that looks right to its writer."""
+def _hint(wanted: object, value: object) -> str:
+    """Return a hint on how YAML reads a value that looks right to its writer."""
     bare = bare_type(wanted)
-    if isinstance(found, str) and bare in (int, float):
+    if isinstance(value, str) and bare in (int, float):
         try:
-            float(int(found, 0)) if found[:2].lower() == "0x" else float(found)
+            float(int(value, 0)) if value[:2].lower() == "0x" else float(value)
         except ValueError:
-            return "; write the number alone, the key names its unit" if len(found.split()) == 2 else ""
-        leading_zero = len(found) > 1 and found[0] == "0" and found[1].isdigit()
+            return "; write the number alone, the key names its unit" if len(value.split()) == 2 else ""
+        leading_zero = len(value) > 1 and value[0] == "0" and value[1].isdigit()
         return f"; write it without {'leading zeros' if leading_zero else 'quotes'}"
-    if isinstance(found, str) and bare is bool and found.lower() in ("yes", "no", "on", "off"):
+    if isinstance(value, str) and bare is bool and value.lower() in ("yes", "no", "on", "off"):
         return "; yes, no, on and off are texts here"
-    if isinstance(found, (int, float)) and bare is str:
+    if isinstance(value, (int, float)) and bare is str:
         return "; write it in quotes"
-    if isinstance(found, (int, float)) and {FractionOfPi, Le} <= {type(bound) for bound in _bounds(wanted)}:
+    if isinstance(value, (int, float)) and {FractionOfPi, Le} <= {type(bound) for bound in _bounds(wanted)}:
         return "; angles are in rad: write 90 degrees as pi/2"
     return ""

@@ -1,6 +1,6 @@
 """The zero offsets of the axes in a file: read and checked whole at the start, replaced as a whole or not at all.
 
-An offset is what an axis' drive shows, rad, where the axis is at 0. Absolute encoders keep it: it is measured once.
+An offset is the drive's position, rad, when its axis is at 0. Absolute encoders keep it: it is measured once.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rtcp.config.document import Document, Finding, read, shown
+from rtcp.config.document import Document, read
+from rtcp.config.findings import Finding
 from rtcp.config.model import ArmConfig, ConfigError
 
 LARGEST = 100.0
-"""rad; a larger offset was written in degrees."""
+"""Largest offset, rad; a larger one is in degrees."""
 
 _KEYS = ("arm", "check", "offsets")
 
 
 def state_directory() -> Path:
-    """Return the directory of what outlives a restart, without making it.
+    """Return the directory of persistent state, without creating it.
 
     `RTCP_STATE_DIR` chooses it; else `/var/lib/rtcp` for root, `$XDG_STATE_HOME/rtcp` or `~/.local/state/rtcp` for
-    anyone else; in it one for each platform with a name (`RTCP_NAME`).
+    anyone else; each platform with a name (`RTCP_NAME`) has its own in it.
     """
     return _unnamed() / os.environ.get("RTCP_NAME", "")
 
@@ -42,12 +43,12 @@ def _unnamed() -> Path:
 
 
 def zero_file(arm: str) -> Path:
-    """Return the file of an arm's offsets; what a file name cannot hold of the arm's name is written as %XX."""
-    return state_directory() / (re.sub(r"[^\w.-]", lambda found: f"%{ord(found[0]):02X}", arm) + ".zero.yaml")
+    """Return the file of an arm's offsets; characters of the arm's name that a file name cannot have become %XX."""
+    return state_directory() / (re.sub(r"[^\w.-]", lambda match: f"%{ord(match[0]):02X}", arm) + ".zero.yaml")
 
 
 def read_zeros(config: ArmConfig) -> tuple[float, ...]:
-    """Return the offset of each of `config.axes`, rad; nothing where there is no file, which means 0 for all.
+    """Return the offset of each of `config.axes`, rad; empty without a file: 0 for all.
 
     Raises:
         ConfigError: the file is damaged, is another arm's, or does not suit this arm's axes; nothing of it is used.
@@ -57,7 +58,7 @@ def read_zeros(config: ArmConfig) -> tuple[float, ...]:
         return ()
     document = read(path)
     if findings := _findings(document, config):
-        raise ConfigError(document.sentences(findings))
+        raise ConfigError(document.placed(findings))
     data: Any = document.data
     return tuple(float(data["offsets"][axis.name]) for axis in config.axes)
 
@@ -65,29 +66,30 @@ def read_zeros(config: ArmConfig) -> tuple[float, ...]:
 def store_zero(config: ArmConfig, axis: int, offset: float) -> Path:
     """Store the offset (rad) of the axis of this place in `config.axes`, keep the others', and return the file.
 
-    Whatever interrupts it, the file is the old or the new one: it is written beside, forced to the disk, renamed, and
-    the directory forced to the disk. A lock on the directory keeps two writers apart.
+    An interrupted call leaves the old or the new file: a temporary file is written, synced and renamed, then the
+    directory is synced. A lock on the directory excludes a second writer.
 
     Raises:
-        ConfigError: the offset is none or beyond what the drive's process data reach, the file in place is damaged, or
-            the disk refuses.
+        ConfigError: the offset is invalid or beyond the range of the drive's process data, the present file is
+            damaged, or the file cannot be written.
     """
-    name = config.axes[axis].name
     if lacking := _wrong(config, axis, offset):
-        raise ConfigError([f"{zero_file(config.name)}: offsets.{name}: {lacking}"])
+        raise ConfigError([lacking.at(zero_file(config.name))])
     path = zero_file(config.name)
     try:
         path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
         directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
-        raise ConfigError([f"{path.parent}: the directory cannot be used: {error.strerror}"]) from error
+        finding = Finding((), "unwritable", what="directory", done="used", reason=error.strerror)
+        raise ConfigError([finding.at(path.parent)]) from error
     try:
         fcntl.flock(directory, fcntl.LOCK_EX)
         offsets = list(read_zeros(config) or (0.0,) * len(config.axes))
         offsets[axis] = offset
         _replace(path, directory, _text(config, offsets))
     except OSError as error:
-        raise ConfigError([f"{path}: the file cannot be written: {error.strerror}"]) from error
+        finding = Finding((), "unwritable", what="file", done="written", reason=error.strerror)
+        raise ConfigError([finding.at(path)]) from error
     finally:
         os.close(directory)
     return path
@@ -104,7 +106,7 @@ def _replace(path: Path, directory: int, text: str) -> None:
     finally:
         os.close(descriptor)
     os.replace(new, path)
-    # Else a loss of power could bring the old name back.
+    # Without it a loss of power could restore the old file.
     os.fsync(directory)
 
 
@@ -122,52 +124,54 @@ def _text(config: ArmConfig, offsets: list[float]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a text as YAML's double quotes hold it."""
+    """Return a text in YAML's double quotes."""
     return '"' + "".join(c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in text) + '"'
 
 
 def _check(arm: str, offsets: Mapping[str, float]) -> int:
-    """Return the CRC-32 of what the file says: it tells a changed digit, which no rule could."""
+    """Return the CRC-32 of arm and offsets: it detects a changed digit, which no rule can."""
     said = "\n".join([arm, *(f"{name}={float(offset)!r}" for name, offset in sorted(offsets.items()))])
     return zlib.crc32(said.encode("utf-8", "surrogatepass"))
 
 
 def _findings(document: Document, config: ArmConfig) -> list[Finding]:
-    data, known = document.data, ", ".join(_KEYS)
-    findings: list[Finding] = [
-        ((), f"the key {key} is missing; there must be {known}") for key in _KEYS if key not in data
-    ]
-    findings += [((key,), f"this key does not exist; allowed are {known}") for key in data if key not in _KEYS]
+    data, need = document.data, f"there must be {', '.join(_KEYS)}"
+    findings = [Finding((), "missing", key=key, need=need) for key in _KEYS if key not in data]
+    findings += [Finding((key,), "unknown", what="key", found=key, allowed=_KEYS) for key in data if key not in _KEYS]
     if data.get("arm", config.name) != config.name:
-        findings.append((("arm",), f'found {data["arm"]!r}, allowed is "{config.name}", the name of this arm'))
+        findings.append(
+            Finding(("arm",), "other_arm", found=data["arm"], allowed=f'"{config.name}", the name of this arm')
+        )
     offsets = data.get("offsets", {})
     if not isinstance(offsets, dict):
-        return [*findings, (("offsets",), "found no mapping, allowed is a number for each axis")]
+        return [*findings, Finding(("offsets",), "type", found=offsets, allowed="a number for each axis")]
     names = [axis.name for axis in config.axes]
-    for name in offsets.keys() - set(names):
-        finding = f"this is no axis of {config.name}; its axes are {', '.join(names)}"
-        findings.append((("offsets", name), finding))
+    findings += [
+        Finding(("offsets", name), "no_axis", of=config.name, allowed=names) for name in offsets.keys() - set(names)
+    ]
     for i, name in enumerate(names):
         if "offsets" in data and name not in offsets:
-            findings.append((("offsets",), f"the key {name} is missing: each axis of {config.name} has its offset"))
+            need = f"each axis of {config.name} has its offset"
+            findings.append(Finding(("offsets",), "missing", key=name, need=need))
         elif name in offsets and (finding := _wrong(config, i, offsets[name])):
-            findings.append((("offsets", name), finding))
+            findings.append(finding)
     if not findings and data["check"] != (right := _check(config.name, offsets)):
-        finding = f"found {data['check']}, allowed is {right}: the file is damaged, or was edited"
-        findings.append((("check",), f"{finding}; if its offsets are right write {right}"))
+        findings.append(Finding(("check",), "checksum", found=data["check"], allowed=right))
     return findings
 
 
-def _wrong(config: ArmConfig, axis: int, offset: object) -> str:
-    """Return what is wrong with the offset of an axis; empty where nothing is."""
-    if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= LARGEST:
-        return f"found {shown(offset)}, allowed is a number from {-LARGEST:g} to {LARGEST:g} (rad)"
+def _wrong(config: ArmConfig, axis: int, offset: object) -> Finding | None:
+    """Return the mistake of an axis' offset, None if it is valid."""
     joint = config.axes[axis]
+    where = ("offsets", joint.name)
+    if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= LARGEST:
+        wanted = f"a number from {-LARGEST:g} to {LARGEST:g} (rad)"
+        return Finding(where, "range", found=offset, allowed=wanted)
     device = next(slave.device for slave in config.slaves if slave.name == joint.slave).of_axis(joint.axis)
     low, high = device.wire_range("target_position")
     ends = (joint.position.min + offset, joint.position.max + offset)
     if all(low <= end <= high for end in ends):
-        return ""
+        return None
     reach = f"position {joint.position.min:g} to {joint.position.max:g} would be {ends[0]:g} to {ends[1]:g} there"
-    finding = f"found {offset:g}, with which the drive of {joint.name} cannot be sent its range: {reach}"
-    return f"{finding}, allowed is {low:g} to {high:g}, the range of target_position of {device.name}"
+    of = {"joint": joint.name, "reach": reach, "device": device.name}
+    return Finding(where, "offset_beyond_wire", found=offset, low=low, high=high, **of)

@@ -28,10 +28,10 @@ class Arm(JointGroup):
     """The joints of the arm, moved by the active controller.
 
     Args:
-        config: joints, limits, cycle, the mode at the start.
-        drives: one a joint, in the order of the joints, with the index of its slave.
+        config: joints, limits, cycle, the control mode at the start.
+        drives: the drive of each joint, in the order of the joints, with the index of its slave.
         plan: returns a slot of the plan area, for controllers that run plans.
-        group: partners in a cell; None: there are none.
+        group: partners in a cell; None: none.
     """
 
     def __init__(
@@ -62,11 +62,11 @@ class Arm(JointGroup):
                 self.tool,
             )
         )
-        """By the commands that they accept."""
+        """Command class -> controller that accepts it."""
         self._holder = self.controllers[MoveJoints]
         jog = self.controllers.get(Jog)
         self.jog = jog if isinstance(jog, JogController) and jog.has_geometry else None
-        """The controller that the joystick commands; None where the geometry is unknown."""
+        """Controller of the joystick; None where the geometry is unknown."""
         self.active = self._holder
         self.control_mode = ControlMode[config.control_mode.upper()]
         self.configured_mode = DriveMode[config.drive_mode.upper()]
@@ -78,7 +78,7 @@ class Arm(JointGroup):
             DriveMode.CST: self._cst,
         }
         self.wanted_mode = self.drive_mode_of(self.control_mode)
-        """Drive mode to hold in; drives are enabled in CSP and change then."""
+        """Drive mode while holding; drives are enabled in CSP and then change to it."""
         self.set_mode(self.wanted_mode)
 
     def drive_mode_of(self, mode: ControlMode) -> DriveMode:
@@ -96,7 +96,7 @@ class Arm(JointGroup):
             drive.mode = mode
 
     def use_tool(self, number: int) -> None:
-        """Use another tool, which holds nothing yet; only at rest."""
+        """Use another tool, without a payload; only at rest."""
         self.tool.number, self.tool.payload = number, None
         self.trajectory_guard.use_tool(number)
         for controller in self.controllers.values():
@@ -104,12 +104,12 @@ class Arm(JointGroup):
         self._publishes_load = True
 
     def carry(self, payload: LinkMass) -> None:
-        """Carry the weight of what the tool holds; only at rest."""
+        """Compensate the weight of a payload; only at rest."""
         self.tool.payload = payload if payload.mass else None
         self._publishes_load = True
 
     def publish(self, values: list[Any]) -> None:
-        """Write modes, progress and what the joints measure and are sent."""
+        """Write modes, progress, and actual and commanded values of the joints."""
         state, controller, at = self.state, self.active, self.at
         values[at : at + len(ARM_MODES)] = (
             self.mode,
@@ -129,7 +129,7 @@ class Arm(JointGroup):
             )  # fmt: skip
             at += 1
         if self._publishes_load:
-            # The list is the same in every cycle: what is written once stays in it.
+            # The list is the same in every cycle, so values written once stay.
             payload, at = self.tool.payload or _NOTHING, self.at + len(ARM_MODES) + 9 * n
             values[at : at + len(LOAD_FIELDS)] = (self.tool.number, payload.mass, *payload.centre)
             self._publishes_load = False
@@ -140,7 +140,7 @@ class Arm(JointGroup):
             self.active.stop(self.state)
 
     def rest(self) -> None:
-        """Hold where the setpoints are; at standstill."""
+        """Hold at the setpoints; only at standstill."""
         for controller in self.controllers.values():
             controller.hold()
         self.active = self._holder
@@ -151,7 +151,7 @@ class Arm(JointGroup):
         self.latch()
 
     def latch(self) -> None:
-        """Let the trajectory guard begin where the setpoints are."""
+        """Restart the trajectory guard at the setpoints."""
         self.trajectory_guard.latch(self.state)
 
     def command(self) -> GuardResult:

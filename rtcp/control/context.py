@@ -1,4 +1,4 @@
-"""What the states of the machine share: the parts of the loop, facts that outlive a state, checks of a cycle."""
+"""Shared data of the machine's states: parts of the loop, facts that outlive a state, checks of a cycle."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 
 
 class Context(PartContext):
-    """One for the machine; a state reads it and calls it, and writes only what is said to be a state's to write.
+    """The machine's context; states read it and call its methods, and write only attributes documented as theirs.
 
     Args:
-        config: timeouts, how many cycles may be lost, and the stop reactions.
+        config: timeouts, tolerated lost cycles, and the stop reactions.
         arm: its joints.
-        gripper: one with a drive of its own, or None.
+        gripper: a gripper with a drive, or None.
         operator: the inputs and outputs with a function.
         devices: the slaves that are no drives.
-        blackboard: where events go, and where the lease is.
+        blackboard: receives events, provides the lease.
         service: the thread beside the cycle.
-        discipline: follows the reference clock, or None without distributed clocks.
-        partners: of the arm in a cell.
-        processes: beside motion.
+        discipline: follows the reference clock; None without distributed clocks.
+        partners: the arm's partners in a cell.
+        processes: processes beside motion.
     """
 
     def __init__(
@@ -79,13 +79,13 @@ class Context(PartContext):
             arm.trajectory_guard.neighbours = partners.watch(arm.state, arm.limits, self.period_s)
         cell = () if partners is None else (partners,)
         self.parts: list[Part] = [*self.joints.groups, operator, *processes, *devices, *cell]
-        """The parts of the cycle; the operator and processes write outputs before their slaves encode them."""
+        """Parts in the order of the cycle: operator and processes write outputs before their slaves encode them."""
         self.boxes = [
             (device.slot + 1, device.driver if isinstance(device.driver, IoBox) else None)
             for device in devices
             if device.name in config.boxes
         ]
-        """Position on the cable and driver of each of the configuration's boxes; None: its driver is no IO box's."""
+        """Position on the cable and driver of each configured box; None: the driver is not an IO box's."""
         self.blackboard = blackboard
         self.service = service
         self.homing = HomingSequence(arm, self.joints, self.period_s)
@@ -95,22 +95,22 @@ class Context(PartContext):
         self._clock_cycles = round(config.ethercat.clock_lost_s / self.period_s)
         self._unlocked = 0
         self.entered = 0
-        """Cycle in which the machine changed to its state."""
+        """Number of the cycle in which the machine changed to its state."""
         self.lost = 0
-        """Cycles in a row without it."""
+        """Consecutive cycles without the expected working counter."""
         self.wkc_error_count = 0
-        """Cycles without it, less those with it, 0 to `bus.lost_cycles`."""
+        """Cycles without the expected working counter minus cycles with it, 0 to `bus.lost_cycles`."""
         self.lease = 0
-        """Lease of the commander whose motion runs; 0: the joystick's, which needs none."""
+        """Lease of the running motion's commander; 0: the joystick, which needs none."""
         self.limited = False
-        """Written by states: whether the stop under way ends in the state stopped by limit."""
+        """Whether the present stop ends in the state stopped by limit; written by states."""
         self.pending: ClockLost | None = None
-        """A fault that begins as soon as the controlled stop that it caused has come to rest."""
+        """Fault that begins at standstill of the controlled stop that it caused."""
 
     # -- the cycle ------------------------------------------------------------------------------------------------
 
     def begin_cycle(self, good: bool) -> None:
-        """Count the cycle; `good`: the exchange had the expected working counter."""
+        """Count the cycle; `good`: it had the expected working counter."""
         self.cycle += 1
         self.good = good
         if good:
@@ -129,16 +129,16 @@ class Context(PartContext):
         return self.cycle - self.entered
 
     def cycles(self, seconds: float) -> int:
-        """Return how many cycles a time lasts."""
+        """Return a time, s, in cycles."""
         return round(seconds / self.period_s)
 
     def publish(self, event: Event) -> None:
         """Report an event that changes no state."""
         self.blackboard.event(event)
 
-    def explain(self, what: str, error: Exception) -> None:
-        """Let an exception be put into the log, not by this thread."""
-        self.service.explain_error(what, error)
+    def explain(self, subject: str, error: Exception) -> None:
+        """Let the thread beside the cycle report an exception raised by `subject`."""
+        self.service.explain_error(subject, error)
 
     @property
     def clock_locked(self) -> bool:
@@ -147,28 +147,28 @@ class Context(PartContext):
 
     @property
     def stop_box_in_op(self) -> bool:
-        """Whether there is a box for the emergency stop, and in OP."""
+        """Whether the box of the emergency stop exists and is in OP."""
         position = self.operator.stop_position
         return position > 0 and self.blackboard.in_op(position)
 
     def clear_lost_boxes(self) -> None:
-        """Clear the outputs of each box that is not in OP; where it was the first slave lost, until the reset."""
+        """Clear the outputs of each box that is not in OP; of the first lost slave until the reset."""
         for position, box in self.boxes:
             if box is not None and (self.service.lost_slave == position or not self.blackboard.in_op(position)):
                 self.operator.clear_outputs(box)
 
     def make_safe(self) -> None:
-        """Tell every part to set its outputs to their safe state."""
+        """Set the outputs of every part to their safe state."""
         for part in self.parts:
             part.safe()
 
-    # -- what ends a state from outside ---------------------------------------------------------------------------
+    # -- external ends of a state ---------------------------------------------------------------------------------
 
     def bus_fault(self) -> Event | None:
-        """Return what was lost of frames, slaves and clock, or what a part has reported."""
+        """Return the event of lost frames, slaves or clock, or one that a part has reported; None: none."""
         if self.reported is not None:
             return self.reported
-        # Not those in a row alone: one good cycle in ten would keep an arm moving that is hardly heard.
+        # Not only consecutive ones: otherwise one good cycle in ten would keep the arm moving.
         if not self.good and self.wkc_error_count >= self._lost_limit:
             return ProcessDataLost(self.lost, self._lost_limit)
         if self.service.lost_slave:
@@ -180,24 +180,24 @@ class Context(PartContext):
         return None
 
     def lease_held(self, lease: int) -> bool:
-        """Return whether the commander of `lease` still holds it; 0: the joystick, which needs none."""
+        """Return whether `lease` is current and not expired; 0: the joystick, which needs none."""
         if not lease:
             return True
-        held, renewed, duration = self.blackboard.lease()
-        return held == lease and self.now_ns - renewed <= duration
+        current, renewed, duration = self.blackboard.lease()
+        return current == lease and self.now_ns - renewed <= duration
 
     def permission_lost(self, lease: int) -> Event | None:
-        """Return why what moves for the commander of `lease` has to stop, or None."""
+        """Return the event that forbids motion for the commander of `lease`, or None."""
         if not self.operator.permitted:
             return PermissionWithdrawn()
         return None if self.lease_held(lease) else LeaseExpired()
 
     def is_controlled(self, event: Event) -> bool:
-        """Return whether the reaction to an event leaves the drives enabled."""
+        """Return whether the reaction to an event is a controlled stop, with the drives enabled."""
         return self.reactions[type(event)] is StopReaction.CONTROLLED_STOP
 
     def drive_event(self, kind: type[DriveFault] | type[DriveLeftEnabled], axis: int) -> Event:
-        """Return the event of a drive, whose error code is looked up; one that shows a fault is in fault."""
+        """Return a `DriveFault` where the drive is in fault, else `kind`; requests a report of its error code."""
         self.service.explain_drive(axis)
         drive = self.joints.drives[axis]
         if drive.state in _IN_FAULT:
@@ -205,16 +205,16 @@ class Context(PartContext):
         return kind(axis, drive.state, drive.statusword)
 
     def wrong_drive_mode(self, axis: int) -> Event:
-        """Return the event of a drive that does not change its mode."""
+        """Return the event of a drive that does not change its drive mode."""
         drive = self.joints.drives[axis]
         return DriveModeTimeout(axis, drive.mode_display, DriveMode(drive.mode))
 
     # -- one cycle of an enabled arm ------------------------------------------------------------------------------
 
     def track(self) -> Event | None:
-        """Check what was lost and measured, then move the setpoints on by one cycle.
+        """Check bus and measurements, then advance the setpoints by one cycle; return the event that ends the state.
 
-        Return what ends the state. Without a good cycle the setpoints stand still: the slaves missed the last ones.
+        Without a good cycle the setpoints do not advance, as the slaves missed the last ones.
         """
         arm, joints = self.arm, self.joints
         event = self.bus_fault()
@@ -232,7 +232,7 @@ class Context(PartContext):
         return self._motion_end(result)
 
     def track_homing(self) -> Event | None:
-        """Run the homing for a cycle, supervised as any motion; return what ends the state."""
+        """Run the homing for a cycle, supervised as any motion; return the event that ends the state."""
         joints, homing = self.joints, self.homing
         event = self.bus_fault()
         if event is not None or not self.good:
@@ -255,7 +255,7 @@ class Context(PartContext):
             return HomingStillMoving(homing.axis, joints.drives[homing.axis].velocity)
         axis = joints.first_outside()
         if axis >= 0:
-            # While the drive searches, and where it counts from a new zero.
+            # During the search, and when the drive counts from a new zero.
             return LeftRange(axis, joints.drives[axis].position)
         if not homing.leaving and (box := self.arm.trajectory_guard.zone_at(self.arm.state.actual)) is not None:
             self.publish(HomingInBox(box))
@@ -263,7 +263,7 @@ class Context(PartContext):
         return None
 
     def _supervise_gripper(self) -> Event | None:
-        """Stop a gripper that nobody commands any more; return what ends the state."""
+        """Stop a gripper without a commander; return the event that ends the state."""
         gripper = self.gripper
         if gripper is None or not gripper.motion.moving or gripper.motion.stops:
             return None
@@ -278,7 +278,7 @@ class Context(PartContext):
         return None
 
     def _motion_end(self, result: GuardResult) -> Event | None:
-        """Return what ends the motion: a guard that stops it, or its controller."""
+        """Return the event that ends the motion: a guard stops it, or its controller has finished."""
         arm, controller = self.arm, self.arm.active
         ended: MotionEnded | None = controller.ended
         if isinstance(ended, ControllerFailed):

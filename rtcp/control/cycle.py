@@ -2,7 +2,7 @@
 
 wake -> send the outputs of the last cycle -> receive -> each part's decode -> command -> state machine (controller ->
 guards -> writer -> limiter) -> each part's update and encode -> publish -> clock discipline. Nothing in here logs,
-blocks, opens or grows.
+blocks, opens files or allocates memory that grows.
 """
 
 from __future__ import annotations
@@ -47,23 +47,23 @@ from rtcp.realtime.discipline import Discipline
 from rtcp.realtime.scheduling import Sleeper
 
 _LARGEST_COUNTER = 0x7FFF
-"""A damaged frame may bring a larger working counter than any segment has."""
+"""Largest working counter in a record: a damaged frame may have a larger one than any segment."""
 _LONGEST_NS: Final = 2_000_000_000
 _TRANSIT_DIVISOR: Final = 20
-"""A frame is on its way for this part of the period at most."""
+"""Longest transit time of a frame: the period divided by this."""
 
 
 class Cycle:
-    """Everything that happens once a cycle.
+    """Runs the loop: exchange, parts, command, state machine and record, once a cycle.
 
     Args:
         config: the arm.
         data: the process image, slaves in SAFE-OP.
-        blackboard: where commands come from and records go.
+        blackboard: provides commands and receives records.
         service: the thread beside the cycle; it need not run.
-        discipline: follows the reference clock, or None without distributed clocks.
-        now: the clock, ns; another one where time is simulated.
-        partners: of the arm in a cell.
+        discipline: follows the reference clock; None without distributed clocks.
+        now: clock, ns; a simulated one in tests.
+        partners: the arm's partners in a cell.
 
     Raises:
         DeviceError: the description of a device does not suit its use.
@@ -100,7 +100,7 @@ class Cycle:
             part.at = at
             at += sum(field.count for field in part.fields)
         self._values: list[Any] = [0] * at
-        """The numbers of the record but its own number, which the blackboard gives it."""
+        """Values of the record without its number, which the blackboard adds."""
         if blackboard.schema != schema_of(part.fields for part in self.parts):
             raise ValueError("the blackboard was made for other records: make it with `record_schema`")
         self._data = data
@@ -111,9 +111,9 @@ class Cycle:
         self._expected = data.expected_wkc
         self._period_ns = round(config.cycle.period_us * 1000)
         ahead_ns = ahead_of_sync0(config)
-        # Half of what is left to SYNC0; the other half is for the frame's way.
+        # Half of the time to SYNC0; the other half is for the frame's transit.
         self._late_ns = ahead_ns // 2
-        # After a frame that SYNC0 has overtaken, the next tick's would come before the same SYNC0 as that one.
+        # After a frame that misses its SYNC0, the next tick's frame would precede the same SYNC0 as that frame.
         self._apart_ns = max(self._period_ns // 2, self._period_ns - ahead_ns + self._period_ns // _TRANSIT_DIVISOR)
         self._spin_ns = round(config.cycle.spin_us * 1000)
         self._locked = False
@@ -121,14 +121,14 @@ class Cycle:
         self.missed = 0
         """Ticks of the grid at which no frame was sent."""
         self._compute_ns = 0
-        """From an answer to the end of its cycle: known after the record of that cycle, so the next one carries it."""
+        """Time from the last answer to the end of its cycle, ns; published in the next cycle's record."""
 
     def shut_down(self) -> None:
-        """Ask for a controlled stop, drives disabled, and the end of `run`. Safe from a signal handler or a thread."""
+        """Request a controlled stop, disabled drives, and the end of `run`. Safe from a signal handler or a thread."""
         self._shutdown = True
 
     def run(self) -> None:
-        """Run until the end was asked for and the drives are disabled (or 2 s have passed)."""
+        """Run until `shut_down` was called and the drives are disabled (or 2 s have passed)."""
         machine, cycle, spin = self.machine, self.cycle, self._spin_ns
         if isinstance(self._data, PacedData):
             planned = monotonic_ns() + self._period_ns
@@ -144,9 +144,9 @@ class Cycle:
             planned = cycle(planned, woken)
 
     def answer(self, data: PacedData, planned: int) -> int:
-        """Do one cycle of a bus that sets the pace: its message is due at `planned`; return when the next one is.
+        """Do one cycle of a bus that sets the pace: its message is due at `planned`; return when the next is due, ns.
 
-        What does not come within half a period is lost. A message that comes later begins the next cycle.
+        A message later than half a period counts as lost and begins the next cycle.
         """
         period = self._period_ns
         wkc = data.receive_until(planned + period // 2)
@@ -158,7 +158,7 @@ class Cycle:
         return (woken if wkc > 0 else max(planned, woken - period)) + period
 
     def cycle(self, planned: int, woken: int) -> int:
-        """Do one cycle, planned at `planned` and begun at `woken` (ns of the clock); return when the next is due."""
+        """Do one cycle, planned at `planned` and begun at `woken`; return when the next is due; ns of the clock."""
         data = self._data
         data.send()
         sent = self._now()
@@ -189,7 +189,7 @@ class Cycle:
         return planned
 
     def _work(self, woken: int, wkc: int) -> None:
-        """Do what lies between an answer and the next outputs."""
+        """Compute the next outputs from an answer."""
         data, machine, parts, context = self._data, self.machine, self.parts, self._context
         good = wkc == self._expected
         context.now_ns = self.arm.state.now_ns = woken
@@ -197,8 +197,8 @@ class Cycle:
             for part in parts:
                 part.decode(data)
         elif wkc > 0 and self._stop_device is not None and context.stop_box_in_op:
-            # Another slave is missing, and which ones were in the frame is unknown. SOEM returns what a slave did not
-            # fill in as it was, so these are the inputs of the box, of now or of before.
+            # A slave is missing, and which ones were in the frame is unknown. SOEM returns bytes that no slave wrote
+            # unchanged, so these inputs of the box are new or old, but valid.
             self._stop_device.decode(data)
             self.operator.read_emergency_stop()
         if machine.partners is not None:
@@ -240,7 +240,7 @@ class Cycle:
             flags |= FLAG_MOTION_ALLOWED
         if operator.joystick_granted:
             flags |= FLAG_ARM_HAS_JOYSTICK
-        # One slice, in the order of CYCLE_FIELDS: cheaper than an index a field.
+        # One slice, in the order of CYCLE_FIELDS: cheaper than an index for each field.
         values[: len(CYCLE_FIELDS) - 1] = (
             context.cycle,
             woken,
@@ -267,11 +267,11 @@ class Cycle:
 
 
 def record_schema(config: ArmConfig, partners: Partners | None = None) -> RecordSchema:
-    """Return what the records of the cycle of this platform hold; `partners`: of the arm in a cell.
+    """Return the schema of this platform's cycle records; `partners`: the arm's partners in a cell.
 
     Raises:
         DeviceError: the description of a device does not suit its use.
-        SchemaError: two slaves have names that differ too little for the names of fields.
+        SchemaError: two slaves have names that give the same field names.
     """
     driven = config.gripper is not None and config.gripper.joint is not None
     arm = (arm_fields(len(config.joints)), GRIPPER_FIELDS if driven else (), OPERATOR_FIELDS)
@@ -288,7 +288,7 @@ def make_drives(config: ArmConfig) -> list[tuple[int, Drive]]:
 
 
 def ahead_of_sync0(config: ArmConfig) -> int:
-    """Return how long before the first SYNC0 of a drive a frame leaves that is in time, ns; half a period without."""
+    """Return the time from a frame in time to the first SYNC0 of a drive, ns; half a period without SYNC0."""
     period_ns = round(config.cycle.period_us * 1000)
     shifts = [round(slave.device.sync0_shift_us * 1000) for slave in config.slaves if slave.device.assign_activate]
     sent = round(config.ethercat.send_phase * period_ns)
@@ -296,7 +296,7 @@ def ahead_of_sync0(config: ArmConfig) -> int:
 
 
 def make_discipline(config: ArmConfig) -> Discipline | None:
-    """Return what follows the reference clock, or None without distributed clocks."""
+    """Return the clock discipline; None without distributed clocks."""
     period_ns = round(config.cycle.period_us * 1000)
     shifts = [slave.device.sync0_shift_us for slave in config.slaves if slave.device.assign_activate]
     if not shifts:
@@ -305,5 +305,5 @@ def make_discipline(config: ArmConfig) -> Discipline | None:
 
 
 def address_of(config: ArmConfig, joint: Joint) -> tuple[int, int]:
-    """Return where the drive that moves `joint` is: its position on the cable, from 1, and its axis."""
+    """Return the position on the cable, from 1, and the axis of the drive of `joint`."""
     return next(slot for slot, slave in enumerate(config.slaves, 1) if slave.name == joint.slave), joint.axis

@@ -1,4 +1,4 @@
-"""A gripper with a drive of its own: a group of one joint in CSP, beside the arm, whose controllers do not know it."""
+"""A gripper with a drive: a group of one joint in CSP, beside the arm and independent of its controllers."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from rtcp.motion.guards.trajectory_guard import GuardResult
 
 
 class DrivenGripper(JointGroup):
-    """The drive of the gripper: enabled and disabled with the arm, moved by itself.
+    """The drive of the gripper: enabled and disabled with the arm, moved independently.
 
-    An object in its grip shows as torque, and as a following error where it is soft: that ends its motion and is no
-    reason to stop the arm. So its torque has no bound, and while it holds something its following error has none.
+    An object in its grip causes torque, and a following error where it is soft: that ends the grip's motion but must
+    not stop the arm. So its torque is not supervised, and its following error only while it grips nothing.
 
     Args:
-        config: of the gripper's joint alone.
-        motion: of that joint.
-        axis: its number.
+        config: configuration with the gripper's joint alone.
+        motion: motion of that joint.
+        axis: axis number of that joint.
 
     Raises:
-        DeviceError: its device's description cannot serve.
+        DeviceError: its device's description is not suitable.
     """
 
     def __init__(self, config: ArmConfig, motion: GripperMotion, axis: int) -> None:
@@ -41,16 +41,16 @@ class DrivenGripper(JointGroup):
         self._error_limit = self.supervision.following_error
         self._moved = False
         self.lease = 0
-        """Lease of the commander that set it in motion; 0: the joystick, which needs none."""
+        """Lease of the commander of its motion; 0: the joystick, which needs none."""
 
     def update(self, context: PartContext) -> None:
-        """Report where it came to rest, if it moved, or was commanded to, since the last cycle."""
+        """Report its position when it has come to rest after a motion or a command."""
         before, self._moved = self._moved, self.motion.moving
         if before and not self._moved and context.all_enabled:
             context.publish(GripperAtRest(self.first, self.state.commanded[0], self.motion.gripped))
 
     def publish(self, values: list[Any]) -> None:
-        """Write what its drive measures and is sent."""
+        """Write actual and commanded values of its drive."""
         drive, at = self.drive, self.at
         values[at : at + len(GRIPPER_FIELDS)] = (
             drive.position, drive.velocity, drive.torque, drive.target_position, drive.state,
@@ -58,18 +58,18 @@ class DrivenGripper(JointGroup):
         )  # fmt: skip
 
     def grip(self, close: bool, lease: int = 0) -> bool:
-        """Close or open, for the commander of `lease`; return False, and do nothing, where its drive is not enabled."""
+        """Close or open, for the commander of `lease`; return False, without effect, where its drive is not enabled."""
         drive = self.drive
         enabled = drive.state is DriveState.OPERATION_ENABLED and drive.mode_display == drive.mode
         if not (enabled and self.motion.grip(self.state, close)):
             return False
         self.lease = lease
-        # Where it already is where it shall be, it comes to rest before the cycle has ended.
+        # Already at its target it comes to rest within this cycle.
         self._moved = True
         return True
 
     def command(self) -> GuardResult:
-        """Write the target of this cycle: motion -> limiter. The next setpoint begins at what was sent."""
+        """Write the target of this cycle: motion -> limiter. The next setpoint starts from the limited target."""
         motion, drive, commanded = self.motion, self.drive, self.state.commanded
         motion.update(self.state)
         drive.target_position = commanded[0]
@@ -88,7 +88,7 @@ class DrivenGripper(JointGroup):
         self.motion.stop(self.state)
 
     def hold(self) -> None:
-        """Hold at the last setpoint, and nothing in its grip."""
+        """Hold at the last setpoint and forget the grip."""
         self.motion.hold(self.state)
         self.motion.gripped = False
 
@@ -98,10 +98,10 @@ class DrivenGripper(JointGroup):
 
 
 def make_gripper(config: ArmConfig) -> DrivenGripper | None:
-    """Return the gripper with a drive, or None where there is none or one on an output.
+    """Return the gripper with a drive; None: no gripper, or one on an output.
 
     Raises:
-        DeviceError: its device's description cannot serve.
+        DeviceError: its device's description is not suitable.
     """
     gripper = config.gripper
     if gripper is None or gripper.joint is None or gripper.open_position is None or gripper.closed_position is None:

@@ -1,7 +1,7 @@
-"""The homing of one joint (CiA 402-2, homing mode): its drive finds its home by itself, the other joints hold.
+"""Homing of one joint (CiA 402-2, homing mode): its drive searches its home by itself, the other joints hold.
 
-How it homes (method, speeds, acceleration, home offset) is in the drive: 0x6098, 0x6099, 0x609A, 0x607C, written by
-the start-up SDOs of its description. Afterwards it counts from its home; the joint's zero offset counts on from there.
+Method, speeds, acceleration and home offset are parameters of the drive: 0x6098, 0x6099, 0x609A, 0x607C, written by the
+start-up SDOs of its description. Afterwards it counts from its home; the joint's zero offset is relative to that.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from rtcp.ipc.events import Event, Homed, HomingFailed, Stopped
 HOMING: Final = 6
 """Mode of operation (CiA 402-2, object 0x6060)."""
 START = ENABLE_OPERATION | 0x10
-"""Controlword with the start bit; taking the bit away interrupts (CiA 402-2, homing mode)."""
+"""Controlword with the start bit; clearing the bit interrupts (CiA 402-2, homing mode)."""
 
 
-class Shown(Enum):
+class HomingStatus(Enum):
     """Meaning of the statusword of a drive in mode 6."""
 
     UNDER_WAY = "homing is under way"
@@ -34,21 +34,21 @@ class Shown(Enum):
 
 _BITS = 0x3400
 # Bits 13 (homing error), 12 (homing attained) and 10 (target reached) of the statusword (CiA 402-2, homing mode)
-SHOWN: dict[int, Shown] = {
-    0x0000: Shown.UNDER_WAY,
-    0x0400: Shown.AT_REST,
-    0x1000: Shown.FOUND,
-    0x1400: Shown.ATTAINED,
-    0x2000: Shown.FAILING,
-    0x2400: Shown.FAILED,
-    # Reserved: what shows an error has not succeeded.
-    0x3000: Shown.FAILING,
-    0x3400: Shown.FAILED,
+HOMING_STATUS: dict[int, HomingStatus] = {
+    0x0000: HomingStatus.UNDER_WAY,
+    0x0400: HomingStatus.AT_REST,
+    0x1000: HomingStatus.FOUND,
+    0x1400: HomingStatus.ATTAINED,
+    0x2000: HomingStatus.FAILING,
+    0x2400: HomingStatus.FAILED,
+    # Reserved: with the error bit it counts as failed.
+    0x3000: HomingStatus.FAILING,
+    0x3400: HomingStatus.FAILED,
 }
 
 
 class HomingPhase(Enum):
-    """How far a homing is; the last five end it."""
+    """Phase of a homing; the last five end it."""
 
     IDLE = "idle"
     ENTERING = "the drive changes to mode 6"
@@ -69,17 +69,17 @@ _MODE_S: Final = 1.0
 _REST_S: Final = 3.0
 _LONGEST_S: Final = 60.0
 _STILL_RAD_S: Final = 0.01
-_TOLD_CYCLES: Final = 10
+_LAG_CYCLES: Final = 10
 """Cycles for which the statusword may still show the end of an earlier homing: it lags behind the controlword."""
 
 
 class Homing:
     """Controls the homing of a drive: `start` once, then `step` every cycle after `decode`, until it has `ended`.
 
-    The drive is enabled, in CSP and at standstill at the start and again at the end. While it homes, nothing but this
-    object sets its controlword and its mode, and the joint's setpoint is `position`, whatever it reads: at the home
-    the drive begins to count anew, and `position` jumps with it. A drive that leaves Operation Enabled is not this
-    object's matter: the caller sees it, and calls `abandon`.
+    The drive is enabled, in CSP and at standstill at the start and again at the end. While it homes, only this object
+    sets its controlword and its mode, and the joint's setpoint is `position`: at the home the drive begins to count
+    anew, and `position` jumps with it. The caller supervises that the drive stays in Operation Enabled, else it calls
+    `abandon`.
     """
 
     __slots__ = (
@@ -88,11 +88,11 @@ class Homing:
     )  # fmt: skip
 
     def __init__(self, period_s: float, longest_s: float = _LONGEST_S) -> None:
-        """Make what homes one drive at a time.
+        """Prepare to home one drive at a time.
 
         Args:
-            period_s: of the cycle, s.
-            longest_s: how long a drive may look for its home, s.
+            period_s: period of the cycle, s.
+            longest_s: longest search of a drive for its home, s.
         """
         self._longest = round(longest_s / period_s)
         self._mode_cycles = round(_MODE_S / period_s)
@@ -101,30 +101,30 @@ class Homing:
         self._cycles = 0
         self._latched = False
         self._turned = False
-        """Whether the drive has shown mode 6: until then it may still follow its target."""
+        """Whether the drive has displayed mode 6: until then it may still follow its target."""
         self._outcome = _P.STOPPED
         self.phase = _P.IDLE
         self.shown = 0
-        """Statusword that ended the search, for the sentence about a failure."""
+        """Statusword that ended the search, for the event of a failure."""
         self.shown_mode = HOMING
-        """Mode at that time: another one where the drive does not home."""
+        """Mode display at that time; not 6 where the drive left homing."""
 
     @property
     def ended(self) -> bool:
-        """Whether the homing is over, well or not; the drive is then in CSP, but where it is STUCK or RUNNING."""
+        """Whether the homing has ended, in success or failure; the drive is then in CSP, except in STUCK or RUNNING."""
         return self.phase in ENDED
 
     @property
     def position(self) -> float:
-        """The joint's setpoint, rad: the last one until the drive is in mode 6, then where the drive is, and from its
-        way back to CSP on where it was then."""
+        """Setpoint of the joint, rad: the last one until the drive is in mode 6, then its actual position, and from the
+        change back to CSP on the position at that time."""
         drive = self._drive
         if drive is None:
             return 0.0
         return drive.position if self._turned and not self._latched else drive.target_position
 
     def start(self, drive: Cia402Drive) -> None:
-        """Begin; `drive` is enabled, in CSP and at standstill."""
+        """Begin to home `drive`, which is enabled, in CSP and at standstill."""
         self._drive = drive
         self._latched = self._turned = False
         self._outcome = _P.STOPPED
@@ -133,7 +133,7 @@ class Homing:
         self._enter(_P.ENTERING)
 
     def stop(self) -> None:
-        """Let the drive come to rest and go back to CSP; does nothing once it is at its home, or has ended."""
+        """Bring the drive to rest and back to CSP; no effect once it is at its home, or has ended."""
         if self.phase in (_P.ENTERING, _P.SEARCHING):
             self._enter(_P.STOPPING)
 
@@ -144,7 +144,7 @@ class Homing:
             self._enter(_P.STOPPED)
 
     def step(self) -> HomingPhase:
-        """Do one cycle; return how far it is. Does nothing before `start` and after the end."""
+        """Do one cycle and return the phase. No effect before `start` and after the end."""
         drive = self._drive
         if drive is None or self.ended:
             return self.phase
@@ -155,7 +155,7 @@ class Homing:
         phase = self.phase
         if phase is _P.ENTERING:
             if drive.mode_display == HOMING:
-                # The start bit was low in mode 6 for a cycle: from here it rises.
+                # The start bit was low in mode 6 for a cycle; its rising edge starts the search.
                 self._enter(_P.SEARCHING)
                 drive.controlword = START
             elif self._cycles > self._mode_cycles:
@@ -164,10 +164,10 @@ class Homing:
         elif phase is _P.SEARCHING:
             self._search(drive)
         elif phase is _P.STOPPING:
-            if abs(drive.velocity) < _STILL_RAD_S and self._cycles > _TOLD_CYCLES:
+            if abs(drive.velocity) < _STILL_RAD_S and self._cycles > _LAG_CYCLES:
                 self._leave(self._outcome)
             elif self._cycles > self._rest:
-                # In CSP its target would stand where it is now: a jerk for a joint that turns. It is stopped otherwise.
+                # CSP would stop a turning joint with a jerk, so it is stopped otherwise.
                 self._enter(_P.RUNNING)
         elif drive.mode_display == CSP and self._cycles > 1:
             self._enter(self._outcome)
@@ -177,16 +177,16 @@ class Homing:
 
     def _search(self, drive: Cia402Drive) -> None:
         drive.controlword = START
-        if self._cycles <= _TOLD_CYCLES:
+        if self._cycles <= _LAG_CYCLES:
             return
-        shown = SHOWN[drive.statusword & _BITS]
+        status = HOMING_STATUS[drive.statusword & _BITS]
         if drive.mode_display != HOMING:
-            # The drive left the mode on its own: its bits have another meaning there.
+            # The drive left the mode by itself; the bits have another meaning there.
             self._fail(drive, _P.STUCK)
-        elif shown is Shown.ATTAINED:
+        elif status is HomingStatus.ATTAINED:
             self.shown = drive.statusword
             self._leave(_P.HOMED)
-        elif shown in (Shown.FAILED, Shown.FAILING) or self._cycles > self._longest:
+        elif status in (HomingStatus.FAILED, HomingStatus.FAILING) or self._cycles > self._longest:
             self._fail(drive, _P.FAILED)
 
     def _fail(self, drive: Cia402Drive, outcome: HomingPhase) -> None:
@@ -196,7 +196,7 @@ class Homing:
         self._enter(_P.STOPPING)
 
     def _leave(self, outcome: HomingPhase) -> None:
-        """Go back to CSP, where the target is the place the drive is at now: latched once, or the arm would sag."""
+        """Return to CSP, with the present position as target: latched once, or the arm would sag."""
         drive = self._drive
         if drive is not None:
             drive.controlword = ENABLE_OPERATION
@@ -217,8 +217,8 @@ class HomingSequence:
 
     Args:
         arm: enabled, at rest, in CSP.
-        joints: all of the platform; those beside the arm's move on.
-        period_s: the cycle, s.
+        joints: all joints of the platform; those beside the arm's move on.
+        period_s: period of the cycle, s.
     """
 
     def __init__(self, arm: Arm, joints: Joints, period_s: float) -> None:
@@ -228,7 +228,7 @@ class HomingSequence:
         self.axis = 0
 
     def begin(self, axis: int) -> None:
-        """Let the drive of a joint begin."""
+        """Start the homing of a joint's drive."""
         drive = self._arm.drives[axis]
         assert isinstance(drive, Cia402Drive), "the command is refused for another"
         self.axis = axis
@@ -239,11 +239,11 @@ class HomingSequence:
         self._homing.stop()
 
     def abandon(self) -> None:
-        """Release the drive, which is commanded elsewhere."""
+        """Release the drive: another stop commands it."""
         self._homing.abandon()
 
     def returned_to_range(self) -> bool:
-        """Move a joint whose home is a little outside its range to the edge; return whether it is there."""
+        """Move a joint whose home is slightly outside its range to the edge; return whether it is there."""
         arm, axis = self._arm, self.axis
         if arm.beyond_range(axis) > 0.0:
             low, high, position = arm.limits.low[axis], arm.limits.high[axis], arm.state.commanded
@@ -253,7 +253,7 @@ class HomingSequence:
         return arm.beyond_range(axis) <= 0.0
 
     def step(self) -> None:
-        """Run a cycle; the setpoint of the joint is where its drive shows it, those of the others stand."""
+        """Do one cycle; the joint's setpoint is its drive's position, the setpoints of the others stay."""
         arm, axis, homing = self._arm, self.axis, self._homing
         self._joints.command_others()
         if homing.ended:
@@ -265,7 +265,7 @@ class HomingSequence:
 
     @property
     def under_way(self) -> bool:
-        """Whether it has begun and is not over."""
+        """Whether it has begun and has not ended."""
         return self._homing.phase is not HomingPhase.IDLE and not self._homing.ended
 
     @property
@@ -280,17 +280,17 @@ class HomingSequence:
 
     @property
     def leaving(self) -> bool:
-        """Whether the drive no longer searches: it comes to rest, or returns to CSP."""
+        """Whether the search has ended: the drive comes to rest, or returns to CSP."""
         return self._homing.phase not in (HomingPhase.ENTERING, HomingPhase.SEARCHING)
 
     @property
     def ended(self) -> bool:
-        """Whether it is over."""
+        """Whether the homing has ended."""
         return self._homing.ended
 
     @property
     def outcome(self) -> Event:
-        """How it ended."""
+        """Event of its end."""
         homing = self._homing
         if homing.phase is HomingPhase.HOMED:
             return Homed(self.axis, homing.position)

@@ -22,13 +22,13 @@ RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_O
 """Drive states without torque and without a fault."""
 _ENABLED = DriveState.OPERATION_ENABLED
 _HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
-"""Drive states with torque: the target stands."""
+"""Drive states with torque, in which the target stays."""
 _STILL_RAD_S: Final = 0.01
 RANGE_MARGIN_RAD: Final = 0.02
-"""Largest distance from its range at which a joint is still enabled, to return to the edge: an overshoot in CST must
-not leave an arm that no command can move."""
+"""Largest distance of a joint from its range, rad, at which it can be enabled, to return to the edge: an overshoot in
+CST must not leave an arm that no command can move."""
 TRACKED_RAD: Final = 0.03
-"""Largest step of a joint without torque between two frames: a larger one is a jump, and enabling ends in a fault.
+"""Largest step of a joint without torque between two frames, rad; a larger one is a jump: enabling ends in a fault.
 Greater than `RANGE_MARGIN_RAD`."""
 
 
@@ -36,10 +36,10 @@ class JointGroup(Part):
     """Drives with consecutive axis numbers. Its setpoints advance only in `command`, when the machine calls it.
 
     Args:
-        name: of the part.
-        fields: of the record.
-        config: its `joints` are those of the group.
-        drives: one a joint, with the index of its slave.
+        name: name of the part.
+        fields: fields of the part in the record.
+        config: configuration with the `joints` of the group.
+        drives: the drive of each joint, with the index of its slave.
         first: axis number of the first joint.
     """
 
@@ -57,7 +57,7 @@ class JointGroup(Part):
         self.pairs = list(drives)
         self.drives = [drive for _, drive in drives]
         self.shares_slaves = False
-        """Whether a drive of it is one of several axes of its slave."""
+        """Whether one of its drives is one of several axes of a slave."""
         self.state = ArmState(len(config.joints))
         self.limits = Limits(config)
         self.output_limiter = OutputLimiter(self.limits, self.period_s)
@@ -84,7 +84,7 @@ class JointGroup(Part):
             data.set_output(slot, drive.encode())
 
     def set_limits(self, new: Values) -> None:
-        """Put other limits into force."""
+        """Apply new limits."""
         self.limits.apply(new)
         for i, drive in enumerate(self.drives):
             drive.low, drive.high = self.limits.low[i], self.limits.high[i]
@@ -94,11 +94,11 @@ class JointGroup(Part):
 
     @property
     def at_rest(self) -> bool:
-        """Whether the setpoints stand still and no guard brakes: the torque may go."""
+        """Whether the setpoints stand still and no guard brakes: the torque may be removed."""
         raise NotImplementedError
 
     def command(self) -> GuardResult:
-        """Write the targets of this cycle; return the verdict of the trajectory guard, PASS without one."""
+        """Write the targets of this cycle; return the result of the trajectory guard, PASS without one."""
         raise NotImplementedError
 
     def stop(self) -> None:
@@ -110,14 +110,14 @@ class JointGroup(Part):
         raise NotImplementedError
 
     def latch(self) -> None:
-        """Let the setpoints, moved by `track_actual`, be at rest."""
+        """Set the setpoints, moved by `track_actual`, to rest."""
         raise NotImplementedError
 
     def track_actual(self) -> None:
         """Let setpoints and targets follow the drives that have no torque.
 
-        The setpoint of a joint outside its range is the edge of it, so that every controller begins inside; from where
-        the joint is to there the output limiter moves its target, once the drive follows it.
+        The setpoint of a joint outside its range is the range's edge, so that every controller begins inside; once the
+        drive follows its target, the output limiter moves it from the joint's position to the edge.
         """
         commanded, latch, limits = self.state.commanded, self.output_limiter.latch, self.limits
         for i, drive in enumerate(self.drives):
@@ -129,7 +129,7 @@ class JointGroup(Part):
         self.latch()
 
     def beyond_range(self, i: int) -> float:
-        """Return how far beyond its range the target of a joint is, rad, or 0; `i` counts from the group's first."""
+        """Return how far the target of joint `i`, counted within the group, is beyond its range, rad; 0 inside."""
         last, limits = self.output_limiter.sent[i], self.limits
         return max(last - limits.high[i], limits.low[i] - last, 0.0)
 
@@ -138,15 +138,15 @@ class Joints:
     """All joints of a platform by axis number. A method `first_...` returns -1 where there is no such joint.
 
     Args:
-        arm: its axes come first.
-        others: groups beside it, which move on while a joint of the arm homes.
+        arm: the arm, whose axes come first.
+        others: groups beside the arm, which move on while a joint of the arm homes.
     """
 
     def __init__(self, arm: JointGroup, others: Sequence[JointGroup]) -> None:
         self.others = list(others)
         self.groups = [arm, *others]
         self.pairs = [pair for group in self.groups for pair in group.pairs]
-        """Index of its slave and driver of each drive."""
+        """Slave index and driver of each drive."""
         share_slaves(self.pairs)
         for group in self.groups:
             group.shares_slaves = any(drive.slave is not None for drive in group.drives)
@@ -163,12 +163,12 @@ class Joints:
             group.track_actual()
 
     def command(self) -> GuardResult:
-        """Write the targets of this cycle; return the verdict of the arm's trajectory guard."""
+        """Write the targets of this cycle; return the result of the arm's trajectory guard."""
         self.command_others()
         return self.groups[0].command()
 
     def command_others(self) -> None:
-        """Write the targets of this cycle of all joints beside the arm's."""
+        """Write this cycle's targets of all joints beside the arm's."""
         for group in self.others:
             group.command()
 
@@ -189,11 +189,11 @@ class Joints:
 
     @property
     def at_rest(self) -> bool:
-        """Whether all setpoints stand still and no guard brakes: the torque may go."""
+        """Whether all setpoints stand still and no guard brakes: the torque may be removed."""
         return all(group.at_rest for group in self.groups)
 
     def beyond_limits(self) -> EmergencyStop | None:
-        """Return what was measured beyond its limit for too long, or None."""
+        """Return the event of a measurement beyond its limit for too long, or None."""
         for group in self.groups:
             event = group.supervision.check(group.state)
             if event is not None:
@@ -201,7 +201,7 @@ class Joints:
         return None
 
     def reset_supervision(self) -> None:
-        """Begin to count anew the cycles beyond a limit."""
+        """Restart the count of cycles beyond a limit."""
         for group in self.groups:
             group.supervision.reset()
 
@@ -213,14 +213,14 @@ class Joints:
         return -1
 
     def first_with_torque(self) -> int:
-        """Return the first joint whose drive gives torque: enabled, in a quick stop or reacting to a fault."""
+        """Return the first joint whose drive has torque: enabled, in a quick stop or reacting to a fault."""
         for axis, drive in enumerate(self.drives):
             if drive.state in WITH_TORQUE:
                 return axis
         return -1
 
     def first_in_another_mode(self) -> int:
-        """Return the first joint whose drive does not show the commanded mode."""
+        """Return the first joint whose drive does not display the commanded mode."""
         for axis, drive in enumerate(self.drives):
             if drive.mode_display != drive.mode:
                 return axis
@@ -234,7 +234,7 @@ class Joints:
         return -1
 
     def first_blocked(self) -> int:
-        """Return the first joint whose drive cannot be enabled before people do something at its controller."""
+        """Return the first joint whose drive cannot be enabled before an action at its controller."""
         for axis, drive in enumerate(self.drives):
             if drive.missing is not Missing.NOTHING:
                 return axis
@@ -255,7 +255,7 @@ class Joints:
         return -1
 
     def first_outside(self) -> int:
-        """Return the first joint that stands outside its range by more than may be enabled."""
+        """Return the first joint outside its range by more than `RANGE_MARGIN_RAD`."""
         for group in self.groups:
             low, high = group.limits.low, group.limits.high
             for i, drive in enumerate(group.drives):
@@ -272,7 +272,7 @@ class Joints:
         return -1
 
     def position_jump(self) -> PositionJumped | None:
-        """Return the first joint that `track_actual` would move further than it can have turned, or None."""
+        """Return the event of the first joint that `track_actual` would move by more than `TRACKED_RAD`, or None."""
         for group in self.groups:
             sent = group.output_limiter.sent
             for i, drive in enumerate(group.drives):

@@ -1,4 +1,4 @@
-"""The state machine: it alone changes the state. What each state does and leads to: `rtcp.control.states`."""
+"""The state machine, which alone changes the state. Actions and transitions of each state: `rtcp.control.states`."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ _ENDED_BY_EMERGENCY_STOP = frozenset(
         State.RESETTING,
     }
 )
-"""States that the input of the emergency stop ends: those with torque, and those after a fault. On the way to OP the
-inputs are not yet valid; while ready no drive has torque, and enabling is refused while it is pressed."""
+"""States that the input of the emergency stop ends: those with torque, and those after a fault. During the start the
+inputs are not yet valid; in ready no drive has torque, and enabling is refused while the button is pressed."""
 _ENDED_BY_PARTNER = _ENDED_BY_EMERGENCY_STOP - {State.FAULT, State.RESETTING}
-"""States that the emergency stop of a partner ends: those with torque. It keeps no arm from being reset: with both
-buttons pressed, or one at both boxes, none could be the first."""
+"""States that the emergency stop of a partner ends: those with torque. It does not prevent a reset: with both buttons
+pressed, or one button at both boxes, neither arm could be reset first."""
 _SAFE = frozenset({State.FAULT, State.EMERGENCY_STOP, State.CLOSING})
-"""States at whose beginning all outputs become safe. Inputs that are stale for too long lead to the fault."""
+"""States that set all outputs to their safe state when they begin. Stale inputs lead to the fault."""
 _SLAVES_RETURN = frozenset({State.FAULT, State.RESETTING, State.EMERGENCY_STOP, State.CLOSING})
 """States in which a slave that has left OP may return to it."""
 
@@ -82,8 +82,8 @@ class StateMachine:
     """Runs the active state once a cycle and changes it.
 
     Args:
-        ctx: what the states share.
-        partners: of the arm in a cell.
+        ctx: shared data of the states.
+        partners: the arm's partners in a cell.
     """
 
     def __init__(self, ctx: Context, partners: Partners | None = None) -> None:
@@ -92,8 +92,8 @@ class StateMachine:
         reaction = FaultReaction(ctx)
         self._holding = Holding()
         self._states: dict[State, MachineState] = {
-            one.state: one
-            for one in (
+            state.state: state
+            for state in (
                 Starting(),
                 ReadyState(reaction),
                 Enabling(),
@@ -111,13 +111,13 @@ class StateMachine:
         }
         self._active = self._states[State.STARTING]
         self.fault = 0
-        """Number of the event that began the present fault; 0: there is none."""
+        """Number of the event that began the present fault; 0: no fault."""
         self.limit = 0
-        """Number of the event by which a limit ended the last motion; 0: none, or it was reset."""
+        """Number of the event of the limit that ended the last motion; 0: none, or it was reset."""
         self.enables = 0
-        """How often the arm was enabled."""
+        """Number of times that the arm was enabled."""
         self.motions = 0
-        """How many motions have begun."""
+        """Number of motions begun."""
 
     @property
     def state(self) -> State:
@@ -135,7 +135,7 @@ class StateMachine:
         return self.context.state is State.HOLDING and self._holding.changing_mode
 
     def update(self, good: bool) -> None:
-        """Do one cycle; `good`: the exchange had the expected working counter."""
+        """Do one cycle; `good`: it had the expected working counter."""
         ctx, partners = self.context, self.partners
         ctx.begin_cycle(good)
         operator = ctx.operator
@@ -145,7 +145,7 @@ class StateMachine:
             self.change(PartnerEmergencyStop(partners.pressed))
         event = self._active.update(ctx)
         if event is not None and self._handle(event):
-            # The state ended before it commanded the arm: the next one does so in this cycle.
+            # The state ended before it commanded the arm: the next state commands it in this cycle.
             event = self._active.update(ctx)
             if event is not None:
                 self._handle(event)
@@ -154,11 +154,11 @@ class StateMachine:
         ctx.drop_reported(self.fault)
 
     def change(self, cause: Cause, lease: int | None = None) -> None:
-        """Change to the state that a command, an event or a signal leads to; an event is published.
+        """Change to the state to which a command, an event or a signal leads; publish an event.
 
         Args:
-            cause: what leads on; one that leads nowhere from here changes nothing.
-            lease: of the commander of a motion; 0: the joystick.
+            cause: the command, event or signal; no change where it leads nowhere from the present state.
+            lease: lease of the commander of a motion; 0: the joystick.
         """
         ctx, before = self.context, self.context.state
         if isinstance(cause, Event) and cause is not ctx.pending:
@@ -179,7 +179,7 @@ class StateMachine:
             self._active.enter(ctx, cause, before)
 
     def change_drive_mode(self, mode: DriveMode) -> None:
-        """Let the drives change their mode: now, at standstill, or when they are next enabled."""
+        """Let the drives change their mode: now at standstill, or when they are next enabled."""
         self.context.arm.wanted_mode = mode
         if self.state is State.HOLDING:
             self._holding.change_mode(self.context, mode)
@@ -187,12 +187,12 @@ class StateMachine:
             self.context.arm.set_mode(mode)
 
     def close(self) -> None:
-        """Stop, disable and end; nothing else is done from then on."""
+        """Stop, disable and end; final."""
         if self.state not in (State.CLOSING, State.OFF):
             self.change(Shutdown())
 
     def _handle(self, event: Event | Signal) -> bool:
-        """Change the state for what ended it; return whether the arm is still to be commanded in this cycle."""
+        """Change the state by `event`; return whether the arm is still to be commanded in this cycle."""
         ctx = self.context
         if isinstance(event, ClockLost) and event is not ctx.pending and self._stops_for_clock(event):
             ctx.publish(event)
@@ -204,16 +204,16 @@ class StateMachine:
         return ctx.state is State.STOPPING and isinstance(event, (LeaseExpired, PermissionWithdrawn))
 
     def _stops_for_clock(self, event: ClockLost) -> bool:
-        """Return whether the arm comes to a controlled stop before the fault."""
+        """Return whether a lost clock leads to a controlled stop before the fault."""
         ctx = self.context
         if not ctx.is_controlled(event):
             return False
-        # On its way to no torque it continues: who commanded none is not left with an arm that holds.
+        # Disabling continues: after the command to remove the torque the arm must not hold.
         disabling = ctx.state is State.DISABLING
         return disabling or (Signal.STOP_FOR_CLOCK in self._active.leads_to and not ctx.joints.at_rest)
 
     def _target(self, cause: Cause) -> State | None:
-        """Return where a cause leads from the active state; the reaction configured for an event may be harder."""
+        """Return the state to which a cause leads; an event with a harder configured reaction leads to the fault."""
         leads_to = self._active.leads_to
         if isinstance(cause, Signal):
             return leads_to.get(cause)

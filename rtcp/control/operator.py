@@ -1,4 +1,4 @@
-"""Controls and lamps at the arm: joystick, toggle, enabling switch, emergency stop; each hangs on an IO box."""
+"""Controls and lamps at the arm, each at an IO box: joystick, toggle, enabling switch, emergency stop."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Operator(Part):
     """Reads the inputs with a function, jogs the arm by the joystick, and writes the outputs with a function.
 
     Args:
-        config: which they are.
-        boxes: the IO boxes by name; none: nothing is pressed, nothing is forbidden and there is no joystick.
-        driven: the gripper where it has a drive of its own.
+        config: configuration of the inputs and outputs.
+        boxes: the IO boxes by name; without any no button is pressed, motion is permitted and there is no joystick.
+        driven: the gripper where it has a drive.
 
     Raises:
-        DeviceError: an input or output with a function hangs on no IO box: it would be ignored.
+        DeviceError: an input or output with a function is not at an IO box, so it would be ignored.
     """
 
     def __init__(self, config: ArmConfig, boxes: Mapping[str, IoBox], driven: DrivenGripper | None) -> None:
@@ -61,25 +61,25 @@ class Operator(Part):
                 raise DeviceError(f"{type(user).__name__} needs an IO box: {box} is none, or has no driver of one")
         names = [slave.name for slave in config.slaves]
         self.stop_position = 0 if self._stop_box is None else 1 + names.index(self._stop_box.name)
-        """Position on the cable of the box with the emergency stop; 0: there is no box."""
+        """Position on the cable of the box with the emergency stop; 0: no box."""
         self._was_granted = True
         self._code_reported = False
         self.emergency_stop = self._stop_box is not None and self._inputs.emergency_stop.active
-        """Whether it is pressed; until the box was read it is."""
+        """Whether the emergency stop is pressed; true until the box was read."""
         self.permitted = self._switch_box is None or self._inputs.enabling_switch.active
         """Whether the enabling switch allows motion."""
         self.joystick_granted = False
-        lamps = [(config.box_of(outputs), one) for one in (outputs.state_lamp, outputs.motion_lamp, outputs.heartbeat)]
+        lamps = [(config.box_of(outputs), led) for led in (outputs.state_lamp, outputs.motion_lamp, outputs.heartbeat)]
         grip = None if gripper is None else gripper.output
         self.reserved = frozenset((*lamps, (config.box_of(gripper), grip)))
-        """Box and number of the outputs that commands may not switch."""
+        """Box and number of each output that commands may not switch."""
         self.has_button = self._stop_box is not None and inputs.emergency_stop is not None
-        """Whether there is an emergency stop at a box."""
+        """Whether a box has an emergency stop."""
         self.has_gripper = self._grip_box is not None and grip is not None
 
     @property
     def joystick_mode(self) -> int:
-        """0 X-Y, 1 Z-yaw, 2 roll-pitch, 3 gripper."""
+        """Axes of the joystick: 0 X-Y, 1 Z-yaw, 2 roll-pitch, 3 gripper."""
         return self._joystick.mode
 
     def publish(self, values: list[Any]) -> None:
@@ -102,7 +102,7 @@ class Operator(Part):
             self._input.read(self._stick_box.inputs)
 
     def read_emergency_stop(self) -> None:
-        """Read that the emergency stop is pressed; never that it was released."""
+        """Update the emergency stop to pressed where it is; never to released."""
         if self._stop_box is not None:
             stop = self._inputs.emergency_stop
             stop.read_active(self._stop_box.inputs)
@@ -110,16 +110,16 @@ class Operator(Part):
 
     @property
     def holds_grip(self) -> bool:
-        """Whether the joystick is held where it opens or closes the gripper."""
+        """Whether the joystick is deflected to open or close the gripper."""
         return self.joystick_granted and self._joystick.holds_grip
 
     @property
     def button_known(self) -> bool:
-        """Whether the emergency stop was read for long enough since `assume_released`."""
+        """Whether the emergency stop was read for its debounce time since `assume_released`."""
         return self._stop_box is None or self._inputs.emergency_stop.settled
 
     def assume_released(self) -> None:
-        """Let the emergency stop count as released until its box shows otherwise."""
+        """Treat the emergency stop as released until its box reports it pressed."""
         self._inputs.emergency_stop.forget()
         self.emergency_stop = False
 
@@ -130,11 +130,11 @@ class Operator(Part):
             box.outputs = self._outputs.write(box.outputs, context.all_enabled, context.state is State.MOVING)
 
     def clear_outputs(self, box: IoBox) -> None:
-        """Clear all outputs of a box but the lamps, as a box does that leaves OP."""
+        """Clear all outputs of a box except the lamps, as a box itself does when it leaves OP."""
         box.outputs = self._outputs.lamps(box.outputs) if box is self._lamp_box else 0
 
     def require_neutral(self) -> None:
-        """Ignore the joystick until it has been neutral."""
+        """Ignore the joystick until it was neutral once."""
         self._joystick.wait_for_neutral()
 
     def grip(self, close: bool) -> None:
@@ -143,9 +143,9 @@ class Operator(Part):
             self._grip_box.outputs = self._outputs.grip(self._grip_box.outputs, close)
 
     def jog_by_joystick(self, arm: Arm, blackboard: Blackboard) -> bool:
-        """Command the jog in control mode joystick; return whether the arm has to start moving.
+        """Command the jog in control mode joystick; return whether the arm has to start a motion.
 
-        Called every cycle in which the arm holds, or moves by the joystick.
+        Called in every cycle in which the arm holds, or moves by the joystick.
         """
         jog = arm.jog
         if arm.control_mode is not ControlMode.JOYSTICK or jog is None:
@@ -154,16 +154,16 @@ class Operator(Part):
         if granted is not self._was_granted:
             self._was_granted = granted
             blackboard.event(JoystickGranted() if granted else JoystickWithdrawn())
-        shown, joystick = self._input, self._joystick
+        joystick_input, joystick = self._input, self._joystick
         before = joystick.mode
-        joystick.update(shown, granted and self.permitted)
+        joystick.update(joystick_input, granted and self.permitted)
         if joystick.mode != before:
             blackboard.event(JoystickModeChanged(joystick.mode))
-        if shown.valid:
+        if joystick_input.valid:
             self._code_reported = False
         elif granted:
             if not self._code_reported:
-                blackboard.event(UnknownJoystickCode(shown.code))
+                blackboard.event(UnknownJoystickCode(joystick_input.code))
             self._code_reported = True
         if joystick.grip is not None:
             self._grip_by_joystick(blackboard, opens=joystick.grip)

@@ -1,8 +1,8 @@
-"""What a cycle is made of: parts, each with its inputs, its outputs and its fields of the cycle record.
+"""Parts of a cycle, each with its inputs, its outputs and its fields of the cycle record.
 
 send -> receive -> each part's `decode` -> command -> machine -> each part's `update` and `encode` -> each part's
-`publish`. Who adds a part writes one class. A part never switches itself on: the machine decides, and tells all parts
-by `safe` when their outputs have to be safe.
+`publish`. A new part is one class. A part never switches itself on: the machine decides, and calls `safe` of all parts
+when their outputs have to be safe.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from rtcp.ipc.states import State
 
 
 class PartContext:
-    """What a part sees of its cycle; `rtcp.control.context.Context` fills it.
+    """A part's view of its cycle; `rtcp.control.context.Context` implements it.
 
     Args:
-        period_s: the cycle, s.
+        period_s: period of the cycle, s.
     """
 
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s
         self.state = State.STARTING
-        """The machine's state; written by the machine alone."""
+        """State of the machine; only the machine writes it."""
         self.cycle = 0
         self.now_ns = 0
         """Instant of the cycle, ns of the clock of the loop."""
         self.good = False
-        """Whether the exchange of this cycle had the expected working counter."""
+        """Whether this cycle had the expected working counter."""
         self.all_enabled = False
         """Whether all drives are in Operation Enabled."""
         self.reported: Event | None = None
-        """A fault that a part has reported; the machine takes it in the next cycle."""
+        """Fault that a part has reported; the machine handles it in the next cycle."""
         self._dropped = 0
 
     def publish(self, event: Event) -> None:
@@ -50,15 +50,15 @@ class PartContext:
         raise NotImplementedError
 
     def lease_held(self, lease: int) -> bool:
-        """Return whether the commander of `lease` still holds it."""
+        """Return whether `lease` is current and not expired."""
         raise NotImplementedError
 
-    def explain(self, what: str, error: Exception) -> None:
-        """Let an exception be put into the log, not by this thread."""
+    def explain(self, subject: str, error: Exception) -> None:
+        """Let the thread beside the cycle report an exception raised by `subject`."""
         raise NotImplementedError
 
     def report(self, event: Event) -> None:
-        """Report an event of a part; one that is a fault stops the arm in the next cycle, the hardest of several."""
+        """Report an event of a part; a fault stops the arm in the next cycle, of several faults the hardest."""
         if not event.is_fault:
             self.publish(event)
         elif self.reported is None:
@@ -70,7 +70,7 @@ class PartContext:
             self.publish(event)
 
     def drop_reported(self, fault: int) -> None:
-        """Forget what was reported and ended no state; publish it once, unless it is of the present `fault`'s kind."""
+        """Forget a reported fault that ended no state; publish it once, unless it is of the present `fault`'s kind."""
         event, self.reported = self.reported, None
         number = 0 if event is None else event.number
         if event is not None and number not in (fault, self._dropped):
@@ -83,9 +83,9 @@ class Part:
     """Base of all parts of the cycle.
 
     Args:
-        name: unique in the platform; a device has that of its slave.
-        fields: of the record, in the order in which `publish` writes them.
-        commands: that are no motions, and that `accept` takes.
+        name: unique in the platform; a device has the name of its slave.
+        fields: fields of the record, in the order in which `publish` writes them.
+        commands: classes of the commands, without motions, that `accept` handles.
     """
 
     def __init__(
@@ -95,17 +95,17 @@ class Part:
         self.fields = tuple(fields)
         self.commands = tuple(commands)
         self.at = 0
-        """Index of its first number among the values of a record; set when the record is laid out."""
+        """Index of its first value in a record; set with the layout of the record."""
 
     def decode(self, data: ProcessData) -> None:
         """Read the inputs of a cycle in which every slave took part."""
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
-        """Carry out one of `commands`, or return why not and change nothing."""
+        """Carry out one of `commands`, or return its refusal without any change."""
         raise NotImplementedError
 
     def update(self, context: PartContext) -> None:
-        """Do what the cycle asks for, after the machine."""
+        """Compute the outputs of the cycle; called after the machine."""
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the cycle."""
@@ -114,18 +114,18 @@ class Part:
         """Write the values of `fields` into the record, from index `at` on."""
 
     def safe(self) -> None:
-        """Set the outputs to their safe state: called by the machine on a fault, on stale inputs and at the end."""
+        """Set the outputs to their safe state; the machine calls it on a fault, on stale inputs and at the end."""
 
 
 class Device(Part):
-    """A slave that is no drive: its driver, which a package may have brought.
+    """A slave that is no drive, with its driver, possibly of another package.
 
-    A driver that raises is a fault of that slave, and no end of the cycle: it is asked no more and its outputs are safe
-    until the machine is ready again.
+    An exception of the driver is a fault of that slave and does not end the cycle: the driver is not called any more,
+    and its outputs are safe, until the machine is ready again.
 
     Args:
         slot: index of the slave.
-        driver: of the slave's kind.
+        driver: driver of the slave.
     """
 
     def __init__(self, slot: int, driver: Driver) -> None:
@@ -156,14 +156,14 @@ class Device(Part):
             return DriverRaised(self.slot + 1)
 
     def set_channel(self, name: str, value: float) -> Refusal | None:
-        """Set an output of a driver that offers its channels, from this cycle's frame on."""
+        """Set an output channel of the driver, from this cycle's frame on."""
         if self._failed:
             return DriverRaised(self.slot + 1)
         self.driver.targets[name] = value
         return None
 
     def update(self, context: PartContext) -> None:
-        """Let the driver do its cycle."""
+        """Update the driver; report its exception as a fault."""
         event = None
         try:
             if not self._failed:
@@ -171,7 +171,7 @@ class Device(Part):
                 if isinstance(event, MotionEnded):
                     raise TypeError(f"a driver ends no motion: {event.name}")
             if self._stays_safe:
-                # From the fault until the reset is done, whatever the driver does meanwhile.
+                # From the fault to the end of the reset, whatever the driver does meanwhile.
                 self._stays_safe = context.state is not State.READY
                 self._failed = self._failed and self._stays_safe
                 if not self._failed:
@@ -197,7 +197,7 @@ class Device(Part):
         data.set_output(self.slot, outputs)
 
     def publish(self, values: list[Any]) -> None:
-        """Write what the driver shows."""
+        """Write the driver's values."""
         try:
             if not self._failed:
                 self.driver.publish(values, self.at)
@@ -216,5 +216,5 @@ class Device(Part):
 def make_devices(config: ArmConfig) -> list[Device]:
     """Return a part for each slave that is no drive; raises DeviceError."""
     period_s = config.cycle.period_us * 1e-6
-    made = [(slot, make_driver(slave, period_s)) for slot, slave in enumerate(config.slaves)]
-    return [Device(slot, driver) for slot, driver in made if not isinstance(driver, Drive)]
+    drivers = [(slot, make_driver(slave, period_s)) for slot, slave in enumerate(config.slaves)]
+    return [Device(slot, driver) for slot, driver in drivers if not isinstance(driver, Drive)]

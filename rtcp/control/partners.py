@@ -1,6 +1,6 @@
-"""The partners of an arm in a cell: their newest records, read once a cycle, and what this arm tells them in its own.
+"""The partners of an arm in a cell: their newest records, read once a cycle, and this arm's fields for them.
 
-Shared memory and nothing else passes between the loops of a cell. Files are opened by the thread beside the cycle.
+The loops of a cell exchange data through shared memory only. The thread beside the cycle opens the files.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from rtcp.motion.state import ArmState
 from rtcp.motion.step_group import Partner, StepGroup, StepPhase
 
 _NOTICE_CYCLES: Final = 1.5
-"""Of the slowest arm: an arm announces its brake this long ahead."""
+"""Lead time with which an arm announces its brake, cycles of the slowest arm."""
 _AHEAD_NS: Final = 1_000_000_000
-"""A record from further in the future is none."""
+"""Greatest time of a record in the future, ns; later ones are ignored."""
 _FORGOTTEN_NS: Final = 1_000_000_000
-"""Age of a partner's newest record from which on its emergency stop counts as unknown."""
+"""Age of a partner's newest record from which its emergency stop counts as unknown, ns."""
 _SCALARS = ("time_ns", "state", "flags", "step_motion", "step_phase", "step_brake_ns", "step_path_s", "step_cell")
 _VECTORS = ("commanded_position", "commanded_velocity", "acceleration_limit")
 _STATES = tuple(State)
@@ -35,61 +35,60 @@ _PHASES = tuple(StepPhase)
 
 
 def step_fields(joints: int) -> tuple[Field, ...]:
-    """Return the fields of the record that partners read."""
+    """Return the fields of the record for the partners of an arm with this number of joints."""
     return (
         Field("step_motion", "uint64", "", "Number of the motion in step; 0: none yet.", part="cell"),
         Field("step_phase", "uint8", "", "Where the arm is in it (rtcp.motion.step_group.StepPhase).", part="cell"),
         Field("step_brake_ns", "int64", "ns", "When the group begins to brake; 0: it does not.", part="cell"),
-        Field("step_path_s", "float64", "s", "How far the arm has got, by the path's own time.", part="cell"),
-        Field("step_cell", "uint64", "", "Digest of the cell's files, as this arm was started with them.", part="cell"),
+        Field("step_path_s", "float64", "s", "Progress of the arm, nominal time of the path.", part="cell"),
+        Field("step_cell", "uint64", "", "Digest of the cell's files at the start of this arm.", part="cell"),
         Field("commanded_velocity", "float64", "rad/s", "Speed of the setpoint.", (joints,), part="cell"),
         Field("acceleration_limit", "float64", "rad/s^2", "Acceleration limit in force.", (joints,), part="cell"),
     )
 
 
 class Partners(Part):
-    """Reads what the partners publish, and publishes what they need to know of this arm.
+    """Reads the partners' records, and publishes this arm's fields for them.
 
     Args:
         cell: the cell.
-        name: of this arm in it.
+        name: name of this arm in the cell.
     """
 
     def __init__(self, cell: CellConfig, name: str) -> None:
         super().__init__("cell", step_fields(len(cell.member(name).config.joints)))
         self._own = cell.member(name)
         self._clearance, self._delay_s = cell.clearance, cell.longest_silence_s + cell.slowest_s
-        self.members: list[Member] = [one for one in cell.members if one.name != name]
+        self.members: list[Member] = [member for member in cell.members if member.name != name]
         self.group = StepGroup(cell.longest_silence_s, _NOTICE_CYCLES * cell.slowest_s, cell.digest)
-        self.group.members = [Partner(len(one.config.joints)) for one in self.members]
-        for partner, one in zip(self.group.members, self.members, strict=True):
-            partner.acceleration[:] = (joint.acceleration for joint in one.config.joints)
+        self.group.members = [Partner(len(member.config.joints)) for member in self.members]
+        for partner, member in zip(self.group.members, self.members, strict=True):
+            partner.acceleration[:] = (joint.acceleration for joint in member.config.joints)
         self._shares_stop = cell.share.emergency_stop
         self.pressed = self.stopped = -1
-        """The first partner whose emergency stop is pressed, where it is shared, or -1; and the first one that has not
-        been reset since."""
-        self.files = [blackboard_file(one.directory) for one in self.members]
-        """Their blackboards."""
+        """First partner whose shared emergency stop is pressed, and first one not reset since; index or -1."""
+        self.files = [blackboard_file(member.directory) for member in self.members]
+        """Blackboard files of the partners."""
         self._inodes = [0] * len(self.members)
         self._views: list[RecordView | None] = [None] * len(self.members)
         self._values: list[list[Any]] = [
-            [0] * (len(_SCALARS) + len(_VECTORS) * len(one.config.joints)) for one in self.members
+            [0] * (len(_SCALARS) + len(_VECTORS) * len(member.config.joints)) for member in self.members
         ]  # fmt: skip
         self._arm: ArmState | None = None
         self._acceleration: Sequence[float] = ()
 
     def watch(self, arm: ArmState, limits: Limits, period_s: float) -> Neighbours | None:
-        """Publish the setpoints of this arm from now on; return what keeps it away from its partners."""
+        """Publish the setpoints of this arm from now on; return the guard data of its partners, None: no geometry."""
         self._arm, self._acceleration = arm, limits.acceleration
         own = body_of(self._own, limits.acceleration)
         if own is None:
             return None
         partners = zip(self.members, self.group.members, strict=True)
-        bodies = [body_of(one, partner.acceleration) for one, partner in partners]
+        bodies = [body_of(member, partner.acceleration) for member, partner in partners]
         return Neighbours(own, bodies, self.group, self._clearance, period_s, self._delay_s)
 
     def open(self) -> None:
-        """Open the blackboards of partners that have started since; not for the cycle."""
+        """Open the blackboards of partners that have started since the last call; too slow for the cycle."""
         for index, path in enumerate(self.files):
             with contextlib.suppress(OSError):
                 inode = path.stat().st_ino
@@ -97,8 +96,12 @@ class Partners(Part):
                     self._views[index] = _view(path, len(self.group.members[index].position))
                     self._inodes[index] = inode
 
+    def close(self) -> None:
+        """Close the blackboards."""
+        self._views = [None] * len(self._views)
+
     def read(self, now_ns: int) -> None:
-        """Read the newest record of each partner; of one that is just being written the one before counts."""
+        """Read the newest complete record of each partner."""
         self.pressed = self.stopped = self.group.foreign = -1
         for index, partner in enumerate(self.group.members):
             view, values = self._views[index], self._values[index]
@@ -113,12 +116,12 @@ class Partners(Part):
                 continue
             if partner.emergency_stop and self.pressed < 0:
                 self.pressed = index
-            # While it is reset its button is not read.
+            # A partner does not read its button during its reset: its state still shows the stop.
             if (partner.emergency_stop or partner.state in _STOPPED) and self.stopped < 0:
                 self.stopped = index
 
     def publish(self, values: list[Any]) -> None:
-        """Write where this arm is in the motion in step."""
+        """Write the progress of this arm in the motion in step."""
         group, arm, at = self.group, self._arm, self.at
         values[at : at + 5] = group.motion, group.phase, group.brake_ns, group.path_s, group.cell
         if arm is not None:
@@ -128,7 +131,7 @@ class Partners(Part):
 
 
 def _view(path: Path, joints: int) -> RecordView | None:
-    """Return a view of a partner's records: whole, or of a platform outside any cell its instants alone."""
+    """Return a view of a partner's records: all fields, or only the instants of a platform outside any cell."""
     for names in ((*_SCALARS, *_VECTORS), ("time_ns",)):
         with contextlib.suppress(RecordViewError):
             view = RecordView(path, names)
@@ -138,12 +141,12 @@ def _view(path: Path, joints: int) -> RecordView | None:
 
 
 def _take(partner: Partner, values: Sequence[Any], now_ns: int) -> None:
-    """Take over a record; one that no loop writes counts as none: its sender becomes silent."""
+    """Copy a record to `partner`. An invalid record is ignored: after some, the partner counts as silent."""
     time_ns = values[0]
     if time_ns > now_ns + _AHEAD_NS:
         return
     if len(values) == 1:
-        # It runs, and as part of no cell.
+        # It runs, but outside a cell.
         partner.time_ns, partner.cell = time_ns, 0
         partner.state, partner.motion_allowed = State.OFF, False
         return
@@ -152,7 +155,7 @@ def _take(partner: Partner, values: Sequence[Any], now_ns: int) -> None:
     speeds = at + n
     accelerations = speeds + n
     whole = sum(values[at:], path_s)
-    # NaN and infinity are no numbers of a joint; an acceleration of 0 is no limit.
+    # NaN, infinity and an acceleration limit of 0 are invalid.
     if (
         state >= len(_STATES)
         or phase >= len(_PHASES)

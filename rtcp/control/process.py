@@ -1,6 +1,6 @@
-"""The loop's process: from a session file to a bus in INIT again, with the cycle between.
+"""The loop's process: reads a session file, runs the cycle, and leaves the bus in INIT.
 
-It reports on a pipe, a JSON object a line: `phase` sentences, then `ready` with the facts of the start, or `error`.
+It reports on a pipe, one JSON object a line: `phase` sentences, then `ready` with the facts of the start, or `error`.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ from rtcp.realtime import scheduling
 
 _DISABLE_CYCLES = 20
 _BLIND_WORDS = {TargetState.QUICK_STOPPED: QUICK_STOP, TargetState.DISABLED: DISABLE_VOLTAGE}
-"""What a drive is told whose driver raises."""
+"""Target state -> controlword for a drive whose driver raises."""
 
 
 class Report:
-    """Tells the launcher how the start goes; silent once nobody listens."""
+    """Reports the progress of the start to the launcher; silent once the pipe is broken."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
 
     def tell(self, event: str, **facts: Any) -> None:
-        """Write one line; a launcher that has gone is no error."""
+        """Write one line; a launcher that has exited is not an error."""
         if self._descriptor < 0:
             return
         line = json.dumps({"event": event, **facts}).encode() + b"\n"
@@ -61,7 +61,7 @@ class Report:
             self._descriptor = -1
 
     def close(self) -> None:
-        """Close the pipe: nothing more is told."""
+        """Close the pipe, which ends the reports."""
         if self._descriptor >= 0:
             with contextlib.suppress(OSError):
                 os.close(self._descriptor)
@@ -71,21 +71,21 @@ class Report:
 def main() -> int:
     """Run the loop's process.
 
-    Return 0 after an orderly end, `EXIT_INCOMPLETE` where slaves did not come to INIT then, 2 where the bus refused,
-    1 after a defect of ours.
+    Return 0 after an orderly end, `EXIT_INCOMPLETE` where slaves did not reach INIT at the end, 2 where the start
+    failed, 1 after a defect of this program.
     """
     parser = argparse.ArgumentParser(prog="rtcp.control.process")
     parser.add_argument("--directory", type=Path, required=True)
     parser.add_argument("--ready-fd", type=int, required=True)
-    given = parser.parse_args()
-    report = Report(given.ready_fd)
+    arguments = parser.parse_args()
+    report = Report(arguments.ready_fd)
     try:
-        session = read_session(given.directory)
+        session = read_session(arguments.directory)
     except SessionError as error:
         report.tell("error", sentences=[str(error)])
         sys.stderr.write(f"{error}\n")
         return 2
-    # Until the cycle runs, SIGTERM unwinds what was opened; then it asks for a controlled stop.
+    # Before the cycle SIGTERM ends the start and closes the bus; then it requests a controlled stop.
     signal.signal(signal.SIGTERM, _leave)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     master: Master | None = None
@@ -93,7 +93,7 @@ def main() -> int:
     try:
         config = session.config
         master = master_of(config.bus)(config, session.interface, session.segment_pid)
-        _work(master, session, given.directory, report)
+        _work(master, session, arguments.directory, report)
     except (BusError, DeviceError, ConfigError, SchemaError, BlackboardTooLarge) as error:
         sentences = list(error.sentences) if isinstance(error, BusError) else str(error).splitlines()
         report.tell("error", sentences=sentences)
@@ -104,7 +104,7 @@ def main() -> int:
             before = len(master.notes)
             master.close()
             left += master.notes[before:]
-        write_exit_report(given.directory, os.getpid(), left)
+        write_exit_report(arguments.directory, os.getpid(), left)
         sys.stderr.write("".join(f"{sentence}\n" for sentence in left))
     return EXIT_INCOMPLETE if left else 0
 
@@ -129,7 +129,6 @@ def _work(master: Master, session: Session, directory: Path, report: Report) -> 
         master,
         blackboard,
         [address_of(config, joint) for joint in config.axes],
-        [joint.name for joint in config.axes],
         config.bus.op_timeout_s,
         cpu,
         config.cycle.priority,
@@ -188,9 +187,9 @@ def _work(master: Master, session: Session, directory: Path, report: Report) -> 
 def stop_blindly(
     data: ProcessData, config: ArmConfig, drives: Sequence[tuple[int, Drive]], devices: Sequence[Device] = ()
 ) -> None:
-    """Bring all drives to rest after a defect in the cycle: a quick stop for as long as it takes, then torque off.
+    """Bring all drives to rest after a defect in the cycle: quick stop until standstill is certain, then torque off.
 
-    Nothing else of the cycle is needed, and what raises for one drive or one frame keeps no other from being told.
+    It uses nothing else of the cycle; an exception of one drive or one frame does not affect the others.
     """
     for device in devices:
         with contextlib.suppress(Exception):
@@ -207,13 +206,13 @@ def stop_blindly(
             with contextlib.suppress(Exception):
                 data.send()
                 data.receive()
-            # At the cycle's pace: a drive that misses frames between its SYNC0 may leave OP.
+            # At the cycle's period: a drive that misses frames between its SYNC0 may leave OP.
             due = max(due + period_s, time.monotonic())
             time.sleep(max(due - time.monotonic(), 0.0))
 
 
 def _outputs(drive: Drive, data: ProcessData, slot: int, goal: TargetState) -> bytes:
-    """Return a drive's outputs one step towards `goal`; where its driver raises: a controlword, and 0 in the rest."""
+    """Return a drive's outputs one step towards `goal`; where its driver raises: a controlword, all other fields 0."""
     try:
         drive.decode(data.input(slot))
         drive.advance(goal)
@@ -221,7 +220,7 @@ def _outputs(drive: Drive, data: ProcessData, slot: int, goal: TargetState) -> b
     except Exception:
         image = drive.rpdo
         control = image.find("controlword")  # a node of another bus has none: zeros are its command to stand
-        own = make_codec(image).pack(*(_BLIND_WORDS[goal] if one is control else 0 for one in image.channels))
+        own = make_codec(image).pack(*(_BLIND_WORDS[goal] if channel is control else 0 for channel in image.channels))
     return own if drive.slave is None else drive.slave.outputs(drive, own)
 
 
@@ -231,9 +230,9 @@ if __name__ == "__main__":
     except SystemExit as ending:
         code = ending.code if isinstance(ending.code, int) else 1
     except BaseException:
-        # A defect of ours: told whole, for the log.
+        # A defect of this program: the whole traceback goes to the log.
         traceback.print_exc()
         code = 1
     sys.stderr.flush()
-    # Past the interpreter's own end: with the collector off, ruckig's objects would be reported as leaked there.
+    # Skips the interpreter's shutdown, which with the collector off would report ruckig's objects as leaked.
     os._exit(code)

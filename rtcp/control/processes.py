@@ -1,7 +1,7 @@
 """Processes beside motion as parts of the cycle: a heater, a pump, a camera's light.
 
-A process reads channels of the slaves, and partners in the cell, and writes channels. It runs after the machine and
-before the slaves' outputs are encoded, so that what it decides leaves with the frame of the same cycle.
+A process reads channels of the slaves and partners in the cell, and writes channels. It runs after the machine and
+before the slaves' outputs are encoded, so that its outputs leave with the frame of the same cycle.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Signal:
 
     @property
     def value(self) -> float:
-        """What the slave has sent last, or what it is sent in this cycle."""
+        """Last value from the slave, or value sent to it in this cycle, SI."""
         return self._values[self._name]
 
     @value.setter
@@ -43,12 +43,12 @@ class Signal:
 
 
 class ProcessSetup:
-    """What a process is made of.
+    """Cycle, channels and partners for a process.
 
     Args:
-        period_s: the cycle, s.
-        signals: of the slaves, by SLAVE.CHANNEL.
-        partners: the newest records of the partners in the cell, by name; read anew in every cycle.
+        period_s: period of the cycle, s.
+        signals: SLAVE.CHANNEL -> signal.
+        partners: name -> newest record of the partner in the cell, updated in every cycle.
     """
 
     def __init__(self, period_s: float, signals: Mapping[str, Signal], partners: Mapping[str, Partner]) -> None:
@@ -62,7 +62,7 @@ class Process:
     """Base of all processes: a subclass writes its outputs in every `update`.
 
     Args:
-        config: its keys.
+        config: its keys in the configuration.
         setup: the cycle, the channels and the partners.
     """
 
@@ -71,11 +71,11 @@ class Process:
         self.commands = config.COMMANDS
 
     def fields(self) -> Sequence[Field]:
-        """Return what it publishes in the cycle record, without its own name."""
+        """Return its fields of the cycle record, without its own name."""
         return ()
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
-        """Carry out one of the configuration's `COMMANDS`, or return why not and change nothing."""
+        """Carry out one of the configuration's `COMMANDS`, or return its refusal without any change."""
         raise NotImplementedError
 
     def update(self, context: PartContext) -> None:
@@ -86,9 +86,9 @@ class Process:
         """Write the values of `fields` into the record, from index `at` on."""
 
     def safe(self) -> None:
-        """Set the outputs to their safe state: called on a fault, on stale inputs and at the end.
+        """Set the outputs to their safe state; called on a fault, on stale inputs and at the end.
 
-        It lasts until the process is commanded again: nothing starts by itself.
+        They stay safe until the next command of the process: nothing starts by itself.
         """
         raise NotImplementedError
 
@@ -96,12 +96,12 @@ class Process:
 class ProcessPart(Part):
     """A process in the cycle.
 
-    One that raises is a fault: it is asked no more, and its outputs are safe until the machine is ready again.
+    Its exception is a fault: it is not called any more, and its outputs are safe, until the machine is ready again.
 
     Args:
-        number: of the process in the configuration, from 0.
-        process: it.
-        outputs: all that it may write.
+        number: index of the process in the configuration, from 0.
+        process: the process.
+        outputs: all signals that it may write.
     """
 
     def __init__(self, number: int, process: Process, outputs: Sequence[Signal]) -> None:
@@ -124,7 +124,7 @@ class ProcessPart(Part):
             return ProcessRaised(self._number)
 
     def update(self, context: PartContext) -> None:
-        """Let the process do its cycle."""
+        """Update the process; report its exception as a fault."""
         if self._failed and self._reported and context.state is State.READY:
             self._failed = self._reported = False
             self.safe()
@@ -146,14 +146,14 @@ class ProcessPart(Part):
                 context.report(ProcessFailed(self._number))
 
     def publish(self, values: list[Any]) -> None:
-        """Write what the process shows."""
+        """Write the process's values."""
         try:
             if not self._failed:
                 self.process.publish(values, self.at)
         except Exception as error:
             self._fail(error)
         if self._failed:
-            # Nothing is busy, and nothing on.
+            # Zeros: not busy, and off.
             at = self.at
             for field in self.fields:
                 values[at : at + field.count] = [0] * field.count
@@ -181,12 +181,12 @@ def make_processes(config: ArmConfig, devices: Sequence[Device], partners: Partn
     }
     records: dict[str, Partner] = {}
     if partners is not None:
-        records = {one.name: record for one, record in zip(partners.members, partners.group.members, strict=True)}
+        records = {member.name: record for member, record in zip(partners.members, partners.group.members, strict=True)}
     setup = ProcessSetup(config.cycle.period_us * 1e-6, {**inputs, **outputs}, records)
-    made = []
+    parts = []
     for number, keys in enumerate(config.processes):
         entry = EntryPoint(keys.kind, keys.PROCESS, keys.ENTRY_POINTS)
         process = load_class(entry, Process)(keys, setup)
         written = [outputs[text] for _, image, text in keys.channels() if image == "rpdo"]
-        made.append(ProcessPart(number, process, written))
-    return made
+        parts.append(ProcessPart(number, process, written))
+    return parts

@@ -8,18 +8,18 @@ from collections.abc import Callable
 from typing import Any
 
 from rtcp.config.scaling import OBJECTS_PER_AXIS
-from rtcp.fieldbus.emergency import error_words
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT
 from rtcp.fieldbus.registers import Steps
 from rtcp.fieldbus.supervision import SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.events import DriveErrorCode
 from rtcp.ipc.layout import SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT, SERVICE_TEXT_SIZE
 
 _ASKED, _ANSWERED = 1, 2
 _POLL_S = 0.0002
 _BUDGET_S = 0.005
-"""Time for one request in a turn, s; most slaves answer within it."""
+"""Time for one request in a poll, s; most slaves answer within it."""
 _LONGEST_S = 4.0
 """Longest time for an answer, s."""
 _ERROR_CODE = 0x603F
@@ -30,7 +30,7 @@ class SdoRequests:
 
     Args:
         bus: the configured bus.
-        blackboard: where requests come from and answers and sentences go.
+        blackboard: provides requests, receives answers and events.
     """
 
     def __init__(self, bus: SupervisedBus, blackboard: Blackboard) -> None:
@@ -45,9 +45,9 @@ class SdoRequests:
         """Whether the error code of a drive is still being read."""
         return self._explaining is not None
 
-    def explain(self, name: str, position: int, axis: int) -> None:
-        """Start to read the error code of an axis of the drive at `position`, and report it."""
-        self._explaining = self._explanation(name, position, axis)
+    def explain(self, axis: int, position: int, slave_axis: int) -> None:
+        """Start to read the error code of an axis from its drive; the result is an event."""
+        self._explaining = self._explanation(axis, position, slave_axis)
 
     def take_steps(self) -> None:
         """Advance the pending requests and start new ones; raises BusError from an explanation that failed."""
@@ -70,17 +70,16 @@ class SdoRequests:
             if ended:
                 self._explaining = None
 
-    def _explanation(self, name: str, position: int, axis: int) -> Steps[None]:
-        index = _ERROR_CODE + (axis - 1) * OBJECTS_PER_AXIS
+    def _explanation(self, axis: int, position: int, slave_axis: int) -> Steps[None]:
+        index = _ERROR_CODE + (slave_axis - 1) * OBJECTS_PER_AXIS
         try:
             code = yield from self._bus.sdo(position).reading_int(index, 0)
         except SdoAborted as error:
             if error.code not in ABSENT:
                 raise
             code = 0  # the drive has no error code
-        of = f", axis {axis}" if axis > 1 else ""
         if code:
-            self._blackboard.text(f"{name} (slave {position}{of}): the drive's error code is {error_words(code)}")
+            self._blackboard.event(DriveErrorCode(axis, position, slave_axis, code & 0xFFFF))
 
     def _answer(self) -> Steps[dict[str, Any]]:
         memory, words = self._blackboard.memory, self._blackboard.words
@@ -94,7 +93,7 @@ class SdoRequests:
         except BusError as error:
             return _error("timeout", "; ".join(error.sentences))
         except Exception as error:
-            # Whatever is wrong with a request, it must not end the thread that watches the slaves.
+            # A malformed request must not end the thread that watches the slaves.
             return _error("invalid", f"the request is not of the service's form: {type(error).__name__} {error}")
 
     def _reply(self, answer: dict[str, Any]) -> None:
@@ -126,12 +125,12 @@ class SdoRequests:
 
 
 def _error(kind: str, sentence: str) -> dict[str, Any]:
-    """Return an answer that is none: `kind` as the control socket has it."""
+    """Return an error reply; `kind`: one of the control socket's kinds."""
     return {"error": sentence, "kind": kind}
 
 
 def _follow(steps: Steps[Any], until: float, done: Callable[[Any], None]) -> bool:
-    """Take steps until `until`, asleep between them; hand over what they return and return True once they end."""
+    """Run steps until `until`, with sleeps between them; once they end call `done` with their result, return True."""
     try:
         next(steps)
         while time.monotonic() < until:

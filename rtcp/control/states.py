@@ -1,8 +1,8 @@
-"""What the machine does in each state, from start to end as `docs/machine.md` draws it.
+"""The states of the machine, from start to end as in the diagram of `docs/machine.md`.
 
 A state is a small object. `enter` is called when the machine changes to it, with the cause: the command or the event
-that leads there. `update` is called once a cycle and returns the event that ends the state, or None. `leads_to` says
-where each cause leads; only the machine (`rtcp.control.machine`) changes the state.
+that leads there. `update` is called once a cycle and returns the event that ends the state, or None. `leads_to` maps
+each cause to the next state; only the machine (`rtcp.control.machine`) changes the state.
 """
 
 from __future__ import annotations
@@ -71,16 +71,16 @@ class Signal(Enum):
 Cause = Message | Signal
 
 FIRST_CYCLES: Final = 10
-"""What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
+"""Cycles before standstill counts: a drive's values are older than its commands."""
 SETTLE_CYCLES: Final = 5
-"""The same, before a drive counts as disabled."""
+"""Cycles before a drive counts as disabled."""
 
 _TARGETS = {
     StopReaction.CONTROLLED_STOP: TargetState.ENABLED,
     StopReaction.QUICK_STOP: TargetState.QUICK_STOPPED,
     StopReaction.TORQUE_OFF: TargetState.TORQUE_OFF,
 }
-"""Where a stop reaction takes the drives."""
+"""Stop reaction -> target state of the drives."""
 _FAULTS: dict[type[Message] | Signal, State] = {
     FaultEvent: State.FAULT,
     EmergencyStop: State.EMERGENCY_STOP,
@@ -94,15 +94,15 @@ class MachineState:
 
     state: ClassVar[State]
     drives: ClassVar[str]
-    """What the drives are commanded, for the documentation."""
+    """Command to the drives, for the documentation."""
     leads_to: ClassVar[dict[type[Message] | Signal, State]]
-    """Where each cause leads; a class stands for its subclasses too."""
+    """Cause -> next state; a class includes its subclasses."""
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Begin; `before` is the state that the machine leaves."""
 
     def update(self, ctx: Context) -> Event | Signal | None:
-        """Do one cycle; return what ends the state."""
+        """Do one cycle; return the event or signal that ends the state."""
         raise NotImplementedError
 
 
@@ -114,10 +114,10 @@ class Starting(MachineState):
     leads_to = {Ready: State.READY, FaultEvent: State.FAULT, Shutdown: State.CLOSING}
 
     def update(self, ctx: Context) -> Event | Signal | None:
-        """Ask for OP once the clock is locked."""
+        """Request OP once the clock is locked."""
         service, joints = ctx.service, ctx.joints
         if service.lost_slave:
-            # It fell before the first cycle in which all was well: nothing has moved yet that needs a reset.
+            # It left OP before the first good cycle: nothing has moved, so no reset is needed.
             service.recover()
         if ctx.clock_locked:
             service.want_op()
@@ -125,14 +125,14 @@ class Starting(MachineState):
         if ctx.good:
             joints.track_actual()
         if not service.all_op:
-            # Frames are not whole yet: cycles lost until all slaves are in OP do not count.
+            # Working counters are incomplete until all slaves are in OP: lost cycles do not count.
             ctx.wkc_error_count = 0
             return None
         if ctx.good and ctx.reported is None:
             return Ready()
         fault = ctx.bus_fault()
         if fault is not None:
-            # Where no cycle was good the box was not read, which is no press of its button.
+            # Without a good cycle the box was not read, which does not mean a pressed button.
             ctx.operator.assume_released()
         return fault
 
@@ -148,7 +148,7 @@ class ReadyState(MachineState):
         self._reaction = reaction
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
-        """Count lost cycles from now on, and after a reset report joints that stand elsewhere."""
+        """Count lost cycles from now on, and after a reset report joints that have moved."""
         ctx.wkc_error_count = 0
         if isinstance(cause, ResetDone):
             self._reaction.report_moved(ctx)
@@ -170,9 +170,9 @@ class ReadyState(MachineState):
 class Enabling(MachineState):
     """To Operation Enabled: target = actual until every drive is there, in CSP.
 
-    A joint that stands a little outside its range then returns to the edge before anything else may move it. A drive
-    obeys its target some frames before it shows that it does, and no limiter cuts what is tracked: a position to which
-    it cannot have turned is not tracked.
+    A joint slightly outside its range then returns to the edge before any other motion. A drive follows its target some
+    frames before its statusword shows that, and no limiter applies to tracked positions: a position to which the joint
+    cannot have turned is not tracked.
     """
 
     state = State.ENABLING
@@ -180,7 +180,7 @@ class Enabling(MachineState):
     leads_to = {**_TORQUE, Enabled: State.HOLDING}
 
     _REPORTED_RAD = 0.001
-    """A joint nearer to its range returns without a report: it was at the edge, and sagged as it rested."""
+    """Distance from its range, rad, below which a joint returns without a report: it sagged at the edge."""
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Begin in CSP, where target = actual means standstill."""
@@ -188,11 +188,11 @@ class Enabling(MachineState):
         ctx.joints.hold()
         ctx.operator.require_neutral()
         self._false_cycles = 0
-        """Cycles in a row in which a drive shows a position to which it cannot have turned."""
+        """Consecutive cycles in which a drive shows a position to which it cannot have turned."""
         self._were_enabled = 0
-        """Drives that have been enabled, a bit each."""
+        """Bit mask of the drives that have been enabled."""
         self._returning = False
-        """All are enabled; joints outside their range return to it."""
+        """Whether all drives are enabled and joints outside their range return to it."""
         ctx.joints.reset_supervision()
 
     def update(self, ctx: Context) -> Event | Signal | None:
@@ -203,7 +203,7 @@ class Enabling(MachineState):
             return event
         event = self._drive_problem(ctx) or self._jump(ctx) or joints.beyond_limits()
         if event is not None or self._false_cycles:
-            # While a position is false the last targets are sent again.
+            # While a position is false the last targets are repeated.
             return event
         joints.advance(TargetState.ENABLED)
         joints.track_actual()
@@ -277,7 +277,7 @@ class Holding(MachineState):
         self._since = 0
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
-        """Hold; after enabling in the drive mode of the control mode."""
+        """Hold; after enabling, in the drive mode of the control mode."""
         self.changing_mode = False
         if isinstance(cause, Reset):
             ctx.operator.require_neutral()
@@ -291,7 +291,7 @@ class Holding(MachineState):
                 self.change_mode(ctx, ctx.arm.wanted_mode)
 
     def change_mode(self, ctx: Context, mode: DriveMode) -> None:
-        """Let the drives, at standstill, change to `mode`."""
+        """Let the drives change to `mode`; only at standstill."""
         ctx.arm.set_mode(mode)
         self.changing_mode = True
         self._since = ctx.cycle
@@ -333,7 +333,7 @@ class Moving(MachineState):
         ctx.limited = False
 
     def update(self, ctx: Context) -> Event | Signal | None:
-        """Move on by one cycle."""
+        """Advance the motion by one cycle."""
         event = ctx.permission_lost(ctx.lease)
         if event is not None:
             return event
@@ -368,7 +368,7 @@ class Stopping(MachineState):
             ctx.joints.stop_others()
 
     def update(self, ctx: Context) -> Event | Signal | None:
-        """Decelerate; at standstill hold, or begin the fault that the stop was for."""
+        """Decelerate; at standstill hold, or begin the fault that caused the stop."""
         arm, joints = ctx.arm, ctx.joints
         event = ctx.track()
         if event is not None:
@@ -382,7 +382,7 @@ class Stopping(MachineState):
 
 
 class StoppedByLimitState(MachineState):
-    """A limit ended the motion; a reset leads on."""
+    """Holds after a limit ended the motion, until a reset."""
 
     state = State.STOPPED_BY_LIMIT
     drives = "the setpoints at which it came to rest, unchanged"
@@ -406,7 +406,7 @@ class HomingState(MachineState):
         ctx.homing.begin(cause.axis)
 
     def update(self, ctx: Context) -> Event | Signal | None:
-        """Run the homing, then return the joint to its range where its home is a little outside."""
+        """Run the homing, then return the joint to its range if its home is slightly outside."""
         event = ctx.track_homing()
         if event is not None or not ctx.good:
             return event
@@ -425,7 +425,7 @@ class Disabling(MachineState):
         ctx.joints.stop()
         self._since = ctx.cycle
         self._commanded = 0
-        """Cycles in which the drives were commanded to disable."""
+        """Number of cycles in which the drives were commanded to disable."""
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Stop, then disable."""
@@ -435,7 +435,7 @@ class Disabling(MachineState):
             self._since = ctx.cycle
             return ctx.track_homing()
         if not joints.at_rest:
-            # The time to disable begins when the arm stands.
+            # The timeout begins at standstill.
             self._since = ctx.cycle
             return ctx.track()
         fault = ctx.bus_fault() or ctx.pending
@@ -458,16 +458,16 @@ class Disabling(MachineState):
 
 
 class Standstill:
-    """Whether joints in a quick stop stand; where no frames return, whether they must by now.
+    """Detects the standstill of joints in a quick stop, by measurement or, without returned frames, by time.
 
     Args:
-        ctx: how long a quick stop takes, and the joints.
+        ctx: duration of a quick stop, and the joints.
     """
 
     _STAND_S = 2.0
-    """A drive that still turns so long after its quick stop began does not stop by itself: its brake has to, s."""
+    """Time after the begin of a quick stop, s, at which a drive that still turns needs its brake to stop."""
     _LOST_S = 0.5
-    """The least time of lost cycles after which `unobservable` holds, s: well beyond a quick stop that began late."""
+    """Least time of lost cycles before `unobservable`, s: well beyond a quick stop that began late."""
 
     def __init__(self, ctx: Context) -> None:
         ramp_s = quick_stop_s(ctx.config)
@@ -476,16 +476,16 @@ class Standstill:
         self._cycles = self._lost = 0
 
     def begin(self) -> None:
-        """Begin with the quick stop."""
+        """Restart; called when the quick stop begins."""
         self._cycles = self._lost = 0
 
     @property
     def unobservable(self) -> bool:
-        """Whether cycles were lost for as long as any quick stop takes: the states of the drives are unknown."""
+        """Whether cycles were lost for longer than any quick stop takes: the states of the drives are unknown."""
         return self._lost > self._lost_limit
 
     def reached(self, ctx: Context) -> bool:
-        """Count the cycle; return whether the joints stand, or waiting for it gains nothing."""
+        """Count the cycle; return whether the joints stand still, or further waiting is useless."""
         self._cycles += 1
         if not ctx.good:
             self._lost += 1
@@ -494,47 +494,47 @@ class Standstill:
 
 
 class FaultReaction:
-    """What the drives do in a fault, also while it is reset: a quick stop, or no torque (CiA 402-2, 0x605E).
+    """Commands the drives in a fault, also during its reset: a quick stop, or no torque (CiA 402-2, 0x605E).
 
     Args:
         ctx: the cycle and the joints.
     """
 
     _ESTOP_S = 2.0
-    """Time after which an emergency stop that cannot be read counts as pressed, s; the slave watcher brings back sooner
-    what merely left OP, also what does so twice."""
+    """Time after which an emergency stop that cannot be read counts as pressed, s; the slave watcher restores a slave
+    that merely left OP, even twice, sooner."""
     _MOVED_RAD = 0.05
-    """A joint that stood at the fault does not move so far until its brake holds (docs/faults.md)."""
+    """Motion, rad, that a joint at rest does not reach after a fault before its brake holds (docs/faults.md)."""
     _RAN_ON_S = 1.0
-    """A joint that moved may have gone on so long at its speed, where frames were taken for lost late."""
+    """Time, s, for which a moving joint may have continued at its speed before lost frames were detected."""
     _NOT_REMEMBERED = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 
     def __init__(self, ctx: Context) -> None:
         self.standstill = Standstill(ctx)
         self._estop_cycles = ctx.cycles(self._ESTOP_S)
         self._unobservable = 0
-        """Cycles in a row in which the emergency stop could not have been read."""
+        """Consecutive cycles in which the emergency stop could not be read."""
         self.torque_off = False
-        """The torque is removed: commanded, or by the reaction, or by an emergency stop."""
+        """Whether the torque is removed: by a command, the reaction, or an emergency stop."""
         self.off_at_rest = False
-        """The torque goes when the joints stand."""
+        """Whether the torque is removed at standstill."""
         self.stood = [nan] * len(ctx.config.joints)
-        """Where each joint was last read before the fault, rad; NaN: nowhere."""
+        """Last position of each joint before the fault, rad; NaN: none."""
         self.turned = [0.0] * len(ctx.config.joints)
-        """How fast it turned there, rad/s."""
+        """Velocity of each joint at that position, rad/s."""
 
     def begin(self, ctx: Context, before: State, *, torque_off: bool, off_at_rest: bool) -> None:
-        """Begin: forget what was under way, and remember where the joints are.
+        """Begin: reset the reaction, and remember the joints' positions.
 
         Args:
             ctx: the cycle and the joints.
             before: the state that the machine left.
-            torque_off: remove the torque at once.
-            off_at_rest: remove it when the joints stand.
+            torque_off: whether to remove the torque at once.
+            off_at_rest: whether to remove it at standstill.
         """
         self.torque_off, self.off_at_rest = torque_off, off_at_rest
-        # Where it begins: a lost slave was last read before that. Not again until the reset, as by an emergency stop in
-        # the fault: its drive may be without supply by then. Nor in a start, in which perhaps no joint was read.
+        # Only when the fault begins: a lost slave was last read before that. Not by an emergency stop in the fault,
+        # when drives may have no supply, and not during the start, in which perhaps no joint was read.
         if before not in self._NOT_REMEMBERED:
             self.stood[:] = ctx.arm.state.actual
             self.turned[:] = ctx.arm.state.actual_velocity
@@ -546,7 +546,7 @@ class FaultReaction:
         self._unobservable = 0
 
     def update(self, ctx: Context) -> None:
-        """Command the drives, whether or not frames return: slaves that hear must not keep their speed or torque."""
+        """Command the drives even without returned frames: slaves that receive must not keep their speed or torque."""
         joints = ctx.joints
         at_rest = not self.torque_off and self.off_at_rest and self.standstill.reached(ctx)
         if not self.torque_off and (at_rest or self._estop_unobservable(ctx)):
@@ -561,19 +561,19 @@ class FaultReaction:
         ctx.publish(TorqueRemoved())
 
     def report_moved(self, ctx: Context) -> None:
-        """Report joints that stand elsewhere than at the fault: moved, or their drives count from another zero.
+        """Report joints whose position differs from the one at the fault: moved, or counted from another zero.
 
-        No refusal: only a person who looks at the arm knows which of the two it is.
+        No refusal: only a person at the arm can tell which of the two.
         """
         here = ctx.arm.state.actual
         for axis, (stood, turned) in enumerate(zip(self.stood, self.turned, strict=True)):
-            # No faster than the limit: a false speed is at times what the fault was.
+            # Limited: a false speed may have caused the fault.
             ran_on = self._RAN_ON_S * min(abs(turned), ctx.config.joints[axis].velocity)
             if abs(here[axis] - stood) > self._MOVED_RAD + ran_on:
                 ctx.publish(MovedSinceFault(axis, here[axis], stood))
 
     def _estop_unobservable(self, ctx: Context) -> bool:
-        """Return whether the emergency stop could not be read for too long: it counts as pressed, as a broken wire."""
+        """Return whether the emergency stop could not be read for too long; like a broken wire it counts as pressed."""
         if ctx.good or not ctx.operator.has_button or ctx.stop_box_in_op:
             self._unobservable = 0
             return False
@@ -585,13 +585,10 @@ class FaultReaction:
 
 
 class FaultState(MachineState):
-    """Something was lost or broke."""
+    """A fault: drives stopped by its reaction, until a reset."""
 
     state = State.FAULT
-    drives = (
-        "quick stop: each drive decelerates by itself and holds (0x605A = 6), or torque off where `stops` says so; "
-        "whether or not frames return"
-    )
+    drives = "the stop reaction of the fault, whether or not frames return"
     leads_to = {
         Reset: State.RESETTING,
         Disable: State.FAULT,
@@ -603,7 +600,7 @@ class FaultState(MachineState):
         self._reaction = reaction
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
-        """Stop all drives by the reaction to the event; what stands already holds by a quick stop."""
+        """Stop all drives by the reaction to the event; an arm at standstill holds by a quick stop."""
         reaction = self._reaction
         if isinstance(cause, Disable):
             reaction.remove_torque(ctx)
@@ -612,7 +609,7 @@ class FaultState(MachineState):
         hard = ctx.reactions.get(type(cause)) is StopReaction.TORQUE_OFF or (
             before is State.DISABLING and cause is ctx.pending
         )
-        # Who commanded no torque is not left with an arm that holds, and a reset that fails does not restore it.
+        # After a command to remove the torque the arm must not hold, and a failed reset must not restore the torque.
         fails = before is State.RESETTING
         reaction.begin(
             ctx,
@@ -631,24 +628,21 @@ class FaultState(MachineState):
 class EmergencyStopState(MachineState):
     """The emergency stop: quick stop, torque off at standstill or at once, slaves to PRE-OP.
 
-    The drives come to rest before the slaves leave OP: one that loses its process data in motion lets the arm fall.
+    The drives come to rest before the slaves leave OP: a drive that loses its process data in motion drops the arm.
     """
 
     state = State.EMERGENCY_STOP
-    drives = (
-        "quick stop, at standstill torque off and brakes closed, or torque off at once where `stops` says so; then the "
-        "slaves to PRE-OP"
-    )
+    drives = "the stop reaction of its cause; torque off and brakes closed at standstill; then the slaves to PRE-OP"
     leads_to = {Reset: State.RESETTING, Disable: State.EMERGENCY_STOP, Shutdown: State.CLOSING}
 
     _OFF_S = 1.0
-    """Time after which the slaves are parked although a drive still shows torque, s."""
+    """Time after which the slaves are parked even if a drive still shows torque, s."""
 
     def __init__(self, reaction: FaultReaction) -> None:
         self._reaction = reaction
         self._off = TargetState.DISABLED
         self._since = 0
-        """Cycle in which the torque was first commanded off."""
+        """Number of the cycle in which the torque was first commanded off."""
         self._parked = False
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
@@ -670,7 +664,7 @@ class EmergencyStopState(MachineState):
             joints.advance(TargetState.QUICK_STOPPED)
             if reaction.standstill.reached(ctx):
                 if reaction.standstill.unobservable:
-                    # The states of the drives are unknown: from each of them this removes the torque.
+                    # The states of the drives are unknown: this removes the torque in any of them.
                     self._off = TargetState.TORQUE_OFF
                 reaction.torque_off = True
                 self._since = ctx.cycle
@@ -708,19 +702,19 @@ class Resetting(MachineState):
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Bring the slaves back."""
-        # In PRE-OP the box says nothing: whether the button is still pressed shows once it is back in OP.
+        # In PRE-OP the box has no inputs: the button is known once the box is back in OP.
         ctx.operator.assume_released()
         ctx.service.recover()
 
     def update(self, ctx: Context) -> Event | Signal | None:
-        """Reset what is back; give up after a while."""
+        """Reset the drives that are back; fail after `_RESET_S`."""
         joints = ctx.joints
         if ctx.reported is not None:
             return ctx.reported
         if not (ctx.good and ctx.service.all_op and ctx.clock_locked):
             self._reaction.update(ctx)
             return self._failure(ctx)
-        # What still moves comes to rest first: its torque goes with the reset.
+        # Moving joints come to rest first: the reset removes their torque.
         joints.advance(TargetState.RESET if joints.first_moving() < 0 else TargetState.QUICK_STOPPED)
         joints.track_actual()
         if joints.first_not_resting() < 0 and ctx.operator.button_known:
@@ -737,7 +731,7 @@ class Resetting(MachineState):
         if axis >= 0 and ctx.good and all_op:
             return ResetWhileMoving(axis, joints.drives[axis].velocity)
         axis = joints.first_not_resting()
-        # Without the clock no drive was commanded to reset: that one is not at rest is not the reason.
+        # Without the clock no drive was commanded to reset, so a drive not at rest is not the cause.
         if axis >= 0 and all_op and ctx.clock_locked:
             ctx.service.explain_drive(axis)
             return ResetTimeout(axis, joints.drives[axis].state, joints.drives[axis].statusword)
@@ -755,13 +749,13 @@ class Closing(MachineState):
     leads_to = {Shutdown: State.CLOSING, Signal.CLOSED: State.OFF}
 
     _CLOSING_S = 2.0
-    """Time for the drives to stop and disable, counted from standstill of the setpoints, s; then the loop ends."""
+    """Time for the drives to stop and disable, from standstill of the setpoints, s; then the loop ends."""
 
     def __init__(self, standstill: Standstill) -> None:
         self._standstill = standstill
         self._target = TargetState.QUICK_STOPPED
         self._hard = False
-        """An emergency came: what still moves stops by the drives themselves."""
+        """Whether an emergency occurred: moving joints are stopped by their drives."""
         self._cycles = self._commanded = 0
 
     def update(self, ctx: Context) -> Event | Signal | None:
@@ -774,7 +768,7 @@ class Closing(MachineState):
         if self._decelerates(ctx):
             return False
         if ctx.lost >= lost_limit:
-            # Slaves that still listen stay in OP until the joints stand.
+            # Slaves that still receive frames stay in OP until standstill.
             joints.advance(self._target if self._hard else _TARGETS[ctx.reactions[ProcessDataLost]])
             return ctx.lost >= lost_limit + ceil(quick_stop_s(ctx.config) / ctx.period_s) + SETTLE_CYCLES
         if self._cycles > ctx.cycles(self._CLOSING_S):
@@ -792,7 +786,7 @@ class Closing(MachineState):
         return self._stop(ctx) and self._remove_torque(ctx)
 
     def _decelerates(self, ctx: Context) -> bool:
-        """React to the emergency stop or a measurement beyond its limit; return whether the arm moves after it."""
+        """React to the emergency stop or a measurement beyond its limit; return whether the arm still decelerates."""
         joints = ctx.joints
         if not self._hard and joints.first_with_torque() >= 0:
             event: Event | None = None
@@ -824,7 +818,7 @@ class Closing(MachineState):
         ctx.publish(event)
 
     def _stop(self, ctx: Context) -> bool:
-        """Bring the setpoints to rest; return whether they are, or the drives do not follow them anyway."""
+        """Bring the setpoints to rest; return whether they are at rest, or no drive follows them."""
         joints = ctx.joints
         joints.stop()
         if joints.at_rest or joints.first_not_enabled() >= 0:
@@ -835,7 +829,7 @@ class Closing(MachineState):
         return False
 
     def _remove_torque(self, ctx: Context) -> bool:
-        # In a fault the drives decelerate by themselves: their torque goes when they stand.
+        # In a fault the drives decelerate by themselves: their torque is removed at standstill.
         joints = ctx.joints
         ramping = joints.first_with_torque() >= 0 and joints.first_not_enabled() >= 0 and joints.first_moving() >= 0
         joints.advance(TargetState.QUICK_STOPPED if ramping else TargetState.DISABLED)

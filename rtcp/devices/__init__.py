@@ -1,4 +1,4 @@
-"""One driver a kind of slave: bytes on the wire on one side, SI units and states on the other."""
+"""Drivers, one per kind of slave: convert process data to SI units and states, and back."""
 
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.devices.drive import Drive, TargetState

@@ -1,4 +1,4 @@
-"""The CiA 402 drive: two tables, and the little code that walks them (CiA 402-2, clause 8: finite state automaton)."""
+"""The CiA 402 drive: two tables and the code that walks them (CiA 402-2, clause 8: finite state automaton)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ENABLE_OPERATION, FAULT_RESET = 0x000F, 0x0080
 """Commands of the controlword (CiA 402-2, table 27)."""
 
 _S = DriveState
-# (state, target) -> controlword of the next step (CiA 402-2, figure 7); DISABLE_VOLTAGE where nothing else stands here.
+# (state, target) -> controlword of the next step (CiA 402-2, figure 7); default DISABLE_VOLTAGE.
 CONTROLWORDS: dict[tuple[DriveState, TargetState], int] = {
     **{(state, target): DISABLE_VOLTAGE for state in DriveState for target in TargetState},
     (_S.SWITCH_ON_DISABLED, TargetState.ENABLED): SHUTDOWN,
@@ -43,7 +43,7 @@ CONTROLWORDS: dict[tuple[DriveState, TargetState], int] = {
     (_S.OPERATION_ENABLED, TargetState.RESET): SWITCH_ON,
     # A fault is reset on request only.
     (_S.FAULT, TargetState.RESET): FAULT_RESET,
-    # From every state: where a false statusword hides an enabled drive, `disable voltage` would let the arm fall.
+    # In every state: if a false statusword hides an enabled drive, `disable voltage` would let the arm fall.
     # Without torque a drive comes to, or stays in, `switch on disabled` (transitions 7 and 10); one in fault stays.
     **{(state, TargetState.QUICK_STOPPED): QUICK_STOP for state in DriveState},
 }
@@ -60,7 +60,7 @@ REACHED: dict[TargetState, frozenset[DriveState]] = {
 }
 
 STATE_BITS = 0x6F
-"""Bits of the statusword that tell the state."""
+"""Statusword bits of the state."""
 _STATE_OF = tuple(
     next((state for (mask, value), state in STATES.items() if word & mask == value), DriveState.UNKNOWN)
     for word in range(0x80)
@@ -73,17 +73,17 @@ _WITH_SPEED = (CSP, CSV)
 _NEEDED = {CSP: MODE_CHANNELS["csp"], CSV: MODE_CHANNELS["csv"], CST: MODE_CHANNELS["cst"]}
 _ENABLED = DriveState.OPERATION_ENABLED
 _WITH_TARGET = (ENABLE_OPERATION, QUICK_STOP)
-"""Controlwords with which the target stands."""
+"""Controlwords that keep the target."""
 
 
 def _slots(image: ImageLayout, names: Sequence[str]) -> tuple[int, ...]:
-    """Return where channels stand in an image; -1: it is not mapped."""
-    found = map(image.find, names)
-    return tuple(-1 if channel is None else image.channels.index(channel) for channel in found)
+    """Return the indices of channels in an image; -1: not mapped."""
+    slots = map(image.find, names)
+    return tuple(-1 if channel is None else image.channels.index(channel) for channel in slots)
 
 
 def state_of(statusword: int) -> DriveState:
-    """Return the state that a statusword shows; UNKNOWN where the standard knows none."""
+    """Return the state of a statusword; UNKNOWN if the standard does not define it."""
     return _STATE_OF[statusword & STATE_BITS]
 
 
@@ -118,7 +118,7 @@ class Cia402Drive(Drive):
             if slot >= 0:
                 integer_range(self.tpdo.channels[slot])  # statusword and mode: raises where one is no integer
         self.changes_mode = self._out[4] >= 0
-        """Whether its mode of operation can be commanded; else it stays in CSP."""
+        """True: its mode of operation can be commanded; False: it stays in CSP."""
         if self.changes_mode and self._in[4] < 0:
             raise DeviceError(f"{self.device}: `rpdo` maps modes_of_operation, `tpdo` no modes_of_operation_display")
         self._limits = tuple((0, 0) if channel is None else integer_range(channel) for channel in targets)
@@ -135,12 +135,12 @@ class Cia402Drive(Drive):
         self._position_slot, self._scale, self._range = self._out[1], self._scales[0], self._limits[0]
         self.controlword = DISABLE_VOLTAGE
         self._sent_mode, self._sent_word, self._changed = 0, -1, True
-        """What the outputs but the position were filled in for; and whether the drive has shown something else."""
+        """Mode and controlword of the present outputs, and whether the drive's state has changed since."""
         self._was_enabled = False
         self._reset_calls = 0
 
     def supports(self, mode: int) -> bool:
-        """Whether the process data has what a mode (CSP, CSV, CST) needs."""
+        """Whether the process data has the channels of a mode (CSP, CSV, CST)."""
         outputs, inputs = _NEEDED[mode]
         return all(map(self.rpdo.find, outputs)) and all(map(self.tpdo.find, inputs))
 
@@ -154,9 +154,9 @@ class Cia402Drive(Drive):
             self.statusword = word
             self.state = _STATE_OF[word & STATE_BITS]
             self._changed = True
-        shown = values[position] * by_position
-        self.position = here = shown - self._zero
-        self.velocity = values[velocity] * by_velocity if velocity >= 0 else self._measured_velocity(shown)
+        drive_position = values[position] * by_position
+        self.position = here = drive_position - self._zero
+        self.velocity = values[velocity] * by_velocity if velocity >= 0 else self._measured_velocity(drive_position)
         if torque >= 0:
             self.torque = values[torque] * by_torque
         display: int = values[mode]
@@ -169,16 +169,16 @@ class Cia402Drive(Drive):
             self.target_position = here
 
     def advance(self, target: TargetState) -> bool:
-        """Choose the controlword of the next step towards `target` by the state found; return whether it is reached."""
+        """Choose the controlword of the next step towards `target` by the actual state; return whether it is there."""
         state = self.state
         word = CONTROLWORDS[state, target]
         if word == ENABLE_OPERATION:
-            # On the step itself, and again when the drive left the state on its own; never while it is enabled.
+            # At the transition, and again if the drive left the state by itself; never while it is enabled.
             if self.controlword != ENABLE_OPERATION or (self._was_enabled and state is not _ENABLED):
                 self.latch()
             self._was_enabled = state is _ENABLED
         elif word == FAULT_RESET:
-            # Only a rising edge resets (CiA 402-2, transition 15); held for a while, then tried anew.
+            # Only a rising edge resets (CiA 402-2, transition 15): hold the bit for a while, then try again.
             self._reset_calls += 1
             if self._reset_calls > _RESET_HOLD:
                 self._reset_calls = 0
@@ -191,16 +191,16 @@ class Cia402Drive(Drive):
     def encode(self) -> bytes:
         """Return the outputs of the cycle.
 
-        Velocity and torque are sent only to a drive that is enabled and has to be. The velocity (in CSP: the speed
-        limit) waits until the drive displays the mode that is commanded: on the way from CSV to CSP it would take the
-        limit for a target velocity, and run. A torque means nothing in CSP and CSV, and is there when CST begins.
-        A target that is no finite number leaves its field as it was; one out of the field's range is cut to it.
+        Velocity and torque are sent only to a drive that is enabled and commanded to be. The velocity (in CSP: the
+        speed limit) is sent once the drive displays the commanded mode: in a change from CSV to CSP it would take the
+        limit for a target velocity, and run. The torque has no effect in CSP and CSV, and is valid when CST begins.
+        A target that is not finite leaves its field unchanged; one out of the field's range is clamped to it.
         """
         fields, at, word, commanded = self._fields, self._position_slot, self.controlword, self.mode
         counts = (self.target_position + self._zero) * self._scale
         low, high = self._range
         fields[at] = round(counts) if low <= counts <= high else self._counts(counts, 0, fields[at])
-        # In CSP nothing but the position changes while the drive follows it.
+        # In CSP only the position changes while the drive follows it.
         if commanded != CSP or self._changed or commanded != self._sent_mode or word != self._sent_word:
             self._sent_mode, self._sent_word, self._changed = commanded, word, False
             self._fill(fields, word, commanded)
@@ -218,7 +218,7 @@ class Cia402Drive(Drive):
             if commanded == CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
             elif commanded == self.mode_display and commanded in _WITH_SPEED:
-                # A limit is no direction: positive also where the joint turns against the drive.
+                # A speed limit is positive even if joint and drive turn in opposite directions.
                 wanted = abs(self.speed_limit * by_velocity) if commanded == CSP else self.target_velocity * by_velocity
                 speed = self._counts(wanted, 1, fields[velocity])
         if velocity >= 0:
@@ -226,11 +226,11 @@ class Cia402Drive(Drive):
         if torque >= 0:
             fields[torque] = effort
 
-    def _counts(self, value: float, which: int, last: int) -> int:
-        low, high = self._limits[which]
+    def _counts(self, value: float, index: int, last: int) -> int:
+        low, high = self._limits[index]
         if low <= value <= high:
             return round(value)
         if value - value != 0.0:
-            # Not a number, or infinite: the last counts that were sent.
+            # NaN or infinite: keep the last counts.
             return last
         return low if value < low else high

@@ -1,4 +1,4 @@
-"""What moves a joint, in SI units: the base class of every drive, and how the driver of a joint is made."""
+"""Base class of the drives of joints, in SI units, and the factory of a joint's driver."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rtcp.ipc.states import DriveState, Missing
 CSP, CSV, CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
 _WINDOW_S: Final = 0.02
-"""Time over which the velocity is measured where the drive does not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
+"""Window of the velocity measurement for drives that do not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
 
 
 class TargetState(Enum):
-    """State to which a drive is brought."""
+    """Target state of a drive."""
 
     DISABLED = "disabled"
     QUICK_STOPPED = "stopped by quick stop"
@@ -30,7 +30,7 @@ class TargetState(Enum):
     TORQUE_OFF = "without torque at once"
     """Disable voltage from every state: no ramp, the brake closes on whatever moves."""
     RESET = "free of faults"
-    """Resets a fault and takes the drive no further than `switch on disabled`."""
+    """Resets a fault and stops at `switch on disabled`."""
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -63,15 +63,15 @@ class Drive(Driver):
         self.statusword = self.mode_display = 0
         self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.missing = Missing.NOTHING
-        """What people have to do at a robot controller before it follows targets."""
+        """Manual action required at a robot controller before it follows targets."""
         self.mode = CSP
         self.speed_limit = speed_limit
         self.deceleration = math.inf
-        """Of a quick stop that this driver ramps itself, rad/s^2."""
+        """Deceleration of a quick stop ramped by this driver, rad/s^2."""
         self.low, self.high = -math.inf, math.inf
         """Ends of that ramp, rad."""
         self.slave: SharedSlave | None = None
-        """Set where other axes of its slave move joints too: its outputs are a part of that slave's."""
+        """Set if other axes of its slave move joints too: its outputs are a part of the slave's."""
         self._zero = zero
         self.target_position = self.target_velocity = self.target_torque = 0.0
         self._past: list[float] = []
@@ -79,7 +79,7 @@ class Drive(Driver):
 
     @property
     def zero(self) -> float:
-        """What the drive shows where the joint is at 0, rad. Set anew, what is shown moves, what is sent does not."""
+        """Position of the drive at joint position 0, rad. A change moves `position`; the sent targets stay."""
         return self._zero
 
     @zero.setter
@@ -94,7 +94,7 @@ class Drive(Driver):
         raise NotImplementedError
 
     def advance(self, target: TargetState) -> bool:
-        """Take the next step towards `target` by the state found; return whether it is reached."""
+        """Take the next step towards `target` by the actual state; return whether it is reached."""
         raise NotImplementedError
 
     def latch(self) -> None:
@@ -102,20 +102,20 @@ class Drive(Driver):
         self.target_position = self.position
         self.target_velocity = self.target_torque = 0.0
 
-    def _measured_velocity(self, shown: float) -> float:
-        """Return the mean velocity over 20 ms, rad/s; `shown`: the position of this cycle, rad."""
+    def _measured_velocity(self, position: float) -> float:
+        """Return the mean velocity over 20 ms, rad/s; `position`: of this cycle, rad."""
         past = self._past
         if not past:
-            past += [shown] * max(round(_WINDOW_S / self.period_s), 1)
+            past += [position] * max(round(_WINDOW_S / self.period_s), 1)
         at = self._past_at
-        moved = shown - past[at]
-        past[at] = shown
+        moved = position - past[at]
+        past[at] = position
         self._past_at = at + 1 if at + 1 < len(past) else 0
         return moved / (len(past) * self.period_s)
 
 
 class SharedSlave:
-    """The outputs of a slave whose axes are several drives: each has its own bits of them.
+    """The outputs of a slave with several drives, each of which has its own bits.
 
     Args:
         drives: its axes.
@@ -128,7 +128,7 @@ class SharedSlave:
             drive.slave = self
 
     def outputs(self, drive: Drive, own: bytes) -> bytes:
-        """Return the slave's outputs: `own` of one drive, and those of the others as they were encoded last."""
+        """Return the slave's outputs: `own` of one drive, and the last encoded outputs of the others."""
         self._parts[drive] = int.from_bytes(own, "little")
         whole = 0
         for part in self._parts.values():
@@ -139,7 +139,7 @@ class SharedSlave:
 def share_slaves(pairs: Sequence[tuple[int, Drive]]) -> None:
     """Let drives of one slave share its outputs; `pairs`: the index of its slave and the driver of each drive."""
     for slot in {slot for slot, _ in pairs}:
-        drives = [drive for other, drive in pairs if other == slot]
+        drives = [drive for number, drive in pairs if number == slot]
         if len(drives) > 1:
             SharedSlave(drives)
 
@@ -148,7 +148,7 @@ def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     """Return the driver of the drive that moves `joint`, with the index of its slave; `zero` as in `Drive`.
 
     Raises:
-        DeviceError: its device's description cannot serve, or it is no drive.
+        DeviceError: the description is not usable, or the device is not a drive.
     """
     slot = next(slot for slot, slave in enumerate(config.slaves) if slave.name == joint.slave)
     slave = config.slaves[slot]

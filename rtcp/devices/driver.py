@@ -1,4 +1,4 @@
-"""The driver of a slave: its base class, how its kind is found, process images as tuples of numbers."""
+"""Drivers of slaves: base class, look-up by kind, and the codec of process images."""
 
 from __future__ import annotations
 
@@ -21,39 +21,38 @@ from rtcp.ipc.states import State
 
 Number = int | float
 ENTRY_POINTS = "rtcp.devices"
-"""Entry point group in which a package registers its drivers: the kind is the name, the class is the object."""
+"""Entry point group of drivers: name is the kind, object is the class."""
 
 
 class DeviceError(ValueError):
-    """A device description that its driver cannot work with."""
+    """A device description that its driver cannot use."""
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
 class Driver:
     """Bytes of one slave's process image on one side, SI units and states on the other.
 
-    A kind of device is one subclass: it names the channels that it cannot do without, unpacks the inputs in `decode`
-    and packs the outputs in `encode`, each called once a cycle. This class keeps the layout of both images, and by
-    itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name; all of
-    them are in the cycle record, named SLAVE_CHANNEL. Channels of type `bytes` are in neither: `arrays` holds those of
-    the inputs, `array_targets` those of the outputs, where the device has such channels. A driver that is commanded
-    names its `commands` and overrides `accept`; one that does something by itself, or reports events, overrides
-    `update`.
+    A subclass drives one kind of device. It names its required channels, and overrides `decode` (inputs) and `encode`
+    (outputs), each called once a cycle. This class holds the layout of both images and by itself offers every mapped
+    channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name; all of them are in the cycle
+    record, named SLAVE_CHANNEL. Channels of type `bytes` are in neither: where the device has some, `arrays` holds
+    those of the inputs, `array_targets` those of the outputs. A driver with commands names them in `commands` and
+    overrides `accept`; a driver that acts by itself, or reports events, overrides `update`.
 
     Args:
         slave: the slave's name and description.
         period_s: the cycle, s.
 
     Raises:
-        DeviceError: a channel is missing, or has a type that cannot serve.
+        DeviceError: a channel is missing, or has an unsuitable type.
     """
 
     REQUIRED_OUTPUTS: ClassVar[tuple[str, ...]] = ()
-    """Channels of `rpdo` that the driver cannot do without."""
+    """Required channels of `rpdo`."""
     REQUIRED_INPUTS: ClassVar[tuple[str, ...]] = ()
-    """Channels of `tpdo` that the driver cannot do without."""
+    """Required channels of `tpdo`."""
     commands: ClassVar[tuple[type[Command], ...]] = ()
-    """Commands that `accept` takes; no other part of the platform takes them."""
+    """Commands for `accept`; each command belongs to one driver only."""
 
     def __init__(self, slave: SlaveConfig, period_s: float) -> None:
         device = slave.device
@@ -66,25 +65,25 @@ class Driver:
             ("tpdo", self.tpdo, self.REQUIRED_INPUTS),
         ):
             if missing := [name for name in required if image.find(name) is None]:
-                found = ", ".join(channel.name for channel in image.channels if channel.index)
+                mapped = ", ".join(channel.name for channel in image.channels if channel.index)
                 raise DeviceError(
                     f"{device.name}: key `{key}` maps no {', '.join(missing)}; kind {device.kind} needs "
-                    f"{', '.join(required)}, found are {found or 'none'}"
+                    f"{', '.join(required)}, found are {mapped or 'none'}"
                 )
         self.period_s = period_s
         self.codec_in, self.codec_out = make_codec(self.tpdo), make_codec(self.rpdo)
         self.values: dict[str, float] = {channel.name: 0.0 for channel in self.tpdo.channels if _is_number(channel)}
         self.safe_values = {entry.name: entry.safe for entry in device.outputs}
-        """What the outputs are at the start and after a fault, SI."""
+        """Outputs at the start and after a fault, SI."""
         self.targets: dict[str, float] = dict(self.safe_values)
         self._counters = {entry.name: Counter(entry.modulo) for entry in device.inputs if entry.modulo}
-        # Only where there are some: an instance of more than 30 attributes is slower in the interpreter.
+        # Only if needed: an instance with more than 30 attributes is slower in the interpreter.
         if arrays := _arrays(self.tpdo):
             self.arrays = arrays
         if arrays := _arrays(self.rpdo):
             self.array_targets = arrays
         self.safe_outputs = Driver.encode(self)
-        """The image of the outputs with these values, for a driver that raises."""
+        """Output image of `safe_values`, sent when the driver has raised an exception."""
         self._input_names, self._output_names = tuple(self.values), tuple(self.targets)
 
     def decode(self, data: bytes) -> None:
@@ -99,11 +98,11 @@ class Driver:
                 self.values[channel.name] = counts * channel.factor + channel.offset
 
     def accept(self, command: Command) -> Refusal | None:
-        """Carry out one of `commands`; or return why not, and change nothing."""
+        """Execute one of `commands`, or return a refusal and change nothing."""
         raise NotImplementedError
 
     def update(self, state: State, now_ns: int) -> Event | None:
-        """Do a cycle, between `decode` and `encode`; return what has happened, a fault among it, or None.
+        """Execute a cycle, between `decode` and `encode`; return an event or a fault, or None.
 
         Args:
             state: of the machine.
@@ -116,7 +115,7 @@ class Driver:
         self.targets.update(self.safe_values)
 
     def fields(self) -> Sequence[Field]:
-        """Return what it publishes in the cycle record, without the slave's name; by default every mapped channel."""
+        """Return its fields in the cycle record, without the slave's name; by default every mapped channel."""
         return [
             Field(
                 identifier(channel.name) + ("_sent" if image is self.rpdo and channel.name in self.values else ""),
@@ -149,8 +148,8 @@ class Driver:
             return int.from_bytes(self.array_targets[channel.name][: channel.bits // 8], "little")
         value = self.targets[channel.name]
         if not isfinite(value):
-            value = self.safe_values[channel.name]  # what is no number is no reason to end the cycle
-        # What a process sets is bounded as what a command sets.
+            value = self.safe_values[channel.name]  # NaN must not end the cycle
+        # The same bounds apply to a process as to a command.
         low, high = channel.limits
         counts = min(max((value - channel.offset) / channel.factor, low), high)
         return counts if channel.type in LARGEST else round(counts)
@@ -160,7 +159,7 @@ class Counter:
     """Continues the count of a counter that wraps to 0 after `modulo` counts, in either direction.
 
     Args:
-        modulo: number of different counts; a step of more than half of them is taken for one in the other direction.
+        modulo: number of different counts; a step of more than half of it counts as a step in the other direction.
     """
 
     __slots__ = ("_last", "_modulo", "_total")
@@ -171,7 +170,7 @@ class Counter:
         self._total = 0
 
     def follow(self, counts: Number) -> int:
-        """Return the counts since 0 of the first turn; `counts`: as they came in this cycle."""
+        """Return the unwrapped count, which begins with the first raw value; `counts`: raw value of this cycle."""
         here, modulo = int(counts) % self._modulo, self._modulo
         if self._last < 0:
             self._total = here
@@ -186,21 +185,21 @@ def make_driver(slave: SlaveConfig, period_s: float) -> Driver:
     """Return the driver of a slave, of the class that is registered for the kind of its device.
 
     Raises:
-        DeviceError: no installed package has a driver for this kind, or the description cannot serve.
-        PluginError: what is registered for this kind is no driver.
+        DeviceError: no installed package has a driver for this kind, or it cannot use the description.
+        PluginError: the class registered for this kind is not a driver.
     """
     return driver_of(slave.device.kind, slave.device.name)(slave, period_s=period_s)
 
 
 def driver_of(kind: str, device: str = "") -> type[Driver]:
     """Return the class that is registered for a kind of device; raises as `make_driver`."""
-    found = registered(ENTRY_POINTS)
-    if kind not in found:
+    drivers = registered(ENTRY_POINTS)
+    if kind not in drivers:
         where = device or "a device"
         raise DeviceError(
-            f"{where}: no driver is installed for kind {kind} (key `kind`); installed are {', '.join(found)}"
+            f"{where}: no driver is installed for kind {kind} (key `kind`); installed are {', '.join(drivers)}"
         )
-    return load_class(found[kind], Driver)
+    return load_class(drivers[kind], Driver)
 
 
 @dataclass(frozen=True)
@@ -238,7 +237,7 @@ def _bit_codec(layout: ImageLayout) -> Codec:
 
 
 def _field(channel: Channel) -> tuple[Callable[[int], Number], Callable[[Number], int]]:
-    """Return what makes a value of a channel's bits, and what makes bits of a value or raises where it does not fit."""
+    """Return the decoder and the encoder of a channel; the encoder raises for a value that does not fit."""
     if channel.type == "bool":
         return int, lambda value: int(bool(value))
     if channel.type.startswith("float"):
@@ -264,7 +263,7 @@ def _is_number(channel: Channel) -> bool:
 
 
 def _arrays(image: ImageLayout) -> dict[str, bytes]:
-    return {one.name: bytes(one.bits // 8) for one in image.channels if one.index and one.type == "bytes"}
+    return {entry.name: bytes(entry.bits // 8) for entry in image.channels if entry.index and entry.type == "bytes"}
 
 
 def integer_range(channel: Channel) -> tuple[int, int]:

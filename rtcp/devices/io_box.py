@@ -1,4 +1,4 @@
-"""The IO box: inputs, outputs, a counter; the terminals that have a meaning, and the joystick on them."""
+"""The IO box: inputs, outputs, a counter; terminals with an assigned function, and the joystick."""
 
 from __future__ import annotations
 
@@ -56,16 +56,16 @@ class IoBox(Driver):
         return before + self._outputs.pack(self.outputs) + after
 
     def safe(self) -> None:
-        """Keep the outputs: a gripper on one would drop what it holds."""
+        """Keep the outputs: a gripper on one would drop its object."""
 
     def fields(self) -> Sequence[Field]:
         """Return inputs, outputs and, where there is one, the counter."""
-        made = [
+        published = [
             Field("inputs", _type(self.tpdo, "inputs"), "", "Levels of the inputs, bit 0 is input 1."),
             Field("outputs", _type(self.rpdo, "outputs"), "", "Levels of the outputs, bit 0 is output 1."),
         ]
         counted = Field("counter", _type(self.tpdo, "counter"), "", "Counts of the encoder.")
-        return made if self._counter is None else [*made, counted]
+        return published if self._counter is None else [*published, counted]
 
     def publish(self, values: list[Any], at: int) -> None:
         """Write them into the record."""
@@ -76,14 +76,14 @@ class IoBox(Driver):
 
     @property
     def output_count(self) -> int:
-        """How many outputs there are."""
+        """Number of outputs."""
         return 8 * self._outputs.size
 
     def set_output(self, number: int, value: bool) -> None:
         """Switch output `number` (1 to 16) on or off.
 
         Raises:
-            DeviceError: there is no such output.
+            DeviceError: no such output.
         """
         if not 1 <= number <= self.output_count:
             raise DeviceError(f"{self.name} has no output {number}; it has 1 to {self.output_count}")
@@ -108,13 +108,13 @@ def _field(box: Driver, image: ImageLayout, name: str) -> tuple[struct.Struct, i
 
 
 class Switch:
-    """An input that means something when `active`. Before its first level has lasted, it has `before`; so it has again
-    when its level has not come to rest for four times the debounce, as at a loose contact.
+    """A debounced input. `active` is `before` until a level has lasted for the debounce time, and again when no level
+    has lasted for four times as long, as at a loose contact.
 
     Args:
-        config: number, polarity, debounce; None: there is no such input and `before` stays.
-        before: what it counts as until then, and for ever where there is none.
-        cycle_s: how often `read` is called, s.
+        config: number, polarity, debounce; None: no such input, `active` is always `before`.
+        before: value without a stable level.
+        cycle_s: interval of the calls of `read`, s.
     """
 
     __slots__ = ("_before", "_bit", "_candidate", "_debounce", "_inverted", "_restless", "_stable", "active")
@@ -129,11 +129,11 @@ class Switch:
 
     @property
     def settled(self) -> bool:
-        """Whether its level has lasted for the debounce, or there is no such input."""
+        """Whether its level has lasted for the debounce time, or no such input exists."""
         return not self._bit or self._stable >= self._debounce
 
     def forget(self) -> None:
-        """Become inactive until an active level has lasted for the debounce."""
+        """Become inactive until an active level has lasted for the debounce time."""
         self.active = self._candidate = False
         self._stable = -1
         self._restless = 0
@@ -147,16 +147,16 @@ class Switch:
         """Update from the levels of all inputs of a cycle."""
         if not self._bit:
             return
-        seen = bool(levels & self._bit) is not self._inverted
-        if seen is self._candidate and self._stable > self._debounce:
+        level = bool(levels & self._bit) is not self._inverted
+        if level is self._candidate and self._stable > self._debounce:
             return
-        if seen is not self._candidate:
-            self._candidate = seen
+        if level is not self._candidate:
+            self._candidate = level
             self._stable = 0
         elif self._stable <= self._debounce:
             self._stable += 1
         if self._stable >= self._debounce:
-            self.active = seen
+            self.active = level
             self._restless = 0
             return
         self._restless += 1
@@ -218,11 +218,11 @@ def _mask(number: int | None) -> int:
 
 
 RESTLESS: Final = 4
-"""After so many times the debounce without rest the lines are no code."""
+"""Multiple of the debounce time after which unsettled lines count as invalid."""
 
 
 class JoystickInput:
-    """What the joystick shows. `read` sets `forward`, `side` (left is +1) and `paddle` (-1, 0, 1), `code` and `valid`.
+    """State of the joystick: `read` sets `forward`, `side` (left is +1) and `paddle` (-1, 0, 1), `code` and `valid`.
 
     Args:
         config: which inputs are the joystick's, and which others have a meaning.
@@ -251,44 +251,44 @@ class JoystickInput:
         self._inverted = sum(self._lines) if joystick.active == "low" else 0
         self._debounce = round(joystick.debounce_ms * 1e-3 / cycle_s)
         self._byte_at = (min(numbers) - 1) // 8 * 8
-        others = (config.arm_toggle, config.enabling_switch, config.emergency_stop)
-        switches: list[InputConfig | NamedTerminal] = [one for one in others if one is not None]
+        terminals = (config.arm_toggle, config.enabling_switch, config.emergency_stop)
+        switches: list[InputConfig | NamedTerminal] = [terminal for terminal in terminals if terminal is not None]
         switches += config.named
-        # What names no box hangs on the only one.
+        # Without a name: the only box.
         same_box = [switch for switch in switches if switch.box == joystick.box or None in (switch.box, joystick.box)]
-        meant = sum(1 << switch.number - 1 for switch in same_box)
+        used = sum(1 << switch.number - 1 for switch in same_box)
         bytes_used = {(number - 1) // 8 for number in numbers}
-        self._checked = sum(0xFF << 8 * byte for byte in bytes_used) & ~meant
+        self._checked = sum(0xFF << 8 * byte for byte in bytes_used) & ~used
 
     def read(self, levels: int) -> None:
         """Update from the levels of all inputs of a cycle; a change counts once it has lasted as long as configured."""
         if not self._lines:
             return
-        seen = levels & self._checked
-        if seen == self._candidate and self._stable > self._debounce:
+        lines = levels & self._checked
+        if lines == self._candidate and self._stable > self._debounce:
             return
-        if seen != self._candidate:
-            self._candidate = seen
+        if lines != self._candidate:
+            self._candidate = lines
             self._stable = 0
         elif self._stable <= self._debounce:
             self._stable += 1
         if self._stable < self._debounce:
             self._restless += 1
             if self._restless > RESTLESS * self._debounce:
-                # Lines that never come to rest, as at a loose contact: the last direction must not go on for ever.
+                # Lines that never settle, as at a loose contact: the last direction must not continue for ever.
                 self.forward = self.side = self.paddle = 0
                 self.valid = False
             return
         self._restless = 0
-        self.code = seen >> self._byte_at & 0xFF
-        active = seen ^ self._inverted
+        self.code = lines >> self._byte_at & 0xFF
+        active = lines ^ self._inverted
         forward, backward, left, right, up, down = (bool(active & line) for line in self._lines)
-        rest = active
+        unassigned = active
         for line in self._lines:
-            rest &= ~line
+            unassigned &= ~line
         deflected = forward or backward or left or right
         self.valid = not (
-            rest or (forward and backward) or (left and right) or (up and down) or (deflected and (up or down))
+            unassigned or (forward and backward) or (left and right) or (up and down) or (deflected and (up or down))
         )
         if self.valid:
             self.forward = forward - backward

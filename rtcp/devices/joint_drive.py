@@ -42,12 +42,12 @@ class JointDrive(Drive):
         self.mode_display = CSP
         self._ramping = False
         self._sent = 0.0
-        """Position reference sent last, rad."""
+        """Last sent position reference, rad."""
         self._speed = 0.0
-        """Speed reference sent last, rad/s."""
+        """Last sent speed reference, rad/s."""
         self._has_velocity = self.tpdo.find("velocity") is not None
         self._encoded = 0
-        """Calls of `encode` since the last `decode`: 1 in a cycle that was answered."""
+        """Calls of `encode` since the last `decode`: 1 in an answered cycle."""
         self._last = self._pack(0.0, 0.0, STAND)
 
     def supports(self, mode: int) -> bool:
@@ -57,15 +57,15 @@ class JointDrive(Drive):
     def decode(self, data: bytes) -> None:
         """Decode the inputs of the cycle. Until the drive is enabled the target follows them."""
         values = self._unpack(data)
-        shown, state, missing = values[:3]
-        self.position = shown - self._zero
-        self.velocity = values[3] if self._has_velocity else self._measured_velocity(shown)
+        bus_position, state, missing = values[:3]
+        self.position = bus_position - self._zero
+        self.velocity = values[3] if self._has_velocity else self._measured_velocity(bus_position)
         self._encoded = 0
         self.mode_display = self.mode
         self.missing = _MISSING[missing]
         drive_state = _STATES[state]
         if drive_state is not DriveState.OPERATION_ENABLED:
-            # The controller stopped by itself, or began a session: what was sent before is no reference any more.
+            # The controller stopped by itself or began a session: earlier references are void.
             self.command, self._ramping = STAND, False
         elif self.command != FOLLOW:
             drive_state = DriveState.SWITCHED_ON
@@ -73,12 +73,12 @@ class JointDrive(Drive):
             drive_state = DriveState.QUICK_STOP_ACTIVE
         self.state = drive_state
         if drive_state not in _FOLLOWING:
-            # Also a controller that was asked to follow and does not yet: meanwhile it may move the joint.
+            # Includes a controller that does not follow yet: meanwhile it may move the joint.
             self.target_position = self._sent = self.position
             self._speed = 0.0
 
     def advance(self, target: TargetState) -> bool:
-        """Take the next step towards `target` by the state found; return whether it is reached.
+        """Take the next step towards `target` by the actual state; return whether it is reached.
 
         A joint that moves comes to rest by its ramp first, whatever else is commanded: there is no torque to remove.
         """
@@ -89,7 +89,7 @@ class JointDrive(Drive):
             self.command, self._ramping = FOLLOW, False
         elif target is TargetState.QUICK_STOPPED or (self.command == FOLLOW and self._speed != 0.0):
             if self.command == FOLLOW and not self._ramping:
-                # In lost cycles nothing was sent, and the controller went on at the last speed.
+                # In lost cycles nothing was sent, and the controller continued at the last speed.
                 lost_s = max(self._encoded - 1, 0) * self.period_s
                 self._sent = self._within(self._sent + self._speed * lost_s)
                 self._ramping = True
@@ -132,5 +132,5 @@ class JointDrive(Drive):
         return self._last
 
     def _within(self, position: float) -> float:
-        """Return a position inside the range; outside it no further out than what was sent last, rad."""
+        """Return a position inside the range, or at most as far outside as the last sent one, rad."""
         return min(max(position, min(self.low, self._sent)), max(self.high, self._sent))

@@ -1,4 +1,4 @@
-"""What a device is by its description, wherever that comes from: an ESI file, an SII image, or a scan of the bus.
+"""The description of a device, from an ESI file, an SII image, or a scan of the bus.
 
 Terms are those of ETG.2000 (ESI) and ETG.1000.6. Lengths in bits unless a field says otherwise, times in ns.
 """
@@ -11,7 +11,7 @@ from enum import Enum, IntEnum
 
 
 class EsiError(Exception):
-    """A description that cannot be read, written or put together; `origin` is the file and line, or what it is of."""
+    """A description that cannot be read, written or assembled; `origin` is the file and line, or the device."""
 
     def __init__(self, origin: str, problem: str) -> None:
         super().__init__(f"{origin}: {problem}")
@@ -20,7 +20,7 @@ class EsiError(Exception):
 
 
 class LookupFailure(EsiError):
-    """No device, or several, are what was asked for; `candidates` are those that there are."""
+    """No device, or several, match; `candidates` lists the existing ones."""
 
     def __init__(self, origin: str, problem: str, candidates: tuple[str, ...]) -> None:
         super().__init__(origin, problem)
@@ -28,7 +28,7 @@ class LookupFailure(EsiError):
 
 
 class Source(Enum):
-    """Where a description comes from."""
+    """Source of a description."""
 
     ESI = "ESI"
     SII = "SII"
@@ -36,7 +36,7 @@ class Source(Enum):
 
 
 class SyncManagerType(IntEnum):
-    """What a sync manager carries (ETG.1000.6, 5.6.7.4; the same numbers in the SII)."""
+    """Use of a sync manager (ETG.1000.6, 5.6.7.4; same numbers in the SII)."""
 
     UNUSED = 0
     MAILBOX_RECEIVE = 1
@@ -47,7 +47,7 @@ class SyncManagerType(IntEnum):
 
 
 class FmmuUse(IntEnum):
-    """What an FMMU is for (ETG.1000.6, table 23)."""
+    """Use of an FMMU (ETG.1000.6, table 23)."""
 
     UNUSED = 0
     OUTPUTS = 1
@@ -86,7 +86,7 @@ class SyncManager:
     type: SyncManagerType
     enabled: bool = True
     virtual: bool = False
-    """It stands for registers that an FMMU maps without any sync manager."""
+    """True: represents registers mapped by an FMMU without a sync manager."""
     minimum: int | None = None
     """Smallest length, bytes."""
     maximum: int | None = None
@@ -122,7 +122,7 @@ class Pdo:
     name: str
     entries: tuple[PdoEntry, ...]
     sync_manager: int | None = None
-    """Sync manager to which it is assigned by default; None: it can be assigned, and is not."""
+    """Default sync manager; None: assignable, but not assigned."""
     fixed: bool = False
     """Its entries cannot be changed."""
     mandatory: bool = False
@@ -197,7 +197,7 @@ class InitCommand:
 
 @dataclass(frozen=True)
 class Coe:
-    """What a device can do over CoE (ETG.1000.6, table 21)."""
+    """CoE details (ETG.1000.6, table 21)."""
 
     sdo_information: bool = False
     pdo_assignment: bool = False
@@ -259,7 +259,7 @@ class Slot:
     index_increment: int = 0
     classes: tuple[str, ...] = ()
     default: int | None = None
-    """Ident of the module that stands there where nothing is chosen."""
+    """Ident of the default module."""
 
 
 @dataclass(frozen=True)
@@ -329,9 +329,9 @@ class Device:
     unit_symbols: Mapping[int, str] = field(default_factory=dict)
     """Symbols of units of its own, by their notation index, see `rtcp.esi.units`."""
     hidden: bool = False
-    """A tool offers it no more: a later revision takes its place."""
+    """True: replaced by a later revision, and no longer offered by tools."""
     unread: Mapping[str, int] = field(default_factory=dict)
-    """Parts of the description that were not understood, by name, with how often; they are warned of."""
+    """Number of unknown elements of the description, by name; each gives a warning."""
 
     def assigned(self, outputs: bool) -> tuple[Pdo, ...]:
         """Return the PDOs of a direction that are assigned by default, in the order of the process image.
@@ -349,7 +349,7 @@ class Device:
 
     @property
     def coe(self) -> Coe | None:
-        """What it can do over CoE; None: it has none."""
+        """CoE details; None: no CoE."""
         return None if self.mailbox is None else self.mailbox.coe
 
 

@@ -19,7 +19,7 @@ def places(device: Device) -> tuple[Slot, ...]:
 
 
 def allowed(slot: Slot, modules: Iterable[Module]) -> tuple[Module, ...]:
-    """Return the modules that may stand in a slot."""
+    """Return the modules allowed in a slot."""
     return tuple(
         module
         for module in modules
@@ -28,7 +28,7 @@ def allowed(slot: Slot, modules: Iterable[Module]) -> tuple[Module, ...]:
 
 
 def defaults(device: Device) -> dict[int, int]:
-    """Return the idents that stand in a device where nothing is chosen, by the number of the place."""
+    """Return the default idents by place number."""
     chosen: dict[int, int] = {}
     number = 0
     for slot in device.slots:
@@ -39,11 +39,11 @@ def defaults(device: Device) -> dict[int, int]:
 
 
 def assemble(device: Device, modules: Iterable[Module], chosen: Mapping[int, int | None] | None = None) -> Device:
-    """Return a device with modules in its places.
+    """Return a device with modules in its slots.
 
-    `chosen` is the ident of the module at a place, from 0; None leaves it empty. A place that is not named holds the
-    slot's default. `modules` are those of the device's file, and of others where a slot names a class. PDOs, objects
-    and start-up commands that depend on the slot grow by its increments. Raises EsiError with what is allowed.
+    `chosen`: ident of the module by place, from 0; None: the place is empty; a place without entry holds the default of
+    its slot. `modules`: those of the device's file, and of other files where a slot names a class. The indices of PDOs,
+    objects and start-up commands grow by the increments of the slot. Raises EsiError, with the allowed modules.
     """
     available = tuple(modules)
     slots = places(device)

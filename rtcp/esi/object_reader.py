@@ -1,4 +1,4 @@
-"""The object dictionary in an ESI file: objects, the data types that they name, and their values."""
+"""The object dictionary of an ESI file: objects, their data types and values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _STATES = (("PREOP", "P"), ("SAFEOP", "S"), ("OP", "O"))
 
 
 class FileTooLarge(EsiError):
-    """Nothing of the file is read further."""
+    """The file exceeds a limit; reading stops."""
 
 
 class _Part(NamedTuple):
@@ -27,7 +27,7 @@ class _Part(NamedTuple):
     type: str
     bits: int
     element: bool
-    """It is an array's."""
+    """True: element of an array."""
 
 
 class ObjectReader:
@@ -75,9 +75,9 @@ class ObjectReader:
         else:
             parts = self._parts(nodes, data_types)
             code = ObjectCode.ARRAY if any(part.element for part in parts) else ObjectCode.RECORD
-            given = _matched(info.below("SubItem") if info is not None else [], parts)
+            sub_items = _matched(info.below("SubItem") if info is not None else [], parts)
             by_number: dict[int, ObjectEntry] = {}
-            for part, item in zip(parts, given, strict=True):
+            for part, item in zip(parts, sub_items, strict=True):
                 name = (name_of(item) if part.element and item is not None else "") or name_of(part.node)
                 own = item.first("Info") if item is not None else part.node
                 entry = self._entry(part, name, part.node.first("Flags") or flags, own, data_types)
@@ -99,8 +99,8 @@ class ObjectReader:
                 first = max(values.number(array, "LBound", 1), following, 1)
                 element = data_types[type_name].value("BaseType") or ""
                 known = types.named(element)  # the length of the whole array is wrong in some files
-                each = known.bits if known is not None and known.bits else bits // max(count, 1)
-                parts += [_Part(first + i, node, element, each, True) for i in range(min(count, 256 - first))]
+                element_bits = known.bits if known is not None and known.bits else bits // max(count, 1)
+                parts += [_Part(first + i, node, element, element_bits, True) for i in range(min(count, 256 - first))]
             else:
                 sub_index = values.number(node, "SubIdx", following, low=0, high=255)
                 parts.append(_Part(sub_index, node, type_name, bits, False))
@@ -129,9 +129,9 @@ class ObjectReader:
             write_states="".join(letter for state, letter in _STATES if state in states),
             rx_mappable="R" in mapping,
             tx_mappable="T" in mapping,
-            default=self._given(info, base, "Default", name),
-            minimum=self._given(info, base, "Min", name),
-            maximum=self._given(info, base, "Max", name),
+            default=self._value_of(info, base, "Default", name),
+            minimum=self._value_of(info, base, "Min", name),
+            maximum=self._value_of(info, base, "Max", name),
             unit=None if unit is None else unit & 0xFFFFFFFF,
         )
 
@@ -139,11 +139,11 @@ class ObjectReader:
         """Return the base type under a name of the file, and its length."""
         name, bits = part.type, part.bits
         for _ in range(8):  # types that name each other in a circle end here
-            found, declared = types.named(name), data_types.get(name)
-            bits = bits or (found.bits if found is not None else 0)
+            base_type, declared = types.named(name), data_types.get(name)
+            bits = bits or (base_type.bits if base_type is not None else 0)
             bits = bits or (self._values.number(declared, "BitSize", 0) if declared is not None else 0)
             base = declared.value("BaseType") if declared is not None else None
-            if found is not None or not base:
+            if base_type is not None or not base:
                 break
             name = base
         if not 0 <= bits <= _MAX_BITS:
@@ -151,25 +151,25 @@ class ObjectReader:
         base_type = types.resolve(name, bits)
         return base_type, bits or base_type.bits
 
-    def _given(self, info: Node | None, base: types.BaseType, which: str, name: str) -> bytes | None:
+    def _value_of(self, info: Node | None, base: types.BaseType, attribute: str, name: str) -> bytes | None:
         """Return a value of `Info`: data, a text or a number; a number's bytes have the type's length."""
         if info is None:
             return None
         warn = self._values.warnings.add
         data: bytes | None = None
-        if info.first(f"{which}Data") is not None:
-            data = self._values.data(info, f"{which}Data")
-        elif text := info.value(f"{which}String"):
+        if info.first(f"{attribute}Data") is not None:
+            data = self._values.data(info, f"{attribute}Data")
+        elif text := info.value(f"{attribute}String"):
             data = text.encode("utf-8", "replace")
-        elif text := info.value(f"{which}Value"):
+        elif text := info.value(f"{attribute}Value"):
             try:
                 value: types.Value | None = text if base.kind in (types.Kind.TEXT, types.Kind.REAL) else number(text)
                 data = types.encode(base, float(text) if value is None else value)
             except (EsiError, ValueError):
-                warn(info.line, f"{name}: {which}Value {text[:40]!r} is no {base.name}; it is left out")
+                warn(info.line, f"{name}: {attribute}Value {text[:40]!r} is no {base.name}; it is left out")
         if data and base.size and base.kind not in (types.Kind.TEXT, types.Kind.BYTES):
             if any(data[base.size :]):
-                warn(info.line, f"{name}: {which}Data has {len(data)} bytes, the type {base.size}; it is cut")
+                warn(info.line, f"{name}: {attribute}Data has {len(data)} bytes, the type {base.size}; it is cut")
             data = data[: base.size].ljust(base.size, b"\0")
         return data
 
@@ -179,6 +179,6 @@ def _matched(infos: list[Node], parts: list[_Part]) -> list[Node | None]:
     if len(infos) < len(parts):
         named = {name_of(info): info for info in reversed(infos)}
         by_name = [named.get(name_of(part.node)) for part in parts]
-        if sum(found is not None for found in by_name) == len(infos):
+        if sum(value is not None for value in by_name) == len(infos):
             return list(by_name)
     return [infos[position] if position < len(infos) else None for position in range(len(parts))]

@@ -1,7 +1,7 @@
-"""ESI files (ETG.2000): their devices and modules, and what is looked up among them.
+"""ESI files (ETG.2000): reader of devices and modules, and look-up.
 
-What real files get wrong is accepted with a warning wherever the meaning is clear; a device that cannot be understood
-is left out with its reason, and the others are read.
+Mistakes of real files are accepted with a warning if the meaning is clear; an unreadable device is skipped with its
+reason.
 """
 
 from __future__ import annotations
@@ -9,25 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from rtcp.esi.model import (
-    Coe,
-    DcMode,
-    Device,
-    DeviceFile,
-    EsiError,
-    FmmuUse,
-    Identity,
-    InitCommand,
-    LookupFailure,
-    Mailbox,
-    Module,
-    Pdo,
-    PdoEntry,
-    Slot,
-    Source,
-    SyncManager,
-    SyncManagerType,
-)
+from rtcp.esi import model
 from rtcp.esi.object_reader import FileTooLarge, ObjectReader
 from rtcp.esi.values import Values, name_of, number
 from rtcp.esi.xml_tree import Node, read_trees
@@ -38,20 +20,20 @@ SLOT_LIMIT = 1024
 """Places for modules of one slot element."""
 _MAX_ENTRY_BITS = 8 * 1486
 _SYNC_MANAGERS = {
-    "mboxout": SyncManagerType.MAILBOX_RECEIVE,
-    "mboxin": SyncManagerType.MAILBOX_SEND,
-    "outputs": SyncManagerType.OUTPUTS,
-    "inputs": SyncManagerType.INPUTS,
+    "mboxout": model.SyncManagerType.MAILBOX_RECEIVE,
+    "mboxin": model.SyncManagerType.MAILBOX_SEND,
+    "outputs": model.SyncManagerType.OUTPUTS,
+    "inputs": model.SyncManagerType.INPUTS,
 }
 _CONTROL = {1: 0x26, 2: 0x22, 3: 0x64, 4: 0x20}
 """Control byte of a sync manager's type, where none is given (ETG.1000.4, table 59)."""
 _FMMUS = {
-    "outputs": FmmuUse.OUTPUTS,
-    "inputs": FmmuUse.INPUTS,
-    "mboxstate": FmmuUse.MAILBOX_STATE,
-    "": FmmuUse.UNUSED,
+    "outputs": model.FmmuUse.OUTPUTS,
+    "inputs": model.FmmuUse.INPUTS,
+    "mboxstate": model.FmmuUse.MAILBOX_STATE,
+    "": model.FmmuUse.UNUSED,
 }
-_FMMU_OF = {SyncManagerType.OUTPUTS: FmmuUse.OUTPUTS, SyncManagerType.INPUTS: FmmuUse.INPUTS}
+_FMMU_OF = {model.SyncManagerType.OUTPUTS: model.FmmuUse.OUTPUTS, model.SyncManagerType.INPUTS: model.FmmuUse.INPUTS}
 _COE = (
     ("sdo_information", "@SdoInfo"),
     ("pdo_assignment", "@PdoAssign"),
@@ -72,14 +54,14 @@ class _Reader:
         self.vendor_id = 0
         self.vendor_name = ""
         self.groups: dict[str, str] = {}
-        self.devices: list[Device] = []
-        self.modules: list[Module] = []
+        self.devices: list[model.Device] = []
+        self.modules: list[model.Module] = []
         self.failures: list[str] = []
         self.hiding: dict[tuple[int | str, int | None], set[tuple[int, int]]] = {}
-        """Product code or type, and revision or None for all, to the devices that hide such ones."""
+        """Product code or type, and revision (None: all) -> devices that hide these."""
 
     def collect(self, node: Node) -> None:
-        """Take a tree of the file."""
+        """Process a tree of the file."""
         if len(self.devices) + len(self.modules) + len(self.failures) >= DEVICE_LIMIT:
             raise self.values.error(node, f"more than {DEVICE_LIMIT} devices and modules")
         try:
@@ -94,13 +76,13 @@ class _Reader:
                 self.modules.append(self.module(node))
         except FileTooLarge:
             raise
-        except EsiError as error:
+        except model.EsiError as error:
             self.failures.append(str(error))
 
-    def file(self) -> DeviceFile:
-        """Return what has been read."""
+    def file(self) -> model.DeviceFile:
+        """Return the result."""
         devices = [replace(device, hidden=True) if self.is_hidden(device) else device for device in self.devices]
-        return DeviceFile(
+        return model.DeviceFile(
             path=self.path,
             vendor_id=self.vendor_id,
             vendor_name=self.vendor_name,
@@ -110,7 +92,7 @@ class _Reader:
             failures=tuple(self.failures),
         )
 
-    def is_hidden(self, device: Device) -> bool:
+    def is_hidden(self, device: model.Device) -> bool:
         """Return whether another device of the file hides this one."""
         own = (device.identity.product_code, device.identity.revision)
         keys = ((kind, revision) for kind in (own[0], device.type) for revision in (own[1], None))
@@ -118,9 +100,9 @@ class _Reader:
 
     # Devices
 
-    def device(self, node: Node) -> Device:
+    def device(self, node: Node) -> model.Device:
         values = self.values
-        identity = Identity(
+        identity = model.Identity(
             self.vendor_id,
             values.number(node, "Type/@ProductCode", 0) & 0xFFFFFFFF,
             values.number(node, "Type/@RevisionNo", 0) & 0xFFFFFFFF,
@@ -143,10 +125,10 @@ class _Reader:
             (number(item.value("NotationIndex")), item.value("Symbol"))
             for item in node.below("Profile/Dictionary/UnitTypes/UnitType")
         ]
-        return Device(
+        return model.Device(
             identity=identity,
             name=name_of(node) or kind,
-            source=Source.ESI,
+            source=model.Source.ESI,
             origin=f"{self.path}:{node.line}",
             type=kind,
             vendor_name=self.vendor_name,
@@ -186,17 +168,19 @@ class _Reader:
         known = (*own, *channels)
         return (402 if 402 in known else known[0] if known else None), channels[:256]
 
-    def sync_managers(self, node: Node, rx_pdos: tuple[Pdo, ...], tx_pdos: tuple[Pdo, ...]) -> tuple[SyncManager, ...]:
+    def sync_managers(
+        self, node: Node, rx_pdos: tuple[model.Pdo, ...], tx_pdos: tuple[model.Pdo, ...]
+    ) -> tuple[model.SyncManager, ...]:
         nodes = node.below("Sm")
         if len(nodes) > 16:
             raise self.values.error(nodes[16], f"{len(nodes)} sync managers; no slave controller has more than 16")
-        assigned = {pdo.sync_manager: SyncManagerType.OUTPUTS for pdo in rx_pdos} | {
-            pdo.sync_manager: SyncManagerType.INPUTS for pdo in tx_pdos
+        assigned = {pdo.sync_manager: model.SyncManagerType.OUTPUTS for pdo in rx_pdos} | {
+            pdo.sync_manager: model.SyncManagerType.INPUTS for pdo in tx_pdos
         }
         has_mailbox = node.first("Mailbox") is not None
         return tuple(self.sync_manager(item, assigned.get(n), has_mailbox) for n, item in enumerate(nodes))
 
-    def sync_manager(self, node: Node, assigned: SyncManagerType | None, has_mailbox: bool) -> SyncManager:
+    def sync_manager(self, node: Node, assigned: model.SyncManagerType | None, has_mailbox: bool) -> model.SyncManager:
         values = self.values
         control = number(node.value("@ControlByte"))
         kind = _SYNC_MANAGERS.get(node.text.lower())
@@ -205,15 +189,15 @@ class _Reader:
             if assigned is not None:
                 kind = assigned
             elif control is None:
-                kind = SyncManagerType.UNUSED
+                kind = model.SyncManagerType.UNUSED
             elif control & 3 == 2 and has_mailbox:
-                kind = SyncManagerType.MAILBOX_RECEIVE if outputs else SyncManagerType.MAILBOX_SEND
+                kind = model.SyncManagerType.MAILBOX_RECEIVE if outputs else model.SyncManagerType.MAILBOX_SEND
             else:
-                kind = SyncManagerType.OUTPUTS if outputs else SyncManagerType.INPUTS
+                kind = model.SyncManagerType.OUTPUTS if outputs else model.SyncManagerType.INPUTS
             values.warnings.add(node.line, f"Sm: the type {node.text[:40]!r} is not known; taken as {kind.name}")
         minimum, maximum = (values.number(node, f"@{name}Size", -1, low=-1, high=0xFFFF) for name in ("Min", "Max"))
         enable = values.number(node, "@Enable", 1)
-        return SyncManager(
+        return model.SyncManager(
             start=values.number(node, "@StartAddress", 0, low=0, high=0xFFFF),
             length=values.number(node, "@DefaultSize", 0, low=0, high=0xFFFF),
             control=_CONTROL.get(kind, 0) if control is None else control & 0xFF,
@@ -225,7 +209,7 @@ class _Reader:
             op_only=values.flag(node, "@OpOnly") or bool(enable & 8),
         )
 
-    def fmmus(self, node: Node, sync_managers: tuple[SyncManager, ...]) -> tuple[FmmuUse, ...]:
+    def fmmus(self, node: Node, sync_managers: tuple[model.SyncManager, ...]) -> tuple[model.FmmuUse, ...]:
         """Return the uses of the FMMUs; one that is named as a sync manager has that one's direction."""
         nodes = node.below("Fmmu")
         if len(nodes) > 16:
@@ -235,20 +219,20 @@ class _Reader:
         for item in nodes:
             use = _FMMUS.get(item.text.lower())
             if use is None:
-                use = _FMMU_OF.get(named.get(item.text, SyncManagerType.UNUSED), FmmuUse.UNUSED)
+                use = _FMMU_OF.get(named.get(item.text, model.SyncManagerType.UNUSED), model.FmmuUse.UNUSED)
                 warning = f"Fmmu: the use {item.text[:40]!r} is not known; taken as {use.name}"
                 self.values.warnings.add(item.line, warning)
             uses.append(use)
         return tuple(uses)
 
-    def pdo(self, node: Node) -> Pdo | None:
+    def pdo(self, node: Node) -> model.Pdo | None:
         values = self.values
         if not node.value("Index"):
             values.warnings.add(node.line, f"{node.tag} without an index is left out")
             return None
         index = values.number(node, "Index", low=0, high=0xFFFF)
         excluded = (number(item.text) for item in node.below("Exclude"))
-        return Pdo(
+        return model.Pdo(
             index=index,
             name=name_of(node),
             entries=values.each(node.below("Entry"), self.pdo_entry),
@@ -261,13 +245,13 @@ class _Reader:
             overwritten_by_module=values.flag(node, "@OverwrittenByModule"),
         )
 
-    def pdo_entry(self, node: Node) -> PdoEntry | None:
+    def pdo_entry(self, node: Node) -> model.PdoEntry | None:
         values = self.values
         bits = values.number(node, "BitLen", low=0, high=_MAX_ENTRY_BITS)
         if bits == 0:
             values.warnings.add(node.line, "Entry of 0 bits is left out")
             return None
-        return PdoEntry(
+        return model.PdoEntry(
             index=values.number(node, "Index", 0, low=0, high=0xFFFF),
             sub_index=values.number(node, "SubIndex", 0, low=0, high=0xFF),
             bits=bits,
@@ -276,7 +260,7 @@ class _Reader:
             depends_on_slot=values.flag(node, "Index/@DependOnSlot"),
         )
 
-    def mailbox(self, node: Node) -> Mailbox | None:
+    def mailbox(self, node: Node) -> model.Mailbox | None:
         mailbox = node.first("Mailbox")
         if mailbox is None:
             return None
@@ -285,13 +269,13 @@ class _Reader:
         described = None
         if coe is not None:
             channels = self.values.number(coe, "@DS402Channels", 0, low=0, high=255)
-            described = Coe(**{name: flag(coe, path) for name, path in _COE}, ds402_channels=channels)
-        others = {name.lower(): mailbox.first(name) is not None for name in ("FoE", "EoE", "AoE", "SoE", "VoE")}
-        return Mailbox(coe=described, **others, data_link_layer=flag(mailbox, "@DataLinkLayer"))
+            described = model.Coe(**{name: flag(coe, path) for name, path in _COE}, ds402_channels=channels)
+        protocols = {name.lower(): mailbox.first(name) is not None for name in ("FoE", "EoE", "AoE", "SoE", "VoE")}
+        return model.Mailbox(coe=described, **protocols, data_link_layer=flag(mailbox, "@DataLinkLayer"))
 
-    def init_command(self, node: Node) -> InitCommand:
+    def init_command(self, node: Node) -> model.InitCommand:
         values = self.values
-        return InitCommand(
+        return model.InitCommand(
             transitions=tuple(item.text.upper() for item in node.below("Transition") if item.text),
             index=values.number(node, "Index", low=0, high=0xFFFF),
             sub_index=values.number(node, "SubIndex", 0, low=0, high=0xFF),
@@ -302,7 +286,7 @@ class _Reader:
             depends_on_slot=values.flag(node, "Index/@DependOnSlot"),
         )
 
-    def dc_mode(self, node: Node) -> DcMode:
+    def dc_mode(self, node: Node) -> model.DcMode:
         def time(tag: str, low: int = -(1 << 31)) -> int:
             return self.values.number(node, tag, 0, low=low, high=(1 << 31) - 1)
 
@@ -313,7 +297,7 @@ class _Reader:
             return tuple(index for item in manager.below("Pdo") if (index := number(item.text)) is not None)
 
         managers = [(number(item.value("@No")), assigned(item)) for item in node.below("Sm")]
-        return DcMode(
+        return model.DcMode(
             name=node.value("Name") or "",
             assign_activate=self.values.number(node, "AssignActivate", 0) & 0xFFFF,
             description=node.value("Desc") or "",
@@ -329,7 +313,7 @@ class _Reader:
 
     # Slots and modules
 
-    def slot(self, device: Node, node: Node) -> Slot:
+    def slot(self, device: Node, node: Node) -> model.Slot:
         values = self.values
 
         def increment(name: str) -> int:
@@ -338,7 +322,7 @@ class _Reader:
 
         idents = [(number(item.text), item) for item in node.below("ModuleIdent")]
         maximum = values.number(node, "@MaxInstances", 1, low=0, high=SLOT_LIMIT)
-        return Slot(
+        return model.Slot(
             name=name_of(node),
             idents=tuple(ident for ident, _ in idents if ident is not None),
             minimum=min(values.number(node, "@MinInstances", 0, low=0), maximum),
@@ -349,9 +333,9 @@ class _Reader:
             default=next((ident for ident, item in idents if values.flag(item, "@Default")), None),
         )
 
-    def module(self, node: Node) -> Module:
+    def module(self, node: Node) -> model.Module:
         values = self.values
-        return Module(
+        return model.Module(
             ident=values.number(node, "Type/@ModuleIdent") & 0xFFFFFFFF,
             name=name_of(node) or name_of(node, "Type"),
             rx_pdos=values.each(node.below("RxPdo"), self.pdo),
@@ -364,7 +348,7 @@ class _Reader:
         )
 
 
-def read_esi(path: Path | str) -> DeviceFile:
+def read_esi(path: Path | str) -> model.DeviceFile:
     """Return the devices and modules of an ESI file.
 
     Raises EsiError where the file is no ESI file, or beyond the limits of this module and of `xml_tree`. A device or
@@ -373,20 +357,20 @@ def read_esi(path: Path | str) -> DeviceFile:
     reader = _Reader(Path(path))
     root = read_trees(Path(path), reader.collect, reader.values.warnings)
     if not (reader.devices or reader.modules or reader.failures):
-        raise EsiError(str(path), f"{root} holds no device and no module")
+        raise model.EsiError(str(path), f"{root} holds no device and no module")
     return reader.file()
 
 
-def describe(device: Device) -> str:
+def describe(device: model.Device) -> str:
     """Return a device in a line: name, type, product code, revision."""
     identity = device.identity
     return f"{device.name} ({device.type}), product 0x{identity.product_code:08X}, revision 0x{identity.revision:08X}"
 
 
 def find_devices(
-    file: DeviceFile, *, product: int | None = None, revision: int | None = None, name: str | None = None
-) -> tuple[Device, ...]:
-    """Return the devices that fit all that is given; `name` is a type or a name, without regard to case."""
+    file: model.DeviceFile, *, product: int | None = None, revision: int | None = None, name: str | None = None
+) -> tuple[model.Device, ...]:
+    """Return the devices that match all criteria; `name` is a type or a name, case-insensitive."""
     wanted = name.lower() if name is not None else None
     return tuple(
         device
@@ -398,11 +382,11 @@ def find_devices(
 
 
 def find_device(
-    file: DeviceFile, *, product: int | None = None, revision: int | None = None, name: str | None = None
-) -> Device:
-    """Return the one device that fits; of several revisions the one that no other hides.
+    file: model.DeviceFile, *, product: int | None = None, revision: int | None = None, name: str | None = None
+) -> model.Device:
+    """Return the single matching device; of several revisions the one not hidden by another.
 
-    Raises LookupFailure with what there is where none fits, or several do.
+    Raises LookupFailure with the candidates if none or several match.
     """
     fitting = find_devices(file, product=product, revision=revision, name=name)
     if len(fitting) > 1:
@@ -410,11 +394,11 @@ def find_device(
     if len(fitting) == 1:
         return fitting[0]
     candidates = tuple(describe(device) for device in fitting or file.devices)
-    asked = [
+    criteria = [
         f"{key} 0x{value:08X}" for key, value in (("product", product), ("revision", revision)) if value is not None
     ]
-    asked += [f"name {name}"] if name is not None else []
-    shown = "; ".join(candidates[:20]) + (f"; and {len(candidates) - 20} more" if len(candidates) > 20 else "")
+    criteria += [f"name {name}"] if name is not None else []
+    listed = "; ".join(candidates[:20]) + (f"; and {len(candidates) - 20} more" if len(candidates) > 20 else "")
     failed = f"; not readable: {'; '.join(file.failures[:5])}" if file.failures else ""
-    problem = f"{len(fitting) or 'no'} devices fit {', '.join(asked) or 'without a choice'}"
-    raise LookupFailure(file.path, f"{problem}; there are: {shown or 'none'}{failed}", candidates)
+    problem = f"{len(fitting) or 'no'} devices fit {', '.join(criteria) or 'without a choice'}"
+    raise model.LookupFailure(file.path, f"{problem}; there are: {listed or 'none'}{failed}", candidates)

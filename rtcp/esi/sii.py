@@ -1,7 +1,8 @@
-"""SII images (ETG.1000.6, 5.4, and ETG.2010): what a slave's EEPROM holds, written and read.
+"""SII images (ETG.1000.6, 5.4, and ETG.2010): reader and writer of the EEPROM content.
 
-SOEM takes the first category of a number, IgH needs a general category of 32 bytes and the sync managers before the
-PDOs, and both an end mark: one category of each kind is written, in rising order.
+The writer writes one category of each kind, in ascending order, and an end mark: SOEM reads only the first category of
+a kind, IgH requires a general category of 32 bytes and the sync managers before the PDOs, and both require the end
+mark.
 """
 
 from __future__ import annotations
@@ -10,27 +11,13 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 
-from rtcp.esi import types
-from rtcp.esi.model import (
-    Coe,
-    DcMode,
-    Device,
-    EsiError,
-    FmmuUse,
-    Identity,
-    Mailbox,
-    Pdo,
-    PdoEntry,
-    Source,
-    SyncManager,
-    SyncManagerType,
-)
+from rtcp.esi import model, types
 
 HEADER_BYTES = 128
 MAX_BYTES = 1 << 17
 """Largest image: categories are addressed in words of 16 bits."""
 SOEM_BYTES = 4096
-"""What SOEM and IgH read of an image."""
+"""Size of an image that SOEM and IgH read."""
 
 _STRINGS, _GENERAL, _FMMU, SYNC_MANAGERS, _TX_PDO, _RX_PDO, _DC, END = 10, 30, 40, 41, 50, 51, 60, 0xFFFF
 _ORDER = (_STRINGS, _GENERAL, _FMMU, SYNC_MANAGERS, _TX_PDO, _RX_PDO, _DC)
@@ -53,7 +40,7 @@ _PORTS = {"Y": 1, "B": 1, "K": 3, "H": 4}
 """Port types of the general category: MII, E-bus, fast hot connect."""
 _PORT_LETTERS = {1: "Y", 3: "K", 4: "H"}
 _LONGEST_ENTRY = 248
-"""Bits of an entry, whose length is one byte; of whole bytes."""
+"""Bits of each part of a longer entry: the length of an entry is one byte, and a part has whole bytes."""
 
 
 def crc(data: bytes) -> int:
@@ -73,7 +60,7 @@ class _Texts:
         self._numbers: dict[bytes, int] = {}
 
     def number(self, text: str) -> int:
-        """Return the number of a text; 0 for an empty one, and for all that no number is left for."""
+        """Return the number of a text; 0 for an empty one, or if all numbers are used."""
         data = text.encode("utf-8", "replace")[:255]
         if not data or (data not in self._numbers and len(self._numbers) == 255):
             return 0
@@ -84,31 +71,31 @@ class _Texts:
         return bytes([len(self._numbers)]) + b"".join(bytes([len(text)]) + text for text in self._numbers)
 
 
-def _pdo_data(pdos: tuple[Pdo, ...], texts: _Texts, entry_names: bool) -> bytes:
+def _pdo_data(pdos: tuple[model.Pdo, ...], texts: _Texts, entry_names: bool) -> bytes:
     data = b""
     for pdo in pdos:
         entries = b""
         count = 0
         name = texts.number(pdo.name)
         for entry in pdo.entries:
-            left = entry.bits
+            remaining = entry.bits
             number = types.resolve(entry.type, entry.bits).number & 0xFF
             text = texts.number(entry.name) if entry_names else 0
-            while left > 0:
-                bits = left if left <= 255 else _LONGEST_ENTRY
+            while remaining > 0:
+                bits = remaining if remaining <= 255 else _LONGEST_ENTRY
                 entries += _PDO_ENTRY.pack(entry.index, entry.sub_index, text, number if entry.index else 0, bits, 0)
                 count += 1
-                left -= bits
+                remaining -= bits
         if count > 255:
-            raise EsiError(f"PDO 0x{pdo.index:04X}", f"{count} entries; an SII image holds at most 255 of a PDO")
+            raise model.EsiError(f"PDO 0x{pdo.index:04X}", f"{count} entries; an SII image holds at most 255 of a PDO")
         flags = _FIXED * pdo.fixed | _MANDATORY * pdo.mandatory | _VIRTUAL * pdo.virtual
         sync_manager = 0xFF if pdo.sync_manager is None else pdo.sync_manager
         data += _PDO_HEADER.pack(pdo.index, count, sync_manager, 0, name, flags) + entries
     return data
 
 
-def _general(device: Device, texts: _Texts) -> bytes:
-    mailbox = device.mailbox or Mailbox()
+def _general(device: model.Device, texts: _Texts) -> bytes:
+    mailbox = device.mailbox or model.Mailbox()
     coe = 0
     if mailbox.coe is not None:
         coe = 1 | sum(bit for bit, name in _COE if getattr(mailbox.coe, name))
@@ -136,12 +123,14 @@ def _general(device: Device, texts: _Texts) -> bytes:
     )
 
 
-def _header(device: Device, alias: int, size: int) -> bytes:
+def _header(device: model.Device, alias: int, size: int) -> bytes:
     config = bytearray(device.config_data.ljust(14, b"\0"))
     if alias:
         config[8:10] = alias.to_bytes(2, "little")
     boxes = {sync.type: sync for sync in reversed(device.sync_managers) if sync.length}
-    receive, send = (boxes.get(kind) for kind in (SyncManagerType.MAILBOX_RECEIVE, SyncManagerType.MAILBOX_SEND))
+    receive, send = (
+        boxes.get(kind) for kind in (model.SyncManagerType.MAILBOX_RECEIVE, model.SyncManagerType.MAILBOX_SEND)
+    )
     mailbox = device.mailbox
     protocols = 0
     if mailbox is not None:
@@ -164,7 +153,7 @@ def _header(device: Device, alias: int, size: int) -> bytes:
     return header.ljust(124, b"\0") + struct.pack("<HH", max(size // 128 - 1, 0), 1)
 
 
-def _categories(device: Device, pdos: bool, entry_names: bool) -> bytes:
+def _categories(device: model.Device, pdos: bool, entry_names: bool) -> bytes:
     texts = _Texts()
     general = _general(device, texts)
     dc = b"".join(
@@ -205,7 +194,7 @@ def _categories(device: Device, pdos: bool, entry_names: bool) -> bytes:
     return image + struct.pack("<H", END)
 
 
-def write_sii(device: Device, alias: int | None = None) -> bytes:
+def write_sii(device: model.Device, alias: int | None = None) -> bytes:
     """Return the SII image of a device, of its EEPROM's size or larger where that cannot hold it.
 
     Where the image does not fit, the PDOs are left out if the device has CoE (they are read by SDO), else the names of
@@ -213,13 +202,9 @@ def write_sii(device: Device, alias: int | None = None) -> bytes:
     """
     alias = device.station_alias if alias is None else alias
     size = device.eeprom_bytes
-    forms = [(True, True)]
-    if device.coe is not None:
-        forms.append((False, True))
-    else:
-        forms.append((True, False))
+    contents = [(True, True), (False, True) if device.coe is not None else (True, False)]
     data = b""
-    for pdos, entry_names in forms if size else forms[:1]:
+    for pdos, entry_names in contents if size else contents[:1]:
         data = _categories(device, pdos, entry_names)
         if HEADER_BYTES + len(data) <= size:
             break
@@ -227,7 +212,7 @@ def write_sii(device: Device, alias: int | None = None) -> bytes:
     if needed > size:
         size = 1 << (needed - 1).bit_length()
     if size > MAX_BYTES:
-        raise EsiError(device.origin, f"an SII image of {needed} bytes; it can have {MAX_BYTES}")
+        raise model.EsiError(device.origin, f"an SII image of {needed} bytes; it can have {MAX_BYTES}")
     return (_header(device, alias, size) + data).ljust(size, b"\xff")
 
 
@@ -268,7 +253,7 @@ def _text(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def _read_pdos(data: bytes, texts: dict[int, str]) -> tuple[Pdo, ...]:
+def _read_pdos(data: bytes, texts: dict[int, str]) -> tuple[model.Pdo, ...]:
     pdos = []
     position = 0
     while position + _PDO_HEADER.size <= len(data):
@@ -281,9 +266,9 @@ def _read_pdos(data: bytes, texts: dict[int, str]) -> tuple[Pdo, ...]:
             entry, sub_index, text, number, bits, _ = _PDO_ENTRY.unpack_from(data, position)
             position += _PDO_ENTRY.size
             kind = types.of_number(number, bits).name if entry or number else ""
-            entries.append(PdoEntry(entry, sub_index, bits, texts.get(text, ""), kind))
+            entries.append(model.PdoEntry(entry, sub_index, bits, texts.get(text, ""), kind))
         pdos.append(
-            Pdo(
+            model.Pdo(
                 index=index,
                 name=texts.get(name, ""),
                 entries=tuple(entries),
@@ -296,14 +281,14 @@ def _read_pdos(data: bytes, texts: dict[int, str]) -> tuple[Pdo, ...]:
     return tuple(pdos)
 
 
-def read_sync_managers(data: bytes) -> tuple[SyncManager, ...]:
+def read_sync_managers(data: bytes) -> tuple[model.SyncManager, ...]:
     """Return the sync managers of a category."""
     return tuple(
-        SyncManager(
+        model.SyncManager(
             start=start,
             length=length,
             control=control,
-            type=SyncManagerType(kind) if kind <= SyncManagerType.INPUTS else SyncManagerType.UNUSED,
+            type=model.SyncManagerType(kind) if kind <= model.SyncManagerType.INPUTS else model.SyncManagerType.UNUSED,
             enabled=bool(enable & 1),
             virtual=bool(enable & 4),
             op_only=bool(enable & 8),
@@ -312,17 +297,17 @@ def read_sync_managers(data: bytes) -> tuple[SyncManager, ...]:
     )
 
 
-def read_sii(image: bytes, origin: str = "SII image") -> Device:
-    """Return the device that an image describes, as far as it goes; `check_sii` says what is wrong with it.
+def read_sii(image: bytes, origin: str = "SII image") -> model.Device:
+    """Return the device described by an image, possibly incomplete; `check_sii` returns its mistakes.
 
     Raises EsiError where it is too short for its fixed part.
     """
     if len(image) < HEADER_BYTES:
-        raise EsiError(origin, f"{len(image)} bytes; the fixed part of an SII image alone has {HEADER_BYTES}")
+        raise model.EsiError(origin, f"{len(image)} bytes; the fixed part of an SII image alone has {HEADER_BYTES}")
     categories: dict[int, bytes] = {}
     unread: Counter[str] = Counter()
     for number, data, _ in _split(image):
-        if number in _ORDER:  # several of a number, as some tools write them, are one
+        if number in _ORDER:  # some tools write several categories of a number: they are joined
             categories[number] = categories.get(number, b"") + data
         elif number != END:
             unread[f"category {number}"] += 1
@@ -335,19 +320,19 @@ def read_sii(image: bytes, origin: str = "SII image") -> Device:
     protocols = int.from_bytes(image[56:58], "little")
     mailbox = None
     if protocols:
-        mailbox = Mailbox(
-            coe=Coe(**{key: bool(coe & bit) for bit, key in _COE}, ds402_channels=channels)
+        mailbox = model.Mailbox(
+            coe=model.Coe(**{key: bool(coe & bit) for bit, key in _COE}, ds402_channels=channels)
             if protocols & 0x04
             else None,
             **{key: bool(protocols & bit) for bit, key in _PROTOCOLS if key != "coe"},
             data_link_layer=bool(flags & 4),
         )
-    fmmus = tuple(FmmuUse(use) if use <= 3 else FmmuUse.UNUSED for use in categories.get(_FMMU, b""))
+    fmmus = tuple(model.FmmuUse(use) if use <= 3 else model.FmmuUse.UNUSED for use in categories.get(_FMMU, b""))
     dc_data = categories.get(_DC, b"")
-    return Device(
-        identity=Identity(vendor, product, revision, serial),
+    return model.Device(
+        identity=model.Identity(vendor, product, revision, serial),
         name=texts.get(name, "") or texts.get(1, ""),
-        source=Source.SII,
+        source=model.Source.SII,
         origin=origin,
         type=texts.get(order, ""),
         group=texts.get(group, ""),
@@ -359,7 +344,7 @@ def read_sii(image: bytes, origin: str = "SII image") -> Device:
         tx_pdos=_read_pdos(categories.get(_TX_PDO, b""), texts),
         mailbox=mailbox,
         dc_modes=tuple(
-            DcMode(
+            model.DcMode(
                 name=texts.get(text, ""),
                 assign_activate=activate,
                 description=texts.get(description, ""),
@@ -384,39 +369,39 @@ def read_sii(image: bytes, origin: str = "SII image") -> Device:
 
 
 def check_sii(image: bytes) -> tuple[str, ...]:
-    """Return a sentence for each thing that is wrong in an image, or that a master would not see."""
+    """Return a sentence for each mistake in an image and each part that a master would not see."""
     if len(image) < HEADER_BYTES:
         return (f"{len(image)} bytes; the fixed part of an SII image alone has {HEADER_BYTES}.",)
-    found = []
+    mistakes = []
     expected = crc(image[:14])
     if image[14] != expected:
-        found.append(f"The CRC of the first seven words is 0x{image[14]:02X}, not 0x{expected:02X}.")
+        mistakes.append(f"The CRC of the first seven words is 0x{image[14]:02X}, not 0x{expected:02X}.")
     size = (int.from_bytes(image[124:126], "little") + 1) * 128
     if size < HEADER_BYTES or size > MAX_BYTES:
-        found.append(f"Its size is given as {size} bytes.")
+        mistakes.append(f"Its size is given as {size} bytes; allowed are {HEADER_BYTES} to {MAX_BYTES}.")
     categories = list(_split(image))
     numbers = [number for number, *_ in categories]
-    found += [f"Category {number} is longer than the image." for number, _, whole in categories if not whole]
+    mistakes += [f"Category {number} is longer than the image." for number, _, whole in categories if not whole]
     if END not in numbers:
-        found.append("The end mark 0xFFFF is missing: IgH drops all categories.")
-    found += [
+        mistakes.append("The end mark 0xFFFF is missing: IgH drops all categories.")
+    mistakes += [
         f"Category {number} occurs {count} times: SOEM reads the first only."
         for number, count in Counter(numbers).items()
         if count > 1 and number in _ORDER
     ]
     data = dict(reversed([(number, body) for number, body, _ in categories]))
     if _GENERAL not in numbers:
-        found.append("Category 30 (general) is missing: SOEM uses no complete access, IgH no names.")
+        mistakes.append("Category 30 (general) is missing: SOEM uses no complete access, IgH no names.")
     elif len(data[_GENERAL]) != 32:
-        found.append(f"Category 30 (general) has {len(data[_GENERAL])} bytes, not 32: IgH refuses it.")
+        mistakes.append(f"Category 30 (general) has {len(data[_GENERAL])} bytes, not 32: IgH refuses it.")
     if len(data.get(SYNC_MANAGERS, b"")) % 8:
-        found.append(f"Category 41 (sync managers) has {len(data[SYNC_MANAGERS])} bytes, no multiple of 8.")
+        mistakes.append(f"Category 41 (sync managers) has {len(data[SYNC_MANAGERS])} bytes, no multiple of 8.")
     pdos = [numbers.index(number) for number in (_TX_PDO, _RX_PDO) if number in numbers]
     if pdos and SYNC_MANAGERS in numbers and numbers.index(SYNC_MANAGERS) > min(pdos):
-        found.append("Category 41 (sync managers) stands behind the PDOs: IgH cannot assign them.")
+        mistakes.append("Category 41 (sync managers) stands behind the PDOs: IgH cannot assign them.")
     used = HEADER_BYTES + sum(4 + len(body) for _, body, _ in categories)
     if used > SOEM_BYTES:
-        found.append(f"It has {used} bytes of categories: SOEM and IgH read {SOEM_BYTES}.")
+        mistakes.append(f"It has {used} bytes of categories: SOEM and IgH read {SOEM_BYTES}.")
     if used > size:
-        found.append(f"It needs {used} bytes, and gives its size as {size}.")
-    return tuple(found)
+        mistakes.append(f"It needs {used} bytes, and gives its size as {size}.")
+    return tuple(mistakes)

@@ -14,7 +14,7 @@ Value = int | float | str | bytes
 
 
 class Kind(Enum):
-    """How the bytes of a type are read."""
+    """Interpretation of the bytes of a type."""
 
     UNSIGNED = "unsigned"
     SIGNED = "signed"
@@ -28,7 +28,7 @@ class BaseType:
     """A base data type."""
 
     name: str
-    """Name of ETG.2000; of an alias the one that it stands for."""
+    """Name in ETG.2000, with aliases resolved."""
     number: int
     """Number of ETG.1000.6, as SDO information and the SII have it; 0: none."""
     bits: int
@@ -91,7 +91,7 @@ def named(name: str) -> BaseType | None:
 
 
 def of_bits(bits: int) -> BaseType:
-    """Return the plainest type of a length: unsigned, or an array of bytes."""
+    """Return the generic type of a length: unsigned, or an array of bytes."""
     return _BY_BITS[bits] if bits in _BY_BITS else _bytes(bits)
 
 
@@ -100,7 +100,7 @@ def _bytes(bits: int) -> BaseType:
 
 
 def of_number(number: int, bits: int) -> BaseType:
-    """Return the type of a number of ETG.1000.6; a number or a length that does not fit: the plainest of the length."""
+    """Return the type of a number of ETG.1000.6; unknown or not `bits` long: the generic type of that length."""
     entry = _BY_NUMBER.get(number)
     if entry is None or (entry.bits and bits and entry.bits != bits):
         return of_bits(bits)
@@ -114,7 +114,7 @@ def of_number(number: int, bits: int) -> BaseType:
 
 @lru_cache(maxsize=1024)
 def resolve(name: str, bits: int) -> BaseType:
-    """Return the type of a name; where it is none, or of another length than `bits`, the plainest of the length."""
+    """Return the type with this name; if it is unknown or not `bits` long, the generic type of that length."""
     entry = named(name)
     if entry is None or (bits and entry.bits != bits):
         if entry is not None and entry.kind in (Kind.TEXT, Kind.BYTES):

@@ -1,4 +1,4 @@
-"""Values in the elements of an ESI file, read so that what is wrong and harmless is accepted with a warning."""
+"""Values in the elements of an ESI file; harmless mistakes are accepted with a warning."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Values:
         return bytes.fromhex(digits)[:limit]
 
     def each(self, nodes: list[Node], build: Callable[[Node], _T | None]) -> tuple[_T, ...]:
-        """Return what is built of each element; those of which nothing can be are left out."""
+        """Return the results of `build` for the elements, without failed ones."""
         if len(nodes) > LIST_LIMIT:
             raise self.error(nodes[0], f"{len(nodes)} elements {nodes[0].tag}; there can be {LIST_LIMIT}")
         return tuple(item for item in map(build, nodes) if item is not None)

@@ -49,7 +49,7 @@ READ = frozenset(
         """,
     )
 )
-"""Elements that are read; all others are left out with all that stands in them."""
+"""Elements that are read; all others are skipped with their content."""
 IGNORED = frozenset(
     re.findall(
         r"\w+",
@@ -62,7 +62,7 @@ IGNORED = frozenset(
         """,
     )
 )
-"""Elements that ETG.2000 has, tools show or vendors use, and nothing here needs."""
+"""Elements of ETG.2000, tools or vendors that are not needed here."""
 _COLLECTED = {"Device": "Devices", "Module": "Modules", "Group": "Groups", "Vendor": None}
 """Elements that are handed out as a tree, with the element in which they stand; None: in any root."""
 
@@ -120,7 +120,7 @@ class Warnings:
             self._left_out += 1
 
     def all(self) -> tuple[str, ...]:
-        """Return them, with the number of those left out."""
+        """Return the warnings, with the number of omitted ones."""
         more = (f"{self.path}: {self._left_out} further warnings are left out",) if self._left_out else ()
         return (*self.sentences, *more)
 

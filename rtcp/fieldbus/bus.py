@@ -1,4 +1,4 @@
-"""The bus as the platform sees it: its operations, the process data, and the description of each slave."""
+"""Interface of a bus: its operations, the process data, and the description of each slave."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from rtcp.config.model import SlaveConfig
-from rtcp.fieldbus.al_state import AlState, code_meaning, code_remedy, state_name
-from rtcp.fieldbus.emergency import Emergency
+from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.topology import PortState
+from rtcp.ipc.codes import ERROR_BIT, status_words
+from rtcp.ipc.events import EmergencyMessage
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class PdoEntryInfo:
 
 @dataclass(frozen=True)
 class PdoInfo:
-    """A PDO that is assigned to a sync manager, and what is mapped into it."""
+    """A PDO that is assigned to a sync manager, and its entries."""
 
     index: int
     entries: tuple[PdoEntryInfo, ...]
@@ -38,17 +39,17 @@ class PdoInfo:
 
 PORTS = 4
 LARGEST_MAILBOX = 1486
-"""Bytes of a mailbox that one datagram carries, and that SOEM has room for."""
+"""Largest mailbox that fits one datagram and SOEM's buffers, bytes."""
 
 
 @dataclass(frozen=True)
 class PortErrors:
-    """What each of a slave's ports has counted."""
+    """Error counters of a slave, one for each port."""
 
     rx: list[int] = field(default_factory=lambda: [0] * PORTS)
-    """Damaged frames that came in over the cable of that port."""
+    """Damaged frames received over the cable of that port."""
     forwarded: list[int] = field(default_factory=lambda: [0] * PORTS)
-    """Damaged frames that somebody before it has already counted."""
+    """Damaged frames that a slave before it has already counted."""
     links: list[int] = field(default_factory=lambda: [0] * PORTS)
     """Lost links."""
 
@@ -65,12 +66,12 @@ class MailboxInfo:
 
     @property
     def has_coe(self) -> bool:
-        """Whether it speaks CoE, and its messages fit."""
+        """Whether it supports CoE, and its messages fit a datagram."""
         return "CoE" in self.protocols and self.fits
 
     @property
     def fits(self) -> bool:
-        """Whether a datagram carries its messages."""
+        """Whether its messages fit a datagram."""
         return max(self.receive_size, self.send_size) <= LARGEST_MAILBOX
 
 
@@ -87,7 +88,7 @@ class SyncManagerInfo:
 
 @dataclass(frozen=True)
 class SlaveInfo:
-    """What is known of a slave from its registers, its EEPROM and its object dictionary."""
+    """Description of a slave from its registers, its EEPROM and its object dictionary."""
 
     position: int
     """Position on the cable, from 1."""
@@ -124,11 +125,11 @@ class SlaveInfo:
     parent: int
     """Position of the slave before it; 0: the master."""
     parent_port: int
-    """Port of that slave at which it hangs."""
+    """Port of the parent at which it hangs."""
     port_errors: PortErrors
     """Error counters of its ports since its power-on, each up to 255."""
     watchdog_off: tuple[int, ...] = ()
-    """Sync managers whose outputs do not trigger the process-data watchdog by its EEPROM; `configure` lets them."""
+    """Sync managers whose outputs do not trigger the process-data watchdog by its EEPROM; `configure` corrects that."""
 
 
 @dataclass(frozen=True)
@@ -144,13 +145,14 @@ class SlaveState:
     code: int
     """AL status code."""
 
+    @property
+    def al_status(self) -> int:
+        """State and error indication as in the register."""
+        return self.state | (ERROR_BIT if self.error else 0)
+
     def words(self) -> str:
-        """Return state and code in words, with what to do about it where that is known."""
-        text = state_name(self.state | (0x10 if self.error else 0))
-        if not self.error:
-            return text
-        remedy = code_remedy(self.code)
-        return f"{text} (0x{self.code:04X}: {code_meaning(self.code)})" + (f"; {remedy}" if remedy else "")
+        """Return state and code in words, with a remedy where one is known."""
+        return status_words(self.al_status, self.code)
 
 
 class ProcessData(Protocol):
@@ -163,23 +165,23 @@ class ProcessData(Protocol):
     missed: int
     """Exchanges without an answer in time, since the start."""
     stale: int
-    """Late frames that were thrown away, since the start."""
+    """Late frames that were dropped, since the start."""
 
     def send(self) -> None:
-        """Send the outputs that were set."""
+        """Send the outputs."""
 
     def receive(self) -> int:
-        """Wait a fraction of the period for the answer; return its working counter, -1 where none came."""
+        """Wait a fraction of the period for the answer; return its working counter, -1: no answer."""
 
     def input(self, index: int) -> bytes:
         """Return the inputs of slave `index` (from 0, in the order of the configuration) of the last answer."""
 
     def set_output(self, index: int, data: bytes) -> None:
-        """Set the outputs of slave `index`; data of another length is not taken, the former outputs stay."""
+        """Set the outputs of slave `index`; data of another length is ignored."""
 
 
 class Bus(Protocol):
-    """A segment and its master. Every method raises BusError where the bus or a slave does not do what was asked."""
+    """A segment and its master. Every method raises BusError where the bus or a slave refuses or does not answer."""
 
     notes: list[str]
     """Deviations that `configure` tolerated, in sentences."""
@@ -191,10 +193,10 @@ class Bus(Protocol):
         """Find the slaves, bring them to PRE-OP and return their descriptions."""
 
     def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> ProcessData:
-        """Compare the slaves with `slaves`, set them up, bring them to SAFE-OP with outputs of zero."""
+        """Compare the segment with `slaves`, set the slaves up, bring them to SAFE-OP with all outputs 0."""
 
     def request_state(self, state: AlState, positions: Iterable[int] | None = None) -> None:
-        """Request `state` of the slaves at `positions`, None: of all; nothing is waited for."""
+        """Request `state` of the slaves at `positions`, None: of all; does not wait."""
 
     def wait_for_state(
         self, state: AlState, timeout_s: float, positions: Iterable[int] | None = None
@@ -202,26 +204,20 @@ class Bus(Protocol):
         """Wait until the slaves are in `state`; return a sentence for each that is not."""
 
     def acknowledge(self, position: int) -> None:
-        """Acknowledge a slave's error: it stays in the state that it is in, without the error indication."""
+        """Acknowledge a slave's error: clears the error indication, keeps the state."""
 
     def read_states(self) -> tuple[SlaveState, ...]:
         """Return the AL status of every slave."""
 
-    def emergencies(self) -> tuple[Emergency, ...]:
+    def emergencies(self) -> tuple[EmergencyMessage, ...]:
         """Return the emergency messages that came since the last call."""
-
-    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
-        """Return an object's value."""
-
-    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
-        """Write an object's value."""
 
     def close(self) -> None:
         """Bring the slaves back to INIT, switch SYNC off, close the bus; may be called at any time, also twice."""
 
 
 def slave_label(position: int, name: str) -> str:
-    """Return how sentences name a slave."""
+    """Return the label of a slave in messages."""
     return f"slave {position} ({name})"
 
 

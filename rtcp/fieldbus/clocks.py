@@ -14,7 +14,7 @@ from rtcp.fieldbus.registers import Register, RegisterPort, Steps
 
 _DC_SPEED_DEFAULT = b"\x00\x10"
 _SYNC_DELAY_NS = 100_000_000
-"""From the activation to the first SYNC0 at least."""
+"""Least time from the activation to the first SYNC0, ns."""
 _SETTLED_NS = 2_000
 _SETTLE_S = 1.5
 _UNTIL_2000_NS = 946_684_800 * 1_000_000_000
@@ -31,7 +31,7 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
         period_ns: the cycle of SYNC0.
 
     Raises:
-        BusError: no clock, SYNC0 in the past, or an activation that the slave does not keep.
+        BusError: no clock, SYNC0 in the past, or an activation that reads back differently.
     """
     clocks = master.config_dc()
     for position, config in enumerate(slaves, 1):
@@ -52,29 +52,29 @@ def take_over_time(
     Args:
         port: the port for registers.
         station: address of the slave whose clock is set; SYNC0 is off.
-        label: how sentences name it.
-        delay: its propagation delay from the reference clock, as register 0x0928 holds it.
-        others: the other slaves that have a clock, the reference first; the first one that answers is believed.
-        always: set it also where it shows the reference's time already.
+        label: the slave in messages.
+        delay: its propagation delay from the reference clock, content of register 0x0928.
+        others: the other slaves with a clock, the reference first; the first one that answers is used.
+        always: set the clock even if it already shows the reference's time.
 
     Raises:
         BusError: it stopped answering, or no slave took the broadcast.
     """
     if not always:
-        shown = port.read(station, Register.DC_DIFFERENCE, 4)
-        if shown is not None and _difference(shown) < _SETTLED_NS:
+        difference = port.read(station, Register.DC_DIFFERENCE, 4)
+        if difference is not None and _difference(difference) < _SETTLED_NS:
             return
-    # Without it the two registers below would hold times of two different frames.
+    # Otherwise the two registers below would hold times of two different frames.
     if port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4)) < 1:
         raise BusError(f"{label}: the local times could not be latched while its clock was set")
     own = port.read(station, Register.DC_RECEIVE_TIME, 8)
     if own is None:
         raise BusError(f"{label} stopped answering while its clock was set")
-    # Where no other clock lives, the host's time is as good as any (SOEM starts with it): ns since 2000.
+    # Without another clock: the host's time, as SOEM does, ns since 2000.
     time_then = time.time_ns() - _UNTIL_2000_NS
-    for other in others:
-        theirs = [port.read(station_of(other), at, 8) for at in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
-        their_delay = port.read(station_of(other), Register.DC_DELAY, 4)
+    for neighbour in others:
+        theirs = [port.read(station_of(neighbour), at, 8) for at in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
+        their_delay = port.read(station_of(neighbour), Register.DC_DELAY, 4)
         if None not in theirs and their_delay is not None:
             time_then = sum(int.from_bytes(part or b"", "little") for part in theirs)
             time_then += int.from_bytes(delay, "little") - int.from_bytes(their_delay, "little")
@@ -85,22 +85,22 @@ def take_over_time(
 
 
 def forget_drift(port: RegisterPort, station: int, label: str) -> None:
-    """Let a slave forget what drift compensation has learnt: it may have followed a reference that stood still."""
+    """Reset a slave's drift compensation: it may have followed a stopped reference clock."""
     port.put(station, Register.DC_SPEED, _DC_SPEED_DEFAULT, label)
 
 
 def settle_clock(port: RegisterPort, station: int, label: str) -> Steps[None]:
-    """Let drift compensation bring a slave's clock to the reference's; raises BusError where it does not get there."""
+    """Wait until drift compensation has settled a slave's clock; raises BusError after `_SETTLE_S`."""
     until = time.monotonic() + _SETTLE_S
     while True:
-        shown = port.read(station, Register.DC_DIFFERENCE, 4)
-        if shown is not None and _difference(shown) < _SETTLED_NS:
+        difference = port.read(station, Register.DC_DIFFERENCE, 4)
+        if difference is not None and _difference(difference) < _SETTLED_NS:
             return
         if time.monotonic() >= until:
-            found = "nothing" if shown is None else f"{_difference(shown) / 1000:g} us"
+            text = "nothing" if difference is None else f"{_difference(difference) / 1000:g} us"
             raise BusError(
                 f"{label}: its clock is not within {_SETTLED_NS / 1000:g} us of the reference clock's after "
-                f"{_SETTLE_S:g} s (register 0x092C shows {found}); it is set anew"
+                f"{_SETTLE_S:g} s (register 0x092C shows {text}); it is set anew"
             )
         yield
 
@@ -111,12 +111,12 @@ def _difference(register: bytes) -> int:
 
 
 def sync_cycles(device: DeviceDescription, period_ns: int) -> tuple[int, int]:
-    """Return the cycle of SYNC0 and the time from it to SYNC1 as registers 0x09A0 and 0x09A4 hold them, ns.
+    """Return the contents of registers 0x09A0 and 0x09A4: cycle of SYNC0, and time from it to SYNC1, ns.
 
-    Where the latter is a cycle of SYNC0 or more, SYNC1 comes after that many of them only (ETG.1000.4, 6.8.5).
+    If that time is a cycle of SYNC0 or more, SYNC1 comes only after it, not with every SYNC0 (ETG.1000.4, 6.8.5).
     """
     sync0 = _cycle(device.sync0_factor, device.sync0_cycle_us, period_ns, period_ns)
-    # As ETG.2000 gives it, SYNC1's cycle counts from the SYNC0 that it comes with; the register from the one after.
+    # In ETG.2000 SYNC1's cycle counts from the SYNC0 at which it occurs; in the register from the next one.
     sync1 = _cycle(device.sync1_factor, device.sync1_cycle_us, sync0, period_ns)
     return sync0, max(sync1 - sync0, 0) + round(device.sync1_shift_us * 1000)
 
@@ -131,7 +131,7 @@ def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescr
     """Start SYNC0 of one slave on the grid of the others: multiples of its cycle, shifted by `sync0_shift_us`.
 
     Raises:
-        BusError: its first SYNC0 lies in the past, or the slave does not keep the activation.
+        BusError: its first SYNC0 lies in the past, or the activation reads back differently.
     """
     shift = round(device.sync0_shift_us * 1000)
     sync0, after = sync_cycles(device, period_ns)
@@ -149,18 +149,18 @@ def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescr
         if port.read(station, Register.DC_SYNC0_CYCLE, len(cycles)) != cycles:
             kept = f"SYNC0, {sync0 / 1000:g} us, and SYNC1, {after / 1000:g} us after it (registers 0x09A0 and 0x09A4)"
             raise BusError(f"{label}: it does not keep the cycle of {kept}")
-        # The whole word at once, as IgH writes it: its low byte says who latches and who controls the unit.
+        # The whole word at once, as IgH does: its low byte assigns latches and sync unit to master or device.
         port.put(station, Register.DC_CYCLIC_UNIT, activation, label)
-        # A SYNC0 whose time had passed at the activation never comes (SOEM#757): frames may have been lost meanwhile.
+        # A SYNC0 whose time has passed at the activation never comes (SOEM#757); lost frames may have delayed that.
         if first_sync_is_ahead(port, station):
             break
     else:
         raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
     active = port.read(station, Register.DC_CYCLIC_UNIT, 2)
     if active != activation:
-        found = "nothing" if active is None else f"0x{int.from_bytes(active, 'little'):04X}"
+        text = "nothing" if active is None else f"0x{int.from_bytes(active, 'little'):04X}"
         raise BusError(
-            f"{label}: `assign_activate` 0x{device.assign_activate:04X} reads back from register 0x0980 as {found}"
+            f"{label}: `assign_activate` 0x{device.assign_activate:04X} reads back from register 0x0980 as {text}"
         )
 
 
@@ -170,6 +170,6 @@ def first_sync_is_ahead(port: RegisterPort, station: int) -> bool:
     start = port.read(station, Register.DC_START, 4)
     if now is None or start is None:
         return False
-    # The low 32 bits alone: an ESC may have no more.
+    # Only the low 32 bits: an ESC may have no more.
     ahead = int.from_bytes(start, "little") - int.from_bytes(now, "little") & 0xFFFFFFFF
     return 0 < ahead < 0x80000000

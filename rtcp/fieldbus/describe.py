@@ -1,4 +1,4 @@
-"""A live slave as a device description: its EEPROM, its registers, and its object dictionary by SDO information."""
+"""Device description of a live slave, from its EEPROM, its registers, and its object dictionary by SDO information."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from rtcp.fieldbus.pdo import ASSIGN, reading_assignment
 from rtcp.fieldbus.registers import finish
 
 _LIST, _OBJECT, _ENTRY = 1, 3, 5
-"""Services of SDO information (ETG.1000.6, 5.6.3): a list of objects, an object's description, an entry's."""
+"""Services of SDO information (ETG.1000.6, 5.6.3): list of objects, object description, entry description."""
 _ALL_OBJECTS = 1
 _DESCRIPTION = struct.Struct("<HHBB")
 """Index, data type, highest subindex, object code; the name follows."""
 _ENTRY_DESCRIPTION = struct.Struct("<HBBHHH")
-"""Index, subindex, what more there is, data type, bits, access; the name follows where nothing more was asked for."""
+"""Index, subindex, value info, data type, bits, access; the name follows where no value info was requested."""
 _READ, _WRITE, _RX, _TX = 0x07, 0x38, 0x40, 0x80
 """Access: read and write in PRE-OP, SAFE-OP and OP, mappable in RxPDOs and TxPDOs."""
 _WRITE_STATES = ((0x08, "P"), (0x10, "S"), (0x20, "O"))
 _CODES = {code.value: code for code in model.ObjectCode}
 _COUNT = 0
-"""Subindex of how many entries there are."""
+"""Subindex of the number of entries."""
 
 
 def pdos_of_eeprom(device: model.Device) -> tuple[tuple[PdoInfo, ...], tuple[PdoInfo, ...]]:
-    """Return the outputs and the inputs that an EEPROM assigns to sync managers by itself."""
+    """Return the RxPDOs and the TxPDOs that an EEPROM assigns to sync managers."""
 
     def info(pdo: model.Pdo) -> PdoInfo:
         entries = (PdoEntryInfo(entry.index, entry.sub_index, entry.bits, entry.name) for entry in pdo.entries)
@@ -42,31 +42,31 @@ def pdos_of_eeprom(device: model.Device) -> tuple[tuple[PdoInfo, ...], tuple[Pdo
 
 
 def describe_device(sdo: SdoClient, has_coe: bool, eeprom: bytes, origin: str, progress: Progress) -> model.Device:
-    """Return the description of a slave in PRE-OP; its PDOs as they are assigned now.
+    """Return the description of a slave in PRE-OP, with its present PDO assignment.
 
     Args:
         sdo: SDO access to it.
-        has_coe: whether it speaks CoE.
+        has_coe: whether it supports CoE.
         eeprom: its EEPROM.
         origin: the bus and its position, in words.
-        progress: receives the part of the object dictionary that was read.
+        progress: receives the fraction of the object dictionary that was read, 0 to 1.
 
     Raises:
         BusError: it stopped answering.
-        EsiError: its EEPROM is too short to hold anything.
+        EsiError: its EEPROM is too short.
     """
     device = replace(read_sii(eeprom, origin), source=model.Source.BUS, origin=origin)
     if not has_coe:
         return device
     objects = tuple(_read_objects(sdo, progress))
-    names = {(one.index, entry.sub_index): entry for one in objects for entry in one.entries}
+    names = {(item.index, entry.sub_index): entry for item in objects for entry in item.entries}
     assigned = _assignments(sdo, device)
     if not assigned:
         return replace(device, objects=objects)
     pdos: dict[bool, list[model.Pdo]] = {True: [], False: []}
-    for number, found in assigned.items():
+    for number, mapped in assigned.items():
         outputs = device.sync_managers[number].type is model.SyncManagerType.OUTPUTS
-        pdos[outputs] += [_pdo(pdo, number, names, objects) for pdo in found]
+        pdos[outputs] += [_pdo(pdo, number, names, objects) for pdo in mapped]
     return replace(
         device,
         objects=objects,
@@ -76,7 +76,7 @@ def describe_device(sdo: SdoClient, has_coe: bool, eeprom: bytes, origin: str, p
 
 
 def _with_the_others(assigned: Sequence[model.Pdo], known: Sequence[model.Pdo]) -> tuple[model.Pdo, ...]:
-    """Return the assigned PDOs with what the EEPROM says of them, and the EEPROM's others, which can be assigned."""
+    """Return the assigned PDOs, completed from the EEPROM, and the EEPROM's other PDOs, which can be assigned."""
     listed = {pdo.index: pdo for pdo in known}
     now = [
         replace(listed[pdo.index], entries=pdo.entries, sync_manager=pdo.sync_manager) if pdo.index in listed else pdo
@@ -87,16 +87,16 @@ def _with_the_others(assigned: Sequence[model.Pdo], known: Sequence[model.Pdo]) 
 
 
 def _assignments(sdo: SdoClient, device: model.Device) -> dict[int, tuple[PdoInfo, ...]]:
-    """Return the PDOs assigned to each sync manager of process data, as far as it has assignment objects."""
+    """Return the PDOs of each sync manager of process data that has an assignment object."""
     kinds = (model.SyncManagerType.OUTPUTS, model.SyncManagerType.INPUTS)
-    found = {}
+    by_manager = {}
     for number, manager in enumerate(device.sync_managers):
         if manager.type in kinds:
             try:
-                found[number] = finish(reading_assignment(sdo, ASSIGN + number))
+                by_manager[number] = finish(reading_assignment(sdo, ASSIGN + number))
             except SdoAborted:
                 continue
-    return found
+    return by_manager
 
 
 def _pdo(
@@ -112,7 +112,7 @@ def _pdo(
         entries.append(
             model.PdoEntry(entry.index, entry.sub_index, entry.bits, known.name if known is not None else "", kind)
         )
-    name = next((one.name for one in objects if one.index == pdo.index), "")
+    name = next((item.name for item in objects if item.index == pdo.index), "")
     count = names.get((pdo.index, _COUNT))
     return model.Pdo(pdo.index, name, tuple(entries), number, fixed=count is not None and not count.writable)
 
@@ -125,13 +125,13 @@ def _read_objects(sdo: SdoClient, progress: Progress) -> Iterator[model.Dictiona
         return
     indices = [index for (index,) in struct.iter_unpack("<H", listed[2 : len(listed) // 2 * 2])]
     for at, index in enumerate(indices, 1):
-        # What is listed and not described exists in some slaves; it is of no use.
+        # Some slaves list objects that they do not describe; these are left out.
         try:
-            made = _read_object(sdo, index)
+            item = _read_object(sdo, index)
         except SdoAborted:
-            made = None
-        if made is not None:
-            yield made
+            item = None
+        if item is not None:
+            yield item
         progress(at / len(indices))
 
 
@@ -139,10 +139,10 @@ def _read_object(sdo: SdoClient, index: int) -> model.DictionaryObject | None:
     data = finish(sdo.information(_OBJECT, struct.pack("<H", index)))
     if len(data) < _DESCRIPTION.size:
         return None
-    found, _, highest, code = _DESCRIPTION.unpack_from(data)
-    if found != index:
+    described, _, highest, code = _DESCRIPTION.unpack_from(data)
+    if described != index:
         where = slave_label(sdo.position, sdo.name)
-        raise BusError(f"{where}: asked for object 0x{index:04X}, it described 0x{found:04X}")
+        raise BusError(f"{where}: asked for object 0x{index:04X}, it described 0x{described:04X}")
     kind = _CODES.get(code, model.ObjectCode.RECORD if highest else model.ObjectCode.VARIABLE)
     entries = []
     for sub_index in range(highest + 1 if kind is not model.ObjectCode.VARIABLE else 1):
@@ -156,7 +156,7 @@ def _read_object(sdo: SdoClient, index: int) -> model.DictionaryObject | None:
 
 
 def read_entry(sdo: SdoClient, index: int, sub_index: int) -> model.ObjectEntry | None:
-    """Return the description of an entry; None: the answer holds none, or that of a gap. Raises BusError."""
+    """Return the description of an entry; None: the answer is empty or describes a gap. Raises BusError."""
     data = finish(sdo.information(_ENTRY, struct.pack("<HBB", index, sub_index, 0)))
     if len(data) < _ENTRY_DESCRIPTION.size:
         return None

@@ -1,4 +1,4 @@
-"""The EEPROM of a slave, its SII: who may access it, and words read and written (ETG.1000.4, 6.4)."""
+"""The EEPROM of a slave (SII): access rights, reading and writing (ETG.1000.4, 6.4)."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ from rtcp.fieldbus.registers import Register, RegisterPort, Steps, finish, pause
 ALIAS_WORD, CHECKSUM_WORD, BOOTSTRAP_WORD, SIZE_WORD = 0x04, 0x07, 0x14, 0x3E
 """Word addresses (ETG.2010, table 2): alias, checksum of the words before it, mailboxes in BOOT, size in KiBit."""
 _EIGHT_BYTES = 0x0040
-"""Status bit: a read gives eight bytes."""
+"""Status bit: a read returns eight bytes."""
 _READ, _WRITE = 0x0100, 0x0201
-"""Commands; a write carries its own permission (bit 0)."""
+"""Commands; a write includes the write enable bit (bit 0)."""
 _BUSY, _FAILED = 0x8000, 0x6000
 """Status bits: busy; command not acknowledged or wrong, write without permission. A wrong checksum is no failure."""
 _READY_S = 0.5
 _ATTEMPTS = 5
 _RETRY_S = 0.005
 Progress = Callable[[float], None]
-"""Receives how much of a transfer is done, 0 to 1."""
+"""Receives the completed fraction of a transfer, 0 to 1."""
 
 
 def eeprom_to_device(port: RegisterPort, station: int) -> bool:
-    """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
+    """Give the slave access to its EEPROM, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
     return port.write(station, Register.EEPROM_CONFIG, b"\x01\x00")
 
 
 def eeprom_to_master(port: RegisterPort, station: int) -> bool:
-    """Take the EEPROM from the slave, also by force; return whether it is the master's (ETG.1000.4, 6.4.2)."""
+    """Give the master access to the EEPROM, by force if need be; return whether it has it (ETG.1000.4, 6.4.2)."""
     return all(port.write(station, Register.EEPROM_CONFIG, value) for value in (b"\x02\x00", b"\x00\x00"))
 
 
 def reading_words(port: RegisterPort, station: int, word: int, label: str) -> Steps[bytes]:
-    """Return four or eight bytes from `word` on; the EEPROM is the master's. Raises BusError."""
+    """Return four or eight bytes from `word` on; the master must have access. Raises BusError."""
     status = 0
     for _ in range(_ATTEMPTS):
         status = yield from _command(port, station, _READ, word, label, "read")
-        found = port.read(station, Register.EEPROM_DATA, 8 if status & _EIGHT_BYTES else 4)
-        if found is not None and not status & _FAILED:
-            return found
+        data = port.read(station, Register.EEPROM_DATA, 8 if status & _EIGHT_BYTES else 4)
+        if data is not None and not status & _FAILED:
+            return data
         # An EEPROM is busy for some milliseconds after a write and refuses commands meanwhile.
         yield from pause(_RETRY_S)
     raise BusError(f"{label}: word 0x{word:04X} of its EEPROM cannot be read (status 0x{status:04X})")
 
 
 def writing_word(port: RegisterPort, station: int, word: int, data: bytes, label: str) -> Steps[None]:
-    """Write the two bytes of `word` and read them back, again where that failed (SOEM#675); raises BusError."""
+    """Write the two bytes of `word` and read them back; repeats after a failure (SOEM#675); raises BusError."""
     status = 0
     kept = b""
     for _ in range(_ATTEMPTS):
@@ -60,12 +60,12 @@ def writing_word(port: RegisterPort, station: int, word: int, data: bytes, label
             if kept == data:
                 return
         yield from pause(_RETRY_S)
-    found = f"reads back as {kept.hex(' ')}" if kept else f"was refused (status 0x{status:04X})"
-    raise BusError(f"{label}: word 0x{word:04X} of its EEPROM was set to {data.hex(' ')} and {found}")
+    outcome = f"reads back as {kept.hex(' ')}" if kept else f"was refused (status 0x{status:04X})"
+    raise BusError(f"{label}: word 0x{word:04X} of its EEPROM was set to {data.hex(' ')} and {outcome}")
 
 
 def _command(port: RegisterPort, station: int, command: int, word: int, label: str, done: str) -> Steps[int]:
-    """Give a command and return the status after it."""
+    """Send a command and return the status after it."""
     port.put(station, Register.EEPROM_CONTROL, struct.pack("<HI", command, word), label)
     deadline = time.monotonic() + _READY_S
     while True:
@@ -81,7 +81,7 @@ def _command(port: RegisterPort, station: int, command: int, word: int, label: s
 
 
 def is_sound(header: bytes) -> bool:
-    """Return whether the checksum in word 7 is that of the words before it; `header`: 16 bytes or more."""
+    """Return whether word 7 is the checksum of the words before it; `header`: 16 bytes or more."""
     return header[2 * CHECKSUM_WORD] == crc(header[: 2 * CHECKSUM_WORD])
 
 
@@ -91,14 +91,14 @@ def alias_of(header: bytes) -> int:
 
 
 def with_alias(image: bytes, alias: int) -> bytes:
-    """Return an image, or its first 16 bytes, with another station alias and the checksum for it."""
+    """Return an image, or its first 16 bytes, with this station alias and a new checksum."""
     at, check = 2 * ALIAS_WORD, 2 * CHECKSUM_WORD
     covered = image[:at] + alias.to_bytes(2, "little") + image[at + 2 : check]
     return covered + bytes((crc(covered),)) + image[check + 1 :]
 
 
 def size_of(header: bytes) -> int:
-    """Return the bytes that an EEPROM says it has; of one that is not sound at most what masters read of any.
+    """Return the size of an EEPROM by its header, bytes; with a wrong checksum limited to the size that masters read.
 
     Args:
         header: its first 128 bytes.
@@ -108,7 +108,7 @@ def size_of(header: bytes) -> int:
 
 
 def read_eeprom(port: RegisterPort, station: int, label: str, progress: Progress, size: int | None = None) -> bytes:
-    """Return `size` bytes of a slave's EEPROM, None: as many as `size_of` says; raises BusError."""
+    """Return `size` bytes of a slave's EEPROM, None: `size_of`; raises BusError."""
     _take(port, station, label)
     try:
         if size is None:
@@ -119,19 +119,19 @@ def read_eeprom(port: RegisterPort, station: int, label: str, progress: Progress
 
 
 def write_eeprom(port: RegisterPort, station: int, label: str, image: bytes, progress: Progress) -> int:
-    """Write `image` from word 0 on, as far as it differs, each word read back; return how many words differed.
+    """Write the words of `image` that differ, from word 0 on, and read each back; return their number.
 
-    The checksum is wrong from the first word written to the last: nobody takes a half-written EEPROM for a sound one.
+    The checksum stays wrong until the last word is written, so that a half-written EEPROM is recognized.
 
     Args:
         port: the port to write through.
         station: the slave's configured address.
-        label: the slave as messages name it.
-        image: 16 bytes or more, under a right checksum.
-        progress: receives how much is done, 0 to 1.
+        label: the slave in messages.
+        image: 16 bytes or more, with a correct checksum.
+        progress: receives the completed fraction, 0 to 1.
 
     Raises:
-        BusError: a word is not kept, or the slave stopped answering; what was written before stays.
+        BusError: a word reads back differently, or the slave stopped answering; words written before stay.
     """
     _take(port, station, label)
     try:

@@ -1,4 +1,4 @@
-"""ABB's Externally Guided Motion as a bus: UDP, the controller speaks first, every message is answered once.
+"""ABB's Externally Guided Motion as a bus: over UDP the controller sends messages, each is answered once.
 
 ABB, Application manual Externally Guided Motion, 3HAC073318-001 rev K. Degrees and millimeters on the wire, SI in the
 process images (`rtcp.config.buses`).
@@ -35,31 +35,31 @@ _MOTORS_ON, _RAPID_STOPPED = 1, 1
 _MCI_ERROR, _MCI_RUNNING = 1, 3
 _DATAGRAM: Final = 2048
 _MOST_WAITING: Final = 64
-"""Datagrams that are read in one cycle: more would be a flood, which must not keep the cycle."""
+"""Most datagrams read in one cycle: a flood must not delay the cycle."""
 _MOST_DROPPED: Final = 4096
 _RECEIVE_BUFFER: Final = 65536
-"""Bytes: some 50 datagrams. What waits longer is of no use."""
+"""Size of the socket's buffer, bytes: some 50 datagrams; older ones are useless."""
 _PACE_MESSAGES: Final = 25
 """Number of messages over which the controller's interval is measured."""
 _PACE_SHARE: Final = 0.05
 _VELOCITY_MESSAGES: Final = 5
-"""Number of messages over which the mean velocity is taken: 20 ms."""
+"""Number of messages over which velocities are averaged: 20 ms."""
 _LARGEST: Final = 1e6
-"""Degrees, mm; what is larger is no measurement."""
+"""Largest valid measurement, degrees or mm."""
 _COMMANDED: Final = struct.Struct("<ddB")
 _MEASURED: Final = struct.Struct("<dBBd")
 _UNIT: Final = struct.Struct("<5BdI6I9d")
 _COUNTER: Final = 0xFFFFFFFF
 _EXTERNAL: Final = 2
-"""Place of the seventh axis in the kinematic order: j1, j2, external, j3 ... j6."""
+"""Index of the seventh axis in the kinematic order: j1, j2, external, j3 ... j6."""
 
 
 def _classes() -> list[Any]:
-    """Return the classes of the messages from and to the controller, and of a force, in a pool of their own."""
-    found = descriptor_pb2.FileDescriptorSet()
-    found.ParseFromString((Path(__file__).parent / "rtcp_egm.binpb").read_bytes())
+    """Return the classes of the messages from and to the controller, and of a force, from a separate pool."""
+    files = descriptor_pb2.FileDescriptorSet()
+    files.ParseFromString((Path(__file__).parent / "rtcp_egm.binpb").read_bytes())
     pool = descriptor_pool.DescriptorPool()
-    for file in found.file:
+    for file in files.file:
         pool.AddSerializedFile(file.SerializeToString())
     names = ("Robot", "Sensor", "MeasuredForce", "MeasuredForce6")
     return [message_factory.GetMessageClass(pool.FindMessageTypeByName(f"rtcp.egm.{name}")) for name in names]
@@ -80,34 +80,34 @@ class EgmData(PacedData):
         self._socket = bound
         self._axes = len(config.joints)
         self._allowed = bus.controller
-        # After the loop has met the loss: the reaction is that of lost messages.
+        # One cycle later than the loop counts `bus.lost_cycles`: its reaction is that to lost messages.
         self._silent_ns = round((bus.lost_cycles + 1) * config.cycle.period_us * 1000)
         self._period_us = config.cycle.period_us
         self._robot_class, self._sensor_class, self._measured_force, self._measured_force_6 = _classes()
         self._robot = self._robot_class()
-        """A new object for each message: one that is parsed into again keeps the memory of all before."""
+        """Created anew for each message: a reused protobuf object never frees the memory of earlier messages."""
         self._buffer = bytearray(_DATAGRAM)
         self._view = memoryview(self._buffer)
         self._sender: Any = None
         self._heard_ns = 0
         self._seqno = -1
         self._sent_us = 0
-        """When the newest message was made, by the controller's clock, us."""
+        """Time stamp of the newest message, controller's clock, us."""
         self._answers = 0
         self._answerable = False
         self._linked = False
-        """Whether the next message may go on with the session of the last one."""
+        """Whether the next message may continue the session of the last one."""
         self._read_ns = self._called_ns = 0
-        """When a message was last taken, and when `receive_until` last ended."""
+        """Instants of the last read message and of the last return of `receive_until` (CLOCK_MONOTONIC), ns."""
         self._pace_base = (0, 0)
-        """Number and instant, us, from which the controller's interval is measured."""
+        """Number and time stamp, us, of the message from which the controller's interval is measured."""
         self._has_pace = True
         self._past: deque[tuple[int, list[float]]] = deque(maxlen=_VELOCITY_MESSAGES + 1)
         self._fresh_session = False
         self._standing = [0.0] * self._axes
-        """References while nothing is commanded, degrees: where the unit began, or stopped."""
+        """References while no joint is commanded, degrees: the position at the begin of the session or at the stop."""
         self._at: Sequence[float] = self._standing
-        """Where the joints were by the newest message, degrees."""
+        """Joint positions of the newest message, degrees."""
         self._references = [0.0] * self._axes
         self._speeds = [0.0] * self._axes
         self.session = self.lost = self.doubled = self.disordered = self.superseded = self.foreign = 0
@@ -125,12 +125,12 @@ class EgmData(PacedData):
     def receive_until(self, deadline_ns: int) -> int:
         """Wait for a message that is newer than the last; return 1, or -1 where none came until `deadline_ns`.
 
-        That the controller has fallen silent is news, too: it is 1 once, and then the drives show it.
+        When the controller falls silent it returns 1 once, so that the loop reads the drives' new state.
         """
         now = monotonic_ns()
         if self._called_ns and now - self._called_ns > self._silent_ns:
             self._drop_backlog()
-        # However fast messages come: a cycle is a step of the setpoints.
+        # A cycle is one step of the setpoints, also if messages come faster.
         if (early := self._read_ns + 500 * self._period_us - now) > 0:
             sleep(early * 1e-9)
         while not self._read_all():
@@ -152,7 +152,7 @@ class EgmData(PacedData):
         return 1
 
     def _drop_backlog(self) -> None:
-        """The loop stood still: what has come meanwhile is old, and the controller may have stopped since."""
+        """Discard the messages received during a stall of the loop: the controller may have stopped since."""
         self._linked = False
         for _ in range(_MOST_DROPPED):
             try:
@@ -162,14 +162,14 @@ class EgmData(PacedData):
             self.superseded = self.superseded + 1 & _COUNTER
 
     def receive(self) -> int:
-        """Return at once what `receive_until` returns for a deadline that is over."""
+        """Do `receive_until` without waiting."""
         return self.receive_until(0)
 
     def send(self) -> None:
         """Answer the newest message, once.
 
-        Nothing is sent without a message, not even a quick stop: what a controller does with answers that waited for
-        its next session is not known.
+        Without a new message nothing is sent, not even a quick stop: the reaction of a controller to answers that it
+        receives before its next session is unknown.
         """
         if not self._answerable:
             return
@@ -189,7 +189,7 @@ class EgmData(PacedData):
         sensor.header.tm = monotonic_ns() // 1_000_000 & 0xFFFFFFFF
         _set(sensor.planned, self._references)
         _set(sensor.speedRef, self._speeds)
-        # From the next message on references are followed.
+        # The controller follows references from the next message on.
         self._fresh_session = False
         with contextlib.suppress(OSError):
             self._socket.sendto(sensor.SerializeToString(), self._sender)
@@ -222,7 +222,7 @@ class EgmData(PacedData):
                 self.superseded = self.superseded + 1 & _COUNTER
             newest = self._robot
             if not _takes_references(newest):
-                # Also where it is superseded at once: what was sent before is no reference any more.
+                # Even if it is superseded at once: the references sent before are void.
                 self._fresh_session = True
         if newest is not None:
             self._decode(newest)
@@ -233,7 +233,7 @@ class EgmData(PacedData):
             return True
         if self._sender is None or sender == self._sender:
             return False
-        # Another one while the controller speaks; after a silence it may be the controller, with another port.
+        # Foreign only while the controller sends; after a silence it may be the controller, with another port.
         return monotonic_ns() - self._heard_ns <= self._silent_ns
 
     def _parse(self, size: int) -> bool:
@@ -243,7 +243,7 @@ class EgmData(PacedData):
         except message.DecodeError:
             return False
         if robot.header.mtype != _DATA or not robot.HasField("feedBack") or not robot.feedBack.HasField("time"):
-            return False  # without `time`: before RobotWare 6.07, whose units are not those of the manual
+            return False  # without `time`: before RobotWare 6.07, whose units differ from the manual
         joints = robot.feedBack.joints.joints
         external = robot.feedBack.externalJoints.joints
         if len(joints) != min(self._axes, 6) or len(external) < self._axes - 6:
@@ -276,7 +276,7 @@ class EgmData(PacedData):
         return True
 
     def _measure_pace(self, seqno: int, sent_us: int) -> None:
-        """Compare the interval of the messages, by the controller's clock, with the cycle: a message is a cycle."""
+        """Compare the interval of the messages, by the controller's clock, with the period of the cycle."""
         first, began_us = self._pace_base
         if seqno - first >= _PACE_MESSAGES:
             interval = (sent_us - began_us) / (seqno - first)
@@ -304,7 +304,7 @@ class EgmData(PacedData):
         elif rapid == _RAPID_STOPPED:
             state, self.missing = DriveState.READY_TO_SWITCH_ON, Missing.PROGRAM
         elif self.mci != _MCI_RUNNING or self._fresh_session:
-            # The first answer of a session is where the unit is; a joint that followed before does not go on.
+            # The first answer of a session is the unit's position; a joint that followed before stops.
             state = DriveState.SWITCHED_ON
             self.missing = Missing.NOTHING if self.mci == _MCI_RUNNING else Missing.CONTROL
         elif not self._has_pace:
@@ -327,8 +327,8 @@ class EgmData(PacedData):
     def _force(self, encoded: bytes) -> Sequence[float]:
         """Return force and torque at the tool, N and Nm; none where no sensor is active."""
         try:
-            found = self._measured_force.FromString(encoded)
-            force: Sequence[float] = found.force if found.fcActive else self._measured_force_6.FromString(encoded).force
+            gauge = self._measured_force.FromString(encoded)
+            force: Sequence[float] = gauge.force if gauge.fcActive else self._measured_force_6.FromString(encoded).force
         except message.DecodeError:
             return ()
         return force if all(-_LARGEST <= value <= _LARGEST for value in force) else ()
@@ -345,9 +345,9 @@ def _takes_references(robot: Any) -> bool:
 
 
 def _in_order(part: Any, axes: int) -> list[float]:
-    """Return the joints of a message in kinematic order, degrees."""
-    found = list(part.joints.joints)
-    return found if axes <= 6 else [*found[:_EXTERNAL], part.externalJoints.joints[0], *found[_EXTERNAL:]]
+    """Return the joint positions of a message in kinematic order, degrees."""
+    joints = list(part.joints.joints)
+    return joints if axes <= 6 else [*joints[:_EXTERNAL], part.externalJoints.joints[0], *joints[_EXTERNAL:]]
 
 
 def _set(part: Any, values: Sequence[float]) -> None:
@@ -389,8 +389,8 @@ class EgmMaster(Master):
             self._socket.bind((address, bus.port))
         except OSError as error:
             raise BusError(
-                f"UDP port {bus.port} of {address} (bus.port) cannot be opened: {error.strerror}; is another program "
-                "there that speaks EGM?"
+                f"UDP port {bus.port} of {address} (bus.port) cannot be opened: {error.strerror}; does another program "
+                "use it?"
             ) from error
         report(f"UDP port {bus.port} of {address} is open for the controller")
         self._data = EgmData(self._socket, self.config, bus)
@@ -398,7 +398,7 @@ class EgmMaster(Master):
 
     @property
     def connected(self) -> bool:
-        """Whether the controller speaks."""
+        """Whether the controller sends."""
         return self._data is not None and self._data.missing is not Missing.CONNECTION
 
     def waiting_for(self) -> str:
@@ -416,7 +416,7 @@ class EgmMaster(Master):
         return MISSING_WORDS[data.missing]
 
     def close(self) -> None:
-        """Close the port; the controller stops by its CommTimeout, with a speed reference of 0 as the last."""
+        """Close the port; the controller, whose last speed reference is 0, stops by its CommTimeout."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None

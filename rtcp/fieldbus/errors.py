@@ -1,23 +1,31 @@
-"""What a bus raises; apart from the modules that raise it, so that all of them may import it."""
+"""Exceptions of a bus; in a module of their own, which all modules of the bus may import."""
 
 from __future__ import annotations
 
 
 class BusError(Exception):
-    """The bus, or a slave on it, refused or failed; `sentences` say what, where, found and expected."""
+    """The bus or a slave refused or failed; `sentences` name the failure, its place, the values found and expected."""
 
     def __init__(self, *sentences: str) -> None:
         super().__init__("\n".join(sentences))
         self.sentences = sentences
 
 
-class SdoAborted(BusError):
-    """The slave refused an SDO service with an abort code (`code`, ETG.1000.6, table 41)."""
+class Refused(BusError):
+    """The slave refused a mailbox service, with an error code."""
 
     def __init__(self, sentence: str, code: int) -> None:
         super().__init__(sentence)
         self.code = code
 
 
+class SdoAborted(Refused):
+    """The slave aborted an SDO service; `code` is the abort code (ETG.1000.6, table 41)."""
+
+
+class FoeRefused(Refused):
+    """The slave refused a file; `code` is the error code (ETG.1000.6, table 92)."""
+
+
 class ForeignSlave(BusError):
-    """Another device answers at the place of a slave; nothing is written to it."""
+    """Another device answers at the position of a slave; nothing is written to it."""

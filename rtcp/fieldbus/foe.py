@@ -1,26 +1,16 @@
-"""Files of a slave over its mailbox (ETG.1000.6, 5.8), and the mailboxes that it has in BOOT."""
+"""Files of a slave over its mailbox (ETG.1000.6, 5.8), and its mailboxes in BOOT."""
 
 from __future__ import annotations
 
 import struct
-import threading
 import time
 from collections.abc import Callable
 
 from rtcp.fieldbus.al_state import AlState, request_state, wait_for_state
 from rtcp.fieldbus.bus import MailboxInfo, slave_label
-from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.mailbox import PATIENCE_S, Mailbox, MailboxType, check_time
+from rtcp.fieldbus.errors import BusError, FoeRefused
+from rtcp.fieldbus.mailbox import Mailbox, MailboxClient, MailboxType, check_time
 from rtcp.fieldbus.registers import Register, RegisterPort, Steps, T, finish, pause
-
-
-class FoeRefused(BusError):
-    """The slave refused a file with an error code (`code`, ETG.1000.6, table 92)."""
-
-    def __init__(self, sentence: str, code: int) -> None:
-        super().__init__(sentence)
-        self.code = code
-
 
 FOE_ERRORS = {
     0x8000: "not defined",
@@ -42,32 +32,17 @@ _READ, _WRITE, _DATA, _ACKNOWLEDGE, _ERROR, _BUSY = range(1, 7)
 _HEADER = struct.Struct("<BxI")
 """Operation code; password, packet number or error code."""
 _TIMEOUT_S, _BUSY_S = 5.0, 60.0
-"""Time for the answer to a packet (flash memory is slow), and for a slave to stay busy, s."""
+"""Longest time for the answer to a packet (flash memory is slow), and for a slave to stay busy, s."""
 _PAUSE_S = 0.01
-_TRANSFERS = 3
-"""How often a transfer is begun where frames get lost."""
 
 
-class FoeClient:
+class FoeClient(MailboxClient):
     """Reads and writes files of a slave (ETG.1000.6, 5.8)."""
 
-    def __init__(
-        self,
-        mailbox: Mailbox | None,
-        position: int,
-        name: str,
-        lock: threading.Lock,
-        other: Callable[[bytes, int], None],
-    ) -> None:
-        """Take the mailbox of the slave at `position`, None: it has none for FoE; the rest as `SdoClient` does."""
-        self._mailbox = mailbox
-        self._label = slave_label(position, name)
-        self._position = position
-        self._lock = lock
-        self._other = other
+    protocol, tries, is_patient = "FoE", 3, False
 
     def read(self, name: str, password: int, progress: Callable[[int], None]) -> bytes:
-        """Return a file; `progress` receives how many bytes there are.
+        """Return a file; `progress` receives the number of bytes read.
 
         Raises:
             FoeRefused: the slave refused.
@@ -77,7 +52,7 @@ class FoeClient:
         return self._transfer(f"read of file {name!r}", request, lambda box: self._reading(box, request, progress))
 
     def write(self, name: str, data: bytes, password: int, progress: Callable[[int], None]) -> None:
-        """Write a file; `progress` receives how many bytes were taken. Raises as `read`."""
+        """Write a file; `progress` receives the number of bytes written. Raises as `read`."""
         request = _HEADER.pack(_WRITE, password) + name.encode()
         return self._transfer(
             f"write of {len(data)} bytes to file {name!r}",
@@ -85,30 +60,14 @@ class FoeClient:
             lambda box: self._writing(box, request, data, progress),
         )
 
-    def _transfer(self, what: str, request: bytes, service: Callable[[Mailbox], Steps[T]]) -> T:
-        if self._mailbox is None:
-            raise BusError(f"{self._label}: {what} is not possible, its EEPROM lists no FoE mailbox")
-        if len(request) > self._mailbox.room:
+    def _transfer(self, task: str, request: bytes, service: Callable[[Mailbox], Steps[T]]) -> T:
+        if self._mailbox is not None and len(request) > self._mailbox.room:
             room = self._mailbox.room - _HEADER.size
             raise BusError(
-                f"{self._label}: {what} is not possible, the name has {len(request) - _HEADER.size} bytes, its mailbox "
-                f"takes {room}: give a shorter name"
+                f"{slave_label(self.position, self.name)}: {task} is not possible, the name has "
+                f"{len(request) - _HEADER.size} bytes, its mailbox takes {room}: give a shorter name"
             )
-        if not self._lock.acquire(timeout=PATIENCE_S):
-            raise BusError(f"{self._label}, {what}: its mailbox is in use by others")
-        try:
-            for attempt in range(1, _TRANSFERS + 1):
-                try:
-                    return finish(service(self._mailbox))
-                except FoeRefused as refused:
-                    raise FoeRefused(f"{self._label} refused the {what}: {refused}", refused.code) from refused
-                except BusError as error:
-                    # Whether a message that got lost has reached the slave is not known: from the beginning.
-                    if attempt == _TRANSFERS:
-                        raise BusError(f"{self._label}, {what}: {error}") from error
-            raise AssertionError
-        finally:
-            self._lock.release()
+        return finish(self._call(task, service))
 
     def _reading(self, box: Mailbox, request: bytes, progress: Callable[[int], None]) -> Steps[bytes]:
         data = bytearray()
@@ -126,7 +85,7 @@ class FoeClient:
     def _writing(self, box: Mailbox, request: bytes, data: bytes, progress: Callable[[int], None]) -> Steps[None]:
         yield from self._exchange(box, request, _ACKNOWLEDGE, 0, progress, 0)
         size = box.room - _HEADER.size
-        # A packet that is not full is the last one, where need be an empty one.
+        # A packet that is not full ends the file, if need be an empty one.
         for number, at in enumerate(range(0, len(data) + 1, size), 1):
             packet = _HEADER.pack(_DATA, number) + data[at : at + size]
             yield from self._exchange(box, packet, _ACKNOWLEDGE, number, progress, at)
@@ -148,8 +107,8 @@ class FoeClient:
             request: the packet.
             expected: operation code of its answer.
             number: packet number of its answer.
-            progress: receives `done` at each answer that says busy, for whom silence is the end of the slave.
-            done: bytes that are through already.
+            progress: receives `done` at each busy answer, so that the caller sees that the slave lives.
+            done: bytes transferred so far.
         """
         patience = time.monotonic() + _BUSY_S
         while True:
@@ -176,18 +135,18 @@ class FoeClient:
             if message is not None and message[0] is MailboxType.FOE and len(message[1]) >= _HEADER.size:
                 return message[1]
             if message is not None and message[0] is MailboxType.COE:
-                self._other(message[1], self._position)
+                self._receive_coe(message[1], self.position)
             check_time(deadline, "no answer in time")
             yield
 
 
 _SYNC_MANAGER = struct.Struct("<HHBBBB")
 _RECEIVE, _SEND = 0x26, 0x22
-"""Control bytes of the mailboxes' sync managers: one buffer, the master writes it, the master reads it."""
+"""Control bytes of the mailboxes' sync managers: mailbox mode, written by the master, read by the master."""
 
 
 def bootstrap_mailbox(words: bytes) -> MailboxInfo | None:
-    """Return the mailboxes in BOOT by words 0x14 to 0x17 of the EEPROM; None: it has none."""
+    """Return the mailboxes in BOOT from words 0x14 to 0x17 of the EEPROM; None: it has none."""
     receive_start, receive_size, send_start, send_size = struct.unpack("<4H", words)
     if not receive_start or not send_start or 0 in (receive_size, send_size) or 0xFFFF in (receive_size, send_size):
         return None
@@ -195,11 +154,11 @@ def bootstrap_mailbox(words: bytes) -> MailboxInfo | None:
 
 
 def enter_boot(port: RegisterPort, station: int, label: str, mailbox: MailboxInfo, timeout_s: float) -> None:
-    """Bring a slave to BOOT with the mailboxes that it has there; raises BusError where it refuses."""
+    """Bring a slave to BOOT with its BOOT mailboxes; raises BusError where it refuses."""
     _go_to(port, station, label, AlState.INIT, timeout_s)
     managers = _SYNC_MANAGER.pack(mailbox.receive_start, mailbox.receive_size, _RECEIVE, 0, 1, 0)
     managers += _SYNC_MANAGER.pack(mailbox.send_start, mailbox.send_size, _SEND, 0, 1, 0)
-    # An ESC takes address and length of a sync manager only while it is off.
+    # An ESC accepts address and length of a sync manager only while it is off.
     port.put(station, Register.SYNC_MANAGER, bytes(len(managers)), label)
     port.put(station, Register.SYNC_MANAGER, managers, label)
     _go_to(port, station, label, AlState.BOOT, timeout_s)

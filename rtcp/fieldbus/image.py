@@ -1,8 +1,8 @@
-"""The process image that SOEM lays out: its limits, checked before it maps, and where it put each slave's images.
+"""SOEM's layout of the process image: limits, checked before it maps, and the place of each slave's images.
 
 SOEM checks none of its limits, gives a slave of several sync managers FMMUs of wrong lengths, and lets neighbours with
-fewer than 8 bits share a byte, of which pysoem tells neither the bit nor, where one crosses into a second byte, that.
-What it wrote into the FMMUs (ETG.1000.4, 6.6) says where everything is.
+fewer than 8 bits share a byte. pysoem reports neither the bit nor that an image crosses into a second byte. The places
+are therefore read from the FMMUs that SOEM wrote (ETG.1000.4, 6.6).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rtcp.fieldbus.pdo import INPUTS, OUTPUTS, by_sync_manager, layout
 from rtcp.fieldbus.registers import Register, RegisterPort
 
 MOST_SLAVES, LARGEST_IMAGE, MOST_FMMUS = 199, 4096, 4
-"""What SOEM and pysoem have room for: slaves of a segment, bytes of the process image, FMMUs of a slave."""
+"""Limits of SOEM and pysoem: slaves of a segment, bytes of the process image, FMMUs of a slave."""
 _FMMU = struct.Struct("<IHBBHBBB3x")
 _READ, _WRITE = 1, 2
 _SYNC_MANAGER = struct.Struct("<HH4x")
@@ -27,7 +27,7 @@ _SYNC_MANAGERS = 8
 
 
 class Place(NamedTuple):
-    """Where the outputs or the inputs of a slave are in the process image."""
+    """Place of the outputs or the inputs of a slave in the process image."""
 
     first: int
     """First bit."""
@@ -36,12 +36,12 @@ class Place(NamedTuple):
 
     @property
     def is_small(self) -> bool:
-        """Whether it has fewer than 8 bits, and may share its byte with a neighbour."""
+        """Whether it has 1 to 7 bits, and may share its byte with a neighbour."""
         return 0 < self.bits < 8
 
 
 class Places(NamedTuple):
-    """Where the images of a slave are."""
+    """Places of a slave's outputs and inputs."""
 
     outputs: Place
     inputs: Place
@@ -64,11 +64,11 @@ def limit_faults(slaves: Sequence[SlaveConfig]) -> list[str]:
             groups = by_sync_manager(pdos, usual)
             areas += len(groups)
             lengths = [_bits(group) for group in groups.values()]
-            needed, given = sum((bits + 7) // 8 for bits in lengths), (sum(lengths) + 7) // 8
-            if needed != given:
+            needed, reserved = sum((bits + 7) // 8 for bits in lengths), (sum(lengths) + 7) // 8
+            if needed != reserved:
                 faults.append(
                     f"{label}: the sync managers of key `{key}` carry {' and '.join(map(str, lengths))} bits, which "
-                    f"need {needed} bytes; SOEM gives them {given}: map whole bytes into all but one of them"
+                    f"need {needed} bytes; SOEM gives them {reserved}: map whole bytes into all but one of them"
                 )
         if areas > MOST_FMMUS:
             faults.append(
@@ -83,7 +83,7 @@ def _bits(pdos: Sequence[Pdo]) -> int:
 
 
 class _Fmmu(NamedTuple):
-    """Bytes of the image and of the slave's memory that stand for each other."""
+    """A mapping of bytes of the image to bytes of the slave's memory."""
 
     image: int
     length: int
@@ -100,10 +100,10 @@ class _Fmmu(NamedTuple):
 
 
 def read_places(port: RegisterPort, slaves: Sequence[SlaveConfig]) -> list[Places]:
-    """Return where SOEM has put the images, and correct the FMMUs of slaves with several sync managers a direction.
+    """Return the places of the images, and correct the FMMUs of slaves with several sync managers for a direction.
 
     Args:
-        port: the port for registers; SOEM has mapped.
+        port: the port for registers, after SOEM's mapping.
         slaves: the slaves of the configuration.
 
     Raises:
@@ -119,12 +119,12 @@ def _read_places(port: RegisterPort, position: int, slave: SlaveConfig) -> Place
     if registers is None or managers is None:
         raise BusError(f"{label} stopped answering while its mapping was read")
     areas = list(_SYNC_MANAGER.iter_unpack(managers))
-    found: list[_Fmmu] = []
+    mapped_fmmus: list[_Fmmu] = []
     starts: dict[int, int] = {}
     lengths: dict[int, int] = {}
     for image, length, first_bit, last_bit, memory, _, kind, active in _FMMU.iter_unpack(registers):
         if active & 1 and length:
-            found.append(_Fmmu(image, length, memory, kind & (_READ | _WRITE)))
+            mapped_fmmus.append(_Fmmu(image, length, memory, kind & (_READ | _WRITE)))
             begin = 8 * image + first_bit
             starts[kind] = min(starts.get(kind, begin), begin)
             lengths[kind] = lengths.get(kind, 0) + 8 * length - 7 + last_bit - first_bit
@@ -134,7 +134,7 @@ def _read_places(port: RegisterPort, position: int, slave: SlaveConfig) -> Place
     for key, pdos, kind in (("rpdo", slave.device.rpdo, _WRITE), ("tpdo", slave.device.tpdo, _READ)):
         bits, first = layout(pdos).bits, starts.get(kind, 0)
         places.append(Place(first, bits))
-        # Of longer images the bytes were compared.
+        # The lengths of longer images were compared before.
         if places[-1].is_small and bits != (mapped := lengths.get(kind, 0)):
             raise BusError(f"{label}: it maps {mapped} bits, its device's file (key `{key}`) {bits}")
         groups = by_sync_manager(pdos, 0)
@@ -145,8 +145,8 @@ def _read_places(port: RegisterPort, position: int, slave: SlaveConfig) -> Place
             wanted.append(_Fmmu(at, length, group[0].start_address or areas[number][0], kind))
             at += length
         if len(groups) == 1:
-            wanted += [fmmu for fmmu in found if fmmu.kind == kind]
-    if several and _bytes_of(found) != _bytes_of(wanted):
+            wanted += [fmmu for fmmu in mapped_fmmus if fmmu.kind == kind]
+    if several and _bytes_of(mapped_fmmus) != _bytes_of(wanted):
         _rewrite(port, station, label, wanted)
     return Places(*places)
 
@@ -168,8 +168,8 @@ def _rewrite(port: RegisterPort, station: int, label: str, fmmus: Sequence[_Fmmu
 
 
 def missing_counts(places: Sequence[Places]) -> int:
-    """Return by how much SOEM's expected working counter is too low: it leaves out who begins no byte of its own."""
-    uncounted = [[one.is_small and one.first % 8 + one.bits < 8 for one in both] for both in places]
+    """Return the deficit of SOEM's expected working counter: it omits slaves whose image begins no byte."""
+    uncounted = [[place.is_small and place.first % 8 + place.bits < 8 for place in both] for both in places]
     return sum(2 * outputs + inputs for outputs, inputs in uncounted)
 
 
@@ -177,13 +177,13 @@ _TIMEOUT_FIELD = 0x5A17C0DE
 
 
 def image_memory(master: Any) -> memoryview:
-    """Return the process image of pysoem's `master`, which it shows in whole bytes of single slaves only.
+    """Return the process image of pysoem's `master`, which itself offers only whole bytes of single slaves.
 
-    The image stands in the object itself, followed by two pointers to the two timeouts that follow them: where a
-    timeout with a value of its own is pointed at from two places before it, the image ends there.
+    The object holds the image, two pointers, and the two timeouts that the pointers refer to. The search looks for a
+    timeout of a unique value and the pointer to it: the image ends before the pointers.
 
     Raises:
-        BusError: this build of pysoem is made otherwise.
+        BusError: this build of pysoem has another layout.
     """
     kept = master.sdo_read_timeout
     master.sdo_read_timeout = _TIMEOUT_FIELD

@@ -1,4 +1,4 @@
-"""The network interface: whether it can be the master's end of a cable, its flags, its namespace, who uses it."""
+"""The network interface: whether the master can use it, its flags, its namespace, its exclusive use."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _REQUEST = struct.Struct("=16sH22x")
 
 
 def check_name(name: str) -> None:
-    """Raise BusError where no interface has this name, or the one that has it has no cable."""
-    known = [found for _, found in socket.if_nameindex()]
+    """Raise BusError where no interface has this name, or it is the loopback."""
+    known = [interface for _, interface in socket.if_nameindex()]
     if name not in known:
         raise BusError(f"there is no network interface {name} (`interface`); there are {', '.join(known) or 'none'}")
     if _flags(name) & _IFF_LOOPBACK:
@@ -30,21 +30,21 @@ def check_name(name: str) -> None:
 
 
 def check_interface(name: str) -> None:
-    """Raise BusError where `check_name` does, or the interface is down."""
+    """Do `check_name`; raise BusError also where the interface is down."""
     check_name(name)
     if not _flags(name) & _IFF_UP:
         raise BusError(f"network interface {name} is down: `ip link set {name} up` brings it up")
 
 
 class PromiscuousMode:
-    """Whether an interface was promiscuous; `close` makes it so again. SOEM switches that on and leaves it on."""
+    """Restores, at `close`, the promiscuous mode of an interface, which SOEM switches on and leaves on."""
 
     def __init__(self, interface: str) -> None:
         self._interface = interface
         self._before = _flags(interface) & _IFF_PROMISC
 
     def close(self) -> None:
-        """Switch the mode off where it was off; may be called twice, and when the interface is gone."""
+        """Switch the mode off if it was off; may be called twice, and when the interface is gone."""
         with contextlib.suppress(OSError):
             flags = _flags(self._interface)
             if flags & _IFF_PROMISC and not self._before:
@@ -67,9 +67,9 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def enter(pid: int) -> None:
-    """Join the user namespace (where it differs from ours) and the network namespace of process `pid`.
+    """Join the user namespace (where it differs) and the network namespace of process `pid`.
 
-    The kernel lets only a process of a single thread join a user namespace: call this before any thread is started.
+    The kernel lets only a single-threaded process join a user namespace: call this before any thread is started.
 
     Raises:
         BusError: the process does not exist, or the kernel refuses.
@@ -101,12 +101,12 @@ def _refusal(kind: str, pid: int, number: int) -> str:
 
 
 def claim(interface: str) -> socket.socket:
-    """Claim the interface for this process: two masters on one cable take the slaves from each other.
+    """Claim the interface for this process: two masters on one cable would disturb each other.
 
-    The claim is a name that the kernel keeps per network namespace and frees with the process.
+    The claim is an abstract socket name, which the kernel keeps per network namespace and frees with the process.
 
     Raises:
-        BusError: another process of this platform has it.
+        BusError: another process of this platform has the claim.
     """
     mine = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:

@@ -1,7 +1,7 @@
 """Mailboxes of the slaves: SDO access and emergency messages (ETG.1000.4, 5.6; ETG.1000.6, 5.6.2).
 
-Not through SOEM: an abort that a slave sends as an SDO response (some do; the standard says request) is a success to
-its download and a wrong length to its upload, and its functions cannot be taken in steps.
+Not through SOEM: some slaves send an abort as an SDO response instead of a request, which SOEM's download takes for a
+success and its upload for a wrong length; and its functions cannot run in steps.
 """
 
 from __future__ import annotations
@@ -12,24 +12,26 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from typing import ClassVar
 
 from rtcp.fieldbus.bus import MailboxInfo, slave_label, station_of
-from rtcp.fieldbus.emergency import Emergency, parse
-from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.errors import BusError, Refused, SdoAborted
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, Steps, T, finish, pause
+from rtcp.ipc.events import EmergencyMessage, ErrorReset
 
 _RETRY_S = 0.01
 """Pause before a service is tried again, s."""
 _TIMEOUT_S = 0.7
-"""Time for the answer to one request, s."""
-PATIENCE_S = 3.0
-"""Time for the mailbox to become free while another service of the same slave is under way, s."""
+"""Longest time for the answer to one request, s."""
+_PATIENCE_S = 3.0
+"""Longest wait for another service of the same slave to end, s."""
 _SDO = struct.Struct("<BHBI")
+_EMERGENCY_MESSAGE = struct.Struct("<HHB5s")
 _COE_HEADER = 2
-_REQUEST, _RESPONSE, _INFORMATION = 2, 3, 8
+_EMERGENCY, _REQUEST, _RESPONSE, _INFORMATION = 1, 2, 3, 8
 """CoE services (ETG.1000.6, table 29)."""
 _INFORMATION_HEADER = struct.Struct("<BxH")
-"""Operation code and whether fragments follow; how many."""
+"""Operation code with the flag for further fragments; number of fragments left."""
 _INCOMPLETE, _INFORMATION_ERROR = 0x80, 7
 _EXPEDITED, _SIZED, _TOGGLE, _LAST, _COMPLETE = 0x02, 0x01, 0x10, 0x01, 0x10
 _DOWNLOAD, _DOWNLOAD_SEGMENT, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0x20, 0x00, 0x40, 0x60, 0x80
@@ -38,13 +40,27 @@ _UPLOADED, _UPLOADED_SEGMENT, _DOWNLOADED, _DOWNLOADED_SEGMENT = 0x40, 0x00, 0x6
 """Commands of the server."""
 _SPECIFIER = 0xE0
 _SEGMENT_DATA = 7
-"""Bytes of data that a segment has at least, filled up (ETG.1000.6, 5.6.2.5 and 5.6.2.3)."""
+"""Least data of a segment, padded, bytes (ETG.1000.6, 5.6.2.5 and 5.6.2.3)."""
 _LARGEST_OBJECT = 1 << 16
-"""Bytes; no object of a drive or a terminal comes near it."""
+"""Largest accepted object, bytes; objects of drives and terminals are far smaller."""
 
 
-class SdoClient:
-    """Reads and writes objects of a slave, one service at a time: at once (`read`) or in steps (`reading`)."""
+class MailboxClient:
+    """One protocol of a slave's mailbox, one service at a time.
+
+    Args:
+        mailbox: the slave's mailbox; None: it has none for the protocol.
+        position: position of the slave on the cable, from 1.
+        name: name of the slave.
+        lock: the lock of this slave's mailbox.
+        receive_coe: receives CoE messages that are not the answer (emergencies), with the slave's position.
+    """
+
+    protocol: ClassVar[str]
+    tries: ClassVar[int]
+    """Least number of attempts of a service whose messages get lost."""
+    is_patient: ClassVar[bool] = True
+    """Whether more attempts follow until the slave's patience ends; a transfer of a file begins anew each time."""
 
     def __init__(
         self,
@@ -52,22 +68,46 @@ class SdoClient:
         position: int,
         name: str,
         lock: threading.Lock,
-        other: Callable[[bytes, int], None],
+        receive_coe: Callable[[bytes, int], None],
     ) -> None:
-        """Take the mailbox of the slave at `position` (from 1); None where it has none for CoE.
-
-        Args:
-            mailbox: the slave's mailbox.
-            position: position of the slave on the cable, from 1.
-            name: name of the slave.
-            lock: the lock of this slave's mailbox.
-            other: takes CoE messages that are no SDO (emergencies), with the slave's position.
-        """
         self.position = position
         self.name = name
         self._mailbox = mailbox
         self._lock = lock
-        self._other = other
+        self._receive_coe = receive_coe
+
+    def _call(self, task: str, service: Callable[[Mailbox], Steps[T]]) -> Steps[T]:
+        where = slave_label(self.position, self.name)
+        if self._mailbox is None:
+            raise BusError(f"{where}: {task} is not possible, its EEPROM lists no {self.protocol} mailbox")
+        deadline = time.monotonic() + _PATIENCE_S
+        while not self._lock.acquire(blocking=False):
+            if time.monotonic() >= deadline:
+                raise BusError(f"{where}, {task}: its mailbox is in use by others")
+            yield
+        try:
+            until = time.monotonic() + self._mailbox.patience_s
+            attempt = 0
+            while True:
+                attempt += 1
+                try:
+                    return (yield from service(self._mailbox))
+                except Refused as error:
+                    raise type(error)(f"{where} refused the {task}: {error}", error.code) from error
+                except BusError as error:
+                    # Each message is sent and fetched once only, so a lost frame fails the attempt.
+                    if attempt >= self.tries and (not self.is_patient or time.monotonic() >= until):
+                        raise BusError(f"{where}, {task}: {error}") from error
+                # An immediate second attempt may fail where one a little later works (SOEM#825).
+                yield from pause(_RETRY_S)
+        finally:
+            self._lock.release()
+
+
+class SdoClient(MailboxClient):
+    """Reads and writes objects of a slave: at once (`read`) or in steps (`reading`)."""
+
+    protocol, tries = "CoE", 2
 
     def read(self, index: int, subindex: int) -> bytes:
         """Return an object's value.
@@ -83,17 +123,17 @@ class SdoClient:
         finish(self.writing(index, subindex, data))
 
     def reading(self, index: int, subindex: int, complete: bool = False) -> Steps[bytes]:
-        """Return an object's value; `complete`: of all entries from `subindex`, 0 or 1, on. Raises as `read`."""
+        """Return an object's value; `complete`: complete access from `subindex`, 0 or 1, on. Raises as `read`."""
         how = ", complete access" if complete else ""
         return self._call(
             f"read of 0x{index:04X}:{subindex}{how}", lambda box: self._upload(box, index, subindex, complete)
         )
 
     def writing(self, index: int, subindex: int, data: bytes, complete: bool = False) -> Steps[None]:
-        """Write an object's value; `complete` as of `reading`. Raises as `read`."""
-        shown = data.hex(" ") if len(data) <= 8 else f"{len(data)} bytes"
-        what = f"write of {shown or 'nothing'} to 0x{index:04X}:{subindex}{', complete access' if complete else ''}"
-        return self._call(what, lambda box: self._download(box, index, subindex, data, complete))
+        """Write an object's value; `complete` as in `reading`. Raises as `read`."""
+        value = data.hex(" ") if len(data) <= 8 else f"{len(data)} bytes"
+        task = f"write of {value or 'nothing'} to 0x{index:04X}:{subindex}{', complete access' if complete else ''}"
+        return self._call(task, lambda box: self._download(box, index, subindex, data, complete))
 
     def reading_int(self, index: int, subindex: int) -> Steps[int]:
         """Return an object's value as an unsigned integer; raises as `read`."""
@@ -107,25 +147,18 @@ class SdoClient:
         """Return the answer to a service of SDO information (ETG.1000.6, 5.6.3), fragments joined; raises as `read`.
 
         Args:
-            service: operation code of the request; that of the answer is the next one.
-            data: what follows the header of the request.
+            service: operation code of the request; the answer has the next one.
+            data: content of the request after its header.
         """
-        what = f"SDO information {service} of {data.hex(' ')}"
-        return self._call(what, lambda box: self._information(box, service, data))
+        task = f"SDO information {service} of {data.hex(' ')}"
+        return self._call(task, lambda box: self._information(box, service, data))
 
     def _information(self, mailbox: Mailbox, service: int, data: bytes) -> Steps[bytes]:
         deadline = time.monotonic() + _TIMEOUT_S
         yield from self._send_alone(mailbox, _INFORMATION, _INFORMATION_HEADER.pack(service, 0) + data, deadline)
         answer = b""
         while True:
-            if (message := mailbox.receive()) is None:
-                check_time(deadline, "no answer in time")
-                yield
-                continue
-            if len(message) < _COE_HEADER + _INFORMATION_HEADER.size or message[1] >> 4 != _INFORMATION:
-                self._other(message, self.position)
-                check_time(deadline, "no answer in time, but other messages")
-                continue
+            message = yield from self._receive(mailbox, (_INFORMATION,), _INFORMATION_HEADER.size, deadline)
             operation, left = _INFORMATION_HEADER.unpack_from(message, _COE_HEADER)
             content = message[_COE_HEADER + _INFORMATION_HEADER.size :]
             if operation & 0x7F == _INFORMATION_ERROR:
@@ -138,64 +171,40 @@ class SdoClient:
                 return answer
             deadline = time.monotonic() + _TIMEOUT_S
 
+    def _receive(self, mailbox: Mailbox, services: tuple[int, ...], size: int, deadline: float) -> Steps[bytes]:
+        """Return the next message of these CoE services with at least `size` bytes behind its CoE header."""
+        while True:
+            if (message := mailbox.receive()) is None:
+                check_time(deadline, "no answer in time")
+                yield
+            elif len(message) >= _COE_HEADER + size and message[1] >> 4 in services:
+                return message
+            else:
+                self._receive_coe(message, self.position)
+                check_time(deadline, "no answer in time, but other messages")
+
     def _send_alone(self, mailbox: Mailbox, service: int, request: bytes, deadline: float) -> Steps[None]:
-        """Empty the slave's mailbox, of which an old message would be taken for the answer, and send a request."""
+        """Empty the slave's mailbox, so that no old message is taken for the answer, and send a request."""
         while (left := mailbox.receive()) is not None:
-            self._other(left, self.position)
+            self._receive_coe(left, self.position)
             check_time(deadline, "its mailbox does not get empty")
         while not mailbox.send((service << 12).to_bytes(2, "little") + request):
             check_time(deadline, "its mailbox stays full")
             yield
 
-    def _call(self, what: str, service: Callable[[Mailbox], Steps[T]]) -> Steps[T]:
-        where = slave_label(self.position, self.name)
-        if self._mailbox is None:
-            raise BusError(f"{where}: {what} is not possible, its EEPROM lists no CoE mailbox")
-        deadline = time.monotonic() + PATIENCE_S
-        while not self._lock.acquire(blocking=False):
-            if time.monotonic() >= deadline:
-                raise BusError(f"{where}, {what}: its mailbox is in use by others")
-            yield
-        try:
-            until = time.monotonic() + self._mailbox.patience_s
-            tried_again = False
-            while True:
-                try:
-                    return (yield from service(self._mailbox))
-                except SdoAborted as error:
-                    raise SdoAborted(f"{where} refused the {what}: {error}", error.code) from error
-                except BusError as error:
-                    # Its messages are sent and fetched once only each: of many frames that get lost some are theirs.
-                    if tried_again and time.monotonic() >= until:
-                        raise BusError(f"{where}, {what}: {error}") from error
-                tried_again = True
-                # An immediate second try may fail where one a little later works (SOEM#825).
-                yield from pause(_RETRY_S)
-        finally:
-            self._lock.release()
-
     def _exchange(
         self, mailbox: Mailbox, request: bytes, specifier: int, address: tuple[int, int] | None
     ) -> Steps[bytes]:  # fmt: skip
-        """Return the answer to an SDO request, from its command on; `address`: index and subindex it must repeat."""
+        """Return the answer to an SDO request, from its command on; `address`: expected index and subindex in it."""
         deadline = time.monotonic() + _TIMEOUT_S
         yield from self._send_alone(mailbox, _REQUEST, request, deadline)
-        while True:
-            if (message := mailbox.receive()) is None:
-                if time.monotonic() >= deadline:
-                    raise BusError("no answer in time")
-                yield
-                continue
-            if len(message) < _COE_HEADER + _SDO.size or message[1] >> 4 not in {_REQUEST, _RESPONSE}:
-                self._other(message, self.position)
-                check_time(deadline, "no answer in time, but other messages")
-                continue
-            command, index, subindex, number = _SDO.unpack_from(message, _COE_HEADER)
-            if command == _ABORT:
-                raise SdoAborted(f"abort code 0x{number:08X}, {abort_meaning(number)}", number)
-            if command & _SPECIFIER != specifier or (address is not None and address != (index, subindex)):
-                raise BusError(f"it answered something else (command 0x{command:02X})")
-            return message[_COE_HEADER:]
+        message = yield from self._receive(mailbox, (_REQUEST, _RESPONSE), _SDO.size, deadline)
+        command, index, subindex, number = _SDO.unpack_from(message, _COE_HEADER)
+        if command == _ABORT:
+            raise SdoAborted(f"abort code 0x{number:08X}, {abort_meaning(number)}", number)
+        if command & _SPECIFIER != specifier or (address is not None and address != (index, subindex)):
+            raise BusError(f"it answered something else (command 0x{command:02X})")
+        return message[_COE_HEADER:]
 
     def _upload(self, mailbox: Mailbox, index: int, subindex: int, complete: bool) -> Steps[bytes]:
         request = _SDO.pack(_UPLOAD | complete * _COMPLETE, index, subindex, 0)
@@ -214,7 +223,7 @@ class SdoClient:
             if command & _TOGGLE != toggle:
                 raise BusError("it repeated a segment")
             part = answer[1:]
-            # Seven bytes or fewer: the command holds how many are valid.
+            # In a segment of seven bytes the command gives the number of unused ones.
             data += part[: _SEGMENT_DATA - (command >> 1 & 7)] if len(part) == _SEGMENT_DATA else part
             toggle ^= _TOGGLE
             if command & _LAST:
@@ -294,9 +303,9 @@ def abort_meaning(code: int) -> str:
 
 _SM0_STATUS, _SM1_STATUS, _FULL = Register.SYNC_MANAGER + 5, Register.SYNC_MANAGER + 13, 0x08
 _SM1_ACTIVATE, _SM1_PDI_CONTROL, _REPEAT = Register.SYNC_MANAGER + 14, Register.SYNC_MANAGER + 15, 0x02
-"""Repeat request and, toggled by the slave, its acknowledgement (ETG.1000.4, 6.7.1)."""
+"""Repeat request, and repeat acknowledge, which the slave toggles (ETG.1000.4, 6.7.1)."""
 _MOST_READS = 20
-"""How often the acknowledgement is read."""
+"""Most reads of the repeat acknowledge."""
 _HEADER = struct.Struct("<HHBB")
 
 
@@ -323,66 +332,66 @@ _ERRORS = {
 
 
 class Mailbox:
-    """Messages to and from one slave. Nothing is waited for but the frames."""
+    """Mailbox messages to and from one slave. It waits for frames only, never for the slave."""
 
     def __init__(self, port: RegisterPort, station: int, info: MailboxInfo) -> None:
-        """Take the mailbox of the slave at configured address `station`."""
+        """Use the mailbox of the slave at configured address `station`."""
         self._port = port
         self._station = station
         self._info = info
 
     @property
     def room(self) -> int:
-        """Bytes that a message to the slave may have behind its mailbox header."""
+        """Largest content of a message to the slave, bytes after the mailbox header."""
         return self._info.receive_size - _HEADER.size
 
     @property
     def patience_s(self) -> float:
-        """For how long a service whose messages get lost is tried again, s."""
+        """Time for which a service whose messages get lost is repeated, s."""
         return self._port.patience_s
 
     @property
     def sent_room(self) -> int:
-        """Bytes that a message of the slave's may have behind its mailbox header."""
+        """Largest content of a message from the slave, bytes after the mailbox header."""
         return self._info.send_size - _HEADER.size
 
     def send(self, content: bytes, kind: MailboxType = MailboxType.COE) -> bool:
         """Send the slave a message; return False while its mailbox is still full.
 
         Args:
-            content: what follows the mailbox header, `room` bytes at most.
+            content: bytes after the mailbox header, at most `room`.
             kind: its protocol.
 
         Raises:
-            BusError: the slave does not answer, or its mailbox has no room for so much.
+            BusError: the slave does not answer, or the content does not fit its mailbox.
         """
         if len(content) > self.room:
             raise BusError(f"a message of {len(content)} bytes does not fit into its mailbox: at most {self.room}")
         if self._is_full(_SM0_STATUS):
             return False
-        # Counter 0 is not checked by slaves; SOEM counts its own messages 1 to 7, unknown to us (ETG.1000.4, table 29).
+        # Slaves do not check counter 0; SOEM counts its own messages from 1 to 7 (ETG.1000.4, table 29).
         message = _HEADER.pack(len(content), 0, 0, kind) + content
         message = message.ljust(self._info.receive_size, b"\0")
-        # Once only: whether a lost frame reached the slave is not known.
+        # Once only: a lost frame may have reached the slave.
         start = self._info.receive_start
         if self._port.exchange(DatagramCommand.FPWR, self._station, start, message, tries=1).wkc != 1:
             raise BusError("it did not take the message")
         return True
 
     def receive(self) -> bytes | None:
-        """Return a CoE message that waits (CoE header first), None where none does; raises as `receive_any`."""
+        """Return a waiting CoE message, CoE header first, None where there is none; raises as `receive_any`."""
         message = self.receive_any()
         return None if message is None or message[0] is not MailboxType.COE else message[1]
 
     def receive_any(self) -> tuple[MailboxType | None, bytes] | None:
-        """Return protocol (None: another one) and content of a message that waits, None where none does.
+        """Return protocol (None: unknown) and content of a waiting message, None where there is none.
 
         Raises:
             BusError: the slave answered with a mailbox error, or its message got lost.
         """
         if not self._is_full(_SM1_STATUS):
             return None
-        # Once only: the mailbox is empty after its last byte was read.
+        # Once only: reading the last byte empties the mailbox.
         message = self._read() or self._read_again()
         if message is None:
             raise BusError("its message got lost")
@@ -397,7 +406,7 @@ class Mailbox:
         return self._port.read(self._station, self._info.send_start, self._info.send_size, tries=1)
 
     def _read_again(self) -> bytes | None:
-        """Return a message whose frame got lost: it is there still, or the slave repeats it; None: it does not."""
+        """Return a message whose frame got lost: still in the mailbox, or repeated by the slave; None: neither."""
         if not self._is_full(_SM1_STATUS):
             control = self._port.read(self._station, _SM1_ACTIVATE, 1)
             if control is None:
@@ -422,16 +431,25 @@ class Mailbox:
 _MESSAGES_A_POLL = 8
 
 
+def parse_emergency(message: bytes, position: int) -> EmergencyMessage | None:
+    """Return the emergency in a CoE message of a slave (ETG.1000.6, 5.6.4.2), None for any other message."""
+    if len(message) < _EMERGENCY_MESSAGE.size:
+        return None
+    coe, code, register, data = _EMERGENCY_MESSAGE.unpack_from(message)
+    kind = EmergencyMessage if code else ErrorReset
+    return kind(position, code, register, int.from_bytes(data, "big")) if coe >> 12 == _EMERGENCY else None
+
+
 class Mailboxes:
-    """The mailboxes of all slaves, each with a lock of its own: a slow slave does not block the others."""
+    """The mailboxes of all slaves, with a lock each: a slow slave does not block the others."""
 
     def __init__(self, port: RegisterPort, names: Sequence[str], infos: Sequence[MailboxInfo | None]) -> None:
-        """Take the names and the mailboxes of the slaves, in the order of the cable."""
+        """Use these names and mailboxes of the slaves, in the order of the cable."""
         self._port = port
         self._names = names
         self._infos = infos
         self._locks = [threading.Lock() for _ in names]
-        self._emergencies: deque[Emergency] = deque(maxlen=256)
+        self._emergencies: deque[EmergencyMessage] = deque(maxlen=256)
 
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to the slave at `position`; raises BusError where there is none."""
@@ -442,28 +460,28 @@ class Mailboxes:
         return SdoClient(mailbox, position, self._names[position - 1], self._locks[position - 1], self._keep)
 
     def access(self, position: int) -> tuple[threading.Lock, Callable[[bytes, int], None]]:
-        """Return what another protocol of a slave's mailbox needs: the lock, and who takes CoE messages meanwhile."""
+        """Return, for another protocol of a slave's mailbox, its lock and the receiver of CoE messages."""
         return self._locks[position - 1], self._keep
 
-    def emergencies(self) -> tuple[Emergency, ...]:
-        """Return the emergency messages that came since the last call; without any it takes one frame.
+    def emergencies(self) -> tuple[EmergencyMessage, ...]:
+        """Return the emergency messages received since the last call; costs one frame where there are none.
 
         Raises:
-            BusError: a message got lost; whatever else there is comes with the next call.
+            BusError: a message got lost; the next call returns the others.
         """
         full = self._port.read_all(_SM1_STATUS, 1).data
         if any(byte & _FULL for byte in full):
             self._empty_all()
-        found = []
+        messages = []
         while self._emergencies:
-            found.append(self._emergencies.popleft())
-        return tuple(found)
+            messages.append(self._emergencies.popleft())
+        return tuple(messages)
 
     def _empty_all(self) -> None:
         faults: list[str] = []
         for position, info in enumerate(self._infos, 1):
             lock = self._locks[position - 1]
-            # While an SDO is in progress, its client reads the mailbox and collects emergencies as well.
+            # While an SDO service runs, its client reads the mailbox and collects the emergencies.
             if info is None or not lock.acquire(blocking=False):
                 continue
             try:
@@ -477,7 +495,7 @@ class Mailboxes:
 
     def _empty(self, position: int, info: MailboxInfo) -> None:
         status = self._port.read(station_of(position), _SM1_STATUS, 1, tries=1)
-        # A slave that does not answer is the watcher's business.
+        # The watcher handles slaves that do not answer.
         if status is None or not status[0] & _FULL:
             return
         mailbox = Mailbox(self._port, station_of(position), info)
@@ -488,6 +506,5 @@ class Mailboxes:
             self._keep(message, position)
 
     def _keep(self, message: bytes, position: int) -> None:
-        found = parse(message, position, self._names[position - 1])
-        if found is not None:
-            self._emergencies.append(found)
+        if (emergency := parse_emergency(message, position)) is not None:
+            self._emergencies.append(emergency)

@@ -1,4 +1,4 @@
-"""The loop's side of a bus, whatever its kind: what every one can do, and what some can do besides."""
+"""Interface between the loop and a bus of any kind."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Master(ABC):
     """A bus from `open` to `close`; a kind of bus names its class in `MASTER` (docs/extending.md).
 
     Args:
-        config: the arm; `config.slaves` says what is on the bus, after `start` in the order in which it is there.
-        interface: that of the session: as configured, or the virtual one.
-        namespace_pid: process whose network namespace has it; 0: this process's own.
+        config: the arm; after `start` `config.slaves` is in the order of the bus.
+        interface: interface of the session: the configured or the virtual one.
+        namespace_pid: process whose network namespace has it; 0: this process.
     """
 
     def __init__(self, config: ArmConfig, interface: str, namespace_pid: int) -> None:
@@ -28,7 +28,7 @@ class Master(ABC):
         self.interface = interface
         self.namespace_pid = namespace_pid
         self.notes: list[str] = []
-        """Deviations that were tolerated, and what `close` could not leave in order, in sentences."""
+        """Tolerated deviations, and failures of `close`, in sentences."""
 
     @staticmethod
     @abstractmethod
@@ -42,11 +42,11 @@ class Master(ABC):
 
     @abstractmethod
     def start(self, directory: Path, report: Callable[[str], None]) -> ProcessData:
-        """Open the bus and return its process data; `report` takes sentences on how far it is.
+        """Open the bus and return its process data.
 
         Args:
             directory: the runtime directory.
-            report: for the user who waits.
+            report: receives sentences on the progress, for the user.
 
         Raises:
             BusError: it cannot be opened.
@@ -54,34 +54,34 @@ class Master(ABC):
 
     @property
     def connected(self) -> bool:
-        """Whether the other side speaks; of no interest where slaves are supervised."""
+        """Whether the other side sends; not used where slaves are supervised."""
         return True
 
     def waiting_for(self) -> str:
-        """Return in a sentence what people have to do before the arm can be enabled; empty: nothing."""
+        """Return a sentence on what a person has to do before the arm can be enabled; empty: nothing."""
         return ""
 
     def explain(self, axis: int) -> str:
-        """Return in a sentence why the drive of a joint left its state; empty: nothing is known."""
+        """Return a sentence on why the drive of a joint left its state; empty: unknown."""
         return ""
 
     @abstractmethod
     def close(self) -> None:
-        """Leave everything at rest; may be called at any time, also twice."""
+        """Bring the bus to rest and close it; may be called at any time, also twice."""
 
 
 def master_of(bus: BusConfig) -> type[Master]:
-    """Return the class of the loop's side of a bus.
+    """Return the `Master` class of a bus.
 
     Raises:
-        PluginError: it cannot be loaded: a package is missing.
+        PluginError: it cannot be loaded, as its package is missing.
     """
     return load_class(EntryPoint(bus.kind, bus.MASTER, ENTRY_POINTS), Master)  # type: ignore[type-abstract]
 
 
 class PacedData(ProcessData):
-    """Process data of a bus that sets the pace: the other side speaks first, and is answered at once."""
+    """Process data of a bus that sets the pace: the other side sends first, and is answered at once."""
 
     def receive_until(self, deadline_ns: int) -> int:
-        """Wait until a message is there or `deadline_ns` (CLOCK_MONOTONIC); return 1, or -1 where none came."""
+        """Wait for a message until `deadline_ns` (CLOCK_MONOTONIC); return 1, or -1 where none came."""
         raise NotImplementedError

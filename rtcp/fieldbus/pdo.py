@@ -1,4 +1,4 @@
-"""The layout of a process image: which channel stands at which bits (ETG.1000.6, 5.6.5; little endian, no gaps)."""
+"""Layout of a process image: the bits of each channel (ETG.1000.6, 5.6.5; little endian, no gaps)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ STRUCT_CODES: dict[str, str] = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
     "float32": "f", "float64": "d",
 }  # fmt: skip
-"""Codes of `struct`, for the types that it knows."""
+"""Type -> code of the `struct` module."""
 
 
 ASSIGN = 0x1C10
 """PDO assignment object of sync manager 0; those of the others follow (ETG.1000.6, 5.6.7.4)."""
 OUTPUTS, INPUTS = 2, 3
-"""Sync managers of process data where a device has a mailbox and one of each direction."""
+"""Usual sync managers of process data: of a device with a mailbox and one for each direction."""
 RX_ASSIGN, TX_ASSIGN = ASSIGN + OUTPUTS, ASSIGN + INPUTS
 Mapping = tuple[tuple[int, tuple[tuple[int, int, int], ...]], ...]
 """PDOs in order, each its index and its entries (index, subindex, bits)."""
@@ -43,7 +43,7 @@ class Channel:
     offset: float = 0.0
     """SI value at 0 counts."""
     limits: tuple[float, float] = (-inf, inf)
-    """Of an output: fewest and most counts that are sent."""
+    """Least and greatest value sent of an output, counts."""
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,16 @@ class ImageLayout:
 
     @property
     def bytes(self) -> int:
-        """Length in bytes, the last one possibly not filled."""
+        """Length in bytes, rounded up."""
         return (self.bits + 7) // 8
 
     def find(self, name: str) -> Channel | None:
-        """Return the channel of that name, None where there is none."""
+        """Return the channel with this name, None where there is none."""
         return next((channel for channel in self.channels if channel.name == name and channel.index), None)
 
 
 def assignments(device: DeviceDescription) -> list[tuple[str, int, list[Pdo]]]:
-    """Return key, sync manager and PDOs of each assignment; a direction without PDOs has its usual one, empty."""
+    """Return key, sync manager and PDOs of each assignment; a direction without PDOs has the usual one, empty."""
     return [
         (key, manager, group)
         for key, pdos, usual in (("rpdo", device.rpdo, OUTPUTS), ("tpdo", device.tpdo, INPUTS))
@@ -77,7 +77,7 @@ def by_sync_manager(pdos: Sequence[Pdo], usual: int) -> dict[int, list[Pdo]]:
 
     Args:
         pdos: the PDOs.
-        usual: the sync manager of those that name none.
+        usual: sync manager of PDOs that name none.
     """
     groups: dict[int, list[Pdo]] = {}
     for pdo in pdos:
@@ -86,7 +86,7 @@ def by_sync_manager(pdos: Sequence[Pdo], usual: int) -> dict[int, list[Pdo]]:
 
 
 def layout(pdos: Sequence[Pdo]) -> ImageLayout:
-    """Return where the entries of `pdos` stand: assigned in this order, each sync manager from a whole byte on."""
+    """Return the layout of `pdos`, assigned in this order; each sync manager begins at a whole byte."""
     channels = []
     offset = 0
     for group in by_sync_manager(pdos, 0).values():
@@ -103,21 +103,21 @@ def layout(pdos: Sequence[Pdo]) -> ImageLayout:
 
 
 def mapping_of(pdos: Sequence[Pdo]) -> Mapping:
-    """Return what `pdos` of a description map."""
+    """Return the mapping of a description's `pdos`."""
     return tuple(
         (pdo.index, tuple((e.index, e.sub_index if e.index else 0, e.length) for e in pdo.channels)) for pdo in pdos
     )  # fmt: skip
 
 
 def entries_of(mapping: Mapping) -> list[tuple[int, int, int]]:
-    """Return the entries of a mapping in one list, paddings behind each other as one."""
-    found: list[tuple[int, int, int]] = []
+    """Return the entries of a mapping in one list, with adjacent paddings joined."""
+    joined: list[tuple[int, int, int]] = []
     for entry in (entry for _, entries in mapping for entry in entries):
-        if found and not entry[0] and not found[-1][0]:
-            found[-1] = 0, 0, found[-1][2] + entry[2]
+        if joined and not entry[0] and not joined[-1][0]:
+            joined[-1] = 0, 0, joined[-1][2] + entry[2]
         else:
-            found.append(entry if entry[0] else (0, 0, entry[2]))
-    return found
+            joined.append(entry if entry[0] else (0, 0, entry[2]))
+    return joined
 
 
 def mapping_text(mapping: Mapping) -> str:
@@ -131,7 +131,7 @@ def mapping_text(mapping: Mapping) -> str:
 
 
 def write_mapping(sdo: SdoClient, assignment: int, pdos: Sequence[Pdo]) -> Steps[None]:
-    """Write PDO mapping and assignment: counts to 0, entries, counts (ETG.1000.6, 5.6.5.2)."""
+    """Write PDO mapping and assignment: counts to 0, then the entries, then the counts (ETG.1000.6, 5.6.5.2)."""
     mapping = mapping_of(pdos)
     yield from sdo.writing_int(assignment, 0, 0, 1)
     for (pdo, entries), fixed in zip(mapping, (pdo.fixed for pdo in pdos), strict=True):
@@ -147,9 +147,9 @@ def write_mapping(sdo: SdoClient, assignment: int, pdos: Sequence[Pdo]) -> Steps
 
 
 def compare_mapping(sdo: SdoClient, assignment: int, expected: Mapping, key: str) -> Steps[None]:
-    """Read the mapping and compare it; raises BusError where it differs (`key`: that of the device's file)."""
+    """Read the mapping and compare it; raises BusError where it differs; `key`: key in the device's file."""
     try:
-        found = tuple(
+        actual = tuple(
             (pdo.index, tuple((e.index, e.sub_index, e.bits) for e in pdo.entries))
             for pdo in (yield from reading_assignment(sdo, assignment))
         )
@@ -157,16 +157,16 @@ def compare_mapping(sdo: SdoClient, assignment: int, expected: Mapping, key: str
         if error.code not in ABSENT or expected:
             raise
         return
-    # Some devices assign PDOs without entries, which carry nothing.
-    if [pdo for pdo in found if pdo[1]] != [pdo for pdo in expected if pdo[1]]:
+    # Some devices assign PDOs without entries.
+    if [pdo for pdo in actual if pdo[1]] != [pdo for pdo in expected if pdo[1]]:
         raise BusError(
             f"{slave_label(sdo.position, sdo.name)}: the mapping assigned through 0x{assignment:04X} differs from "
-            f"the device's file (key `{key}`): expected {mapping_text(expected)}, found {mapping_text(found)}"
+            f"the device's file (key `{key}`): expected {mapping_text(expected)}, found {mapping_text(actual)}"
         )
 
 
 def reading_assignment(sdo: SdoClient, assignment: int) -> Steps[tuple[PdoInfo, ...]]:
-    """Return the PDOs that 0x1C12 or 0x1C13 lists and what is mapped into them; names are left empty.
+    """Return the PDOs that 0x1C12 or 0x1C13 lists, with their entries; names are empty.
 
     Raises:
         BusError: the slave refuses or does not answer.
@@ -183,8 +183,8 @@ def reading_assignment(sdo: SdoClient, assignment: int) -> Steps[tuple[PdoInfo, 
 
 
 def _reading(sdo: SdoClient, index: int, subindex: int, most: int) -> Steps[int]:
-    found = yield from sdo.reading_int(index, subindex)
-    if found > most:
+    value = yield from sdo.reading_int(index, subindex)
+    if value > most:
         where = slave_label(sdo.position, sdo.name)
-        raise BusError(f"{where}: 0x{index:04X}:{subindex} reads as 0x{found:X}, at most 0x{most:X} is possible")
-    return found
+        raise BusError(f"{where}: 0x{index:04X}:{subindex} reads as 0x{value:X}, at most 0x{most:X} is possible")
+    return value

@@ -1,8 +1,8 @@
-"""The exchange of process data through SOEM: one frame a cycle, and never an old answer taken for a new one.
+"""The exchange of process data through SOEM: one frame a cycle; an old answer is never taken for a new one.
 
-SOEM knows a frame's answer by an index of 0 to 15 only: an answer that is 16 cycles late is taken for the current one,
-and the cycles after it each take the next late one, for ever. Frames do not overtake one another on a segment, so once
-a NOP datagram with a number of its own is back, no older frame is under way any more.
+SOEM identifies a frame's answer by an index of 0 to 15 only: it takes an answer that is 16 cycles late for the current
+one, and then in each cycle the next late one, for ever. Frames do not overtake one another on a segment, so once a
+numbered NOP datagram is back, no older frame is under way.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from rtcp.fieldbus.image import Place, Places, image_memory, missing_counts
 from rtcp.fieldbus.registers import DatagramCommand, build_frame, open_socket
 
 _LARGEST_FRAME_DATA: Final = 1466
-"""Bytes of process data that fit one frame beside the clock's datagram (SOEM: EC_MAXLRWDATA - EC_FIRSTDCDATAGRAM)."""
+"""Most process data of a frame with the clock's datagram, bytes (SOEM: EC_MAXLRWDATA - EC_FIRSTDCDATAGRAM)."""
 
 
 class SoemProcessData:
     """ProcessData over a configured pysoem master. `receive` holds the interpreter and polls, at most `receive_us`.
 
-    After an exchange without an answer the next `send` first lets a barrier frame pass, throws away what came back
-    before it and only then sends: the answer that follows can only be the new one. While that frame does not come back,
-    outputs are still sent (a drive that receives frames must get its targets), but no answer is taken.
+    After an exchange without an answer the next `send` first waits for a barrier frame, drops all frames that came back
+    before it and only then sends, so that the next answer is the new one. While the barrier frame does not come back,
+    outputs are still sent (a drive that receives frames must get its targets), but answers are ignored.
     """
 
     def __init__(
@@ -38,16 +38,16 @@ class SoemProcessData:
         receive_us: int,
         barrier_us: int,
     ) -> None:
-        """Take over the image of `slaves` (pysoem's), outputs zero.
+        """Use the image of `slaves` (pysoem's), with all outputs 0.
 
         Args:
             master: pysoem's master after `config_map`.
             slaves: its slaves.
-            places: where their images are.
+            places: places of their images.
             socket_fd: a duplicate of SOEM's packet socket, non-blocking.
             barrier: the frame barrier on the same interface.
-            receive_us: how long an answer is waited for.
-            barrier_us: how long the barrier frame is waited for.
+            receive_us: longest wait for an answer, us.
+            barrier_us: longest wait for the barrier frame, us.
         """
         self.expected_wkc = int(master.expected_wkc) + missing_counts(places)
         self.missed = 0
@@ -71,18 +71,18 @@ class SoemProcessData:
         )
         self._several_frames = sum(map(len, self._inputs + self._outputs)) > _LARGEST_FRAME_DATA
         self._buffer = ctypes.create_string_buffer(1518)
-        # SOEM sends frames again while it configures: their late answers are around at the start.
+        # SOEM repeats frames while it configures, so late answers may arrive at the start.
         self._doubtful = True
         self._blind = False
         self.dc_time = int(master.dc_time)
 
     def send(self) -> None:
-        """Send the outputs that were set."""
+        """Send the outputs; after a lost answer a barrier frame first."""
         if self._doubtful:
             self._blind = not self._barrier.pass_through(self._barrier_ns)
             self.stale += drain(self._fd, self._buffer)
         outputs = self._outputs
-        # All of them, each time: SOEM copies what comes back, also an older frame's outputs, over its image.
+        # All outputs each time: SOEM overwrites its image with every frame that comes back, also an older one.
         for i, slave in self._with_outputs:
             slave.output = outputs[i]
         if self._small is not None:
@@ -90,10 +90,10 @@ class SoemProcessData:
         self._master.send_processdata()
 
     def receive(self) -> int:
-        """Return the working counter of the answer, -1 where none came in time; then inputs and `dc_time` stay."""
+        """Return the working counter of the answer, -1: none in time; inputs and `dc_time` then stay."""
         if self._blind:
             self.stale += drain(self._fd, self._buffer)
-            # Only gives SOEM's buffer back; whatever it finds is not known to be new.
+            # Only returns SOEM's buffer; a frame that it finds may be old.
             self._master.receive_processdata(0)
             self._blind = False
             self.missed += 1
@@ -117,26 +117,26 @@ class SoemProcessData:
         return self._inputs[index]
 
     def set_output(self, index: int, data: bytes) -> None:
-        """Set the outputs of slave `index` for the next `send`; data of another length is not taken."""
+        """Set the outputs of slave `index` for the next `send`; data of another length is ignored."""
         if len(data) == self._lengths[index]:
             self._outputs[index] = data
 
 
 class SmallImages:
-    """Images of 1 to 7 bits, which lie beside and across the bytes of others, in the order of the cable."""
+    """Images of 1 to 7 bits, which share bytes with others, in the order of the cable."""
 
     def __init__(
         self, image: memoryview, outputs: Sequence[tuple[int, Place]], inputs: Sequence[tuple[int, Place]]
     ) -> None:
-        """Take the process image, and of each such image the slave's index and its place."""
+        """Use the process image, and index and place of each slave with such an image."""
         self._image = image
         self._reads = tuple(
             (i, slice(place.first // 8, (place.first + place.bits + 7) // 8), place.first % 8, (1 << place.bits) - 1)
             for i, place in inputs
         )
-        # Bytes that are written at once, and who has which bits of them: slaves that share a byte.
+        # Runs of bytes that are written at once, with the bits of each slave that shares them.
         runs: list[tuple[int, int, list[tuple[int, int, int]]]] = []
-        for i, place in sorted(outputs, key=lambda one: one[1].first):
+        for i, place in sorted(outputs, key=lambda output: output[1].first):
             begin, end = place.first // 8, (place.first + place.bits + 7) // 8
             if not runs or begin >= runs[-1][1]:
                 runs.append((begin, end, []))
@@ -146,7 +146,7 @@ class SmallImages:
         self._writes = tuple((slice(begin, end), end - begin, tuple(members)) for begin, end, members in runs)
 
     def write(self, outputs: Sequence[bytes]) -> None:
-        """Write the bits of each slave's outputs; the bits around them stay those of the others."""
+        """Write the bits of each slave's outputs; bits of other slaves stay."""
         for where, length, members in self._writes:
             value = 0
             for i, shift, mask in members:
@@ -162,13 +162,13 @@ class SmallImages:
 _BYTES: Final = tuple(bytes((value,)) for value in range(256))
 _INDEX = 0xF0
 _NUMBER_AT: Final = 26
-# PyDLL keeps the interpreter's lock: the cycle must not have to win it back from another thread after each poll.
+# PyDLL keeps the interpreter's lock, so that the cycle need not regain it from another thread after each poll.
 _libc = ctypes.PyDLL(None)
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 
 
 class FrameBarrier:
-    """Numbered NOP frames (ETG.1000.4, 5.4.1: passed on by every slave, acted on by none). Used by the cycle only."""
+    """Numbered NOP frames, which slaves forward without effect (ETG.1000.4, 5.4.1). Used by the cycle only."""
 
     def __init__(self, interface: str) -> None:
         """Open its socket; raises BusError where the interface cannot be opened."""
@@ -181,7 +181,7 @@ class FrameBarrier:
         self._number = 0
 
     def pass_through(self, timeout_ns: int) -> bool:
-        """Send the next number and poll for its return; return whether it came within `timeout_ns`."""
+        """Send the next number and poll for its return; return whether it came back within `timeout_ns`."""
         deadline = time.monotonic_ns() + timeout_ns
         self._number += 1
         number = self._number.to_bytes(8, "little")
@@ -201,7 +201,7 @@ class FrameBarrier:
 
 
 def drain(fd: int, buffer: ctypes.Array[ctypes.c_char]) -> int:
-    """Read the frames that wait at packet socket `fd` into `buffer` until there is none; return how many there were."""
+    """Read and drop all waiting frames of packet socket `fd`; return their number."""
     count = 0
     while _libc.recv(fd, buffer, len(buffer), _DONTWAIT) > 0:
         count += 1

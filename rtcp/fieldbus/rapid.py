@@ -1,7 +1,7 @@
 """RAPID streaming as a bus: joint targets by Simple Message over TCP to a program on the controller (`abb/rapid`).
 
-A point is answered when the program has accepted it, and that holds the next one back: until then the newest target
-takes the place of the one that waits. Nothing here blocks. rad on the wire, float32.
+The program answers a point when it has accepted it; the next point waits for that answer, and newer targets replace a
+waiting one. Nothing here blocks. Units on the wire: rad, float32.
 """
 
 from __future__ import annotations
@@ -23,19 +23,8 @@ from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.interface import enter
 from rtcp.fieldbus.master import Master
+from rtcp.fieldbus.simple_message import messages
 from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder, FrameError
-from rtcp.fieldbus.simple_message.messages import (
-    JOINTS,
-    ByteOrder,
-    CommType,
-    MessageError,
-    MessageType,
-    ReplyCode,
-    RobotMode,
-    SpecialSequence,
-    Status,
-    TriState,
-)
 from rtcp.ipc.names import MISSING_WORDS
 from rtcp.ipc.states import DriveState, Missing
 
@@ -46,23 +35,23 @@ _MEASURED: Final = struct.Struct("<dBB")
 _UNIT: Final = struct.Struct("<IIBdBB")
 _READ_BYTES: Final = 4096
 _MOST_READS: Final = 64
-"""In a cycle: what waits after a stall is read at once, or old states would be taken for new ones for many cycles."""
+"""Most reads in a cycle: enough to read all old states at once after a stall."""
 _RECONNECT_NS: Final = 1_000_000_000
-"""Between two attempts to connect, as the driver specification of ROS-Industrial asks."""
+"""Interval between two attempts to connect, ns (ROS-Industrial driver specification)."""
 _CONNECT_NS: Final = 3_000_000_000
 _LARGEST: Final = 1e3
-"""rad; what is larger is no measurement."""
+"""Largest valid measurement, rad."""
 _START_RAD: Final = 0.01
-"""A stream begins within this distance of where the joints stand: the program has no other point to count from."""
+"""Greatest distance of a stream's first target from the joints' positions, rad: the program starts from there."""
 
 
 class Connection:
-    """A TCP connection to one of the controller's servers, made again while there is none; nothing here waits.
+    """A TCP connection to one of the controller's servers, with automatic reconnection; does not block.
 
     Args:
-        name: of the server, for sentences.
+        name: name of the server in messages.
         host: IPv4 address.
-        port: of the server.
+        port: TCP port of the server.
     """
 
     def __init__(self, name: str, host: str, port: int) -> None:
@@ -72,12 +61,12 @@ class Connection:
         self._name = name
         self._address = host, port
         self._socket: socket.socket | None = None
-        self._decoder = FrameDecoder(ByteOrder.LITTLE)
+        self._decoder = FrameDecoder(messages.ByteOrder.LITTLE)
         self._due_ns = 0
-        """When to connect again; while connecting: when to give up."""
+        """Instant of the next attempt to connect; while connecting: of the timeout, ns."""
 
     def receive(self, now_ns: int) -> list[Frame]:
-        """Connect where there is no connection, and return what has arrived."""
+        """Connect if there is no connection, and return the received frames."""
         if self._socket is None:
             if now_ns >= self._due_ns:
                 self._connect(now_ns)
@@ -103,7 +92,7 @@ class Connection:
         return frames
 
     def send(self, data: bytes, now_ns: int) -> None:
-        """Send a message. One that does not fit whole means that the controller does not read: the connection ends."""
+        """Send a message; end the connection where the send buffer is full, as the controller does not read."""
         if self._socket is None or not self.is_open:
             return
         try:
@@ -115,12 +104,12 @@ class Connection:
             self._lose("it does not read", now_ns)
 
     def end(self, problem: str, now_ns: int) -> None:
-        """Close an open connection; a new one is made after a while."""
+        """Close an open connection; the next attempt to connect follows after `_RECONNECT_NS`."""
         if self.is_open:
             self._lose(problem, now_ns)
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection for good."""
         self.is_open = False
         if self._socket is not None:
             self._socket.close()
@@ -144,7 +133,7 @@ class Connection:
         if number:
             self._lose(os.strerror(number), now_ns)
             return False
-        self._decoder = FrameDecoder(ByteOrder.LITTLE)
+        self._decoder = FrameDecoder(messages.ByteOrder.LITTLE)
         self.is_open = True
         return True
 
@@ -162,7 +151,7 @@ class RapidData(ProcessData):
         config: the arm.
         bus: its bus.
         host: IPv4 address of the controller.
-        now: the clock, ns; another one where time is simulated.
+        now: clock, ns; a simulated one in tests.
     """
 
     def __init__(self, config: ArmConfig, bus: RapidBus, host: str, now: Callable[[], int] = monotonic_ns) -> None:
@@ -173,55 +162,55 @@ class RapidData(ProcessData):
         self.state = Connection("state server", host, bus.state_port)
         self.missing = Missing.CONNECTION
         self.accepted = self.refused = 0
-        """Points since the start."""
+        """Points accepted and refused since the start."""
         self.acceptance_s = 0.0
-        """How long the last acceptance took."""
+        """Time from the last point to its acceptance, s."""
         self._axes = axes = len(config.joints)
-        on_wire = max(axes, JOINTS)
+        on_wire = max(axes, messages.JOINTS)
         self._position = struct.Struct(f"<i{on_wire}f")
         self._point = struct.Struct(f"<i{on_wire}fff")
         self._unused = (0.0,) * (on_wire - axes)
         self._answer_ns = round(bus.answer_timeout_s * 1e9)
         self._state_ns = round(bus.state_period_s * 1e9)
         self._state = DriveState.NOT_READY_TO_SWITCH_ON
-        self._status: Status | None = None
-        """The newest one of this connection."""
+        self._status: messages.Status | None = None
+        """Newest status of this connection."""
         self._actual = [0.0] * axes
         self._positions_ns = self._status_ns = -self._state_ns - 1
-        """When the newest positions and the newest status came."""
+        """Instants of the newest positions and the newest status, ns."""
         self._targets = [0.0] * axes
         self._outputs = [_COMMANDED.pack(0.0, 0.0, 0)] * axes
         self._inputs = [_MEASURED.pack(0.0, DriveState.NOT_READY_TO_SWITCH_ON, Missing.CONNECTION)] * axes
         self._inputs.append(bytes(_UNIT.size))
         self._velocity = [joint.velocity for joint in config.joints]
         self._blocked = False
-        """Whether targets to follow were not sent: a stop is not answered, or the stream would begin elsewhere."""
+        """Whether targets were not sent: a stop is unanswered, or the first target is too far from the joints."""
         self.refusal = ""
-        """Why a point was refused, for people; empty: the stream goes on."""
+        """Message on a refused point; empty: none was refused."""
         self._reset()
 
     def _reset(self) -> None:
-        """Forget what is under way: the connection has ended, or everything stands."""
+        """Forget all pending points: the connection has ended, or the joints stand still."""
         self._reference: list[float] = []
-        """Target that the program has, rad: the last accepted one, or where the joints stood; empty: none."""
+        """Program's target, rad: the last accepted one, or the joints' positions at standstill; empty: none."""
         self._reference_ns = 0
-        """When the joints were commanded to be there."""
+        """Instant for which that target was commanded, ns."""
         self._offered: list[float] = []
-        """Target whose answer has not come, rad; empty: none."""
+        """Unanswered target, rad; empty: none."""
         self._offered_ns = 0
         self._waits = False
         """Whether a newer target than the offered one waits."""
         self._sequence = 0
-        """Number of the next point; above 0 something may be under way."""
+        """Number of the next point; above 0 the program may have points."""
         self._stop_ns = 0
-        """When the stop was sent whose answer has not come; 0: none."""
+        """Instant at which the unanswered stop was sent, ns; 0: none."""
         self._refused = False
-        """Whether a point was refused: what the program has is stopped, whatever is commanded."""
+        """Whether a point was refused: the program is stopped, whatever the command."""
 
     # -- the cycle ----------------------------------------------------------------------------------------------------
 
     def receive(self) -> int:
-        """Read what has arrived; return 1, or -1 where positions or status are older than `state_period_s`."""
+        """Read all received messages; return 1, or -1 where positions or status are older than `state_period_s`."""
         now = self._now()
         for frame in self.state.receive(now):
             self._read_state(frame, now)
@@ -241,7 +230,7 @@ class RapidData(ProcessData):
         return -1
 
     def send(self) -> None:
-        """Offer the newest targets, or stop what is under way where not all joints are to follow or may."""
+        """Offer the newest targets, or stop the program unless all joints are commanded and allowed to follow."""
         now = self._now()
         follows = True
         for i in range(self._axes):
@@ -253,38 +242,40 @@ class RapidData(ProcessData):
         if not follows or self._state is not DriveState.OPERATION_ENABLED:
             if self._sequence or self._offered or self._refused:
                 self._stop_ns = now
-                self._send_point(SpecialSequence.STOP_TRAJECTORY, self._targets, 0.0, now)
+                self._send_point(messages.SpecialSequence.STOP_TRAJECTORY, self._targets, 0.0, now)
             else:
                 self._reference = []
         elif not self._blocked:
             self._follow(now)
 
     def _at_start(self) -> bool:
-        """Return whether the targets are where the joints stand."""
+        """Return whether all targets are within `_START_RAD` of the joints' positions."""
         return all(abs(self._targets[i] - self._actual[i]) <= _START_RAD for i in range(self._axes))
 
     def _follow(self, now: int) -> None:
         if self._offered:
             self._waits = True
         elif not self._reference or self._targets == self._reference:
-            # Standing needs no message, and the way to the next target begins now.
+            # Standstill needs no message; the time to the next target counts from now.
             self._reference, self._reference_ns = self._targets.copy(), now
             self.refusal = ""
         elif now - self._reference_ns > self._answer_ns:
-            # The arm has come to rest by itself: it does not go on when a suspended loop does.
+            # The arm has come to rest by itself and must not move on when a suspended loop continues.
             self.motion.end(f"the loop stood still for {1e-9 * (now - self._reference_ns):.1f} s in a motion", now)
         else:
             duration_s = 1e-9 * (now - self._reference_ns)
             for i, target in enumerate(self._targets):
-                # A cycle that comes early asks for no higher speed than the joint's.
+                # An early cycle must not demand more than the joint's speed limit.
                 duration_s = max(duration_s, abs(target - self._reference[i]) / self._velocity[i])
             self._offered, self._offered_ns = self._targets.copy(), now
             self._send_point(self._sequence, self._offered, duration_s, now)
 
     def _send_point(self, sequence: int, targets: Sequence[float], duration_s: float, now: int) -> None:
         body = self._point.pack(sequence, *targets, *self._unused, 1.0, duration_s)
-        frame = Frame(MessageType.JOINT_TRAJ_PT, CommType.SERVICE_REQUEST, ReplyCode.INVALID, body)
-        self.motion.send(frame.pack(ByteOrder.LITTLE), now)
+        frame = Frame(
+            messages.MessageType.JOINT_TRAJ_PT, messages.CommType.SERVICE_REQUEST, messages.ReplyCode.INVALID, body
+        )
+        self.motion.send(frame.pack(messages.ByteOrder.LITTLE), now)
 
     def input(self, index: int) -> bytes:
         """Return the inputs of a node: the joints in their order, then the unit."""
@@ -296,9 +287,9 @@ class RapidData(ProcessData):
             self._outputs[index] = data
 
     def close(self) -> None:
-        """Stop what is under way and close the connections; may be called twice."""
+        """Stop the program and close the connections; may be called twice."""
         if self._sequence or self._offered:
-            self._send_point(SpecialSequence.STOP_TRAJECTORY, self._targets, 0.0, self._now())
+            self._send_point(messages.SpecialSequence.STOP_TRAJECTORY, self._targets, 0.0, self._now())
         self._reset()
         self.motion.close()
         self.state.close()
@@ -306,32 +297,32 @@ class RapidData(ProcessData):
     # -- messages -----------------------------------------------------------------------------------------------------
 
     def _read_state(self, frame: Frame, now: int) -> None:
-        """Take a message of the state server. Unknown ones are left out."""
-        if frame.msg_type == MessageType.STATUS:
-            with contextlib.suppress(MessageError):
-                self._status = Status.unpack(frame.body, ByteOrder.LITTLE)
+        """Read a message of the state server; unknown ones are ignored."""
+        if frame.msg_type == messages.MessageType.STATUS:
+            with contextlib.suppress(messages.MessageError):
+                self._status = messages.Status.unpack(frame.body, messages.ByteOrder.LITTLE)
                 self._status_ns = now
-        elif frame.msg_type == MessageType.JOINT_POSITION and len(frame.body) == self._position.size:
+        elif frame.msg_type == messages.MessageType.JOINT_POSITION and len(frame.body) == self._position.size:
             _, *joints = self._position.unpack(frame.body)
             if all(-_LARGEST <= joint <= _LARGEST for joint in joints):
                 self._actual[:] = joints[: self._axes]
                 self._positions_ns = now
 
     def _read_reply(self, frame: Frame, now: int) -> None:
-        """Take a reply of the motion server; only their order says to which request they belong."""
-        if frame.comm_type is not CommType.SERVICE_REPLY:
+        """Read a reply of the motion server; replies match requests by their order only."""
+        if frame.comm_type is not messages.CommType.SERVICE_REPLY:
             return
-        taken = frame.reply_code is ReplyCode.SUCCESS
-        if frame.msg_type != MessageType.JOINT_TRAJ_PT or not (self._offered or self._stop_ns):
+        accepted = frame.reply_code is messages.ReplyCode.SUCCESS
+        if frame.msg_type != messages.MessageType.JOINT_TRAJ_PT or not (self._offered or self._stop_ns):
             self.motion.end("a reply came that nothing had asked for", now)
         elif self._offered:
-            if taken:
+            if accepted:
                 self.accepted += 1
                 self.acceptance_s = 1e-9 * (now - self._offered_ns)
                 self._reference, self._reference_ns = self._offered, self._offered_ns
                 self._sequence += 1
             else:
-                # Offered again, with more time, it would be accepted, and lead past the points between.
+                # A repetition with more time would be accepted, but would skip the points in between.
                 self.refused += 1
                 self._refused = True
                 self.refusal = (
@@ -340,22 +331,22 @@ class RapidData(ProcessData):
                 )
             self._offered = []
             self._waits = False
-        elif taken:
+        elif accepted:
             self._reset()
         else:
-            # Only the end of the connection stops the arm now.
+            # Now only the end of the connection stops the arm.
             self.motion.end("it refused to stop", now)
 
     def _show(self) -> None:
-        """Show the joints what the newest messages say."""
+        """Write the inputs of the joints from the newest messages."""
         status = self._status
         if status is None or not self.motion.is_open:
             state, self.missing = DriveState.NOT_READY_TO_SWITCH_ON, Missing.CONNECTION
-        elif status.in_error is TriState.TRUE:
+        elif status.in_error is messages.TriState.TRUE:
             state, self.missing = DriveState.FAULT, Missing.CLEARANCE
-        elif status.e_stopped is TriState.TRUE or status.drives_powered is TriState.FALSE:
+        elif status.e_stopped is messages.TriState.TRUE or status.drives_powered is messages.TriState.FALSE:
             state, self.missing = DriveState.SWITCH_ON_DISABLED, Missing.MOTORS
-        elif status.motion_possible is TriState.FALSE:
+        elif status.motion_possible is messages.TriState.FALSE:
             state, self.missing = DriveState.READY_TO_SWITCH_ON, Missing.PROGRAM
         else:
             ends = self._blocked or self._refused
@@ -364,8 +355,8 @@ class RapidData(ProcessData):
         self._state = state
         for i in range(self._axes):
             self._inputs[i] = _MEASURED.pack(self._actual[i], state, self.missing)
-        is_stopped = status is not None and status.e_stopped is TriState.TRUE
-        mode = RobotMode.UNKNOWN if status is None else status.mode
+        is_stopped = status is not None and status.e_stopped is messages.TriState.TRUE
+        mode = messages.RobotMode.UNKNOWN if status is None else status.mode
         self._inputs[self._axes] = _UNIT.pack(
             self.accepted & 0xFFFFFFFF, self.refused & 0xFFFFFFFF, self._waits, self.acceptance_s, is_stopped,
             max(mode, 0),
@@ -381,14 +372,14 @@ class RapidMaster(Master):
 
     @staticmethod
     def check_interface(name: str) -> None:
-        """Raise BusError where this is no IPv4 address."""
+        """Raise BusError where `name` is no IPv4 address."""
         try:
             socket.inet_pton(socket.AF_INET, name)
         except OSError:
             raise BusError(f"{name} (`interface`) is no IPv4 address: that of the controller is expected") from None
 
     def start(self, directory: Path, report: Callable[[str], None]) -> RapidData:
-        """Begin to connect, which goes on in the cycle."""
+        """Begin to connect; the cycle continues that."""
         bus = self.config.bus
         assert isinstance(bus, RapidBus)
         if self.namespace_pid:
@@ -416,6 +407,6 @@ class RapidMaster(Master):
         return self.waiting_for() or ("" if self._data is None else self._data.refusal)
 
     def close(self) -> None:
-        """Stop what is under way and close the connections."""
+        """Stop the program and close the connections."""
         if self._data is not None:
             self._data.close()

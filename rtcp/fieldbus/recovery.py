@@ -1,4 +1,4 @@
-"""Recovery of slaves that are not in OP: what is known of each, the table of actions, one small step a turn."""
+"""Recovery of slaves that are not in OP: state of each slave, table of actions, one small step each poll."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from rtcp.fieldbus.al_state import ERROR_BIT, AlState, is_emulated, refusal
-from rtcp.fieldbus.bus import SlaveState, slave_label, station_of
+from rtcp.fieldbus.al_state import AlState, is_emulated
+from rtcp.fieldbus.bus import station_of
 from rtcp.fieldbus.errors import BusError, ForeignSlave
+from rtcp.fieldbus.port_errors import REPORT_INTERVAL_S
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, Steps
 from rtcp.fieldbus.slave_setup import SlaveRestorer, provisional_of
 from rtcp.fieldbus.topology import PortState, Topology, port_states
+from rtcp.ipc.codes import ERROR_BIT
+from rtcp.ipc.events import ErrorReported, Event, OtherSlaveAnswers, SlaveSetUpAgain, StateNotReached
 
 LONG_AGO = float("-inf")
-REPORT_INTERVAL_S = 10.0
-"""Least interval between two reports about one slave, s; the first one comes at once."""
 
 
 class Action(Enum):
-    """What is done with a slave."""
+    """Recovery action for a slave."""
 
     NOTHING = "nothing"
     ACKNOWLEDGE = "acknowledge its error"
@@ -31,7 +32,7 @@ class Action(Enum):
     MARK_LOST = "mark the slave lost; recover it when it answers again"
 
 
-# (state, error) -> what is done; any other state that answers is RECONFIGURE.
+# (state, error) -> action; RECONFIGURE for any other state of a slave that answers.
 TABLE: dict[tuple[AlState, bool], Action] = {
     (AlState.OP, False): Action.NOTHING,
     (AlState.OP, True): Action.ACKNOWLEDGE,
@@ -42,7 +43,7 @@ TABLE: dict[tuple[AlState, bool], Action] = {
 
 
 def action_for(state: AlState, error: bool) -> Action:
-    """Return the action for a slave in `state`."""
+    """Return the action of `TABLE` for a slave in `state`."""
     return TABLE.get((state, error), Action.RECONFIGURE)
 
 
@@ -51,45 +52,46 @@ class MonitoredSlave:
     """State, counters and pending work of one slave; written by the watcher and the recovery."""
 
     position: int
-    name: str
     state: AlState = AlState.OP
     error: bool = False
     code: int = 0
     lost: int = 0
-    """Times that it left OP."""
+    """Number of exits from OP."""
     recovered: int = 0
-    """Times that it came back to OP."""
+    """Number of returns to OP."""
     left_at: float | None = None
+    """Instant of its first exit from OP that is not reported as recovered (time.monotonic), s."""
     was_in_op: bool = True
+    """Whether it was in OP at the last poll."""
     back_at: float = LONG_AGO
     """Instant of its last return to OP (time.monotonic), s."""
     flaps: int = 0
-    """Times in a row that it left OP within 1 s of its return."""
-    kept: bool = False
-    """It is parked in PRE-OP and keeps its set-up."""
+    """Number of consecutive exits from OP within 1 s of the return."""
+    keeps_setup: bool = False
+    """Whether it is parked in PRE-OP with a valid configuration."""
     leaving: bool = False
-    """PRE-OP was requested and it has not left OP yet."""
+    """Whether PRE-OP was requested and it has not left OP yet."""
     provisional: bool = False
-    """It lost its address, and its restoration has given it another one for the time until it is known."""
+    """Whether it lost its address and has a provisional one until it is identified."""
     unfinished: bool = False
-    """A restoration was started and has not ended."""
+    """Whether a restoration was started and has not ended."""
     work: Steps[None] | None = None
-    asked: tuple[Action, AlState, bool, float] | None = None
-    """Requested action, state and error at the request, deadline."""
+    pending: tuple[Action, AlState, bool, float] | None = None
+    """Requested action, state and error at the request, deadline (time.monotonic, s)."""
     failed: int = 0
+    """Number of failed actions in a row."""
     pause_until: float = 0.0
+    """No action before this instant (time.monotonic), s."""
     probe_at: float = 0.0
+    """Instant of the next `_probe` (time.monotonic), s."""
     reported_at: float = LONG_AGO
+    """Instant of the last report of a failed action (time.monotonic), s."""
     fall_reported_at: float = LONG_AGO
+    """Instant of the last report of an exit from OP (time.monotonic), s."""
     unreported: int = 0
-    """Times that it left OP since the last report of that."""
+    """Number of exits from OP since the last report."""
     return_due: bool = False
-    """Its return is to be reported, because its fall was."""
-
-    @property
-    def label(self) -> str:
-        """Name in messages."""
-        return slave_label(self.position, self.name)
+    """Whether to report its return, because its fall was reported."""
 
     @property
     def station(self) -> int:
@@ -102,14 +104,15 @@ class MonitoredSlave:
         return self.state is AlState.OP and not self.error and not self.leaving
 
     def update(self, state: AlState, error: bool, code: int) -> None:
-        """Store the state that its AL status shows."""
+        """Store its AL status."""
         self.state, self.error, self.code = state, error, code
         if state not in (AlState.OP, AlState.NONE):
             self.leaving = False
 
-    def words(self) -> str:
-        """Return its state, with the AL status code, in words."""
-        return SlaveState(self.position, self.station, self.name, self.state, self.error, self.code).words()
+    @property
+    def al_status(self) -> int:
+        """State and error indication as in the register."""
+        return self.state | (ERROR_BIT if self.error else 0)
 
 
 _REQUESTS = {
@@ -120,13 +123,17 @@ _REQUESTS = {
 _TRIES = 3
 """Refusals before a slave is set up again."""
 _PAUSE_S, _LONGEST_PAUSE_S, _FOREIGN_PAUSE_S = 1.0, 5.0, 10.0
-_PATIENCE_S = 3.0
+"""Pause after a failed action, longest pause, and pause after an answer of another device, s."""
+_TRANSITION_S = 3.0
+"""Time for a change of state after its request, s."""
 _WELL_S = 1.0
-"""A slave that leaves OP sooner than this after its return has not recovered, s."""
+"""Least time in OP after which a slave counts as recovered, s."""
 _PROBE_S = 0.05
-_POLL_S = 0.0003
+"""Interval between two checks whether a lost slave answers, s."""
+_STEP_S = 0.0003
+"""Pause between two steps of a restoration, s."""
 _STEPS_S = 0.003
-"""Time for restorations in one turn, s; several steps fit where a slave answers at once."""
+"""Time for restorations in one poll, s; several steps fit where a slave answers at once."""
 
 
 class SlaveRecovery:
@@ -136,7 +143,7 @@ class SlaveRecovery:
         port: the port for registers.
         slaves: the slaves in the order of the cable.
         restorer: sets up a slave again.
-        report: receives the messages.
+        report: receives the events.
         topology: the tree of the slaves.
     """
 
@@ -145,7 +152,7 @@ class SlaveRecovery:
         port: RegisterPort,
         slaves: Sequence[MonitoredSlave],
         restorer: SlaveRestorer,
-        report: Callable[[str], None],
+        report: Callable[[Event], None],
         topology: Topology,
     ) -> None:
         self._port = port
@@ -176,19 +183,19 @@ class SlaveRecovery:
 
     def _next_action(self, slave: MonitoredSlave, now: float) -> None:
         state, error = slave.state, slave.error
-        if slave.asked is not None:
-            action, state_then, error_then, until = slave.asked
-            same = (state, error) == (state_then, error_then)
-            if same and now < until:
+        if slave.pending is not None:
+            action, state_then, error_then, until = slave.pending
+            unchanged = (state, error) == (state_then, error_then)
+            if unchanged and now < until:
                 return
-            slave.asked = None
-            if same or (action in _REQUESTS and error):
+            slave.pending = None
+            if unchanged or (action in _REQUESTS and error):
                 self._fail(slave, now, _REQUESTS.get(action, state))
                 return
         if now < slave.pause_until:
             return
         action = action_for(state, error)
-        if slave.kept and state is AlState.PREOP and not error:
+        if slave.keeps_setup and state is AlState.PREOP and not error:
             action = Action.REQUEST_SAFEOP
         if (slave.failed >= _TRIES or slave.unfinished) and action is not Action.MARK_LOST:
             action = Action.RECONFIGURE
@@ -201,20 +208,20 @@ class SlaveRecovery:
         elif action is Action.RECONFIGURE:
             self._start_restoration(slave, None)
         elif action is Action.ACKNOWLEDGE:
-            slave.asked = action, state, error, now + _PAUSE_S
+            slave.pending = action, state, error, now + _PAUSE_S
             self.request(slave, state, acknowledge=True)
         else:
-            slave.asked = action, state, error, now + _PATIENCE_S
+            slave.pending = action, state, error, now + _TRANSITION_S
             self.request(slave, _REQUESTS[action], acknowledge=error)
 
     def request(self, slave: MonitoredSlave, state: AlState, *, acknowledge: bool = False) -> bool:
-        """Request `state` of a slave; return False where it certainly did not receive that."""
+        """Request `state` of a slave; return False if no slave processed the frame. A lost frame may have arrived."""
         word = state | (ERROR_BIT if acknowledge and not is_emulated(self._port, slave.station) else 0)
         data = word.to_bytes(2, "little")
         return self._port.exchange(DatagramCommand.FPWR, slave.station, Register.AL_CONTROL, data, tries=1).wkc != 0
 
     def note_fall(self, slave: MonitoredSlave, now: float) -> None:
-        """Note that a slave left OP; one that does so repeatedly is brought back after pauses, and set up again."""
+        """Record an exit from OP. Repeated ones lead to pauses before the recovery, and then to a new set-up."""
         if now - slave.back_at < _WELL_S:
             slave.flaps += 1
             slave.pause_until = now + min(_PAUSE_S * slave.flaps, _LONGEST_PAUSE_S)
@@ -225,15 +232,14 @@ class SlaveRecovery:
 
     def _fail(self, slave: MonitoredSlave, now: float, wanted: AlState) -> None:
         slave.failed += 1
-        slave.kept = False
+        slave.keeps_setup = False
         slave.pause_until = now + _PAUSE_S
-        found = slave.state | (ERROR_BIT if slave.error else 0)
-        self.report_limited(slave, refusal(slave.label, wanted, found, slave.code) + "; it is asked again every second")
+        self.report_refusal(slave, wanted)
 
     def _probe(self, slave: MonitoredSlave, now: float) -> None:
-        """Look whether a slave that lost its address has come back to its place."""
-        slave.asked = None
-        slave.kept = False
+        """Check whether a slave that lost its address answers at its position again."""
+        slave.pending = None
+        slave.keeps_setup = False
         if now < slave.probe_at:
             return
         slave.probe_at = now + _PROBE_S
@@ -246,31 +252,29 @@ class SlaveRecovery:
         if wkc != 1:
             return
         station = int.from_bytes(data, "little")
-        other = next((one for one in self._slaves if one.station == station), None)
-        if other is None:
+        answering = next((peer for peer in self._slaves if peer.station == station), None)
+        if answering is None:
             self._start_restoration(slave, place)
-        elif other is not slave:
+        elif answering is not slave:
             slave.pause_until = now + _PAUSE_S
-            self.report_limited(
-                slave, f"{slave.label}: at its place answers {other.label}: put the cables back in their order"
-            )
+            self._report_limited(slave, OtherSlaveAnswers(slave.position, answering.position))
 
     def _place_of(self, slave: MonitoredSlave) -> int | None:
-        """Return at which place in the frame's way a lost slave would answer, from 1; None: it cannot be there now.
+        """Return at which place, from 1, among the answering slaves a lost slave answers; None: unknown at present.
 
-        Places count who answers. Whoever is lost and hangs at a slave that answers, behind a port with a link, is there
-        without an address: the first of them in the frame's way gets one first, the places behind it are not known yet.
+        A lost slave without an address can answer if its parent answers and has a link to it. Of several such slaves
+        only the place of the first is certain: the next one's is known when the first has an address.
         """
-        addressed = {other.position for other in self._slaves if other is not slave and self._has_address(other)}
+        addressed = {peer.position for peer in self._slaves if peer is not slave and self._has_address(peer)}
         if self._reached <= len(addressed):
             return None
-        for other in self._slaves:
-            if other.position not in addressed and self._is_linked(other):
-                return 1 + sum(position < slave.position for position in addressed) if other is slave else None
+        for peer in self._slaves:
+            if peer.position not in addressed and self._is_linked(peer):
+                return 1 + sum(position < slave.position for position in addressed) if peer is slave else None
         return None
 
     def _has_address(self, slave: MonitoredSlave) -> bool:
-        """Whether a slave answers at its own address, or at the one that its restoration has given it."""
+        """Whether a slave answers at its own or its provisional address."""
         if slave.state is not AlState.NONE:
             return True
         if (
@@ -281,7 +285,7 @@ class SlaveRecovery:
         return slave.provisional
 
     def _is_linked(self, slave: MonitoredSlave) -> bool:
-        """Whether the slave before it answers and has a link to it."""
+        """Whether its parent answers and has a link to it."""
         parent = self._topology.parent(slave.position)
         if not parent:
             return True
@@ -294,13 +298,12 @@ class SlaveRecovery:
         return ports[self._topology.port(slave.position)] is PortState.OPEN
 
     def _start_restoration(self, slave: MonitoredSlave, place: int | None) -> None:
-        slave.asked = None
-        slave.kept = False
+        slave.pending = None
+        slave.keeps_setup = False
         slave.unfinished = True
         slave.provisional = place is not None
-        what = "it was without supply" if place is not None else f"it is in {slave.words()}"
         if slave.failed == 0 and slave.flaps == 0:
-            self._report(f"{slave.label} is set up again: {what}")
+            self._report(SlaveSetUpAgain(slave.position, slave.al_status, slave.code))
         slave.work = self._restorer.restore(slave.position, place)
 
     def _continue_restoration(self, slave: MonitoredSlave, until: float) -> None:
@@ -309,7 +312,7 @@ class SlaveRecovery:
         try:
             next(work)
             while time.monotonic() < until:
-                time.sleep(_POLL_S)
+                time.sleep(_STEP_S)
                 next(work)
         except StopIteration:
             slave.work = None
@@ -320,18 +323,21 @@ class SlaveRecovery:
             slave.failed += 1
             pause = min(_PAUSE_S * slave.failed, _LONGEST_PAUSE_S)
             slave.pause_until = time.monotonic() + (_FOREIGN_PAUSE_S if isinstance(error, ForeignSlave) else pause)
-            self.report_limited(slave, "; ".join(error.sentences))
+            self._report_limited(slave, ErrorReported("; ".join(error.sentences)))
 
     def drop(self, slave: MonitoredSlave) -> None:
         """Abandon the pending request or restoration of a slave."""
-        slave.asked = None
+        slave.pending = None
         if slave.work is not None:
             slave.work.close()
             slave.work = None
 
-    def report_limited(self, slave: MonitoredSlave, sentence: str) -> None:
-        """Report something about a slave, at most every 10 s."""
+    def report_refusal(self, slave: MonitoredSlave, requested: AlState) -> None:
+        """Report that a slave did not reach a state, at most every 10 s."""
+        self._report_limited(slave, StateNotReached(slave.position, requested, slave.al_status, slave.code))
+
+    def _report_limited(self, slave: MonitoredSlave, event: Event) -> None:
         now = time.monotonic()
         if now - slave.reported_at >= REPORT_INTERVAL_S:
             slave.reported_at = now
-            self._report(sentence)
+            self._report(event)

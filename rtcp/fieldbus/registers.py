@@ -1,8 +1,8 @@
-"""Registers of the slaves, read and written beside the cycle by a socket of their own.
+"""Registers of the slaves, read and written outside the cycle through a separate socket.
 
-SOEM's functions hold the interpreter while they wait for a frame; a thread that waits here does not. Datagram indices
-from 0x80 up tell these frames from SOEM's, which uses 0 to 15 (EC_MAXBUF); a filter in the kernel gives each socket its
-own answers only. Frames: ETG.1000.4, 5.4 and 5.5.
+SOEM's functions hold the interpreter while they wait for a frame; these do not. Datagram indices from 0x80 up
+distinguish these frames from SOEM's, which uses 0 to 15 (EC_MAXBUF); a filter in the kernel gives each socket its own
+answers only. Frames: ETG.1000.4, 5.4 and 5.5.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rtcp.fieldbus.errors import BusError
 
 ETHERTYPE = 0x88A4
 FIRST_INDEX, LAST_INDEX = 0x80, 0xEF
-"""Datagram indices of this port; those above are the frame barrier's."""
+"""Datagram indices of this port; the frame barrier uses those above."""
 _COMMAND_AT, _INDEX_AT, _STATION_AT, _ADDRESS_AT, _LENGTH_AT = 16, 17, 18, 20, 22
 _LENGTH_MASK = 0x07FF
 _DATA_AT = 26
@@ -63,10 +63,10 @@ class Register(IntEnum):
     FMMU = 0x0600
     SYNC_MANAGER = 0x0800
     DC_PORT_RECEIVE_TIMES = 0x0900
-    """A write latches the local time, in every slave that the frame passes, here and in DC_RECEIVE_TIME."""
+    """A write latches the local time here and in DC_RECEIVE_TIME, in every slave that the frame passes."""
     DC_SYSTEM_TIME = 0x0910
     DC_RECEIVE_TIME = 0x0918
-    """Local time at which the processing unit received the frame that latched, ns."""
+    """Local time at which the processing unit received the latching frame, ns."""
     DC_OFFSET = 0x0920
     DC_DELAY = 0x0928
     """Propagation delay from the reference clock, ns."""
@@ -77,7 +77,7 @@ class Register(IntEnum):
     """Bit 0 cyclic operation, bit 1 SYNC0, bit 2 SYNC1."""
     DC_START = 0x0990
     DC_SYNC0_CYCLE = 0x09A0
-    """Four bytes; those of SYNC1 follow."""
+    """Cycle of SYNC0, 4 bytes, ns; the 4 bytes of SYNC1 follow."""
 
 
 DEVICE_EMULATION = 0x01
@@ -86,14 +86,14 @@ FEATURE_DC = 0x04
 """Bit of FEATURES: the slave has a distributed clock."""
 _ANSWER_S = 0.02
 TRIES, PATIENT_TRIES = 3, 25
-"""Frames for a datagram: beside the cycle, where a quick answer counts, and before it, where half a second without any
-is no shared host's stall."""
+"""Attempts for a datagram: beside the cycle, for a quick answer, and before it, for half a second, which is longer than
+a shared host's stall."""
 _BY_STATION = (DatagramCommand.FPRD, DatagramCommand.FPWR)
 _NOT_TAKEN = "{label} did not take what was written to register 0x{address:04X}"
 
 
 class Answer(NamedTuple):
-    """What came back: data and working counter, -1 where no frame came."""
+    """Returned data and working counter; -1: no frame came back."""
 
     data: bytes
     wkc: int
@@ -109,10 +109,10 @@ def build_frame(command: DatagramCommand, index: int, station: int, address: int
 
 
 def open_socket(interface: str, first: int, last: int) -> socket.socket:
-    """Return a packet socket that receives EtherCAT frames whose first datagram's index is in `first`..`last`.
+    """Return a packet socket that receives only EtherCAT frames whose first datagram's index is in `first`..`last`.
 
     Raises:
-        BusError: no such interface, or no right to raw sockets.
+        BusError: no such interface, or no permission for raw sockets.
     """
     try:
         port = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
@@ -120,7 +120,7 @@ def open_socket(interface: str, first: int, last: int) -> socket.socket:
         raise BusError(f"a raw socket on {interface} needs the capability CAP_NET_RAW (or root): {error}") from error
     try:
         attach_filter(port, first, last)
-        # Bound last: with protocol 0 the socket receives nothing before its filter stands.
+        # Bind last: with protocol 0 the socket receives nothing before its filter is attached.
         port.bind((interface, ETHERTYPE))
     except OSError as error:
         port.close()
@@ -129,7 +129,7 @@ def open_socket(interface: str, first: int, last: int) -> socket.socket:
 
 
 def attach_filter(port: socket.socket, first: int, last: int) -> None:
-    """Let packet socket `port` receive frames only whose first datagram's index is in `first`..`last`."""
+    """Limit packet socket `port` to frames whose first datagram's index is in `first`..`last`."""
     # Classic BPF: A = byte 17; below `first` or above `last`: drop; else accept.
     lines = ((0x30, 0, 0, _INDEX_AT), (0x35, 0, 2, first), (0x25, 1, 0, last), (0x06, 0, 0, 0xFFFF), (0x06, 0, 0, 0))
     program = b"".join(struct.pack("=HBBI", *line) for line in lines)
@@ -138,10 +138,10 @@ def attach_filter(port: socket.socket, first: int, last: int) -> None:
 
 
 def _answers(frame: bytes, sent: bytes, length: int) -> bool:
-    """Whether `frame` is what was sent, come back. Indices are reused soon, so the index alone is not enough."""
+    """Whether `frame` is the answer to `sent`. Indices are reused soon, so more than the index is compared."""
     if len(frame) < _DATA_AT + length + 2 or frame[_COMMAND_AT:_STATION_AT] != sent[_COMMAND_AT:_STATION_AT]:
         return False
-    # Each slave counts up the station field of every command that goes by position or to all of them.
+    # Each slave increments the station field of auto-increment and broadcast commands.
     kept = _STATION_AT if sent[_COMMAND_AT] in _BY_STATION else _ADDRESS_AT
     if frame[kept:_LENGTH_AT] != sent[kept:_LENGTH_AT]:
         return False
@@ -149,10 +149,10 @@ def _answers(frame: bytes, sent: bytes, length: int) -> bool:
 
 
 class RegisterPort:
-    """Single datagrams to one slave or to all of them. Its methods may be called from any thread."""
+    """Sends single datagrams to one slave or to all. Its methods may be called from any thread."""
 
     tries = TRIES
-    """Frames for a datagram of which no other number is asked for; all of them lost: the slave does not answer."""
+    """Default number of attempts for a datagram; after that the slave counts as not answering."""
 
     def __init__(self, interface: str) -> None:
         """Open the port; raises BusError where the interface cannot be opened."""
@@ -170,10 +170,10 @@ class RegisterPort:
         timeout_s: float = _ANSWER_S,
         tries: int | None = None,
     ) -> Answer:
-        """Send a datagram and wait for it to come back; a lost frame is sent again, `tries` times in all."""
+        """Send a datagram and wait for its return; repeat a lost frame, `tries` attempts in all."""
         with self._lock:
             for _ in range(self.tries if tries is None else tries):
-                # A new index each time: a late answer to the former try is not taken for this one's.
+                # A new index each time distinguishes a late answer to the former attempt.
                 self._index = FIRST_INDEX if self._index >= LAST_INDEX else self._index + 1
                 frame = build_frame(command, self._index, station, address, data)
                 try:
@@ -199,7 +199,7 @@ class RegisterPort:
 
     @property
     def patience_s(self) -> float:
-        """For how long a service of several datagrams is tried again; beside the cycle not for long: 0."""
+        """Time for which a service of several datagrams is repeated, s; 0 beside the cycle."""
         return (self.tries - TRIES) * _ANSWER_S
 
     def read(self, station: int, address: int, length: int, *, tries: int | None = None) -> bytes | None:
@@ -209,25 +209,25 @@ class RegisterPort:
         return data if wkc == 1 else None
 
     def write(self, station: int, address: int, data: bytes) -> bool:
-        """Write registers of the slave at configured address `station` (FPWR); return whether it took them."""
+        """Write registers of the slave at configured address `station` (FPWR); return whether it did."""
         return self.exchange(DatagramCommand.FPWR, station, address, data).wkc == 1
 
     def put(self, station: int, address: int, data: bytes, label: str) -> None:
-        """Write registers as `write` does; raises BusError where the slave, named `label`, does not take them."""
+        """Do `write`; raise BusError where that fails; `label`: the slave in the message."""
         if not self.write(station, address, data):
             raise BusError(_NOT_TAKEN.format(label=label, address=address))
 
     def read_at(self, position: int, address: int, length: int) -> bytes | None:
-        """Return registers of the slave at `position` on the cable (APRD), which needs no station address for it."""
+        """Return registers of the slave at `position` on the cable (APRD), which works without a station address."""
         data, wkc = self.exchange(DatagramCommand.APRD, 1 - position & 0xFFFF, address, bytes(length))
         return data if wkc == 1 else None
 
     def write_at(self, position: int, address: int, data: bytes) -> bool:
-        """Write registers of the slave at `position` on the cable (APWR); return whether it took them."""
+        """Write registers of the slave at `position` on the cable (APWR); return whether it did."""
         return self.exchange(DatagramCommand.APWR, 1 - position & 0xFFFF, address, data).wkc == 1
 
     def read_all(self, address: int, length: int) -> Answer:
-        """Read registers of all slaves (BRD): data OR-ed together, the working counter is their number."""
+        """Read registers of all slaves (BRD): OR of their data, and their number as working counter."""
         return self.exchange(DatagramCommand.BRD, 0, address, bytes(length))
 
     def write_all(self, address: int, data: bytes) -> int:
@@ -245,18 +245,18 @@ _POLL_S = 0.0002
 
 
 def finish(steps: Steps[T]) -> T:
-    """Take all steps, asleep between them; return what they return, raise what they raise."""
+    """Run all steps, with sleeps between them; return their result or raise their exception."""
     while True:
         try:
             next(steps)
         except StopIteration as end:
-            found: T = end.value
-            return found
+            result: T = end.value
+            return result
         time.sleep(_POLL_S)
 
 
 def pause(seconds: float) -> Steps[None]:
-    """Let time pass."""
+    """Yield until this time has passed."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         yield

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from rtcp.esi.sii import END, HEADER_BYTES, SYNC_MANAGERS, read_sync_managers
-from rtcp.fieldbus.al_state import ERROR_BIT, AlState, code_meaning, read_al, state_name
+from rtcp.fieldbus.al_state import AlState, read_al
 from rtcp.fieldbus.bus import MailboxInfo, PdoInfo, SlaveInfo, SyncManagerInfo
 from rtcp.fieldbus.describe import read_entry
 from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
@@ -18,18 +18,19 @@ from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, reading_assignment
 from rtcp.fieldbus.port_errors import ERROR_COUNTERS_SIZE, read_port_errors
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, finish
 from rtcp.fieldbus.topology import port_states
+from rtcp.ipc.codes import ERROR_BIT, code_meaning, state_name
 
 _DEVICE_NAME = 0x1008
 _SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
 _EEPROM_US = 500_000
-"""For a word of it: a shared host may be off its CPU for longer than the 20 ms that pysoem gives it."""
+"""Timeout for a word of the EEPROM, us: a shared host may be off its CPU for longer than pysoem's 20 ms."""
 _SMALLEST_MAILBOX = 16
-"""Bytes: headers and an SDO (ETG.1000.6, 5.6.2)."""
+"""Smallest valid mailbox, bytes: headers and an SDO (ETG.1000.6, 5.6.2)."""
 _PROTOCOLS = ("AoE", "EoE", "CoE", "FoE", "SoE", "VoE")
 """Bits 0 to 5 of SII word 0x1C (ETG.2010, table 4)."""
 _SYNC_MANAGER = struct.Struct("<HHBBBB")
 _MOST_CATEGORIES, _SYNC_MANAGERS_WORDS = 64, 32
-"""How many categories of an EEPROM are passed; words of eight sync managers in it."""
+"""Most categories of an EEPROM that are read; size of eight sync managers in it, words."""
 
 
 def read_mailbox(slave: Any) -> MailboxInfo | None:
@@ -45,7 +46,7 @@ def read_mailbox(slave: Any) -> MailboxInfo | None:
 
 
 def name_of(slave: Any) -> str:
-    """Return the name that the EEPROM of pysoem's `slave` gives; bytes that are no UTF-8 are taken for Latin-1."""
+    """Return the name in the EEPROM of pysoem's `slave`, decoded as UTF-8, else as Latin-1."""
     try:
         return str(slave.name)
     except UnicodeDecodeError as error:
@@ -53,12 +54,12 @@ def name_of(slave: Any) -> str:
 
 
 def read_serial(slave: Any) -> int:
-    """Return the serial number in the EEPROM."""
+    """Return the serial number in the EEPROM of pysoem's `slave`."""
     return int.from_bytes(slave.eeprom_read(_SII_SERIAL, _EEPROM_US), "little")
 
 
 def _with_names(sdo: SdoClient, pdos: tuple[PdoInfo, ...]) -> tuple[PdoInfo, ...]:
-    """Return the PDOs with the names of their entries, as far as the slave offers SDO information."""
+    """Return the PDOs with the names of their entries, where the slave supports SDO information."""
     offered = True
 
     def name(index: int, sub_index: int) -> str:
@@ -83,15 +84,15 @@ def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, .
     data = port.read(station, Register.SYNC_MANAGER, 4 * _SYNC_MANAGER.size)
     if data is None:
         return ()
-    found = []
+    managers = []
     for number, (start, length, control, _status, activate, _pdi) in enumerate(_SYNC_MANAGER.iter_unpack(data)):
         if start:
-            found.append(SyncManagerInfo(number, start, length, control, bool(activate & 1)))
-    return tuple(found)
+            managers.append(SyncManagerInfo(number, start, length, control, bool(activate & 1)))
+    return tuple(managers)
 
 
 def watchdog_off(port: RegisterPort, station: int) -> tuple[int, ...]:
-    """Return the sync managers whose outputs do not trigger the watchdog by the EEPROM; none where it is unreadable."""
+    """Return the sync managers whose outputs, by the EEPROM, do not trigger the watchdog; none if it is unreadable."""
 
     def read(word: int) -> bytes:
         return finish(reading_words(port, station, word, ""))[:4]
@@ -118,7 +119,7 @@ def watchdog_off(port: RegisterPort, station: int) -> tuple[int, ...]:
 def describe(
     slave: Any, sdo: SdoClient, port: RegisterPort, station: int, mailbox: MailboxInfo | None, serial: int
 ) -> SlaveInfo:
-    """Return the description of a slave; what it does not provide is empty.
+    """Return the description of a slave; fields that it does not provide are empty.
 
     Args:
         slave: pysoem's slave, in PRE-OP where it has a mailbox.
@@ -139,14 +140,14 @@ def describe(
     outputs: tuple[PdoInfo, ...] = ()
     inputs: tuple[PdoInfo, ...] = ()
     if has_coe and state in {AlState.PREOP, AlState.SAFEOP, AlState.OP}:
-        # SOEM reads the EEPROM's strings once for all slaves of one identity, which may differ in the name.
+        # SOEM reads the EEPROM's strings once for all slaves of one identity, whose names may differ.
         with contextlib.suppress(BusError):
             name = sdo.read(_DEVICE_NAME, 0).rstrip(b"\0").decode("latin-1")
         try:
             outputs = _with_names(sdo, finish(reading_assignment(sdo, RX_ASSIGN)))
             inputs = _with_names(sdo, finish(reading_assignment(sdo, TX_ASSIGN)))
         except BusError:
-            # A slave need not have assignment objects (ETG.1000.6, 5.6.7.4): its PDOs are then fixed in its EEPROM.
+            # Without assignment objects (ETG.1000.6, 5.6.7.4) the PDOs are fixed in the EEPROM.
             outputs, inputs = (), ()
     dc = bool(register(Register.FEATURES, 2) & FEATURE_DC)
     return SlaveInfo(

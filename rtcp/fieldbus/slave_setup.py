@@ -1,7 +1,7 @@
-"""Setting up one slave: in PRE-OP before the cycle, and again beside it after the slave has lost its set-up.
+"""Set-up of one slave: in PRE-OP before the cycle, and again beside it after the slave has lost its set-up.
 
 Everything written is read back. `SlaveRestorer` does for one slave beside the cycle what `SoemBus.configure` does
-through SOEM for all: what SOEM chose (FMMUs, sync managers, delays) is copied after `configure` and written back.
+through SOEM for all: SOEM's choices (FMMUs, sync managers, delays) are copied after `configure` and written back.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
 from rtcp.config.scaling import OBJECTS_PER_AXIS
-from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
+from rtcp.fieldbus.al_state import AlState, read_al, request_state
 from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
@@ -26,6 +26,7 @@ from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
 from rtcp.fieldbus.scaling import check_quick_stop, compare_scaling
 from rtcp.fieldbus.scan import name_of
+from rtcp.ipc.codes import ERROR_BIT, refusal
 
 _FMMUS_SIZE = 0x80
 _SYNC_MANAGER_SIZE, _SYNC_MANAGER_COUNT = 8, 8
@@ -43,21 +44,21 @@ _STATE_S = 3.0
 
 @dataclass(frozen=True)
 class SlaveSetup:
-    """What a slave's registers hold after `configure`, beside what its object dictionary does."""
+    """Contents of a slave's registers after `configure`."""
 
     fmmus: bytes
     sync_managers: tuple[bytes, ...]
     """Eight bytes each, status and the slave's own byte left out."""
     delay: bytes | None
-    """Propagation delay from the reference clock, as register 0x0928 holds it; None: it has no clock."""
+    """Propagation delay from the reference clock, content of register 0x0928; None: it has no clock."""
     serial: int
     """Serial number in its EEPROM; 0: it has none."""
     mailboxes: int
-    """How many sync managers, from 0 on, are mailboxes."""
+    """Number of mailbox sync managers, from 0 on."""
 
 
 def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SlaveSetup:
-    """Return a slave's set-up as its registers hold it; `serial`: its serial number. Raises BusError: no answer."""
+    """Return a slave's set-up from its registers; `serial`: its serial number. Raises BusError: no answer."""
     station = station_of(position)
     fmmus = port.read(station, Register.FMMU, _FMMUS_SIZE)
     managers = port.read(station, Register.SYNC_MANAGER, _SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT)
@@ -67,20 +68,20 @@ def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> Sl
     own = [managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE)]
     return SlaveSetup(
         fmmus,
-        tuple(one[:5] + bytes((0, one[_ACTIVATE] & 1, 0)) for one in own),
+        tuple(registers[:5] + bytes((0, registers[_ACTIVATE] & 1, 0)) for registers in own),
         port.read(station, Register.DC_DELAY, 4) if features[0] & FEATURE_DC else None,
         serial,
-        sum(one[_CONTROL] & _MODE == _MAILBOX for one in own[:2]),
+        sum(registers[_CONTROL] & _MODE == _MAILBOX for registers in own[:2]),
     )
 
 
 def provisional_of(position: int) -> int:
-    """Return the address of a slave that has lost its own, until it is known to be the right one."""
+    """Return the provisional address of a slave that has lost its own, until it is identified."""
     return 0x2000 + position
 
 
 class SlaveRestorer:
-    """Sets up single slaves again, each in steps of a few frames."""
+    """Sets up single slaves again, in steps of a few frames each."""
 
     def __init__(
         self,
@@ -90,14 +91,14 @@ class SlaveRestorer:
         sdo: Callable[[int], SdoClient],
         period_ns: int,
     ) -> None:
-        """Take the configured segment.
+        """Prepare for a configured segment.
 
         Args:
             port: the port for registers.
             slaves: the slaves of the configuration, in the order of the cable.
             set_ups: their registers after `configure`.
-            sdo: gives SDO access to the slave at a position.
-            period_ns: the cycle.
+            sdo: returns SDO access to the slave at a position.
+            period_ns: period of the cycle, ns.
         """
         self._port = port
         self._slaves = slaves
@@ -111,29 +112,29 @@ class SlaveRestorer:
 
         Args:
             position: its position on the cable, from 1.
-            place: where in the frame's way it answers, from 1: it was without supply and has no station address. None:
-                it has one.
+            place: its place in the frame's path, from 1, if it lost its supply and has no station address. None: it has
+                one.
 
         Raises:
             ForeignSlave: another device answers there.
-            BusError: it refuses something, or stops answering.
+            BusError: it refuses a service, or stops answering.
         """
         port, station, config = self._port, station_of(position), self._slaves[position - 1]
         set_up, label = self._set_ups[position - 1], self._label(position)
-        found_at = station
+        address = station
         if place is not None:
-            # Its place changes with whoever comes or goes before it: from here on an address of its own is used.
-            found_at = provisional_of(position)
-            self._write_address(position, found_at, partial(port.write_at, place), partial(port.read_at, place))
-            yield from self._identify(position, found_at)
+            # Its place changes when slaves before it come or go, so it gets an address at once.
+            address = provisional_of(position)
+            self._write_address(position, address, partial(port.write_at, place), partial(port.read_at, place))
+            yield from self._identify(position, address)
         if set_up.delay is not None:
-            # SYNC0 first: it must not run on while the time is set. The address last: the frames of the cycle ask the
+            # SYNC0 first: it must not run while the time is set. The address last: the frames of the cycle read the
             # reference clock by its address, and every other slave follows its time.
-            port.put(found_at, Register.DC_ACTIVATION, b"\0", label)
-            others = [other for other in self._clocks if other != position]
-            take_over_time(port, found_at, label, set_up.delay, others, always=place is not None)
+            port.put(address, Register.DC_ACTIVATION, b"\0", label)
+            others = [clock for clock in self._clocks if clock != position]
+            take_over_time(port, address, label, set_up.delay, others, always=place is not None)
         if place is not None:
-            self._write_address(position, station, partial(port.write, found_at), partial(port.read, station))
+            self._write_address(position, station, partial(port.write, address), partial(port.read, station))
         if set_up.delay is not None:
             forget_drift(port, station, label)
         yield
@@ -167,7 +168,7 @@ class SlaveRestorer:
                 f"0x{product:08X}), expected {device.name} (vendor 0x{device.vendor_id:08X}, product "
                 f"0x{device.product_id:08X}): it is left alone; put the right one there"
             )
-        # Two of a kind that were swapped move each other's joint.
+        # Two swapped drives of one type would move each other's joint.
         expected = self._set_ups[position - 1].serial
         if expected and (serial := (yield from self._reading_eeprom(position, station, _SII_SERIAL))) != expected:
             raise ForeignSlave(
@@ -177,7 +178,7 @@ class SlaveRestorer:
             )
 
     def _reading_eeprom(self, position: int, station: int, word: int) -> Steps[int]:
-        """Return four bytes of the EEPROM from `word` on; at power-on the device may have it, it is taken by force."""
+        """Return four bytes of the EEPROM from `word` on; takes the access, which the device may have at power-on."""
         label = self._label(position)
         if not eeprom_to_master(self._port, station):
             raise BusError(
@@ -203,7 +204,7 @@ class SlaveRestorer:
             if any(setting):
                 address = Register.SYNC_MANAGER + number * _SYNC_MANAGER_SIZE
                 port.put(station, address, setting, label)
-                # The control byte holds the trigger of the process-data watchdog.
+                # The control byte contains the trigger of the process-data watchdog.
                 if port.read(station, address, _CONTROL + 1) != setting[: _CONTROL + 1]:
                     raise BusError(f"{label} does not keep sync manager {number} (register 0x{address:04X})")
 
@@ -214,13 +215,13 @@ class SlaveRestorer:
         deadline = time.monotonic() + _STATE_S
         while True:
             yield
-            found, error, code = read_al(port, station)
-            if found is state and not error:
+            reached, error, code = read_al(port, station)
+            if reached is state and not error:
                 return
-            # An old error may still show until the slave has looked at the request.
+            # An old error may still show until the slave has processed the request.
             late = time.monotonic() >= deadline
-            if late or found is AlState.NONE or (error and time.monotonic() >= deadline - _STATE_S + 0.1):
-                raise BusError(refusal(self._label(position), state, found | (ERROR_BIT if error else 0), code))
+            if late or reached is AlState.NONE or (error and time.monotonic() >= deadline - _STATE_S + 0.1):
+                raise BusError(refusal(self._label(position), state, reached | (ERROR_BIT if error else 0), code))
 
 
 _DIVIDER = 2498
@@ -228,14 +229,14 @@ _DIVIDER = 2498
 _INTERPOLATION = 0x60C2
 
 
-def by_alias(slaves: Sequence[SlaveConfig], found: Sequence[SlaveInfo]) -> tuple[SlaveConfig, ...]:
-    """Return the slaves of the configuration in the order of the cable: those with an alias where it was found.
+def by_alias(slaves: Sequence[SlaveConfig], present: Sequence[SlaveInfo]) -> tuple[SlaveConfig, ...]:
+    """Return the slaves of the configuration in the order of the cable, with aliases at the positions that have them.
 
     Raises:
-        BusError: nobody has an alias, or several do.
+        BusError: no slave, or more than one, has an alias of the configuration.
     """
-    at = {slave.alias: [info.position for info in found if info.alias == slave.alias] for slave in slaves}
-    there = ", ".join(f"slave {info.position} ({info.name}) has {info.alias}" for info in found if info.alias)
+    at = {slave.alias: [info.position for info in present if info.alias == slave.alias] for slave in slaves}
+    there = ", ".join(f"slave {info.position} ({info.name}) has {info.alias}" for info in present if info.alias)
     faults = []
     for slave in slaves:
         if slave.alias and not at[slave.alias]:
@@ -249,27 +250,27 @@ def by_alias(slaves: Sequence[SlaveConfig], found: Sequence[SlaveInfo]) -> tuple
     if faults:
         raise BusError(*faults)
     placed = {at[slave.alias][0]: slave for slave in slaves if slave.alias}
-    if not placed or len(found) != len(slaves):
+    if not placed or len(present) != len(slaves):
         return tuple(slaves)
     others = iter([slave for slave in slaves if not slave.alias])
-    return tuple(placed.get(info.position) or next(others) for info in found)
+    return tuple(placed.get(info.position) or next(others) for info in present)
 
 
-def identity_faults(found: Sequence[Any], expected: Sequence[SlaveConfig]) -> list[str]:
-    """Return a sentence for each position where the slaves found differ from the configuration.
+def identity_faults(present: Sequence[Any], expected: Sequence[SlaveConfig]) -> list[str]:
+    """Return a sentence for each position whose slave differs from the configuration.
 
     Args:
-        found: pysoem's slaves.
+        present: pysoem's slaves.
         expected: the slaves of the configuration, in the order of the cable.
     """
     faults = []
-    if len(found) != len(expected):
-        faults.append(f"{len(found)} slaves answer, the configuration (key `slaves`) lists {len(expected)}")
-    for position in range(1, max(len(found), len(expected)) + 1):
-        slave = found[position - 1] if position <= len(found) else None
+    if len(present) != len(expected):
+        faults.append(f"{len(present)} slaves answer, the configuration (key `slaves`) lists {len(expected)}")
+    for position in range(1, max(len(present), len(expected)) + 1):
+        slave = present[position - 1] if position <= len(present) else None
         config = expected[position - 1] if position <= len(expected) else None
         if config is None and slave is not None:
-            faults.append(f"position {position}: expected nothing, found {_found(slave)}")
+            faults.append(f"position {position}: expected nothing, found {_identity_of(slave)}")
         if config is None:
             continue
         device = config.device
@@ -277,7 +278,7 @@ def identity_faults(found: Sequence[Any], expected: Sequence[SlaveConfig]) -> li
         if slave is None:
             faults.append(f"position {position} ({config.name}): expected {wanted}, found nothing")
         elif (slave.man, slave.id) != (device.vendor_id, device.product_id):
-            faults.append(f"position {position} ({config.name}): expected {wanted}, found {_found(slave)}")
+            faults.append(f"position {position} ({config.name}): expected {wanted}, found {_identity_of(slave)}")
     return faults
 
 
@@ -285,20 +286,20 @@ def _identity(name: str, vendor: int, product: int) -> str:
     return f"{name} (vendor 0x{vendor:08X}, product 0x{product:08X})"
 
 
-def _found(slave: Any) -> str:
+def _identity_of(slave: Any) -> str:
     return _identity(name_of(slave), slave.man, slave.id)
 
 
 def configure_slave(
     sdo: SdoClient, port: RegisterPort, station: int, config: SlaveConfig, period_ns: int
 ) -> Steps[list[str]]:
-    """Set up one slave that is in PRE-OP, in steps.
+    """Set up one slave in PRE-OP, in steps.
 
     Returns:
-        Sentences on what was tolerated.
+        Sentences on tolerated deviations.
 
     Raises:
-        BusError: the slave refuses something, or keeps another value than it was given.
+        BusError: the slave refuses a service, or a value reads back differently.
     """
     device = config.device
     notes: list[str] = []
@@ -318,7 +319,7 @@ def configure_slave(
     for startup in device.sdo:
         notes += yield from write_startup(sdo, startup)
     if device.kind == "cia402":
-        # Before anything that moves: a drive that counts otherwise must not come to SAFE-OP.
+        # Before any motion: a drive with other units must not come to SAFE-OP.
         notes += yield from compare_scaling(sdo, config)
         notes += yield from check_quick_stop(sdo, config)
         for axis in device.axes:
@@ -327,7 +328,7 @@ def configure_slave(
 
 
 def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
-    """Write a start-up SDO and read it back; return a note where the device lacks it and may."""
+    """Write a start-up SDO and read it back; return a note where the device lacks an optional object."""
     if startup.type == "bytes":
         data = bytes.fromhex(startup.data)
     elif startup.value is None:
@@ -336,32 +337,32 @@ def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
         data = struct.Struct("<" + STRUCT_CODES[startup.type]).pack(startup.value)
     else:
         data = int(startup.value).to_bytes(startup.length, "little", signed=startup.type.startswith("int"))
-    what = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
+    label = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
     try:
-        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, startup.type, startup.complete)
+        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, label, startup.type, startup.complete)
     except SdoAborted as error:
         if startup.optional and error.code in ABSENT:
-            return [f"{slave_label(sdo.position, sdo.name)} has no {what}; it is marked optional and was left out"]
+            return [f"{slave_label(sdo.position, sdo.name)} has no {label}; it is marked optional and was left out"]
         raise
     return []
 
 
 def _write_and_verify(
-    sdo: SdoClient, index: int, sub_index: int, data: bytes, what: str, kind: str, complete: bool = False
+    sdo: SdoClient, index: int, sub_index: int, data: bytes, label: str, kind: str, complete: bool = False
 ) -> Steps[None]:
     yield from sdo.writing(index, sub_index, data, complete)
     kept = yield from sdo.reading(index, sub_index, complete)
     if complete:
-        kept = kept[: len(data)]  # entries behind those that were written
+        kept = kept[: len(data)]  # without entries behind the written ones
     elif kind == "bytes":
-        kept = kept.rstrip(b"\0").ljust(len(data), b"\0")  # a text comes back with zeros behind it, or without
+        kept = kept.rstrip(b"\0").ljust(len(data), b"\0")  # a text comes back with or without trailing zeros
     if kept != data:
-        found = _shown(kept, kind) if len(kept) == len(data) else f"bytes {kept.hex(' ')}"
+        text = _value_text(kept, kind) if len(kept) == len(data) else f"bytes {kept.hex(' ')}"
         where = slave_label(sdo.position, sdo.name)
-        raise BusError(f"{where}: {what} was set to {_shown(data, kind)} and reads back as {found}")
+        raise BusError(f"{where}: {label} was set to {_value_text(data, kind)} and reads back as {text}")
 
 
-def _shown(data: bytes, kind: str) -> str:
+def _value_text(data: bytes, kind: str) -> str:
     if kind == "bytes":
         return data.hex(" ")
     if kind.startswith("float"):
@@ -381,7 +382,7 @@ def interpolation_time(period_ns: int) -> tuple[int, int] | None:
 
 
 def write_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Steps[list[str]]:
-    """Set 0x60C2 of an axis to the period where the drive has it; return a note where that was not possible."""
+    """Set 0x60C2 of an axis to the period; return a note where the drive lacks it or cannot express the period."""
     where = slave_label(sdo.position, sdo.name)
     value = interpolation_time(period_ns)
     index = _INTERPOLATION + (axis - 1) * OBJECTS_PER_AXIS
@@ -390,9 +391,9 @@ def write_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> S
         return [f"{where}: its interpolation time (0x{index:04X}) cannot express {us:g} us and was left as it is"]
     try:
         for sub_index, (number, kind) in enumerate(zip(value, ("uint8", "int8"), strict=True), 1):
-            what = f"0x{index:04X}:{sub_index} (interpolation time)"
+            label = f"0x{index:04X}:{sub_index} (interpolation time)"
             data = number.to_bytes(1, "little", signed=kind == "int8")
-            yield from _write_and_verify(sdo, index, sub_index, data, what, kind)
+            yield from _write_and_verify(sdo, index, sub_index, data, label, kind)
     except SdoAborted as error:
         if error.code in ABSENT:
             return [f"{where} has no interpolation time (0x{index:04X})"]
@@ -403,20 +404,20 @@ def write_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> S
 def trigger_watchdog(port: RegisterPort, position: int, config: SlaveConfig, mailboxes: int) -> list[str]:
     """Let every sync manager of outputs trigger the process-data watchdog (ETG.1000.4, 6.7.2: control bit 6).
 
-    SOEM writes the control byte as the EEPROM has it. Many EEPROMs leave the bit off: the slave then keeps its last
-    outputs when the master dies.
+    SOEM writes the control byte from the EEPROM. Many EEPROMs leave the bit off: the slave then keeps its last outputs
+    when the master dies.
 
     Args:
         port: the port for registers; the slave is mapped and not yet in SAFE-OP.
         position: its position on the cable, from 1.
         config: the slave.
-        mailboxes: how many sync managers, from 0 on, are mailboxes.
+        mailboxes: number of mailbox sync managers, from 0 on.
 
     Returns:
         A sentence for each sync manager that does not keep the bit.
 
     Raises:
-        BusError: as that, of a drive; or the slave stopped answering.
+        BusError: a sync manager of a drive does not keep the bit; or the slave stopped answering.
     """
     station, label = station_of(position), slave_label(position, config.name)
     managers = port.read(station, Register.SYNC_MANAGER, _SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT)
@@ -432,15 +433,15 @@ def trigger_watchdog(port: RegisterPort, position: int, config: SlaveConfig, mai
         if control == wanted:
             continue
         address = Register.SYNC_MANAGER + at
-        # An ESC takes the control byte only while the sync manager is off.
+        # An ESC accepts the control byte only while the sync manager is off.
         for offset, value in ((_ACTIVATE, 0), (_CONTROL, wanted), (_ACTIVATE, active)):
             port.put(station, address + offset, bytes((value,)), label)
         kept = port.read(station, address + _CONTROL, 1)
         if kept != bytes((wanted,)):
-            found = "nothing" if kept is None else f"0x{kept[0]:02X}"
+            text = "nothing" if kept is None else f"0x{kept[0]:02X}"
             faults.append(
                 f"{label}: the control byte of sync manager {number} was set to 0x{wanted:02X} and reads back as "
-                f"{found}: its outputs do not trigger the process-data watchdog"
+                f"{text}: its outputs do not trigger the process-data watchdog"
             )
     if not triggered:
         faults.append(f"{label}: no sync manager carries its outputs: nothing triggers the process-data watchdog")
@@ -457,8 +458,8 @@ def set_watchdog(port: RegisterPort, station: int, label: str, device: DeviceDes
         port.write(station, address, data)
         kept = port.read(station, address, 2)
         if kept != data:
-            shown = "nothing" if kept is None else str(int.from_bytes(kept, "little"))
+            text = "nothing" if kept is None else str(int.from_bytes(kept, "little"))
             raise BusError(
                 f"{label}: watchdog register 0x{address:04X} was set to {value} (watchdog_ms: {device.watchdog_ms:g}) "
-                f"and reads back as {shown}"
+                f"and reads back as {text}"
             )

@@ -30,7 +30,6 @@ from rtcp.fieldbus.eeprom import (
     read_eeprom,
     write_eeprom,
 )
-from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.foe import FoeClient, bootstrap_mailbox, enter_boot
 from rtcp.fieldbus.image import MOST_SLAVES, Places, limit_faults, read_places
@@ -51,13 +50,14 @@ from rtcp.fieldbus.slave_setup import (
 )
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
 from rtcp.fieldbus.topology import Topology, port_states
+from rtcp.ipc.events import EmergencyMessage, Event
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
 _BELOW_SAFEOP = 0x03
 """Bits of the AL state that INIT, PRE-OP and BOOT have, OP and SAFE-OP have not."""
 _MAP_ATTEMPTS = 8
 _DISCOVERY_ATTEMPTS = 4
-"""Each takes `_PATIENCE_US`: a host that runs master and slaves may stand still for longer than one."""
+"""Attempts of `_PATIENCE_US` each: a host that runs master and slaves may stall for longer than one."""
 _MAILBOXES, _MAILBOXES_SIZE = 2, 16
 """Sync managers of a slave's mailboxes, and the bytes of their registers (ETG.1000.4, 6.7)."""
 
@@ -65,7 +65,7 @@ _MAILBOXES, _MAILBOXES_SIZE = 2, 16
 _SOEM_LAST_INDEX = 15
 _SDO_TIMEOUT_US = 700_000
 _ANSWER_US, _PATIENCE_US = 40_000, 500_000
-"""Until SOEM sends a frame again, and until it gives up. The cycle's frames have a time of their own."""
+"""Time until SOEM repeats a frame, and until it gives up, us; outside the cycle."""
 
 
 class SoemBus:
@@ -150,7 +150,7 @@ class SoemBus:
             raise
 
     def scan(self) -> tuple[SlaveInfo, ...]:
-        """Find the slaves, bring them to PRE-OP, measure delays; return what is known of each.
+        """Find the slaves, bring them to PRE-OP, measure delays; return their descriptions.
 
         Raises:
             BusError: no slave answers.
@@ -158,8 +158,8 @@ class SoemBus:
         self._discover()
         self._to_preop()
         self._master.config_dc()
-        found = self._describe()
-        tree = Topology.of([info.ports for info in found])
+        slaves = self._describe()
+        tree = Topology.of([info.ports for info in slaves])
         return tuple(
             replace(
                 info,
@@ -167,7 +167,7 @@ class SoemBus:
                 parent_port=tree.port(info.position),
                 watchdog_off=watchdog_off(self.port, station_of(info.position)),
             )
-            for info in found
+            for info in slaves
         )
 
     def _describe(self) -> tuple[SlaveInfo, ...]:
@@ -184,7 +184,7 @@ class SoemBus:
             period_ns: the cycle.
 
         Raises:
-            BusError: what is on the bus differs from the configuration, or a slave refuses.
+            BusError: the bus differs from the configuration, or a slave refuses.
         """
         if faults := limit_faults(slaves):
             raise BusError(*faults)
@@ -215,20 +215,20 @@ class SoemBus:
         ]
         self._topology = self._read_topology()
         self._restorer = SlaveRestorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
-        # From here on a cycle runs, and slaves are watched beside it: what is lost is to be known soon.
+        # From here on a cycle runs, and the watcher needs to learn of losses soon.
         self.port.tries = TRIES
         return data
 
     def _read_topology(self) -> Topology:
         status = [self.port.read(station, Register.DL_STATUS, 2) for station in self._stations(None)]
-        return Topology.of([port_states(int.from_bytes(one or b"", "little")) for one in status])
+        return Topology.of([port_states(int.from_bytes(register or b"", "little")) for register in status])
 
     def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int, failures: Sequence[int]) -> None:
         """Bring the slaves from INIT to PRE-OP, each set up as configured; raises BusError.
 
-        SOEM reads a slave's mapping by complete access first, after a failure by single subindices, and so on in turn:
-        some slaves answer complete access wrongly; single subindices take many frames, of which one is lost sooner.
-        Of several slaves of one identity it reads the first one's, and copies it where it knows of no mailbox.
+        SOEM reads a slave's mapping by complete access first; after a failure it alternates with single subindices:
+        some slaves answer complete access wrongly, and single subindices take many frames, any of which may be lost.
+        For several slaves of one identity it reads the first one's mapping, and copies it where it knows no mailbox.
         """
         self.notes.clear()
         self._discover()
@@ -249,7 +249,7 @@ class SoemBus:
         for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
             device = config.device
             first = first_of.setdefault((slave.man, slave.id, slave.rev, device.rpdo, device.tpdo), i)
-            # Without CoE SOEM would ask over SoE, where it takes an error reply for none: 11 s for a slave.
+            # Without CoE SOEM would use SoE, where it does not recognize an error reply: 11 s for a slave.
             if not device.coe or (failures[i] <= failures[first] and i != first):
                 self._hide_mailbox(slave, i + 1)
             elif failures[i] % 2 or not device.complete_access:
@@ -266,7 +266,7 @@ class SoemBus:
             raise BusError(*faults)
 
     def _eeprom_faults(self, slaves: Sequence[SlaveConfig]) -> list[str]:
-        """Return a sentence for each slave without CoE whose EEPROM maps something else than its device's file."""
+        """Return a sentence for each slave without CoE whose EEPROM maps other objects than its device's file."""
         faults = []
         known: dict[tuple[int, int, int], tuple[tuple[PdoInfo, ...], tuple[PdoInfo, ...]]] = {}
         for position, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True), 1):
@@ -279,10 +279,8 @@ class SoemBus:
                 except EsiError as error:
                     faults.append(f"{slave_label(position, config.name)}: its EEPROM cannot be read: {error}")
                     continue
-            for key, pdos, found in zip(("rpdo", "tpdo"), (device.rpdo, device.tpdo), known[identity], strict=True):
-                mapping = tuple(
-                    (pdo.index, tuple((e.index, e.sub_index, e.bits) for e in pdo.entries)) for pdo in found
-                )
+            for key, pdos, own in zip(("rpdo", "tpdo"), (device.rpdo, device.tpdo), known[identity], strict=True):
+                mapping = tuple((pdo.index, tuple((e.index, e.sub_index, e.bits) for e in pdo.entries)) for pdo in own)
                 # An EEPROM need not list PDOs; their lengths are compared all the same.
                 if mapping and entries_of(mapping) != entries_of(mapping_of(pdos)):
                     faults.append(
@@ -301,7 +299,7 @@ class SoemBus:
         if registers is None:
             raise BusError(f"{label} stopped answering while it was set up")
         for mailbox in ("out", "in"):
-            # Writes the registers first, in a frame that is not sent again; what SOEM knows changes only after that.
+            # This writes the registers first, in a frame that is not repeated; SOEM's own data change only after that.
             for _ in range(PATIENT_TRIES):
                 with contextlib.suppress(pysoem.WkcError):
                     slave.amend_mbx(mailbox, 0, 0)
@@ -319,12 +317,12 @@ class SoemBus:
         # Also stops SYNC0 and SYNC1 that the last run left active, and resets FMMUs and sync managers (SOEM#60).
         if not any(self._master.config_init() > 0 for _ in range(_DISCOVERY_ATTEMPTS)):
             raise BusError(f"no slave answers on {self.interface}: check the cable and the slaves' supply")
-        found = self._master.slaves
-        self._names = [name_of(slave) for slave in found]
-        self._infos = [read_mailbox(slave) for slave in found]
-        self._serials = [read_serial(slave) for slave in found]
+        slaves = self._master.slaves
+        self._names = [name_of(slave) for slave in slaves]
+        self._infos = [read_mailbox(slave) for slave in slaves]
+        self._serials = [read_serial(slave) for slave in slaves]
         self._boxes = Mailboxes(self.port, self._names, self._infos)
-        for position in range(1, len(found) + 1):
+        for position in range(1, len(slaves) + 1):
             eeprom_to_device(self.port, station_of(position))
         left = self.port.read_all(Register.DC_ACTIVATION, 1).data
         if any(left):
@@ -338,26 +336,26 @@ class SoemBus:
     def _map(self, slaves: Sequence[SlaveConfig]) -> dict[int, list[str]]:
         """Let SOEM lay out the process image; return sentences for each position whose images have a wrong length.
 
-        The result counts, not the errors that SOEM reports: the mappings were compared entry by entry before, and SOEM
-        corrects many errors by reading again.
+        Only the lengths decide, not the errors that SOEM reports: the mappings were compared entry by entry before, and
+        SOEM corrects many errors by reading again.
         """
         reported: dict[int, list[str]] = {}
-        stations = [station_of(position) for position, one in enumerate(slaves, 1) if not one.device.coe]
+        stations = [station_of(position) for position, entry in enumerate(slaves, 1) if not entry.device.coe]
         for station in stations:
-            # Their PDOs are in the EEPROM alone, which SOEM takes for its own since it has read it.
+            # Their PDOs are in the EEPROM only, and SOEM assumes that the master still owns it after reading.
             eeprom_to_master(self.port, station)
         try:
             self._master.config_map()
         except pysoem.ConfigMapError as error:
             for fault in error.error_list:
-                # An emergency that SOEM meets is in its list too, as an error of no kind.
+                # SOEM also lists emergencies, as errors without a type.
                 if isinstance(fault, pysoem.SdoError):
-                    what = f"object 0x{fault.index:04X}:{fault.subindex}: {fault.desc}"
+                    cause = f"object 0x{fault.index:04X}:{fault.subindex}: {fault.desc}"
                 elif isinstance(fault, (pysoem.MailboxError, pysoem.PacketError)):
-                    what = _words(fault)
+                    cause = _words(fault)
                 else:
                     continue
-                reported.setdefault(fault.slave_pos, []).append(what)
+                reported.setdefault(fault.slave_pos, []).append(cause)
         for station in stations:
             eeprom_to_device(self.port, station)
         faults: dict[int, list[str]] = {}
@@ -370,7 +368,7 @@ class SoemBus:
                     # SOEM may report the same error hundreds of times.
                     causes = "; ".join(dict.fromkeys(reported.get(position, ())))
                     objects = " and ".join(
-                        f"0x{ASSIGN + manager:04X}" for one, manager, _ in assignments(config.device) if one == key
+                        f"0x{ASSIGN + manager:04X}" for name, manager, _ in assignments(config.device) if name == key
                     )
                     origin = f"the PDO mapping assigned through {objects}" if config.device.coe else "the PDOs"
                     faults.setdefault(position, []).append(
@@ -426,24 +424,16 @@ class SoemBus:
             result.append(SlaveState(position, station, name, state, error, code))
         return tuple(result)
 
-    def emergencies(self) -> tuple[Emergency, ...]:
+    def emergencies(self) -> tuple[EmergencyMessage, ...]:
         """Return the emergency messages that came since the last call; without any it takes one frame."""
         return self._mailboxes.emergencies()
-
-    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
-        """Return an object's value; raises SdoAborted (the slave refused) or BusError (no answer)."""
-        return self._mailboxes.sdo(position).read(index, subindex)
-
-    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
-        """Write an object's value; raises as `sdo_read`."""
-        self._mailboxes.sdo(position).write(index, subindex, data)
 
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps; raises BusError where there is no such slave."""
         return self._mailboxes.sdo(position)
 
     def discover(self) -> tuple[SlaveInfo, ...]:
-        """Find the slaves, bring them to INIT with their mailboxes programmed; return what is known of each there.
+        """Find the slaves, bring them to INIT with their mailboxes programmed; return their descriptions in INIT.
 
         Raises:
             BusError: no slave answers.
@@ -451,29 +441,29 @@ class SoemBus:
         self._discover()
         return self._describe()
 
-    def position_of(self, name: str, slaves: Sequence[SlaveConfig], found: Sequence[SlaveInfo]) -> int:
+    def position_of(self, name: str, slaves: Sequence[SlaveConfig], present: Sequence[SlaveInfo]) -> int:
         """Return the position of the slave that the configuration calls `name`.
 
-        With a station alias it may hang anywhere; without one the whole bus has to be as the configuration says.
+        With a station alias it may hang anywhere; without one the whole bus has to match the configuration.
 
         Args:
             name: a name in `slaves`.
             slaves: the slaves of the configuration.
-            found: the slaves on the bus.
+            present: the slaves on the bus.
 
         Raises:
             BusError: it is not there, or another device is in its place.
         """
         wanted = next(slave for slave in slaves if slave.name == name)
         if not wanted.alias:
-            ordered = by_alias(slaves, found)
+            ordered = by_alias(slaves, present)
             if faults := identity_faults(self._master.slaves, ordered):
                 remedy = f"which slave is {name} is not certain without a station alias: give its position instead"
                 raise BusError(*faults, remedy)
             return ordered.index(wanted) + 1
-        by_alias([wanted], found)
-        position = next(info.position for info in found if info.alias == wanted.alias)
-        info, device = found[position - 1], wanted.device
+        by_alias([wanted], present)
+        position = next(info.position for info in present if info.alias == wanted.alias)
+        info, device = present[position - 1], wanted.device
         if (info.vendor_id, info.product_code) != (device.vendor_id, device.product_id):
             raise BusError(
                 f"{slave_label(position, info.name)} has the station alias {wanted.alias} of {name}, but is vendor "
@@ -483,7 +473,7 @@ class SoemBus:
         return position
 
     def boot(self, position: int) -> None:
-        """Bring a slave to BOOT, where its firmware is written; `foe` then speaks to the mailboxes that it has there.
+        """Bring a slave to BOOT, where its firmware is written; `foe` then uses the slave's BOOT mailboxes.
 
         Raises:
             BusError: it has no BOOT, or refuses it.
@@ -510,7 +500,7 @@ class SoemBus:
 
         Args:
             position: position on the cable, from 1.
-            progress: receives how much of it was read, 0 to 1.
+            progress: receives the fraction that was read, 0 to 1.
         """
         sdo, info = self._mailboxes.sdo(position), self._infos[position - 1]
         has_coe = info is not None and info.has_coe
@@ -519,7 +509,7 @@ class SoemBus:
         return describe_device(sdo, has_coe, eeprom, origin, lambda part: progress(0.1 + 0.9 * part))
 
     def with_eeprom_pdos(self, slave: SlaveInfo) -> SlaveInfo:
-        """Return a slave without assignment objects with the PDOs that its EEPROM assigns; any other as it is."""
+        """Add the PDOs that the EEPROM assigns to a slave without assignment objects; return any other unchanged."""
         if slave.outputs or slave.inputs:
             return slave
         with contextlib.suppress(EsiError):
@@ -543,10 +533,10 @@ class SoemBus:
         self._names = []
         self.close()
 
-    def watcher(self, report: Callable[[str], None]) -> SlaveWatcher:
-        """Return the watcher of the configured slaves, all of them in OP; `report` receives its messages."""
+    def watcher(self, report: Callable[[Event], None]) -> SlaveWatcher:
+        """Return the watcher of the configured slaves, all of them in OP; `report` receives its events."""
         assert self._restorer is not None, "only a configured bus has something to restore"
-        return SlaveWatcher(self.port, self._names, self._restorer, report, self._topology)
+        return SlaveWatcher(self.port, len(self._names), self._restorer, report, self._topology)
 
     def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
         wanted = range(1, len(self._names) + 1) if positions is None else positions
@@ -560,7 +550,7 @@ class SoemBus:
         except BusError as error:
             self.notes.append(f"the slaves on {self.interface} could not be brought back to INIT: {error}")
         finally:
-            # The claim last: the next master must not find what this one still undoes.
+            # The claim last: the next master must not start while this one still cleans up.
             for part in (self._port, self._barrier, self._socket, self._master, self._promiscuous, self._claim):
                 if part is not None:
                     part.close()
@@ -576,7 +566,9 @@ class SoemBus:
         if reported.data[0] & _BELOW_SAFEOP == 0:
             al_state.broadcast_state(port, AlState.SAFEOP)
             al_state.wait_for_state(port, everyone, AlState.SAFEOP, _LEAVE_OP_S)
-        elif in_op := {one: label for one, label in everyone.items() if al_state.read_al(port, one)[0] is AlState.OP}:
+        elif in_op := {
+            station: label for station, label in everyone.items() if al_state.read_al(port, station)[0] is AlState.OP
+        }:
             al_state.request_state(port, in_op, AlState.SAFEOP)
             al_state.wait_for_state(port, in_op, AlState.SAFEOP, _LEAVE_OP_S)
         al_state.broadcast_state(port, AlState.INIT)
@@ -596,7 +588,7 @@ class SoemMaster(Master):
 
     @staticmethod
     def check_interface(name: str) -> None:
-        """Raise BusError where no interface has this name, or the one that has it has no cable."""
+        """Raise BusError where no interface has this name, or it is the loopback."""
         check_name(name)
 
     @property
@@ -608,10 +600,10 @@ class SoemMaster(Master):
         """Find the slaves, compare them with the configuration, bring them to SAFE-OP."""
         bus = self._bus
         bus.open()
-        found = bus.scan()
-        report(f"{len(found)} slaves on {self.interface}")
-        (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in found]))
-        self.config = replace(self.config, slaves=by_alias(self.config.slaves, found))
+        slaves = bus.scan()
+        report(f"{len(slaves)} slaves on {self.interface}")
+        (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in slaves]))
+        self.config = replace(self.config, slaves=by_alias(self.config.slaves, slaves))
         data = bus.configure(self.config.slaves, round(self.config.cycle.period_us * 1000))
         for note in bus.notes:
             report(note)
@@ -632,8 +624,8 @@ def open_master(interface: str) -> tuple[Any, socket.socket]:
         BusError: the interface cannot be opened.
     """
     timeouts = pysoem.settings.timeouts
-    # By default an answer after 2 ms is one too late: a shared host, or a segment in software, may be off its CPU for
-    # longer. In a mailbox SOEM then takes the answer to one SDO for that to the next, and its map fails.
+    # By default SOEM waits 2 ms for an answer: a shared host, or a segment in software, may be off its CPU for longer.
+    # In a mailbox SOEM then takes the answer to one SDO for the answer to the next, and its map fails.
     timeouts.ret = _ANSWER_US
     timeouts.safe = timeouts.eeprom = _PATIENCE_US
     master = pysoem.Master()
@@ -657,7 +649,7 @@ def open_master(interface: str) -> tuple[Any, socket.socket]:
 
 
 def _words(fault: Any) -> str:
-    """Return what pysoem says of an error; it knows not all codes of a packet error."""
+    """Return pysoem's text of an error; pysoem lacks texts for some codes of a packet error."""
     try:
         return str(fault.desc)
     except KeyError:
@@ -665,11 +657,11 @@ def _words(fault: Any) -> str:
 
 
 def _sockets() -> set[tuple[int, str]]:
-    found = set()
+    sockets = set()
     for name in os.listdir("/proc/self/fd"):
         # The descriptor of the listing itself is gone by now.
         with contextlib.suppress(FileNotFoundError):
             target = os.readlink(f"/proc/self/fd/{name}")
             if target.startswith("socket:"):
-                found.add((int(name), target))
-    return found
+                sockets.add((int(name), target))
+    return sockets

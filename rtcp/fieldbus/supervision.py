@@ -1,23 +1,25 @@
-"""Supervision of the slaves beside the cycle: who left OP, and what is done to bring it back.
+"""Supervision of the slaves beside the cycle: detects which slaves left OP, and brings them back.
 
-While all is well a turn is one frame. No turn waits for a slave: what takes time is a request whose outcome the next
-turns see, or a restoration in steps.
+While all slaves are in OP a poll is one frame. No poll waits for a slave: slow actions are requests, whose outcome
+later polls read, or restorations in steps.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby
 from typing import Protocol
 
-from rtcp.fieldbus.al_state import ERROR_BIT, STATE_NAMES, AlState, refusal
+from rtcp.fieldbus.al_state import AlState, parse_al
 from rtcp.fieldbus.bus import Bus
 from rtcp.fieldbus.mailbox import SdoClient
-from rtcp.fieldbus.port_errors import ErrorCounters
-from rtcp.fieldbus.recovery import LONG_AGO, REPORT_INTERVAL_S, MonitoredSlave, SlaveRecovery
+from rtcp.fieldbus.port_errors import REPORT_INTERVAL_S, ErrorCounters
+from rtcp.fieldbus.recovery import LONG_AGO, MonitoredSlave, SlaveRecovery
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, T
 from rtcp.fieldbus.slave_setup import SlaveRestorer
 from rtcp.fieldbus.topology import Topology
+from rtcp.ipc.events import Event, NoSlaveAnswers, SlavesAnswerAgain, SlavesBackInOp, SlavesLeftOp
 
 _PARK_S = 3.0
 _SILENCE_S = 0.25
@@ -25,26 +27,13 @@ _RARELY_S = 0.1
 """Interval at which error counters and parked slaves are read, s."""
 
 
-def _runs(words: Iterable[tuple[MonitoredSlave, T]]) -> Iterator[tuple[MonitoredSlave, MonitoredSlave, T]]:
-    """Yield the first and the last of each run of neighbours of which the same is said, and that."""
-    run: list[MonitoredSlave] = []
-    shared: T | None = None
-    for slave, text in words:
-        if run and shared is not None and (text != shared or slave.position != run[-1].position + 1):
-            yield run[0], run[-1], shared
-            run = []
-        run.append(slave)
-        shared = text
-    if run and shared is not None:
-        yield run[0], run[-1], shared
-
-
-def _fall_count(falls: int) -> str:
-    return f"; it left OP {falls} times since the last report" if falls > 1 else ""
-
-
-def _slaves_named(first: MonitoredSlave, last: MonitoredSlave) -> str:
-    return first.label if first is last else f"{first.label} to {last.label}"
+def _runs(facts: Iterable[tuple[MonitoredSlave, T]]) -> Iterator[tuple[int, int, T]]:
+    """Yield the first and the last position of each run of neighbours with equal facts, and the facts."""
+    # Within a run the difference of position and list index is constant.
+    alike = groupby(enumerate(facts), lambda entry: (entry[1][0].position - entry[0], entry[1][1]))
+    for (_, shared), run in alike:
+        slaves = [slave for _, (slave, _) in run]
+        yield slaves[0].position, slaves[-1].position, shared
 
 
 class SlaveWatcher:
@@ -52,35 +41,35 @@ class SlaveWatcher:
 
     Args:
         port: the port for registers.
-        names: the slaves' names in the order of the cable.
+        count: how many slaves there are.
         restorer: sets up a slave again.
-        report: receives the messages.
+        report: receives the events.
         topology: the tree of the slaves; None: a chain.
     """
 
     def __init__(
         self,
         port: RegisterPort,
-        names: Sequence[str],
+        count: int,
         restorer: SlaveRestorer,
-        report: Callable[[str], None],
+        report: Callable[[Event], None],
         topology: Topology | None = None,
     ) -> None:
         self._port = port
-        self._topology = topology or Topology.chain(len(names))
+        self._topology = topology or Topology.chain(count)
         self._report = report
-        self.slaves = tuple(MonitoredSlave(position, name) for position, name in enumerate(names, 1))
-        self.errors = ErrorCounters(port, names, report, self._topology)
+        self.slaves = tuple(MonitoredSlave(position) for position in range(1, count + 1))
+        self.errors = ErrorCounters(port, count, report, self._topology)
         self._recovery = SlaveRecovery(port, self.slaves, restorer, report, self._topology)
         self._rarely_at = 0.0
         self._answered_at = time.monotonic()
         self._silent_since: float | None = None
-        self._silence_told = False
+        self._silence_reported = False
         self._parked_at: float | None = None
         self.all_op = True
-        """Whether every slave was in OP at the last look."""
+        """Whether every slave was in OP at the last poll."""
         self.op_allowed = True
-        """Whether OP may be asked for: not while outputs come at other instants than SYNC0 wants them."""
+        """Whether OP may be requested: not while the outputs are not synchronous to SYNC0."""
 
     @property
     def silent(self) -> bool:
@@ -93,16 +82,16 @@ class SlaveWatcher:
         self.all_op = False
         for slave in self.slaves:
             self._recovery.drop(slave)
-            # A slave in restoration has to be set up again: its progress is unknown.
-            slave.kept = slave.kept or slave.was_in_op
+            # A slave in restoration has to be set up again: its configuration is incomplete.
+            slave.keeps_setup = slave.keeps_setup or slave.was_in_op
             slave.was_in_op = False
             slave.leaving = True
-        # Noted for all first: the interface may be gone, and back while they are still to be parked.
+        # First note it for all: the interface may fail now, and return while slaves are still to be parked.
         for slave in self.slaves:
             slave.leaving = self._recovery.request(slave, AlState.PREOP, acknowledge=slave.error)
 
     def resume(self) -> None:
-        """Bring back whatever is not in OP, without the pauses that are left."""
+        """Bring back all slaves that are not in OP, without the remaining pauses."""
         self._parked_at = None
         for slave in self.slaves:
             slave.pause_until = 0.0
@@ -110,10 +99,10 @@ class SlaveWatcher:
             slave.fall_reported_at = LONG_AGO
 
     def turn(self) -> int:
-        """Look at the slaves and take a step with those that need it.
+        """Poll the states of the slaves and advance the recovery of those that are not in OP.
 
         Returns:
-            Position of a slave that has left OP since the last turn; 0: none.
+            Position of a slave that has left OP since the last poll; 0: none.
 
         Raises:
             BusError: the interface is gone.
@@ -127,7 +116,7 @@ class SlaveWatcher:
         self._answered_at, answered_before = now, self._answered_at
         left = 0
         if self._parked_at is None:
-            left = self._look_at_all(data == b"\x08\0" and wkc >= len(self.slaves), now, answered_before)
+            left = self._update_all(data == b"\x08\0" and wkc >= len(self.slaves), now, answered_before)
             if not self.all_op:
                 self._recovery.take_steps(now, wkc, self.op_allowed)
         if now >= self._rarely_at:
@@ -138,20 +127,20 @@ class SlaveWatcher:
             self.errors.report_due()
         return left
 
-    # -- looking --------------------------------------------------------------------------------------------------
+    # -- polling --------------------------------------------------------------------------------------------------
 
-    def _look_at_all(self, all_in_op: bool, now: float, answered_before: float) -> int:
+    def _update_all(self, all_in_op: bool, now: float, answered_before: float) -> int:
         if all_in_op and self.all_op:
             return 0
         if all_in_op:
-            found = [(AlState.OP, False, 0)] * len(self.slaves)
+            answers = [(AlState.OP, False, 0)] * len(self.slaves)
         else:
-            # Half a look would be taken for what all of them are in.
-            looks = [self._look(slave) for slave in self.slaves]
-            found = [look for look in looks if look is not None]
-            if len(found) < len(looks):
+            # An incomplete poll says nothing about the segment as a whole.
+            readings = [self._read_status(slave) for slave in self.slaves]
+            answers = [reading for reading in readings if reading is not None]
+            if len(answers) < len(readings):
                 return 0
-        for slave, (state, error, code) in zip(self.slaves, found, strict=True):
+        for slave, (state, error, code) in zip(self.slaves, answers, strict=True):
             slave.update(state, error, code)
         left = [slave for slave in self.slaves if slave.was_in_op and not slave.well]
         for slave in left:
@@ -165,29 +154,26 @@ class SlaveWatcher:
         self.all_op = all(slave.well for slave in self.slaves)
         return left[0].position if left else 0
 
-    def _look(self, slave: MonitoredSlave) -> tuple[AlState, bool, int] | None:
-        """Read a slave's state, whether it shows an error, its code; None where the frame did not come back."""
-        found = (AlState.NONE, False, 0)
-        # A frame that was damaged unnoticed must not stop the arm: who was in OP is asked twice.
+    def _read_status(self, slave: MonitoredSlave) -> tuple[AlState, bool, int] | None:
+        """Read a slave's state, error indication and AL status code; None where the frame did not come back."""
+        status = (AlState.NONE, False, 0)
+        # An undetected damaged frame must not stop the arm: a slave that was in OP is read twice.
         for _ in range(2 if slave.was_in_op else 1):
             data, wkc = self._port.exchange(DatagramCommand.FPRD, slave.station, Register.AL_STATUS, bytes(6), tries=1)
             if wkc < 0:
                 return None
-            status = int.from_bytes(data[:2], "little") if wkc else 0
-            base = status & 0x0F
-            # What is no state of the standard is as good as INIT: it answers, and has to be set up.
-            state = AlState(base) if base in STATE_NAMES else AlState.INIT
-            found = state, bool(status & ERROR_BIT), int.from_bytes(data[4:6], "little") if wkc else 0
-            if found[:2] == (AlState.OP, False):
+            # An answer, and no state in it: it has to be set up again.
+            status = parse_al(data, AlState.INIT) if wkc else (AlState.NONE, False, 0)
+            if status[:2] == (AlState.OP, False):
                 break
-        return found
+        return status
 
     def _note_return(self, slave: MonitoredSlave, now: float) -> bool:
-        """Note that a slave is well; return whether to report that: its fall was reported."""
+        """Note that a slave is well; return whether to report that, because its fall was reported."""
         if not slave.was_in_op:
             slave.back_at = now
         slave.was_in_op = True
-        slave.kept = False
+        slave.keeps_setup = False
         slave.unfinished = False
         slave.failed = 0
         self._recovery.drop(slave)
@@ -205,67 +191,52 @@ class SlaveWatcher:
 
     def _report_left(self, left: Sequence[MonitoredSlave], now: float) -> None:
         lost = {slave.position for slave in left if slave.state is AlState.NONE}
-        for first, last, (words, _) in _runs(
-            (slave, (slave.words() + _fall_count(slave.unreported), self._topology.first_lost(slave.position, lost)
-                     if slave.position in lost else 0))
+        for first, last, (status, code, falls, _) in _runs(
+            (slave, (slave.al_status, slave.code if slave.error else 0, slave.unreported,
+                     self._topology.first_lost(slave.position, lost) if slave.position in lost else 0))
             for slave in left
         ):  # fmt: skip
-            if first.state is not AlState.NONE:
-                where = "it is in" if first is last else "each is in"
-                self._report(f"{_slaves_named(first, last)} left OP: {where} {words}")
-                continue
-            parent = self._topology.parent(first.position)
-            before = self.slaves[parent - 1].label if parent else "the master"
-            what = "it does not answer" if first is last else "none of them answers"
-            check = f"check the supply of {first.label} and the cable between {before} and {first.label}"
-            self._report(f"{_slaves_named(first, last)} left OP: {what}; {check}{_fall_count(first.unreported)}")
+            self._report(SlavesLeftOp(first, last, status, code, self._topology.parent(first), falls))
         for slave in left:
             slave.fall_reported_at, slave.unreported, slave.return_due = now, 0, True
 
     def _report_back(self, back: Sequence[MonitoredSlave], now: float) -> None:
-        for first, last, after in _runs((slave, f"{now - (slave.left_at or now):.1f} s") for slave in back):
-            are = "is" if first is last else "are"
-            self._report(
-                f"{_slaves_named(first, last)} {are} back in OP after {after}; the arm does not move before "
-                "`rtcp reset` and `rtcp enable`"
-            )
+        for first, last, after_s in _runs((slave, round(now - (slave.left_at or now), 1)) for slave in back):
+            self._report(SlavesBackInOp(first, last, after_s))
         for slave in back:
             slave.left_at = None
 
     def _note_silence(self, now: float) -> None:
         self._silent_since = self._silent_since or now
-        if now - self._silent_since < _SILENCE_S or self._silence_told:
+        if now - self._silent_since < _SILENCE_S or self._silence_reported:
             return
         # Which slave left OP shows when they answer again; the cycle counts the lost frames and stops the arm.
-        self._silence_told = True
+        self._silence_reported = True
         self.all_op = False
         for slave in self.slaves:
             slave.state, slave.error, slave.code = AlState.NONE, False, 0
-        self._report(
-            f"no slave answers: check the cable between the master and {self.slaves[0].label}, and that slave's supply"
-        )
+        self._report(NoSlaveAnswers())
 
     def _note_answer(self, now: float) -> None:
-        if self._silence_told and self._silent_since is not None:
-            self._report(f"slaves answer again, after {now - self._silent_since:.1f} s without any")
+        if self._silence_reported and self._silent_since is not None:
+            self._report(SlavesAnswerAgain(now - self._silent_since))
         self._silent_since = None
-        self._silence_told = False
+        self._silence_reported = False
 
     def _keep_parked(self, late: bool) -> None:
         for slave in self.slaves:
-            look = self._look(slave)
-            if look is None:
+            status = self._read_status(slave)
+            if status is None:
                 return
-            slave.update(*look)
+            slave.update(*status)
             at_home = slave.state in (AlState.PREOP, AlState.SAFEOP, AlState.OP)
-            # What lost its supply meanwhile is set up again when it is brought back.
-            slave.kept = slave.kept and at_home
+            # A slave that lost its supply meanwhile is set up again when it is brought back.
+            slave.keeps_setup = slave.keeps_setup and at_home
             if not at_home or (slave.state is AlState.PREOP and not slave.error):
                 continue
             self._recovery.request(slave, AlState.PREOP, acknowledge=slave.error)
             if late:
-                found = slave.state | (ERROR_BIT if slave.error else 0)
-                self._recovery.report_limited(slave, refusal(slave.label, AlState.PREOP, found, slave.code))
+                self._recovery.report_refusal(slave, AlState.PREOP)
 
 
 class SupervisedBus(Bus, Protocol):
@@ -274,5 +245,5 @@ class SupervisedBus(Bus, Protocol):
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps."""
 
-    def watcher(self, report: Callable[[str], None]) -> SlaveWatcher:
-        """Return the watcher of the configured slaves, all of them in OP; `report` receives its messages."""
+    def watcher(self, report: Callable[[Event], None]) -> SlaveWatcher:
+        """Return the watcher of the configured slaves, all of them in OP; `report` receives its events."""

@@ -1,4 +1,4 @@
-"""The slaves as a tree: which one hangs at which port of which other (ETG.1000.4, 4.3)."""
+"""The slaves as a tree: the parent of each slave, and the port at which it hangs (ETG.1000.4, 4.3)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class PortState(str, Enum):
     OPEN = "open"
     """A neighbour answers behind it."""
     CLOSED = "closed"
-    """It has a link, and nobody answers."""
+    """It has a link, but no neighbour answers."""
     NO_LINK = "no link"
 
 
@@ -34,7 +34,7 @@ def port_states(dl_status: int) -> tuple[PortState, ...]:
 
 
 class Connection(NamedTuple):
-    """Where a slave hangs: position of the slave before it (0: the master) and the port of that slave."""
+    """Position of a slave's parent (0: the master) and the port of the parent at which the slave hangs."""
 
     parent: int
     port: int
@@ -49,12 +49,12 @@ class Topology:
 
     @classmethod
     def chain(cls, count: int) -> Topology:
-        """Return the tree of slaves that hang one behind the other."""
+        """Return the tree of slaves in a line."""
         return cls([Connection(position, 1 if position else 0) for position in range(count)])
 
     @classmethod
     def of(cls, ports: Sequence[Sequence[PortState]]) -> Topology:
-        """Return the tree that the ports of the slaves show; a slave with too few open ones hangs at the one before."""
+        """Return the tree according to the slaves' ports; without a free open port a slave hangs at the one before."""
         connections: list[Connection] = []
         free: list[tuple[int, list[int]]] = []  # position, ports still without a child; innermost last
         for position, own in enumerate(ports, 1):
@@ -72,7 +72,7 @@ class Topology:
         return len(self._connections)
 
     def parent(self, position: int) -> int:
-        """Return the position of the slave before the one at `position`; 0: the master."""
+        """Return the position of the parent of the slave at `position`; 0: the master."""
         return self._connections[position - 1].parent
 
     def port(self, position: int) -> int:
@@ -84,12 +84,12 @@ class Topology:
         return self._children.get(Connection(position, port))
 
     def depth(self, position: int) -> int:
-        """Return how many slaves there are between the one at `position` and the master."""
+        """Return the number of slaves between the one at `position` and the master."""
         parent = self.parent(position)
         return 1 + self.depth(parent) if parent else 0
 
     def first_lost(self, position: int, lost: Container[int]) -> int:
-        """Return the slave nearest to the master that is lost too and in the way to the one at `position`."""
+        """Return the lost slave nearest to the master on the path to the one at `position`."""
         while (parent := self.parent(position)) in lost:
             position = parent
         return position

@@ -1,7 +1,7 @@
-"""The black box: at every fault the last seconds of the blackboard's ring go to the disk.
+"""The black box: at every fault it writes the last seconds of the blackboard's ring to the disk.
 
-It reads what the loop publishes anyway: the cycle does nothing for it. Waiting and writing happen in a thread of its
-own, so that the gateway goes on answering.
+It only reads what the loop publishes: the cycle does nothing for it. Waiting and writing happen in a thread of its own,
+so that the gateway goes on answering.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtcp.ipc.events import ResetDone
-from rtcp.ipc.layout import EVENTS, TEXTS
+from rtcp.ipc.layout import EVENTS
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import EventRecord, Observer
 from rtcp.ipc.recording import About, FaultRecording, Moment, RecordingError, listed, versions, write
@@ -27,89 +27,88 @@ from rtcp.ipc.states import State
 from rtcp.ipc.tool_motion import ToolMotion
 
 SILENT_S = 1.0
-"""A loop that has published nothing for so long hangs."""
+"""Time without a record after which the loop counts as hanging, s."""
 _WATCHDOG = "the drives' watchdog stops them"
 _ENDED = f"ended unexpectedly; {_WATCHDOG}"
 _IN_FAULT = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 log = logging.getLogger("rtcp.blackbox")
 BEFORE_S = 10.0
 AFTER_S = 1.0
-"""A recording's time before and after the fault's instant."""
+"""A recording's time before and after the fault's instant, s."""
 
 
 @dataclass(frozen=True)
 class FaultRecord:
-    """What has begun: by an event of the loop, or (number 0) by its silence or end."""
+    """The beginning of a fault: by an event of the loop, or (number 0) by its silence or end."""
 
     time_ns: int
-    """CLOCK_REALTIME, for people."""
+    """CLOCK_REALTIME, for display."""
     monotonic_ns: int
-    """CLOCK_MONOTONIC: it decides."""
+    """CLOCK_MONOTONIC, for all comparisons."""
     what: str
     number: int = 0
     code: int = 0
     """Number of the kind of the event."""
     later: bool = False
-    """It came while a fault was on already."""
+    """Whether another fault was present already."""
 
 
 class RecordingTrigger:
-    """Divides events into recordings: within one fault at most one begins in 10 s.
+    """Assigns events to recordings: within one fault at most one begins in 10 s.
 
-    What comes in between is put off: the newest event of it begins a recording then, and the others are in the ten
-    seconds before that. The events' own instants decide, so that a gateway that finds old ones divides them as the one
-    before it did: those of CLOCK_MONOTONIC, because the wall clock may be set by hours just then.
+    Events in between are deferred: the newest of them begins the next recording, whose ten seconds before it hold the
+    others. The instants of the events are compared, not those of their arrival: a restarted gateway assigns old events
+    as before. They are of CLOCK_MONOTONIC, because the wall clock may be set.
 
     Args:
-        names: of the arm, for the texts and for what is a fault.
+        names: names of the arm, for texts and kinds of fault.
     """
 
     def __init__(self, names: Names) -> None:
         self._names = names
         self.on = False
-        """A fault is on."""
-        self._later: FaultRecord | None = None
+        """Whether a fault is present."""
+        self._deferred: FaultRecord | None = None
         self._ends_ns = self._next_ns = 0
-        """When the newest recording ends, and from when on another may begin; CLOCK_MONOTONIC."""
+        """End of the newest recording, and earliest begin of the next; CLOCK_MONOTONIC."""
 
     def begun(self, events: Sequence[EventRecord], now_ns: int) -> list[FaultRecord]:
-        """Return what begins a recording, of new events and of what was put off; `now_ns`: CLOCK_MONOTONIC."""
-        found: list[FaultRecord] = []
+        """Return the new and deferred faults that begin a recording; `now_ns`: CLOCK_MONOTONIC."""
+        faults: list[FaultRecord] = []
         for event in events:
-            found += self._due(event.monotonic_ns)
+            faults += self._due(event.monotonic_ns)
             if isinstance(event.event, ResetDone):
-                found += self.put_off()
+                faults += self.release_deferred()
                 self.on = False
             elif type(event.event) in self._names.faults:
-                what = self._names.message(event.event)
-                found += self.met(
-                    FaultRecord(event.time_ns, event.monotonic_ns, what, event.number, event.event.number)
-                )
-        return found + self._due(now_ns)
+                text = self._names.message(event.event)
+                fault = FaultRecord(event.time_ns, event.monotonic_ns, text, event.number, event.event.number)
+                faults += self.add(fault)
+        return faults + self._due(now_ns)
 
-    def put_off(self) -> list[FaultRecord]:
-        """Return what was put off: it begins its recording now."""
-        if self._later is None:
+    def release_deferred(self) -> list[FaultRecord]:
+        """Return the deferred fault, whose recording begins now; empty: there is none."""
+        if self._deferred is None:
             return []
-        fault, self._later = self._later, None
+        fault, self._deferred = self._deferred, None
         self._begin(fault, max(self._next_ns, fault.monotonic_ns))
         return [fault]
 
-    def met(self, fault: FaultRecord) -> list[FaultRecord]:
-        """Return what a fault begins: its own recording, or that of what was put off."""
+    def add(self, fault: FaultRecord) -> list[FaultRecord]:
+        """Return the faults whose recordings begin with a fault: its own, and one that was deferred."""
         fault = replace(fault, later=self.on)
         if not self.on:
             self.on = True
-            before = self.put_off()
+            before = self.release_deferred()
             self._begin(fault, fault.monotonic_ns)
             return [*before, fault]
-        # A silence shows only after it has begun: no recording that began before has it.
+        # A silence is detected after it has begun: no recording that began before covers it.
         if fault.monotonic_ns > self._ends_ns or not fault.number:
-            self._later = fault
+            self._deferred = fault
         return self._due(fault.monotonic_ns)
 
     def _due(self, now_ns: int) -> list[FaultRecord]:
-        return self.put_off() if now_ns >= self._next_ns else []
+        return self.release_deferred() if now_ns >= self._next_ns else []
 
     def _begin(self, fault: FaultRecord, begun_ns: int) -> None:
         self._ends_ns = fault.monotonic_ns + round(AFTER_S * 1e9)
@@ -117,13 +116,13 @@ class RecordingTrigger:
 
 
 class BlackBox:
-    """Watches one platform and writes its faults.
+    """Monitors one platform and records its faults.
 
     Args:
         observer: the blackboard; it is read in another thread too.
-        session: what was started.
-        directory: where the files go.
-        report: called with messages on what was written or could not be; from any thread.
+        session: the running platform.
+        directory: of the files.
+        report: called with messages on files written, and on failures; from any thread.
     """
 
     def __init__(self, observer: Observer, session: Session, directory: Path, report: Callable[[str], None]) -> None:
@@ -135,39 +134,39 @@ class BlackBox:
         self._events = RecordingTrigger(self._names)
         self._event = 0
         self._since = 0.0
-        """When the fault that is on was seen."""
+        """When the present fault was detected, s."""
         self._head, self._head_at = observer.head, time.monotonic()
         self._silent = False
         self._dead = self._end_wanted = False
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="blackbox")
         self._over = threading.Event()
-        """Nobody is there to wait for what follows a fault."""
+        """Set at the end: recordings no longer wait for the time after a fault."""
         if faults := self._begun():
-            self._writer.submit(self._make_up_for, faults)
+            self._writer.submit(self._record_missed, faults)
 
     # -- when -------------------------------------------------------------------------------------------------------
 
-    def look(self) -> None:
-        """Look for faults that have begun; a few times in each tenth of a second."""
+    def poll(self) -> None:
+        """Check for faults that have begun; called several times in 0.1 s."""
         if self._over.is_set():
             return
         for fault in self._begun():
             self._writer.submit(self._record, fault)
         now = time.monotonic()
-        self._listen(now)
+        self._check_silence(now)
         if self._events.on and now - self._since > AFTER_S and not (self._silent or self._machine_in_fault()):
-            # Not every event of this kind leads to a state that only a reset ends.
+            # Some of these events lead to a state that ends without a reset.
             self._events.on = False
 
     def end_is_wanted(self) -> None:
-        """The loop is told to end: from here on neither its silence nor its end is a fault."""
+        """Note an intentional stop: from now on neither silence nor end of the loop is a fault."""
         self._end_wanted = True
 
     def loop_has_ended(self) -> None:
-        """Record that the loop's process has ended without having been told to."""
+        """Record an end of the loop's process that was not requested."""
         if self._dead:
             return
-        self.look()
+        self.poll()
         self._dead = True
         if not self._end_wanted:
             self._process_fault(time.monotonic_ns(), _ENDED)
@@ -179,31 +178,31 @@ class BlackBox:
         if latest is not None:
             sentence = f"the loop (process {self._observer.loop_pid}) {_ENDED}"
             last_ns = int(latest["time_ns"][0])
-            self._writer.submit(self._make_up_for, [FaultRecord(_wall(last_ns), last_ns, sentence)])
+            self._writer.submit(self._record_missed, [FaultRecord(_wall(last_ns), last_ns, sentence)])
 
     def finish(self) -> None:
-        """Write what is still to be written and return when it is; a second time is harmless."""
-        self.look()
-        for fault in self._events.put_off():
+        """Write all pending recordings, then return; may be called again."""
+        self.poll()
+        for fault in self._events.release_deferred():
             self._writer.submit(self._record, fault)
         self._over.set()
         self._writer.shutdown()
 
     def _begun(self) -> list[FaultRecord]:
-        """Return the faults that events have begun since the last look."""
+        """Return the faults that events have begun since the last call."""
         events = self._observer.events_since(self._event)
         self._event = events[-1].number if events else self._event
-        if found := self._events.begun(events, time.monotonic_ns()):
+        if faults := self._events.begun(events, time.monotonic_ns()):
             self._since = time.monotonic()
-        return found
+        return faults
 
-    def _listen(self, now: float) -> None:
+    def _check_silence(self, now: float) -> None:
         head = self._observer.head
         if head != self._head:
             self._head, self._head_at = head, now
             if self._silent:
                 self._silent = False
-                self._since = now  # a fault that it finds itself in shows a little later
+                self._since = now  # a fault of its own appears a little later
                 self._say(f"the loop (process {self._observer.loop_pid}) publishes again")
         elif now - self._head_at > SILENT_S and not (self._silent or self._dead or self._end_wanted):
             self._silent = True
@@ -214,28 +213,28 @@ class BlackBox:
         latest = self._observer.latest()
         return latest is not None and State(int(latest["state"][0])) in _IN_FAULT
 
-    def _process_fault(self, monotonic_ns: int, what: str) -> None:
-        sentence = f"the loop (process {self._observer.loop_pid}) {what}"
+    def _process_fault(self, monotonic_ns: int, predicate: str) -> None:
+        sentence = f"the loop (process {self._observer.loop_pid}) {predicate}"
         self._say(sentence)
         if self._over.is_set():
             return
         fault = FaultRecord(_wall(monotonic_ns), monotonic_ns, sentence)
-        # Nothing comes after its end that would have to be kept apart from it.
-        begun = [fault] if self._dead else self._events.met(fault)
+        # No events follow the end of the loop: it needs no separation from others.
+        begun = [fault] if self._dead else self._events.add(fault)
         self._since = time.monotonic()
-        for one in begun:
-            self._writer.submit(self._record, one)
+        for fault in begun:
+            self._writer.submit(self._record, fault)
 
     def _say(self, sentence: str) -> None:
         log.error("%s", sentence)
         self._report(sentence)
 
-    # -- what; in the writer's thread -------------------------------------------------------------------------------
+    # -- contents, in the writer's thread ---------------------------------------------------------------------------
 
-    def _make_up_for(self, faults: Sequence[FaultRecord]) -> None:
-        """Record faults that began before this gateway did, unless that was done or they have left the ring."""
+    def _record_missed(self, faults: Sequence[FaultRecord]) -> None:
+        """Record faults from before this gateway's start, unless they are recorded or have left the ring."""
         try:
-            abouts = [one.about for one in listed(self._directory) if one.about is not None]
+            abouts = [entry.about for entry in listed(self._directory) if entry.about is not None]
             mine = [about for about in abouts if about.began_ns == self._session.began_ns]
             done = {(about.event, "" if about.event else about.what) for about in mine}
             missing = [fault for fault in faults if (fault.number, "" if fault.number else fault.what) not in done]
@@ -256,7 +255,7 @@ class BlackBox:
 
     def _record(self, fault: FaultRecord) -> None:
         try:
-            # At once: a short cycle's ring is soon written over.
+            # At once: a short cycle's ring is soon overwritten.
             before, _ = self._observer.since(0)
             ends_ns = fault.monotonic_ns + round(AFTER_S * 1e9)
             self._over.wait(0.0 if self._dead else max((ends_ns - time.monotonic_ns()) * 1e-9, 0.0))
@@ -266,16 +265,16 @@ class BlackBox:
         except RecordingError as error:
             self._say(f"black box: {error}")
         except Exception as error:
-            # One fault's recording is lost, and said to be; the next is tried again.
+            # The recording of this fault is lost and reported; the next one is tried again.
             self._defect("a fault was not recorded", error)
         else:
             sentence = f"black box: this fault is number {number} (`rtcp faults show {number}`)"
             log.info("%s: %s", sentence, path)
             self._report(sentence)
 
-    def _defect(self, what: str, error: Exception) -> None:
+    def _defect(self, failure: str, error: Exception) -> None:
         log.exception("black box")
-        self._say(f"black box: {what}, by a defect: {type(error).__name__} {error}")
+        self._say(f"black box: {failure}, by a defect: {type(error).__name__} {error}")
 
     def _recording(
         self, fault: FaultRecord, before: npt.NDArray[np.void], after: npt.NDArray[np.void], ends_ns: int
@@ -309,29 +308,24 @@ class BlackBox:
             timeline=timeline,
         )
         tool = ToolMotion(config.models, self._observer.schema)
-        records = tool.add(records)
-        return FaultRecording(about, {name: records[name] for name in tool.schema.names}, tool.schema)
+        return FaultRecording(about, tool.add(records), tool.schema)
 
     def _timeline(self, fault: FaultRecord, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
-        """Return what was said in the recording's time, and what of that is lost."""
-        events, texts = self._observer.events_since(0), self._observer.texts_since(0)
-        # Counted from the fault, however the wall clock is set meanwhile. A text has its wall time alone.
-        said = [(event.monotonic_ns - fault.monotonic_ns, self._names.message(event.event)) for event in events]
-        said += [(text.time_ns - fault.time_ns, text.sentence) for text in texts]
-        said += [(0, fault.what)] if not fault.number else []
+        """Return the messages in the recording's time, and notes on lost ones."""
+        events = self._observer.events_since(0)
+        # Relative to the fault: the wall clock may be set meanwhile.
+        texts = [(event.monotonic_ns - fault.monotonic_ns, self._names.message(event.event)) for event in events]
+        texts += [(0, fault.what)] if not fault.number else []
         begins_ns, ends_ns = -round(BEFORE_S * 1e9), ends_ns - fault.monotonic_ns
         notes = []
-        oldest = [("events", EVENTS, one.number, one.monotonic_ns - fault.monotonic_ns) for one in events[:1]]
-        oldest += [("messages", TEXTS, one.number, one.time_ns - fault.time_ns) for one in texts[:1]]
-        for name, room, number, away_ns in oldest:
-            if number > 1 and away_ns > begins_ns:
-                notes.append(f"more than {room} {name} came: those before {away_ns * 1e-9:+.1f} s are lost")
-        kept = sorted((one for one in said if begins_ns <= one[0] <= ends_ns), key=lambda one: one[0])
+        if events and events[0].number > 1 and (away_ns := events[0].monotonic_ns - fault.monotonic_ns) > begins_ns:
+            notes.append(f"more than {EVENTS} events came: those before {away_ns * 1e-9:+.1f} s are lost")
+        kept = sorted((text for text in texts if begins_ns <= text[0] <= ends_ns), key=lambda text: text[0])
         return tuple(Moment(fault.time_ns + away_ns, message) for away_ns, message in kept), notes
 
 
 def _place(records: npt.NDArray[np.void], fault: FaultRecord, newest: int) -> int:
-    """Return the index of the cycle in which the fault began, -1 without records; `newest` was the last one then."""
+    """Return the index of the cycle in which the fault began, -1: no records; `newest`: the last at its detection."""
     if not len(records):
         return -1
     if not fault.number:
@@ -339,13 +333,13 @@ def _place(records: npt.NDArray[np.void], fault: FaultRecord, newest: int) -> in
     codes = records["fault"].astype(np.int64)
     begins = np.flatnonzero((codes == fault.code) & (np.concatenate([[0], codes[:-1]]) != fault.code))
     away = np.abs(records["time_ns"] - fault.monotonic_ns)
-    # An event that is no fault of the machine's state, or not its first, has no such cycle: the clock tells.
+    # An event that is not the first fault of the machine's state has no such cycle: the clock decides.
     own = len(begins) and not fault.later
     return int(begins[np.argmin(away[begins])]) if own else int(np.argmin(away))
 
 
 def _wall(monotonic_ns: int) -> int:
-    """Return what the wall clock, as it is set now, showed at an instant of CLOCK_MONOTONIC."""
+    """Convert an instant of CLOCK_MONOTONIC to CLOCK_REALTIME by their present difference, ns."""
     return monotonic_ns - time.monotonic_ns() + time.time_ns()
 
 
@@ -356,14 +350,14 @@ def _state(records: npt.NDArray[np.void], at: int) -> str:
 
 
 def _silent_s(records: npt.NDArray[np.void], first: int) -> float:
-    """Return how long nothing was published before the first record that is kept; 0 where none is known before it."""
+    """Return the time without records before the first record that is kept, s; 0: the one before it is lost."""
     if not first or int(records["number"][first - 1]) + 1 != int(records["number"][first]):
         return 0.0
     return float(records["time_ns"][first] - records["time_ns"][first - 1]) * 1e-9
 
 
 def _lacking(records: npt.NDArray[np.void], at: int, silent_s: float) -> list[str]:
-    """Return in sentences which cycles of the recording's time are not in it; `silent_s` passed before its first."""
+    """Return notes on the cycles that a recording lacks; `silent_s`: time without records before its first, s."""
     if not len(records):
         return ["the ring holds no cycle of it"]
     notes, instants, numbers = [], records["time_ns"], records["number"].astype(np.int64)

@@ -1,4 +1,4 @@
-"""The way of a command to the loop: lease, ring, answer, outcome. One follower wakes everyone who waits."""
+"""Commands to the loop: lease, ring, answer, outcome. One task reads the blackboard for all waiting requests."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Json = dict[str, Any]
 IN_MOTION = frozenset({State.MOVING, State.STOPPING})
 """States that a motion passes through."""
 _POLL_S = 0.002
-"""Interval at which the blackboard is read while somebody waits, s; for the answer to a command half a cycle."""
+"""Longest interval of reading the blackboard while a request waits, s."""
 _ANSWER_S = 2.0
 """Time for the loop to accept or refuse a command, s."""
 _PROGRESS_S = 0.1
@@ -39,59 +39,60 @@ BROKEN = frozenset({State.FAULT, State.EMERGENCY_STOP})
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks: a name for people, the connection, and how it is told of progress."""
+    """The client of a request: its name, its connection, and the function that reports progress to it."""
 
     name: str
     connection: int
     report: Callable[[Json], None] = lambda progress: None
     is_stalled: Callable[[float], bool] = lambda seconds: False
-    """Whether it has not read what was sent to it for so many seconds."""
+    """Return whether the client has read no message for this time, s."""
 
 
 class _Waiter(Generic[T]):
     def __init__(
         self,
-        look: Callable[[], T | None],
+        poll: Callable[[], T | None],
         timeout_s: float,
         timed_out: Callable[[], RtcpError],
         interval_s: float,
         pace: Callable[[], float],
     ) -> None:
         self.interval_s = interval_s
-        self._look = look
+        self._poll = poll
         self._left_s, self._before = timeout_s, monotonic()
         self._timed_out = timed_out
         self._pace = pace
         self.outcome: asyncio.Future[T] = asyncio.get_running_loop().create_future()
 
     def update(self) -> None:
-        """Look once; a result or an error ends the wait."""
+        """Poll once; a result or an error ends the wait."""
         if self.outcome.done():
             return
         try:
-            found = self._look()
+            result = self._poll()
             now = monotonic()
             self._left_s -= self._pace() * (now - self._before)
             self._before = now
-            if found is None and self._left_s < 0.0:
+            if result is None and self._left_s < 0.0:
                 raise self._timed_out()
         except Exception as error:
             self.outcome.set_exception(error)
         else:
-            if found is not None:
-                self.outcome.set_result(found)
+            if result is not None:
+                self.outcome.set_result(result)
 
 
 class Lease(int):
-    """The id of a lease, for one request: `request` counts these, so that what is older than a stop begins nothing."""
+    """The id of a lease, as held by one request."""
 
     request: int
+    """Number of the request; one that is older than a stop cannot begin a motion."""
 
 
 class CommandChannel:
-    """Sends commands to the loop and waits for what comes of them, on behalf of all methods.
+    """Sends commands to the loop and waits for their outcomes, on behalf of all methods.
 
-    `follow` has to run as a task. All methods raise RtcpError.
+    `follow` must run as a task. All methods raise RtcpError.
 
     Args:
         observer: the blackboard.
@@ -107,14 +108,14 @@ class CommandChannel:
         self._ring = asyncio.Lock()
         self._answer_poll_s = min(0.2e-6 * config.cycle.period_us, _POLL_S)
         self._requests = self._barrier = 0
-        """Requests that have asked to move the arm; those before the barrier came before a stop or a newer motion."""
+        """Number of the last request, and of the last that a stop or a newer motion has superseded."""
         self._shared: dict[int, tuple[int, int]] = {}
-        """Lease, and how many calls hold it, by connection."""
+        """Lease, and number of calls that hold it, by connection."""
         self._waiters: list[_Waiter[Any]] = []
         self._has_waiters = asyncio.Event()
         self._sleeper = ThreadPoolExecutor(1, "follow")
 
-    # -- what the loop shows now --------------------------------------------------------------------------------------
+    # -- the latest record --------------------------------------------------------------------------------------------
 
     def record(self) -> Any:
         """Return the latest cycle record, a numpy record."""
@@ -131,8 +132,8 @@ class CommandChannel:
     @property
     def control_mode(self) -> ControlMode | None:
         """Control mode in the latest record."""
-        found = int(self.record()["control_mode"])
-        return ControlMode(found) if found in tuple(ControlMode) else None
+        number = int(self.record()["control_mode"])
+        return ControlMode(number) if number in tuple(ControlMode) else None
 
     def speed_override(self) -> float:
         """Return the speed override in the latest record."""
@@ -158,13 +159,13 @@ class CommandChannel:
             "positions": self.joints("actual_position"),
         }
 
-    def ahead_s(self) -> float:
-        """Return how long the motion under way still lasts, s."""
+    def remaining_s(self) -> float:
+        """Return the remaining time of the motion under way, s."""
         record = self.record()
         return float(record["duration_s"]) - float(record["elapsed_s"])
 
     def check_loop(self) -> None:
-        """Raise RtcpError where the loop has ended."""
+        """Raise RtcpError if the loop has ended."""
         if not self.snapshot.loop_lives:
             raise RtcpError("fault", f"the loop (process {self.observer.loop_pid}) has ended")
 
@@ -174,8 +175,8 @@ class CommandChannel:
     async def lease(self, caller: Caller) -> AsyncIterator[Lease]:
         """Hold the lease, renewed, until the block ends; report progress meanwhile.
 
-        A motion that replaces another of its connection shares the lease with it. It is not renewed for a caller that
-        does not read its reports: such a client is stopped (SIGSTOP) or hangs.
+        A motion that replaces another of its connection shares its lease. The lease of a caller that does not read its
+        reports is not renewed: such a client is stopped (SIGSTOP) or hangs.
         """
         lease, users = self._shared.get(caller.connection, (0, 0))
         if not users:
@@ -203,8 +204,8 @@ class CommandChannel:
         return next((lease for lease, _ in self._shared.values()), 0)
 
     def is_shared(self, lease: int) -> bool:
-        """Whether another request of the connection holds this lease too, so that its end does not stop the arm."""
-        return any(held == lease and users > 1 for held, users in self._shared.values())
+        """Whether several requests of a connection hold this lease, so that the end of one does not stop the arm."""
+        return any(shared == lease and users > 1 for shared, users in self._shared.values())
 
     def acquire(self, caller: Caller) -> int:
         """Acquire the lease and return its id; the caller renews and releases it."""
@@ -221,7 +222,7 @@ class CommandChannel:
     # -- commands and their outcome -----------------------------------------------------------------------------------
 
     async def send(self, lease: int, command: Command) -> None:
-        """Send a command; return when it was accepted and a record of a later cycle is there."""
+        """Send a command; return when it was accepted and a later cycle was published."""
         await self.run(lease, command, lambda: True, _ANSWER_S, command.name)
 
     async def run(
@@ -230,24 +231,33 @@ class CommandChannel:
         command: Command,
         outcome: Callable[[], T | None],
         timeout_s: float,
-        what: str,
+        name: str,
         pace: Callable[[], float] = lambda: 1.0,
     ) -> T:
-        """Send a command and wait until `outcome` returns something; it is called from the first record on that knows
-        of the command, and may raise. `pace`: how fast the time passes of which there is `timeout_s`."""
+        """Send a command and wait until `outcome` returns a value.
+
+        Args:
+            lease: of the request.
+            command: the command.
+            outcome: returns the result, or None while there is none; may raise. Its first call is after the cycle that
+                accepted the command.
+            timeout_s: longest wait, s.
+            name: of the command in messages.
+            pace: returns the factor on elapsed time that counts against `timeout_s`, as the speed override of a motion.
+        """
         head = await self.accept(lease, command)
 
-        def look() -> T | None:
+        def poll() -> T | None:
             self.check_loop()
             return outcome() if self.observer.head > head else None
 
         def timed_out() -> RtcpError:
-            return RtcpError("timeout", f"{what} took longer than {timeout_s:.1f} s: the machine is {self.state.words}")
+            return RtcpError("timeout", f"{name} took longer than {timeout_s:.1f} s: the machine is {self.state.words}")
 
-        return await self.wait(look, timeout_s, timed_out, pace=pace)
+        return await self.wait(poll, timeout_s, timed_out, pace=pace)
 
     async def accept(self, lease: int, command: Command) -> int:
-        """Send a command; return, once the loop has accepted it, the number of the last record without it.
+        """Send a command; return, when the loop has accepted it, the number of the last record before its effect.
 
         A motion that was planned while a stop or a newer motion was sent is refused, reason `superseded`.
         """
@@ -266,7 +276,7 @@ class CommandChannel:
             except (ValueError, OverflowError, struct.error) as error:
                 raise RtcpError("invalid", f"{command.name}: a field cannot be sent: {error}") from None
             late = RtcpError("timeout", f"the loop did not answer {command.name} within {_ANSWER_S:g} s")
-            # The answer is a little older than the record of its cycle.
+            # The answer is written before the record of its cycle.
             return await self.wait(lambda: self._accepted(number), _ANSWER_S, lambda: late, self._answer_poll_s)
 
     def _accepted(self, number: int) -> int | None:
@@ -286,14 +296,14 @@ class CommandChannel:
 
     async def wait(
         self,
-        look: Callable[[], T | None],
+        poll: Callable[[], T | None],
         timeout_s: float,
         timed_out: Callable[[], RtcpError],
         interval_s: float = _POLL_S,
         pace: Callable[[], float] = lambda: 1.0,
     ) -> T:
-        """Return what `look` returns, once that is not None; it is called at least every `interval_s` and may raise."""
-        waiter = _Waiter(look, timeout_s, timed_out, interval_s, pace)
+        """Return the value of `poll`, once that is not None; it is called at least every `interval_s` and may raise."""
+        waiter = _Waiter(poll, timeout_s, timed_out, interval_s, pace)
         self._waiters.append(waiter)
         self._has_waiters.set()
         try:
@@ -302,28 +312,28 @@ class CommandChannel:
             self._waiters.remove(waiter)
 
     async def follow(self) -> None:
-        """Read the blackboard for all who wait; rest while nobody does."""
+        """Read the blackboard for all waiting requests; sleep while there are none."""
         while True:
             await self._has_waiters.wait()
             for waiter in list(self._waiters):
                 waiter.update()
             interval_s = min((waiter.interval_s for waiter in self._waiters), default=_POLL_S)
-            # Not `asyncio.sleep`: epoll's resolution makes at least 1 ms of it, two cycles more for each answer.
+            # Not `asyncio.sleep`: epoll's resolution of 1 ms would delay each answer by two cycles.
             await asyncio.get_running_loop().run_in_executor(self._sleeper, sleep, interval_s)
             if not self._waiters:
                 self._has_waiters.clear()
 
-    def reaching(self, wanted: State, through: frozenset[State], what: str, since: int) -> Callable[[], State | None]:
+    def reaching(self, wanted: State, through: frozenset[State], name: str, since: int) -> Callable[[], State | None]:
         """Return an outcome: the state `wanted`, reached through the states `through` only.
 
         Args:
             wanted: the state; while the drives change their mode it does not count.
-            through: others that are passed; any other fails.
-            what: names the command in messages.
+            through: states on the way; any other fails.
+            name: of the command in messages.
             since: number of the last event before the command.
         """
 
-        def look() -> State | None:
+        def poll() -> State | None:
             self.check_loop()
             record = self.record()
             state = State(int(record["state"]))
@@ -334,10 +344,10 @@ class CommandChannel:
             if state in through:
                 return None
             if state is State.STOPPED_BY_LIMIT:
-                raise self.ended(self.early_end(since), f"{what} was stopped by a limit")
-            raise RtcpError("refused", f"{what} was ended by another command: the machine is {state.words}")
+                raise self.ended(self.early_end(since), f"{name} was stopped by a limit")
+            raise RtcpError("refused", f"{name} was ended by another command: the machine is {state.words}")
 
-        return look
+        return poll
 
     # -- events -------------------------------------------------------------------------------------------------------
 
@@ -347,8 +357,8 @@ class CommandChannel:
 
     def early_end(self, since: int) -> Event | None:
         """Return the last event after `since` that ends a motion before its goal."""
-        found = [one.event for one in self.events(since) if self._ends_early(one.event)]
-        return found[-1] if found else None
+        events = [record.event for record in self.events(since) if self._ends_early(record.event)]
+        return events[-1] if events else None
 
     def _ends_early(self, event: Event) -> bool:
         ends = isinstance(event, MotionEnded | LeaseExpired | PermissionWithdrawn)
@@ -356,29 +366,29 @@ class CommandChannel:
 
     def fault_since(self, since: int) -> RtcpError:
         """Return the error for the last fault after `since`."""
-        found = [one.event for one in self.events(since) if type(one.event) in self.names.faults]
-        if found:
-            return self.error("fault", found[-1])
+        faults = [record.event for record in self.events(since) if type(record.event) in self.names.faults]
+        if faults:
+            return self.error("fault", faults[-1])
         return RtcpError("fault", self.snapshot.last_fault or "the machine went into fault: see `rtcp status`")
 
-    def ended(self, event: Event | None, what: str) -> RtcpError:
+    def ended(self, event: Event | None, name: str) -> RtcpError:
         """Return the error for a motion that `event` ended."""
         if event is None:
-            return RtcpError("fault", f"{what}: see `rtcp status`")
-        return self.error("fault", event, before=f"{what}: ")
+            return RtcpError("fault", f"{name}: see `rtcp status`")
+        return self.error("fault", event, before=f"{name}: ")
 
     def error(self, kind: ErrorKind, about: Refusal | Event, before: str = "", after: str = "") -> RtcpError:
-        """Return the error that carries a refusal or an event."""
+        """Return the error for a refusal or an event."""
         return RtcpError(kind, before + self.names.message(about) + after, about.name, about.as_json())
 
 
 class StreamingCommands:
-    """Carries commands that last only while more of them follow; each connection keeps one lease from first to last.
+    """Sends commands that expire unless another follows; a connection holds one lease for all of a motion.
 
-    A client that falls silent has three ends: the hold time of its command, its lease, its connection.
+    The motion of a silent client ends with the hold time of its last command, with its lease or with its connection.
 
     Args:
-        channel: the way to the loop.
+        channel: to the loop.
     """
 
     def __init__(self, channel: CommandChannel) -> None:
@@ -386,7 +396,7 @@ class StreamingCommands:
         self._leases: dict[int, tuple[int, int]] = {}
         """Lease and last event before it, by connection."""
         self._head = 0
-        """Number of the last record without the command that was accepted last."""
+        """Number of the last record before the newest command's effect."""
 
     async def send(self, caller: Caller, command: Command) -> Json:
         """Send a command; return state and positions."""
@@ -402,20 +412,20 @@ class StreamingCommands:
         return {"state": channel.state.name.lower(), "positions": channel.joints("actual_position")}
 
     async def open(self, caller: Caller, motion: int = 0, partners: int = 0) -> Json:
-        """Begin a stream that the client feeds itself; return what it needs for that; it renews the lease."""
+        """Begin a stream of the client; return its number and lease, which the client renews, and the last event."""
         lease, since = self._lease(caller)
         stream = monotonic_ns()
         self._head = await self._channel.accept(lease, OpenStream(stream, motion, partners))
         return {"stream": stream, "lease": lease, "since": since}
 
     async def rest(self, caller: Caller) -> None:
-        """End what this connection moves and wait until the arm rests: another command follows."""
+        """End the motion of this connection and wait until the arm rests; called before a command of another kind."""
         if caller.connection in self._leases:
             self.end(caller.connection)
             await self.wait_for_rest()
 
     async def wait_for_rest(self) -> None:
-        """Wait until the arm rests, after its commander has let go."""
+        """Wait until the arm rests, after its lease was released."""
         channel = self._channel
 
         def rested() -> bool | None:
@@ -426,18 +436,18 @@ class StreamingCommands:
             await channel.wait(rested, _REST_S, lambda: RtcpError("timeout", "the arm does not come to rest"))
 
     def end(self, connection: int) -> None:
-        """End what a connection moves: its lease goes, and the loop stops the arm."""
+        """End the motion of a connection: its lease is released, and the loop stops the arm."""
         lease, _ = self._leases.pop(connection, (0, 0))
         if lease:
             self._channel.observer.release(lease)
 
     def lease_of(self, connection: int) -> int:
-        """Return the lease of what a connection moves; 0: it moves nothing."""
+        """Return the lease of a connection's motion; 0: it moves nothing."""
         return self._leases.get(connection, (0, 0))[0]
 
     def _lease(self, caller: Caller) -> tuple[int, int]:
-        held = self._leases.get(caller.connection)
-        if held is None or not self._channel.observer.renew(held[0]):
+        lease = self._leases.get(caller.connection)
+        if lease is None or not self._channel.observer.renew(lease[0]):
             since = self._channel.observer.last_event
-            self._leases[caller.connection] = held = self._channel.acquire(caller), since
-        return held
+            self._leases[caller.connection] = lease = self._channel.acquire(caller), since
+        return lease

@@ -1,7 +1,7 @@
 """The joystick of the virtual IO box: forces its inputs through its objects, and releases them by itself.
 
-An input that stays forced when whoever forced it has died is a known accident: every hold is short and has to be
-repeated, a connection that closes releases, and a gateway that starts releases what an earlier one left.
+An input must not stay forced when its client has died: every hold is short and must be repeated, a closed connection
+releases, and a starting gateway releases the inputs of an earlier one.
 """
 
 from __future__ import annotations
@@ -11,16 +11,20 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+from annotated_types import Gt, Le
 
 from rtcp.config.model import VIRTUAL, ArmConfig, InputConfig
 from rtcp.gateway.command_channel import Caller, Json
 from rtcp.gateway.machine_actions import MachineActions
+from rtcp.gateway.method import left, method
 from rtcp.ipc.errors import RtcpError
 
 OBJECT, MASK, LEVELS, HOLD = 0x2000, 1, 2, 3
-"""Of the virtual IO box: which inputs are forced, to what, and for how long (`rtcp.virtual.models.diewu`)."""
+"""Object of the virtual IO box; its subindices: forced inputs, levels, hold time (`rtcp.virtual.models.diewu`)."""
 _BOX_HOLD_MS, _REPEAT_S = 1500, 0.4
-"""The box releases by itself where this process is killed."""
+"""Hold time, after which the box releases by itself if this process is killed, ms; interval of repetition, s."""
 DIRECTIONS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
 CHAIR, EMERGENCY_STOP, ENABLING_SWITCH = "chair", "emergency_stop", "enabling_switch"
 LONGEST_HOLD_S = 1.0
@@ -33,8 +37,8 @@ class JoystickOverride:
 
     Args:
         actions: writes the objects.
-        config: which inputs they are.
-        bus: there is such an object on the virtual bus only.
+        config: has the numbers of the inputs.
+        bus: must be the virtual one, which alone has this object.
     """
 
     def __init__(self, actions: MachineActions, config: ArmConfig, bus: str) -> None:
@@ -53,18 +57,26 @@ class JoystickOverride:
         """Whether there is a virtual IO box."""
         return self._bus == VIRTUAL and bool(self._boxes)
 
-    async def force(self, caller: Caller, pressed: Sequence[str] | None, byte: int | None, hold_s: float) -> Json:
-        """Hold the joystick as `pressed` names it, or at `byte`, for `hold_s`; None and None: release it.
+    @method(streams=True)
+    async def joystick(
+        self,
+        caller: Caller,
+        pressed: tuple[str, ...] | None = None,
+        byte: int | None = None,
+        hold_s: Annotated[float, Gt(0), Le(LONGEST_HOLD_S)] = LONGEST_HOLD_S,
+        sent_s: float | None = None,
+    ) -> Json:
+        """Hold the joystick of the virtual IO box as `pressed` names it, or at `byte`; neither: release it.
 
-        Raises:
-            RtcpError: `refused` where another holds it.
+        `pressed`: of forward, backward, left, right, mode_up, mode_down, chair, emergency_stop, enabling_switch.
         """
+        left(hold_s, sent_s)
         if self._bus == VIRTUAL and not self._boxes:
             raise RtcpError("refused", "inputs are forced at an IO box: none is configured (slaves in the file)")
         if not self.possible:
             raise RtcpError("refused", f"inputs are forced on the virtual bus only, not on {self._bus}")
         if self._owner is not None and self._owner.connection != caller.connection:
-            # What it holds ends by itself within a second.
+            # Its hold expires within a second.
             raise RtcpError("refused", f"the joystick is held by {self._owner.name}: wait until it is released")
         inputs = {} if pressed is None and byte is None else forced(self._config, pressed or (), byte)
         if not any(mask for mask, _ in inputs.values()):
@@ -75,7 +87,7 @@ class JoystickOverride:
         return {box: {"mask": mask, "levels": levels} for box, (mask, levels) in inputs.items()}
 
     async def release(self) -> None:
-        """Release everything; what fails is tried again by `watch`."""
+        """Release all inputs; `watch` repeats failed writes."""
         self._owner = None
         self._repeated = 0.0
         if self.possible:
@@ -83,12 +95,12 @@ class JoystickOverride:
                 await self._write({})
 
     async def end(self, connection: int) -> None:
-        """Release what a connection that has closed was holding."""
+        """Release the inputs of a connection that has closed."""
         if self._owner is not None and self._owner.connection == connection:
             await self.release()
 
     async def watch(self) -> None:
-        """Release what is not repeated; runs as long as the gateway does."""
+        """Release inputs whose hold is not repeated; runs as long as the gateway."""
         while True:
             await asyncio.sleep(_POLL_S)
             expired = self._owner is not None and time.monotonic() > self._until
@@ -99,14 +111,14 @@ class JoystickOverride:
         async with self._writing:
             repeats = time.monotonic() - self._repeated > _REPEAT_S
             refused: RtcpError | None = None
-            # What is released first: a box that does not answer keeps no other one's stick deflected.
+            # Releases first: a box that does not answer must not delay them.
             for box in sorted(self._boxes, key=lambda box: inputs.get(box, (0, 0))[0] != 0):
                 mask, levels = inputs.get(box, (0, 0))
                 try:
                     if mask and (repeats or not self._written.get((box, MASK))):
                         await self._write_object(box, HOLD, _BOX_HOLD_MS)
                         self._repeated = time.monotonic()
-                    # Levels first, so that no input takes one that nobody asked for; but none is released late.
+                    # Levels before the mask: no input gets an old level. A full release needs the mask alone.
                     for subindex, value in ((LEVELS, levels), (MASK, mask)) if mask else ((MASK, mask),):
                         if self._written.get((box, subindex)) != value:
                             self._written.pop((box, subindex), None)
@@ -126,13 +138,13 @@ def forced(config: ArmConfig, pressed: Sequence[str], byte: int | None) -> dict[
     """Return the mask of the inputs that are forced and their levels, by box.
 
     Args:
-        config: where joystick, toggle, emergency stop and enabling switch are.
+        config: has the inputs of joystick, toggle, emergency stop and enabling switch.
         pressed: of `DIRECTIONS`, and `chair` (the toggle gives the joystick to the wheelchair), `emergency_stop`,
             `enabling_switch`.
-        byte: the joystick's byte, or None: as `pressed` says.
+        byte: the joystick's byte; None: by `pressed`.
 
     Raises:
-        RtcpError: naming what is unknown or not configured.
+        RtcpError: a name is unknown, or an input is not configured.
     """
     inputs = config.inputs
     switches: dict[str, tuple[InputConfig | None, bool]] = {
@@ -161,12 +173,12 @@ def forced(config: ArmConfig, pressed: Sequence[str], byte: int | None) -> dict[
     bits = {name: 1 << getattr(joystick, name) - 1 for name in DIRECTIONS}
     place = (min(bits.values()).bit_length() - 1) // 8 * 8
     box = config.box_of(joystick)
-    here = (one for one, _ in switches.values() if one is not None and config.box_of(one) == box)
-    others = sum(1 << one.number - 1 for one in here)
+    here = (switch for switch, _ in switches.values() if switch is not None and config.box_of(switch) == box)
+    others = sum(1 << switch.number - 1 for switch in here)
     lines = sum(bits.values())
     if byte is None:
-        shown = sum(bits[name] for name in DIRECTIONS if name in pressed)
-        level = lines & ~shown if joystick.active == "low" else shown
+        active_lines = sum(bits[name] for name in DIRECTIONS if name in pressed)
+        level = lines & ~active_lines if joystick.active == "low" else active_lines
     elif not 0 <= byte <= _BYTE:
         raise RtcpError("invalid", f"byte: found {byte}, allowed is 0 to 255")
     else:

@@ -1,40 +1,36 @@
-"""The limits in force, as the gateway knows them: shown, changed as one transaction, kept for the next gateway."""
+"""The limits in force: reported, changed as one transaction, and kept for the next gateway."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from math import inf
 from pathlib import Path
+from typing import Any
 
 from rtcp.config.model import ArmConfig
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json
+from rtcp.gateway.method import method
 from rtcp.ipc.commands import SetLimits
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import limits_file
-from rtcp.motion.limits import LEAST_PART, Corners, Limits, Values, rows
+from rtcp.motion.limits import FIELDS, Corners, Limits, Values, WrongLimit, rows, wrong_limits
 
-_JOINT_KEYS = {
-    "min": "low",
-    "max": "high",
-    "velocity": "velocity",
-    "acceleration": "acceleration",
-    "jerk": "jerk",
-    "torque": "torque",
-}
+_JOINT_KEYS = {{"low": "min", "high": "max"}.get(name, name): name for name in FIELDS}
 _ENDS = ("min", "max")
 ALL = "joints"
-"""Stands for every joint in a key."""
+"""Name for all joints in a key."""
 
 
 class LimitSettings:
-    """Shows and changes the limits.
+    """Reports and changes the limits.
 
     Args:
-        channel: the way to the loop.
+        channel: to the loop.
         limits: in force; changed here when the loop has accepted the change.
-        directory: the runtime directory, where they are kept as long as the loop lives.
+        directory: the runtime directory, which keeps them as long as the loop lives.
     """
 
     def __init__(self, channel: CommandChannel, limits: Limits, directory: Path) -> None:
@@ -45,13 +41,14 @@ class LimitSettings:
         if kept := _read(self._file, channel.observer.loop_pid):
             limits.apply(kept)
 
-    def show(self) -> Json:
-        """Return what is in force beside what is configured."""
+    @method(at_once=True)
+    async def limits(self, caller: Caller) -> Json:
+        """Return the `limits` in force beside those that are `configured`."""
         config = self._config
         return {
             "joint_names": [joint.name for joint in config.joints],
-            "limits": _shown(config, now(self._limits)),
-            "configured": _shown(config, self._limits.widest),
+            "limits": _as_json(config, now(self._limits)),
+            "configured": _as_json(config, self._limits.widest),
             "cartesian": {
                 name: getattr(config.cartesian, name)
                 for name in (
@@ -60,8 +57,9 @@ class LimitSettings:
             } | {"singularity": dataclasses.asdict(config.cartesian.singularity)},
         }  # fmt: skip
 
-    async def change(self, caller: Caller, changes: Mapping[str, float]) -> Json:
-        """Change limits, all or none; keys as `joint2.max`, `joints.velocity`, `box.min.x`, `user.max.z`."""
+    @method()
+    async def set_limits(self, caller: Caller, changes: dict[str, Any]) -> Json:
+        """Narrow limits, all or none; keys as `joint2.max`, `joints.velocity`, `box.min.x`. Returns as `limits`."""
         new = changed(self._config, now(self._limits), changes)
         async with self._channel.lease(caller) as lease:
             plan = rows(new)
@@ -69,12 +67,12 @@ class LimitSettings:
             await self._channel.send(lease, SetLimits(slot, len(plan)))
             self._limits.apply(new)
             _write(self._file, new, self._channel.observer.loop_pid)
-        return self.show()
+        return await self.limits(caller)
 
 
 def now(limits: Limits) -> Values:
     """Return the limits in force."""
-    joints = {name: tuple(getattr(limits, name)) for name in _JOINT_KEYS.values()}
+    joints = {name: tuple(getattr(limits, name)) for name in FIELDS}
     return Values(**joints, box=limits.box, keep_out=limits.keep_out)
 
 
@@ -82,81 +80,70 @@ def changed(config: ArmConfig, values: Values, changes: Mapping[str, float]) -> 
     """Return `values` with `changes`.
 
     Raises:
-        RtcpError: `invalid`, naming each key or number that is none.
+        RtcpError: `invalid`, naming each invalid key or number.
     """
     if not changes:
         raise RtcpError("invalid", f"changes: found none, give a key and a number, as {_example(config)}")
-    names = [joint.name for joint in config.joints]
-    per_joint, boxes = _lists(config, values)
-    wrong = []
+    widest = Values.configured(config)
+    wrong, limits, new = [], [], values
     for key, number in changes.items():
         if type(number) not in (int, float) or not abs(number) <= sys.float_info.max:
             wrong.append(f"{key}: found {json.dumps(number)[:60]}, allowed is a finite number")
             continue
-        head, _, rest = key.rpartition(".") if key.rpartition(".")[2] in _JOINT_KEYS else (key, "", "")
-        which, _, end = head.rpartition(".")
-        box, _, side = which.rpartition(".")
-        if rest and (head in names or head == ALL):
-            numbers = per_joint[_JOINT_KEYS[rest]]
-            for joint in range(len(names)) if head == ALL else (names.index(head),):
-                numbers[joint] = number
-                wrong += _joint_beyond(config, joint, rest, number)
-        elif box in boxes and side in _ENDS and end in ("x", "y", "z"):
-            boxes[box][3 * _ENDS.index(side) + "xyz".index(end)] = number
-            wrong += _corner_beyond(config, box, side, end, number)
-        else:
+        try:
+            new = _put(config, new, key, number)
+        except KeyError:
             wrong.append(f"{key}: there is no such limit; allowed are {_example(config)}")
-    if wrong := wrong or [*_empty(names, per_joint, boxes)]:
+        # After each key, because a later one may replace its number, or make room for it.
+        limits += [limit for limit in wrong_limits(widest, new) if not limit.no_room]
+    limits += wrong_limits(widest, new)
+    wrong += dict.fromkeys(_sentence(config, limit) for limit in limits)
+    if wrong:
         raise RtcpError("invalid", "\n".join(wrong))
+    return new
+
+
+def _put(config: ArmConfig, values: Values, key: str, number: float) -> Values:
+    """Return `values` with a finite number at a key; raises KeyError."""
+    names = [joint.name for joint in config.joints]
+    per_joint, boxes = _lists(config, values)
+    head, _, rest = key.rpartition(".") if key.rpartition(".")[2] in _JOINT_KEYS else (key, "", "")
+    which, _, end = head.rpartition(".")
+    box, _, side = which.rpartition(".")
+    if rest and (head in names or head == ALL):
+        for joint in range(len(names)) if head == ALL else (names.index(head),):
+            per_joint[_JOINT_KEYS[rest]][joint] = number
+    elif box in boxes and side in _ENDS and end in ("x", "y", "z"):
+        boxes[box][3 * _ENDS.index(side) + "xyz".index(end)] = number
+    else:
+        raise KeyError(key)
     joints = {name: tuple(numbers) for name, numbers in per_joint.items()}
     inner = _corners(boxes.pop("box")) if values.box is not None else None
     return Values(**joints, box=inner, keep_out=tuple(_corners(corners) for corners in boxes.values()))
 
 
+def _sentence(config: ArmConfig, wrong: WrongLimit) -> str:
+    """Return the message for a limit that cannot be set: its key, its value and the allowed range."""
+    name = next((key for key, name in _JOINT_KEYS.items() if name == wrong.name), wrong.name)
+    if wrong.axis >= 0:
+        part, where = config.joints[wrong.axis].name, f"joints[{wrong.axis}]"
+        allowed = f"{wrong.low:g} to {wrong.high:g}"
+    else:
+        part = "box" if wrong.box < 0 else config.cartesian.keep_out[wrong.box].name
+        where = "cartesian.box" if wrong.box < 0 else "cartesian.keep_out"
+        allowed = f"at least {wrong.low:g}" if wrong.high == inf else f"at most {wrong.high:g}"
+    text = f"{part}.{name}: found {wrong.found:g}, allowed is"
+    if wrong.no_room:
+        return f"{text} less than {part}.{name.replace('min', 'max')}, which is {wrong.high:g}"
+    return f"{text} {allowed} ({where} in {config.source.name}: limits are only narrowed while running)"
+
+
 def _lists(config: ArmConfig, values: Values) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
-    """Return limits as lists to change: of the joints by attribute, of the boxes by name, the inner one first."""
+    """Return limits as mutable lists: of the joints by attribute, of the boxes by name, the inner one first."""
     boxes = {} if values.box is None else {"box": list(values.box)}
-    named = zip((one.name for one in config.cartesian.keep_out), values.keep_out, strict=True)
+    named = zip((box.name for box in config.cartesian.keep_out), values.keep_out, strict=True)
     boxes |= {name: list(corners) for name, corners in named}
-    return {name: list(getattr(values, name)) for name in _JOINT_KEYS.values()}, boxes
-
-
-def _joint_beyond(config: ArmConfig, joint: int, key: str, number: float) -> Iterator[str]:
-    """Say where a joint's limit is wider than the configuration's, or too narrow to be one."""
-    widest = Values.configured(config)
-    low, high = widest.low[joint], widest.high[joint]
-    if key not in _ENDS:
-        high = getattr(widest, _JOINT_KEYS[key])[joint]
-        low = LEAST_PART * high
-    if not low <= number <= high:
-        yield (
-            f"{config.joints[joint].name}.{key}: found {number:g}, allowed is {low:g} to {high:g} "
-            f"(joints[{joint}] in {config.source.name}: limits are only narrowed while running)"
-        )
-
-
-def _corner_beyond(config: ArmConfig, box: str, side: str, end: str, number: float) -> Iterator[str]:
-    """Say where a box allows more than the configuration's."""
-    widest = _lists(config, Values.configured(config))[1][box]
-    bound = widest[3 * _ENDS.index(side) + "xyz".index(end)]
-    at_least = (side == "min") is (box == "box")
-    if number < bound if at_least else number > bound:
-        where = "cartesian.box" if box == "box" else "cartesian.keep_out"
-        yield (
-            f"{box}.{side}.{end}: found {number:g}, allowed is at {'least' if at_least else 'most'} {bound:g} "
-            f"({where} in {config.source.name}: limits are only narrowed while running)"
-        )
-
-
-def _empty(names: list[str], joints: Mapping[str, list[float]], boxes: Mapping[str, list[float]]) -> Iterator[str]:
-    """Say which ranges and boxes have no room between their ends."""
-    ends = zip(names, joints["low"], joints["high"], strict=True)
-    ranges = [(name, "", low, high) for name, low, high in ends]
-    for name, six in boxes.items():
-        ranges += [(name, f".{axis}", low, high) for axis, low, high in zip("xyz", six[:3], six[3:], strict=True)]
-    for name, axis, low, high in ranges:
-        if not low < high:
-            yield f"{name}.min{axis}: found {low:g}, allowed is less than {name}.max{axis}, which is {high:g}"
+    return {name: list(getattr(values, name)) for name in FIELDS}, boxes
 
 
 def _example(config: ArmConfig) -> str:
@@ -171,8 +158,8 @@ def _corners(six: list[float]) -> Corners:
     return a, b, c, d, e, f
 
 
-def _shown(config: ArmConfig, values: Values) -> Json:
-    boxes = zip((one.name for one in config.cartesian.keep_out), values.keep_out, strict=True)
+def _as_json(config: ArmConfig, values: Values) -> Json:
+    boxes = zip((box.name for box in config.cartesian.keep_out), values.keep_out, strict=True)
     return {
         **{key: list(getattr(values, name)) for key, name in _JOINT_KEYS.items()},
         "box": None if values.box is None else _ends(values.box),
@@ -191,14 +178,14 @@ def _write(path: Path, values: Values, loop: int) -> None:
 
 
 def _read(path: Path, loop: int) -> Values | None:
-    """Return what was kept for this loop; the limits of an earlier one are over with it."""
+    """Return the limits kept for this loop; None for those of an earlier loop."""
     try:
         kept = json.loads(path.read_text())
         if kept["loop"] != loop:
             return None
         values = kept["values"]
         box = None if values["box"] is None else _corners(values["box"])
-        joints = {name: tuple(values[name]) for name in _JOINT_KEYS.values()}
-        return Values(**joints, box=box, keep_out=tuple(_corners(one) for one in values["keep_out"]))
+        joints = {name: tuple(values[name]) for name in FIELDS}
+        return Values(**joints, box=box, keep_out=tuple(_corners(corners) for corners in values["keep_out"]))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None

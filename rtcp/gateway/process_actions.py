@@ -1,4 +1,4 @@
-"""Commands of processes beside motion that last."""
+"""Commands of processes beside motion, which last."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class ProcessActions:
     """Carries out commands of processes.
 
     Args:
-        channel: the way to the loop.
+        channel: to the loop.
         config: the platform.
     """
 
@@ -25,16 +25,16 @@ class ProcessActions:
         self._config = config
 
     async def run(self, caller: Caller, command: ProcessCommand) -> Json:
-        """Carry out a command that lasts; return when the process has finished.
+        """Carry out a command; return when the process has finished.
 
         Raises:
-            RtcpError: it was refused; or it ended early, and `reason` and `fields` say by what.
+            RtcpError: it was refused, or ended early by the event in `reason` and `fields`.
         """
         channel = self._channel
         busy = f"{identifier(self._process_of(command).name)}_busy"
-        since = max((one.number for one in channel.events(0)), default=0)
+        since = max((record.number for record in channel.events(0)), default=0)
 
-        def look() -> bool | None:
+        def poll() -> bool | None:
             channel.check_loop()
             if channel.state in BROKEN:
                 raise channel.fault_since(since)
@@ -45,10 +45,10 @@ class ProcessActions:
 
         async with channel.lease(caller) as lease:
             head = await channel.accept(lease, command)
-            await channel.wait(lambda: look() if channel.observer.head > head else None, math.inf, timed_out)
+            await channel.wait(lambda: poll() if channel.observer.head > head else None, math.inf, timed_out)
         if channel.early_end(since) is not None:
             raise channel.fault_since(since)
-        ends = [one.event for one in channel.events(since) if isinstance(one.event, ProcessEnded)]
+        ends = [record.event for record in channel.events(since) if isinstance(record.event, ProcessEnded)]
         if ends:
             raise channel.ended(ends[-1], command.name)
         return {}

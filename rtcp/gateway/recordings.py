@@ -1,4 +1,4 @@
-"""Recordings, on behalf of clients: each is a process of its own, which a gateway that was started anew finds again."""
+"""Recordings, on behalf of clients: each is a process of its own, which a restarted gateway finds again."""
 
 from __future__ import annotations
 
@@ -7,21 +7,24 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from rtcp.config.model import RecordingConfig
+from annotated_types import Ge, Gt, Le
+
+from rtcp.config.model import RecordingConfig, RecordingFormat
 from rtcp.config.serialization import to_json
 from rtcp.config.zero import state_directory
-from rtcp.gateway.command_channel import Json
+from rtcp.gateway.command_channel import Caller, Json
+from rtcp.gateway.method import method
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.session import Pid, is_running, terminate, wait_for_exit
 
 _READY_S, _END_S = 12.0, 12.0
-"""Less than a client waits for its answer."""
+"""Timeouts of a recorder's start and end, s: less than a client waits for its answer."""
 
 
 def recordings_directory() -> Path:
-    """Return where recordings go that name no place."""
+    """Return the default directory of recordings."""
     return state_directory() / "recordings"
 
 
@@ -38,7 +41,7 @@ class Recordings:
     async def start_once(self, options: RecordingConfig) -> None:
         """Start the recorder that begins with the platform, unless an earlier gateway has. Raises as `start`."""
         try:
-            # Removed with what the recorders tell, at the end of the platform.
+            # Removed with the recorders' own files at the end of the platform.
             (self._directory / "recorder-begun.json").touch(mode=0o600, exist_ok=False)
         except FileExistsError:
             return
@@ -47,10 +50,10 @@ class Recordings:
         await self.start(options)
 
     async def start(self, options: RecordingConfig) -> Json:
-        """Start a recorder; return what it is doing.
+        """Start a recorder; return its fields.
 
         Raises:
-            RtcpError: where and why it cannot: reason `relative_path` (`out`), or one of the recorder's.
+            RtcpError: it cannot start: reason `relative_path` (`out`), or one of the recorder's.
         """
         path = recordings_directory() if options.out is None else Path(options.out)
         if not path.is_absolute():
@@ -65,7 +68,7 @@ class Recordings:
         try:
             line = await asyncio.wait_for(process.stdout.readline(), _READY_S)
         except BaseException as error:
-            # Also where the client has gone: nobody would know of this recording.
+            # Also if the client has gone: nobody would know of this recording.
             process.kill()
             await process.wait()
             if isinstance(error, asyncio.TimeoutError):
@@ -76,39 +79,59 @@ class Recordings:
         answer: dict[str, Any] = json.loads(line)
         if "error" in answer:
             raise RtcpError(answer["kind"], str(answer["error"]), answer["reason"], answer["fields"])
-        return _shown(answer["recording"], True)
+        return _as_json(answer["recording"], True)
 
-    def status(self) -> list[Json]:
-        """Return what the recorders of this platform do or have done, the oldest first."""
-        return [_shown(found, is_running(pid)) for pid, found in self._recorders()]
+    @method(at_once=True)
+    async def record_start(
+        self,
+        caller: Caller,
+        out: str | None = None,
+        formats: tuple[RecordingFormat, ...] = (),
+        signals: tuple[str, ...] = (),
+        every: Annotated[int, Ge(1), Le(1_000_000)] = 1,
+        seconds: Annotated[float, Gt(0)] | None = None,
+        max_file_mb: Annotated[int, Ge(1)] | None = None,
+        max_file_seconds: Annotated[float, Ge(1)] | None = None,
+        keep: Annotated[int, Ge(1)] | None = None,
+        reserve_mb: Annotated[int, Ge(0)] = RecordingConfig.reserve_mb,
+    ) -> Json:
+        """Start a recording: the keys of `recording` in the arm's file. Returns what `record_status` lists."""
+        rotation = (max_file_mb, max_file_seconds, keep)
+        return await self.start(RecordingConfig(out, formats, signals, every, seconds, *rotation, reserve_mb))
 
-    async def stop(self, only: int | None = None) -> list[Json]:
-        """End the recorders that run, or the process `only`, and return what they have done."""
-        running = [pid for pid, _ in self._recorders() if is_running(pid) and only in (None, pid)]
-        await asyncio.gather(*(asyncio.to_thread(terminate, pid, _END_S) for pid in running))
-        return [_shown(found, False) for pid, found in self._recorders() if pid in running]
+    @method(at_once=True)
+    async def record_stop(self, caller: Caller, pid: int | None = None) -> Json:
+        """End all recordings, or that of the process `pid`. Returns `recordings`: those that were ended."""
+        ended = [process for process, _ in self._recorders() if is_running(process) and pid in (None, process)]
+        await asyncio.gather(*(asyncio.to_thread(terminate, process, _END_S) for process in ended))
+        return {"recordings": [_as_json(entry, False) for process, entry in self._recorders() if process in ended]}
+
+    @method(at_once=True)
+    async def record_status(self, caller: Caller) -> Json:
+        """Return `recordings`: files, rotations, records, missing, bytes, seconds, whether it runs, its problem."""
+        return {"recordings": [_as_json(entry, is_running(pid)) for pid, entry in self._recorders()]}
 
     async def finish(self) -> None:
-        """Wait until all recorders have completed their files, now that the loop has ended; remove what they told."""
+        """Wait until all recorders have completed their files, now that the loop has ended; remove their own files."""
         running = [pid for pid, _ in self._recorders() if is_running(pid)]
         await asyncio.gather(*(asyncio.to_thread(wait_for_exit, pid, _END_S) for pid in running))
         for path in self._directory.glob("recorder-*.json"):
             path.unlink(missing_ok=True)
 
     def _recorders(self) -> list[tuple[Pid, dict[str, Any]]]:
-        found = []
+        recorders = []
         for path in self._directory.glob("recorder-*.json"):
             try:
-                one = json.loads(path.read_text())
-                found.append((Pid(int(one["pid"]), int(one["identity"])), one))
+                entry = json.loads(path.read_text())
+                recorders.append((Pid(int(entry["pid"]), int(entry["identity"])), entry))
             except (OSError, ValueError, LookupError, TypeError):
                 continue
-        return sorted(found, key=lambda one: str(one[1]["files"]))
+        return sorted(recorders, key=lambda recorder: str(recorder[1]["files"]))
 
 
-def _shown(found: dict[str, Any], running: bool) -> Json:
+def _as_json(recorder: dict[str, Any], running: bool) -> Json:
     """Return a recorder's fields for clients; one that was killed has a problem."""
-    shown = {name: value for name, value in found.items() if name not in ("identity", "ended")}
-    if not running and not found["ended"]:
-        shown["problem"] = "the recorder was ended from outside: its file is whole up to its last second"
-    return {**shown, "running": running and not found["ended"]}
+    fields = {name: value for name, value in recorder.items() if name not in ("identity", "ended")}
+    if not running and not recorder["ended"]:
+        fields["problem"] = "the recorder was ended from outside: its file is whole up to its last second"
+    return {**fields, "running": running and not recorder["ended"]}

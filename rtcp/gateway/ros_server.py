@@ -15,7 +15,7 @@ _END_S = 5.0
 
 
 class RosServer:
-    """Starts it once a platform, whatever becomes of the gateway meanwhile, and ends it.
+    """Starts it once in the life of a platform, also if the gateway is restarted, and ends it.
 
     Args:
         directory: the runtime directory.
@@ -49,13 +49,13 @@ class RosServer:
         self._file.write_text(json.dumps({"pid": int(pid), "identity": pid.identity}))
 
     async def finish(self) -> None:
-        """End it."""
+        """End the server, if it runs."""
         await asyncio.to_thread(terminate, self._pid(), _END_S)
         self._file.unlink(missing_ok=True)
 
     def _pid(self) -> Pid:
         try:
-            found = json.loads(self._file.read_text())
-            return Pid(int(found["pid"]), int(found["identity"]))
+            content = json.loads(self._file.read_text())
+            return Pid(int(content["pid"]), int(content["identity"]))
         except (OSError, ValueError, LookupError, TypeError):
             return NO_PROCESS

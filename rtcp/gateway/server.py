@@ -1,6 +1,6 @@
-"""The gateway's process: JSON-RPC on the control socket, and what follows the loop beside it.
+"""The gateway's process: JSON-RPC on the control socket, status and black box.
 
-It may die and be started again while the loop holds the arm: a motion that it was carrying ends with its lease.
+It may die and be started again while the loop holds the arm: a motion on its behalf ends with its lease.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ from rtcp.ipc.session import (
 
 _FOLLOW_S = 0.02
 _REPEAT_LOG_S = 10.0
-"""Between two lines of the log on the same defect."""
+"""Interval between two lines of the log on the same defect, s."""
 _MOST_PENDING = 256
-"""Requests of one connection that wait for their answers."""
+"""Most requests of one connection that wait for their answers."""
 _MOST_UNREAD = 1 << 16
-"""Bytes of answers that wait for a client; with more, it is told of no progress."""
+"""Most bytes of answers that wait for a client; beyond, it gets no progress reports."""
 _SEND_BUFFER = 4096
-"""Bytes, before doubling by the kernel: a client that does not read is noticed after about ten progress reports."""
+"""Send buffer, bytes, which the kernel doubles: a client that does not read is noticed after about ten reports."""
 _LINGER_S = 1.0
 log = logging.getLogger("rtcp.gateway")
 
 
 class _Connection:
-    """One client: its requests in their turn, but for the methods that are carried out at once."""
+    """One client: its requests are carried out in order, except for methods marked `at_once`."""
 
     def __init__(
         self, number: int, writer: asyncio.StreamWriter, methods: Methods, answered: Callable[[], None]
@@ -66,17 +66,17 @@ class _Connection:
         self._answered = answered
         self._name = "an unnamed client"
         self._disables_when_lost = False
-        self._turn = asyncio.Lock()
+        self._in_order = asyncio.Lock()
         self._requests: dict[asyncio.Task[None], jsonrpc.RequestId] = {}
         self._unread_since: float | None = None
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
 
     async def serve(self, reader: asyncio.StreamReader) -> None:
-        """Answer requests until the client has gone; what it asked for ends with it."""
+        """Answer requests until the client disconnects, which ends all that it requested."""
         try:
-            while given := await _read_line(reader):
-                self._receive(given)
-            if given is None:
+            while line := await _read_line(reader):
+                self._receive(line)
+            if line is None:
                 if self._requests:
                     await asyncio.wait(self._requests)
                 message = f"the request is a line longer than {jsonrpc.LINE_LIMIT} bytes: the connection is closed"
@@ -89,11 +89,11 @@ class _Connection:
             await self._methods.end_connection(self._number)
             if self._disables_when_lost and self._methods.channel.observer.holder() in ("", self._name):
                 with contextlib.suppress(RtcpError):
-                    await self._methods.machine.disable()
+                    await self._methods.machine.disable(Caller(self._name, self._number))
 
-    def _receive(self, given: bytes) -> None:
+    def _receive(self, line: bytes) -> None:
         try:
-            number, method, params, is_notification = jsonrpc.read_request(given)
+            number, method, params, is_notification = jsonrpc.read_request(line)
             if is_notification:
                 return self._notified(method, params)
             if method not in self._methods.table:
@@ -126,9 +126,9 @@ class _Connection:
         caller = Caller(self._name, self._number, lambda progress: self._report(number, progress), self._is_stalled)
         at_once = self._methods.table[method].at_once or params.get("replace") is True
         try:
-            async with contextlib.AsyncExitStack() as turn:
+            async with contextlib.AsyncExitStack() as stack:
                 if not at_once:
-                    await turn.enter_async_context(self._turn)
+                    await stack.enter_async_context(self._in_order)
                 answer = {"id": number, "result": await self._methods.call(method, caller, params)}
         except RtcpError as error:
             answer = jsonrpc.failure(number, error)
@@ -158,7 +158,7 @@ class _Connection:
             self._send({"method": "progress", "params": {"request": number, **progress}})
 
     def _unread(self) -> int:
-        """Return how many bytes wait because the client does not read."""
+        """Return the number of bytes that the client has not read."""
         return self._writer.transport.get_write_buffer_size()
 
     def _is_stalled(self, seconds: float) -> bool:
@@ -167,7 +167,7 @@ class _Connection:
 
 
 async def _read_line(reader: asyncio.StreamReader) -> bytes | None:
-    """Return the next line; nothing where the client has gone, None for a line beyond the limit."""
+    """Return the next line; empty: the client has disconnected; None: the line is beyond the limit."""
     try:
         return await reader.readline()
     except ConnectionError:
@@ -177,7 +177,7 @@ async def _read_line(reader: asyncio.StreamReader) -> bytes | None:
 
 
 async def _discard(reader: asyncio.StreamReader) -> None:
-    """Read what a client still sends, for a while: it reads its answer only when it has sent everything."""
+    """Read the rest of a client's request, for a limited time: it reads its answer only after sending all."""
 
     async def rest() -> None:
         while await reader.read(jsonrpc.LINE_LIMIT):
@@ -199,15 +199,15 @@ class Gateway:
         session = read_session(directory)
         self._observer = Observer(blackboard_file(directory))
         started = read_json(directory / "started.json", dict)
-        load_messages()  # before anyone asks which events are faults
+        load_messages()  # before the kinds of fault are collected
         self._snapshot = StatusSnapshot(self._observer, session, started)
-        self._snapshot.follow()  # what an earlier gateway has logged, with its time, is not logged again
+        self._snapshot.follow()  # messages that an earlier gateway logged are not logged again
         self._box = BlackBox(self._observer, session, faults_directory(), self._snapshot.note)
         self._methods = Methods(self._observer, self._snapshot, session, directory, self._end_platform)
         self._recording = session.config.recording
         self._ros, self._ros_server = session.config.ros, RosServer(directory)
         self._logged: dict[str, float] = {}
-        """When a defect was logged, by what met it."""
+        """Time of the last log line, s, by name of the failed step."""
         self._connections = 0
         self._ended = asyncio.Event()
         self._stopping = False
@@ -237,7 +237,7 @@ class Gateway:
         if self._ros is not None:
             await self._ros_server.start_once(self._ros.simple_message, self._observer.loop_pid)
         await self._ended.wait()
-        # Not waiting for clients that are still there (`status --watch`): they learn it by the closed connection.
+        # Does not wait for connected clients (`status --watch`): their connections close.
         server.close()
         watching.cancel()
         if self._snapshot.loop_lives and not self._stopping:
@@ -249,7 +249,7 @@ class Gateway:
         await asyncio.to_thread(self._box.finish)
 
     async def _record(self) -> None:
-        """Start the recording that the arm's file asks for; one that cannot start costs the platform nothing."""
+        """Start the recording of the arm's file; the platform runs on if it cannot start."""
         if self._recording is None:
             return
         try:
@@ -293,36 +293,36 @@ class Gateway:
     async def _follow(self) -> None:
         while True:
             self._try("the status snapshot", self._log_messages)
-            self._try("the black box", self._box.look)
+            self._try("the black box", self._box.poll)
             await asyncio.sleep(_FOLLOW_S)
 
     def _log_messages(self) -> None:
         for message in self._snapshot.follow():
             log.info("%s", message)
 
-    def _try(self, what: str, turn: Callable[[], None]) -> None:
-        """Take one turn; a defect in it is logged, now and then, and ends neither the others nor the next one."""
+    def _try(self, name: str, step: Callable[[], None]) -> None:
+        """Run a step; log a defect in it at most every `_REPEAT_LOG_S`: other steps and later runs go on."""
         try:
-            turn()
+            step()
         except Exception:
             now = time.monotonic()
-            if now - self._logged.get(what, -_REPEAT_LOG_S) >= _REPEAT_LOG_S:
-                self._logged[what] = now
-                log.exception("%s cannot follow the loop; it is tried again", what)
+            if now - self._logged.get(name, -_REPEAT_LOG_S) >= _REPEAT_LOG_S:
+                self._logged[name] = now
+                log.exception("%s cannot follow the loop; it is tried again", name)
 
     async def _end_platform(self) -> list[str]:
-        """End all processes but this one, which ends after its answer; return what could not be left in order."""
+        """End all processes but this one, which ends after its answer; return the problems with that."""
         processes = read_processes(self._directory)
         was_running = is_running(processes.loop)
         if processes.loop and not was_running:
-            # It died before it was told to, and whoever saw that was quicker here than its end.
+            # It died before the request, which arrived before the notification of its end.
             self._loop_has_ended()
         self._box.end_is_wanted()
         stop_marker(self._directory).touch(mode=0o600)
         if self._snapshot.loop_lives:
             with contextlib.suppress(BlackboardError):
                 await self._methods.machine.end_loop()
-            # The blocking waits run beside, so that this process goes on answering `status`.
+            # Blocking waits run in threads, so that this process goes on answering `status`.
             if not await asyncio.to_thread(wait_for_exit, processes.loop, 6.0):
                 await asyncio.to_thread(terminate, processes.loop, 4.0)
         await self._ros_server.finish()
@@ -342,18 +342,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="rtcp.gateway.server")
     parser.add_argument("--directory", type=Path, required=True)
     parser.add_argument("--ready-fd", type=int, required=True)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     to_stderr = logging.StreamHandler(sys.stderr)
     to_stderr.setFormatter(log_format())
     logging.basicConfig(level=logging.INFO, handlers=[to_stderr])
 
     def ready() -> None:
         with contextlib.suppress(OSError):
-            os.write(given.ready_fd, json.dumps({"event": "ready", "pid": os.getpid()}).encode() + b"\n")
-            os.close(given.ready_fd)
+            os.write(arguments.ready_fd, json.dumps({"event": "ready", "pid": os.getpid()}).encode() + b"\n")
+            os.close(arguments.ready_fd)
 
     try:
-        asyncio.run(_run(given.directory, ready))
+        asyncio.run(_run(arguments.directory, ready))
     except (BlackboardError, SessionError, OSError, TypeError) as error:
         sys.stderr.write(f"gateway: {error}\n")
         return 1
@@ -362,8 +362,8 @@ def main() -> int:
 
 async def _run(directory: Path, ready: Callable[[], None]) -> None:
     await Gateway(directory).serve(ready)
-    # asyncio closes the pipe that it learns of signals by before it takes its handlers back: one in between would be a
-    # traceback in the log.
+    # asyncio closes its signal pipe before it removes its handlers: a signal in between would leave a traceback in the
+    # log.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
 

@@ -1,4 +1,4 @@
-"""What `rtcp status` shows of the running platform, made from the blackboard."""
+"""The status of the running platform for `rtcp status`, from the blackboard."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ import numpy.typing as npt
 from kinematics.forward import frames
 from kinematics.jacobian import singularity_distances
 from rtcp.config.model import PLATFORM_PARTS
-from rtcp.ipc.events import JOYSTICK_MODES, ResetDone, severity
+from rtcp.ipc.codes import state_name
+from rtcp.ipc.events import JOYSTICK_MODES, ResetDone, ServiceEvent, severity
 from rtcp.ipc.names import SINGULARITIES, Names
 from rtcp.ipc.observer import EventRecord, Observer
 from rtcp.ipc.robot_status import RobotStatus
@@ -38,10 +39,9 @@ from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.realtime.statistics import SlidingPercentiles, diagnose
 
-AL_NAMES = {1: "INIT", 2: "PRE-OP", 3: "BOOT", 4: "SAFE-OP", 8: "OP"}
 _MESSAGES = 50
 _SHOWN = 10
-"""The last so many of them are shown."""
+"""Number of messages in the status."""
 _SILENT_S = 1.0
 _SECOND_NS = 1_000_000_000
 _UNDER_WAY = (int(State.MOVING), int(State.STOPPING))
@@ -49,23 +49,16 @@ _FIGURES = {"wakeup": "wakeup_ns", "exchange": "exchange_ns", "compute": "comput
             "filtered": "dc_filtered_ns"}  # fmt: skip
 
 _SECOND = ("cycles", "unanswered", "incomplete", "tracked")
-"""What is counted of the last second, in cycles: all, those without an answer, those with another working counter than
-the expected, those with an answer and a locked clock."""
-
-
-def al_name(status: int) -> str:
-    """Return the AL state in words (ETG.1000.6, table 9); `no answer` for 0."""
-    if status == 0:
-        return "no answer"
-    return AL_NAMES.get(status & 0x0F, f"0x{status:02X}") + (" + ERROR" if status & 0x10 else "")
+"""Counts of cycles in the last second: all, without an answer, with a working counter other than expected, with an
+answer and a locked clock."""
 
 
 class StatusSnapshot:
-    """Follows the blackboard: statistics of the cycle, the last messages, the fault.
+    """Reads the blackboard: statistics of the cycle, the last messages, the fault.
 
     Args:
         observer: the blackboard.
-        session: what was started.
+        session: the running platform.
         started: facts of the start that the loop reported (realtime, start to OP).
     """
 
@@ -75,34 +68,33 @@ class StatusSnapshot:
         self._started = started
         self.names = Names(session.config, session.partners)
         self.limits = Limits(session.config)
-        """In force."""
+        """Limits in force."""
         self._tool = None if session.config.arm is None else ToolMotion(session.config.models, observer.schema)
         self._at = max(observer.head - 1, 0)
         self._event = 0
-        self._text = 0
         self._figures = {name: SlidingPercentiles() for name in _FIGURES}
         self._recent: deque[tuple[int, npt.NDArray[np.int64], int]] = deque()
-        """Of the batches of the last second: instant of its last cycle, ns; counts as `_SECOND` names them; working
+        """For each batch of the last second: instant of its last cycle, ns; counts in the order of `_SECOND`; working
         counter of its last answer, -1: none."""
         self._enables = 0
         self.fault = ""
-        """Message of the present fault: why the machine is in it."""
+        """Message of the present fault."""
         self.last_fault = ""
         self.message = ""
-        """The last message on what has become of the arm."""
+        """The last message about the arm."""
         self._message_ns = 0
-        """Its instant, CLOCK_REALTIME."""
+        """Instant of `message`, CLOCK_REALTIME, ns."""
         self._moves = 0
         self._moving = False
         self._began_ns = 0
-        """When the last motion began, CLOCK_MONOTONIC."""
+        """Begin of the last motion, CLOCK_MONOTONIC, ns."""
         self.messages: deque[tuple[int, str]] = deque(maxlen=_MESSAGES)
         self.loop_lives = True
 
     # -- following ----------------------------------------------------------------------------------------------------
 
     def follow(self) -> list[str]:
-        """Read what is new; return the messages that came since the last call."""
+        """Read new records and events; return the messages since the last call."""
         records, _ = self._observer.since(self._at)
         if len(records):
             self._at = int(records[-1]["number"])
@@ -111,7 +103,7 @@ class StatusSnapshot:
         return self._read_messages()
 
     def note(self, message: str) -> None:
-        """Add a message of the gateway's own."""
+        """Add a message of the gateway."""
         self.messages.append((time.time_ns(), message))
 
     def _count(self, records: npt.NDArray[np.void]) -> None:
@@ -126,7 +118,7 @@ class StatusSnapshot:
             self._figures[name].add(now, np.abs(records[field]) / 1e3 if "dc" in field else records[field] / 1e3)
 
     def _note_answers(self, records: npt.NDArray[np.void]) -> None:
-        """Count the cycles that were answered, wholly or not, and those in which the clock was tracked."""
+        """Count complete and incomplete answers, and cycles with a locked clock."""
         wkc, answered = records["wkc"], records["wkc"] >= 0
         incomplete = answered & (wkc != records["wkc_expected"])
         tracked = answered & (records["flags"] & FLAG_DC_LOCKED != 0)
@@ -143,36 +135,31 @@ class StatusSnapshot:
         return dict(zip(_SECOND, map(int, counts), strict=True)), last
 
     def _note_motion(self, records: npt.NDArray[np.void]) -> None:
-        """Find the last cycle in which a motion began: from rest, or one that took another's place."""
+        """Note the last cycle in which a motion began, from rest or in place of another."""
         moving, moves = np.isin(records["state"], _UNDER_WAY), records["moves"].astype(np.int64)
         rested = ~np.concatenate([[self._moving], moving[:-1]])
-        other = moves != np.concatenate([[self._moves], moves[:-1]])
-        begun = np.flatnonzero(moving & (rested | other))
+        replaced = moves != np.concatenate([[self._moves], moves[:-1]])
+        begun = np.flatnonzero(moving & (rested | replaced))
         if len(begun):
             self._began_ns = int(records["time_ns"][begun[-1]])
         self._moving, self._moves = bool(moving[-1]), int(moves[-1])
 
     def _read_messages(self) -> list[str]:
-        new: list[tuple[int, str, bool]] = []
+        new: list[str] = []
         for record in self._observer.events_since(self._event):
             self._event, event = record.number, record.event
             message = self.names.message(event)
-            new.append((record.time_ns, message, True))
+            new.append(message)
+            self.messages.append((record.time_ns, message))
+            if not isinstance(event, ServiceEvent) or event.is_problem:
+                self.message, self._message_ns = message, record.time_ns
             if type(event) in self.names.faults:
-                # An emergency stop out of a fault is what has to be ended first.
+                # An emergency stop during a fault must be ended first.
                 self.fault = message if event.is_emergency else self.fault or message
                 self.last_fault = message
             elif isinstance(event, ResetDone):
                 self.fault = ""
-        for text in self._observer.texts_since(self._text):
-            self._text = text.number
-            new.append((text.time_ns, text.sentence, text.is_problem))
-        new.sort()
-        self.messages.extend((at_ns, message) for at_ns, message, _ in new)
-        for at_ns, message, is_problem in new:
-            if is_problem:
-                self.message, self._message_ns = message, at_ns
-        return [message for _, message, _ in new]
+        return new
 
     # -- showing ------------------------------------------------------------------------------------------------------
 
@@ -188,44 +175,44 @@ class StatusSnapshot:
         }
 
     def _limited_by(self, record: npt.NDArray[np.void]) -> dict[str, str]:
-        """Return what keeps the motion below the commanded velocity: a sentence under the name of each limit."""
+        """Return the limits that keep the motion below the commanded velocity: a sentence under the name of each."""
         held, q = int(record["held"]), [float(value) for value in record["commanded_position"]]
-        names, models, found = self.names, self._session.config.models, {}
+        names, models, limits = self.names, self._session.config.models, {}
         low, high = self.limits.low, self.limits.high
         for axis in (axis for axis in range(len(q)) if held >> axis & 1):
             name = names.joint(axis)
-            found[name] = f"a guard cuts the target of {name} (limits of {names.key(axis)} in {names.file})"
+            limits[name] = f"a guard cuts the target of {name} (limits of {names.key(axis)} in {names.file})"
         if (axis := (held >> HELD_SPEED_AT & 15) - 1) >= 0:
             name, speed = names.joint(axis), self.limits.velocity[axis]
-            found[f"{name} speed"] = (
+            limits[f"{name} speed"] = (
                 f"{name} moves at its speed limit, {speed:g} rad/s ({names.key(axis)}.velocity in {names.file})"
             )
         if (axis := (held >> HELD_RANGE_AT & 15) - 1) >= 0:
             name, end = names.joint(axis), low[axis] if q[axis] - low[axis] < high[axis] - q[axis] else high[axis]
-            found[f"{name} range"] = (
+            limits[f"{name} range"] = (
                 f"{name} is {abs(end - q[axis]):.4f} rad from the end of its range, {end:g} rad "
                 f"({names.key(axis)}.position in {names.file})"
             )
         if not models:
-            return found
+            return limits
         model = models[int(record["tool"])]
         distances = singularity_distances(model, q)
         for which, (name, unit) in enumerate(SINGULARITIES):
             if held & HELD_SHOULDER << which:
                 least = getattr(self._session.config.cartesian.singularity, name)
-                found[name] = (
+                limits[name] = (
                     f"the {name} is {distances[which] or 0.0:.3f} {unit} from its singularity, limit {least:g} {unit} "
                     f"(cartesian.singularity.{name} in {names.file}): jog away from it, or jog joints"
                 )
         if (box := (held >> HELD_BOX_AT) - 2) >= -1:
             clearance = self._session.config.cartesian.clearance
             near = Zones(model, self.limits, clearance).clearances(frames(model, q), math.inf)
-            distance = next((one.distance for one in near if min(one.zone, HELD_ITSELF) == box), 0.0)
-            found["box"] = f"the arm is {distance:.3f} m from {names.box(box)}"
-        return found
+            distance = next((zone.distance for zone in near if min(zone.zone, HELD_ITSELF) == box), 0.0)
+            limits["box"] = f"the arm is {distance:.3f} m from {names.box(box)}"
+        return limits
 
     def _headline(self, state: State, limits: dict[str, str], paused: bool) -> str:
-        """Return why the machine is in fault, else the last message; while a motion lasts none of an earlier one."""
+        """Return the reason of a fault, else the last message; during a motion none of an earlier one."""
         if self.fault or int(state) not in _UNDER_WAY:
             return self.fault or self.message
         if paused:
@@ -236,7 +223,7 @@ class StatusSnapshot:
         return f"{state.words}, limited: {'; '.join(limits.values())}" if limits else state.words
 
     def _loop_problem(self, silent_s: float) -> str:
-        """Return what is wrong with the loop's process; empty: it publishes."""
+        """Return the problem of the loop's process; empty: it publishes."""
         loop = f"the loop (process {self._observer.loop_pid})"
         way_out = "the drives' watchdog stops them: `rtcp stop`, then `rtcp start`"
         if not self.loop_lives:
@@ -249,19 +236,19 @@ class StatusSnapshot:
         if "states" in self._session.config.bus.LACKS:
             return []
         slaves = self._session.config.slaves
-        found = zip(slaves, self._observer.slaves(len(slaves)), self._observer.health(len(slaves)), strict=True)
+        rows = zip(slaves, self._observer.slaves(len(slaves)), self._observer.health(len(slaves)), strict=True)
         return [
             {
                 "position": position,
                 "name": slave.name,
-                "state": al_name(al) if self.loop_lives else "unknown",
+                "state": state_name(al) if self.loop_lives else "unknown",
                 "al_status_code": code,
                 "lost": health.lost,
                 "recovered": health.recovered,
                 "temperature": None if math.isnan(health.temperature) else round(health.temperature, 1),
                 "errors": {"rx": health.rx, "forwarded": health.forwarded, "links": health.links},
             }
-            for position, (slave, (al, code), health) in enumerate(found, 1)
+            for position, (slave, (al, code), health) in enumerate(rows, 1)
         ]
 
     def _tool_motion(self, record: np.void) -> dict[str, list[float]] | None:
@@ -270,44 +257,45 @@ class StatusSnapshot:
             return None
         q = np.stack([record["actual_position"], record["commanded_position"]])
         poses, velocities = self._tool.of(q, np.stack([record["actual_velocity"]] * 2), np.stack([record["tool"]] * 2))
-        found = {"pose": poses[0], "velocity": velocities[0], "commanded_pose": poses[1]}
-        return {name: [round(one, 7) for one in values.tolist()] for name, values in found.items()}
+        motion = {"pose": poses[0], "velocity": velocities[0], "commanded_pose": poses[1]}
+        return {name: [round(number, 7) for number in values.tolist()] for name, values in motion.items()}
 
     def _devices(self, record: np.void) -> dict[str, dict[str, dict[str, Any]]]:
-        """Return value and unit of what each slave that is no drive publishes, by slave and field."""
-        found: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in self._session.config.boxes}
+        """Return value and unit of the fields of each slave that is no drive, by slave and field."""
+        devices: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in self._session.config.boxes}
         for field in self._observer.schema.fields:
             if field.part in PLATFORM_PARTS:
                 continue
             value = record[field.name].tolist()
             numbers = value if field.shape else [value]
-            known = [one if math.isfinite(one) else None for one in numbers]  # no JSON has the others
-            shown = {"value": known if field.shape else known[0], "unit": field.unit}
-            found.setdefault(field.part, {})[field.local_name] = shown
-        return found
+            known = [number if math.isfinite(number) else None for number in numbers]  # JSON has no others
+            entry = {"value": known if field.shape else known[0], "unit": field.unit}
+            devices.setdefault(field.part, {})[field.local_name] = entry
+        return devices
 
     def _processes(self, record: np.void) -> dict[str, dict[str, Any]]:
         """Return kind, state in words, and names of the commands of each process, by name."""
-        found: dict[str, dict[str, Any]] = {}
+        processes: dict[str, dict[str, Any]] = {}
         for process in self._session.config.processes:
             words = None
             if process.STATES is not None:
                 number = int(record[f"{identifier(process.name)}_state"])
-                words = next((one.name.lower().replace("_", " ") for one in process.STATES if one == number), "unknown")
+                names = (state.name for state in process.STATES if state == number)
+                words = next(names, "unknown").lower().replace("_", " ")
             commands = [command.name for command in process.COMMANDS]
-            found[process.name] = {"kind": process.kind, "state": words, "commands": commands}
-        return found
+            processes[process.name] = {"kind": process.kind, "state": words, "commands": commands}
+        return processes
 
     def _skipped_ticks(self, cycles: int, missed: int) -> dict[str, Any] | None:
-        """Return why the loop skips more ticks than it should and what to do, or None."""
+        """Return cause and remedy if the loop skips too many ticks, else None."""
         wakeup, exchange, compute = (self._figures[name].read() for name in ("wakeup", "exchange", "compute"))
-        found = diagnose(self._observer.period_ns * 1e-3, cycles, missed, wakeup, exchange, compute)
-        if found is None:
+        cause = diagnose(self._observer.period_ns * 1e-3, cycles, missed, wakeup, exchange, compute)
+        if cause is None:
             return None
-        return {"share": found.share, "part": found.part.value, "message": found.message, "remedy": found.remedy}
+        return {"share": cause.share, "part": cause.part.value, "message": cause.message, "remedy": cause.remedy}
 
     def status(self, processes: Processes, goal: Sequence[float] | None) -> dict[str, Any]:
-        """Return everything, as `rtcp status --json` prints it; `goal`: where the motion under way ends, rad."""
+        """Return the whole status, as `rtcp status --json` prints it; `goal`: of the motion under way, rad."""
         latest = self._observer.latest()
         if latest is None:
             raise RuntimeError("the loop has published no cycle yet")
@@ -316,7 +304,7 @@ class StatusSnapshot:
         problem = self._loop_problem((time.monotonic_ns() - int(record["time_ns"])) * 1e-9)
         robot = RobotStatus.lost(control_mode) if problem else RobotStatus.of_record(record)
         figures = {name: figure.read().as_json() for name, figure in self._figures.items()}
-        shown = list(self.messages)[-_SHOWN:]
+        newest = list(self.messages)[-_SHOWN:]
         last_second, wkc = self._last_second()
         limits = self._limited_by(record) if state is State.MOVING else {}
         return {
@@ -355,7 +343,7 @@ class StatusSnapshot:
                 if record[name].dtype.kind == "f"
             },
             "tool": self._tool_motion(record),
-            # An arm that stops does not go there any more.
+            # An arm that stops no longer has a goal.
             "goal": None
             if goal is None or problem or state is not State.MOVING
             else [round(value, 7) for value in goal],
@@ -383,13 +371,13 @@ class StatusSnapshot:
                 "gateway": processes.gateway,
                 "segment": processes.segment if is_running(processes.segment) else 0,
             },
-            "messages": [message for _, message in shown],
-            "message_times": [_iso(at) for at, _ in shown],
+            "messages": [message for _, message in newest],
+            "message_times": [_iso(at) for at, _ in newest],
         }
 
 
 def _name(kind: type[ControlMode] | type[DriveMode], number: int) -> str:
-    return next((one.name.lower() for one in kind if one == number), str(number))
+    return next((member.name.lower() for member in kind if member == number), str(number))
 
 
 def _iso(time_ns: int) -> str:

@@ -1,91 +1,124 @@
-"""Inputs and outputs of the IO boxes, and channels of slaves that are nothing else, by name: read, waited for, set."""
+"""Inputs and outputs of the IO boxes, and channels of other slaves, by name: read, waited for, set."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Annotated, TypeVar
+
+from annotated_types import Ge
 
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json
+from rtcp.gateway.method import method
 from rtcp.ipc.commands import SetChannel, SetOutput
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.terminals import NumberChannel, Terminal, terminals_of
 
 _REPORT_S = 0.5
-"""Interval between progress reports of a wait: the client sees that the platform lives."""
+"""Interval between progress reports of a wait, s: the client sees that the platform lives."""
 
 
 class Terminals:
     """The terminals of all IO boxes, and the channels; every method raises RtcpError.
 
     Args:
-        channel: the way to the loop.
+        channel: to the loop.
     """
 
     def __init__(self, channel: CommandChannel) -> None:
         self._channel = channel
         self._terminals, self._numbers = terminals_of(channel.config, channel.observer.schema)
 
-    def read(self) -> Json:
-        """Return every terminal, by `inputs` and `outputs`, with its level, and the `channels`."""
+    @method(at_once=True)
+    async def read_io(self, caller: Caller) -> Json:
+        """Return `inputs` and `outputs`: `name`, `box`, `number`, level `value`, `has_function` of all terminals.
+
+        Channels of one bit of other slaves are among them; `channels`: `name`, `value` and `unit` of those with a
+        number, and of outputs whether they are `settable`, and their `range`.
+        """
         record = self._channel.record()
-        found: Json = {
+        answer: Json = {
             which: [
                 {
-                    "name": one.name,
-                    "box": one.slave,
-                    "number": one.number,
-                    "value": one.value(record),
-                    "has_function": one.has_function,
+                    "name": terminal.name,
+                    "box": terminal.slave,
+                    "number": terminal.number,
+                    "value": terminal.value(record),
+                    "has_function": terminal.has_function,
                 }
-                for one in self._terminals
-                if one.is_output is is_output
+                for terminal in self._terminals
+                if terminal.is_output is is_output
             ]
             for which, is_output in (("inputs", False), ("outputs", True))
         }
-        found["channels"] = [
+        answer["channels"] = [
             {
-                "name": one.name,
-                "value": _finite(one.value(record)),
-                "unit": one.entry.unit,
-                "is_output": one.is_output,
-                "settable": one.settable,
-                "range": [_finite(end) for end in one.entry.range] if one.settable else None,
+                "name": number.name,
+                "value": _finite(number.value(record)),
+                "unit": number.entry.unit,
+                "is_output": number.is_output,
+                "settable": number.settable,
+                "range": [_finite(end) for end in number.entry.range] if number.settable else None,
             }
-            for one in self._numbers
+            for number in self._numbers
         ]
-        return found
+        return answer
 
-    async def write(self, caller: Caller, name: str, value: float) -> Json:
-        """Set an output; one with two levels to 0 or 1, one with a number not by a truth value."""
+    @method()
+    async def set_output(self, caller: Caller, output: int, value: bool, box: str | None = None) -> Json:
+        """Set a digital output, from 1, of an IO box; `box`: its slave, needed with several."""
+        boxes = self._channel.config.boxes
+        if (box is None and len(boxes) > 1) or (box is not None and box not in boxes):
+            error = "the key is missing" if box is None else f'found the text "{box}"'
+            raise RtcpError("invalid", f"box: {error}, allowed is one of {', '.join(boxes) or 'none: there is no box'}")
+        async with self._channel.lease(caller) as lease:
+            await self._channel.send(lease, SetOutput(output, value, boxes.index(box) if box else 0))
+        return {}
+
+    @method()
+    async def write_io(self, caller: Caller, name: str, value: bool) -> Json:
+        """Set the digital output of a name (`outputs.named`, `box.number`, `slave.channel`) as `set_output` does."""
+        return await self._write(caller, name, value)
+
+    @method()
+    async def set_channel(self, caller: Caller, name: str, value: float) -> Json:
+        """Set an output with a number, `slave.channel`, in its unit; or as `write_io`, to 0 or 1."""
+        return await self._write(caller, name, value)
+
+    async def _write(self, caller: Caller, name: str, value: float) -> Json:
+        """Set an output: one with two levels to 0 or 1, one with a number to a number, not a bool."""
         outputs: list[Terminal | NumberChannel] = [*self._terminals, *self._numbers]
-        one = _find([one for one in outputs if one.is_output], name)
-        if isinstance(one, NumberChannel):
+        output = _find([output for output in outputs if output.is_output], name)
+        if isinstance(output, NumberChannel):
             if isinstance(value, bool):
-                low, high = one.entry.range
-                text = f"value: found {'on' if value else 'off'}, allowed is {low:g} to {high:g} for {one.name}"
+                low, high = output.entry.range
+                text = f"value: found {'on' if value else 'off'}, allowed is {low:g} to {high:g} for {output.name}"
                 raise RtcpError("invalid", text, "wrong_level", {"name": name, "value": value})
-            return await self._send(caller, one, value)
+            return await self._send(caller, output, value)
         if value not in (0.0, 1.0):
-            text = f"value: found {value:g}, allowed is 0 or 1 for {one.name}, which has two levels"
+            text = f"value: found {value:g}, allowed is 0 or 1 for {output.name}, which has two levels"
             raise RtcpError("invalid", text, "wrong_level", {"name": name, "value": value})
-        if one.is_channel:
-            return await self._send(caller, one, value)
+        if output.is_channel:
+            return await self._send(caller, output, value)
+        return await self.set_output(caller, output.number, bool(value), output.slave)
+
+    async def _send(self, caller: Caller, output: Terminal | NumberChannel, value: float) -> Json:
+        position = 1 + [slave.name for slave in self._channel.config.slaves].index(output.slave)
         async with self._channel.lease(caller) as lease:
-            box = self._channel.config.boxes.index(one.slave)
-            await self._channel.send(lease, SetOutput(one.number, bool(value), box))
+            await self._channel.send(lease, SetChannel(position, output.number - 1, float(value)))
         return {}
 
-    async def _send(self, caller: Caller, one: Terminal | NumberChannel, value: float) -> Json:
-        position = 1 + [slave.name for slave in self._channel.config.slaves].index(one.slave)
-        async with self._channel.lease(caller) as lease:
-            await self._channel.send(lease, SetChannel(position, one.number - 1, float(value)))
-        return {}
-
-    async def wait(self, caller: Caller, name: str, value: bool, timeout_s: float | None) -> Json:
-        """Return once the level is `value` in a cycle from now on; a level of one cycle counts."""
-        terminal = _find(sorted(self._terminals, key=lambda one: one.is_output), name)
+    @method(at_once=True)
+    async def wait_io(
+        self,
+        caller: Caller,
+        name: str,
+        value: bool = True,
+        timeout_s: Annotated[float, Ge(0)] | None = None,
+    ) -> Json:
+        """Return when the input or output of a name has the level `value`, if only for a cycle; without lease."""
+        terminal = _find(sorted(self._terminals, key=lambda terminal: terminal.is_output), name)
         channel = self._channel
         patience_s = math.inf if timeout_s is None else timeout_s
         message = f"{terminal.name} was not {'high' if value else 'low'} within {patience_s:g} s"
@@ -98,7 +131,7 @@ class Terminals:
         channel = self._channel
         seen, reported = channel.observer.head - 1, time.monotonic()
 
-        def look() -> bool | None:
+        def poll() -> bool | None:
             nonlocal seen, reported
             channel.check_loop()
             if time.monotonic() - reported > _REPORT_S:
@@ -110,17 +143,17 @@ class Terminals:
             levels = (records[terminal.field].astype("uint64") >> terminal.bit) & 1
             return bool((levels == value).any()) or None
 
-        return look
+        return poll
 
 
-_Found = TypeVar("_Found", bound=Terminal | NumberChannel)
+_Entry = TypeVar("_Entry", bound=Terminal | NumberChannel)
 
 
-def _find(terminals: Sequence[_Found], name: str) -> _Found:
+def _find(terminals: Sequence[_Entry], name: str) -> _Entry:
     for terminal in terminals:
         if name in terminal.names:
             return terminal
-    allowed = [one.name for one in terminals]
+    allowed = [terminal.name for terminal in terminals]
     none = "none: there is no IO box, and no slave with channels"
     text = f'name: found the text "{name}", allowed is one of {", ".join(allowed) or none}'
     raise RtcpError("invalid", text, "unknown_terminal", {"name": name, "allowed": allowed})

@@ -1,4 +1,4 @@
-"""Tolerances of a trajectory: every cycle record of its way, and its end, compared with them."""
+"""Tolerances of a trajectory, for all its cycle records and for its end."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from rtcp.ipc.errors import RtcpError
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How far a trajectory may be off: rad a joint, infinite where it may be off by anything; s."""
+    """Largest deviations of a trajectory: rad a joint, infinite: unlimited; s."""
 
     path: Sequence[float]
-    """Of the measured position from the commanded one, in every cycle of the way."""
+    """Largest distance of the measured from the commanded position in every cycle."""
     goal: Sequence[float]
-    """Of the measured position from the last point, at the end."""
+    """Largest distance of the measured position from the last point, at the end."""
     time_s: float
-    """How much later than planned the arm may be inside `goal`, at a speed override of 1."""
+    """Largest delay until the arm is within `goal`, s, at a speed override of 1."""
 
 
 class Violation(Exception):
-    """A tolerance that was not kept."""
+    """A tolerance was exceeded."""
 
     def __init__(self, error: RtcpError) -> None:
         super().__init__(str(error))
@@ -44,12 +44,12 @@ class Tracking:
         self._left_s = duration_s + tolerances.time_s
         self._time_ns = int(channel.record()["time_ns"])
 
-    def look(self) -> None:
-        """Raise Violation where the path was left, or where the end is late."""
+    def check(self) -> None:
+        """Compare the new records; raises Violation off the path, or after the latest end."""
         records, _ = self._channel.observer.since(self._at)
         if len(records):
             self._at = int(records["number"][-1])
-            # The planned time passes at the speed override.
+            # The speed override scales the elapsed time.
             self._left_s -= 1e-9 * float(np.diff(records["time_ns"], prepend=self._time_ns) @ records["speed_override"])
             self._time_ns = int(records["time_ns"][-1])
             off = np.abs(records["actual_position"] - records["commanded_position"]).max(axis=0)
@@ -60,15 +60,15 @@ class Tracking:
             self._compare("goal_tolerance_violated", off, self._tolerances.goal, "when its time was up")
 
     def arrived(self, positions: Sequence[float]) -> bool:
-        """Whether the arm is inside the goal's tolerances."""
+        """Whether the arm is within the goal's tolerances."""
         return all(
             abs(a - b) <= most for a, b, most in zip(positions, self._end, self._tolerances.goal, strict=True)
         )  # fmt: skip
 
     def _compare(self, reason: str, off: Sequence[float], most: Sequence[float], when: str) -> None:
-        for axis, (found, allowed) in enumerate(zip(off, most, strict=True)):
-            if found > allowed:
+        for axis, (error, allowed) in enumerate(zip(off, most, strict=True)):
+            if error > allowed:
                 joint = self._channel.names.joint(axis)
-                message = f"the trajectory: {joint} was {found:.4g} rad off {when}, allowed is {allowed:g} rad"
-                fields = {"axis": axis, "error": found, "limit": allowed}
+                message = f"the trajectory: {joint} was {error:.4g} rad off {when}, allowed is {allowed:g} rad"
+                fields = {"axis": axis, "error": error, "limit": allowed}
                 raise Violation(RtcpError("fault", message, reason, fields))

@@ -1,1 +1,1 @@
-"""What processes say to each other: shared memory, commands, events, sessions, the client of the control socket."""
+"""Communication between processes: shared memory, commands, events, sessions, the client of the control socket."""

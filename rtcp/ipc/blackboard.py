@@ -1,7 +1,7 @@
-"""The loop's end of the blackboard: it writes cycle records, events and texts, and takes commands.
+"""The loop's end of the blackboard: it writes cycle records and events, and takes commands.
 
 Writers and readers share no lock. A record carries its number at both ends, the first written last: a reader that
-finds two different numbers, or another than it wanted, knows that the record is torn or gone.
+finds two different numbers, or another than it expects, knows that the record is torn or overwritten.
 """
 
 from __future__ import annotations
@@ -57,10 +57,6 @@ from rtcp.ipc.layout import (
     SLAVES_MAX,
     STREAM_AT,
     TEMPERATURE,
-    TEXT,
-    TEXTS,
-    TEXTS_AT,
-    TEXTS_HEAD_AT,
     AtomicWords,
     file_size,
     plan_slot,
@@ -72,41 +68,41 @@ from rtcp.ipc.schema import RecordSchema, SchemaError
 
 _OP: Final = 8
 """AL state OP (ETG.1000.6, table 9)."""
-_HOTTEST: Final = 1e6
+_HOTTEST: Final = 1e6  # C
 _U16, _U24, _I63 = 0xFFFF, 0xFF_FFFF, (1 << 63) - 1
 _AL_STATE = 0x0F
 
 
 class BlackboardTooLarge(Exception):
-    """There is no room for the blackboard: the message says where, and how much is wanted."""
+    """The file system lacks room for the blackboard: the message says where and how many bytes."""
 
 
 class Blackboard:
-    """Written by the loop's process alone, but for the lease and the command ring.
+    """The mapped file. The loop's process alone writes it, except for lease, commands, setpoints and plans.
 
     Args:
         path: file to make, on a memory file system; an older one is replaced.
         schema: of the cycle records.
-        period_ns: the cycle.
+        period_ns: of the cycle.
 
     Raises:
-        SchemaError: the schema is longer than its place.
+        SchemaError: the schema is longer than `SCHEMA_SIZE`.
         BlackboardTooLarge: its file system has too little room.
     """
 
     def __init__(self, path: Path, schema: RecordSchema, period_ns: int) -> None:
-        records, text = records_for(period_ns), schema.as_json().encode()
+        records, text = records_for(period_ns), schema.definition()
         if len(text) > SCHEMA_SIZE:
             raise SchemaError(f"the schema of the cycle record has {len(text)} bytes, at most {SCHEMA_SIZE} fit")
         size = file_size(schema.size, records)
         self.path = path
         self.schema = schema
-        # A new file, not the old one emptied: whoever still maps the old one keeps reading something whole.
+        # A new file: processes that still map the old one keep reading its whole content.
         fresh = path.with_name(path.name + f".{os.getpid()}")
         fresh.unlink(missing_ok=True)
         descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
         try:
-            # All of it now: a page that cannot be had later would end the process in the cycle.
+            # Allocated in full: a page that is missing later would end the process in the cycle.
             os.posix_fallocate(descriptor, 0, size)
             self._map = mmap.mmap(descriptor, size)
         except OSError as error:
@@ -116,7 +112,7 @@ class Blackboard:
         finally:
             os.close(descriptor)
         HEADER.pack_into(
-            self._map, 0, MAGIC, len(text), schema.size, records, COMMANDS, EVENTS, TEXTS, period_ns, os.getpid(), 0
+            self._map, 0, MAGIC, len(text), schema.size, records, COMMANDS, EVENTS, 0, period_ns, os.getpid(), 0
         )
         self._map[SCHEMA_AT : SCHEMA_AT + len(text)] = text
         os.replace(fresh, path)
@@ -128,11 +124,10 @@ class Blackboard:
         self._plans = [plan_slot(self._map, slot) for slot in range(PLANS)]
         self._records = 0
         self._events = 0
-        self._texts = 0
         self._taken = self._setpoints_taken = 0
         self.stream = 0
-        """Number of the stream that is shown as followed."""
-        self._text_lock = threading.Lock()
+        """Number of the open stream; 0: none."""
+        self._event_lock = threading.Lock()
         for position in range(1, SLAVES_MAX + 1):
             self.health(position, 0, 0, math.nan, [(0, 0, 0)] * PORTS)
         # Every page is touched now, so that none is faulted in by the cycle.
@@ -153,25 +148,15 @@ class Blackboard:
         self._records = number
 
     def event(self, event: Event) -> None:
-        """Append an event."""
-        number = self._events + 1
-        at = EVENTS_AT + (number % EVENTS) * EVENT_SIZE
-        EVENT.pack_into(self._map, at, number, time.time_ns(), time.monotonic_ns(), event.number)
-        event.pack_into(self._map, at + EVENT.size)
-        self._words.fence()
-        self._words[EVENTS_HEAD_AT] = number
-        self._events = number
-
-    def text(self, sentence: str, *, is_problem: bool = True) -> None:
-        """Append a sentence. Not for the cycle; any other thread of the loop's process may call it."""
-        encoded = sentence.encode()[:500]
-        with self._text_lock:
-            number = self._texts + 1
-            at = TEXTS_AT + (number % TEXTS) * TEXT.size
-            TEXT.pack_into(self._map, at, number, time.time_ns(), len(encoded), is_problem, encoded)
+        """Append an event; any thread of the loop's process may call it; a lock serializes them."""
+        with self._event_lock:
+            number = self._events + 1
+            at = EVENTS_AT + (number % EVENTS) * EVENT_SIZE
+            EVENT.pack_into(self._map, at, number, time.time_ns(), time.monotonic_ns(), event.number)
+            event.pack_into(self._map, at + EVENT.size)
             self._words.fence()
-            self._words[TEXTS_HEAD_AT] = number
-            self._texts = number
+            self._words[EVENTS_HEAD_AT] = number
+            self._events = number
 
     def slave(self, position: int, al_status: int, al_status_code: int) -> None:
         """Note the state of the slave at `position` (from 1)."""
@@ -179,20 +164,20 @@ class Blackboard:
             self._words[SLAVES_AT + (position - 1) * 8] = al_status | al_status_code << 16
 
     def in_op(self, position: int) -> bool:
-        """Whether the slave at `position` was in OP when its state was last noted; beyond what is noted: always."""
+        """Whether the slave at `position` was in OP when last noted; always true beyond `SLAVES_MAX`."""
         at = SLAVES_AT + (position - 1) * 8
         return position > SLAVES_MAX or self._words[at] & _AL_STATE == _OP
 
     def health(
         self, position: int, lost: int, recovered: int, temperature: float, ports: Iterable[tuple[int, int, int]]
     ) -> None:
-        """Note how often the slave at `position` left OP and came back, its temperature (C), what its ports counted.
+        """Note how often the slave at `position` left OP and came back, its temperature, C, and its ports' counters.
 
-        A port counts damaged frames that came in there, damaged frames forwarded, and lost links.
+        Counters of a port: damaged frames received, damaged frames forwarded, lost links.
         """
         if 1 <= position <= SLAVES_MAX:
             at = HEALTH_AT + (position - 1) * HEALTH_SIZE
-            # What a drive sends may be anything, also what no float of this width and no JSON can hold.
+            # A drive may send any value, also one that neither float32 nor JSON can hold.
             known = temperature if abs(temperature) < _HOTTEST else math.nan
             temperature_bits = int.from_bytes(TEMPERATURE.pack(known), "little")
             self._words[at] = min(lost, _U16) | min(recovered, _U16) << 16 | temperature_bits << 32
@@ -205,11 +190,11 @@ class Blackboard:
         return words[LEASE_ID_AT], words[LEASE_RENEWED_AT], words[LEASE_DURATION_AT]
 
     def command_waits(self) -> bool:
-        """Whether a command waits to be taken."""
+        """Whether the ring holds a command that was not read."""
         return self._words[COMMAND_HEAD_AT] != self._taken
 
     def take_command(self) -> tuple[int, int, Command | Malformed]:
-        """Read the next command: its number in the ring, the lease id, and what it is. Only when `command_waits`."""
+        """Read the next command: its number in the ring, the lease id, the command. Only when `command_waits`."""
         at = COMMANDS_AT + ((self._taken + 1) % COMMANDS) * COMMAND_SIZE
         number, lease, kind = COMMAND.unpack_from(self._map, at)
         self._taken += 1
@@ -220,7 +205,7 @@ class Blackboard:
             return number, lease, Malformed(kind & _I63)
 
     def setpoint_waits(self) -> bool:
-        """Whether a setpoint waits to be taken."""
+        """Whether the ring holds a setpoint that was not read."""
         return self._words[SETPOINT_HEAD_AT] != self._setpoints_taken
 
     def take_setpoint(self) -> tuple[int, int, float, tuple[float, ...]]:
@@ -232,7 +217,7 @@ class Blackboard:
         return stream, bits, stamp_s, tuple(numbers)
 
     def open_stream(self, stream: int) -> None:
-        """Show which stream's setpoints are followed; 0: none."""
+        """Publish the number of the open stream, whose setpoints the loop tracks; 0: none."""
         self.stream = stream
         self._words[STREAM_AT] = stream
 
@@ -243,18 +228,18 @@ class Blackboard:
         else:
             ANSWER.pack_into(self._map, ANSWER_AT, refusal.number)
             refusal.pack_into(self._map, ANSWER_AT + ANSWER.size)
-        # The number goes in last: a reader that finds its own number finds the whole answer.
+        # The number is written last: a reader that sees its own number sees the whole answer.
         self._words.fence()
         self._words[ANSWER_NUMBER_AT] = number
 
     @property
     def memory(self) -> mmap.mmap:
-        """The mapped file, for the service thread's own part."""
+        """The mapped file, for the part that the service thread writes."""
         return self._map
 
     @property
     def words(self) -> AtomicWords:
-        """The same by words."""
+        """The mapped file as 64-bit words."""
         return self._words
 
     def plan(self, slot: int) -> memoryview[float]:
@@ -262,11 +247,11 @@ class Blackboard:
         return self._plans[slot]
 
     def use_plan(self, slot: int) -> None:
-        """Note which slot is being read, so that the next plan goes into another; -1: none."""
+        """Note the slot that the loop reads, so that the next plan is written to the other; -1: none."""
         self._words[PLAN_IN_USE_AT] = slot + 1
 
     def close(self) -> None:
-        """Unmap; the file stays for those who read what happened last."""
+        """Unmap; the file stays, so that readers still get the last records and events."""
         for view in self._plans:
             view.release()
         self._words.close()

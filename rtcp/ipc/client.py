@@ -17,7 +17,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
 from rtcp.ipc.session import is_running, read_processes
 
-Progress = Callable[[Mapping[str, Any]], None]
+Progress = Callable[[Mapping[str, Any]], object]
 
 ANSWER_TIMEOUT_S = 15.0
 """Longest silence of the platform within one request: longer than any step of its start or stop."""
@@ -39,7 +39,7 @@ class ControlClient:
         """Connect.
 
         Args:
-            name: who asks, as others are told it when they are refused; this process is named when it is empty.
+            name: of this client, in refusals to others; empty: name and id of this process.
             path: the control socket; that of the runtime directory when None.
 
         Raises:
@@ -74,16 +74,16 @@ class ControlClient:
     ) -> dict[str, Any]:
         """Send one request and return the result of its answer.
 
-        A call that an exception leaves before its answer (Ctrl-C, or one out of `progress`) ends what it asked for.
+        An exception before the answer (Ctrl-C, or one of `progress`) cancels the request.
 
         Args:
-            method: what to do (`docs/protocol.md`).
+            method: its name (`docs/protocol.md`).
             params: its parameters.
             progress: called with each progress report that comes before the answer.
             timeout_s: longest silence, not longest duration: a progress report starts it anew.
 
         Raises:
-            RtcpError: what the platform answered; `timeout` after `timeout_s` of silence; `lost` when the
+            RtcpError: the one that the platform answered; `timeout` after `timeout_s` of silence; `lost` when the
                 connection ends first.
         """
         self._request = number = self._request + 1
@@ -99,7 +99,7 @@ class ControlClient:
         return jsonrpc.result(reply, method)
 
     def _reply(self, number: int, method: str, progress: Progress | None, timeout_s: float) -> dict[str, Any]:
-        """Return the answer to a request; pass on the progress before it."""
+        """Return the answer to a request; report the progress before it."""
         while True:
             reply = jsonrpc.read_reply(self._receive(method, timeout_s), method)
             report = jsonrpc.progress(reply)
@@ -145,7 +145,7 @@ class ControlClient:
 
 
 def client_name(name: str) -> str:
-    """Return the name under which others hear of this client: `name`, or the process."""
+    """Return the name of this client in messages to others: `name`, or name and id of the process."""
     return name or f"{Path(sys.argv[0]).name} (pid {os.getpid()})"
 
 
@@ -180,7 +180,7 @@ def _who_runs(path: Path) -> str:
     loop = read_processes(path.parent).loop
     if is_running(loop):
         return f"the loop (process {loop}) runs without a gateway: `rtcp start` gives it one, `rtcp stop` ends it"
-    # Of the platform that was asked, which may be another one than that of the environment.
+    # The requested platform, which may differ from that of the environment.
     name = path.parent.name if path.parent.parent.absolute() == runtime_directory("").absolute() else ""
     how = f"`rtcp --name {name} start`, or `rtcp cell start`" if name else "`rtcp start`"
     return f"no platform is running (nobody listens at {path}): start one with {how}"

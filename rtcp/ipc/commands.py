@@ -1,8 +1,8 @@
 """The commands that the loop accepts: one frozen dataclass each, its fields in SI, and the states that accept it.
 
 A command crosses the ring of the blackboard as bytes (`rtcp.ipc.message`). On the control socket it is a JSON-RPC
-method of the same name where nothing has to be planned first (`docs/protocol.md`). A package outside registers its own
-by subclassing; the controller or handler that names it receives it.
+method of the same name unless it needs planning first (`docs/protocol.md`). A package outside registers its own by
+subclassing; the controller or handler that names a command receives it.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ class Command(Message, abstract=True):
     states: ClassVar[frozenset[State]]
     """States in which it is accepted."""
     needs_lease: ClassVar[bool] = True
-    """False where it only makes the arm safer: anyone may send it at any time."""
+    """False for commands that only make the arm safer: anyone may send them at any time."""
     waits_for_drive_mode: ClassVar[bool] = False
     """Whether it is refused while the drives change their mode."""
 
 
 class MotionCommand(Command, abstract=True):
-    """Base of what a motion controller accepts (`rtcp.motion.controllers`).
+    """Base of the commands of motion controllers (`rtcp.motion.controllers`).
 
-    A field `hold_s` makes it a command that expires: on the control socket it then is 0.25 s where it is left out.
+    A command with the field `hold_s` expires after that time; default on the control socket: 0.25 s.
     """
 
     states = MOTION
     waits_for_drive_mode = True
     renewed: ClassVar[bool] = False
-    """Whether it lasts only for its hold time, or while more of its kind follow; else it ends by itself."""
+    """Whether it lasts for its hold time, or as long as more of its kind arrive; else it ends by itself."""
 
 
 class ProcessCommand(Command, abstract=True):
-    """Base of what a process carries out over time (`rtcp.processes`).
+    """Base of the commands of processes (`rtcp.processes`).
 
-    It lasts while the process' field `busy` is not 0, and ends with its commander's lease.
+    A command lasts while the field `busy` of the process is not 0, and ends with its commander's lease.
     """
 
     states = AT_REST | {State.MOVING}
@@ -90,9 +90,9 @@ class SetControlMode(Command):
 
 
 class Halt(Command):
-    """Bring what moves to rest and processes into their safe state; the drives stay enabled.
+    """Bring all axes to rest and processes into their safe state; the drives stay enabled.
 
-    Without torque nothing moves, and it is no mistake.
+    Without torque it is accepted too, and nothing moves.
     """
 
     states = frozenset({State.READY, State.HOLDING, State.MOVING, State.STOPPING, State.STOPPED_BY_LIMIT, State.HOMING})
@@ -153,7 +153,7 @@ class SetSpeedOverride(Command):
 
 
 class Pause(Command):
-    """Bring the motion under way to rest on its path; it ends, and is no more paused, by all that ends a motion."""
+    """Bring the motion under way to rest on its path; all that ends a motion also ends a paused one."""
 
     states = frozenset({State.MOVING})
     needs_lease = False
@@ -166,7 +166,7 @@ class Resume(Command):
 
 
 class SetTool(Command):
-    """Use another tool; it holds nothing yet."""
+    """Use another tool, without a payload."""
 
     states = AT_REST
     waits_for_drive_mode = True
@@ -175,7 +175,7 @@ class SetTool(Command):
 
 
 class SetPayload(Command):
-    """Carry the weight of what the tool holds: its mass, kg, and its centre in the frame of the tool, m."""
+    """Set the payload, whose weight the arm carries: its mass, kg, and its centre in the frame of the tool, m."""
 
     states = AT_REST
     waits_for_drive_mode = True
@@ -186,7 +186,7 @@ class SetPayload(Command):
 
 
 class SetZero(Command):
-    """Set what a drive shows where its axis is at 0."""
+    """Set the zero offset of an axis: the position of its drive at the axis' zero."""
 
     states = frozenset({State.READY})
     axis: int
@@ -226,7 +226,7 @@ class RunTrajectory(MotionCommand):
 
 
 class ExtendTrajectory(MotionCommand):
-    """Say how many rows the open trajectory under way has by now, and whether these are all."""
+    """Set the number of rows of the open trajectory under way, and whether it ends with them."""
 
     states = frozenset({State.MOVING})
     rows: int
@@ -245,7 +245,7 @@ class RunInStep(MotionCommand):
     start_ns: int
     """CLOCK_MONOTONIC at which it begins."""
     brakes: int
-    """Numbers behind the rows: how long the whole group takes to brake, s, at every `brake_step_s` of the path."""
+    """Count of numbers after the rows: times for the whole group to brake, s, at every `brake_step_s` of the path."""
     brake_step_s: float
     tool: int = 0
     """As of `RunTrajectory`."""
@@ -302,7 +302,7 @@ class MoveAtVelocity(MotionCommand):
 
 
 class ApplyTorque(MotionCommand):
-    """Add joint torques, Nm, to what carries the weight of the arm, for `hold_s`."""
+    """Add joint torques, Nm, to those that carry the weight of the arm, for `hold_s`."""
 
     renewed = True
     torque: Joints

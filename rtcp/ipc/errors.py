@@ -1,4 +1,4 @@
-"""What may come of a request to the platform instead of its result: one exception a kind."""
+"""Errors of requests to the platform: one exception a kind."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class RtcpError(Exception):
 
     Attributes:
         kind: for programs: refused, fault, replaced, timeout, invalid, internal (the platform's own); not running, lost
-            (found at this end: nobody answers; the connection ended before the answer).
+            (raised at this end: nobody answers; the connection ended before the answer).
         message: for people: what happened, where, what to do.
         reason: name of the refusal (`rtcp.ipc.refusals`) or event (`rtcp.ipc.events`) behind it; empty: none.
         fields: its fields by name, SI units.
@@ -43,7 +43,7 @@ class Refused(RtcpError):
 
 
 class Faulted(RtcpError):
-    """It was begun and went wrong: a fault, an emergency stop, a motion that ended before its goal."""
+    """It was begun and failed: a fault, an emergency stop, a motion that ended before its goal."""
 
 
 class Replaced(RtcpError):

@@ -1,7 +1,7 @@
-"""What happens in the loop: one frozen dataclass a kind, whose docstring is its message.
+"""Events of the loop: one frozen dataclass a kind, whose docstring is its message.
 
 The number of a kind is also the error code in cycle records, in `rtcp status` and in ROS-Industrial's RobotStatus.
-Code decides on kinds and fields; `rtcp.ipc.names` makes the text, at the edge. An event of a package outside is
+Code decides on kinds and fields; `rtcp.ipc.names` makes the text. An event of a package outside is
 a subclass of `MotionEnded` with a number from 1000 on, which its controller returns by `give_up`.
 """
 
@@ -19,12 +19,13 @@ class Event(Message, abstract=True):
     """Base of all events."""
 
     kinds: ClassVar[Kinds[Event]] = Kinds()
+    cuts_texts = True
     is_fault: ClassVar[bool] = False
     """Whether it begins a fault or an emergency stop."""
     is_emergency: ClassVar[bool] = False
-    """Whether it begins the emergency stop, also out of a fault."""
+    """Whether it begins the emergency stop, also from the fault state."""
     is_warning: ClassVar[bool] = False
-    """Whether a person has to know of it, though it is no fault."""
+    """Whether the operator must know of it, though it is no fault."""
     stop_key: ClassVar[str] = ""
     """Key under `stops` that sets its stop reaction (`rtcp.ipc.stop_reactions`); empty: a fault takes a quick stop."""
 
@@ -202,7 +203,7 @@ class GripperAtRest(Event, number=40):
     axis: int
     position: float
     holds: bool
-    """Something keeps it from its end position."""
+    """An object keeps it from its end position."""
 
 
 class ZeroSet(Event, number=34):
@@ -227,7 +228,7 @@ class HomingFailed(Event, number=36):
     axis: int
     statusword: int
     mode: int
-    """Another one than 6: the drive does not home."""
+    """Mode of operation display; not 6: the drive does not home."""
 
 
 class HomingInBox(Event, number=42):
@@ -235,6 +236,157 @@ class HomingInBox(Event, number=42):
 
     is_warning = True
     box: int
+
+
+# -- beside the cycle -------------------------------------------------------------------------------------------------
+
+
+class ServiceEvent(Event, abstract=True):
+    """Base of events that are detected outside the cycle; where a stop is needed, the cycle detects its own fault."""
+
+    is_problem: ClassVar[bool] = True
+    """Whether it may be the message of the status; others are only listed."""
+
+
+class SlavesLeftOp(ServiceEvent, number=60):
+    """{slaves_named} left OP: {left_words}{falls_words}"""
+
+    slave: int
+    """Position of the first of several neighbours that left OP in the same way."""
+    last: int
+    al_status: int
+    """0: no answer."""
+    code: int
+    parent: int
+    """Position of the slave before the first; 0: the master."""
+    falls: int
+    """Times that each left OP since the last report."""
+
+
+class SlavesBackInOp(ServiceEvent, number=61):
+    """{slaves_named} {are} back in OP after {after_s:.1f} s; the arm does not move before `rtcp reset` and `rtcp
+    enable`"""
+
+    slave: int
+    last: int
+    after_s: float
+
+
+class NoSlaveAnswers(ServiceEvent, number=62):
+    """no slave answers: check the cable between the master and {first_slave}, and that slave's supply"""
+
+
+class SlavesAnswerAgain(ServiceEvent, number=63):
+    """slaves answer again, after {silent_s:.1f} s without any"""
+
+    silent_s: float
+
+
+class StateNotReached(ServiceEvent, number=64):
+    """{refusal_words}; it is asked again"""
+
+    slave: int
+    requested: int
+    al_status: int
+    code: int
+
+
+class OtherSlaveAnswers(ServiceEvent, number=65):
+    """{slave_label}: at its place answers {other_label}: put the cables back in their order"""
+
+    slave: int
+    other: int
+
+
+class SlaveSetUpAgain(ServiceEvent, number=66):
+    """{slave_label} is set up again: {set_up_reason}"""
+
+    slave: int
+    al_status: int
+    """Before the set-up; 0: it was without supply."""
+    code: int
+
+
+class CableEvent(ServiceEvent, abstract=True):
+    """Base of errors that enter at a cable."""
+
+    near: int
+    """Position of the slave at the end towards the master; 0: the master."""
+    far: int
+    """Position of the slave at its other end; 0: none that is configured."""
+    count: int
+    began_ns: int
+    """Instant of the first, CLOCK_REALTIME."""
+
+
+class DamagedFrames(CableEvent, number=67):
+    """errors enter {cable}: {frames_counted} since {began}; check that cable and its plugs"""
+
+
+class LinkLost(CableEvent, number=68):
+    """the link {cable} was lost {times} since {began}; check that cable, its plugs and the supply"""
+
+
+class EmergencyMessage(ServiceEvent, number=69):
+    """{slave_label} sent emergency 0x{error_code:04X}: {error_meaning} (error register 0x{error_register:02X}, data
+    {data_bytes}){error_advice}{repeated}"""
+
+    slave: int
+    error_code: int
+    error_register: int
+    data: int
+    """Five bytes specific to the maker, the first one highest."""
+    again: int = 0
+    """Times that it came again in `seconds`."""
+    seconds: float = 0.0
+
+
+class ErrorReset(EmergencyMessage, number=70):
+    """{slave_label} sent emergency 0x0000: error reset, or no error (error register 0x{error_register:02X}, data
+    {data_bytes}){repeated}"""
+
+    is_problem = False
+
+
+class DriveErrorCode(ServiceEvent, number=71):
+    """{joint} (slave {slave}{slave_axis_words}): the drive's error code is {error_words}"""
+
+    axis: int
+    slave: int
+    slave_axis: int
+    error_code: int
+
+
+class WaitingForRobot(ServiceEvent, number=72):
+    """waiting for the robot: {text}"""
+
+    is_problem = False
+    text: str
+    """The reason for waiting (`Master.waiting_for`)."""
+
+
+class RobotReady(ServiceEvent, number=73):
+    """the robot is ready"""
+
+    is_problem = False
+
+
+class ErrorReported(ServiceEvent, number=74):
+    """{text}{repeated}"""
+
+    text: str
+    """Message of an exception: of the bus, a driver or a process."""
+    again: int = 0
+    seconds: float = 0.0
+
+
+class MessagesLeftOut(ServiceEvent, number=75):
+    """further {messages_of} were left out: {count} in {seconds:.0f} s"""
+
+    slave: int
+    """0: failures of the bus."""
+    count: int
+    seconds: float
 
 
 # -- faults -----------------------------------------------------------------------------------------------------------
@@ -454,20 +606,20 @@ class FollowingError(EmergencyStop, number=26):
 
 
 class MotionEnded(Event, abstract=True):
-    """Base of what ends a motion, by its controller or by a guard."""
+    """Base of the reasons for which a controller or a guard ends a motion."""
 
     by_limit: ClassVar[bool] = True
-    """Whether it leads to the state stopped by limit, which a reset leaves; else the arm holds and accepts commands."""
+    """Whether the state becomes stopped by limit, which needs a reset; else the arm holds and accepts commands."""
 
 
 class ProcessEnded(Event, abstract=True):
-    """Base of what ends a command of a process before it was carried out, without a fault of the machine."""
+    """Base of the reasons for which a command of a process ends early, without a fault of the machine."""
 
     is_warning = True
 
 
 def severity(kind: type[Event]) -> str:
-    """Return what a kind asks of a person: emergency_stop, fault, limit (reset, and move away), warning or note."""
+    """Return the severity of a kind: emergency_stop, fault, limit (reset, and move away), warning or note."""
     if kind.is_fault:
         return "emergency_stop" if kind.is_emergency else "fault"
     if issubclass(kind, MotionEnded) and kind.by_limit:

@@ -1,4 +1,4 @@
-"""JSON-RPC 2.0 as the control socket speaks it: one message a line (`docs/protocol.md`); both ends use this file.
+"""JSON-RPC 2.0 on the control socket, for both ends: one message a line (`docs/protocol.md`).
 
 No library: those on PyPI bring HTTP or Content-Length framing, or answer a request only when it is complete, while a
 motion reports its progress before.
@@ -15,7 +15,7 @@ from rtcp.ipc.errors import ErrorKind, RtcpError
 
 VERSION = "2.0"
 LINE_LIMIT = 1 << 22
-"""Bytes of a request: a trajectory of the most points, with velocities and accelerations of ten joints."""
+"""Largest request, bytes: fits a trajectory of the most points, with velocities and accelerations of ten joints."""
 PARSE_ERROR, INVALID_REQUEST, METHOD_NOT_FOUND, INVALID_PARAMS, INTERNAL_ERROR = -32700, -32600, -32601, -32602, -32603
 """JSON-RPC 2.0 specification, section 5.1."""
 CODES = {
@@ -31,7 +31,7 @@ RequestId = int | str | None
 
 
 class InvalidMessage(ValueError):
-    """A line that is no request; `code` says what of the specification it breaks, `request` is its id if it has one."""
+    """A line that is no request; `code` is its JSON-RPC error code, `request` its id if it has one."""
 
     def __init__(self, code: int, message: str, request: RequestId = None) -> None:
         super().__init__(message)
@@ -40,7 +40,7 @@ class InvalidMessage(ValueError):
 
 
 def line(message: Mapping[str, Any]) -> bytes:
-    """Return a message as it is sent.
+    """Return a message as a line.
 
     Raises:
         ValueError: a number in it is not finite.
@@ -51,16 +51,16 @@ def line(message: Mapping[str, Any]) -> bytes:
 def request(number: int, method: str, params: Mapping[str, Any]) -> bytes:
     """Return a request; raises RtcpError (`invalid`) for what JSON cannot express."""
     try:
-        made = line({"id": number, "method": method, "params": dict(params)})
+        data = line({"id": number, "method": method, "params": dict(params)})
     except (TypeError, ValueError) as error:
         raise RtcpError("invalid", f"{method}: the parameters cannot be sent as JSON: {error}") from error
-    if len(made) > LINE_LIMIT:
-        raise RtcpError("invalid", f"{method}: the parameters are {len(made)} bytes, longer than {LINE_LIMIT} bytes")
-    return made
+    if len(data) > LINE_LIMIT:
+        raise RtcpError("invalid", f"{method}: the parameters are {len(data)} bytes, longer than {LINE_LIMIT} bytes")
+    return data
 
 
 def answer(message: Mapping[str, Any]) -> bytes:
-    """Return an answer or a notification as it is sent; numbers that are not finite become null."""
+    """Return an answer or a notification as a line; numbers that are not finite become null."""
     try:
         return line(message)
     except ValueError:
@@ -69,36 +69,36 @@ def answer(message: Mapping[str, Any]) -> bytes:
 
 def _finite(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def failure(number: RequestId, error: RtcpError, code: int = 0) -> dict[str, Any]:
     """Return the answer to a request that failed."""
     data = {"kind": error.kind, "reason": error.reason, "fields": error.fields}
-    found = {"code": code or CODES.get(error.kind, INTERNAL_ERROR), "message": error.message, "data": data}
-    return {"id": number, "error": found}
+    details = {"code": code or CODES.get(error.kind, INTERNAL_ERROR), "message": error.message, "data": data}
+    return {"id": number, "error": details}
 
 
-def read_request(given: bytes) -> tuple[RequestId, str, dict[str, Any], bool]:
+def read_request(text: bytes) -> tuple[RequestId, str, dict[str, Any], bool]:
     """Return id, method, parameters, and whether it is a notification.
 
     Raises:
         InvalidMessage: it is no JSON or no request.
     """
     try:
-        found = json.loads(given, parse_constant=_refuse_constant)
+        message = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InvalidMessage(PARSE_ERROR, f"the request is no JSON: {error}") from None
-    if not isinstance(found, dict):
-        raise InvalidMessage(INVALID_REQUEST, f"the request must be an object, not {type(found).__name__}")
-    number, method, params = found.get("id"), found.get("method"), found.get("params", {})
+    if not isinstance(message, dict):
+        raise InvalidMessage(INVALID_REQUEST, f"the request must be an object, not {type(message).__name__}")
+    number, method, params = message.get("id"), message.get("method"), message.get("params", {})
     if type(number) not in (int, str, type(None)):
         raise InvalidMessage(INVALID_REQUEST, f"id: found {type(number).__name__}, allowed is an integer or a text")
-    if found.get("jsonrpc") != VERSION:
-        version = json.dumps(found.get("jsonrpc"))[:60]
+    if message.get("jsonrpc") != VERSION:
+        version = json.dumps(message.get("jsonrpc"))[:60]
         raise InvalidMessage(INVALID_REQUEST, f'jsonrpc: found {version}, allowed is "{VERSION}"', number)
     if not isinstance(method, str):
         raise InvalidMessage(INVALID_REQUEST, f"method: found {type(method).__name__}, allowed is a text", number)
@@ -107,19 +107,19 @@ def read_request(given: bytes) -> tuple[RequestId, str, dict[str, Any], bool]:
     return number, method, params, number is None
 
 
-def _refuse_constant(found: str) -> float:
-    """NaN and Infinity, which Python accepts, are no JSON."""
-    raise ValueError(f"{found} is no number")
+def _refuse_constant(constant: str) -> float:
+    """Refuse NaN and Infinity, which Python accepts and JSON does not."""
+    raise ValueError(f"{constant} is no number")
 
 
-def read_reply(given: bytes, method: str) -> dict[str, Any]:
+def read_reply(text: bytes, method: str) -> dict[str, Any]:
     """Return an answer or a notification; raises RtcpError (`internal`) for what is neither."""
     try:
-        reply = json.loads(given)
+        reply = json.loads(text)
     except ValueError as error:
-        raise RtcpError("internal", f"the answer to {method!r} is not JSON: {given[:80]!r}") from error
+        raise RtcpError("internal", f"the answer to {method!r} is not JSON: {text[:80]!r}") from error
     if not isinstance(reply, dict):
-        raise RtcpError("internal", f"the answer to {method!r} is not an object: {given[:80]!r}")
+        raise RtcpError("internal", f"the answer to {method!r} is not an object: {text[:80]!r}")
     return reply
 
 
@@ -130,10 +130,9 @@ def progress(reply: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def result(reply: Mapping[str, Any], method: str) -> dict[str, Any]:
-    """Return the result of an answer; raises RtcpError for the error in it, whatever its form."""
+    """Return the result of an answer; raises RtcpError for an error of any form."""
     if "result" in reply:
-        found = reply["result"]
-        return found if isinstance(found, dict) else {}
+        return _object(reply["result"])
     error = _object(reply.get("error"))
     data = _object(error.get("data"))
     kind = data.get("kind")
@@ -145,5 +144,5 @@ def result(reply: Mapping[str, Any], method: str) -> dict[str, Any]:
     )
 
 
-def _object(found: object) -> dict[str, Any]:
-    return found if isinstance(found, dict) else {}
+def _object(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}

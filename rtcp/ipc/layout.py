@@ -1,4 +1,4 @@
-"""The layout of the blackboard: one file in memory, mapped by the loop and by whoever reads or commands it.
+"""The layout of the blackboard: one file in memory, mapped by the loop, its readers and commanders.
 
 | offset | what | written by |
 |---|---|---|
@@ -6,14 +6,14 @@
 | 128 | lease: id, renewed at, duration, holder's name | commanders, under a file lock |
 | 256 | command head; 264: commands taken; 272: number of the last answer | commander; loop; loop |
 | 280 | setpoint head; 288: setpoints taken; 296: open stream | commander; loop; loop |
-| 384 | published records; published events; published texts | loop |
+| 384 | published records; published events | loop |
 | 512 | request and answer of the service thread | commander; service thread |
-| 768 | answer to the last command | loop |
 | 1024 | slave states | service thread |
 | 3072 | slave health: lost, recovered, temperature, error counters | service thread |
-| 16384 | service text, texts, events, commands, setpoints, plans, schema, cycle records | loop and commanders |
+| 15360 | answer to the last command | loop |
+| 16384 | service text, events, commands, setpoints, plans, schema, cycle records | loop and commanders |
 
-Nothing here imports numpy: its threads would keep the loop's process from joining a user namespace.
+Nothing here imports numpy: the loop's process could not join a user namespace with its threads.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from typing import Final
 from rtcp.config.model import MOST_AXES
 from rtcp.ipc.message import PAYLOAD_SIZE
 
-MAGIC = 0x5254_4350_0000_0009
-HEADER = struct.Struct("<QIIIIIIQIi")
-"""magic, length of the schema, record size, records, commands, events, texts, period ns, loop pid, reserved"""
+MAGIC = 0x5254_4350_0000_000B
+HEADER = struct.Struct("<QIIIIIiQIi")
+"""magic, length of the schema, record size, records, commands, events, reserved, period ns, loop pid, reserved"""
 
 LEASE_ID_AT: Final = 128
 """0: free. Written last when the lease is taken."""
@@ -48,20 +48,19 @@ ANSWER_NUMBER_AT: Final = 272
 SETPOINT_HEAD_AT: Final = 280
 SETPOINT_TAKEN_AT: Final = 288
 STREAM_AT: Final = 296
-"""Number of the stream whose setpoints the loop follows; 0: none, or it has ended."""
-ANSWER_AT: Final = 768
+"""Number of the stream whose setpoints the loop tracks; 0: none, or it has ended."""
+ANSWER_AT: Final = 15360
 ANSWER = struct.Struct("<Q")
 """number of the refusal's kind (0: accepted); its fields follow (`rtcp.ipc.message`)"""
 
 RECORDS_HEAD_AT: Final = 384
 EVENTS_HEAD_AT: Final = 392
-TEXTS_HEAD_AT: Final = 400
 
 PLAN_IN_USE_AT: Final = 408
 """Slot of the plan that the loop reads from, plus 1; 0: none."""
 
 SERVICE_STATE_AT: Final = 512
-"""0 idle, 1 asked, 2 answered"""
+"""0 idle, 1 requested, 2 answered"""
 SERVICE_LENGTH_AT: Final = 520
 SERVICE_TEXT_AT: Final = 16384
 SERVICE_TEXT_SIZE: Final = 8192
@@ -73,21 +72,16 @@ SLAVES_MAX: Final = 256
 HEALTH_AT = SLAVES_AT + SLAVES_MAX * 8
 PORTS: Final = 4
 HEALTH_SIZE = 8 * (1 + PORTS)
-"""A word of a slave: how often it left OP | how often it came back << 16 | its temperature << 32 (C, a float; not a
-number: none is known); then one for each of its ports: damaged frames that came in there | damaged frames forwarded
-<< 24 | lost links << 48."""
+"""A word of a slave: times it left OP | times it came back << 16 | its temperature << 32 (C, float32; NaN: unknown);
+then one for each port: damaged frames received | damaged frames forwarded << 24 | lost links << 48."""
 TEMPERATURE = struct.Struct("<f")
 
-TEXTS_AT = SERVICE_TEXT_AT + SERVICE_TEXT_SIZE
-TEXT = struct.Struct("<QqHH500s")
-"""number, CLOCK_REALTIME ns, length, whether it is a problem, UTF-8 text"""
-TEXTS: Final = 64
-
-EVENTS_AT = TEXTS_AT + TEXTS * TEXT.size
+EVENTS_AT = SERVICE_TEXT_AT + SERVICE_TEXT_SIZE
 EVENT = struct.Struct("<QqqQ")
 """number, CLOCK_REALTIME ns, CLOCK_MONOTONIC ns, number of the event's kind; its fields follow (`rtcp.ipc.message`)"""
 EVENT_SIZE = EVENT.size + PAYLOAD_SIZE
-EVENTS: Final = 256
+EVENTS: Final = 2048
+"""Slaves whose emergencies change all the time, seven of them, fill it in 9 minutes: until then a fault stays in it."""
 
 COMMANDS_AT = EVENTS_AT + EVENTS * EVENT_SIZE
 COMMAND = struct.Struct("<QQQ")
@@ -101,25 +95,25 @@ SETPOINT = struct.Struct(f"<QQQd{3 * MOST_AXES}d")
 rad/s^2, `MOST_AXES` each"""
 SETPOINTS: Final = 256
 SETPOINT_HAS_VELOCITY, SETPOINT_HAS_ACCELERATION, SETPOINT_ENDS = 1, 2, 4
-"""The last one has no numbers: it brings the arm to rest and ends the stream."""
+"""Bits of a setpoint. One with the last bit has no numbers: it brings the arm to rest and ends the stream."""
 
 PLAN_ROWS, PLAN_COLUMNS = 4096, 2 + 3 * MOST_AXES
 """A plan: rows of doubles, each a waypoint of a trajectory or a straight piece (`rtcp.motion.planning.plan`)."""
 _ROW = struct.Struct(f"<{PLAN_COLUMNS}d")
 PLAN_SIZE = PLAN_ROWS * PLAN_COLUMNS * 8
 PLANS: Final = 2
-"""Two places: one is written while the plan in the other runs."""
+"""Slots: one is written while the plan in the other runs."""
 PLANS_AT = (SETPOINTS_AT + SETPOINTS * SETPOINT.size + 4095) & ~4095
 
 SCHEMA_AT = (PLANS_AT + PLANS * PLAN_SIZE + 4095) & ~4095
 SCHEMA_SIZE = 1 << 18
-"""The schema of the cycle records (`rtcp.ipc.schema`), JSON: written once, by the loop."""
+"""The schema of the cycle records (`rtcp.ipc.schema`), a message definition: written once, by the loop."""
 
 RECORDS_AT = (SCHEMA_AT + SCHEMA_SIZE + 4095) & ~4095
 RECORDS = 1 << 15
-"""The ring of a cycle of 366 us and longer; a shorter one has a longer ring, see `records_for`."""
+"""Length of the ring for cycles of 366 us and longer; shorter cycles have a longer one, see `records_for`."""
 RING_S: Final = 12.0
-"""Seconds that every ring holds: those that are written down before a fault, and until they have been read."""
+"""Least duration of a ring, s: the time recorded before a fault, and the time to read it."""
 
 
 def records_for(period_ns: int) -> int:
@@ -152,7 +146,7 @@ class AtomicWords:
         self.plain[at >> 3] = value
 
     def fence(self) -> None:
-        """Order the stores before against those after, also on weakly ordered CPUs (aarch64): two passes of a lock."""
+        """Order the stores before against those after, also on weakly ordered CPUs (aarch64), by locking twice."""
         lock = self._lock
         lock.acquire()
         lock.release()
@@ -160,13 +154,13 @@ class AtomicWords:
         lock.release()
 
     def close(self) -> None:
-        """Release the file, which cannot be unmapped before."""
+        """Release the views; the file can be unmapped only afterwards."""
         self.plain.release()
         self._view.release()
 
 
 class PlanTooLong(ValueError):
-    """More rows than fit."""
+    """The plan has more rows than a slot holds."""
 
 
 def plan_slot(memory: mmap.mmap, slot: int) -> memoryview[float]:

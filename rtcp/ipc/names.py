@@ -1,14 +1,16 @@
-"""The text of events and refusals: their docstrings, filled in with what the configuration calls things."""
+"""The text of events and refusals: their docstrings, filled in with the names of the configuration."""
 
 from __future__ import annotations
 
 import inspect
 import string
+import time
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any
 
 from rtcp.config.model import VIRTUAL, ArmConfig, Capability
+from rtcp.ipc import codes
 from rtcp.ipc.commands import COMMANDS, Reset
 from rtcp.ipc.events import JOYSTICK_MODES, EmergencyStop
 from rtcp.ipc.message import Message
@@ -27,12 +29,12 @@ MISSING_WORDS = {
     Missing.PACE: "the controller sends at another interval than cycle.period_us says: correct that key, or "
     "\\SampleRate in the controller's program",
 }
-"""What people have to do at a robot controller."""
+"""Remedies at a robot controller."""
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class Names:
-    """What a configuration calls joints, slaves, boxes and reactions.
+    """Names that a configuration gives to joints, slaves, boxes and reactions.
 
     Args:
         config: the arm.
@@ -49,11 +51,11 @@ class Names:
             for kind, reaction in self.reactions.items()
             if kind.is_fault or reaction > StopReaction.CONTROLLED_STOP
         )
-        """Events that begin a fault or an emergency stop, also because their reaction is configured harder."""
+        """Events that begin a fault or an emergency stop, by their kind or by their configured reaction."""
 
     @property
     def file(self) -> str:
-        """The configuration file, without its folder."""
+        """Name of the configuration file, without its folder."""
         return self.config.source.name or "the configuration"
 
     def joint(self, axis: int) -> str:
@@ -66,11 +68,11 @@ class Names:
         return f"joints[{axis}]" if axis < len(self.config.joints) else "gripper.joint"
 
     def lacks(self, capability: Capability) -> str:
-        """Return why the bus does not offer something; empty: it does."""
+        """Return why the bus lacks a capability; empty: it has it."""
         return self.config.bus.LACKS.get(capability, "")
 
     def drive(self, about: Any) -> str:
-        """Return what the drive of an event's axis shows: its state, and the statusword where it has one."""
+        """Return state and, if it has one, statusword of the drive of an event's axis."""
         axes, slaves = self.config.axes, self.config.slaves
         named = axes[about.axis].slave if 0 <= about.axis < len(axes) else ""
         channels = (e.name for s in slaves if s.name == named for pdo in s.device.tpdo for e in pdo.channels)
@@ -81,6 +83,27 @@ class Names:
         """Return the name of the slave at `position`, from 1."""
         slaves = self.config.slaves
         return slaves[position - 1].name if 1 <= position <= len(slaves) else "not configured"
+
+    def label(self, position: int) -> str:
+        """Return the slave at `position` with its name; 0: the master."""
+        return f"slave {position} ({self.slave(position)})" if position else "the master"
+
+    def slaves_named(self, first: int, last: int) -> str:
+        """Return the names of neighbours on the cable, by the positions of the first and the last."""
+        return self.label(first) if first == last else f"{self.label(first)} to {self.label(last)}"
+
+    def left_op(self, about: Any) -> str:
+        """Return the state of slaves that left OP, with the remedy if they do not answer."""
+        alone = about.slave == about.last
+        if about.al_status:
+            return f"{'it' if alone else 'each'} is in {codes.status_words(about.al_status, about.code)}"
+        first = self.label(about.slave)
+        check = f"check the supply of {first} and the cable between {self.label(about.parent)} and {first}"
+        return f"{'it does not answer' if alone else 'none of them answers'}; {check}"
+
+    def cable(self, near: int, far: int) -> str:
+        """Return the name of a cable by the slaves at its ends."""
+        return f"between {self.label(near)} and {self.label(far)}" if far else f"behind {self.label(near)}"
 
     def channel(self, position: int, number: int) -> str:
         """Return an output channel of the slave at `position`, as SLAVE.CHANNEL."""
@@ -113,25 +136,25 @@ class Names:
         return self._partners[which] if 0 <= which < len(self._partners) else f"partner {which + 1}"
 
     def link(self, number: int) -> str:
-        """Return what a link is called: by the joint that moves it."""
+        """Return the name of a link: that of the joint that moves it."""
         return f"the link of {self.joint(number - 1)}" if number else "the base"
 
     def lost_cycles(self) -> str:
-        """Return the keys that set how many cycles may be lost."""
+        """Return the keys that set the number of cycles that may be lost."""
         bus = self.config.bus
         if bus.interface == VIRTUAL and bus.timeout_scale != 1:
             return f"bus.lost_cycles times bus.timeout_scale, {bus.timeout_scale:g},"
         return "bus.lost_cycles"
 
     def reaction(self, event: Any) -> str:
-        """Return the stop reaction to an event, the key that sets it, and the way out where the arm does not hold."""
-        found = self.reactions[type(event)]
-        words = found.words
+        """Return the stop reaction to an event, the key that sets it, and the reset where it is needed."""
+        stop_reaction = self.reactions[type(event)]
+        words = stop_reaction.words
         if isinstance(event, EmergencyStop):
-            words += " at once" if found is StopReaction.TORQUE_OFF else ", then torque off"
+            words += " at once" if stop_reaction is StopReaction.TORQUE_OFF else ", then torque off"
         if event.stop_key:
             words += f" (stops.{event.stop_key} in {self.file})"
-        hold = event.is_fault or found is StopReaction.CONTROLLED_STOP
+        hold = event.is_fault or stop_reaction is StopReaction.CONTROLLED_STOP
         return words if hold else f"{words}; then `rtcp reset`"
 
     def message(self, about: Message) -> str:
@@ -169,6 +192,34 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "process_name": lambda names, about: names.process(about.process),
     "channel_name": lambda names, about: names.channel(about.slave, about.channel),
     "slave_name": lambda names, about: names.slave(about.slave),
+    "slave_label": lambda names, about: names.label(about.slave),
+    "other_label": lambda names, about: names.label(about.other),
+    "first_slave": lambda names, about: names.label(1),
+    "slaves_named": lambda names, about: names.slaves_named(about.slave, about.last),
+    "are": lambda names, about: "is" if about.slave == about.last else "are",
+    "left_words": Names.left_op,
+    "falls_words": lambda names, about: (
+        f"; it left OP {about.falls} times since the last report" if about.falls > 1 else ""
+    ),
+    "refusal_words": lambda names, about: codes.refusal(
+        names.label(about.slave), about.requested, about.al_status, about.code
+    ),
+    "set_up_reason": lambda names, about: (
+        f"it is in {codes.status_words(about.al_status, about.code)}" if about.al_status else "it was without supply"
+    ),
+    "cable": lambda names, about: names.cable(about.near, about.far),
+    "frames_counted": lambda names, about: "1 damaged frame" if about.count == 1 else f"{about.count} damaged frames",
+    "times": lambda names, about: _times(about.count),
+    "began": lambda names, about: time.strftime("%H:%M:%S", time.localtime(about.began_ns * 1e-9)),
+    "error_meaning": lambda names, about: codes.error_meaning(about.error_code),
+    "error_advice": lambda names, about: codes.error_advice(about.error_code),
+    "error_words": lambda names, about: codes.error_words(about.error_code),
+    "data_bytes": lambda names, about: (about.data & (1 << 40) - 1).to_bytes(5, "big").hex(" "),
+    "slave_axis_words": lambda names, about: f", axis {about.slave_axis}" if about.slave_axis > 1 else "",
+    "repeated": lambda names, about: f" ({_times(about.again)} again in {about.seconds:.0f} s)" if about.again else "",
+    "messages_of": lambda names, about: (
+        f"emergency messages of slave {about.slave}" if about.slave else "failures of the bus"
+    ),
     "reaction": Names.reaction,
     "lost_cycles": lambda names, about: names.lost_cycles(),
     "enable_timeout": lambda names, about: names.config.enable_timeout_s,
@@ -178,10 +229,10 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "singularity": lambda names, about: SINGULARITIES[about.which % 3][0],
     "singularity_unit": lambda names, about: SINGULARITIES[about.which % 3][1],
     "command_name": lambda names, about: COMMANDS[about.command].name,
-    "accepting_states": lambda names, about: ", ".join(sorted(one.words for one in COMMANDS[about.command].states)),
+    "accepting_states": lambda names, about: ", ".join(sorted(state.words for state in COMMANDS[about.command].states)),
     "way_out": lambda names, about: _way_out(about.command, about.state),
 }
-"""What a message may name beside its own fields."""
+"""Words for the messages beside their own fields."""
 
 
 class _Template(string.Formatter):
@@ -192,7 +243,7 @@ class _Template(string.Formatter):
         self._about = about
 
     def get_value(self, key: int | str, args: Any, kwargs: Any) -> object:
-        """Return the value of a field, or what `_WORDS` has under its name."""
+        """Return the value of a field, or that of `_WORDS` with this name."""
         word = _WORDS.get(str(key))
         if word is not None:
             return word(self._names, self._about)
@@ -200,8 +251,12 @@ class _Template(string.Formatter):
         return value.name.lower().replace("_", " ") if isinstance(value, IntEnum) else value
 
 
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
 def _way_out(number: int, state: State) -> str:
-    """Return what leads from a state to one that accepts the command."""
+    """Return the command that leads from a state to one that accepts the refused command."""
     command = COMMANDS[number]
     if state in Reset.states:
         return "; `rtcp reset` first"

@@ -1,4 +1,4 @@
-"""The other end of the blackboard: reading what the loop publishes, and commanding it under a lease."""
+"""The observer's end of the blackboard: it reads cycle records and events, and commands the loop under a lease."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import mmap
 import os
 import struct
 import time
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,10 +62,6 @@ from rtcp.ipc.layout import (
     SLAVES_AT,
     STREAM_AT,
     TEMPERATURE,
-    TEXT,
-    TEXTS,
-    TEXTS_AT,
-    TEXTS_HEAD_AT,
     AtomicWords,
     file_size,
     records_for,
@@ -75,13 +72,15 @@ from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import REFUSALS, Refusal
 from rtcp.ipc.schema import RecordSchema, SchemaError
 
+INFORMATION, WARNING, ERROR = 2, 3, 4
+"""Levels of a message, as in `foxglove.Log`."""
 NUMBER_AGAIN, PADDING = "_number_again", "_padding"
-"""Behind the fields of a record in the ring; no field's name begins with an underscore."""
+"""Follow the fields of a record in the ring; no field's name begins with an underscore."""
 
 
 def numpy_fields(schema: RecordSchema) -> list[Any]:
     """Return the fields as numpy describes them."""
-    return [(one.name, np.dtype(one.type).newbyteorder("<"), one.shape) for one in schema.fields]
+    return [(field.name, np.dtype(field.type).newbyteorder("<"), field.shape) for field in schema.fields]
 
 
 def record_type(schema: RecordSchema) -> np.dtype[np.void]:
@@ -91,7 +90,7 @@ def record_type(schema: RecordSchema) -> np.dtype[np.void]:
 
 
 class BlackboardError(Exception):
-    """The blackboard is not there or is none of ours: a sentence."""
+    """The blackboard is missing, damaged, of another version, or its loop hangs; the message is a sentence."""
 
 
 class LeaseRefused(Exception):
@@ -108,35 +107,24 @@ class EventRecord:
 
     number: int
     time_ns: int
-    """CLOCK_REALTIME, for people: it may be set meanwhile, forwards and back."""
+    """CLOCK_REALTIME, for display: this clock may be set forwards and back."""
     monotonic_ns: int
     """CLOCK_MONOTONIC, as in the cycle records."""
     event: Event
 
 
 @dataclass(frozen=True)
-class Text:
-    """A sentence of the loop's service thread."""
-
-    number: int
-    time_ns: int
-    sentence: str
-    is_problem: bool
-    """Whether it is of something wrong; the emergency that takes an earlier one back is not."""
-
-
-@dataclass(frozen=True)
 class Health:
-    """What a slave has been through since the start: how often it left OP and came back, what its ports counted."""
+    """Counters of a slave since the start: times that it left OP and came back, errors of its ports."""
 
     lost: int
     recovered: int
     temperature: float
-    """C; not a number: none is known."""
+    """C; NaN: unknown."""
     rx: tuple[int, ...]
-    """Damaged frames that came in at each port."""
+    """Damaged frames received at each port."""
     forwarded: tuple[int, ...]
-    """Damaged frames at each port that slaves before it had counted."""
+    """Damaged frames received at each port that a slave before had counted."""
     links: tuple[int, ...]
     """Lost links of each port."""
 
@@ -148,7 +136,9 @@ class Answer:
     refusal: Refusal | None
 
 
-_LOCK_TURNS, _LOCK_WAIT_S = 50, 0.002
+_LOCK_ATTEMPTS, _LOCK_WAIT_S = 50, 0.002
+_NEARLY_OVERWRITTEN = 64
+"""Oldest records of the ring that are not read, since the loop may overwrite them meanwhile."""
 
 
 class Observer:
@@ -158,7 +148,7 @@ class Observer:
         path: the blackboard's file.
 
     Raises:
-        BlackboardError: where it cannot be opened or is of another version.
+        BlackboardError: it cannot be opened or is of another version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -166,9 +156,11 @@ class Observer:
             self._descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except OSError as error:
             raise BlackboardError(f"blackboard {path} cannot be opened: {error.strerror}") from error
+        # Also where nobody closes the observer: of a simulation it would keep 20 MB.
+        self._close_file = weakref.finalize(self, os.close, self._descriptor)
         size = os.fstat(self._descriptor).st_size
         if size < RECORDS_AT or size % 8:
-            os.close(self._descriptor)
+            self._close_file()
             raise BlackboardError(f"blackboard {path} is cut short: {size} bytes, at least {RECORDS_AT} expected")
         self._map = mmap.mmap(self._descriptor, size)
         self._words = AtomicWords(self._map)
@@ -176,7 +168,7 @@ class Observer:
         schema = None
         if magic == MAGIC and length <= SCHEMA_SIZE:
             with contextlib.suppress(SchemaError):
-                schema = RecordSchema.from_json(self._map[SCHEMA_AT : SCHEMA_AT + length])
+                schema = RecordSchema.from_definition(self._map[SCHEMA_AT : SCHEMA_AT + length])
         whole = schema is not None and period > 0 and records == records_for(period)
         if schema is None or not whole or record_size != schema.size or size != file_size(record_size, records):
             self.close()
@@ -186,16 +178,18 @@ class Observer:
         self.loop_pid = int(pid)
         self._dtype = record_type(schema)
         self.records = int(records)
-        """Cycle records that the ring holds."""
+        """Capacity of the ring, cycle records."""
         self._ring = np.frombuffer(self._map, dtype=self._dtype, count=self.records, offset=RECORDS_AT)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Unmap the file and close it; may be called again."""
+        if not self._close_file.alive:
+            return
         if hasattr(self, "_ring"):
             del self._ring
         self._words.close()
         self._map.close()
-        os.close(self._descriptor)
+        self._close_file()
 
     # -- records ------------------------------------------------------------------------------------------------
 
@@ -207,9 +201,9 @@ class Observer:
     def latest(self) -> npt.NDArray[np.void] | None:
         """Return the last record, shape (1,), or None before the first."""
         for _ in range(100):
-            found, _ = self.since(self.head - 1)
-            if len(found):
-                return found[-1:]
+            records, _ = self.since(self.head - 1)
+            if len(records):
+                return records[-1:]
             if self.head == 0:
                 return None
         return None
@@ -220,18 +214,18 @@ class Observer:
         Lost are those overwritten before they were read, and torn ones.
         """
         head = self.head
-        first = max(number + 1, head - self.records + 64, 1)
+        first = max(number + 1, head - self.records + _NEARLY_OVERWRITTEN, 1)
         if head < first:
             return np.empty(0, dtype=self._dtype), 0
         numbers = np.arange(first, head + 1, dtype=np.uint64)
         copied = self._ring[(numbers % np.uint64(self.records)).astype(np.intp)]
-        # What the writer reached meanwhile may be torn although both numbers agree: it is dropped.
+        # Records that the writer has reached meanwhile may be torn although both numbers agree: they are dropped.
         overtaken = self.head - self.records + 1
         whole = (copied["number"] == numbers) & (copied[NUMBER_AGAIN] == numbers) & (numbers > max(overtaken, 0))
         kept = copied[whole]
         return kept, int(head - max(number, 0)) - len(kept)
 
-    # -- events and texts ---------------------------------------------------------------------------------------
+    # -- events ---------------------------------------------------------------------------------------------------
 
     @property
     def last_event(self) -> int:
@@ -241,66 +235,58 @@ class Observer:
     def events_since(self, number: int) -> list[EventRecord]:
         """Return the events after `number`, oldest first."""
         head = self._words[EVENTS_HEAD_AT]
-        found = []
+        events = []
         for wanted in range(max(number + 1, head - EVENTS + 1, 1), head + 1):
             at = EVENTS_AT + (wanted % EVENTS) * EVENT_SIZE
-            made, when, monotonic, kind = EVENT.unpack_from(self._map, at)
-            if made != wanted:
+            published, when, monotonic, kind = EVENT.unpack_from(self._map, at)
+            if published != wanted:
                 continue
-            # An event may be overwritten while it is read, and be of a kind that only the loop's process knows.
+            # An event may be overwritten while it is read, or be of a kind that this process lacks.
             with contextlib.suppress(MalformedMessage):
-                found.append(
-                    EventRecord(made, when, monotonic, EVENT_KINDS.unpack_from(kind, self._map, at + EVENT.size))
+                events.append(
+                    EventRecord(published, when, monotonic, EVENT_KINDS.unpack_from(kind, self._map, at + EVENT.size))
                 )
-        return found
-
-    def texts_since(self, number: int) -> list[Text]:
-        """Return the sentences after `number`, oldest first."""
-        head = self._words[TEXTS_HEAD_AT]
-        found = []
-        for wanted in range(max(number + 1, head - TEXTS + 1, 1), head + 1):
-            made, when, length, is_problem, text = TEXT.unpack_from(self._map, TEXTS_AT + (wanted % TEXTS) * TEXT.size)
-            if made == wanted:
-                found.append(Text(made, when, text[:length].decode(errors="replace"), bool(is_problem)))
-        return found
+        return events
 
     def slaves(self, count: int) -> list[tuple[int, int]]:
         """Return AL status and AL status code of the first `count` slaves."""
-        found = [self._words[SLAVES_AT + i * 8] for i in range(count)]
-        return [(word & 0xFFFF, word >> 16 & 0xFFFF) for word in found]
+        words = [self._words[SLAVES_AT + i * 8] for i in range(count)]
+        return [(word & 0xFFFF, word >> 16 & 0xFFFF) for word in words]
 
     def health(self, count: int) -> list[Health]:
-        """Return what the first `count` slaves have been through."""
-        found = []
+        """Return the counters of the first `count` slaves."""
+        slaves = []
         for at in range(HEALTH_AT, HEALTH_AT + count * HEALTH_SIZE, HEALTH_SIZE):
             life, *ports = [self._words[at + 8 * word] for word in range(1 + PORTS)]
             counts = zip(*((word & 0xFF_FFFF, word >> 24 & 0xFF_FFFF, word >> 48) for word in ports), strict=True)
             (temperature,) = TEMPERATURE.unpack((life >> 32).to_bytes(4, "little"))
-            found.append(Health(life & 0xFFFF, life >> 16 & 0xFFFF, temperature, *counts))
-        return found
+            slaves.append(Health(life & 0xFFFF, life >> 16 & 0xFFFF, temperature, *counts))
+        return slaves
 
     # -- the lease ----------------------------------------------------------------------------------------------
 
     def holder(self) -> str:
-        """Return the name of who holds a lease that has not run out, or an empty string."""
-        if self._words[LEASE_ID_AT] == 0 or self._run_out():
+        """Return the name of the lease's holder; empty: none, or it has expired."""
+        if self._words[LEASE_ID_AT] == 0 or self._is_expired():
             return ""
         name = bytes(self._map[LEASE_HOLDER_AT : LEASE_HOLDER_AT + LEASE_HOLDER_SIZE])
-        shown = "".join(letter for letter in name.decode(errors="replace") if letter.isprintable())
-        return shown or "an unnamed commander"
+        printable = "".join(letter for letter in name.decode(errors="replace") if letter.isprintable())
+        return printable or "an unnamed commander"
 
-    def _run_out(self) -> bool:
+    def _is_expired(self) -> bool:
         return time.monotonic_ns() - self._words[LEASE_RENEWED_AT] > self._words[LEASE_DURATION_AT]
 
     @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
-        for turn in range(_LOCK_TURNS):
+    def _locked(self) -> Iterator[None]:
+        for attempt in range(_LOCK_ATTEMPTS):
             try:
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                if turn == _LOCK_TURNS - 1:
-                    raise BlackboardError("the lease is locked by another process that does not let go") from None
+                if attempt == _LOCK_ATTEMPTS - 1:
+                    held_s = _LOCK_ATTEMPTS * _LOCK_WAIT_S
+                    message = f"another process has locked the lease for {held_s:g} s: it hangs or is suspended"
+                    raise BlackboardError(message) from None
                 time.sleep(_LOCK_WAIT_S)
         try:
             yield
@@ -313,7 +299,7 @@ class Observer:
         Raises:
             LeaseRefused: while another holds it.
         """
-        with self._alone():
+        with self._locked():
             if holder := self.holder():
                 raise LeaseRefused(holder)
             words, now = self._words, time.monotonic_ns()
@@ -327,16 +313,16 @@ class Observer:
             return now
 
     def renew(self, lease: int) -> bool:
-        """Renew the lease; return False where it is no longer this one or has run out."""
-        with self._alone():
-            if self._words[LEASE_ID_AT] != lease or self._run_out():
+        """Renew the lease; return False if it has expired or another has replaced it."""
+        with self._locked():
+            if self._words[LEASE_ID_AT] != lease or self._is_expired():
                 return False
             self._words[LEASE_RENEWED_AT] = time.monotonic_ns()
             return True
 
     def release(self, lease: int) -> None:
-        """Release the lease; does nothing where another commander holds it by now."""
-        with self._alone():
+        """Release the lease; no effect if another commander holds it."""
+        with self._locked():
             if self._words[LEASE_ID_AT] == lease:
                 self._words[LEASE_ID_AT] = 0
 
@@ -356,7 +342,7 @@ class Observer:
         """Put a command into the ring; return its number. The lease's holder is the only writer.
 
         Raises:
-            BlackboardError: where the loop takes no commands any more (the ring is full).
+            BlackboardError: the ring is full: the loop takes no commands any more.
         """
         number = self._words[COMMAND_HEAD_AT] + 1
         if number - self._words[COMMAND_TAKEN_AT] > COMMANDS:
@@ -378,8 +364,8 @@ class Observer:
             numbers: 3 x `MOST_AXES`: positions, rad, velocities, rad/s, accelerations, rad/s^2.
 
         Raises:
-            BlackboardError: the ring is full: they come faster than the loop takes them, or it hangs.
-            struct.error: what is no number.
+            BlackboardError: the ring is full: setpoints arrive faster than the loop takes them, or it hangs.
+            struct.error: an entry of `numbers` is not a number.
         """
         words = self._words
         if words[STREAM_AT] != stream:
@@ -395,7 +381,7 @@ class Observer:
 
     @property
     def open_stream(self) -> int:
-        """Number of the stream whose setpoints the loop follows; 0: none."""
+        """Number of the stream whose setpoints the loop tracks; 0: none."""
         return self._words[STREAM_AT]
 
     @property
@@ -404,10 +390,10 @@ class Observer:
         return self._words[SETPOINT_TAKEN_AT]
 
     def write_plan(self, rows: Sequence[Sequence[float]]) -> int:
-        """Write a plan, rows of up to 20 numbers, for a command that names the slot which is returned.
+        """Write a plan, rows of up to 20 numbers, for a command with the returned slot.
 
         Raises:
-            PlanTooLong: where it does not fit.
+            PlanTooLong: it does not fit.
         """
         return write_plan(self._map, self._words, rows)
 
@@ -425,7 +411,7 @@ class Observer:
     # -- the service thread -------------------------------------------------------------------------------------
 
     def ask_service(self, request: dict[str, Any]) -> None:
-        """Leave a request for the service thread. One at a time: the caller sees to it."""
+        """Write a request for the service thread. The caller ensures one at a time."""
         text = json.dumps(request).encode()
         if len(text) > SERVICE_TEXT_SIZE:
             raise BlackboardError(f"the request is {len(text)} bytes long, at most {SERVICE_TEXT_SIZE} fit")
@@ -439,6 +425,6 @@ class Observer:
         if self._words[SERVICE_STATE_AT] != 2:
             return None
         length = self._words[SERVICE_LENGTH_AT]
-        found: dict[str, Any] = json.loads(bytes(self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length]))
+        answer: dict[str, Any] = json.loads(bytes(self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length]))
         self._words[SERVICE_STATE_AT] = 0
-        return found
+        return answer

@@ -14,7 +14,7 @@ from rtcp.ipc.schema import RecordSchema, SchemaError
 
 
 class RecordViewError(Exception):
-    """The blackboard is not there, or has not what is looked for: a sentence."""
+    """The blackboard or a field of it is missing: a sentence."""
 
 
 class RecordView:
@@ -34,18 +34,18 @@ class RecordView:
         except OSError as error:
             raise RecordViewError(f"{path} cannot be opened: {error.strerror}") from error
         try:
-            found = os.fstat(descriptor)
-            if found.st_size < RECORDS_AT:
-                raise RecordViewError(f"{path} is cut short: {found.st_size} bytes")
-            self._map = mmap.mmap(descriptor, found.st_size, prot=mmap.PROT_READ)
+            status = os.fstat(descriptor)
+            if status.st_size < RECORDS_AT:
+                raise RecordViewError(f"{path} is cut short: {status.st_size} bytes")
+            self._map = mmap.mmap(descriptor, status.st_size, prot=mmap.PROT_READ)
         finally:
             os.close(descriptor)
         magic, length, size, records, _, _, _, period, _, _ = HEADER.unpack_from(self._map, 0)
         try:
             if magic != MAGIC or not 0 < length <= SCHEMA_SIZE or period <= 0 or records != records_for(period):
                 raise SchemaError("its head is of another version")
-            schema = RecordSchema.from_json(self._map[SCHEMA_AT : SCHEMA_AT + length])
-            if size != schema.size or found.st_size != file_size(size, records):
+            schema = RecordSchema.from_definition(self._map[SCHEMA_AT : SCHEMA_AT + length])
+            if size != schema.size or status.st_size != file_size(size, records):
                 raise SchemaError("its size is not that of its schema")
             self._fields = [_place(schema, name) for name in names]
         except (SchemaError, KeyError) as error:
@@ -55,7 +55,7 @@ class RecordView:
         self._size, self._mask = size, records - 1
         self._words = memoryview(self._map).cast("Q")
         # Every page is touched now, none in the cycle.
-        for page in range(0, found.st_size, mmap.PAGESIZE):
+        for page in range(0, status.st_size, mmap.PAGESIZE):
             self._map[page]
 
     def read(self, values: list[Any]) -> bool:
@@ -75,7 +75,7 @@ class RecordView:
 
 
 def _place(schema: RecordSchema, name: str) -> tuple[int, int, Any]:
-    """Return the offset of a field in the record, how many numbers it has, and what unpacks it."""
+    """Return the offset of a field in the record, its count of numbers, and the function that unpacks it."""
     before = 0
     for field in schema.fields:
         if field.name == name:

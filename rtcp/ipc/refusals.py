@@ -1,5 +1,4 @@
-"""Why a command is refused: one frozen dataclass a reason, whose docstring is its message
-(`rtcp.ipc.names.message`)."""
+"""Refusals of commands: one frozen dataclass a reason, whose docstring is its message (`rtcp.ipc.names.message`)."""
 
 from __future__ import annotations
 

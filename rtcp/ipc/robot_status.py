@@ -1,4 +1,4 @@
-"""The fields of ROS-Industrial's RobotStatus, from a cycle record and nothing else."""
+"""The fields of ROS-Industrial's RobotStatus, from a cycle record alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOTION_POSSIBLE = frozenset({State.HOLDING, State.MOVING})
 
 @dataclass(frozen=True)
 class RobotStatus:
-    """What industrial_msgs/RobotStatus says."""
+    """The fields of industrial_msgs/RobotStatus."""
 
     mode: Literal["manual", "auto"]
     """Under the joystick the arm is in manual mode (ISO 10218-1)."""
@@ -33,7 +33,7 @@ class RobotStatus:
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> RobotStatus:
-        """Return the status that a cycle record shows: one of `rtcp.Feed`, or anything with its fields."""
+        """Return the status of a cycle record: one of `rtcp.Feed`, or any mapping with its fields."""
         state, flags = State(int(record["state"])), int(record["flags"])
         e_stopped = state is State.EMERGENCY_STOP or bool(flags & FLAG_EMERGENCY_STOP)
         in_error = state in _IN_ERROR

@@ -1,4 +1,4 @@
-"""The runtime directory of one platform: where it is, what lies in it, its lock, and where its processes log."""
+"""The runtime directory of one platform: its path, its files, its lock, and the logs of its processes."""
 
 from __future__ import annotations
 
@@ -65,18 +65,18 @@ def make_runtime_directory(directory: Path) -> None:
     try:
         if not directory.exists():
             directory.mkdir(mode=0o700, parents=True)
-        found = directory.stat()
+        status = directory.stat()
     except OSError as error:
         raise RuntimeDirectoryError(f"runtime directory {directory} cannot be made: {error.strerror}") from error
-    if found.st_uid != os.geteuid():
+    if status.st_uid != os.geteuid():
         raise RuntimeDirectoryError(
-            f"runtime directory {directory} belongs to user {found.st_uid}, not to user {os.geteuid()}: "
+            f"runtime directory {directory} belongs to user {status.st_uid}, not to user {os.geteuid()}: "
             "set RTCP_RUNTIME_DIR to one of your own"
         )
-    if not stat.S_ISDIR(found.st_mode) or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+    if not stat.S_ISDIR(status.st_mode) or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise RuntimeDirectoryError(
             f"runtime directory {directory} is no directory, or one that others may write to "
-            f"(mode {stat.S_IMODE(found.st_mode):04o}): set RTCP_RUNTIME_DIR to one of your own"
+            f"(mode {stat.S_IMODE(status.st_mode):04o}): set RTCP_RUNTIME_DIR to one of your own"
         )
 
 
@@ -117,7 +117,7 @@ def is_listening(path: Path) -> bool:
 
 
 def stop_marker(directory: Path) -> Path:
-    """Return the path of the file that exists while a stop is under way: a loop that exits then was asked to."""
+    """Return the path of the file that exists while a stop is under way; it marks an intentional stop."""
     return directory / "stopping"
 
 
@@ -128,7 +128,7 @@ def limits_file(directory: Path) -> Path:
 
 def blackboard_file(directory: Path) -> Path:
     """Return the path of the blackboard, which is always in memory: a slow disk must not delay the cycle."""
-    # A digest: two directories never share a name, however they are spelt.
+    # A digest: every directory has a name of its own, independent of its spelling.
     digest = hashlib.sha256(os.fsencode(directory.resolve())).hexdigest()[:16]
     return Path("/dev/shm") / f"rtcp-{os.geteuid()}-{digest}"
 
@@ -173,14 +173,14 @@ def stderr_is_journal() -> bool:
     The variable alone is not enough: a terminal opened by a desktop service inherits it.
     """
     try:
-        found = os.fstat(_STDERR)
+        status = os.fstat(_STDERR)
     except OSError:
         return False
-    return os.environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Open the log of a process for appending: the journal where standard error is the journal, else the file."""
+    """Open the log of a process for appending: the journal if standard error is connected to it, else the file."""
     if stderr_is_journal():
         path.unlink(missing_ok=True)
         return os.fdopen(os.dup(_STDERR), "wb")

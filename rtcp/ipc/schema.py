@@ -1,12 +1,11 @@
-"""What a cycle record holds: the fields that the parts of the cycle declare, with type, unit and meaning.
+"""Schema of a cycle record: the fields that the parts of the cycle declare, with type, unit and meaning.
 
-The loop stores the schema with its records, and a recording carries it in its message definition: whoever reads either
-one looks fields up by name. Nothing here imports numpy (see `rtcp.ipc.layout`).
+The loop stores the schema with its records, a recording with its messages, both as a message definition: readers look
+fields up by name. Nothing here imports numpy (see `rtcp.ipc.layout`).
 """
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 from collections.abc import Collection, Iterable, Sequence
@@ -18,7 +17,7 @@ CODES = {"uint8": "B", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i",
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,127}")
 _LINE = re.compile(r"(\w+?)(?:\[(\d{1,4})\])? ([a-z][a-z0-9_]*)(?:  # ([^,:]*), ([^,:]*): (.*))?")
 MOST_NUMBERS = 4096
-"""Numbers of a record: far more than any platform has, far less than a damaged file may claim."""
+"""Most numbers of a record: more than any platform has, less than a damaged file may claim."""
 
 
 class SchemaError(ValueError):
@@ -50,8 +49,8 @@ class Field:
             ("its name is not of lower case letters, digits and underscores", not _NAME.fullmatch(self.name)),
             (f"its type {self.type} is none of {', '.join(CODES)}", self.type not in CODES),
             (f"its shape is {self.shape}", len(self.shape) > 1 or not 0 <= self.count <= MOST_NUMBERS),
-            (f"its unit {self.unit!r} has a comma or a colon", any(one in self.unit for one in ",:")),
-            (f"its part {self.part!r} has a comma or a colon", any(one in self.part for one in ",:")),
+            (f"its unit {self.unit!r} has a comma or a colon", any(mark in self.unit for mark in ",:")),
+            (f"its part {self.part!r} has a comma or a colon", any(mark in self.part for mark in ",:")),
             ("its texts are not of one line", not (self.unit + self.part + self.description).isprintable()),
         ):
             if bad:
@@ -59,7 +58,7 @@ class Field:
 
     @property
     def count(self) -> int:
-        """How many numbers it has."""
+        """Count of its numbers."""
         return self.shape[0] if self.shape else 1
 
     @property
@@ -69,12 +68,12 @@ class Field:
 
     @property
     def local_name(self) -> str:
-        """The name without that of its part, where a device's slave stands before it."""
+        """The name without the prefix of a device's slave."""
         return self.name.removeprefix(f"{identifier(self.part)}_")
 
 
 def identifier(name: str) -> str:
-    """Return a name as the first part of a field's: lower case, with an underscore for what no field's name has."""
+    """Return a name as prefix of a field's name: lower case, an underscore for each character that is not allowed."""
     return re.sub(r"[^a-z0-9_]", "_", name.lower()).lstrip("_0123456789") or "part"
 
 
@@ -129,41 +128,12 @@ class RecordSchema:
         """Return the schema of those fields only."""
         return RecordSchema(tuple(field for field in self.fields if field.name in names))
 
-    def as_json(self) -> str:
-        """Return the schema as JSON: a list of objects with field, type, unit, shape, description and part."""
-        return json.dumps(
-            [
-                {"field": one.name, "type": one.type, "unit": one.unit, "shape": one.shape,
-                 "description": one.description, "part": one.part}
-                for one in self.fields
-            ],
-            separators=(",", ":"),
-        )  # fmt: skip
-
-    @classmethod
-    def from_json(cls, text: str | bytes) -> RecordSchema:
-        """Read what `as_json` returned; raises SchemaError."""
-        try:
-            found = json.loads(text)
-            fields = [
-                Field(str(one["field"]), str(one["type"]), str(one["unit"]), str(one["description"]),
-                      tuple(map(int, one["shape"])), str(one["part"]))
-                for one in found
-            ]  # fmt: skip
-        except SchemaError:
-            raise
-        except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-            raise SchemaError(f"no schema: {type(error).__name__} {error}") from error
-        if not fields or (fields[0].name, fields[0].type, fields[0].shape) != ("number", "uint64", ()):
-            raise SchemaError("no schema of a record: its first field is not `number`, uint64")
-        return cls(tuple(fields))
-
     def definition(self) -> bytes:
         """Return the schema as a ROS 2 message definition, unit and meaning in comments."""
         lines = [
-            f"{one.type}{f'[{one.shape[0]}]' if one.shape else ''} {one.name}  # {one.part}, {one.unit}: "
-            f"{one.description}"
-            for one in self.fields
+            f"{field.type}{f'[{field.shape[0]}]' if field.shape else ''} {field.name}  # {field.part}, {field.unit}: "
+            f"{field.description}"
+            for field in self.fields
         ]
         return ("\n".join(lines) + "\n").encode()
 
@@ -178,6 +148,8 @@ class RecordSchema:
             kind, count, name, part, unit, description = match.groups()
             shape = (int(count),) if count else ()
             fields.append(Field(name, kind, unit or "", description or "", shape, part or ""))
+        if not fields or (fields[0].name, fields[0].type, fields[0].shape) != ("number", "uint64", ()):
+            raise SchemaError("no schema of a record: its first field is not `number`, uint64")
         return cls(tuple(fields))
 
 
@@ -208,7 +180,7 @@ CYCLE_FIELDS = _fields_of(
     ("enables", "uint32", "", "How often the arm was enabled."),
     ("moves", "uint32", "", "How many motions have begun."),
 )
-"""What every record has, whatever the platform consists of."""
+"""Fields of every record, for any platform."""
 OPERATOR_FIELDS = (Field("joystick_mode", "uint8", "", "0 X-Y, 1 Z-yaw, 2 roll-pitch, 3 gripper.", part="operator"),)
 ARM_MODES = (
     Field("drive_mode", "uint8", "", "Commanded mode of operation (CiA 402, 0x6060).", part="arm"),
@@ -259,7 +231,7 @@ GRIPPER_FIELDS = _fields_of(
     ("gripper_drive_state", "uint8", "", "State of the drive (rtcp.ipc.states.DriveState)."),
     ("gripper_statusword", "uint16", "", "Statusword of the drive (CiA 402, 0x6041)."),
 )
-"""Of a gripper with a drive of its own."""
+"""Fields of a gripper with a drive of its own."""
 
 
 def schema_of(parts: Iterable[Sequence[Field]]) -> RecordSchema:
@@ -268,7 +240,7 @@ def schema_of(parts: Iterable[Sequence[Field]]) -> RecordSchema:
 
 
 def arm_schema(joints: int) -> RecordSchema:
-    """Return the schema of an arm without any device: what every recording of an arm has."""
+    """Return the schema of an arm without devices: the fields that every recording of an arm has."""
     return schema_of((OPERATOR_FIELDS, arm_fields(joints)))
 
 
@@ -288,7 +260,7 @@ FLAG_MOTION_ALLOWED = 32
 FLAG_ARM_HAS_JOYSTICK = 64
 
 HELD_SHOULDER = 1 << 16
-"""`held`, bits 0 to 15: a guard or the output limiter cut the target of this joint. From here on, what limits a jog:
+"""`held`, bits 0 to 15: a guard or the output limiter cut the target of this joint. From here on, the limit of a jog:
 the singularity of the shoulder; elbow and wrist are the next two bits."""
 HELD_RANGE_AT, HELD_SPEED_AT = 19, 23
 """4 bits each: 1 + the joint whose range, or whose speed, is the limit; 0: none."""

@@ -1,6 +1,6 @@
-"""The processes of one running platform and what the launcher hands them: JSON files in the runtime directory.
+"""The processes of one running platform and their session: JSON files in the runtime directory.
 
-The loop's process reads the session and writes its exit report; psutil is loaded only where processes are looked up.
+The loop's process reads the session and writes its exit report; psutil is loaded only to look processes up.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ _POLL_S = 0.01
 
 
 class SessionError(Exception):
-    """A file of the runtime directory is missing, damaged or not to be trusted; the message names it."""
+    """A file of the runtime directory is missing, damaged or writable by others; the message names it."""
 
 
 # -- processes --------------------------------------------------------------------------------------------------
 
 
 class Pid(int):
-    """A process id with psutil's identity of its process, which no later process with the same id has."""
+    """A process id with psutil's identity of its process, which a later process with the same id does not share."""
 
     identity: int
 
     def __new__(cls, number: int, identity: int = 0) -> Pid:
         """Combine both; `identify` looks the identity up."""
-        made = super().__new__(cls, number)
-        made.identity = identity
-        return made
+        pid = super().__new__(cls, number)
+        pid.identity = identity
+        return pid
 
 
 NO_PROCESS = Pid(0)
@@ -133,8 +133,9 @@ def processes_file(directory: Path) -> Path:
 def read_processes(directory: Path) -> Processes:
     """Return the processes that `processes.json` names; none where it is missing or damaged."""
     try:
-        found = json.loads(processes_file(directory).read_text())
-        return Processes(*(Pid(int(found[one.name]), int(found["identities"][one.name])) for one in fields(Processes)))
+        content = json.loads(processes_file(directory).read_text())
+        identities = content["identities"]
+        return Processes(*(Pid(int(content[role.name]), int(identities[role.name])) for role in fields(Processes)))
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError):
         return Processes()
 
@@ -150,7 +151,7 @@ def _replace(path: Path, content: object) -> None:
 
 @dataclass(frozen=True)
 class Session:
-    """What the launcher hands to the loop and the gateway."""
+    """Settings that the launcher passes to the loop and the gateway."""
 
     config: ArmConfig
     bus: str
@@ -161,7 +162,7 @@ class Session:
     state: Path | None = None
     """Directory of persistent state, also for a gateway that is started later; None: from its environment."""
     segment_control: Path | None = None
-    """Control socket of the virtual segment that was started with it; None: there is none."""
+    """Control socket of the platform's virtual segment; None: it has none."""
     cell: CellConfig | None = None
     """The cell that the arm belongs to."""
     name: str = ""
@@ -170,7 +171,8 @@ class Session:
     @property
     def partners(self) -> tuple[str, ...]:
         """Names of the other arms of the cell."""
-        return () if self.cell is None else tuple(one.name for one in self.cell.members if one.name != self.name)
+        members = () if self.cell is None else self.cell.members
+        return tuple(member.name for member in members if member.name != self.name)
 
     def write(self, directory: Path) -> None:
         """Write the session file with mode 0600."""
@@ -187,7 +189,7 @@ def session_file(directory: Path) -> Path:
 
 
 def read_session(directory: Path) -> Session:
-    """Read what `Session.write` wrote.
+    """Read the session file.
 
     Raises:
         SessionError: the file is missing, damaged or of another version, or others may write to it.
@@ -199,11 +201,11 @@ def read_session(directory: Path) -> Session:
         raise SessionError(f"{path} cannot be read: {error.strerror}") from error
     if owner.st_uid not in (0, os.geteuid()) or owner.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise SessionError(f"{path} is another user's, or others may write to it: it is not read")
-    found = read_json(path, dict)
-    if found.get("version") != rtcp.__version__:
+    content = read_json(path, dict)
+    if content.get("version") != rtcp.__version__:
         raise SessionError(f"{path} was written by another version of rtcp: it is not read by {rtcp.__version__}")
     try:
-        return from_json(Session, found.get("session"))
+        return from_json(Session, content.get("session"))
     except ValueError as error:
         raise SessionError(f"{path} is damaged: {error}") from error
 
@@ -215,14 +217,14 @@ def read_json(path: Path, kind: type[T]) -> T:
         SessionError: the file is missing or damaged.
     """
     try:
-        found = json.loads(path.read_text())
+        content = json.loads(path.read_text())
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise SessionError(f"{path} is damaged: {error}") from error
-    if not isinstance(found, kind):
-        raise SessionError(f"{path} is damaged: found {type(found).__name__}, allowed is {kind.__name__}")
-    return found
+    if not isinstance(content, kind):
+        raise SessionError(f"{path} is damaged: found {type(content).__name__}, allowed is {kind.__name__}")
+    return content
 
 
 # -- the loop's exit report -------------------------------------------------------------------------------------
@@ -238,18 +240,18 @@ def remove_exit_report(directory: Path) -> None:
 
 
 def write_exit_report(directory: Path, pid: int, problems: Sequence[str]) -> None:
-    """Record that the loop `pid` has left the bus, and what it could not leave in order."""
+    """Record that the loop `pid` has left the bus, and its problems with that."""
     path = _exit_report(directory)
     try:
         _replace(path, {"pid": pid, "left": list(problems)})
     except OSError as error:
-        # Without a report the end counts as a crash, which is the safe side.
+        # Without a report the end counts as a crash, which is safe.
         with contextlib.suppress(OSError):
             sys.stderr.write(f"{path} cannot be written: {error.strerror}\n")
 
 
 def exit_problems(directory: Path, loop: Pid, was_running: bool) -> tuple[str, ...]:
-    """Return in sentences what a loop did not leave with drives disabled and slaves in INIT.
+    """Return, in sentences, drives that a loop left enabled and slaves that it left in another state than INIT.
 
     Args:
         directory: the runtime directory.

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class State(IntEnum):
-    """What the arm is doing."""
+    """State of the machine."""
 
     OFF = 0
     STARTING = 1
@@ -30,10 +30,10 @@ class State(IntEnum):
 
 
 class DriveState(IntEnum):
-    """What a drive is doing: the states of CiA 402-2, clause 8, which drives of every kind show."""
+    """State of a drive, by CiA 402-2, clause 8, for drives of every kind."""
 
     NOT_READY_TO_SWITCH_ON = 0
-    """Also a drive from which nothing has come."""
+    """Also of a drive that has not sent yet."""
     SWITCH_ON_DISABLED = 1
     READY_TO_SWITCH_ON = 2
     SWITCHED_ON = 3
@@ -51,11 +51,11 @@ class DriveState(IntEnum):
 
 
 WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
-"""States in which a drive gives torque."""
+"""States in which a drive applies torque."""
 
 
 class Missing(IntEnum):
-    """What keeps a drive behind a robot controller from following targets; only people at the controller can add it."""
+    """Condition that a drive behind a robot controller lacks to track targets; only a person there can provide it."""
 
     NOTHING = 0
     CONNECTION = 1
@@ -65,7 +65,7 @@ class Missing(IntEnum):
     PROGRAM = 3
     """Its program does not run."""
     CONTROL = 4
-    """Its program does not take references now."""
+    """Its program does not accept references now."""
     CLEARANCE = 5
     """It reports a fault, as after a collision."""
     PACE = 6
@@ -91,7 +91,7 @@ class ControlMode(IntEnum):
 
 
 class JogFrame(IntEnum):
-    """The axes that the six velocities of a jog command refer to."""
+    """Frame that the six velocities of a jog command refer to."""
 
     BASE = 0
     TOOL = 1

@@ -1,7 +1,7 @@
-"""Stop reactions: which one an event takes, and how long and how far the arm moves at most until it stands.
+"""Stop reactions: the one of each event, and upper bounds on stopping time and distance.
 
-Hold is the reaction to every cycle with a wrong working counter, up to `bus.lost_cycles`. For the others the section
-`stops` of the configuration has a key an event; a fault without a key takes a quick stop.
+Hold is the reaction to every cycle with a wrong working counter, up to `bus.lost_cycles`. For other events the
+configuration has keys under `stops`; a fault without a key takes a quick stop.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from rtcp.config.model import ArmConfig, Joint, StopsConfig
 from rtcp.ipc.events import EVENTS, Event
 
 _LATENCY_CYCLES = 3
-"""From the cycle that finds a reason to the drive that obeys, and to the master that sees it: frame, SYNC0, frame."""
+"""Cycles from the detection of an event to the drive's reaction and its feedback: frame, SYNC0, frame."""
 _DRIVE_S = 0.03
-"""A joint comes to rest so long after the end of its drive's ramp, or of its setpoints, at most."""
+"""Upper bound on the time from the end of the drive's ramp, or of the setpoints, to rest, s."""
 _QUICK_STOP_DECELERATION = 0x6085
 _UNKNOWN_S = 2.0
-"""A quick stop at a rate that is not known is given so long: as the emergency stop gives it."""
+"""Time of a quick stop whose rate is unknown, s: as in an emergency stop."""
 
 
 class StopReaction(IntEnum):
@@ -43,7 +43,7 @@ class StopReaction(IntEnum):
 
 
 def reactions(stops: StopsConfig) -> dict[type[Event], StopReaction]:
-    """Return the stop reaction to every event that has a key under `stops`, and to every fault: a quick stop else."""
+    """Return the stop reaction to every event with a key under `stops`, and to every fault; default: a quick stop."""
     return {
         kind: StopReaction[getattr(stops, kind.stop_key).upper()] if kind.stop_key else StopReaction.QUICK_STOP
         for kind in EVENTS
@@ -52,59 +52,59 @@ def reactions(stops: StopsConfig) -> dict[type[Event], StopReaction]:
 
 
 class Bound(NamedTuple):
-    """Within which what moves at full speed stands: counted from the cycle that finds the reason."""
+    """Upper bound on stopping time and distance from full speed, from the cycle that detects the event."""
 
     time_s: float
     way_rad: float
-    """Of a joint, or of the tool's turning; m of the tool's way."""
+    """Distance: rad of a joint or of the tool's rotation, m of the tool's path."""
 
 
 def bounds(config: ArmConfig, reaction: StopReaction, braking: Sequence[float] = ()) -> tuple[Bound, ...]:
     """Return the bound of each joint.
 
     Args:
-        config: limits of the joints, of the tool and of the bus, and what the drives are set to.
-        reaction: how it is stopped. Of `HOLD` it is what may pass until the next reaction, not until standstill.
-        braking: rad/s^2, what each joint's closed brake slows it down by at least, weight taken off; for `TORQUE_OFF`.
+        config: limits of the joints, of the tool and of the bus, and the settings of the drives.
+        reaction: of the stop. The bound of `HOLD` ends at the next reaction, not at standstill.
+        braking: for `TORQUE_OFF`: least deceleration of each joint by its closed brake, less its weight, rad/s^2.
 
     Raises:
-        ValueError: what the bound rests on is not known: 0x6085 of a drive, or a brake.
+        ValueError: 0x6085 of a drive, or a brake, is not known.
     """
     period_s = config.cycle.period_us * 1e-6
     late_s = _LATENCY_CYCLES * period_s
-    found = []
+    limits = []
     for at, joint in enumerate(config.joints):
         v = joint.velocity
         if reaction is StopReaction.HOLD:
-            # In CSP a joint stands sooner. In CSV it runs on at the last speed.
-            held_s = config.bus.lost_cycles * period_s
-            found.append(Bound(held_s, v * (held_s + late_s)))
+            # In CSV a joint continues at the last speed; in CSP it stops sooner.
+            lost_s = config.bus.lost_cycles * period_s
+            limits.append(Bound(lost_s, v * (lost_s + late_s)))
         elif reaction is StopReaction.CONTROLLED_STOP:
             stop = _ramp(v, joint.acceleration, joint.jerk)
-            found.append(Bound(stop.time_s + late_s + _DRIVE_S, stop.way_rad + v * (late_s + _DRIVE_S)))
+            limits.append(Bound(stop.time_s + late_s + _DRIVE_S, stop.way_rad + v * (late_s + _DRIVE_S)))
         else:
             rate = (
                 _quick_stop_rate(config, joint) if reaction is StopReaction.QUICK_STOP else _brake(braking, at, joint)
             )
-            late = late_s + _DRIVE_S
-            found.append(Bound(v / rate + late, 0.5 * v * v / rate + v * late))
-    return tuple(found)
+            delay_s = late_s + _DRIVE_S
+            limits.append(Bound(v / rate + delay_s, 0.5 * v * v / rate + v * delay_s))
+    return tuple(limits)
 
 
 def watchdog_bounds(config: ArmConfig) -> tuple[Bound, ...]:
-    """Return the bound of each joint where no frame reaches its drive any more, counted from the first that does not.
+    """Return the bound of each joint when frames no longer reach its drive, from the first missing frame.
 
-    Until its watchdog ends it the drive goes on with its last target; then it is in fault and ramps down (0x605E = 2).
+    Until its watchdog expires the drive keeps its last target; then it is in fault and ramps down (0x605E = 2).
     """
-    found = []
+    limits = []
     for joint, stop in zip(config.joints, bounds(config, StopReaction.QUICK_STOP), strict=True):
         watchdog_s = 1e-3 * next(s.device.watchdog_ms for s in config.slaves if s.name == joint.slave)
-        found.append(Bound(watchdog_s + stop.time_s, joint.velocity * watchdog_s + stop.way_rad))
-    return tuple(found)
+        limits.append(Bound(watchdog_s + stop.time_s, joint.velocity * watchdog_s + stop.way_rad))
+    return tuple(limits)
 
 
 def quick_stop_s(config: ArmConfig) -> float:
-    """Return within which time all that drives move, the gripper too, stands by a quick stop, s."""
+    """Return the upper bound on the time of a quick stop of all axes, the gripper's among them, s."""
     try:
         return max(bound.time_s for bound in bounds(replace(config, joints=config.axes), StopReaction.QUICK_STOP))
     except ValueError:
@@ -112,14 +112,14 @@ def quick_stop_s(config: ArmConfig) -> float:
 
 
 def longest_s(config: ArmConfig) -> float:
-    """Return the longest time of all reactions within which all that drives move stands, s."""
+    """Return the upper bound on the time of a controlled or quick stop of all axes and of the tool, s."""
     controlled = bounds(replace(config, joints=config.axes), StopReaction.CONTROLLED_STOP)
     tool = tool_bounds(config, config.cartesian.speed, config.cartesian.angular_speed)
     return max(quick_stop_s(config), *(bound.time_s for bound in (*controlled, *tool)))
 
 
 def tool_bounds(config: ArmConfig, speed: float, angular_speed: float) -> tuple[Bound, Bound]:
-    """Return the bounds of the tool's controlled stop: from `speed`, m/s, its way in m; from `angular_speed`, rad/s."""
+    """Return the bounds of the tool's controlled stop from `speed`, m/s, and from `angular_speed`, rad/s."""
     limits = config.cartesian
     late_s = _LATENCY_CYCLES * config.cycle.period_us * 1e-6 + _DRIVE_S
     along = _ramp(speed, limits.acceleration, limits.jerk)
@@ -131,7 +131,7 @@ def tool_bounds(config: ArmConfig, speed: float, angular_speed: float) -> tuple[
 
 
 def _ramp(v: float, a: float, j: float) -> Bound:
-    """Bound a stop that is limited in jerk, from a speed of at most `v`, with whatever acceleration was under way.
+    """Bound a jerk-limited stop from a speed of at most `v` and any acceleration of at most `a`.
 
     At worst the speed rises with `a` when the stop begins: that acceleration ends first, at speed `v`, and the rest is
     the stop from there, which is symmetrical.
@@ -143,11 +143,11 @@ def _ramp(v: float, a: float, j: float) -> Bound:
 
 
 def _quick_stop_rate(config: ArmConfig, joint: Joint) -> float:
-    """Return what 0x6085 among the start-up SDOs of the joint's drive says, rad/s^2; `joint` ramps at the limit."""
+    """Return 0x6085 of the start-up SDOs of the joint's drive, rad/s^2; of a drive of kind `joint`: the limit."""
     device = next(slave.device for slave in config.slaves if slave.name == joint.slave)
     if device.kind == "joint":
         return joint.acceleration
-    # A rate counts as a speed does, by the second.
+    # The unit of a rate is that of a speed, per second.
     channels = (entry for pdo in device.of_axis(joint.axis).rpdo for entry in pdo.channels)
     scaling = device.scaling_of(joint.axis)
     factors = [entry.factor for entry in channels if entry.name == "target_velocity"]

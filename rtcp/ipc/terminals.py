@@ -1,4 +1,4 @@
-"""Inputs and outputs of the IO boxes, and channels of slaves that are nothing else: their names and record fields."""
+"""Inputs and outputs of the IO boxes, and channels of other slaves: their names and record fields."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ class Terminal:
     """An input or output of an IO box, or a channel of one bit."""
 
     name: str
-    """Of the file, or `box.number`; of a channel `slave.channel`."""
+    """Name in the file, or `box.number`; of a channel `slave.channel`."""
     slave: str
     number: int
-    """On the box; of a channel among those of the slave in its direction, from 1."""
+    """Number on the box; of a channel: its number among the slave's inputs or outputs, from 1."""
     field: str
-    """Of the cycle record."""
+    """Field of the cycle record."""
     is_output: bool
     has_function: bool
-    """The platform reads or writes it itself."""
+    """Whether the platform itself reads or writes it."""
     is_channel: bool = False
 
     @property
     def bit(self) -> int:
-        """Of the field."""
+        """Bit of the field."""
         return 0 if self.is_channel else self.number - 1
 
     @property
     def place(self) -> str:
-        """The name that every terminal has."""
+        """`box.number`, which every terminal has."""
         return f"{self.slave}.{self.number}"
 
     @property
@@ -62,7 +62,7 @@ class NumberChannel:
 
     slave: str
     number: int
-    """Among those of the slave in its direction, from 1."""
+    """Number among the channels of the slave in its direction, from 1."""
     is_output: bool
     entry: PdoEntry
     field: str
@@ -130,5 +130,5 @@ def terminals_of(config: ArmConfig, schema: RecordSchema) -> tuple[list[Terminal
 
 
 def named(terminals: Sequence[Terminal], numbers: Sequence[NumberChannel]) -> list[Terminal | NumberChannel]:
-    """Return all but the terminals of IO boxes that have a number only."""
-    return [*(one for one in terminals if one.is_channel or one.name != one.place), *numbers]
+    """Return all terminals and channels but those of IO boxes without a name."""
+    return [*(terminal for terminal in terminals if terminal.is_channel or terminal.name != terminal.place), *numbers]

@@ -1,6 +1,6 @@
 """The motion of the tool: fields that a reader computes from a cycle record, beside those that the loop publishes.
 
-In the loop this would add 164 to the 232 thousand instructions of a cycle that holds (`benchmarks/instructions.py hold
+In the loop this would add 164 to the 232 thousand instructions of a holding cycle (`benchmarks/instructions.py hold
 --source`); a reader has the time.
 """
 
@@ -51,13 +51,13 @@ class ToolMotion:
         if not self._models:
             return records
         before = records.dtype.itemsize
-        found = np.empty(len(records), self._kind)
+        extended = np.empty(len(records), self._kind)
         if len(records):
-            rows = found.view(np.uint8).reshape(len(records), -1)
+            rows = extended.view(np.uint8).reshape(len(records), -1)
             rows[:, :before] = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), -1)
             motion = np.hstack(self.of(records["actual_position"], records["actual_velocity"], records["tool"]))
             rows[:, before:] = np.ascontiguousarray(motion, "<f8").view(np.uint8)
-        return found
+        return extended
 
     def of(
         self, q: npt.NDArray[np.float64], velocity: npt.NDArray[np.float64], tool: npt.NDArray[np.integer[Any]]

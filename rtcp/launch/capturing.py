@@ -153,7 +153,7 @@ class Capture:
                 pipe.close()
 
     def wait(self, seconds: float | None) -> Counted:
-        """Let it run for a time, None: until Ctrl-C; end it and return what it has written.
+        """Let it run for a time, s, or until Ctrl-C (None); end it and return the counts of its frames.
 
         Raises:
             RtcpError: a frame could not be written or received.
@@ -175,7 +175,7 @@ def main() -> int:
             check_interface(question["interface"])
             with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as port:
                 _prepare(port, question["interface"])
-                _tell({})
+                _send({})
                 frames = 0
                 writer = PcapngFile(file, question["interface"])
                 while sys.stdin not in select.select([port, sys.stdin], [], [])[0]:
@@ -183,12 +183,12 @@ def main() -> int:
                 frames += _write_waiting(port, writer)
                 lost = struct.unpack("=II", port.getsockopt(_SOL_PACKET, _PACKET_STATISTICS, 8))[1]
     except PermissionError as error:
-        _tell({"error": f"capturing on {question['interface']} needs the capability CAP_NET_RAW (or root): {error}"})
+        _send({"error": f"capturing on {question['interface']} needs the capability CAP_NET_RAW (or root): {error}"})
         return 1
     except (OSError, BusError) as error:
-        _tell({"error": getattr(error, "strerror", None) or str(error)})
+        _send({"error": getattr(error, "strerror", None) or str(error)})
         return 1
-    _tell({"frames": frames, "lost": lost})
+    _send({"frames": frames, "lost": lost})
     return 0
 
 
@@ -209,13 +209,13 @@ def _write_waiting(port: socket.socket, writer: PcapngFile) -> int:
         time_ns = time.time_ns()
         for level, kind, data in extras:
             if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
-                seconds, part = _TIME.unpack(data)
-                time_ns = seconds * 1_000_000_000 + part
+                seconds, nanoseconds = _TIME.unpack(data)
+                time_ns = seconds * 1_000_000_000 + nanoseconds
         writer.write(frame, time_ns, address[2] == socket.PACKET_OUTGOING)
     return _FRAMES_AT_ONCE
 
 
-def _tell(answer: dict[str, object]) -> None:
+def _send(answer: dict[str, object]) -> None:
     os.write(1, json.dumps(answer).encode() + b"\n")
 
 

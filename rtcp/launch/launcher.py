@@ -50,9 +50,9 @@ CheckSegment = Callable[[Path], object]
 """Raises ConfigError where no segment can be made of the file; `rtcp.virtual` knows which device models exist."""
 
 START_TIMEOUT_S = 1.0
-"""Wait for the lock of a start: restarting a gateway holds it for a moment."""
+"""Longest wait for the lock in a start, s: restarting a gateway holds it for a moment."""
 STOP_TIMEOUT_S = 30.0
-"""Wait for the lock of a stop: another stop holds it for 20 s at most, or a start."""
+"""Longest wait for the lock in a stop, s: another stop holds it for 20 s at most, or a start."""
 
 
 @dataclass(frozen=True)
@@ -100,26 +100,26 @@ def start(options: StartOptions, report: Report, check_segment: CheckSegment = l
     with _locked(directory, START_TIMEOUT_S):
         _record_unseen_end(directory, report)
         stop_marker(directory).unlink(missing_ok=True)
-        found = read_processes(directory)
-        if not is_running(found.loop):
-            clear(directory, found)
+        pids = read_processes(directory)
+        if not is_running(pids.loop):
+            clear(directory, pids)
             config = _configure(options)
             for warning in config.warnings:
                 report(f"warning: {warning}")
             _check_bus(config, check_segment)
             return _start_all(directory, config, options, began_ns, report)
-        if is_running(found.gateway):
+        if is_running(pids.gateway):
             raise RtcpError(
-                "refused", f"the platform is running already (loop process {found.loop}): `rtcp status`, `rtcp stop`"
+                "refused", f"the platform is running already (loop process {pids.loop}): `rtcp status`, `rtcp stop`"
             )
-        lone = f"the loop (process {found.loop}) is running without a gateway"
+        lone = f"the loop (process {pids.loop}) is running without a gateway"
         if options != StartOptions():
             raise RtcpError(
                 "refused",
                 f"{lone}: `rtcp start` without options starts one; for other options `rtcp stop` first",
             )
         report(f"{lone}: starting one")
-        platform, ready = _begin_gateway(directory, found)
+        platform, ready = _begin_gateway(directory, pids)
     # Without the lock: a stop must not wait for a gateway.
     platform.await_gateway(ready)
     return platform
@@ -132,30 +132,30 @@ def replace_gateway(directory: Path) -> int:
         RtcpError: a start or stop is under way (refused), or the gateway does not become ready (fault).
     """
     with _locked(directory):
-        found = read_processes(directory)
-        if not is_running(found.loop) or is_running(found.gateway) or stop_marker(directory).exists():
+        pids = read_processes(directory)
+        if not is_running(pids.loop) or is_running(pids.gateway) or stop_marker(directory).exists():
             return 0
-        platform, ready = _begin_gateway(directory, found)
+        platform, ready = _begin_gateway(directory, pids)
     try:
         platform.await_gateway(ready)
     except RtcpError:
-        if is_running(found.loop) and not stop_marker(directory).exists():
+        if is_running(pids.loop) and not stop_marker(directory).exists():
             raise
         return 0  # the platform was stopped meanwhile, and the gateway with it
     return platform.processes.gateway
 
 
 def stop(report: Report) -> tuple[str, ...]:
-    """Stop the platform; `report` receives what does not go as usual.
+    """Stop the platform; `report` receives problems on the way.
 
-    Return in sentences what was not left in order: drives disabled, slaves in INIT.
+    Return the steps that failed, in sentences: drives disabled, slaves in INIT.
 
     Raises:
         RtcpError: nothing runs (not running), or another start or stop takes longer than `STOP_TIMEOUT_S` (refused).
     """
     directory = runtime_directory()
-    found = read_processes(directory)
-    if not any(is_running(pid) for pid in (found.loop, found.gateway, found.segment)):
+    pids = read_processes(directory)
+    if not any(is_running(pid) for pid in (pids.loop, pids.gateway, pids.segment)):
         raise RtcpError("not running", f"no platform is running (runtime directory {directory})")
 
     def on_wait() -> None:
@@ -165,7 +165,7 @@ def stop(report: Report) -> tuple[str, ...]:
         _record_unseen_end(directory, report)
         now = read_processes(directory)  # a gateway may have been replaced meanwhile
         # Another stop may have ended everything: report how the loop ended all the same.
-        return end_platform(directory, now if now.loop else found, report)
+        return end_platform(directory, now if now.loop else pids, report)
 
 
 @contextlib.contextmanager
@@ -182,12 +182,12 @@ def _locked(directory: Path, timeout_s: float = 0.0, on_wait: Callable[[], None]
 
 def _record_unseen_end(directory: Path, report: Report) -> None:
     """Have the black box record a loop that died while there was no gateway, before its files are removed."""
-    found = read_processes(directory)
-    if not found.loop or any(is_running(pid) for pid in (found.loop, found.gateway)) or stop_marker(directory).exists():
+    pids = read_processes(directory)
+    if not pids.loop or any(is_running(pid) for pid in (pids.loop, pids.gateway)) or stop_marker(directory).exists():
         return
     try:
         with contextlib.closing(Observer(blackboard_file(directory))) as observer:
-            if observer.loop_pid == found.loop:
+            if observer.loop_pid == pids.loop:
                 session = read_session(directory)
                 box = BlackBox(observer, session, faults_directory(session.state), report)
                 box.loop_had_ended()
@@ -197,16 +197,16 @@ def _record_unseen_end(directory: Path, report: Report) -> None:
     except Exception as error:
         # The files are removed all the same, whatever is wrong with them.
         why = str(error) if isinstance(error, SessionError) else f"{type(error).__name__}: {error}"
-        report(f"the end of the loop (process {found.loop}) was not recorded: {why}")
+        report(f"the end of the loop (process {pids.loop}) was not recorded: {why}")
 
 
-def _begin_gateway(directory: Path, found: Processes) -> tuple[Platform, int]:
+def _begin_gateway(directory: Path, pids: Processes) -> tuple[Platform, int]:
     """Start a gateway for a running loop; return also the pipe on which it reports that it is ready."""
     try:
         session = read_session(directory)
     except SessionError as error:
         raise RtcpError("fault", f"{error}: `rtcp stop`, then start anew") from error
-    platform = Platform(directory, session.config, found, session.state)
+    platform = Platform(directory, session.config, pids, session.state)
     return platform, platform.begin_gateway()
 
 
@@ -251,7 +251,7 @@ def _segment_words(facts: dict[str, Any]) -> str:
 def _placed(cell: CellConfig) -> CellConfig:
     """Return the cell with the runtime directories of its arms."""
     arms, processes = (
-        tuple(dataclasses.replace(one, directory=runtime_directory(one.name).absolute()) for one in group)
+        tuple(dataclasses.replace(member, directory=runtime_directory(member.name).absolute()) for member in group)
         for group in (cell.arms, cell.processes)
     )
     return dataclasses.replace(cell, arms=arms, processes=processes)

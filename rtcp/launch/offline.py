@@ -1,7 +1,7 @@
-"""Questions to a bus while no platform runs: a child process opens the bus, asks one question and closes it.
+"""Requests to a bus while no platform runs: a child process opens the bus, carries out one request and closes it.
 
 The child lives in the virtual segment's namespaces, and a crash of the master's C library ends it alone. For the bus
-`virtual` a segment runs for as long as the question takes. `python -m rtcp.launch.offline` is the child: a JSON object
+`virtual` a segment runs during the request. `python -m rtcp.launch.offline` is the child: a JSON object
 on standard input, one on standard output.
 """
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from rtcp.fieldbus.soem import SoemBus
 
 SEGMENT_TIMEOUT_S = 10.0
-"""A segment creates its namespace and its pair of interfaces in far less."""
+"""Longest wait for a segment, s; it creates its namespace and its interfaces in far less."""
 QUESTION_TIMEOUT_S = 30.0
-"""A scan reads every slave's EEPROM; a slow one takes a second."""
+"""Longest wait for an answer, s: a scan reads every slave's EEPROM, which takes up to 1 s each."""
 STATE_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 3.0
 
@@ -58,8 +58,8 @@ def ignore(done: float) -> None:
 class OfflineBus:
     """A bus that is opened for each question and closed again; methods as those of `rtcp.api.Robot`.
 
-    `slave` is a position from 1, or a name of the arm's file: the slave then is found by its station alias, or by its
-    place in the file, and has to be the device that the file says.
+    `slave` is a position from 1, or a name of the arm's file: that slave is looked up by its station alias, or by its
+    place in the file, and must be the device that the file says.
 
     Each raises RtcpError where the segment or the bus cannot be opened or does not answer, with a slave's abort code in
     words, and ConfigError where the configuration of the virtual segment has mistakes.
@@ -78,11 +78,11 @@ class OfflineBus:
         """That slave as messages name it: position, device, serial number."""
 
     def scan(self) -> list[dict[str, Any]]:
-        """Return what each slave reports of itself, as `rtcp.fieldbus.bus.SlaveInfo` has it, bytes as hex."""
+        """Return the description of each slave, as `rtcp.fieldbus.bus.SlaveInfo` has it, bytes as hex."""
         return list(self._ask("scan")["slaves"])
 
     def sdo_read(self, slave: int | str, index: int, subindex: int) -> bytes:
-        """Return the object's bytes as they came over the wire."""
+        """Return the object's bytes, little endian as on the wire."""
         return bytes.fromhex(self._ask("sdo_read", slave=slave, index=index, subindex=subindex)["hex"])
 
     def sdo_write(self, slave: int | str, index: int, subindex: int, data: bytes) -> None:
@@ -90,8 +90,8 @@ class OfflineBus:
         self._ask("sdo_write", slave=slave, index=index, subindex=subindex, hex=data.hex())
 
     def object_lengths(self, slave: int, objects: Sequence[tuple[int, int]]) -> list[int | None]:
-        """Return the bytes that objects, by index and subindex, have; -1: there is none; None: it cannot be read."""
-        return list(self._ask("object_lengths", slave=slave, objects=[list(one) for one in objects])["lengths"])
+        """Return the lengths of objects, by index and subindex, bytes; -1: there is none; None: it cannot be read."""
+        return list(self._ask("object_lengths", slave=slave, objects=[list(address) for address in objects])["lengths"])
 
     def describe(self, slave: int | str, progress: Progress = ignore) -> dict[str, Any]:
         """Return the description of a slave: the fields of `rtcp.esi.model.Device`, bytes as hex."""
@@ -109,7 +109,7 @@ class OfflineBus:
         self._ask("foe_write", progress, slave=slave, name=name, hex=data.hex(), password=password, boot=boot)
 
     def eeprom_read(self, slave: int | str, size: int = 0, progress: Progress = ignore) -> bytes:
-        """Return the first `size` bytes of a slave's EEPROM; 0: as many as it says it has."""
+        """Return the first `size` bytes of a slave's EEPROM; 0: the size that it states."""
         return bytes.fromhex(self._ask("eeprom_read", progress, slave=slave, size=size)["hex"])
 
     def eeprom_write(self, slave: int | str, before: bytes, image: bytes, progress: Progress = ignore) -> int:
@@ -117,7 +117,7 @@ class OfflineBus:
 
         Args:
             slave: the slave.
-            before: with what its EEPROM begins, as it was read; nothing is written where it begins otherwise.
+            before: expected first bytes of its EEPROM, as they were read; where they differ nothing is written.
             image: the image.
             progress: receives how much is done, 0 to 1.
         """
@@ -125,8 +125,8 @@ class OfflineBus:
         return int(self._ask("eeprom_write", progress, **question)["written"])
 
     def eeprom_beginnings(self, slave: int | str) -> list[bytes]:
-        """Return the first 16 bytes of the EEPROM of every slave, in the order of the cable; `slave` is found, too."""
-        return [bytes.fromhex(one) for one in self._ask("eeprom_beginnings", slave=slave)["beginnings"]]
+        """Return the first 16 bytes of the EEPROM of every slave, in the order of the cable, and look up `slave`."""
+        return [bytes.fromhex(text) for text in self._ask("eeprom_beginnings", slave=slave)["beginnings"]]
 
     def state(self, slave: int | str, state: str) -> str:
         """Bring a slave to an AL state through those before it and leave it there; return its state in words."""
@@ -158,7 +158,7 @@ def _ask(bus: str, config: Path | None, question: Mapping[str, Any], progress: P
 
 
 def _question(question: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
-    """Ask one question in a child process and return its answer; `progress` receives how far it is."""
+    """Carry out one request in a child process and return its answer; `progress` receives the progress."""
     bus = question["interface"]
     with ExitStack() as stack:
         # A signal between start and registration would leave a process that nobody ends.
@@ -206,7 +206,7 @@ def _silence(child: subprocess.Popen[bytes], bus: str) -> dict[str, Any]:
 
 @contextmanager
 def _segment(file: Path) -> Iterator[dict[str, Any]]:
-    """Run a virtual segment in namespaces of its own; give its ready line: `pid` and `interface`."""
+    """Run a virtual segment in namespaces of its own; yield its ready line: `pid` and `interface`."""
     arguments = ("--config", str(file))
     with ExitStack() as stack:
         with defer_signals():
@@ -254,7 +254,7 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
             arm's file, where `slave` is a name in it.
 
     Returns:
-        `slaves`, `hex` or whatever was asked for, with `position` and `label` of the slave; or `error`, a sentence, and
+        `slaves`, `hex` or another result, with `position` and `label` of the slave; or `error`, a sentence, and
         its `kind`.
 
     Raises:
@@ -263,39 +263,39 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
     from rtcp.fieldbus.soem import SoemBus  # here: the command itself does without SOEM
 
     slave = question.get("slave")
-    # Before the namespace is joined, in which this user is somebody else.
+    # Before joining the namespace, in which this user has another id.
     named = configuration(Path(question["config"]) if question["config"] else None) if isinstance(slave, str) else None
     bus = SoemBus(question["interface"], namespace_pid=question["namespace_pid"])
     bus.open()
     try:
         do = question["do"]
-        # What concerns the EEPROM or a state needs no slave in PRE-OP, which a wrong EEPROM may keep it from.
-        found = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
+        # Requests for EEPROM or state need no slave in PRE-OP, which a wrong EEPROM may prevent.
+        slaves = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
         if do == "scan":
-            return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(one)) for one in found]}
-        position = int(question["slave"]) if named is None else bus.position_of(str(slave), named.slaves, found)
-        if not 1 <= position <= len(found):
-            missing = f"no slave at position {position}: the bus {question['interface']} has {len(found)}"
+            return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(info)) for info in slaves]}
+        position = int(question["slave"]) if named is None else bus.position_of(str(slave), named.slaves, slaves)
+        if not 1 <= position <= len(slaves):
+            missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
             return {"error": missing, "kind": "invalid"}
-        device = found[position - 1]
+        device = slaves[position - 1]
         label = f"slave {position} ({device.name}, serial {device.serial})"
         return {"position": position, "label": label, **_ANSWERS[do](bus, position, question)}
     finally:
         bus.close()
 
 
-def _tell(done: float) -> None:
+def _report_progress(done: float) -> None:
     print(json.dumps({"progress": done}), flush=True)
 
 
-def _tell_part(done: float) -> None:
-    # A line a word would be thousands.
+def _report_percent(done: float) -> None:
+    # A line for each percent: one for each word would be thousands.
     if int(1000 * done) % 10 == 0:
-        _tell(done)
+        _report_progress(done)
 
 
 def _sdo_read(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
-    return {"hex": bus.sdo_read(position, question["index"], question["subindex"]).hex()}
+    return {"hex": bus.sdo(position).read(question["index"], question["subindex"]).hex()}
 
 
 def _object_lengths(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
@@ -305,36 +305,36 @@ def _object_lengths(bus: SoemBus, position: int, question: dict[str, Any]) -> di
     lengths: list[int | None] = []
     for index, subindex in question["objects"]:
         try:
-            lengths.append(len(bus.sdo_read(position, index, subindex)))
+            lengths.append(len(bus.sdo(position).read(index, subindex)))
         except SdoAborted as error:
             lengths.append(-1 if error.code in ABSENT else None)
     return {"lengths": lengths}
 
 
 def _sdo_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
-    bus.sdo_write(position, question["index"], question["subindex"], bytes.fromhex(question["hex"]))
+    bus.sdo(position).write(question["index"], question["subindex"], bytes.fromhex(question["hex"]))
     return {}
 
 
 def _describe(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
-    return {"device": dataclasses.asdict(bus.describe_device(position, _tell_part))}
+    return {"device": dataclasses.asdict(bus.describe_device(position, _report_percent))}
 
 
 def _foe_read(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
     if question["boot"]:
         bus.boot(position)
-    return {"hex": bus.foe(position).read(question["name"], question["password"], _tell).hex()}
+    return {"hex": bus.foe(position).read(question["name"], question["password"], _report_progress).hex()}
 
 
 def _foe_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
     if question["boot"]:
         bus.boot(position)
-    bus.foe(position).write(question["name"], bytes.fromhex(question["hex"]), question["password"], _tell)
+    bus.foe(position).write(question["name"], bytes.fromhex(question["hex"]), question["password"], _report_progress)
     return {}
 
 
 def _eeprom_read(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
-    return {"hex": bus.read_eeprom(position, _tell_part, question["size"] or None).hex()}
+    return {"hex": bus.read_eeprom(position, _report_percent, question["size"] or None).hex()}
 
 
 def _eeprom_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
@@ -342,11 +342,11 @@ def _eeprom_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict
     if bus.read_eeprom(position, ignore, len(before)) != before:
         changed = f"the EEPROM of slave {position} is not the one that was read; nothing was written: begin again"
         return {"error": changed, "kind": "refused"}
-    return {"written": bus.write_eeprom(position, image, _tell_part)}
+    return {"written": bus.write_eeprom(position, image, _report_percent)}
 
 
 def _eeprom_beginnings(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
-    return {"beginnings": [bus.read_eeprom(one.position, ignore, 16).hex() for one in bus.read_states()]}
+    return {"beginnings": [bus.read_eeprom(info.position, ignore, 16).hex() for info in bus.read_states()]}
 
 
 def _state(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:
@@ -388,17 +388,16 @@ def _plain(value: object) -> object:
 
 def main() -> int:
     """Answer the question on standard input; errors of the bus are answers too."""
-    from rtcp.fieldbus.errors import BusError, SdoAborted
-    from rtcp.fieldbus.foe import FoeRefused
+    from rtcp.fieldbus.errors import BusError, Refused
 
     # An interrupted command ends this process: the bus is closed on the way out.
     signal.signal(signal.SIGTERM, _leave)
     question = json.loads(sys.stdin.buffer.read())
     try:
-        found = answer(question)
+        reply = answer(question)
     except BusError as error:
-        found = {"error": str(error), "kind": "refused" if isinstance(error, SdoAborted | FoeRefused) else "fault"}
-    print(json.dumps(found, default=_plain), flush=True)
+        reply = {"error": str(error), "kind": "refused" if isinstance(error, Refused) else "fault"}
+    print(json.dumps(reply, default=_plain), flush=True)
     return 0
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from rtcp.config.model import ArmConfig
+from rtcp.ipc import session
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import (
@@ -29,27 +30,16 @@ from rtcp.ipc.runtime_directory import (
     open_log,
     stop_marker,
 )
-from rtcp.ipc.session import (
-    EXIT_INCOMPLETE,
-    NO_PROCESS,
-    Processes,
-    exit_problems,
-    identify,
-    is_running,
-    processes_file,
-    read_processes,
-    terminate,
-)
 from rtcp.realtime.scheduling import available_cpus, choose_cpu
 
 _READY_TIMEOUT_S = 60.0
-"""Of each process, from its start or its last report."""
+"""Longest time until a process is ready, from its start or its last report, s."""
 _ANSWER_TIMEOUT_S = 3.0
-"""For the gateway's answer to `status`: one that hangs must not delay the stop, the arm is under torque."""
+"""Longest wait for the gateway's answer to `status`, s: one that hangs must not delay the stop of the arm."""
 _STOP_TIMEOUT_S = 20.0
 _EXIT_TIMEOUT_S = 5.0
 _LOOP_END_TIMEOUT_S = 10.0
-"""For a controlled stop, disabling the drives and the way to INIT: a loop that is killed leaves them to a watchdog."""
+"""Time for a controlled stop, disabling the drives and INIT, s; a loop that is killed leaves them to a watchdog."""
 _END_TIMEOUT_S = 5.0
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that stop the platform."""
@@ -80,12 +70,12 @@ def spawn(
 
 
 def read_lines(reading: int, timeout_s: float) -> Iterator[dict[str, Any]]:
-    """Yield the JSON lines of a pipe until it ends or nothing comes for `timeout_s`; close it then."""
-    rest = b""
+    """Yield the JSON lines of a pipe until it ends or is silent for `timeout_s`; then close it."""
+    pending = b""
     with open(reading, "rb", buffering=0) as pipe:
         while select.select([pipe], [], [], timeout_s)[0] and (read := pipe.read(65536)):
-            *whole, rest = (rest + read).split(b"\n")
-            for line in whole:
+            *lines, pending = (pending + read).split(b"\n")
+            for line in lines:
                 yield json.loads(line)
 
 
@@ -99,16 +89,18 @@ class Platform:
         state: directory of persistent state, for the processes; None: as in this process's environment.
     """
 
-    def __init__(self, directory: Path, config: ArmConfig, processes: Processes, state: Path | None = None) -> None:
+    def __init__(
+        self, directory: Path, config: ArmConfig, processes: session.Processes, state: Path | None = None
+    ) -> None:
         self.directory = directory
         self.processes = processes
         self._config = config
-        # Whole paths: what a child starts itself must not look for the platform's name in them again.
+        # Absolute paths: a child must not look for the platform's name in them again.
         self._environment = None if state is None else {**os.environ, "RTCP_STATE_DIR": str(state), "RTCP_NAME": ""}
         self.segment_control: Path | None = None
         """Control socket of the segment that was started."""
         self.facts: dict[str, Any] = {}
-        """What the loop reported of its start: realtime, start_to_op_s."""
+        """Facts that the loop reported of its start: realtime, start_to_op_s."""
         self._children: list[subprocess.Popen[bytes]] = []
 
     # -- starting -----------------------------------------------------------------------------------------------
@@ -120,7 +112,7 @@ class Platform:
             child, reading = spawn(module, *arguments, stdout=log, stderr=log, env=self._environment)
             before = getattr(self.processes, name)
             self._children.append(child)
-            setattr(self.processes, name, identify(child.pid))
+            setattr(self.processes, name, session.identify(child.pid))
             try:
                 self.processes.write(self.directory)
             except BaseException:
@@ -193,9 +185,9 @@ class Platform:
     def ended_in_order(self) -> bool:
         """Return whether an `rtcp stop` ended the loop; then a new platform may own the directory already."""
         loop = next((child for child in self._children if child.pid == self.processes.loop), None)
-        if loop is not None and loop.wait() not in (0, EXIT_INCOMPLETE):
+        if loop is not None and loop.wait() not in (0, session.EXIT_INCOMPLETE):
             return False
-        return stop_marker(self.directory).exists() or not processes_file(self.directory).exists()
+        return stop_marker(self.directory).exists() or not session.processes_file(self.directory).exists()
 
     def reap(self, timeout_s: float) -> None:
         """Wait for the processes that this one has started."""
@@ -206,42 +198,42 @@ class Platform:
     def stop(self, report: Report | None = None) -> tuple[str, ...]:
         """Stop everything: controlled stop, drives disabled, slaves in INIT, processes ended; again: no effect.
 
-        Return, and report, in sentences what of that could not be done.
+        Return, and report, the steps that failed, in sentences.
         """
-        left = end_platform(self.directory, self.processes, report)
+        problems = end_platform(self.directory, self.processes, report)
         self.reap(2.0)
         if report is not None:
-            for sentence in left:
+            for sentence in problems:
                 report(f"stopped, but: {sentence}")
-        return left
+        return problems
 
 
-def end_platform(directory: Path, found: Processes, report: Report | None = None) -> tuple[str, ...]:
-    """Stop a platform, by its gateway where that answers; return in sentences what was not left in order.
+def end_platform(directory: Path, processes: session.Processes, report: Report | None = None) -> tuple[str, ...]:
+    """Stop a platform, by its gateway where that answers; return the steps that failed, in sentences.
 
     `report` receives why the gateway did not do it.
     """
-    lived, answers = is_running(found.loop), is_running(found.gateway)
+    lived, answers = session.is_running(processes.loop), session.is_running(processes.gateway)
     error = _stop_by_gateway(directory)
     if error is not None and answers and report is not None:
         report(f"the gateway did not stop the platform: {error}; its processes are ended one by one")
-    clear(directory, found)
-    return exit_problems(directory, found.loop, lived)
+    clear(directory, processes)
+    return session.exit_problems(directory, processes.loop, lived)
 
 
-def clear(directory: Path, found: Processes) -> None:
-    """End what is left of a platform and remove its files."""
-    now = read_processes(directory)
-    # A gateway that has been replaced since.
-    newer = now.gateway if now.loop == found.loop else NO_PROCESS
-    terminate(found.loop, _LOOP_END_TIMEOUT_S)
-    for pid in (found.gateway, newer, found.segment):
-        terminate(pid, _END_TIMEOUT_S)
-    processes_file(directory).unlink(missing_ok=True)
+def clear(directory: Path, processes: session.Processes) -> None:
+    """End the remaining processes of a platform and remove its files."""
+    now = session.read_processes(directory)
+    # The gateway may have been replaced since.
+    newer = now.gateway if now.loop == processes.loop else session.NO_PROCESS
+    session.terminate(processes.loop, _LOOP_END_TIMEOUT_S)
+    for pid in (processes.gateway, newer, processes.segment):
+        session.terminate(pid, _END_TIMEOUT_S)
+    session.processes_file(directory).unlink(missing_ok=True)
     controls = (*directory.glob("segment*.sock"), *directory.glob("irc5*.sock"))
     sockets = [path for path in controls if not is_listening(path)]
     recorders = directory.glob("recorder-*.json")
-    # Narrowed limits name their loop by its process id, which may come again.
+    # Narrowed limits name their loop by its process id, which may be used again.
     for path in (control_socket(directory), blackboard_file(directory), limits_file(directory), *sockets, *recorders):
         path.unlink(missing_ok=True)
 
@@ -263,7 +255,7 @@ def _stop_by_gateway(directory: Path) -> Exception | None:
 
 @contextlib.contextmanager
 def defer_signals() -> Iterator[None]:
-    """Deliver `SIGNALS` only after the block, when what it started is known, or has ended."""
+    """Deliver `SIGNALS` only after the block, when its process is registered, or has ended."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

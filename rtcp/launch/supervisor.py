@@ -31,7 +31,7 @@ class GatewaySupervisor:
 
     Args:
         platform: the platform.
-        report: receives in a sentence what happened.
+        report: receives events as sentences.
     """
 
     def __init__(self, platform: Platform, report: Callable[[str], None]) -> None:
@@ -44,11 +44,11 @@ class GatewaySupervisor:
         self._ready: int | None = None
         """Pipe on which the gateway that is being started reports that it is ready."""
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Restart the gateway if it has ended; report a failure once, and try again within the limit."""
         now = time.monotonic()
         try:
-            self._look(now)
+            self._poll(now)
         except (OSError, ValueError) as error:
             # Must not end the launcher: nobody would supervise the loop.
             self.close()
@@ -56,13 +56,13 @@ class GatewaySupervisor:
                 self._starts.append(now)
             if str(error) != self._error:
                 self._error = str(error)
-                self._tell(f"the gateway cannot be restarted: {error}")
+                self._notify(f"the gateway cannot be restarted: {error}")
 
-    def _look(self, now: float) -> None:
+    def _poll(self, now: float) -> None:
         platform = self._platform
         if self._ready is not None and select.select([self._ready], [], [], 0.0)[0]:
             if os.read(self._ready, 4096):
-                self._tell(f"the gateway (process {platform.processes.gateway}) answers again")
+                self._notify(f"the gateway (process {platform.processes.gateway}) answers again")
             self.close()
         if is_running(platform.processes.gateway):
             return
@@ -76,7 +76,7 @@ class GatewaySupervisor:
             self._gave_up = True
             where = log_location(platform.directory / "gateway.log")
             again = f"it is tried again later; {where} has the reason"
-            self._tell(f"{self._fate()}, {STARTS} times within {WINDOW_S:g} s: {again}")
+            self._notify(f"{self._fate()}, {STARTS} times within {WINDOW_S:g} s: {again}")
 
     def close(self) -> None:
         """Close the pipe."""
@@ -86,11 +86,11 @@ class GatewaySupervisor:
 
     def _start(self, now: float) -> None:
         platform = self._platform
-        found = read_processes(platform.directory)
-        if found.loop != platform.processes.loop or stop_marker(platform.directory).exists():
+        processes = read_processes(platform.directory)
+        if processes.loop != platform.processes.loop or stop_marker(platform.directory).exists():
             return
-        if is_running(found.gateway):
-            platform.processes = found  # a command was quicker
+        if is_running(processes.gateway):
+            platform.processes = processes  # a command was quicker
             return
         self._starts.append(now)
         self._gave_up = False
@@ -98,9 +98,9 @@ class GatewaySupervisor:
         self.close()
         self._ready = platform.begin_gateway()
         self._error = ""
-        self._tell(f"{fate}: it is restarted")
+        self._notify(f"{fate}: it is restarted")
 
-    def _tell(self, sentence: str) -> None:
+    def _notify(self, sentence: str) -> None:
         with contextlib.suppress(OSError):  # the terminal may be gone
             self._report(sentence)
 
@@ -114,7 +114,7 @@ class GatewaySupervisor:
 # -- systemd: sd_notify(3), a few words in a datagram -----------------------------------------------------------
 
 PINGS_A_WATCHDOG = 3
-"""Checks of the cycle within systemd's watchdog interval; sd_watchdog_enabled(3) advises at least two."""
+"""Pings within systemd's watchdog interval; sd_watchdog_enabled(3) advises at least two."""
 _SEND_S = 0.5
 
 
@@ -148,16 +148,16 @@ class Notifier:
         """Return the notifier that the environment of this process asks for, or one that does nothing."""
         address = os.environ.get("NOTIFY_SOCKET", "")
         # sd_watchdog_enabled(3): the pings may be expected of another process.
-        mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        is_for_this = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         watchdog_us = os.environ.get("WATCHDOG_USEC", "")
-        return cls(blackboard, address, int(watchdog_us) * 1e-6 if mine and watchdog_us.isdecimal() else 0.0)
+        return cls(blackboard, address, int(watchdog_us) * 1e-6 if is_for_this and watchdog_us.isdecimal() else 0.0)
 
     def ready(self) -> None:
         """Notify that every slave is in OP and commands are accepted."""
         self._send("READY=1")
         self._due_s = time.monotonic() + self._every_s
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Send the state if it has changed, and a ping if one is due and the cycle has published a record since."""
         if self._observer is None:
             return
@@ -184,10 +184,10 @@ class Notifier:
             self._socket = None
 
     def _send_state(self, observer: Observer) -> None:
-        found = observer.latest()
-        if found is None:
+        record = observer.latest()
+        if record is None:
             return
-        words = State(int(found["state"][0])).words
+        words = State(int(record["state"][0])).words
         if words != self._state:
             self._state = words
             self._send(f"STATUS={words}")
@@ -202,8 +202,8 @@ class Notifier:
 def supervise(platform: Platform, report: Callable[[str], None]) -> int:
     """Wait until the platform is stopped or its loop ends, restart its gateway, notify systemd; return the exit code.
 
-    SIGINT, SIGTERM and SIGHUP stop it (0), and so does `rtcp stop` (0). 5: something is not left as it should be, or
-    the loop ended by itself; the rest is then stopped too.
+    0: it was stopped in order, by SIGINT, SIGTERM, SIGHUP or `rtcp stop`. 5: drives, slaves or processes were not
+    stopped in order, or the loop ended by itself, and the rest was stopped then.
     """
     received: list[int] = []
     before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in SIGNALS}
@@ -212,8 +212,8 @@ def supervise(platform: Platform, report: Callable[[str], None]) -> int:
     try:
         notifier.ready()
         while not received and is_running(platform.processes.loop):
-            notifier.look()
-            gateway.look()
+            notifier.poll()
+            gateway.poll()
             time.sleep(_POLL_S)
         notifier.stopping("stopping" if received else "the loop has ended")
         if not received and platform.ended_in_order():

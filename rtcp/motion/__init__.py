@@ -1,1 +1,1 @@
-"""Motion in joint space: controllers, planning, the guards behind every controller, the writers of the drive modes."""
+"""Motion in joint space: controllers, planning, the guards behind every controller, the drive writers."""

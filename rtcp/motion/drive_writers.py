@@ -1,7 +1,7 @@
-"""How setpoints reach a drive in each cyclic synchronous mode (CiA 402: CSP, CSV, CST).
+"""Drive writers: targets of a drive in each cyclic synchronous mode (CiA 402: CSP, CSV, CST).
 
-In CSP the drive closes the position loop; in CSV and CST it is closed here, so that `hold` and `move` mean the same in
-all three.
+In CSP the drive closes the position loop; for CSV and CST it is closed here, so that `hold` and `move` mean the same
+in all three.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from rtcp.config.model import Joint
 from rtcp.ipc.states import DriveMode
 
 _FADE_S: Final = 0.3
-"""Time constant with which the drive's own following error gives way to the position loop closed here."""
+"""Time constant of the transition from the drive's own following error to the position loop closed here."""
 
 
 class Commanded(Protocol):
-    """The part of a drive that a mode reads and writes, in SI."""
+    """The part of a drive that a writer reads and writes, in SI units."""
 
     position: float
     velocity: float
@@ -29,27 +29,27 @@ class Commanded(Protocol):
 
 
 class DriveWriter(Protocol):
-    """One mode for all joints."""
+    """Writer of one drive mode for all joints."""
 
     mode: DriveMode
 
     def start(self, drives: Sequence[Commanded]) -> None:
-        """Begin at standstill: forget what an earlier use left behind."""
+        """Reset, at standstill."""
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write the targets of the drives for the setpoints `position` (rad) and `velocity` (rad/s)."""
 
 
 class CspWriter:
-    """CSP: the setpoint itself."""
+    """CSP: writes the setpoint itself."""
 
     mode = DriveMode.CSP
 
     def start(self, drives: Sequence[Commanded]) -> None:
-        """Nothing is kept."""
+        """No state to reset."""
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
-        """Pass the setpoints on; the drive takes the velocity field as its speed limit, which the driver fills in."""
+        """Write the positions; drives with a velocity field use it as their speed limit, which the driver fills in."""
         for i, drive in enumerate(drives):
             drive.target_position = position[i]
             drive.target_velocity = 0.0
@@ -57,7 +57,7 @@ class CspWriter:
 
 
 class CsvWriter:
-    """CSV: the setpoint's velocity and a proportional pull back to its position."""
+    """CSV: velocity of the setpoint plus a proportional correction to its position."""
 
     mode = DriveMode.CSV
 
@@ -67,7 +67,7 @@ class CsvWriter:
         self._bias = [0.0] * len(self._gain)
 
     def start(self, drives: Sequence[Commanded]) -> None:
-        """Begin without a pull: what a drive is away from its target now is taken back little by little."""
+        """Start without a correction: the present following error is removed gradually."""
         for i, drive in enumerate(drives):
             self._bias[i] = drive.target_position - drive.position
 
@@ -82,7 +82,7 @@ class CsvWriter:
 
 
 class CstWriter:
-    """CST: stiffness, damping and a bounded integral about the setpoint (an impedance that ends where it should)."""
+    """CST: stiffness, damping and a bounded integral about the setpoint (an impedance without a steady-state error)."""
 
     mode = DriveMode.CST
 
@@ -95,16 +95,16 @@ class CstWriter:
         self._passed = False
 
     def start(self, drives: Sequence[Commanded]) -> None:
-        """Begin with the torque that holds the arm now, so that it does not sag on the change."""
+        """Start with the present holding torque, so that the arm does not sag."""
         self._passed = False
         for i, drive in enumerate(drives):
             bound = self._bound[i]
             self._integral[i] = min(max(drive.torque, -bound), bound)
 
     def pass_on(self, position: Sequence[float], torque: Sequence[float], drives: Sequence[Commanded]) -> None:
-        """Write `torque` (Nm) itself, with nothing about a setpoint; `position` (rad) is where the arm is.
+        """Write `torque` (Nm) itself, without a position loop; `position` (rad) is the actual position.
 
-        `update` takes over without a step, wherever its setpoint is.
+        `update` takes over without a step, from any setpoint.
         """
         integral = self._integral
         self._passed = True

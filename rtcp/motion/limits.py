@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
 from typing import Final, TypeAlias
 
 from rtcp.config.model import MOST_AXES, ArmConfig
@@ -52,6 +53,61 @@ def corners(low: tuple[float, ...], high: tuple[float, ...]) -> Corners:
     return a, b, c, d, e, f
 
 
+FIELDS: Final = ("low", "high", "velocity", "acceleration", "jerk", "torque")
+"""Fields of `Values` with a number a joint."""
+_CORNERS: Final = ("min.x", "min.y", "min.z", "max.x", "max.y", "max.z")
+
+
+@dataclass(frozen=True)
+class WrongLimit:
+    """A refused limit: not finite, outside its allowed range, or a lower end that is not below the upper one."""
+
+    axis: int
+    """Number of the joint, from 0; -1: a box."""
+    box: int
+    """Number of a keep-out box; -1: the box that the tool stays in."""
+    name: str
+    """Field of `Values`, or `min.x` to `max.z` of a box."""
+    found: float
+    low: float
+    high: float
+    """Allowed is from low to high; where there is no room: less than high, the other end."""
+    no_room: bool = False
+
+    @property
+    def refusal(self) -> Refusal:
+        """The refusal of the loop."""
+        if self.no_room:
+            return ImpossibleLimit(self.axis, self.high, self.found)
+        below = self.found < self.low
+        bound = self.low if below else self.high
+        if isfinite(self.found) and (self.axis < 0 or below == (self.name == "low")):
+            return LimitWidened(self.axis, self.found, bound)
+        return ImpossibleLimit(self.axis, self.found, bound)
+
+
+def wrong_limits(widest: Values, new: Values) -> Iterator[WrongLimit]:
+    """Yield every number of `new` that cannot come into force for an arm configured as `widest`, of as many parts."""
+    for axis, (lower, upper) in enumerate(zip(new.low, new.high, strict=True)):
+        low, high = widest.low[axis], widest.high[axis]
+        for name in FIELDS:
+            found, most = getattr(new, name)[axis], getattr(widest, name)[axis]
+            ends = (low, high) if name in ("low", "high") else (LEAST_PART * most, most)
+            if not ends[0] <= found <= ends[1]:
+                yield WrongLimit(axis, -1, name, found, *ends)
+        if low <= upper <= lower <= high:
+            yield WrongLimit(axis, -1, "low", lower, low, upper, no_room=True)
+    for box, (now, bounds) in enumerate(zip((new.box, *new.keep_out), (widest.box, *widest.keep_out), strict=True), -1):
+        for at, found in enumerate(now or ()):
+            bound = None if bounds is None else bounds[at]
+            inward = (at < 3) is (box < 0)
+            least, most = -inf if bound is None or not inward else bound, inf if bound is None or inward else bound
+            if not (isfinite(found) and least <= found <= most):
+                yield WrongLimit(-1, box, _CORNERS[at], found, least, most)
+            elif now is not None and at < 3 and not found < now[at + 3]:
+                yield WrongLimit(-1, box, _CORNERS[at], found, -inf, now[at + 3], no_room=True)
+
+
 def rows(values: Values) -> list[list[float]]:
     """Return limits as rows of the plan area, numbers in front, for `read`.
 
@@ -88,10 +144,10 @@ def read(plan: memoryview[float], count: int) -> Values | None:
 
 
 class Limits:
-    """What is in force. Lists keep their identity: whoever holds one sees every change.
+    """The limits in force. The lists are changed in place, so that a reference to one stays valid.
 
     Args:
-        config: the arm; its limits are the widest that there may be.
+        config: the arm; its limits are the widest allowed ones.
     """
 
     def __init__(self, config: ArmConfig) -> None:
@@ -117,29 +173,22 @@ class Limits:
 
         The boxes are compared with those of the configuration only, not with the arm (`TrajectoryGuard.refusal_of`).
         """
-        if len(new.low) != len(self.low):
-            return ImpossibleLimit(-1, float(len(new.low)), float(len(self.low)))
+        widest = self.widest
+        for given, count in ((len(new.low), len(widest.low)), (len(new.keep_out), len(widest.keep_out))):
+            if given != count:
+                return ImpossibleLimit(-1, float(given), float(count))
+        if widest.box is not None and new.box is None:
+            return LimitWidened(-1, 0.0, 0.0)
+        for wrong in wrong_limits(widest, new):
+            return wrong.refusal
         for axis, (q, v) in enumerate(zip(position, velocity, strict=True)):
-            refused = self._joint(new, axis, q, v)
+            refused = self._excluded(new, axis, q, v)
             if refused is not None:
                 return refused
-        return self._boxes(new)
+        return None
 
-    def _joint(self, new: Values, axis: int, q: float, v: float) -> Refusal | None:
+    def _excluded(self, new: Values, axis: int, q: float, v: float) -> Refusal | None:
         low, high = new.low[axis], new.high[axis]
-        if not (isfinite(low) and isfinite(high) and low < high):
-            return ImpossibleLimit(axis, low if not isfinite(low) else high, low)
-        widest = self.widest
-        if low < widest.low[axis]:
-            return LimitWidened(axis, low, widest.low[axis])
-        if high > widest.high[axis]:
-            return LimitWidened(axis, high, widest.high[axis])
-        for name in ("velocity", "acceleration", "jerk", "torque"):
-            found, most = getattr(new, name)[axis], getattr(widest, name)[axis]
-            if not (isfinite(found) and found >= LEAST_PART * most):
-                return ImpossibleLimit(axis, found, LEAST_PART * most)
-            if found > most:
-                return LimitWidened(axis, found, most)
         rest = q + 0.5 * v * abs(v) / new.acceleration[axis]
         if abs(v) > new.velocity[axis] < self.velocity[axis]:
             return ImpossibleLimit(axis, new.velocity[axis], abs(v))
@@ -148,25 +197,4 @@ class Limits:
             return None
         if not low <= min(q, rest) <= max(q, rest) <= high:
             return LimitsExcludeJoint(axis, rest, high if rest > high or q > high else low)
-        return None
-
-    def _boxes(self, new: Values) -> Refusal | None:
-        for box in (*new.keep_out, *(() if new.box is None else (new.box,))):
-            for lower, upper in zip(box[:3], box[3:], strict=True):
-                if not (isfinite(lower) and isfinite(upper) and lower < upper):
-                    return ImpossibleLimit(-1, lower if not isfinite(lower) else upper, lower)
-        widest = self.widest
-        if widest.box is not None:
-            if new.box is None:
-                return LimitWidened(-1, 0.0, 0.0)
-            for at in range(6):
-                beyond = new.box[at] < widest.box[at] if at < 3 else new.box[at] > widest.box[at]
-                if beyond:
-                    return LimitWidened(-1, new.box[at], widest.box[at])
-        if len(new.keep_out) != len(widest.keep_out):
-            return ImpossibleLimit(-1, float(len(new.keep_out)), float(len(widest.keep_out)))
-        for box, least in zip(new.keep_out, widest.keep_out, strict=True):
-            for at in range(6):
-                if box[at] > least[at] if at < 3 else box[at] < least[at]:
-                    return LimitWidened(-1, box[at], least[at])
         return None

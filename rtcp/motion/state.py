@@ -1,4 +1,4 @@
-"""What a controller sees and returns in a cycle: preallocated, plain floats."""
+"""Input and output of a controller in a cycle: preallocated, plain floats."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from enum import IntEnum
 
 
 class Phase(IntEnum):
-    """What a controller is doing."""
+    """Phase of a controller."""
 
     HOLD = 0
-    """At rest; nothing to do."""
+    """At rest."""
     MOVE = 1
     STOP = 2
-    """On the way to rest under the limits."""
+    """Braking to rest under the limits."""
 
 
 class ArmState:
-    """The arm at the beginning of a cycle; lists have one number a joint: rad, rad/s, rad/s^2, Nm.
+    """State of the arm at the start of a cycle; lists have one number per joint: rad, rad/s, rad/s^2, Nm.
 
-    `commanded`, `commanded_velocity`, `commanded_acceleration` are those of the last cycle, after the guards: a
-    controller that continues from them is continuous whatever the guards did. `actual`, `actual_velocity`,
-    `actual_torque` are measured.
+    `commanded`, `commanded_velocity`, `commanded_acceleration` are the values of the last cycle after the guards: a
+    controller that continues from them is continuous despite a cut. `actual`, `actual_velocity`, `actual_torque` are
+    measured.
     """
 
     __slots__ = (
@@ -45,7 +45,7 @@ class ArmState:
 
 
 class Setpoint:
-    """What a controller asks for in the next cycle: rad, rad/s; and in CST a torque, Nm."""
+    """Setpoints of the next cycle: rad, rad/s; in CST also a torque, Nm."""
 
     __slots__ = ("direct", "position", "torque", "velocity")
 
@@ -54,4 +54,4 @@ class Setpoint:
         self.velocity = [0.0] * joints
         self.torque = [0.0] * joints
         self.direct = False
-        """Whether `torque` is the whole torque of the joints, without the position loop of CST."""
+        """True: `torque` is the whole torque of the joints, without the position loop of CST."""

@@ -1,7 +1,7 @@
-"""A motion in step as one arm of the group sees it: its partners, and what it tells them. Plain numbers.
+"""A motion in step from the view of one arm: records of its partners, and its own record. Plain numbers.
 
-The loop fills in the partners once a cycle (`rtcp.control.partners`); the controller that moves in step reads them, and
-writes what the loop publishes of this arm.
+The loop updates the partners once a cycle (`rtcp.control.partners`); the controller of the motion reads them and writes
+this arm's record, which the loop publishes.
 """
 
 from __future__ import annotations
@@ -22,45 +22,45 @@ from rtcp.ipc.states import State
 
 
 class StepPhase(IntEnum):
-    """Where an arm is in a motion in step."""
+    """Phase of an arm in a motion in step."""
 
     NONE = 0
     ARMED = 1
-    """It has accepted the motion and waits for the common instant."""
+    """Accepted; waits for the common instant."""
     MOVING = 2
     BRAKING = 3
-    """Along its path, together with the group."""
+    """Brakes along its path, together with the group."""
     DONE = 4
-    """It has arrived."""
+    """Arrived."""
     ENDED = 5
-    """It has stopped before the end."""
+    """Stopped before the end."""
 
 
 _NEWEST_NS: Final = 60_000_000_000
-"""The number of a motion may be this far ahead of CLOCK_MONOTONIC: those who number by that clock never use one up."""
+"""Upper bound on the lead of a motion's number over CLOCK_MONOTONIC: numbers taken from that clock stay usable."""
 _LONGEST_WAIT_NS: Final = 1_000_000_000
-"""For partners to open a stream in step."""
+"""Upper bound on the wait for partners to open a stream in step."""
 _ARRIVED = (State.MOVING, State.STOPPING, State.HOLDING)
 _UNDER_WAY = (StepPhase.ARMED, StepPhase.MOVING)
 _IN_STEP = (StepPhase.ARMED, StepPhase.MOVING, StepPhase.BRAKING)
 
 
 class Partner:
-    """The newest record of another arm; lists have one number a joint: rad, rad/s."""
+    """The newest record of another arm; lists have one number per joint: rad, rad/s."""
 
     def __init__(self, joints: int) -> None:
         self.time_ns = 0
-        """CLOCK_MONOTONIC of its cycle; 0: there is none."""
+        """CLOCK_MONOTONIC of its cycle; 0: no record."""
         self.state = State.OFF
         self.emergency_stop = False
-        """Whether its emergency stop is pressed."""
+        """True while its emergency stop is pressed."""
         self.motion_allowed = False
-        """Whether its enabling switch is pressed, or it has none."""
+        """True while its enabling switch is pressed, or if it has none."""
         self.motion = 0
         self.phase = StepPhase.NONE
         self.brake_ns = 0
         self.path_s = 0.0
-        """How far it has got, by the path's own time."""
+        """Its path time, s."""
         self.position = [0.0] * joints
         """Commanded."""
         self.velocity = [0.0] * joints
@@ -68,45 +68,45 @@ class Partner:
         self.acceleration = [1.0] * joints
         """Limits in force, rad/s^2; `rtcp.control.partners` begins with the configured ones."""
         self.cell = 0
-        """Digest of the cell that it was started with."""
+        """Digest of the cell it was started with."""
 
 
 class StepGroup:
     """The motion in step that an arm takes part in, and its partners in the order of the cell.
 
     Args:
-        silence_s: how old a partner's newest record may be, and how far it may be behind on its path, s.
-        notice_s: how long before it brakes an arm says so, s: every partner has seen it by then.
-        cell: digest of the cell that this arm was started with.
+        silence_s: upper bound on the age of a partner's newest record and on its lag along the path, s.
+        notice_s: time between the announcement and the start of braking, s; by then every partner has seen it.
+        cell: digest of the cell this arm was started with.
     """
 
     def __init__(self, silence_s: float = 0.0, notice_s: float = 0.0, cell: int = 0) -> None:
         self.members: list[Partner] = []
         self.cell = cell
         self.foreign = -1
-        """The first partner that runs as part of another cell, of another state of its files, or of none; or -1."""
+        """First partner without a cell, of another cell, or with other files of the same cell; -1: none."""
         self._silence_ns = round(silence_s * 1e9)
         self.notice_ns = round(notice_s * 1e9)
         self.motion = 0
-        """Number of the motion, the same for all its arms; 0: none yet."""
+        """Number of the motion, common to all its arms; 0: none yet."""
         self.phase = StepPhase.NONE
         self.brake_ns = 0
-        """CLOCK_MONOTONIC at which the group begins to brake; 0: it does not."""
+        """CLOCK_MONOTONIC at which the group begins to brake; 0: not braking."""
         self.path_s = 0.0
-        """How far this arm has got on its path, by the path's own time, s."""
+        """Path time of this arm, s."""
         self._start_ns = self._armed_ns = 0
         self.mask = 0
-        """The partners that take part, a bit each."""
+        """Bit mask of the partners that take part."""
 
     def refusal(self, motion: int, mask: int, now_ns: int) -> Refusal | None:
         """Return why this arm cannot take part in a motion, or None."""
         if motion <= 0 or not 0 <= mask < 1 << len(self.members):
             return UnknownPartner(mask.bit_length(), len(self.members))
         if motion > now_ns + _NEWEST_NS:
-            # After it no number of a clock could be used any more.
+            # A greater number would make all clock numbers unusable.
             return MotionNumberAhead(motion, now_ns)
         if motion <= self.motion:
-            # A partner may still show that it has arrived in the motion that had this number.
+            # A partner's record may still say DONE of a motion with this number.
             return MotionNumberUsed(motion, self.motion)
         silent = self.silent(mask, now_ns)
         if silent >= 0:
@@ -114,9 +114,9 @@ class StepGroup:
         return PartnerOfAnotherCell(self.foreign) if self.foreign >= 0 else None
 
     def lost(self, now_ns: int, has_setpoint: bool) -> MotionEnded | None:
-        """Return why an arm that follows no path ends a motion in step.
+        """Return why an arm without a path ends a motion in step, or None.
 
-        It moves once all have accepted the motion, and each has its first setpoint.
+        Motion begins once all have accepted it and each has its first setpoint.
         """
         silent, absent = self.silent(self.mask, now_ns), self.not_armed()
         if self.phase is not StepPhase.ARMED:
@@ -142,16 +142,16 @@ class StepGroup:
         return -1
 
     def is_finished(self) -> bool:
-        """Whether a partner has ended the motion in order, as its commander asked."""
+        """Whether a partner ended the motion regularly, by its commander."""
         for index, partner in enumerate(self.members):
             if self.mask >> index & 1 and partner.motion == self.motion and partner.phase is StepPhase.DONE:
                 return True
         return False
 
     def join(self, motion: int, mask: int, start_ns: int) -> None:
-        """Take part in a motion that begins at an instant of CLOCK_MONOTONIC, until which it waits for its partners.
+        """Join a motion that begins at an instant of CLOCK_MONOTONIC, by which all partners must have joined.
 
-        Without an instant (0) it follows no path, and begins when all have accepted it.
+        An instant of 0: the motion has no path and begins when all have joined.
         """
         self.motion, self.mask, self._start_ns = motion, mask, start_ns
         self.phase, self.brake_ns, self.path_s = StepPhase.ARMED, 0, 0.0
@@ -159,53 +159,53 @@ class StepGroup:
 
     @property
     def under_way(self) -> bool:
-        """Whether this arm has accepted a motion that has not ended."""
+        """Whether this arm is in a motion that has not ended."""
         return self.phase in _IN_STEP
 
     def leave(self) -> None:
-        """End it early, where it has not ended."""
+        """End the motion early."""
         if self.phase in _IN_STEP:
             self.phase = StepPhase.ENDED
 
     def silent(self, mask: int, now_ns: int) -> int:
-        """Return the first partner of `mask`, a bit each, that publishes no records any more, or -1."""
+        """Return the first partner of the bit mask `mask` that no longer publishes records, or -1."""
         for index, partner in enumerate(self.members):
             if mask >> index & 1 and now_ns - partner.time_ns > self._silence_ns:
                 return index
         return -1
 
     def not_armed(self) -> int:
-        """Return the first partner in the motion that has not accepted it, or has left it; -1: all have."""
+        """Return the first partner in the motion that has not accepted it or has left it; -1: none."""
         for index, partner in enumerate(self.members):
             if self.mask >> index & 1 and not (partner.motion == self.motion and self._keeps(partner)):
                 return index
         return -1
 
     def refused(self) -> int:
-        """Return the first partner that has left the motion before its beginning, or -1."""
+        """Return the first partner that left the motion before its start, or -1."""
         for index, partner in enumerate(self.members):
             if self.mask >> index & 1 and partner.motion == self.motion and not self._keeps(partner):
                 return index
         return -1
 
     def braking(self) -> int:
-        """Return the first partner that brakes along its path, or will, or -1; `brake_ns` becomes the earliest."""
-        found = -1
+        """Return the first partner that has announced braking, or -1; set `brake_ns` to the earliest announcement."""
+        first = -1
         for index, partner in enumerate(self.members):
             due = partner.brake_ns
             if self.mask >> index & 1 and due and partner.motion == self.motion:
-                found = index if found < 0 else found
+                first = index if first < 0 else first
                 self.brake_ns = due if not self.brake_ns or due < self.brake_ns else self.brake_ns
-        return found
+        return first
 
     def _keeps(self, partner: Partner) -> bool:
-        """Whether it has accepted the motion, has arrived, or is where it should be on its path."""
+        """Whether a partner has accepted the motion, has arrived, or is on schedule."""
         phase = partner.phase
         if phase is StepPhase.DONE:
-            # It holds what both hold, until this one has arrived too.
+            # It keeps holding a common load until this arm has arrived too.
             return self.phase is not StepPhase.ARMED and partner.state in _ARRIVED
         if phase in _UNDER_WAY and self._start_ns:
-            # Also of one that has not begun in time.
+            # Includes a partner that did not start in time.
             behind_ns = partner.time_ns - self._start_ns - 1e9 * partner.path_s
             if behind_ns > self._silence_ns:
                 return False

@@ -10,9 +10,9 @@ from rtcp.config.model import ArmConfig
 
 
 class ToolInUse:
-    """`number`: of the tool, an index into `ArmConfig.models`. `payload`: what it holds, in the tool's frame, or None.
+    """`number`: of the tool, an index into `ArmConfig.models`. `payload`: in the tool's frame, or None.
 
-    One for all controllers; only `rtcp.control.arm.Arm` writes it, at rest: no tool changes during a motion.
+    Shared by all controllers; only `rtcp.control.arm.Arm` writes it, at rest.
     """
 
     __slots__ = ("number", "payload")
@@ -23,11 +23,11 @@ class ToolInUse:
 
 
 class Gravity:
-    """What carries the weight of an arm with the tool and the payload in use.
+    """Gravity compensation of an arm with the tool and the payload in use.
 
     Args:
-        config: the arm; without geometry or masses nothing is carried.
-        tool: read every time.
+        config: of the arm; without geometry or masses the torques are 0.
+        tool: read at each call.
     """
 
     def __init__(self, config: ArmConfig, tool: ToolInUse) -> None:
@@ -41,7 +41,7 @@ class Gravity:
         return bool(self._models)
 
     def torques(self, q: Sequence[float]) -> Sequence[float]:
-        """Return the torques, Nm, that hold the arm still at `q`, rad, one a joint; 0 where masses are unknown."""
+        """Return the torques that hold the arm still at `q`, rad: Nm, one per joint; 0 if masses are unknown."""
         if not self._models:
             return self._none
         tool = self._tool

@@ -1,6 +1,6 @@
-"""Who may reach the panel: sessions, roles, passwords, and what is refused before it gets to a page.
+"""Access to the panel: sessions, roles, passwords, and requests that are refused before they reach a page.
 
-Without a password file whoever reaches the panel is an operator, and it listens at loopback only. A request is refused
+Without a password file every visitor is an operator, and it listens at loopback only. A request is refused
 where its Host is no name of this machine (DNS rebinding), where its Origin is another site's, where its cookie names no
 session, and where one visitor sends too many.
 """
@@ -40,11 +40,11 @@ _SCRYPT = {"n": 1 << 14, "r": 8, "p": 1}
 _SESSION_S = 12 * 3600.0
 _MOST_SESSIONS = 256
 _BURST, _RATE = 400.0, 100.0
-"""Requests of one visitor: at once, and each second."""
+"""Requests of one visitor: burst, and per second."""
 _MOST_BYTES = 64 << 10
-"""Of a request's body."""
+"""Largest request body, bytes."""
 _TRIES, _TRIES_S = 5, 60.0
-"""Wrong passwords of one address in a minute; of all that have never given a right one, ten times as many."""
+"""Wrong passwords of one address in a minute; of all untrusted addresses together, ten times as many."""
 _LONGEST_NAME = 32
 _HEADERS = [
     (b"x-content-type-options", b"nosniff"),
@@ -76,14 +76,14 @@ def set_password(path: Path, role: Role, password: str) -> None:
     if len(password) < SHORTEST_PASSWORD:
         message = f"password: found {len(password)} characters, allowed are {SHORTEST_PASSWORD} and more"
         raise RtcpError("invalid", message)
-    kept = read_passwords(path) if path.exists() else {}
+    hashes = read_passwords(path) if path.exists() else {}
     salt = secrets.token_bytes(16)
-    kept[role] = {"salt": salt.hex(), "scrypt": _hash(password, salt).hex()}
+    hashes[role] = {"salt": salt.hex(), "scrypt": _hash(password, salt).hex()}
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     fresh = path.with_suffix(".new")
     fresh.unlink(missing_ok=True)
     with open(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "w") as file:
-        json.dump(kept, file)
+        json.dump(hashes, file)
     fresh.replace(path)
 
 
@@ -97,25 +97,25 @@ def read_passwords(path: Path) -> dict[str, dict[str, str]]:
     if stat.S_IMODE(path.stat().st_mode) & 0o077:
         raise RtcpError("invalid", f"{path}: others may read it, allowed is mode 0600: `chmod 600 {path}`")
     try:
-        found = json.loads(path.read_text())
-        for role, one in found.items():
-            if role not in ROLES or len(bytes.fromhex(one["salt"])) < 8 or len(bytes.fromhex(one["scrypt"])) != 32:
+        hashes = json.loads(path.read_text())
+        for role, entry in hashes.items():
+            if role not in ROLES or len(bytes.fromhex(entry["salt"])) < 8 or len(bytes.fromhex(entry["scrypt"])) != 32:
                 raise ValueError(role)
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         message = f"{path}: it is damaged ({error}): remove it, then `rtcp panel password`"
         raise RtcpError("invalid", message) from error
-    return dict(found)
+    return dict(hashes)
 
 
 def role_of(passwords: dict[str, dict[str, str]], password: str) -> Role | None:
-    """Return the role of a password; every hash is computed, so that the time tells nothing."""
-    found: Role | None = None
+    """Return the role of a password; every hash is computed, so that the time reveals nothing."""
+    match: Role | None = None
     for role in ROLES:
         if role in passwords:
-            kept = passwords[role]
-            if hmac.compare_digest(_hash(password, bytes.fromhex(kept["salt"])), bytes.fromhex(kept["scrypt"])):
-                found = found or role
-    return found
+            entry = passwords[role]
+            if hmac.compare_digest(_hash(password, bytes.fromhex(entry["salt"])), bytes.fromhex(entry["scrypt"])):
+                match = match or role
+    return match
 
 
 def _hash(password: str, salt: bytes) -> bytes:
@@ -127,7 +127,7 @@ def _hash(password: str, salt: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class Visitor:
-    """Whoever has a session."""
+    """The holder of a session."""
 
     name: str
     role: Role
@@ -140,7 +140,7 @@ class Visitor:
 
 @dataclass
 class Bucket:
-    """What one visitor may still send: so much at once, and so much each second."""
+    """Token bucket: the requests that one visitor may still send."""
 
     most: float = _BURST
     rate: float = _RATE
@@ -151,7 +151,7 @@ class Bucket:
         self.left = self.most
 
     def allows(self) -> bool:
-        """Count one; return whether it was still allowed."""
+        """Count one request; return whether it is allowed."""
         now = time.monotonic()
         self.left = min(self.most, self.left + (now - self.at) * self.rate) - 1.0
         self.at = now
@@ -165,7 +165,7 @@ class Sessions:
     """The sessions by their secret, which only a cookie carries.
 
     Args:
-        passwords: the file of `read_passwords`; None: nobody is asked.
+        passwords: the file of `read_passwords`; None: no password is needed.
     """
 
     def __init__(self, passwords: Path | None) -> None:
@@ -173,7 +173,7 @@ class Sessions:
         self._sessions: dict[str, Visitor] = {}
         self._failures: list[tuple[float, str]] = []
         self._trusted = {"127.0.0.1", "::1"}
-        """Addresses that a right password came from, and this machine: wrong ones of others lock nobody out there."""
+        """This machine, and addresses that have logged in: failures elsewhere do not lock them out."""
         self._numbers = 0
         self._local = self.begin("local", "operator", "this machine") if passwords is None else ""
 
@@ -184,27 +184,27 @@ class Sessions:
 
     @property
     def local(self) -> str:
-        """Secret of the session that everybody has where nobody is asked; it lasts as long as the panel."""
+        """Secret of the shared session where no password is needed; it lasts as long as the panel."""
         return self._local
 
     def find(self, secret: str) -> Visitor | None:
-        """Return whose session it is; None: nobody's, or it has expired."""
-        found = self._sessions.get(secret)
-        if found is not None and self.asks and time.monotonic() - found.since > _SESSION_S:
+        """Return the visitor of a session; None: there is none, or it has expired."""
+        visitor = self._sessions.get(secret)
+        if visitor is not None and self.asks and time.monotonic() - visitor.since > _SESSION_S:
             del self._sessions[secret]
             return None
-        return found
+        return visitor
 
     def begin(self, name: str, role: Role, address: str) -> str:
         """Begin a session; return its secret."""
         self._numbers += 1
-        shown = "".join(letter for letter in name.strip() if letter.isprintable())[:_LONGEST_NAME]
+        label = "".join(letter for letter in name.strip() if letter.isprintable())[:_LONGEST_NAME]
         while len(self._sessions) >= _MOST_SESSIONS:
             # Of the same role first: viewers cannot throw an operator out.
-            same = (key for key, one in self._sessions.items() if one.role == role)
+            same = (key for key, visitor in self._sessions.items() if visitor.role == role)
             del self._sessions[next(same, next(iter(self._sessions)))]
         secret = secrets.token_urlsafe(32)
-        self._sessions[secret] = Visitor(shown or f"visitor {self._numbers}", role, address, time.monotonic())
+        self._sessions[secret] = Visitor(label or f"visitor {self._numbers}", role, address, time.monotonic())
         return secret
 
     def end(self, secret: str) -> None:
@@ -214,8 +214,8 @@ class Sessions:
     def too_many_tries(self, address: str) -> bool:
         """Return whether an address has to wait before its next try."""
         since = time.monotonic() - _TRIES_S
-        self._failures = [one for one in self._failures if one[0] > since]
-        if sum(one == address for _, one in self._failures) >= _TRIES:
+        self._failures = [failure for failure in self._failures if failure[0] > since]
+        if sum(source == address for _, source in self._failures) >= _TRIES:
             return True
         return address not in self._trusted and len(self._failures) >= 10 * _TRIES
 
@@ -292,7 +292,7 @@ class Access:
         return self._buckets.setdefault(key, Bucket()).allows()
 
     def _foreign(self, scope: Scope, headers: dict[bytes, str]) -> str:
-        """Return why a request does not come from a page of this panel; empty: it does, or has no need to."""
+        """Return the reason why a request is foreign to this panel; empty: it is not, or it is harmless."""
         host = headers.get(b"host", "").lower()
         name = urlsplit(f"//{host}").hostname or ""
         try:
@@ -319,7 +319,7 @@ class Access:
         visitor: Visitor | None,
         secret: str,
     ) -> Response | None:
-        """Return the answer of what needs no page; None: a page answers, for a visitor."""
+        """Return the response to a request that needs no page; None: a page answers it."""
         path, method = scope["path"], scope["method"]
         if method not in ("GET", "HEAD", "POST"):
             return PlainTextResponse("method not allowed", 405)
@@ -334,7 +334,7 @@ class Access:
         if visitor is not None:
             return None
         if path == "/metrics" and method == "GET" and not self._sessions.asks:
-            # Prometheus keeps no cookies; whoever asks here could open the page as well.
+            # Prometheus keeps no cookies; its client could open the page as well.
             scope["visitor"] = self._sessions.find(self._sessions.local)
             return None
         if self._sessions.asks:
@@ -342,7 +342,7 @@ class Access:
             return RedirectResponse("/login", 303) if wants_page else None
         if method != "GET" or "text/html" not in headers.get(b"accept", ""):
             return None
-        # Not to a path that begins with two slashes, which is another host's.
+        # Never to a path with two leading slashes, which names another host.
         return self._welcome(RedirectResponse("/" + path.strip("/"), 303), self._sessions.local)
 
     async def _log_in(self, receive: Receive, address: str) -> Response:
@@ -356,9 +356,9 @@ class Access:
                 return PlainTextResponse("too long", 413)
             if not message.get("more_body"):
                 break
-        given = parse_qs(body.decode(errors="replace"))
+        form = parse_qs(body.decode(errors="replace"))
         try:
-            secret = await self._sessions.log_in(given.get("name", [""])[0], given.get("password", [""])[0], address)
+            secret = await self._sessions.log_in(form.get("name", [""])[0], form.get("password", [""])[0], address)
         except (RtcpError, OSError) as error:
             return _login_page(f"The password file cannot be used: {error}", 500)
         if secret is None:
@@ -376,7 +376,7 @@ class Access:
             await receive()
             await send({"type": "websocket.close", "code": 1008, "reason": why})
         else:
-            # Whoever sends too much has to connect again; what else came over that connection is not even read.
+            # A visitor that sends too much has to connect again; its pending input is not read.
             headers = {"connection": "close"} if status == 429 else None
             await PlainTextResponse(why, status, headers)(scope, receive, _with_headers(send))
 
@@ -390,8 +390,8 @@ def is_loopback(host: str) -> bool:
 
 
 def _cookie(header: str) -> str:
-    found = re.search(rf"(?:^|;\s*){COOKIE}=([\w-]{{43}})(?:;|$)", header)
-    return found[1] if found else ""
+    match = re.search(rf"(?:^|;\s*){COOKIE}=([\w-]{{43}})(?:;|$)", header)
+    return match[1] if match else ""
 
 
 def _with_headers(send: Send) -> Send:
@@ -404,8 +404,8 @@ def _with_headers(send: Send) -> Send:
 
 
 def _login_page(problem: str, status: int = 200) -> HTMLResponse:
-    shown = f'<p role="alert">{html.escape(problem)}</p>' if problem else ""
-    return HTMLResponse(_LOGIN.replace("PROBLEM", shown), status)
+    alert = f'<p role="alert">{html.escape(problem)}</p>' if problem else ""
+    return HTMLResponse(_LOGIN.replace("PROBLEM", alert), status)
 
 
 _LOGIN = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>rtcp panel: log in</title>
@@ -423,7 +423,7 @@ input, button { font: inherit; width: 100%; padding: .6rem; box-sizing: border-b
 
 
 def passwords_for(host: str, file: Path) -> Path | None:
-    """Return the password file that a panel at this address uses; None: nobody is asked.
+    """Return the password file that a panel at this address uses; None: no password is needed.
 
     Raises:
         Invalid: other machines reach the address and there is no password, or the file cannot be used.

@@ -1,4 +1,4 @@
-"""The arm in space, as an element of a page: what its URDF draws, and the boxes of the limits in force."""
+"""The arm in space, as an element of a page: the links of its URDF, and the boxes of the limits in force."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class ArmView(Element, component="static/arm_view.js", esm={"nicegui-scene": str
         assert model is not None
         self._props["links"] = links(to_urdf(model))
         self._props["partners"] = [] if own is None else [
-            {"name": one.name, **_between(own.base, one.base), "links": links(to_urdf(one.config.arm))}
-            for one in partners
-            if one.config.arm is not None
+            {"name": partner.name, **_between(own.base, partner.base), "links": links(to_urdf(partner.config.arm))}
+            for partner in partners
+            if partner.config.arm is not None
         ]  # fmt: skip
 
     def preview(self, path: list[list[float]], duration_s: float) -> None:
@@ -45,9 +45,9 @@ class ArmView(Element, component="static/arm_view.js", esm={"nicegui-scene": str
         self.run_method("preview", path, duration_s)
 
 
-def _between(own: Base, other: Base) -> Json:
-    """Return where the other base stands, seen from the own one; R = Rx Ry Rz."""
-    pose = _pose(own).inverse() @ _pose(other)
+def _between(own: Base, partner: Base) -> Json:
+    """Return the pose of a partner's base in the frame of the own one; R = Rx Ry Rz."""
+    pose = _pose(own).inverse() @ _pose(partner)
     return {"position": pose.position, "rpy": pose.rpy}
 
 
@@ -60,24 +60,24 @@ def links(urdf: str) -> list[Json]:
     robot = ET.fromstring(urdf)
     joints = {_attribute(joint.find("child"), "link"): joint for joint in robot.iter("joint")}
     numbers = {
-        name: at for at, name in enumerate(one for one, joint in joints.items() if joint.get("type") == "revolute")
+        name: at for at, name in enumerate(key for key, joint in joints.items() if joint.get("type") == "revolute")
     }
-    found = []
+    tree = []
     for link in robot.iter("link"):
         name = link.get("name", "")
         joint = joints.get(name)
         axis = None if joint is None else joint.find("axis")
-        found.append(
+        tree.append(
             {
                 "name": name,
                 "parent": "" if joint is None else _attribute(joint.find("parent"), "link"),
                 **_origin(joint),
                 "joint": numbers.get(name, -1),
                 "axis": [1.0, 0.0, 0.0] if axis is None else _numbers(axis.get("xyz", "1 0 0")),
-                "visuals": [_visual(one) for one in link.iter("visual")],
+                "visuals": [_visual(visual) for visual in link.iter("visual")],
             }
         )
-    return found
+    return tree
 
 
 def _visual(visual: ET.Element) -> Json:
@@ -107,4 +107,4 @@ def _attribute(element: ET.Element | None, name: str) -> str:
 
 
 def _numbers(text: str) -> list[float]:
-    return [float(one) for one in text.split()]
+    return [float(number) for number in text.split()]

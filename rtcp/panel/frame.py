@@ -1,4 +1,4 @@
-"""The frame around the tabs: the arm in space, its state and what to do next, its commands, who operates it, STOP.
+"""The frame around the tabs: the arm in space, its state and next step, its commands, its operator, STOP.
 
 It is built once for a page of a browser; the tabs are exchanged inside it.
 """
@@ -14,7 +14,7 @@ from nicegui import ui
 
 from rtcp.api import AsyncRobot, Feed, RtcpError
 from rtcp.panel.arm_view import ArmView
-from rtcp.panel.page import ENABLED, View, button, no_geometry, remember_click, shown, text
+from rtcp.panel.page import ENABLED, View, button, live_value, no_geometry, remember_click, text
 from rtcp.panel.pages.start import start_virtual
 
 _UNITS = {"Angles": ("rad", {"rad": "rad", "deg": "degrees"}), "Lengths": ("m", {"m": "m", "mm": "mm"})}
@@ -42,10 +42,10 @@ class Frame:
     def __init__(self, view: View, tabs: Mapping[str, Tab], asks: bool) -> None:
         self._view, self._live, self._tabs = view, view.live, tabs
         self._feed: Feed | None = None
-        """Of the platform for which the tab was built."""
+        """Feed of the platform for which the tab was built."""
         self._path = "/"
         self._drawn: object = None
-        """What the picture shows."""
+        """What the arm view shows."""
         self._header()
         with ui.element("div").props("id=frame"):
             with ui.element("section").props('id=side aria-label="The arm and its commands"'):
@@ -68,10 +68,10 @@ class Frame:
     def _header(self) -> None:
         with ui.element("header").props("id=head") as head:
             head.props["data-page"] = self._view.page.key
-            shown("state", tag="span").props("role=status aria-live=polite")
+            live_value("state", tag="span").props("role=status aria-live=polite")
             with ui.element("div").props("id=says role=status"):
-                shown("message", tag="span")
-                shown("next", tag="b")
+                live_value("message", tag="span")
+                live_value("next", tag="b")
             with ui.element("div").props("id=who"):
                 text("span", "", id="operator")
                 text("a", "", id="alarmed", href="/alarms", hidden="")
@@ -84,7 +84,7 @@ class Frame:
     # -- tabs ---------------------------------------------------------------------------------------------------------
 
     def _builder(self, path: str) -> Callable[[], Any]:
-        async def made() -> None:
+        async def build() -> None:
             view = self._view
             view.page.scope = None
             view.leave()
@@ -96,24 +96,24 @@ class Frame:
             ui.run_javascript(f"rtcp.tab('{path}')")
             with ui.element("section").classes("page"):
                 try:
-                    if inspect.isawaitable(found := tab.build(view)):
-                        await found
+                    if inspect.isawaitable(pending := tab.build(view)):
+                        await pending
                 except RtcpError as error:
                     text("p", error.message, "bad")
 
-        return made
+        return build
 
     def _known_feed(self) -> Feed | None:
-        """Return that of the platform once its status is known too: a tab needs both."""
+        """Return the feed once the status is known too: a tab needs both."""
         return None if self._live.status is None else self._live.feed
 
     def _follow(self) -> None:
-        """Draw the arm and build the tab anew for a platform that has begun to run."""
+        """Draw the arm and rebuild the tab for a platform that has begun to run."""
         self._draw()
         feed = self._known_feed()
         if feed is not None and feed is not self._feed:
             self._feed = feed
-            if self._path != "/":  # Start tells about the start itself
+            if self._path != "/":  # the tab Start reports the start itself
                 self._place.refresh()
 
     def _draw(self) -> None:
@@ -179,11 +179,11 @@ def _override(view: View) -> None:
         heading.move(target_index=0)
         slider.props.update({"type": "range", "min": "1", "max": "100", "step": "1", "data-override": ""})
         slider.on("change", changed, js_handler="(event) => emit([rtcp.token, +event.target.value])")
-        shown("speed_override", tag="output").props["data-suffix"] = " %"
+        live_value("speed_override", tag="output").props["data-suffix"] = " %"
 
 
 def _first_steps(view: View) -> None:
-    """Lead somebody for whom no platform runs; `panel.js` shows it, and which steps are done."""
+    """Guide a person while no platform runs; `panel.js` shows the steps, and which are done."""
     with ui.element("section").props('id=lead hidden aria-label="First steps"'):
         with ui.element("ol"):
             with ui.element("li").props("data-step=start"):

@@ -1,12 +1,12 @@
-"""What goes to and fro all the time: the state to every page at 20 Hz, and what the operator's hand does.
+"""WebSocket traffic: state out to every page at 20 Hz, the operator's input in.
 
 Each message to a page carries a token: the instant at which it left. The page answers with the token of the newest
-message that it has dealt with. What the operator does counts from that instant, on this machine's clock: however long
-the network, the browser or a queue has kept an answer, it is known how old it may be. That bounds three things:
+message that it has processed. An input counts from that instant, on this machine's clock, so that its age is bounded
+however long the network, the browser or a queue has delayed it. That bounds three things:
 
-- a jog command holds until `JOG_S` after its token, and the next one of the same press comes before that or never;
-- a motion goes on while answers come from a visible page with a token not older than `PRESENCE_S`;
-- whoever closes the page has gone at once.
+- a jog command is valid until `JOG_S` after its token; a press ends where its next command comes later;
+- a motion continues while a visible page answers with a token not older than `PRESENCE_S`;
+- the operator of a page that closes is gone at once.
 """
 
 from __future__ import annotations
@@ -40,34 +40,34 @@ T = TypeVar("T")
 Json = dict[str, Any]
 
 STATE_S = 0.05
-"""Between two messages to a page."""
+"""Interval of messages to a page, s."""
 JOG_S = 0.25
 """Time from the operator's last input to the end of a jog, s."""
 LEAST_HOLD_S = 0.08
-"""A jog command that would hold for less is refused: the way to the browser and back takes too long."""
+"""Shortest validity of a jog command, s: below it the round trip to the browser takes too long."""
 PRESENCE_S = 1.0
 """Time from the last answer of the operator's page to the end of a motion, s."""
 TAKE_OVER_S = 10.0
-"""An operator who does not answer loses the arm to the one who asks."""
+"""Time after which an operator who does not answer a take-over loses the arm, s."""
 _RETRY_S = 0.5
 _LOG_S = 10.0
-"""Between two reports of a defect."""
+"""Interval between reports of a defect, s."""
 _MESSAGES = 200.0
-"""Messages of a page, at once and each second."""
+"""Messages accepted from a page: burst, and per second."""
 _MOST_UNSEEN = 32
-"""Pages that no browser has shown yet."""
-_SCOPE_TURNS = 2
-"""The scopes are read in every second turn."""
-_LIMIT_TURNS = 10
-"""The limits in every tenth."""
-_PARTNER_TURNS = 20
-"""Partners that have begun to run are looked for in every twentieth."""
-_EVENT_TURNS = 10
-"""New events are asked for in every tenth."""
+"""Limit of pages that no browser has shown yet."""
+_SCOPE_UPDATES = 2
+"""The scopes are read in every second update."""
+_LIMIT_UPDATES = 10
+"""The limits are read in every tenth."""
+_PARTNER_UPDATES = 20
+"""Partners that have started are looked up in every twentieth."""
+_EVENT_UPDATES = 10
+"""New events are read in every tenth."""
 _MOST_EVENTS = 1000
 _MOST_ALARMS = 200
 _MOST_HALTS = 16
-"""STOPs of the pages' sockets that wait for an answer; `/stop` takes them too."""
+"""Limit of STOPs from the sockets of pages that wait for an answer; `/stop` takes them too."""
 _STOP = "panel: stop"
 NEXT = {
     "off": "Start a platform on the tab Start",
@@ -85,19 +85,19 @@ NEXT = {
     "resetting": "Wait until the fault is cleared",
     "closing": "Wait until the platform has ended",
 }
-"""What a person does next, by the state of the machine."""
+"""The next step of a person, by the state of the machine."""
 _ASIDE = re.compile(
     r"[;,:][^;,:`()]*`rtcp [^`]*`[^;,.]*"  # what to type
     r"| \((?:[\w.\[\]]+ in \S+|\w+\.[\w.]+)\)"  # the key that sets a limit
 )
-"""What the header leaves out of a message: the whole one is on the tab Alarms."""
+"""Parts that the header leaves out of a message; the tab Alarms shows the whole one."""
 _JOINTS = ("actual_position", "actual_velocity", "actual_torque", "commanded_position")
 log = logging.getLogger("rtcp.panel")
 
 
 @dataclass(frozen=True)
 class Click:
-    """A click: the token that its page had then, and when it came."""
+    """A click: the token that its page had then, and the instant of its arrival."""
 
     token_ns: int
     came_ns: int
@@ -105,7 +105,7 @@ class Click:
 
 _NO_CLICK = Click(0, 0)
 CLICK: ContextVar[Click] = ContextVar("click", default=_NO_CLICK)
-"""What the code that runs was called for."""
+"""The click that the running code handles."""
 
 
 class HeldByAnother(Exception):
@@ -122,32 +122,32 @@ class EndedOnPurpose(Exception):
 
 @dataclass(eq=False)
 class Page:
-    """One open page: a tab of somebody's browser."""
+    """One open page: a tab of a browser."""
 
     key: str
     visitor: Visitor
     number: int = 0
     """Counted from the panel's start: tells two tabs of one person apart."""
     secret: str = ""
-    """Of its session."""
+    """Secret of its session."""
     socket: WebSocket | None = None
     sent_ns: int = 0
     """Token of the last message to it."""
     seen_ns: int = 0
     """Newest token that it has answered with while it was visible."""
     notes: list[str] = field(default_factory=list)
-    """For its next message."""
+    """Notes for its next message."""
     press: int = 0
     """Number of the press that jogs."""
     ended: int = 0
-    """Newest press that has ended: what still comes of it moves nothing."""
+    """Newest press that has ended: its further commands move nothing."""
     jogged_ns: int = 0
-    """When the jog of that press ends."""
+    """Instant at which the jog of that press ends."""
     sending: asyncio.Task[None] | None = None
     scope: Scope | None = None
     """The picture that it shows."""
     block: Json | None = None
-    """Of the scope, for its next message."""
+    """Block of the scope, for its next message."""
     notify: Callable[[str], None] = lambda message: None
     asked: Callable[[str, asyncio.Future[bool]], None] = lambda who, answer: answer.set_result(True)
     """Asks the person whether another may take over."""
@@ -156,12 +156,12 @@ class Page:
         return f"{self.visitor} (page {self.number})"
 
     def check_may_command(self) -> None:
-        """Raise Refused where its visitor may only look."""
+        """Raise Refused where its visitor is a viewer."""
         if self.visitor.role != "operator":
             raise RtcpError("refused", f"{self.visitor.name} may look, and not command: log in as an operator")
 
     def age_s(self, now_ns: int) -> float:
-        """Return for how long nothing is known of whoever looks at it, s."""
+        """Return the time since the page last answered while it was visible, s."""
         return (now_ns - self.seen_ns) * 1e-9 if self.socket is not None else math.inf
 
 
@@ -171,24 +171,24 @@ def operator_name(page: str) -> str:
 
 
 class Operator:
-    """The one page that may move the arm, with a connection of its own: closing that stops what it moves."""
+    """The one page that may move the arm, with a connection of its own: closing it stops its motions."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
         self._robot: AsyncRobot | None = None
         self._connecting = asyncio.Lock()
         self._motions: set[asyncio.Task[Any]] = set()
-        self._wanted: tuple[Sequence[float], str, int] | None = None
+        self._pending: tuple[Sequence[float], str, int] | None = None
         self._jogging: asyncio.Task[None] | None = None
         self._has_ended = False
 
     async def robot(self) -> AsyncRobot:
-        """Return the connection, made anew where it was lost."""
+        """Return the connection; connect again where it was lost."""
         async with self._connecting:
             if not self._has_ended and (self._robot is None or not self._robot.is_open):
-                made = AsyncRobot(operator_name(str(self.page)))
-                await made.__aenter__()
-                self._robot = made
+                connection = AsyncRobot(operator_name(str(self.page)))
+                await connection.__aenter__()
+                self._robot = connection
             robot = self._robot
             if self._has_ended or robot is None:
                 if robot is not None:
@@ -198,7 +198,7 @@ class Operator:
 
     @property
     def moves(self) -> bool:
-        """Whether something of this page's may move the arm."""
+        """Whether a command of this page may move the arm."""
         return bool(self._motions)
 
     async def run(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
@@ -239,13 +239,13 @@ class Operator:
 
     def jog(self, velocity: Sequence[float], frame: str, token_ns: int) -> None:
         """Move with a velocity until `JOG_S` after `token_ns`; only the newest command waits for its turn."""
-        self._wanted = (velocity, frame, token_ns)
+        self._pending = (velocity, frame, token_ns)
         if self._jogging is None or self._jogging.done():
             self._jogging = asyncio.create_task(self._jog())
 
     async def _jog(self) -> None:
-        while self._wanted is not None:
-            (velocity, frame, token_ns), self._wanted = self._wanted, None
+        while self._pending is not None:
+            (velocity, frame, token_ns), self._pending = self._pending, None
             try:
                 robot = await self.robot()
                 await robot.jog(velocity, frame, JOG_S, token_ns * 1e-9)
@@ -254,11 +254,11 @@ class Operator:
                 self.page.ended = self.page.press
 
     async def end(self) -> None:
-        """Close the connection for good: what it moves comes to a controlled stop, what waits is not sent."""
+        """Close the connection for good: its motions come to a controlled stop, waiting commands are not sent."""
         self._has_ended = True
-        self._wanted = None
-        for one in self._motions:
-            one.cancel()
+        self._pending = None
+        for motion in self._motions:
+            motion.cancel()
         robot, self._robot = self._robot, None
         if robot is not None:
             await robot.close()
@@ -274,28 +274,28 @@ class Live:
     def __init__(self, is_session: Callable[[str], bool]) -> None:
         self._is_session = is_session
         self.status: Status | None = None
-        """Newest; None: no platform runs."""
+        """Newest status; None: no platform runs."""
         self.problem = "no platform has been looked for yet"
         """Why there is no status."""
         self.config: ArmConfig | None = None
         self.limits: Json | None = None
-        """In force, as `Robot.limits` has them."""
+        """Limits in force, as `Robot.limits` has them."""
         self.feed: Feed | None = None
         self.events: list[EventRecord] = []
         """Of the platform that runs, or ran last; oldest first."""
         self.alarms: list[EventRecord] = []
-        """What has happened that a person has to know of, oldest first."""
+        """Events that a person has to know of, oldest first."""
         self.starting = 0
         """Commands under way that start a platform."""
         self._acknowledged: dict[tuple[int, str], str] = {}
-        """Who has seen an alarm, by its number and time: numbers begin anew with each platform."""
+        """The person who has acknowledged an alarm, by its number and time: numbers restart with each platform."""
         self.trends = Trends()
         self.partners = Partners()
         self.pages: dict[str, Page] = {}
         self.operator: Operator | None = None
         self._viewing: AsyncRobot | None = None
         self._retry_at = 0.0
-        self._turn = 0
+        self._updates = 0
         self._scoped = False
         self._last_event = 0
         self._halting: set[asyncio.Task[str]] = set()
@@ -310,7 +310,7 @@ class Live:
         """Return a page that is being made.
 
         Raises:
-            Refused: too many have been asked for and not been shown.
+            Refused: too many were requested and not shown.
         """
         if sum(page.sent_ns == 0 for page in self.pages.values()) >= _MOST_UNSEEN:
             raise RtcpError("refused", f"{_MOST_UNSEEN} pages wait for a browser already")
@@ -347,33 +347,33 @@ class Live:
                 page.socket = None
                 await self.leave(page)
 
-    def _receive(self, page: Page, given: Json) -> None:
-        token_ns = given["seen"]
+    def _receive(self, page: Page, message: Json) -> None:
+        token_ns = message["seen"]
         if type(token_ns) is not int or not 0 <= token_ns <= page.sent_ns:
             raise ValueError("a token that was never sent")
-        if given.get("visible") is True:
+        if message.get("visible") is True:
             page.seen_ns = max(page.seen_ns, token_ns)
-        if given.get("stop"):
+        if message.get("stop"):
             if len(self._halting) < _MOST_HALTS:
                 halting = asyncio.create_task(self.halt())
                 self._halting.add(halting)
                 halting.add_done_callback(self._halting.discard)
-        elif "jog" in given:
-            self._jog(page, given, token_ns)
+        elif "jog" in message:
+            self._jog(page, message, token_ns)
 
-    def _jog(self, page: Page, given: Json, token_ns: int) -> None:
+    def _jog(self, page: Page, message: Json, token_ns: int) -> None:
         if page.visitor.role != "operator":
             return
-        press, velocity, frame = given["press"], given["jog"], given["frame"]
+        press, velocity, frame = message["press"], message["jog"], message["frame"]
         if type(press) is not int or frame not in ("base", "tool", "joints") or len(velocity) > 16:
             raise ValueError("jog")
-        velocity = [float(one) for one in velocity]
+        velocity = [float(value) for value in velocity]
         if press <= page.ended:
             return
         now_ns = time.monotonic_ns()
         age_s = (now_ns - token_ns) * 1e-9
         if press == page.press and now_ns > page.jogged_ns:
-            # It has stopped already: going on would be a start that nobody expects.
+            # The jog has stopped already: continuing it would be an unexpected start.
             self._end_press(page, press, "the jog has ended, nothing was heard for a while: release, then press again")
         elif token_ns <= self._halted_ns:
             self._end_press(page, press, "no jog: STOP was pressed after this: release, then press again")
@@ -397,11 +397,11 @@ class Live:
     # -- who operates -------------------------------------------------------------------------------------------------
 
     def claim(self, page: Page) -> Operator:
-        """Make a page the operator's, where nobody else is.
+        """Make a page the operator's, where no other page is.
 
         Raises:
             HeldByAnother: another page has the arm.
-            Refused: the visitor may only look.
+            Refused: the visitor is a viewer.
         """
         page.check_may_command()
         if page.age_s(time.monotonic_ns()) > PRESENCE_S:
@@ -413,17 +413,17 @@ class Live:
         return self.operator
 
     async def take_over(self, page: Page) -> bool:
-        """Ask the operator for the arm; return whether `page` has it now. What moves is stopped first."""
-        held = self.operator
-        if held is None or held.page is page:
+        """Ask the operator for the arm; return whether `page` has it now. The operator's motion is stopped first."""
+        current = self.operator
+        if current is None or current.page is page:
             self.claim(page)
             return True
         if self._asking:
-            raise RtcpError("refused", "somebody else asks for the arm already")
+            raise RtcpError("refused", "another page is asking for the arm: try again when the operator has answered")
         self._asking = True
         try:
             answer: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
-            held.page.asked(str(page), answer)
+            current.page.asked(str(page), answer)
             done, _ = await asyncio.wait([answer], timeout=TAKE_OVER_S)
             if done and not answer.result():
                 return False
@@ -431,8 +431,8 @@ class Live:
         finally:
             self._asking = False
         if page.age_s(time.monotonic_ns()) > PRESENCE_S:
-            return False  # who asked has gone
-        # In one step: in between nobody else can claim it.
+            return False  # the page that asked is gone
+        # No await in between: nobody else can claim it.
         before, self.operator = self.operator, Operator(page)
         if before is not None:
             before.page.notify(f"{page} has taken over the arm")
@@ -440,7 +440,7 @@ class Live:
         return True
 
     async def leave(self, page: Page) -> None:
-        """Take the arm from a page; what it moves stops."""
+        """Take the arm from a page and stop its motion."""
         if self.operator is not None and self.operator.page is page:
             operator, self.operator = self.operator, None
             await operator.end()
@@ -455,7 +455,7 @@ class Live:
             raise RtcpError("refused", "STOP was pressed after this click: click again")
 
     async def command(self, page: Page, command: Callable[[AsyncRobot], Awaitable[T]], instead: bool = False) -> T:
-        """Carry out a command as `Operator.run`; raises HeldByAnother too. `instead`: what it moves stops first."""
+        """Carry out a command as `Operator.run`; raises HeldByAnother too. `instead`: stop the page's motion first."""
         return await (await self._operator(page, instead)).run(command)
 
     async def command_cell(self, page: Page, command: Callable[[AsyncCell], Awaitable[T]], instead: bool = False) -> T:
@@ -466,7 +466,7 @@ class Live:
         return await operator.run_in_cell(self.partners.cell, command)
 
     async def _operator(self, page: Page, instead: bool) -> Operator:
-        """Return the operator that a page which was clicked has become."""
+        """Make a page that was clicked the operator's; return the operator."""
         self.check_click(page)
         operator = self.claim(page)
         if instead and operator.moves:
@@ -475,7 +475,7 @@ class Live:
         return operator
 
     async def halt(self) -> str:
-        """Stop every motion and what waits, of all arms of the cell, whoever asks; return what was not stopped and why.
+        """Stop all motions and waiting commands of all arms of the cell, for any visitor; return what failed and why.
 
         The arms are reached at once and each by itself.
         """
@@ -486,9 +486,9 @@ class Live:
         try:
             if self.partners.cell is not None:
                 failed = await AsyncCell(self.partners.cell, _STOP).halt()
-                # Beside one that moves others may have no torque, and so nothing to stop.
-                told = {name: error for name, error in failed.items() if getattr(error, "reason", "") != "wrong_state"}
-                return "; ".join(f"{name}: {error}" for name, error in told.items())
+                # Arms without torque have nothing to stop.
+                errors = {name: e for name, e in failed.items() if getattr(e, "reason", "") != "wrong_state"}
+                return "; ".join(f"{name}: {error}" for name, error in errors.items())
             async with AsyncRobot(_STOP) as robot:
                 await robot.halt()
         except RtcpError as error:
@@ -518,9 +518,9 @@ class Live:
         return self.status is not None and self.status.state is State.MOVING and self.status.speed_override > 0.0
 
     async def pause(self, page: Page) -> None:
-        """Pause the motion under way, by whoever it is; raises RtcpError.
+        """Pause the motion under way, whoever began it; raises RtcpError.
 
-        By the connection of the operator, who may resume it then, or, where that is another page, by nobody's.
+        Over the connection of the operator, who may then resume it; for another page over a connection of nobody's.
         """
         page.check_may_command()
         try:
@@ -541,7 +541,7 @@ class Live:
         await (await self.claim(page).robot()).resume()
 
     async def view(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
-        """Ask something that commands nothing.
+        """Send a query, which commands nothing.
 
         Raises:
             NotRunning: no platform runs.
@@ -556,13 +556,13 @@ class Live:
         """Follow the platform for as long as the panel runs."""
         due, log_at = time.monotonic(), 0.0
         while True:
-            self._turn += 1
+            self._updates += 1
             try:
                 await self._read_status()
                 self._send_all()
                 await self._end_sessions()
             except Exception:
-                # The pages are served on; what every turn meets is logged now and then.
+                # Pages are served further; a lasting defect is logged every `_LOG_S`.
                 if time.monotonic() >= log_at:
                     log_at = time.monotonic() + _LOG_S
                     log.exception("a turn of the panel")
@@ -588,15 +588,15 @@ class Live:
                     return
                 self._retry_at = time.monotonic() + _RETRY_S
                 self.partners.find_cell()
-                made = AsyncRobot("panel: view")
-                await made.__aenter__()
-                self._viewing = made
+                connection = AsyncRobot("panel: view")
+                await connection.__aenter__()
+                self._viewing = connection
                 self.feed = Feed()
                 self.config = self.feed.config
             self.status = await asyncio.wait_for(self._viewing.status(), 2.0)
-            if self.limits is None or self._turn % _LIMIT_TURNS == 0:
+            if self.limits is None or self._updates % _LIMIT_UPDATES == 0:
                 self.limits = (await asyncio.wait_for(self._viewing.limits(), 2.0))["limits"]
-            if self._turn % _EVENT_TURNS == 0:
+            if self._updates % _EVENT_UPDATES == 0:
                 await self._read_events(self._viewing)
             raw = self.status.raw
             self.trends.read(raw, self.limits["torque"], self._temperatures(raw))
@@ -605,35 +605,35 @@ class Live:
             await self._lost()
 
     async def _read_events(self, robot: AsyncRobot) -> None:
-        found = await asyncio.wait_for(robot.events(self._last_event), 2.0)
-        if found and not self._last_event:
+        events = await asyncio.wait_for(robot.events(self._last_event), 2.0)
+        if events and not self._last_event:
             self.events, self.alarms = [], []  # of the platform before
-        self._last_event = found[-1].number if found else self._last_event
-        self.events = [*self.events, *found][-_MOST_EVENTS:]
-        if found:
-            self._keep_alarms([one for one in found if one.severity != "note"])
+        self._last_event = events[-1].number if events else self._last_event
+        self.events = [*self.events, *events][-_MOST_EVENTS:]
+        if events:
+            self._keep_alarms([event for event in events if event.severity != "note"])
 
-    def _keep_alarms(self, found: Sequence[EventRecord]) -> None:
-        """Add alarms; those that somebody has acknowledged are dropped first."""
-        alarms = [*self.alarms, *found]
-        dropped = sorted(alarms, key=lambda one: not self.acknowledged_by(one))[: max(0, len(alarms) - _MOST_ALARMS)]
-        self.alarms = [one for one in alarms if one not in dropped]
-        kept = {(one.number, one.time) for one in self.alarms}
+    def _keep_alarms(self, events: Sequence[EventRecord]) -> None:
+        """Add alarms; acknowledged ones are dropped first."""
+        alarms = [*self.alarms, *events]
+        dropped = sorted(alarms, key=lambda e: not self.acknowledged_by(e))[: max(0, len(alarms) - _MOST_ALARMS)]
+        self.alarms = [alarm for alarm in alarms if alarm not in dropped]
+        kept = {(alarm.number, alarm.time) for alarm in self.alarms}
         self._acknowledged = {key: by for key, by in self._acknowledged.items() if key in kept}
 
     def _temperatures(self, raw: Mapping[str, Any]) -> list[float | None]:
-        """Return those of the drives, C, one a joint; None: its drive maps none."""
-        found = {slave["name"]: slave["temperature"] for slave in raw["slaves"]}
-        return [] if self.config is None else [found.get(joint.slave) for joint in self.config.joints]
+        """Return the temperatures of the drives, C, one a joint; None: its drive maps none."""
+        temperatures = {slave["name"]: slave["temperature"] for slave in raw["slaves"]}
+        return [] if self.config is None else [temperatures.get(joint.slave) for joint in self.config.joints]
 
     def acknowledged_by(self, alarm: EventRecord) -> str:
-        """Return who has acknowledged an alarm; empty: nobody."""
+        """Return the person who has acknowledged an alarm; empty: nobody."""
         return self._acknowledged.get((alarm.number, alarm.time), "")
 
     def acknowledge(self, alarms: Sequence[EventRecord], by: str) -> None:
-        """Note for all pages that somebody has seen alarms."""
-        for one in alarms:
-            self._acknowledged.setdefault((one.number, one.time), by)
+        """Mark alarms as acknowledged, for all pages."""
+        for alarm in alarms:
+            self._acknowledged.setdefault((alarm.number, alarm.time), by)
 
     async def _lost(self) -> None:
         self.status = self.limits = None
@@ -663,18 +663,18 @@ class Live:
     def _send_all(self) -> None:
         if not any(page.socket for page in self.pages.values()):
             return
-        if self._turn % _PARTNER_TURNS == 0:
+        if self._updates % _PARTNER_UPDATES == 0:
             self.partners.find()
         state = self.state()
-        if self._turn % _SCOPE_TURNS == 0:
+        if self._updates % _SCOPE_UPDATES == 0:
             self._read_scopes()
         for page in list(self.pages.values()):
-            # One that does not take its messages gets the newest when it does.
+            # A page that is slow to receive gets the newest message when it is ready.
             if page.socket is not None and (page.sending is None or page.sending.done()):
                 page.sending = asyncio.create_task(self._send(page, page.socket, state))
 
     def _read_scopes(self) -> None:
-        """Give the cycles since the last time to every scope that somebody looks at."""
+        """Pass the cycles since the last call to every scope that a page shows."""
         watching = [page for page in self.pages.values() if page.scope is not None and page.socket is not None]
         if self.feed is None:
             return
@@ -700,8 +700,8 @@ class Live:
             await socket.send_json({"token": page.sent_ns, **state, "operator": who, "mine": mine, "notes": notes})
 
     def state(self) -> Json:
-        """Return what every page shows, SI units."""
-        everywhere: Json = {"alarms": sum(not self.acknowledged_by(one) for one in self.alarms)}
+        """Return the values that every page shows, SI units."""
+        everywhere: Json = {"alarms": sum(not self.acknowledged_by(alarm) for alarm in self.alarms)}
         if self.partners.cell is not None:
             everywhere |= {
                 "partners": self.partners.state(),
@@ -713,7 +713,7 @@ class Live:
             return {"state": state, "message": sentence(message), "next": NEXT[state], **everywhere}
         raw = self.status.raw
         joints = raw["joints"]
-        shown: Json = {
+        values: Json = {
             "state": raw["state"],
             "message": sentence(raw["message"]),
             "next": NEXT[raw["state"]],
@@ -724,7 +724,7 @@ class Live:
             "holder": raw["lease"]["holder"],
             "age_s": round(raw["lost_s"] + max(0, time.monotonic_ns() - raw["time_ns"]) * 1e-9, 1),
             "bus": raw["bus"],
-            "joints": {name: [_number(one, 5) for one in joints[name]] for name in _JOINTS},
+            "joints": {name: [_number(value, 5) for value in joints[name]] for name in _JOINTS},
             "goal": raw["goal"],
             "statuswords": raw["statuswords"],
             "wkc": raw["wkc"],
@@ -734,16 +734,16 @@ class Live:
             **everywhere,
         }
         if raw["processes"]:
-            shown["processes"] = {name: self._process(name, raw) for name in raw["processes"]}
-        shown["temperature"] = self._temperatures(raw)
+            values["processes"] = {name: self._process(name, raw) for name in raw["processes"]}
+        values["temperature"] = self._temperatures(raw)
         q = joints["actual_position"]
         model = None if self.config is None else self.config.model_of(raw["tool_name"])
         if model is not None and all(map(math.isfinite, q)):
             pose = forward(model, q)
             distances = singularity_distances(model, q)
-            shown["tool"] = [round(one, 5) for one in (*pose.position, *pose.rpy)]
-            shown["singular"] = [None if one is None else round(one, 4) for one in distances]
-        return shown
+            values["tool"] = [round(value, 5) for value in (*pose.position, *pose.rpy)]
+            values["singular"] = [None if distance is None else round(distance, 4) for distance in distances]
+        return values
 
     def _process(self, name: str, raw: Mapping[str, Any]) -> Json:
         """Return state, fields and lamps of a process."""
@@ -755,19 +755,19 @@ class Live:
                     slave, _, channel = str(getattr(process, key)).partition(".")
                     lamps[key] = "on" if devices[slave][channel]["value"] else "off"
         fields = {
-            field: None if one["value"] is None else _number(one["value"], 5)
-            for field, one in devices.get(name, {}).items()
-            if not isinstance(one["value"], list)
+            field: None if entry["value"] is None else _number(entry["value"], 5)
+            for field, entry in devices.get(name, {}).items()
+            if not isinstance(entry["value"], list)
         }
         return {"state": raw["processes"][name]["state"] or "", "fields": fields, "lamps": lamps}
 
 
 def sentence(message: str) -> str:
-    """Return a message as a sentence for somebody who has no terminal and no files at hand."""
+    """Return a message as a sentence for a person without terminal and files."""
     short = _ASIDE.sub("", message).replace("`", "").rstrip(".")
     return short and f"{short[0].upper()}{short[1:]}."
 
 
 def _number(value: float, digits: int) -> float | None:
-    """Return a number as JSON has it, which knows none that is not finite."""
+    """Return a number for JSON, which has none that is not finite."""
     return round(value, digits) + 0.0 if math.isfinite(value) else None  # fields show no -0

@@ -1,4 +1,4 @@
-"""What Prometheus reads at `/metrics`: state, cycle times, counters of the platform and of the panel itself."""
+"""Metrics for Prometheus at `/metrics`: state, cycle times, counters of the platform and of the panel itself."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rtcp.panel.live import Live
 
 
 class PlatformCollector(Collector):
-    """The newest state, as it is when it is asked for.
+    """The newest state at each request.
 
     Args:
         live: follows the platform.
@@ -23,7 +23,7 @@ class PlatformCollector(Collector):
         self._live = live
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the metrics; without a platform only that there is none."""
+        """Yield the metrics; without a platform only the one that says so."""
         status = self._live.status
         yield GaugeMetricFamily("rtcp_up", "Whether a platform runs.", value=float(status is not None))
         pages = sum(page.socket is not None for page in self._live.pages.values())
@@ -32,8 +32,8 @@ class PlatformCollector(Collector):
             return
         raw = status.raw
         states = GaugeMetricFamily("rtcp_state", "1 for the state of the machine.", labels=["state"])
-        for one in State:
-            states.add_metric([one.name.lower()], float(one is status.state))
+        for state in State:
+            states.add_metric([state.name.lower()], float(state is status.state))
         yield states
         yield CounterMetricFamily("rtcp_cycles", "Cycles since the start.", value=raw["cycles"])
         yield CounterMetricFamily("rtcp_skipped_cycles", "Cycles skipped since the start.", value=raw["missed"])
@@ -95,9 +95,9 @@ class PlatformCollector(Collector):
             "rtcp_device_value", "What a slave that is no drive publishes.", labels=["device", "field", "unit"]
         )
         for device, fields in raw["devices"].items():
-            for name, shown in fields.items():
-                if isinstance(shown["value"], (int, float)):
-                    devices.add_metric([device, name, shown["unit"]], shown["value"])
+            for name, field in fields.items():
+                if isinstance(field["value"], (int, float)):
+                    devices.add_metric([device, name, field["unit"]], field["value"])
         yield devices
 
 

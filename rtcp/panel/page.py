@@ -1,4 +1,4 @@
-"""What every page is built of: native HTML controls with labels, and commands whose refusals are shown."""
+"""Parts of every page: native HTML controls with labels, and commands whose refusals are shown."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ Handler = Callable[[], Awaitable[object] | object]
 _BESIDE = "seamless position=bottom"
 """A dialog that covers nothing: STOP stays in reach."""
 _PAUSE_S = 0.05
-"""Between two looks at what a pause has to hold."""
+"""Interval between checks that a pause holds, s."""
 _ABOVE: Final = "top-right"
 """Position of notifications: away from the pads and buttons of a tab."""
 _COMMANDS = asyncio.Semaphore(2)
-"""Of `rtcp` at once."""
+"""Limits the commands `rtcp` that run at once."""
 _LONGEST_LINE = 1 << 22
 Heading = str | tuple[str, str]
-"""Of a column: its name, or name and unit."""
+"""Heading of a column: its name, or name and unit."""
 POSE = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 ENABLED = "holding moving stopping"
 """States with torque, as `data-when` of a control has them."""
 
 
 class Field:
-    """A control with a label; `value` is what it says, SI: the browser shows and reads it in the units chosen there."""
+    """A control with a label; `value` in SI units: the browser shows and reads it in the units chosen there."""
 
     def __init__(self, tag: str, label: str, value: str, unit: str = "", **attributes: str) -> None:
         self._name = label
@@ -52,7 +52,7 @@ class Field:
         self.control.props.update(attributes)
         if unit:
             self.control.props["data-in"] = unit
-        # An attribute: a property would be written again, over what was typed, when something near is drawn anew.
+        # An attribute: a property would overwrite typed text when a neighbour is drawn anew.
         self.control.props["^value"] = value
         self.control.on("input", self._changed, js_handler="(event) => emit(rtcp.typed(event.target))")
         self._value = value
@@ -60,8 +60,8 @@ class Field:
 
     def _changed(self, event: Any) -> None:
         self._value = str(event.args)  # the browser shows it already
-        for one in self._on_change:
-            one()
+        for handler in self._on_change:
+            handler()
 
     def on_change(self, handler: Callable[[], object]) -> None:
         """Call `handler` when the person has changed it."""
@@ -69,20 +69,20 @@ class Field:
 
     @property
     def value(self) -> str:
-        """What it shows."""
+        """Text of the control."""
         return self._value
 
     @value.setter
     def value(self, value: str) -> None:
         self._value = value
-        # Not by its properties: those are only written where they change, and what was typed is none of them.
+        # Not by its properties: only changes of these are sent, and typed text does not change them.
         self.control.client.run_javascript(f"rtcp.fill('{self.control.html_id}', {json.dumps(value)})")
 
     def number(self) -> float:
         """Return its number.
 
         Raises:
-            Invalid: it is none.
+            Invalid: the text is no number.
         """
         try:
             return float(self._value)
@@ -97,28 +97,28 @@ def field(label: str, value: str = "", **attributes: str) -> Field:
 
 def number(label: str, value: str = "", unit: str = "", **attributes: str) -> Field:
     """Return a field for a number; `step` any."""
-    given = {"type": "number", "step": "any", "inputmode": "decimal", **attributes}
-    return Field("input", label, value, unit, **given)
+    options = {"type": "number", "step": "any", "inputmode": "decimal", **attributes}
+    return Field("input", label, value, unit, **options)
 
 
 def choice(label: str, options: Iterable[str] | Mapping[str, str], value: str) -> Field:
-    """Return a field with options: values, or values and what is shown."""
-    made = Field("select", label, value)
-    named = options if isinstance(options, Mapping) else {one: one for one in options}
-    with made.control:
+    """Return a field with options: values, or values and their labels."""
+    select = Field("select", label, value)
+    named = options if isinstance(options, Mapping) else {option: option for option in options}
+    with select.control:
         for key, name in named.items():
             option = text("option", name)
             option.props["value"] = key
             if key == value:
                 option.props["^selected"] = ""
-    return made
+    return select
 
 
 def text(tag: str, content: str, classes: str = "", **attributes: str) -> TextElement:
     """Return an element with text, which is never read as HTML."""
-    made = TextElement(tag=tag, text=content)
-    made.props.update(attributes)
-    return made.classes(classes) if classes else made
+    element = TextElement(tag=tag, text=content)
+    element.props.update(attributes)
+    return element.classes(classes) if classes else element
 
 
 def with_unit(label: str, unit: str, between: str = " ") -> None:
@@ -128,48 +128,48 @@ def with_unit(label: str, unit: str, between: str = " ") -> None:
         text("span", unit, **{"data-unit": unit})
 
 
-def shown(name: str, digits: int | None = None, tag: str = "td", unit: str = "") -> Element:
+def live_value(name: str, digits: int | None = None, tag: str = "td", unit: str = "") -> Element:
     """Return a place for a value of the live state (`Live.state`): `message`, `actual_position.2`."""
-    made = ui.element(tag)
-    made.props["data-live"] = name
+    element = ui.element(tag)
+    element.props["data-live"] = name
     if digits is not None:
-        made.props["data-digits"] = str(digits)
+        element.props["data-digits"] = str(digits)
     if unit:
-        made.props["data-in"] = unit
-    return made
+        element.props["data-in"] = unit
+    return element
 
 
 def quantity(value: float, unit: str, digits: int | None = None) -> Element:
-    """Return a value that stands, in the unit that the browser shows."""
-    made = text("span", f"{value:g}", **{"data-si": repr(value), "data-in": unit})
+    """Return a constant value, in the unit that the browser shows."""
+    element = text("span", f"{value:g}", **{"data-si": repr(value), "data-in": unit})
     if digits is not None:
-        made.props["data-digits"] = str(digits)
-    return made
+        element.props["data-digits"] = str(digits)
+    return element
 
 
 def button(label: str, handler: Handler | None = None, *, when: str = "", plain: bool = False) -> TextElement:
     """Return a button; `when`: the states of the machine in which it can be used."""
-    made = text("button", label, "act plain" if plain else "act", type="button")
+    control = text("button", label, "act plain" if plain else "act", type="button")
     if when:
-        made.props["data-when"] = when
+        control.props["data-when"] = when
     if handler is not None:
-        on_click(made, handler)
-    return made
+        on_click(control, handler)
+    return control
 
 
 def on_click(element: Element, handler: Handler) -> None:
-    """Call `handler` for a click; what it commands is judged by when the person has clicked."""
+    """Call `handler` for a click; its commands are judged by the instant of the click."""
 
     async def clicked(event: Any) -> None:
         remember_click(event.args)
-        if inspect.iscoroutine(found := handler()):  # not a dialog that has closed, whose await opens it again
-            await found
+        if inspect.iscoroutine(outcome := handler()):  # not a dialog that has closed, whose await opens it again
+            await outcome
 
     element.on("click", clicked, js_handler="() => emit(rtcp.token)")
 
 
 def remember_click(token_ns: object) -> None:
-    """Judge what the running code commands by the token that its page had at the click."""
+    """Judge the commands of the running code by the token that its page had at the click."""
     CLICK.set(Click(token_ns if type(token_ns) is int else 0, time.monotonic_ns()))
 
 
@@ -191,7 +191,7 @@ def table(headings: Sequence[Heading], caption: str, kind: str = "") -> Element:
 
 def row(body: Element, first: str, *cells: str | tuple[float, str, int]) -> Element:
     """Add a row of text, or of values with unit and digits, and return it; its first cell is its heading."""
-    with body, ui.element("tr") as made:
+    with body, ui.element("tr") as line:
         text("th", first, scope="row")
         for cell in cells:
             if isinstance(cell, str):
@@ -199,7 +199,7 @@ def row(body: Element, first: str, *cells: str | tuple[float, str, int]) -> Elem
             else:
                 with ui.element("td"):
                     quantity(*cell)
-    return made
+    return line
 
 
 def tool_pose() -> None:
@@ -207,16 +207,16 @@ def tool_pose() -> None:
     with table(("", *POSE), "Pose of the tool", "numbers pose"), ui.element("tr"):
         text("th", "pose", scope="row")
         for at, (_, unit) in enumerate(POSE):
-            shown(f"tool.{at}", 4, unit=unit)
+            live_value(f"tool.{at}", 4, unit=unit)
 
 
 def no_platform() -> None:
-    """Say on a page that needs a platform that none runs."""
+    """Show on a page that needs a platform that none runs."""
     text("p", "No platform runs: start one on the tab Start.")
 
 
 def no_geometry() -> None:
-    """Say where an arm would be drawn that its geometry is unknown."""
+    """Show in the place of the arm that its geometry is unknown."""
     text("p", "The arm has no geometry (the key kinematics is missing): joints alone move, no pose is known.")
 
 
@@ -228,9 +228,9 @@ class ProgramSession:
         self.at = 0
         """Step that is next, from 0."""
         self.running = False
-        self.said = ""
+        self.notice = ""
         self.changed: Callable[[], None] = lambda: None
-        """Shows it anew, where its tab is shown."""
+        """Redraws the tab, where it is open."""
         self._go = threading.Event()
         self._ended = False
 
@@ -274,21 +274,21 @@ class View:
         self.leaving: list[Callable[[], None]] = []
         """Called by `leave`."""
         self.kept: dict[str, Any] = {}
-        """What a tab keeps while another one is shown, by its name."""
+        """State of each tab while another one is open, by name."""
         self._visit = 0
         """Number of the page of the panel that is shown."""
         self._client = client
         page.notify, page.asked = self.warn, self._ask
 
     def leave(self) -> None:
-        """Another page is shown, or this one closes."""
+        """Called when another page is shown, or this one closes."""
         self._visit += 1
         while self.leaving:
             self.leaving.pop()()
 
     @contextlib.contextmanager
     def _visited(self) -> Iterator[None]:
-        """End the handler that awaits inside where its page is left meanwhile: it would draw on removed elements."""
+        """End a handler whose page is left while it awaits inside: it would draw on removed elements."""
         visit = self._visit
         try:
             yield
@@ -297,19 +297,19 @@ class View:
                 raise asyncio.CancelledError
 
     def say(self, message: str) -> None:
-        """Show that something went well."""
+        """Show a success."""
         with self._client:
             ui.notify(message, type="positive", position=_ABOVE, timeout=3000)
 
     def warn(self, message: str) -> None:
-        """Show that something did not."""
+        """Show a problem."""
         with self._client:
             ui.notify(message, type="negative", position=_ABOVE, timeout=10_000, close_button="Close", multi_line=True)
 
     async def act(
         self, command: Callable[[AsyncRobot], Awaitable[T]], done: str = "", *, instead: bool = False
     ) -> T | None:
-        """Carry out a command; show what becomes of it. `instead`: what this page moves is stopped first."""
+        """Carry out a command; show its outcome. `instead`: stop the motion of this page first."""
         return await self._act(self.live.command(self.page, command, instead), done)
 
     async def act_in_cell(
@@ -323,14 +323,14 @@ class View:
             return await self._show_outcome(command, done)
 
     async def act_beyond_visit(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T | None:
-        """Carry out a command as `act`; its handler goes on when its tab is left, and draws nothing of its own."""
+        """Carry out a command as `act`; its handler continues when its tab is left, and draws nothing of its own."""
         return await self._show_outcome(self.live.command(self.page, command, False), "")
 
     async def _show_outcome(self, command: Awaitable[T], done: str) -> T | None:
         try:
-            found = await command
-        except HeldByAnother as held:
-            self._offer_to_take_over(held.holder)
+            answer = await command
+        except HeldByAnother as holding:
+            self._offer_to_take_over(holding.holder)
         except EndedOnPurpose:
             pass  # the header says that the arm has stopped
         except (RtcpError, OSError) as error:
@@ -338,7 +338,7 @@ class View:
         else:
             if done:
                 self.say(done)
-            return found
+            return answer
         return None
 
     async def set_speed_override(self, fraction: float) -> None:
@@ -350,7 +350,7 @@ class View:
         session = self.kept.get("program")
         if isinstance(session, ProgramSession) and session.running:
             session.pause()
-            # What is planned just now begins to move later.
+            # A motion that is being planned begins to move later.
             while session.paused:
                 if self.live.moves_unpaused:
                     await self._pause_motion()
@@ -380,12 +380,12 @@ class View:
         return True
 
     async def query(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
-        """Ask the platform something that commands nothing; raises RtcpError."""
+        """Send a query, which commands nothing; raises RtcpError."""
         with self._visited():
             return await self.live.view(query)
 
     async def ask(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T | None:
-        """Return what `query` does; None where its error is shown instead."""
+        """Return the answer of `query`; None: its error is shown."""
         try:
             return await self.query(query)
         except RtcpError as error:
@@ -400,7 +400,7 @@ class View:
             self.say("The arm holds" if self.live.partners.cell is None else "All arms hold")
 
     def may_command(self) -> bool:
-        """Return whether this person is an operator; else say that they are not."""
+        """Return whether this person is an operator; else show that they are not."""
         try:
             self.page.check_may_command()
         except RtcpError as error:
@@ -409,12 +409,12 @@ class View:
         return True
 
     def claim(self) -> bool:
-        """Make this page the operator's; return False where it says why not."""
+        """Make this page the operator's; return False after showing why it cannot be."""
         try:
             self.live.check_click(self.page)
             self.live.claim(self.page)
-        except HeldByAnother as held:
-            self._offer_to_take_over(held.holder)
+        except HeldByAnother as holding:
+            self._offer_to_take_over(holding.holder)
             return False
         except RtcpError as error:
             self.warn(error.message)

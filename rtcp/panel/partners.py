@@ -20,7 +20,7 @@ Json = dict[str, Any]
 _STEP = ("no", "waits to begin", "moves", "brakes", "no", "no")
 """Phases of a motion in step, by the number in the record: `rtcp.motion.step_group.StepPhase`."""
 _SILENT_NS = 1_000_000_000
-"""A record as old as this says nothing of now."""
+"""Age from which on an arm counts as silent, ns."""
 _ROD_S = 3600.0
 """Longest time for which a rod is drawn, s."""
 
@@ -43,7 +43,7 @@ class Partners:
     @property
     def members(self) -> tuple[Member, ...]:
         """The others, in the order of the cell."""
-        return () if self.cell is None else tuple(one for one in self.cell.arms if one is not self.own)
+        return () if self.cell is None else tuple(arm for arm in self.cell.arms if arm is not self.own)
 
     def find_cell(self) -> None:
         """Look up the cell: it is known while an arm of it runs."""
@@ -53,7 +53,7 @@ class Partners:
         self.cell, self.own = cell, own
 
     def find(self) -> None:
-        """Read also those that run now, and no more those that have ended."""
+        """Begin to read the arms that have started; drop those that have ended."""
         for member in self.members:
             if (feed := self._feeds.get(member.name)) is not None and feed.ended(0.0):
                 self._feeds.pop(member.name).close()
@@ -64,13 +64,13 @@ class Partners:
         self.rod = self._read_rod()
 
     def _read_rod(self) -> list[list[list[float]]]:
-        """Return the curves of the rod that the arms are to bend, seen from the own base, m; often none."""
+        """Return the curves of the rod that the arms are to bend, in the frame of the own base, m; often none."""
         if self.own is None:
             return []
         base = self.own.base
         back = Pose.from_xyzrpy(*base.position, *base.rpy).inverse()
 
-        def seen(point: Sequence[float]) -> list[float]:
+        def in_own_frame(point: Sequence[float]) -> list[float]:
             x, y, z = point
             return [round(a + b, 4) for a, b in zip(applied(back.rotation, (x, y, z)), back.position, strict=True)]
 
@@ -80,34 +80,34 @@ class Partners:
             os.kill(rod["pid"], 0)
             if time.time() - file.stat().st_mtime > _ROD_S:
                 return []
-            return [[seen(point) for point in curve] for curve in rod["curves"]]
+            return [[in_own_frame(point) for point in curve] for curve in rod["curves"]]
         except (OSError, OverflowError, ValueError, TypeError, KeyError):
             # Also where its writer has died (`os.kill`).
             return []
 
     def close(self) -> None:
-        """Let go of all."""
+        """Release the shared memory of all."""
         while self._feeds:
             self._feeds.popitem()[1].close()
 
     def state(self) -> Json:
-        """Return by name what the pages show of each: state, q (rad; only where it runs), step, holder, message."""
-        return {one.name: arm_state(self._feeds.get(one.name)) for one in self.members}
+        """Return the state of each by name: state, q (rad; only where it runs), step, holder, message."""
+        return {member.name: arm_state(self._feeds.get(member.name)) for member in self.members}
 
 
 def arm_state(feed: Feed | None) -> Json:
-    """Return what is shown of an arm of a cell; `feed` None: it does not run."""
+    """Return the state of an arm of a cell for the pages; `feed` None: it does not run."""
     record = None if feed is None or feed.ended(0.0) else feed.latest()
     if feed is None or record is None:
         return {"state": "off", "message": "its platform does not run"}
-    found: Json = {
+    state: Json = {
         "state": State(int(record["state"][0])).name.lower(),
         "step": _STEP[int(record["step_phase"][0])],
         "holder": feed.holder,
         "message": feed.last_event(),
     }
     if time.monotonic_ns() - int(record["time_ns"][0]) > _SILENT_NS:
-        found["state"] = "silent"
+        state["state"] = "silent"
     if all(map(math.isfinite, q := record["actual_position"][0].tolist())):
-        found["q"] = [round(one, 5) for one in q]
-    return found
+        state["q"] = [round(angle, 5) for angle in q]
+    return state

@@ -13,28 +13,28 @@ from rtcp.api.feed import Records
 from rtcp.config.model import ArmConfig
 
 _HIDDEN = frozenset({"number", "cycle", "time_ns", "dc_time_ns", "flags", "held", "statusword", "wkc_expected"})
-"""Fields that no curve shows anything of."""
+"""Fields that are of no use as curves."""
 EVENTS = {"state": "the machine's state changes", "fault": "a fault begins", "inputs": "an input changes"}
 SHORTEST_S, LONGEST_S = 0.02, 60.0
 MOST_SIGNALS = 8
 COLUMNS = 600
-"""Of a picture; each has the least and the largest value of its cycles."""
+"""Columns of a picture; each has the least and the largest value of its cycles."""
 _BEFORE = 0.2
 """Share of the picture before its trigger."""
 
 
 def signals_of(config: ArmConfig, schema: RecordSchema) -> dict[str, str]:
-    """Return the signals, `name` or `name.number`, with what a person reads: every field, and the following error."""
+    """Return the signals, `name` or `name.number`, with their labels: every field, and the following error."""
     joints = [joint.name for joint in config.joints]
-    vectors = {one.name: one.count for one in schema.fields if one.shape and one.name not in _HIDDEN}
+    vectors = {field.name: field.count for field in schema.fields if field.shape and field.name not in _HIDDEN}
     vectors["following_error"] = len(joints)
     named = {
         f"{name}.{at}": f"{_words(name)} {joints[at] if count == len(joints) else at}"
         for name, count in vectors.items()
         for at in range(count)
     }
-    single = [one.name for one in schema.fields if not one.shape and one.name not in _HIDDEN]
-    return named | {name: _words(name) for one in single for name in [one[:-3] + "_us" if one.endswith("_ns") else one]}
+    single = [field.name for field in schema.fields if not field.shape and field.name not in _HIDDEN]
+    return named | {name: _words(name) for key in single for name in [key[:-3] + "_us" if key.endswith("_ns") else key]}
 
 
 def _words(name: str) -> str:
@@ -45,23 +45,23 @@ class Scope:
     """One picture.
 
     Args:
-        allowed: the signals that there are, of `signals_of`.
-        signals: of `signals_of`, at most `MOST_SIGNALS`.
-        span_s: of the picture, s.
-        trigger: a signal, or of `EVENTS`; empty: none, the picture rolls.
-        level: of a signal that triggers as it rises through it.
-        period_ns: of a cycle.
+        allowed: all signals of the platform, the keys of `signals_of`.
+        signals: the signals of the picture, 1 to `MOST_SIGNALS`.
+        span_s: duration that the picture shows, s.
+        trigger: a signal, or a key of `EVENTS`; empty: none, the picture rolls.
+        level: value of the trigger signal whose rising crossing triggers.
+        period_ns: period of the cycle, ns.
 
     Raises:
-        Invalid: of something else.
+        RtcpError: `invalid`: an unknown signal, or a number of signals or a duration out of range.
     """
 
     def __init__(
         self, allowed: Collection[str], signals: list[str], span_s: float, trigger: str, level: float, period_ns: int
     ) -> None:
-        for one in (*signals, *([trigger] if trigger and trigger not in EVENTS else [])):
-            if one not in allowed:
-                raise RtcpError("invalid", f'signals: found "{one}", allowed are {", ".join(allowed)}')
+        for signal in (*signals, *([trigger] if trigger and trigger not in EVENTS else [])):
+            if signal not in allowed:
+                raise RtcpError("invalid", f'signals: found "{signal}", allowed are {", ".join(allowed)}')
         if not 0 < len(signals) <= MOST_SIGNALS:
             raise RtcpError("invalid", f"signals: found {len(signals)}, allowed are 1 to {MOST_SIGNALS}")
         if not SHORTEST_S <= span_s <= LONGEST_S:
@@ -69,38 +69,39 @@ class Scope:
         self.signals, self.span_s = signals, span_s
         self._trigger, self._level = trigger, level
         count = int(span_s * 1e9 / period_ns) + 2
-        self._kept = 2 * count
+        self._capacity = 2 * count
         self._time = np.empty(0, dtype=np.int64)
         self._values = np.empty((len(signals) + 1, 0), dtype=np.float32)
-        """A row a signal, and one of what triggers."""
+        """One row for each signal, then that of the trigger."""
         self._at_ns = 0
-        """Instant of the trigger; 0: it is waited for."""
+        """Instant of the trigger; 0: not triggered yet."""
         self._shown: dict[str, Any] | None = None
 
     def read(self, records: Records) -> None:
-        """Take the next cycle records, oldest first."""
+        """Read the next cycle records, oldest first."""
         if not len(records):
             return
-        source = self._trigger or self.signals[0]
-        rows = [_column(records, one) for one in (*self.signals, source)]
-        self._time = np.concatenate([self._time, records["time_ns"]])[-self._kept :]
-        self._values = np.concatenate([self._values, np.array(rows, dtype=np.float32)], axis=1)[:, -self._kept :]
+        trigger = self._trigger or self.signals[0]
+        rows = [_column(records, signal) for signal in (*self.signals, trigger)]
+        self._time = np.concatenate([self._time, records["time_ns"]])[-self._capacity :]
+        self._values = np.concatenate([self._values, np.array(rows, dtype=np.float32)], axis=1)[:, -self._capacity :]
         if self._trigger and not self._at_ns:
-            self._look_for_trigger(len(records))
+            self._find_trigger(len(records))
 
-    def _look_for_trigger(self, fresh: int) -> None:
-        after = self._values[-1][-fresh - 1 :]
+    def _find_trigger(self, fresh: int) -> None:
+        """Search the last `fresh` records for the trigger."""
+        values = self._values[-1][-fresh - 1 :]
         if self._trigger == "fault":
-            found = (after[1:] > 0) & (after[:-1] == 0)
+            triggered = (values[1:] > 0) & (values[:-1] == 0)
         elif self._trigger in EVENTS:
-            found = after[1:] != after[:-1]
+            triggered = values[1:] != values[:-1]
         else:
-            found = (after[:-1] < self._level) & (after[1:] >= self._level)
-        if len(hits := np.flatnonzero(found)):
-            self._at_ns = int(self._time[-len(after) + 1 + int(hits[0])])
+            triggered = (values[:-1] < self._level) & (values[1:] >= self._level)
+        if len(hits := np.flatnonzero(triggered)):
+            self._at_ns = int(self._time[-len(values) + 1 + int(hits[0])])
 
     def block(self) -> dict[str, Any] | None:
-        """Return the picture: `t`, s, from its trigger or its end, and `y`, values by signal; None: no new one."""
+        """Return the picture: `t`, s, from its trigger or its end, and `y`, values by signal; None: it is unchanged."""
         if not len(self._time):
             return None
         span_ns = int(self.span_s * 1e9)
@@ -116,8 +117,8 @@ class Scope:
         inside = (self._time >= begin) & (self._time <= begin + span_ns)
         time_s, values = (self._time[inside] - zero) * 1e-9, self._values[:-1, inside]
         time_s, values = decimated(time_s, values)
-        y = [[round(float(one), 7) for one in line] for line in values]
-        return {"t": [round(float(one), 6) for one in time_s], "y": y, "signals": self.signals, "span": self.span_s}
+        y = [[round(float(value), 7) for value in line] for line in values]
+        return {"t": [round(float(t), 6) for t in time_s], "y": y, "signals": self.signals, "span": self.span_s}
 
 
 def decimated(time_s: npt.NDArray[Any], values: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
@@ -141,13 +142,13 @@ def _column(records: Records, signal: str) -> npt.NDArray[Any]:
         column: npt.NDArray[Any] = records[name][:, at]
         return column
     if name == "inputs":
-        # Any box: a number, exact in float32, that changes whenever one of them does.
+        # A hash of the inputs of all boxes: 24 bits, so exact in float32; it changes when an input does.
         mixed = np.zeros(len(records), np.uint64)
-        boxes = [one for one in records.dtype.names or () if one.endswith("_inputs") and records[one].ndim == 1]
-        for at, one in enumerate(boxes):
-            mixed += records[one].astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15 + 2 * at)
-        shown: npt.NDArray[Any] = mixed >> np.uint64(40)
-        return shown
+        boxes = [box for box in records.dtype.names or () if box.endswith("_inputs") and records[box].ndim == 1]
+        for at, box in enumerate(boxes):
+            mixed += records[box].astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15 + 2 * at)
+        code: npt.NDArray[Any] = mixed >> np.uint64(40)
+        return code
     if name.endswith("_us"):
         in_us: npt.NDArray[Any] = records[f"{name[:-3]}_ns"] / 1e3
         return in_us

@@ -95,7 +95,7 @@ class Panel:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((options.host, options.port))
-            self._socket.listen()  # whoever is quicker than the start waits
+            self._socket.listen()  # a client that is quicker than the start waits
         except OSError as error:
             self._socket.close()
             problem = f"{options.host} port {options.port} cannot be listened at: {error.strerror or error}"
@@ -182,15 +182,15 @@ class Panel:
 
 
 def _file(directory: Path, path: str, endings: tuple[str, ...]) -> Response:
-    """Return a file of a directory; one outside of it, or of another kind, does not exist."""
+    """Return a file of a directory; 404 for a file outside of it, or of another kind."""
     try:
-        found = (directory / path).resolve()
-        is_ours = found.is_relative_to(directory.resolve()) and found.suffix[1:] in endings and found.is_file()
+        target = (directory / path).resolve()
+        is_ours = target.is_relative_to(directory.resolve()) and target.suffix[1:] in endings and target.is_file()
     except (OSError, ValueError):
         is_ours = False  # too long, or with a NUL
     if not is_ours:
         return Response("no such file", 404)
-    return FileResponse(found)
+    return FileResponse(target)
 
 
 def serve(options: PanelOptions, announce: Callable[[str], None]) -> None:

@@ -13,7 +13,7 @@ SAMPLE_S = 5.0
 """Interval between two samples."""
 KEPT_S = 3600.0
 _POINTS = 180
-"""Of a drawn line: each is the largest sample of its part of the hour."""
+"""Points of a drawn line: each is the largest sample of its part of the hour."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Trend:
 
 
 class Trends:
-    """All figures of a platform, by what they are of."""
+    """All figures of a platform, by their subject."""
 
     def __init__(self) -> None:
         self.all: dict[str, Trend] = {}
@@ -45,7 +45,7 @@ class Trends:
         self._missed: int | None = None
 
     def read(self, status: Mapping[str, Any], torque_limits: Sequence[float], temperatures: Sequence[Any]) -> None:
-        """Take a status, as often as one comes; sampled every `SAMPLE_S`."""
+        """Read a status; sampled every `SAMPLE_S`, however often it is called."""
         for name, unit, value in _figures(status, torque_limits, temperatures):
             self._names[name] = name, unit
             self._largest[name] = max(value, self._largest.get(name, value))
@@ -65,7 +65,7 @@ class Trends:
 def _figures(
     status: Mapping[str, Any], torque_limits: Sequence[float], temperatures: Sequence[Any]
 ) -> Iterator[tuple[str, str, float]]:
-    """Yield name, unit and value of what stands in a status."""
+    """Yield name, unit and value of each figure of a status."""
     for joint, torque, limit in zip(
         status["joint_names"], status["joints"]["actual_torque"], torque_limits, strict=False
     ):

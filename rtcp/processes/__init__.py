@@ -1,4 +1,4 @@
-"""Processes beside motion; what a package needs that brings one (docs/processes.md)."""
+"""Processes beside motion; the interface for a package with one of its own (docs/processes.md)."""
 
 from rtcp.config.model import InputChannel, OutputChannel, ProcessConfig
 from rtcp.control.processes import Process, ProcessSetup, Signal

@@ -5,8 +5,8 @@ with the master's time just before sending this gives the difference of the two 
 A second-order filter tracks that difference (phase and rate), and the next wake-up is computed straight from the
 reference time: wake-up jitter never enters the clocks, and there is no gain to tune against it. Residuals are bounded:
 one late frame moves the estimate by little. A frame that is later than any clock drifts (its sender or its receiver
-was kept off the CPU) is ignored, until so many more are late than in time that it must be the clock. A reference whose
-time stands although frames return is not followed until it moves again.
+was kept off the CPU) is ignored, until late frames outnumber timely ones so far that the clock itself has moved. A
+reference whose time stands although frames return is not tracked until it moves again.
 
 Three phases: *measure* (the clocks are compared for `MEASURE_CYCLES`, nothing is moved), *align* (one jump of the
 grid to the configured phase between two SYNC0, before any drive is in OP), *track*.
@@ -31,12 +31,12 @@ _LATE_BEYOND_NS: Final = 50_000.0
 UNHEARD_CYCLES: Final = 200
 """Frames in a row with the same reference time that the holdover bridges at the last rate; then the lock is lost."""
 _LATE_MORE: Final = 150
-"""Excess of late frames over those in time, above which they are the clock's. A host that takes the CPU away in bursts
+"""Excess of late frames over timely ones that shows a moved clock. A host that takes the CPU away in bursts
 of tens of frames, fewer than half of all, does not reach it; it reaches 40."""
 _LATE_MOST: Final = 200
-"""Limit of that count: where most frames are late all late ones are used, not one ignored for each in time."""
+"""Limit of that count: where most frames are late every late one is used, not one ignored for each timely one."""
 _RATE_BOUND: Final = 500e-6
-"""No two oscillators differ by more; keeps a jump of the reference from winding up the rate."""
+"""Largest difference of two oscillators' rates; keeps a jump of the reference from winding up the rate."""
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -77,7 +77,7 @@ class Discipline:
     def observe(self, sent_ns: int, reference_ns: int) -> None:
         """Update from one frame: the master's time just before sending and the reference time when it passed, ns."""
         if reference_ns == self._reference:
-            # The reference slave did not answer: what came back is what was sent.
+            # The reference slave did not answer: the field returned as it was sent.
             self.holdover()
             self._standing += 1
             if self._standing == UNHEARD_CYCLES:
@@ -96,9 +96,9 @@ class Discipline:
         residual = reference_ns - sent_ns - self._base - self._difference
         if abs(residual) > period:
             # The reference was set: only its phase within the period matters, whole periods are taken over at once.
-            whole = round(residual / period) * period
-            self._base += whole
-            residual -= whole
+            shift = round(residual / period) * period
+            self._base += shift
+            residual -= shift
         if abs(residual) <= _LATE_BEYOND_NS:
             if self._late:
                 self._late -= 1

@@ -1,6 +1,6 @@
-"""What of a host stands in the way of real time: a table of checks, each with what it found and what remedies it.
+"""Obstacles to real time on a host: a table of checks, each with its finding and its remedy.
 
-`examine(case)` asks every check in the table `CHECKS` at the end; nothing is changed on the host.
+`examine(case)` runs every check in the table `CHECKS` at the end; nothing is changed on the host.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NET = "/sys/class/net"
 
 @dataclass(frozen=True)
 class Case:
-    """The host, and what the loop would ask of it."""
+    """The host, and the requirements of the loop."""
 
     host: Host
     cpu: int
@@ -33,25 +33,25 @@ class Case:
     wait_us: float
     """How long the loop waits for its frame."""
     blackboard: Path | None = None
-    """Blackboard of the platform that may be running; None: do not look."""
+    """Blackboard of a platform that may be running; None: not checked."""
     build: Build = BUILD
 
 
 class Severity(IntEnum):
-    """How much a finding stands in the way; the larger number is the worse."""
+    """Severity of a finding; the larger number is the worse."""
 
     OK = 0
     NOTE = 1
     """Worth knowing, not known, or not applicable to this host."""
     WARNING = 2
-    """Cycles come late at times."""
+    """Cycles are late at times."""
     BAD = 3
-    """The loop cannot keep its cycle, or not run at all."""
+    """The loop cannot keep its cycle, or cannot run at all."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a probe found; `remedy` is lines for a root shell, in their order, where something is to be changed."""
+    """Result of a probe; `remedy`: lines for a root shell, in their order, where something is to be changed."""
 
     severity: Severity
     found: str
@@ -68,7 +68,7 @@ class Finding(Result):
 
 @dataclass(frozen=True)
 class Check:
-    """A row of the table. The probe returns None where the check makes no sense, and raises `NotKnown`."""
+    """A row of the table. The probe returns None where the check does not apply, and raises `NotKnown`."""
 
     key: str
     probe: Callable[[Case], Result | None]
@@ -76,7 +76,7 @@ class Check:
 
 
 def examine(case: Case) -> list[Finding]:
-    """Return what each check that makes sense on this host found; what a host does not say is a note."""
+    """Return the finding of each check that applies to this host; what cannot be read is a note."""
     findings = []
     for check in CHECKS:
         try:
@@ -88,8 +88,8 @@ def examine(case: Case) -> list[Finding]:
     return findings
 
 
-def _result(severity: Severity, found: str, *remedy: str) -> Result:
-    return Result(severity, found, remedy)
+def _result(severity: Severity, text: str, *remedy: str) -> Result:
+    return Result(severity, text, remedy)
 
 
 _ok = partial(_result, Severity.OK)
@@ -182,22 +182,20 @@ def _throttling(case: Case) -> Result:
 def _clock_source(case: Case) -> Result:
     host = case.host
     current = host.word(f"{_CLOCK}/current_clocksource")
-    found = f"the clock is read from {current}"
+    fact = f"the clock is read from {current}"
     if current in _GOOD_CLOCKS:
-        return _ok(found)
+        return _ok(fact)
     available = host.text(f"{_CLOCK}/available_clocksource").split()
     if better := next((name for name in _GOOD_CLOCKS if name in available), None):
         now = f"echo {better} > {_CLOCK}/current_clocksource"
-        return _warning(
-            f"{found} although {better} is available", now, _kernel_arguments(host, f"clocksource={better}")
-        )
+        return _warning(f"{fact} although {better} is available", now, _kernel_arguments(host, f"clocksource={better}"))
     if current not in _SLOW_CLOCKS:
-        return _note(found)
-    found += ", and the kernel offers no faster one"
+        return _note(fact)
+    fact += ", and the kernel offers no faster one"
     if "tsc" not in host.text_or("/proc/cpuinfo", "").split():
-        return _warning(found)
-    found += ": it found the CPU's own counter (tsc) unstable (dmesg | grep -i tsc)"
-    return _warning(found, _kernel_arguments(host, "tsc=reliable"))
+        return _warning(fact)
+    fact += ": it found the CPU's own counter (tsc) unstable (dmesg | grep -i tsc)"
+    return _warning(fact, _kernel_arguments(host, "tsc=reliable"))
 
 
 def _hypervisor(case: Case) -> Result:
@@ -237,8 +235,8 @@ def _isolated_cpu(case: Case) -> Result:
     if isolated:
         key = f"# in the arm's file: cycle: {{cpu: {max(isolated)}}}"
         return _warning(f"isolated is {name_cpus(isolated)}, and the cycle is to run on CPU {cpu}", key)
-    others = format_cpus(online - {cpu})
-    words = f"isolcpus=managed_irq,domain,{cpu} nohz_full={cpu} rcu_nocbs={cpu} irqaffinity={others}"
+    remaining = format_cpus(online - {cpu})
+    words = f"isolcpus=managed_irq,domain,{cpu} nohz_full={cpu} rcu_nocbs={cpu} irqaffinity={remaining}"
     return _warning(
         f"no CPU is isolated; the cycle is to run on CPU {cpu}",
         _kernel_arguments(host, words),
@@ -270,10 +268,10 @@ def _tick(case: Case) -> Result:
     tickless = case.host.cpus(path)
     if case.cpu in tickless:
         return _ok(f"CPU {case.cpu} runs without the tick")
-    found = f"CPU {case.cpu} has the scheduler's tick; without it is {name_cpus(tickless)}"
+    fact = f"CPU {case.cpu} has the scheduler's tick; without it is {name_cpus(tickless)}"
     if case.cpu not in case.host.cpus(f"{_CPUS}/isolated"):
-        return _note(found)  # what isolates the CPU takes the tick from it, too
-    return _note(found, _kernel_arguments(case.host, f"nohz_full={case.cpu} rcu_nocbs={case.cpu}"))
+        return _note(fact)  # isolating the CPU removes its tick, too
+    return _note(fact, _kernel_arguments(case.host, f"nohz_full={case.cpu} rcu_nocbs={case.cpu}"))
 
 
 def _frequencies(case: Case) -> tuple[int, int]:
@@ -287,12 +285,12 @@ def _governor(case: Case) -> Result:
     file = f"{_CPUS}/cpu{case.cpu}/cpufreq/scaling_governor"
     if not case.host.exists(f"{_CPUS}/cpu{case.cpu}/cpufreq"):
         return _note(f"nothing in this system sets the frequency of CPU {case.cpu} (the firmware may)")
-    found = f"CPU {case.cpu} is governed by {(chosen := case.host.word(file))}"
+    fact = f"CPU {case.cpu} is governed by {(chosen := case.host.word(file))}"
     if chosen == "performance":
-        return _ok(found)
+        return _ok(fact)
     with suppress(NotKnown):  # the governor is what matters
-        found += ", {} to {} MHz".format(*_frequencies(case))
-    return _warning(found, f"echo performance > {file}", _at_boot(file, "performance"))
+        fact += ", {} to {} MHz".format(*_frequencies(case))
+    return _warning(fact, f"echo performance > {file}", _at_boot(file, "performance"))
 
 
 def _idle_states(case: Case) -> Result:
@@ -323,12 +321,12 @@ def _idle_states(case: Case) -> Result:
 
 
 def _smt(case: Case) -> Result:
-    others = case.host.cpus(f"{_CPUS}/cpu{case.cpu}/topology/thread_siblings_list") - {case.cpu}
-    if not others:
+    siblings = case.host.cpus(f"{_CPUS}/cpu{case.cpu}/topology/thread_siblings_list") - {case.cpu}
+    if not siblings:
         return _ok(f"CPU {case.cpu} has its core to itself")
     now = f"echo off > {_CPUS}/smt/control"
-    found = f"CPU {case.cpu} shares its core with {name_cpus(others)} (SMT)"
-    return _warning(found, now, _kernel_arguments(case.host, "nosmt"))
+    fact = f"CPU {case.cpu} shares its core with {name_cpus(siblings)} (SMT)"
+    return _warning(fact, now, _kernel_arguments(case.host, "nosmt"))
 
 
 # -- interrupts -------------------------------------------------------------------------------------------------
@@ -345,7 +343,7 @@ class _Interrupt:
     """A line of /proc/interrupts: its number, its count on the cycle's CPU, and the device's name."""
 
     number: int
-    here: int
+    count: int
     owner: str
 
 
@@ -354,15 +352,15 @@ def _interrupts(case: Case) -> list[_Interrupt]:
     columns = lines[0].split()
     if f"CPU{case.cpu}" not in columns:
         raise NotKnown(f"/proc/interrupts has no column of CPU {case.cpu}")
-    found = []
+    interrupts = []
     for line in lines[1:]:
-        number, _, rest = line.partition(":")
-        words = rest.split()
+        number, _, entry = line.partition(":")
+        words = entry.split()
         counts, owner = words[: len(columns)], " ".join(words[len(columns) :])
         if number.strip().isdecimal() and len(counts) == len(columns) and all(map(str.isdecimal, counts)):
             here = whole(counts[columns.index(f"CPU{case.cpu}")], "/proc/interrupts")
-            found.append(_Interrupt(whole(number, "/proc/interrupts"), here, owner))
-    return found
+            interrupts.append(_Interrupt(whole(number, "/proc/interrupts"), here, owner))
+    return interrupts
 
 
 def _other_interrupts(case: Case) -> Result:
@@ -370,22 +368,22 @@ def _other_interrupts(case: Case) -> Result:
     if len(online) == 1:
         return _note("this host has one CPU, which takes all interrupts")
     cards = _of_the_card(case)
-    found = [
-        each
-        for each in _interrupts(case)
-        if each not in cards and each.here and case.cpu in _handled_on(case.host, each.number)
+    busy = [
+        interrupt
+        for interrupt in _interrupts(case)
+        if interrupt not in cards and interrupt.count and case.cpu in _handled_on(case.host, interrupt.number)
     ]
-    if not found:
+    if not busy:
         return _ok(f"no device interrupts CPU {case.cpu}")
-    named = ", ".join(f"{each.number} ({(each.owner.split() or ['unnamed'])[-1]})" for each in found[:_NAMED])
-    more = f" and {len(found) - _NAMED} others" if len(found) > _NAMED else ""
+    named = ", ".join(f"{line.number} ({(line.owner.split() or ['unnamed'])[-1]})" for line in busy[:_NAMED])
+    more = f" and {len(busy) - _NAMED} others" if len(busy) > _NAMED else ""
     elsewhere = format_cpus(online - {case.cpu})
     isolated = case.cpu in case.host.cpus(f"{_CPUS}/isolated")
     return _warning(
         f"CPU {case.cpu} takes the interrupts {named}{more}",
-        f"for n in {' '.join(str(each.number) for each in found)}; do echo {elsewhere} > "
+        f"for n in {' '.join(str(each.number) for each in busy)}; do echo {elsewhere} > "
         "/proc/irq/$n/smp_affinity_list; done   # refused for interrupts that are bound to a CPU",
-        # Where the CPU is not isolated yet, the words that isolate it have this one among them.
+        # Where the CPU is not isolated yet, the kernel arguments that isolate it include this one.
         *((_kernel_arguments(case.host, f"irqaffinity={elsewhere}"),) if isolated else ()),
     )
 
@@ -395,32 +393,32 @@ def _irqbalance(case: Case) -> Result:
         return _ok("irqbalance does not run")
     if case.cpu in case.host.cpus(f"{_CPUS}/isolated"):
         return _ok(f"irqbalance runs and leaves isolated CPUs alone, CPU {case.cpu} among them")
-    found = f"irqbalance runs and may put any interrupt on CPU {case.cpu}"
-    return _warning(found, "systemctl disable --now irqbalance")
+    fact = f"irqbalance runs and may put any interrupt on CPU {case.cpu}"
+    return _warning(fact, "systemctl disable --now irqbalance")
 
 
 def _card_interrupt(case: Case) -> Result:
     host, name = case.host, case.interface
     if name is None:
         return _note("does not apply: the bus is virtual")
-    places = {each.number: _handled_on(host, each.number) for each in _of_the_card(case)}
+    places = {interrupt.number: _handled_on(host, interrupt.number) for interrupt in _of_the_card(case)}
     if not places:
         raise NotKnown(f"/proc/interrupts names none of {name}")
     here = [number for number, cpus in places.items() if case.cpu in cpus]
     threads = [thread for number in here if (thread := _thread_of(host, number))]
-    found = f"{name}'s interrupts: " + "; ".join(f"{number} on {name_cpus(cpus)}" for number, cpus in places.items())
+    fact = f"{name}'s interrupts: " + "; ".join(f"{number} on {name_cpus(cpus)}" for number, cpus in places.items())
     if low := {pid: rank for pid, rank in threads if rank <= case.priority}:
         return _bad(
-            f"{found}; on CPU {case.cpu} its thread has priority {min(low.values())} and the loop {case.priority}",
+            f"{fact}; on CPU {case.cpu} its thread has priority {min(low.values())} and the loop {case.priority}",
             *(f"chrt -f -p {_CARD_PRIORITY} {pid}" for pid in low),
         )
     if not here:
-        return _ok(f"{found}, not on CPU {case.cpu} of the cycle")
-    return _ok(f"{found}, handled {'by threads that outrank the loop' if threads else 'at once, not by threads'}")
+        return _ok(f"{fact}, not on CPU {case.cpu} of the cycle")
+    return _ok(f"{fact}, handled {'by threads that outrank the loop' if threads else 'at once, not by threads'}")
 
 
 def _of_the_card(case: Case) -> list[_Interrupt]:
-    """Return the interrupts whose name is the interface's or its device's, or which its PCI function lists."""
+    """Return the interrupts named after the interface or its device, or listed by its PCI function."""
     if case.interface is None:
         return []
     device = f"{_NET}/{case.interface}/device"
@@ -429,11 +427,11 @@ def _of_the_card(case: Case) -> list[_Interrupt]:
         names.append(case.host.target(device))
     # The name, or the name and a queue: eth0, eth0-TxRx-1; not eth01.
     name = re.compile(rf"(?<!\S)(?:{'|'.join(map(re.escape, names))})(?![^\W_])")
-    return [each for each in _interrupts(case) if str(each.number) in listed or name.search(each.owner)]
+    return [line for line in _interrupts(case) if str(line.number) in listed or name.search(line.owner)]
 
 
 def _handled_on(host: Host, number: int) -> frozenset[int]:
-    """Return the CPUs that take an interrupt: where it goes in effect, else where it may go."""
+    """Return the CPUs that an interrupt reaches: its effective affinity, else the allowed one."""
     folder = f"/proc/irq/{number}"
     try:
         return host.cpus(f"{folder}/effective_affinity_list") or host.cpus(f"{folder}/smp_affinity_list")
@@ -484,7 +482,7 @@ def _of_interface(probe: Callable[[Case, str], Result]) -> Callable[[Case], Resu
 def _interface(case: Case, name: str) -> Result:
     host, folder = case.host, f"{_NET}/{name}"
     if not host.exists(folder):
-        there = ", ".join(each for each in host.names(_NET) if each != "lo") or "none"
+        there = ", ".join(interface for interface in host.names(_NET) if interface != "lo") or "none"
         return _bad(f"there is no interface {name}; there are: {there}", _OTHER_BUS)
     if host.text(f"{folder}/operstate") == "down":
         flags = f"{folder}/flags"
@@ -495,10 +493,10 @@ def _interface(case: Case, name: str) -> Result:
     speed, duplex = host.integer(f"{folder}/speed"), host.text(f"{folder}/duplex")
     if speed <= 0:
         return _note(f"{name} is up and has a link; its driver tells no speed")
-    found = f"{name} is up and has a link of {speed} Mbit/s, {duplex} duplex"
+    fact = f"{name} is up and has a link of {speed} Mbit/s, {duplex} duplex"
     if duplex == "half" or speed < 100:
-        return _bad(found, f"ethtool -s {name} speed 100 duplex full autoneg on")
-    return _ok(found)
+        return _bad(fact, f"ethtool -s {name} speed 100 duplex full autoneg on")
+    return _ok(fact)
 
 
 def _driver(case: Case, name: str) -> Result:
@@ -518,18 +516,18 @@ def _driver(case: Case, name: str) -> Result:
     chip = host.text(f"{folder}/device/device")
     if chip in _PLAIN_E1000E:
         return _ok(f"{name} is an Intel 82574L (driver e1000e)")
-    found = f"{name} is driven by e1000e and is chip {chip}: most are an I219 or its kin, part of the chipset"
-    return _warning(found, _BETTER_CARD.format("a"))
+    fact = f"{name} is driven by e1000e and is chip {chip}: most are an I219 or its kin, part of the chipset"
+    return _warning(fact, _BETTER_CARD.format("a"))
 
 
 def _coalescing(case: Case, name: str) -> Result:
-    held = case.host.coalescing(name)
-    if held is None:
+    settings = case.host.coalescing(name)
+    if settings is None:
         return _ok(f"the driver of {name} has no coalescing to set")
-    times = f"rx-usecs {held.receive_us}, tx-usecs {held.send_us}{', adaptive' if held.adaptive else ''}"
-    if not (held.receive_us or held.send_us or held.adaptive):
+    times = f"rx-usecs {settings.receive_us}, tx-usecs {settings.send_us}{', adaptive' if settings.adaptive else ''}"
+    if not (settings.receive_us or settings.send_us or settings.adaptive):
         return _ok(f"{name} reports every frame at once ({times})")
-    adaptive = " adaptive-rx off adaptive-tx off" if held.adaptive else ""
+    adaptive = " adaptive-rx off adaptive-tx off" if settings.adaptive else ""
     link = f"[Match]\\nOriginalName={name}\\n[Link]\\nRxCoalesceSec=0\\nTxCoalesceSec=0\\n"
     remedy = (
         f"ethtool -C {name}{adaptive} rx-usecs 0 tx-usecs 0",
@@ -538,13 +536,13 @@ def _coalescing(case: Case, name: str) -> Result:
     kind = ""
     with suppress(NotKnown):
         kind = case.host.target(f"{_NET}/{name}/device/driver")
-    if held.receive_us in _DYNAMIC.get(kind, ()):
+    if settings.receive_us in _DYNAMIC.get(kind, ()):
         return _warning(f"{name} holds frames back for a time that follows the traffic ({times}, {kind})", *remedy)
-    total_us = held.receive_us + held.send_us
+    total_us = settings.receive_us + settings.send_us
     if total_us < case.wait_us:
         return _warning(f"{name} holds frames back ({times})", *remedy)
-    found = f"{name} holds frames back for up to {total_us} us ({times})"
-    return _bad(f"{found}, and the loop waits {case.wait_us:g} us for its frame", *remedy)
+    fact = f"{name} holds frames back for up to {total_us} us ({times})"
+    return _bad(f"{fact}, and the loop waits {case.wait_us:g} us for its frame", *remedy)
 
 
 def _other_traffic(case: Case, name: str) -> Result:
@@ -554,7 +552,7 @@ def _other_traffic(case: Case, name: str) -> Result:
     sockets = map(str.split, host.text_or("/proc/net/packet", "").splitlines()[1:])
     if any(words[3:5] == [_ETHERCAT, number] for words in sockets):
         return _note(f"not counted: an EtherCAT master is using {name}")
-    counters = [f"{_NET}/{name}/statistics/{way}_packets" for way in ("rx", "tx")]
+    counters = [f"{_NET}/{name}/statistics/{direction}_packets" for direction in ("rx", "tx")]
     before = [host.integer(file) for file in counters]
     host.wait(_WATCHED_S)
     received, sent = (host.integer(file) - then for file, then in zip(counters, before, strict=True))
@@ -567,17 +565,17 @@ def _other_traffic(case: Case, name: str) -> Result:
 
 
 def _ip_address(case: Case, name: str) -> Result:
-    host, found = case.host, []
+    host, addresses = case.host, []
     remedy: tuple[str, ...] = ()
     if address := host.ipv4_address(name):
-        found.append(address)
+        addresses.append(address)
         remedy += (f"ip -4 address flush dev {name}",)
     if any(words[5:6] == [name] for words in map(str.split, host.text_or("/proc/net/if_inet6", "").splitlines())):
-        found.append("an IPv6 address")
+        addresses.append("an IPv6 address")
         remedy += _sysctl(f"net.ipv6.conf.{name.replace('.', '/')}.disable_ipv6=1")  # sysctl.d(5): a dot in a name
-    if not found:
+    if not addresses:
         return _ok(f"{name} has no IP address")
-    has = f"{name} has {' and '.join(found)}"
+    has = f"{name} has {' and '.join(addresses)}"
     routes = map(str.split, host.text_or("/proc/net/route", "").splitlines()[1:])
     if any(words[:2] == [name, "00000000"] for words in routes):
         return _bad(f"{has} and the default route: it is this host's way to its network, not a bus", _OTHER_BUS)
@@ -586,31 +584,31 @@ def _ip_address(case: Case, name: str) -> Result:
 
 def _network_services(case: Case, name: str) -> Result:
     running = case.host.processes()
-    found, remedy = [], []
+    services, remedy = [], []
     if "NetworkManager" in running:
         number = case.host.integer(f"{_NET}/{name}/ifindex")
         # Without a file of its state it may manage the interface.
         if "managed=false" not in case.host.text_or(f"/run/NetworkManager/devices/{number}", "").splitlines():
-            found.append("NetworkManager manages it")
+            services.append("NetworkManager manages it")
             unmanaged = f"[keyfile]\\nunmanaged-devices=interface-name:{name}\\n"
             remedy.append(f"nmcli device set {name} managed no")
             remedy.append(f"printf '{unmanaged}' > /etc/NetworkManager/conf.d/90-rtcp.conf{_KEPT}")
     if "avahi-daemon" in running:
-        found.append("avahi-daemon announces services on every interface with an address")
+        services.append("avahi-daemon announces services on every interface with an address")
         remedy.append(f"sed -i '/^\\[server\\]/a deny-interfaces={name}' /etc/avahi/avahi-daemon.conf")
         remedy.append("systemctl restart avahi-daemon")
-    if not found:
+    if not services:
         return _ok(f"neither NetworkManager nor avahi manages {name}")
-    return _warning(f"{name}: {', and '.join(found)}", *remedy)
+    return _warning(f"{name}: {', and '.join(services)}", *remedy)
 
 
-# -- what the kernel grants this process ------------------------------------------------------------------------
+# -- permissions of this process --------------------------------------------------------------------------------
 
 _NET_ADMIN, _NET_RAW, _IPC_LOCK, _SYS_NICE = 12, 13, 14, 23
 """linux/capability.h"""
 _LIMITS = "/etc/security/limits.d/90-rtcp.conf"
 _NEEDED_BYTES = 512 << 20
-"""What the loop's process maps, with room: mlockall counts all of it."""
+"""Memory that the loop's process maps, with a margin, bytes: mlockall counts all of it."""
 _CAPABLE = (
     "rtcp service install   # as a service it has its rights; else, for an ordinary user:",
     "install -m 755 $(readlink -f $(command -v python3)) /usr/local/bin/rtcp-python",
@@ -623,10 +621,10 @@ def _raw_frames(case: Case) -> Result:
     lacking = [name for name, bit in needed if not _capable(case, bit)]
     if not lacking:
         return _ok("CAP_NET_RAW and CAP_NET_ADMIN are granted")
-    found = f"{' and '.join(lacking)} {'is' if len(lacking) == 1 else 'are'} not granted"
+    fact = f"{' and '.join(lacking)} {'is' if len(lacking) == 1 else 'are'} not granted"
     if case.interface is None:
-        return _ok(f"{found}, which the virtual bus does without")
-    return _bad(f"{found}: {case.interface} cannot be opened", *_CAPABLE)
+        return _ok(f"{fact}, which the virtual bus does without")
+    return _bad(f"{fact}: {case.interface} cannot be opened", *_CAPABLE)
 
 
 def _priority(case: Case) -> Result:
@@ -669,10 +667,10 @@ def _outermost(case: Case) -> bool:
 
 def _limit(case: Case, name: str) -> int | None:
     """Return a soft limit of /proc/self/limits, None for unlimited."""
-    found = re.search(rf"^{name} +(\S+)", case.host.text("/proc/self/limits"), re.MULTILINE)
-    if found is None:
+    match = re.search(rf"^{name} +(\S+)", case.host.text("/proc/self/limits"), re.MULTILINE)
+    if match is None:
         raise NotKnown(f"/proc/self/limits has no line {name!r}")
-    return None if found[1] == "unlimited" else whole(found[1], f"/proc/self/limits, {name},")
+    return None if match[1] == "unlimited" else whole(match[1], f"/proc/self/limits, {name},")
 
 
 # -- memory -----------------------------------------------------------------------------------------------------
@@ -731,11 +729,11 @@ def _heat(case: Case) -> Result | None:
             f"the hottest zone ({_kind(host, zone)}) has {celsius:.0f} C; no zone tells when it is slowed down"
         )
     margin, celsius, zone = min(margins)
-    found = f"{_kind(host, zone)} has {celsius:.0f} C and is slowed down at {celsius + margin:.0f} C"
+    fact = f"{_kind(host, zone)} has {celsius:.0f} C and is slowed down at {celsius + margin:.0f} C"
     if margin >= _CLOSE_C:
-        return _ok(found)
+        return _ok(fact)
     remedy = (*(("jetson_clocks --fan",) if jetson else ()), "# cool it: a fan, a larger heat sink, less load")
-    return _bad(found, *remedy) if margin <= 0 else _warning(found, *remedy)
+    return _bad(fact, *remedy) if margin <= 0 else _warning(fact, *remedy)
 
 
 def _celsius(host: Host, path: str) -> float | None:
@@ -752,13 +750,13 @@ def _kind(host: Host, zone: str) -> str:
 
 def _trip(host: Host, zone: str) -> float | None:
     """Return the lowest temperature at which the kernel slows the zone down."""
-    found = []
+    limits = []
     for file in host.names(zone):
         point = re.fullmatch(r"(trip_point_\d+)_type", file)
         # A passive trip point slows down; an active one starts a fan; critical and hot switch off.
         if point is not None and host.text_or(f"{zone}/{file}", "") == "passive":
-            found.append(_celsius(host, f"{zone}/{point[1]}_temp") or 0.0)
-    return min((celsius for celsius in found if celsius > 0), default=None)
+            limits.append(_celsius(host, f"{zone}/{point[1]}_temp") or 0.0)
+    return min((celsius for celsius in limits if celsius > 0), default=None)
 
 
 def _power_mode(case: Case) -> Result | None:
@@ -770,10 +768,10 @@ def _power_mode(case: Case) -> Result | None:
         raise NotKnown(f"{_POWER_STATUS} holds {status[:40]!r}, not pmode:NUMBER")
     modes = case.host.text_or("/etc/nvpmodel.conf", "")
     named = re.search(rf"< POWER_MODEL ID={mode[1]} NAME=(\S+) >", modes)
-    found = f"power mode {mode[1]}{f' ({named[1]})' if named else ''}"
+    fact = f"power mode {mode[1]}{f' ({named[1]})' if named else ''}"
     if mode[1] == "0":  # without limits on most boards
-        return _ok(found)
-    return _warning(f"{found}: fewer CPUs or lower clocks than the board has", f"nvpmodel -m 0{_KEPT}")
+        return _ok(fact)
+    return _warning(f"{fact}: fewer CPUs or lower clocks than the board has", f"nvpmodel -m 0{_KEPT}")
 
 
 def _jetson_clocks(case: Case) -> Result | None:
@@ -795,8 +793,8 @@ def _jetson_clocks(case: Case) -> Result | None:
 def _compiled(case: Case) -> Result:
     if case.build.is_used:
         return _ok("the cycle runs compiled")
-    found = f"the cycle runs as source: {case.build.reason}"
-    return (_warning if case.build.is_stale else _note)(found, "make fast   # needs a C compiler")
+    fact = f"the cycle runs as source: {case.build.reason}"
+    return (_warning if case.build.is_stale else _note)(fact, "make fast   # needs a C compiler")
 
 
 def _skipped_ticks(case: Case) -> Result | None:

@@ -1,4 +1,4 @@
-"""What a Linux host says of itself: the files under /proc, /sys, /dev, /etc and /run, and its network drivers."""
+"""Facts about a Linux host: the files under /proc, /sys, /dev, /etc and /run, and its network drivers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ETHTOOL_REQUEST = struct.Struct("16sP16x")
 
 
 class NotKnown(Exception):
-    """The host does not say; the text names the file and the reason."""
+    """A fact that the host does not report; the text names the file and the reason."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Coalescing:
 class Host:
     """Reads a host's files; every path is given as on the host and looked up below `root`.
 
-    Every method but `exists`, `names` and `text_or` raises `NotKnown` where the host gives no answer.
+    Every method but `exists`, `names` and `text_or` raises `NotKnown` where the host does not report the fact.
     """
 
     root: Path = Path("/")
@@ -115,11 +115,11 @@ class Host:
 
     def processes(self) -> dict[str, list[int]]:
         """Return the process ids by process name (at most 15 characters)."""
-        found: dict[str, list[int]] = {}
+        pids: dict[str, list[int]] = {}
         for name in filter(str.isdecimal, self.names("/proc")):
             if comm := self.text_or(f"/proc/{name}/comm", ""):  # empty: it has ended meanwhile
-                found.setdefault(comm, []).append(int(name))
-        return found
+                pids.setdefault(comm, []).append(int(name))
+        return pids
 
     def coalescing(self, interface: str) -> Coalescing | None:
         """Return the coalescing of a network card, None where its driver has none; asks the running kernel."""
@@ -139,19 +139,19 @@ class Host:
         import psutil  # here: it loads slowly
 
         with _not_known(f"the address of {interface}"):
-            found = psutil.net_if_addrs().get(interface, [])
-        return next((each.address for each in found if each.family == socket.AF_INET), None)
+            addresses = psutil.net_if_addrs().get(interface, [])
+        return next((address.address for address in addresses if address.family == socket.AF_INET), None)
 
     def _at(self, path: str) -> str:
         return os.path.join(self.root, path.lstrip("/"))
 
 
 @contextmanager
-def _not_known(what: str) -> Iterator[None]:
+def _not_known(subject: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise NotKnown(f"{what}: {os.strerror(error.errno) if error.errno else error}") from error
+        raise NotKnown(f"{subject}: {os.strerror(error.errno) if error.errno else error}") from error
 
 
 def whole(text: str, where: str, base: int = 10) -> int:
@@ -159,8 +159,8 @@ def whole(text: str, where: str, base: int = 10) -> int:
     try:
         return int(text, base)
     except ValueError as error:
-        shown = text if len(text) <= 40 else f"{text[:40]}..."
-        raise NotKnown(f"{where} holds {shown!r}, not a number") from error
+        excerpt = text if len(text) <= 40 else f"{text[:40]}..."
+        raise NotKnown(f"{where} holds {excerpt!r}, not a number") from error
 
 
 # -- lists of CPUs (Documentation/admin-guide/kernel-parameters.rst, "cpu lists") -------------------------------
@@ -172,15 +172,15 @@ def parse_cpus(text: str) -> frozenset[int]:
     Raises:
         ValueError: it is no such list.
     """
-    found: set[int] = set()
+    cpus: set[int] = set()
     if text in ("", "(null)"):
         return frozenset()
     for part in text.split(","):
         ends = re.fullmatch(r"([0-9]{1,4})(?:-([0-9]{1,4}))?", part)
         if ends is None:
             raise ValueError(f"{text[:40]!r} is no list of CPUs")
-        found.update(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
-    return frozenset(found)
+        cpus.update(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
+    return frozenset(cpus)
 
 
 def format_cpus(cpus: Iterable[int]) -> str:

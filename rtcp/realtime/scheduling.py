@@ -31,7 +31,7 @@ class _Timespec(ctypes.Structure):
 class Sleeper:
     """Sleeps until an instant of CLOCK_MONOTONIC; everything it needs is allocated once.
 
-    The call goes through ctypes, which lets go of the interpreter while it sleeps.
+    The call goes through ctypes, which releases the interpreter while it sleeps.
     """
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class Sleeper:
 
 @dataclass
 class Realtime:
-    """What the loop runs with, and what was refused."""
+    """Real-time properties of the loop, and what the host refused."""
 
     scheduler: str = "SCHED_OTHER"
     """SCHED_OTHER, or SCHED_FIFO and its priority."""
@@ -73,16 +73,16 @@ def choose_cpu(wanted: int | None) -> int:
     return available_cpus()[-1] if wanted is None else wanted
 
 
-def prepare(made: Realtime, priority: int, cpu: int | None) -> None:
+def prepare(granted: Realtime, priority: int, cpu: int | None) -> None:
     """Prepare the calling thread to run the cycle: pin it, lock and prefault memory, freeze the collector, SCHED_FIFO.
 
-    Call it after everything is imported and built; what was granted goes into `made`.
+    Call it after everything is imported and built; what was granted goes into `granted`.
     """
-    _pin(made, cpu)
-    _lock_memory(made)
-    _hold_latency(made)
+    _pin(granted, cpu)
+    _lock_memory(granted)
+    _hold_latency(granted)
     _timer_slack()
-    _fifo(made, priority)
+    _fifo(granted, priority)
     freeze_garbage()
 
 
@@ -93,26 +93,26 @@ def freeze_garbage() -> None:
     gc.disable()
 
 
-def release(made: Realtime) -> None:
+def release(granted: Realtime) -> None:
     """Withdraw the CPU latency request."""
-    if made._latency_file >= 0:
-        os.close(made._latency_file)
-        made._latency_file = -1
+    if granted._latency_file >= 0:
+        os.close(granted._latency_file)
+        granted._latency_file = -1
 
 
-def _pin(made: Realtime, cpu: int | None) -> None:
+def _pin(granted: Realtime, cpu: int | None) -> None:
     allowed = available_cpus()
     chosen = choose_cpu(cpu)
     try:
         # Also a CPU that is isolated: no process has it among its CPUs before it asks.
         os.sched_setaffinity(0, {chosen})
     except (OSError, ValueError, OverflowError):
-        made.notes.append(f"cycle.cpu is {chosen}, which this process may not use (allowed: {allowed}): not pinned")
+        granted.notes.append(f"cycle.cpu is {chosen}, which this process may not use (allowed: {allowed}): not pinned")
         return
-    made.cpu = chosen
+    granted.cpu = chosen
 
 
-def _lock_memory(made: Realtime) -> None:
+def _lock_memory(granted: Realtime) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     # Freed memory stays in the process, so that a later allocation does not fault pages in again.
     libc.mallopt(_M_TRIM_THRESHOLD, -1)
@@ -120,12 +120,12 @@ def _lock_memory(made: Realtime) -> None:
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         allowed = "unlimited" if limit == resource.RLIM_INFINITY else f"{limit // 1024} KiB"
-        made.notes.append(
+        granted.notes.append(
             f"memory is not locked ({os.strerror(ctypes.get_errno())}): allow it with LimitMEMLOCK=infinity or "
             f"CAP_IPC_LOCK (RLIMIT_MEMLOCK is {allowed})"
         )
         return
-    made.memory_locked = True
+    granted.memory_locked = True
     bytearray(_PREFAULT_BYTES)
     _touch_stack()
 
@@ -135,12 +135,12 @@ def _touch_stack() -> None:
     ctypes.memset(page, 0, _STACK_BYTES)
 
 
-def _hold_latency(made: Realtime) -> None:
+def _hold_latency(granted: Realtime) -> None:
     try:
-        made._latency_file = os.open("/dev/cpu_dma_latency", os.O_WRONLY)
-        os.write(made._latency_file, struct.pack("=i", 0))
+        granted._latency_file = os.open("/dev/cpu_dma_latency", os.O_WRONLY)
+        os.write(granted._latency_file, struct.pack("=i", 0))
     except OSError as error:
-        made.notes.append(f"idle states are not held off: /dev/cpu_dma_latency: {error.strerror}")
+        granted.notes.append(f"idle states are not held off: /dev/cpu_dma_latency: {error.strerror}")
 
 
 def _timer_slack() -> None:
@@ -148,16 +148,16 @@ def _timer_slack() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
-def _fifo(made: Realtime, priority: int) -> None:
+def _fifo(granted: Realtime, priority: int) -> None:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
-        made.notes.append(
+        granted.notes.append(
             f"SCHED_FIFO {priority} is refused ({error.strerror}): allow it with CAP_SYS_NICE or "
             f"LimitRTPRIO={priority}; the cycle runs on as an ordinary thread"
         )
         return
-    made.scheduler = f"SCHED_FIFO {priority}"
+    granted.scheduler = f"SCHED_FIFO {priority}"
 
 
 def thread_beside(avoid_cpu: int, priority: int) -> None:
@@ -174,7 +174,7 @@ def thread_beside(avoid_cpu: int, priority: int) -> None:
 
 
 def cpu_hint(cpu: int) -> str:
-    """Return what software on this host that answers the frames must know of the cycle's CPU; without SCHED_FIFO none.
+    """Return a hint about the cycle's CPU for software on this host that answers the frames; empty without SCHED_FIFO.
 
     The cycle waits for its frame without sleeping: an ordinary process on its CPU runs after that, too late to answer.
     """

@@ -44,7 +44,7 @@ def percentiles(samples_us: npt.NDArray[np.float64]) -> Percentiles:
 class SlidingPercentiles:
     """Percentiles of the samples of the last `WINDOW_S` seconds, to 0.5 us up to 4 ms; the maximum exact.
 
-    One histogram a second: what is older than the window falls out a second at a time.
+    One histogram a second: older samples leave the window a second at a time.
     """
 
     def __init__(self) -> None:
@@ -120,9 +120,9 @@ class SkippedTicks:
     cycles: int
     period_us: float
     part: Part
-    """The part that takes longest in the slow cycles."""
+    """The slowest part in the slow cycles."""
     part_us: float
-    """What it takes there."""
+    """Its time there, us."""
     suggested_period_us: int
     """Period, us, that the slow cycles fit into."""
 
@@ -133,12 +133,12 @@ class SkippedTicks:
 
     @property
     def remedy(self) -> str:
-        """What to do, in a sentence."""
+        """The remedy, in a sentence."""
         return f"{_CAUSES[self.part]}, or set cycle.period_us to {self.suggested_period_us} or more"
 
     @property
     def message(self) -> str:
-        """What happens, in a sentence."""
+        """The problem, in a sentence."""
         skipped = f"{100 * self.share:.2g} % of the ticks are skipped (limit {100 * SKIPPED_SHARE:g} %)"
         return f"{skipped}: in slow cycles {self.part.value} takes {self.part_us:.0f} of {self.period_us:g} us"
 
@@ -159,11 +159,11 @@ def diagnose(
     if missed < SKIPPED_SHARE * (cycles + missed) or missed <= 0:
         return None
     parts = {Part.WAKEUP: wakeup, Part.EXCHANGE: exchange, Part.COMPUTE: compute}
-    # As many cycles as skip ticks are slow.
-    slow = {part: found.p99 if missed > 0.01 * cycles else found.p999 for part, found in parts.items()}
+    # As many cycles are slow as skip ticks.
+    slow = {part: values.p99 if missed > 0.01 * cycles else values.p999 for part, values in parts.items()}
     worst = max(slow, key=slow.__getitem__)
-    # The others as usual: two parts are seldom slow in the same cycle. A wake-up must come within half a period.
-    needed_us = slow[worst] + sum(found.p50 for part, found in parts.items() if part is not worst)
+    # The other parts at their median: two are seldom slow in the same cycle. A wake-up must come within half a period.
+    needed_us = slow[worst] + sum(values.p50 for part, values in parts.items() if part is not worst)
     needed_us = max(needed_us * _MARGIN, 2 * slow[Part.WAKEUP], period_us + 1)
     suggested = math.ceil(needed_us / _PERIOD_STEP_US) * _PERIOD_STEP_US
     return SkippedTicks(missed, cycles, period_us, worst, slow[worst], suggested)

@@ -1,7 +1,7 @@
-"""What becomes of a ROS command: without ROS types, on asyncio, over the public API.
+"""Execution of ROS commands: without ROS types, on asyncio, over the public API.
 
-One motion is under way at a time, and a new one replaces it. What is refused raises RtcpError with the reason, which
-the skin gives to the caller and writes into the log.
+One motion runs at a time, and a new one replaces it. A refused command raises RtcpError with the reason, which the
+layer of ROS 1 or ROS 2 returns to the caller and logs.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ from rtcp.ros.held_up import HeldUp
 Numbers = Sequence[float]
 _NEEDS_RESET = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT)
 _PAUSE_S = 1.0
-"""After such a pause a joint_command begins a new stream, whose times begin anew."""
+"""Pause after which a joint_command begins a new stream with new times."""
 _REPEAT_S = 0.1
-"""A target is sent again after so long: the platform takes 0.2 s without one for the end of a stream."""
-_LOOK_S = 0.05
-_THERE_RAD = 1e-6
+"""Interval of repeated targets: the platform ends a stream after 0.2 s without one."""
+_POLL_S = 0.05
+_ARRIVED_RAD = 1e-6
+"""Largest distance of a joint from its target on arrival."""
 _RAN_OUT = ("out_of_points", "not_open")
-"""An open trajectory that came to rest at its last point."""
+"""Ends of an open trajectory that came to rest at its last point."""
 _LATEST_S = 0.5
-"""Largest age of a trajectory's stamp: what is later would run on as planned for then."""
+"""Upper bound on the age of a trajectory's stamp, s."""
 _LONGEST_WAIT_S = 60.0
-"""Longest wait for the stamp of a trajectory."""
+"""Longest wait for the stamp of a trajectory, s."""
 START_RAD = 0.01
-"""Largest distance of a trajectory's first point from where the arm is commanded; MoveIt allows as much."""
+"""Largest distance of a trajectory's first point from the commanded position; MoveIt allows as much."""
 GOAL_RAD = 0.01
-"""Default tolerance of a goal, that of the reference client; on the way the platform supervises the drives."""
+"""Default goal tolerance, that of the reference client; during the motion the platform supervises the drives."""
 
 
 @dataclass(frozen=True)
 class TrajectoryPoint:
-    """trajectory_msgs/JointTrajectoryPoint; rad, rad/s, rad/s^2, one number a joint; what is empty is not given."""
+    """trajectory_msgs/JointTrajectoryPoint; rad, rad/s, rad/s^2, a number for each joint; empty: not specified."""
 
     time_s: float
     positions: Numbers
@@ -56,7 +57,7 @@ class Trajectory:
     joint_names: Sequence[str]
     points: Sequence[TrajectoryPoint]
     begin_s: float = 0.0
-    """When time 0 of the points is, s since 1970; 0: at once."""
+    """Instant of time 0 of the points, s since 1970; 0: at once."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Tolerance:
 
 
 class FollowCode(IntEnum):
-    """How a FollowJointTrajectory ended (control_msgs)."""
+    """Error code of a FollowJointTrajectory (control_msgs)."""
 
     SUCCESSFUL = 0
     INVALID_GOAL = -1
@@ -88,12 +89,12 @@ _CODES = {
     "goal_tolerance_violated": FollowCode.GOAL_TOLERANCE_VIOLATED,
     "goal_time_exceeded": FollowCode.GOAL_TOLERANCE_VIOLATED,
 }
-"""By the reason of an RtcpError; any other is an invalid goal where nothing had begun."""
+"""Reason of an RtcpError -> code; any other reason is an invalid goal if the motion had not begun."""
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What a FollowJointTrajectory goal allows; `goal_time_s`: 0 is the robot's default."""
+    """Tolerances of a FollowJointTrajectory goal; `goal_time_s`: 0 is the robot's default."""
 
     path: Sequence[Tolerance] = ()
     goal: Sequence[Tolerance] = ()
@@ -105,70 +106,70 @@ Connect = Callable[[], contextlib.AbstractAsyncContextManager[AsyncRobot]]
 
 @dataclass(frozen=True)
 class CommandOptions:
-    """How the commands are taken."""
+    """Options of the commands."""
 
     enables: bool = False
-    """A motion enables the drives; not after an emergency stop, a fault, or robot_disable."""
+    """Whether a motion enables the drives; not after an emergency stop, a fault, or robot_disable."""
     allows_partial: bool = False
-    """Joints that a trajectory does not name hold their position."""
+    """Whether joints that a trajectory does not name hold their position."""
     buffer_s: float = 0.0
-    """joint_command is executed so much later than it came, by a trajectory through the points; 0: each replaces."""
+    """Delay of joint_command, executed as a trajectory through the points, s; 0: each replaces the last."""
 
 
 class Commander:
-    """Carries out what ROS asks for.
+    """Executes ROS commands.
 
     Args:
-        connect: connects to the platform; a connection that is lost is made anew with the next command.
-        options: how commands are taken.
-        log: takes the outcome of a motion that nobody waits for, a sentence.
+        connect: connects to the platform; after a loss again with the next command.
+        options: options of the commands.
+        log: receives a sentence on the outcome of a motion that no caller waits for.
     """
 
     def __init__(self, connect: Connect, options: CommandOptions, log: Callable[[str], None]) -> None:
         self._connect, self._options, self._log = connect, options, log
         self._robot: AsyncRobot | None = None
         self._status: Status | None = None
-        """The last one of this connection."""
+        """Last status of this connection."""
         self._closing = contextlib.AsyncExitStack()
         self._connecting = asyncio.Lock()
         self._motions: set[asyncio.Task[Arrival]] = set()
-        self._asked = self._barrier = 0
-        """Trajectories, stops and streams that were asked for; of those before the barrier none begins any more."""
+        self._requests = self._barrier = 0
+        """Number of requested trajectories, stops and streams; requests before the barrier are cancelled."""
         self._disabled = 0
-        """How often robot_disable was called: an enabling under way gives way to it."""
+        """Number of robot_disable calls: each aborts an enabling in progress."""
         self._may_enable = True
         self._points = _Points(self, options.buffer_s, log)
         self._held_up = HeldUp(self._was_held_up)
-        self._looking = asyncio.get_running_loop().create_task(self._look())
+        self._polling = asyncio.get_running_loop().create_task(self._poll())
 
     @property
     def is_moving(self) -> bool:
-        """Whether something that was asked for here is under way."""
+        """Whether a motion requested here is in progress."""
         return bool(self._motions) or self._points.are_followed
 
     async def close(self) -> None:
-        """Close the connection: what it moves comes to a controlled stop."""
-        self._looking.cancel()
+        """Close the connection: its motion comes to a controlled stop."""
+        self._polling.cancel()
         self._robot = None
         await self._closing.aclose()
 
     def note_stop(self) -> None:
-        """An emergency stop or a fault was seen: only `enable` enables after it."""
+        """Record an emergency stop or a fault: from now on only `enable` enables the drives."""
         self._may_enable = False
         self._bar()
 
     def _bar(self) -> None:
-        """End what was asked for and has not begun."""
-        self._asked = self._barrier = self._asked + 1
+        """Cancel requests that have not begun."""
+        self._requests = self._barrier = self._requests + 1
 
     def _require_newest(self, number: int, robot: AsyncRobot) -> None:
         if number < self._barrier or not robot.is_open:
             raise refusal("superseded", "another command, a stop or the end of the platform came before it began")
 
-    async def _look(self) -> None:
+    async def _poll(self) -> None:
         while True:
-            self._held_up.look()
-            await asyncio.sleep(_LOOK_S)
+            self._held_up.check()
+            await asyncio.sleep(_POLL_S)
 
     def _was_held_up(self, gap_s: float) -> None:
         self._bar()
@@ -176,7 +177,7 @@ class Commander:
         self._log(f"this node did not run for {gap_s:.1f} s: commands of that time are refused")
 
     def is_timely(self) -> bool:
-        """Whether a command that comes now did not wait while this process did not run."""
+        """Whether a command received now is not delayed by a stall of this process."""
         return self._held_up.is_timely()
 
     def _require_timely(self) -> None:
@@ -186,7 +187,7 @@ class Commander:
     # -- motions ------------------------------------------------------------------------------------------------------
 
     async def begin_trajectory(self, trajectory: Trajectory) -> None:
-        """joint_path_command: begin it, in place of what is under way; return when it is accepted.
+        """joint_path_command: begin a trajectory, which replaces the present motion; return when it is accepted.
 
         A trajectory without points stops the motion.
         """
@@ -206,15 +207,15 @@ class Commander:
     async def follow(
         self, trajectory: Trajectory, tolerances: Tolerances, accepted: Callable[[], None]
     ) -> tuple[FollowCode, str]:
-        """FollowJointTrajectory: run it and return how it ended. Cancelled, the arm brakes on the path.
+        """FollowJointTrajectory: run it; return its code and message. When cancelled, the arm brakes on its path.
 
         Args:
             trajectory: with at least one point.
-            tolerances: what the goal allows.
-            accepted: called when it is.
+            tolerances: tolerances of the goal.
+            accepted: called when the goal is accepted.
 
         Raises:
-            RtcpError: it was begun and ended before its end, for a reason that no code says.
+            RtcpError: it ended early, for a reason without a code.
         """
         has_begun = False
 
@@ -233,9 +234,9 @@ class Commander:
         return FollowCode.SUCCESSFUL, f"there, largest error {arrival.error:.6f} rad"
 
     async def command_point(self, point: TrajectoryPoint) -> None:
-        """joint_command: the joints, base to tool, go there in place of what is under way; at any rate.
+        """joint_command: move the joints, base to tool, to a point, which replaces the present motion; at any rate.
 
-        A point with a time that is not after the one before is dropped, unless a second has passed since.
+        A point whose time does not follow that of the last one is dropped, unless that one came over a second ago.
         """
         await self._points.take(point)
 
@@ -250,7 +251,7 @@ class Commander:
         await self._points.take(TrajectoryPoint(time_s, ordered["q"], ordered.get("v", ()), ordered.get("a", ())))
 
     async def stop(self) -> None:
-        """stop_motion: stop whatever moves, or waits for its stamp; return when the arm holds."""
+        """stop_motion: stop any motion, also one that waits for its stamp; return when the arm holds."""
         self._bar()
         self._points.end()
         robot = await self.connected()
@@ -263,8 +264,8 @@ class Commander:
         self._require_timely()
         before, robot = self._disabled, await self.connected()
         if (await robot.status()).state in _NEEDS_RESET:
-            left = await robot.reset()
-            if left is State.STOPPED_BY_LIMIT:
+            former = await robot.reset()
+            if former is State.STOPPED_BY_LIMIT:
                 return "the arm holds again"
         state = (await robot.status()).state
         if self._disabled != before:
@@ -275,18 +276,18 @@ class Commander:
         return "the drives are enabled"
 
     async def set_speed_override(self, fraction: float) -> None:
-        """speed_override: move at a fraction of the speed from now on, also what is under way."""
+        """speed_override: scale the speed of the present and all later motions."""
         await (await self.connected()).set_speed_override(fraction)
 
     async def set_outputs(self, values: Iterable[tuple[str, str, float]]) -> None:
-        """Set outputs, each by slave, name and value, in this order; the first that is refused ends it."""
+        """Set outputs (slave, name, value), in this order, up to the first refusal."""
         self._require_timely()
         robot = await self.connected()
         for slave, name, value in values:
             await robot.set_output(f"{slave}.{name}", float(value))
 
     async def disable(self) -> str:
-        """robot_disable: stop, remove the torque; return a sentence."""
+        """robot_disable: stop the arm and remove the torque; return a sentence."""
         self._may_enable = False
         self._disabled += 1
         self._bar()
@@ -295,13 +296,13 @@ class Commander:
         await robot.disable()
         return "the drives are disabled"
 
-    # -- the way there ------------------------------------------------------------------------------------------------
+    # -- execution ----------------------------------------------------------------------------------------------------
 
     async def _begin(
         self, trajectory: Trajectory, tolerances: Tolerances | None, accepted: Callable[[], None]
     ) -> asyncio.Task[Arrival]:
         self._require_timely()
-        self._asked = number = self._asked + 1
+        self._requests = number = self._requests + 1
         if not trajectory.points:
             raise refusal("no_points", "the trajectory has no points")
         robot = await self.connected()
@@ -341,24 +342,24 @@ class Commander:
         return motion
 
     async def end_motions(self) -> None:
-        """Stop the trajectory under way along its path; one that waits for its stamp does not begin."""
+        """Stop the present trajectory on its path; one that waits for its stamp does not begin."""
         self._bar()
         if self._motions:
             await (await self.connected()).halt()
             await asyncio.gather(*self._motions, return_exceptions=True)
 
     async def _known(self) -> Status:
-        """Return a status, which may be old: for the names of the joints."""
+        """Return a status, which may be old, for the names of the joints."""
         robot = await self.connected()
         if self._status is None:
             self._status = await robot.status()
         return self._status
 
     async def enabled(self) -> Status:
-        """Return a status, which may be old, the drives enabled where that is asked for and allowed."""
+        """Enable the drives where requested and allowed; return a status, which may be old."""
         robot = await self.connected()
         if not (self._options.enables or self._options.allows_partial):
-            return await self._known()  # a request less before a motion
+            return await self._known()  # saves a request before a motion
         status = self._status = await robot.status()
         if status.state is State.READY and self._options.enables:
             if not self._may_enable:
@@ -369,10 +370,10 @@ class Commander:
         return status
 
     async def connected(self) -> AsyncRobot:
-        """Return the connection to the platform, made anew where it was lost."""
+        """Return the connection to the platform; connect again where it was lost."""
         async with self._connecting:
             if self._robot is None or not self._robot.is_open:
-                await self._closing.aclose()  # a connection that was lost
+                await self._closing.aclose()  # the lost connection
                 self._robot, self._status = await self._closing.enter_async_context(self._connect()), None
             return self._robot
 
@@ -383,42 +384,42 @@ class Commander:
 
 
 class _Points:
-    """joint_command: each a setpoint of a stream, or, buffered, a point of an open trajectory.
+    """joint_command: a setpoint of a stream, or, buffered, a point of an open trajectory.
 
-    A stream that something else has ended (a stop, a trajectory, a target out of range) stays ended until its sender
-    pauses for `_PAUSE_S`: nobody who just goes on sending starts the arm again.
+    A stream that was ended by a stop, a trajectory or a target out of range stays ended until its sender pauses for
+    `_PAUSE_S`: continued sending does not restart the arm.
     """
 
     def __init__(self, commander: Commander, buffer_s: float, log: Callable[[str], None]) -> None:
         self._commander, self._buffer_s, self._log = commander, buffer_s, log
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
         self._stream: Stream | None = None
         self._attending: asyncio.Task[None] | None = None
         self.status: Status | None = None
-        """Of the robot when the stream began; None: there is none."""
+        """Status of the robot at the begin of the stream; None: no stream."""
         self._has_ended = False
         self._newest: TrajectoryPoint | None = None
         self._last_s = 0.0
-        """Time of the last point, on its sender's clock."""
+        """Time of the last point on its sender's clock, s."""
         self._is_dropping = False
-        """Whether points are dropped, whose times do not rise; it is logged once."""
+        """Whether points are being dropped because their times do not rise; logged once."""
         self._came_s = self._before_s = -math.inf
-        """When it came, and the one before."""
+        """Arrival of the last point and of the one before, s."""
         self._sent_s = 0.0
         self._anchor_s: float | None = None
-        """Our clock less the sender's; None: to be found with the next point."""
+        """Local clock minus the sender's, s; None: determined with the next point."""
         self._began_s = 0.0
-        """Time 0 of the open trajectory."""
+        """Time 0 of the open trajectory, local clock, s."""
 
     @property
     def are_followed(self) -> bool:
-        """Whether the arm is on its way to one."""
+        """Whether the arm follows the points."""
         lasts_s = self._buffer_s + _PAUSE_S if self._buffer_s else math.inf
         return self.status is not None and time.monotonic() - self._came_s < lasts_s
 
     @property
     def target(self) -> Numbers | None:
-        """The newest target while the arm follows them, rad."""
+        """Newest target while the arm follows the points, rad."""
         return self._newest.positions if self.status is not None and self._newest is not None else None
 
     def end(self) -> None:
@@ -434,10 +435,14 @@ class _Points:
         self._stream = self.status = self._attending = None
 
     async def take(self, point: TrajectoryPoint) -> None:
-        """Follow a point; while the stream is being opened the newest counts."""
+        """Send a point to the platform; of points that arrive while the stream is being opened only the last is sent.
+
+        Raises:
+            RtcpError: the point or the stream is refused.
+        """
         now = time.monotonic()
         if not self._commander.is_timely():
-            self._came_s = now  # the pause that makes a new beginning counts from here
+            self._came_s = now  # the pause before a new stream counts from here
             return
         is_first = now - self._came_s > _PAUSE_S
         self._before_s, self._came_s = self._came_s, now
@@ -447,31 +452,31 @@ class _Points:
             return
         if point.time_s > 0.0 and not is_first and point.time_s <= self._last_s:
             if self._is_dropping:
-                return  # said once
+                return  # logged once
             self._is_dropping = True
             message = f"its time {point.time_s:g} s is not after {self._last_s:g} s: dropped"
             raise refusal("point_in_the_past", message)
         self._last_s, self._is_dropping = point.time_s, False
-        for what, values in vars(point).items():
-            if what != "time_s" and not all(map(math.isfinite, values)):
-                raise refusal("not_finite", f"{what} has a number that is not finite: dropped")
+        for field_name, values in vars(point).items():
+            if field_name != "time_s" and not all(map(math.isfinite, values)):
+                raise refusal("not_finite", f"{field_name} has a number that is not finite: dropped")
         self._newest = point
         try:
             if self._buffer_s:
-                async with self._turn:
+                async with self._lock:
                     if not self._has_ended:
                         await self._append(point)
             elif self._stream is not None:
                 await self._send(self._stream, point)
-            elif not self._turn.locked():  # else whoever opens the stream sends the newest
-                async with self._turn:
+            elif not self._lock.locked():  # else the task that opens the stream sends the newest
+                async with self._lock:
                     await self._open()
         except RtcpError:
             self.end()
             raise
 
     def _stamp(self, point: TrajectoryPoint) -> float:
-        """Return the instant of a point on our clock: its sender's times tell more than when they came."""
+        """Return the instant of a point on the local clock: the sender's times are better than the arrival times."""
         if self._anchor_s is None:
             self._anchor_s = time.monotonic() - point.time_s
         return time.monotonic() if point.time_s == 0.0 else self._anchor_s + point.time_s
@@ -497,7 +502,7 @@ class _Points:
         await self._send(stream, self._newest)
 
     async def _send(self, stream: Stream, point: TrajectoryPoint, rests: bool = False) -> None:
-        # At a low rate the arm has to rest at a target: how long it would keep the speed nobody knows.
+        # At a low rate the arm has to rest at a target: the duration of its speed is unknown.
         has_speed = point.velocities and self._came_s - self._before_s < _REPEAT_S and not rests
         velocity = (0.0,) * len(point.positions) if rests else point.velocities if has_speed else None
         stamp = None if rests else self._stamp(point)
@@ -507,28 +512,28 @@ class _Points:
         except RtcpError as error:
             if error.reason != "stream_ended":
                 raise
-            # Nobody has stopped the arm: this process was held up for too long. It goes on as after a pause.
+            # No stop, but a stall of this process: continue as after a pause.
             self._log("joint_command: no setpoint reached the platform for 0.2 s: the stream is opened again")
             stream.close()
             self._stream = self._anchor_s = None
-            if not self._turn.locked():
-                async with self._turn:
+            if not self._lock.locked():
+                async with self._lock:
                     await self._open()
 
     async def _attend(self, robot: AsyncRobot) -> None:
         """Keep the stream open until the arm is at its last point."""
         while (stream := self._stream) is not None and (point := self._newest) is not None:
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_POLL_S)
             if time.monotonic() - self._sent_s < _REPEAT_S:
                 continue
             try:
                 if time.monotonic() - self._came_s > _PAUSE_S:
                     commanded = (await robot.status()).commanded_positions
-                    if max(abs(a - b) for a, b in zip(commanded, point.positions, strict=True)) < _THERE_RAD:
+                    if max(abs(a - b) for a, b in zip(commanded, point.positions, strict=True)) < _ARRIVED_RAD:
                         self._close()
                         return
                 if self._newest is not point or self._stream is not stream:
-                    continue  # a newer one came meanwhile
+                    continue  # a newer point came meanwhile
                 self._anchor_s = None
                 await self._send(stream, point, rests=True)
             except RtcpError as error:
@@ -540,14 +545,14 @@ class _Points:
 
     async def _append(self, point: TrajectoryPoint) -> None:
         robot = await self._commander.connected()
-        made: dict[str, Any] = {"q": list(point.positions)}
+        row: dict[str, Any] = {"q": list(point.positions)}
         if point.velocities:
-            made["v"] = list(point.velocities)
+            row["v"] = list(point.velocities)
             if point.accelerations:
-                made["a"] = list(point.accelerations)
+                row["a"] = list(point.accelerations)
         if self.status is not None:
             try:
-                await robot.append([made | {"t": self._stamp(point) - self._began_s}])
+                await robot.append([row | {"t": self._stamp(point) - self._began_s}])
             except RtcpError as error:
                 if self._has_ended:
                     return
@@ -560,15 +565,15 @@ class _Points:
                 return
             self.status = status
             self._began_s = self._stamp(point) - self._buffer_s
-            await robot.open_trajectory([made | {"t": self._buffer_s}], replace=True)
+            await robot.open_trajectory([row | {"t": self._buffer_s}], replace=True)
 
 
 def points_of(
-    trajectory: Trajectory, status: Status, allows_partial: bool = False, held: Numbers | None = None
+    trajectory: Trajectory, status: Status, allows_partial: bool = False, hold_at: Numbers | None = None
 ) -> list[dict[str, Any]]:
-    """Return the points in the robot's order of joints, as `Robot.run_trajectory` takes them; it checks the values.
+    """Return the points in the robot's order of joints, for `Robot.run_trajectory`, which checks the values.
 
-    `held`: where joints that are not named hold, rad; None: where they are commanded.
+    `hold_at`: positions of joints that are not named, rad; None: the commanded ones.
 
     Raises:
         RtcpError: `refused`; reasons too_many_points, unknown_joint, missing_joint, wrong_count.
@@ -577,57 +582,57 @@ def points_of(
         raise refusal(
             "too_many_points", f"the trajectory has {len(trajectory.points)} points, at most {MOST_POINTS} are allowed"
         )
-    given, names = list(trajectory.joint_names), status.joint_names
-    if unknown := [name for name in given if name not in names or given.count(name) > 1]:
+    given_names, names = list(trajectory.joint_names), status.joint_names
+    if unknown := [name for name in given_names if name not in names or given_names.count(name) > 1]:
         raise refusal(
             "unknown_joint", f"joint {unknown[0]!r} is unknown or named twice: the robot has {', '.join(names)}"
         )
-    if (missing := [name for name in names if name not in given]) and not (allows_partial and given):
+    if (missing := [name for name in names if name not in given_names]) and not (allows_partial and given_names):
         raise refusal("missing_joint", f"joint {missing[0]!r} is missing: name all of {', '.join(names)}")
-    place = [given.index(name) if name in given else None for name in names]
+    place = [given_names.index(name) if name in given_names else None for name in names]
 
-    def ordered(number: int, what: str, values: Numbers, others: Numbers) -> list[float]:
-        if len(values) != len(given):
-            message = f"point {number} has {len(values)} {what}, its trajectory names {len(given)} joints"
+    def ordered(number: int, field_name: str, values: Numbers, defaults: Numbers) -> list[float]:
+        if len(values) != len(given_names):
+            message = f"point {number} has {len(values)} {field_name}, its trajectory names {len(given_names)} joints"
             raise refusal("wrong_count", message)
-        return [other if at is None else float(values[at]) for at, other in zip(place, others, strict=True)]
+        return [default if at is None else float(values[at]) for at, default in zip(place, defaults, strict=True)]
 
-    holds, rests = status.commanded_positions if held is None else held, [0.0] * len(names)
+    holds, rests = status.commanded_positions if hold_at is None else hold_at, [0.0] * len(names)
     has_velocities = all(point.velocities for point in trajectory.points)
     has_accelerations = has_velocities and all(point.accelerations for point in trajectory.points)
     points = []
     for number, point in enumerate(trajectory.points, 1):
-        made: dict[str, Any] = {"t": point.time_s, "q": ordered(number, "positions", point.positions, holds)}
+        row: dict[str, Any] = {"t": point.time_s, "q": ordered(number, "positions", point.positions, holds)}
         if has_velocities:
-            made["v"] = ordered(number, "velocities", point.velocities, rests)
+            row["v"] = ordered(number, "velocities", point.velocities, rests)
         if has_accelerations:
-            made["a"] = ordered(number, "accelerations", point.accelerations, rests)
-        points.append(made)
+            row["a"] = ordered(number, "accelerations", point.accelerations, rests)
+        points.append(row)
     return points
 
 
 def tolerances_of(tolerances: Tolerances, names: Sequence[str]) -> dict[str, Any]:
-    """Return them as `Robot.run_trajectory` takes them: one number a joint, rad, 0: none.
+    """Return the tolerances for `Robot.run_trajectory`: a number for each joint, rad, 0: none.
 
     Raises:
         RtcpError: `refused`; reasons unknown_joint, unsupported_tolerance.
     """
 
-    def numbers(given: Sequence[Tolerance], default: float) -> list[float]:
-        found = dict.fromkeys(names, default)
-        for one in given:
-            if one.name not in found:
+    def numbers(tolerances: Sequence[Tolerance], default: float) -> list[float]:
+        values = dict.fromkeys(names, default)
+        for joint in tolerances:
+            if joint.name not in values:
                 raise refusal(
-                    "unknown_joint", f"a tolerance names joint {one.name!r}: the robot has {', '.join(names)}"
+                    "unknown_joint", f"a tolerance names joint {joint.name!r}: the robot has {', '.join(names)}"
                 )
-            if one.velocity > 0.0 or one.acceleration > 0.0:
-                message = f"the tolerance of {one.name} has a velocity or acceleration: only positions are supervised"
+            if joint.velocity > 0.0 or joint.acceleration > 0.0:
+                message = f"the tolerance of {joint.name} has a velocity or acceleration: only positions are supervised"
                 raise refusal("unsupported_tolerance", message)
-            if not math.isfinite(one.position):
-                raise refusal("not_finite", f"the tolerance of {one.name} is {one.position}: a number is needed")
-            if one.position:
-                found[one.name] = max(one.position, 0.0)
-        return list(found.values())
+            if not math.isfinite(joint.position):
+                raise refusal("not_finite", f"the tolerance of {joint.name} is {joint.position}: a number is needed")
+            if joint.position:
+                values[joint.name] = max(joint.position, 0.0)
+        return list(values.values())
 
     return {
         "path_tolerance": numbers(tolerances.path, 0.0),
@@ -637,5 +642,5 @@ def tolerances_of(tolerances: Tolerances, names: Sequence[str]) -> dict[str, Any
 
 
 def refusal(reason: str, message: str) -> RtcpError:
-    """Return the error of a command that is refused here."""
+    """Return the error of a command that this module refuses."""
     return RtcpError("refused", message, reason)

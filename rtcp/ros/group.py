@@ -1,7 +1,7 @@
 """All arms of a cell as one group of joints for ROS: `left_joint_1` and so on, in the order of the cell's file.
 
-`GroupRobot` is to `rtcp.ros.commands.Commander` what a connection to one arm is; its motions are in step.
-`GroupStates` makes one sample and one status of those of the arms. The URDF has all arms on one world.
+`rtcp.ros.commands.Commander` uses `GroupRobot` in place of a connection to one arm; its motions are in step.
+`GroupStates` merges the joint samples and the statuses of the arms. The URDF has all arms on one link `world`.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus,
 T = TypeVar("T")
 Numbers = Sequence[float]
 _STALE_NS: Final = 500_000_000
+"""Age at which a sample of an arm is left out, ns."""
 _WORST = (
     State.EMERGENCY_STOP, State.FAULT, State.RESETTING, State.STARTING, State.CLOSING, State.OFF,
     State.STOPPED_BY_LIMIT, State.DISABLING, State.READY, State.ENABLING, State.STOPPING, State.HOMING, State.MOVING,
@@ -43,12 +44,12 @@ _WORST = (
 
 
 def joint_names(cell: CellConfig) -> tuple[str, ...]:
-    """Return the names of all joints: those of an arm behind the arm's."""
+    """Return the names of all joints, each with its arm's name as prefix."""
     return tuple(f"{arm.name}_{joint.name}" for arm in cell.arms for joint in arm.config.joints)
 
 
 def group_urdf(cell: CellConfig) -> str:
-    """Return all arms whose geometry is known as one URDF document, the arm's name before those of links and joints."""
+    """Return one URDF document of all arms with known geometry; links and joints have the arm's name as prefix."""
     robot = ET.Element("robot", name=cell.name)
     ET.SubElement(robot, "link", name="world")
     for arm in cell.arms:
@@ -79,7 +80,7 @@ def group_urdf(cell: CellConfig) -> str:
 
 @dataclass(frozen=True)
 class GroupStatus:
-    """What a commander looks at: the worst state, and the joints of all arms."""
+    """Status of the group: the worst state of an arm, and the joints of all, rad."""
 
     state: State
     joint_names: tuple[str, ...]
@@ -90,8 +91,8 @@ class GroupStream:
     """A stream of all joints in step; methods as of `Stream`.
 
     Args:
-        stream: of the arms.
-        counts: of the joints of each.
+        stream: streams of the arms.
+        counts: number of joints of each arm.
     """
 
     def __init__(self, stream: CellStream, counts: Mapping[str, int]) -> None:
@@ -115,12 +116,12 @@ class GroupStream:
 
 
 def split(numbers: Numbers, counts: Mapping[str, int]) -> dict[str, list[float]]:
-    """Return the numbers of each arm."""
-    found, at = {}, 0
+    """Return each arm's part of `numbers`; `counts`: number of joints of each arm."""
+    parts, at = {}, 0
     for name, count in counts.items():
-        found[name] = list(numbers[at : at + count])
+        parts[name] = list(numbers[at : at + count])
         at += count
-    return found
+    return parts
 
 
 class GroupRobot:
@@ -159,15 +160,17 @@ class GroupRobot:
 
     @property
     def is_open(self) -> bool:
-        """Whether all connections stand."""
+        """Whether all connections are open."""
         return all(robot.is_open for robot in self._arms.values())
 
     async def status(self) -> GroupStatus:
         """Return the worst state, and where all joints are commanded."""
-        found = await self._all(AsyncRobot.status)
-        states = {one.state for one in found.values()}
-        state = next(one for one in _WORST if one in states)
-        return GroupStatus(state, self._names, tuple(q for one in found.values() for q in one.commanded_positions))
+        statuses = await self._all(AsyncRobot.status)
+        states = {status.state for status in statuses.values()}
+        state = next(state for state in _WORST if state in states)
+        return GroupStatus(
+            state, self._names, tuple(q for status in statuses.values() for q in status.commanded_positions)
+        )
 
     async def enable(self) -> None:
         """Enable the arms that are ready."""
@@ -179,11 +182,11 @@ class GroupRobot:
 
     async def reset(self) -> State:
         """Leave the faults of all arms; return the worst state that was left."""
-        left = await self._all(AsyncRobot.reset)
-        return next(one for one in _WORST if one in left.values())
+        states = await self._all(AsyncRobot.reset)
+        return next(state for state in _WORST if state in states.values())
 
     async def set_speed_override(self, fraction: float) -> None:
-        """Set it of all arms; below 1 motions in step are refused."""
+        """Set the speed override of all arms; below 1 motions in step are refused."""
         await self._all(lambda robot: robot.set_speed_override(fraction))
 
     async def set_output(self, output: str, value: float) -> None:
@@ -192,7 +195,8 @@ class GroupRobot:
             if output.startswith(f"{name}_"):
                 await robot.set_output(output.removeprefix(f"{name}_"), value)
                 return
-        text = f"name: found {output!r}, allowed is the name of an output behind one of {', '.join(self._arms)} and _"
+        allowed = " or ".join(f"{name}_OUTPUT" for name in self._arms)
+        text = f"name: found {output!r}, allowed is {allowed}, with the name of an output"
         raise RtcpError("invalid", text, "unknown_terminal", {"name": output})
 
     async def halt(self) -> None:
@@ -212,44 +216,45 @@ class GroupRobot:
         """Run a trajectory of all joints in step; a motion under way is stopped first.
 
         Raises:
-            RtcpError: as `Cell.run_trajectory`; `refused`, unsupported_tolerance: of the path, which no arm supervises
-                in step.
+            RtcpError: as `Cell.run_trajectory`; `refused`, unsupported_tolerance: a path tolerance, which arms in step
+                do not supervise.
         """
         if any(path_tolerance):
-            raise RtcpError("refused", "a motion in step has no tolerance of its path", "unsupported_tolerance")
+            message = "a path tolerance is not supervised in motions in step: leave it out"
+            raise RtcpError("refused", message, "unsupported_tolerance")
         status = await self.status()
         if status.state in (State.MOVING, State.STOPPING):
             await self.halt()
             status = await self.status()
         here = status.commanded_positions
-        given = [dict(point) for point in points]
-        first = given[0]
+        copies = [dict(point) for point in points]
+        first = copies[0]
         if first["t"] > 0.0:
-            # Every arm begins at time 0, where it stands.
+            # Every arm begins at time 0 at its present position.
             at_rest: dict[str, Any] = {key: [0.0] * len(here) for key in ("v", "a") if key in first}
-            given.insert(0, {"t": 0.0, "q": list(here), **at_rest})
+            copies.insert(0, {"t": 0.0, "q": list(here), **at_rest})
         elif max(abs(a - b) for a, b in zip(first["q"], here, strict=True)) <= start_tolerance:
             first["q"] = list(here)
-        targets = [{"arm": name, "points": some} for name, some in self._by_arm(given).items()]
+        targets = [{"arm": name, "points": rows} for name, rows in self._by_arm(copies).items()]
         robot, asked_ns = next(iter(self._arms.values())), time.monotonic_ns()
         plan = StepPlan.from_json(await robot.command("plan_in_step", targets=targets), asked_ns)
         motion = time.monotonic_ns()
         accepted: set[str] = set()
 
         async def run(name: str) -> Arrival:
-            def report(found: Progress) -> None:
-                if found.accepted and name not in accepted:
+            def report(arm_progress: Progress) -> None:
+                if arm_progress.accepted and name not in accepted:
                     accepted.add(name)
                     if len(accepted) == len(self._arms) and progress is not None:
-                        progress(found)
+                        progress(arm_progress)
 
             fields = plan.fields_of(name, motion)
             return result(Arrival, await self._arms[name].command("run_in_step", report, **fields))
 
         arrived = await _gather({name: run(name) for name in self._arms})
-        positions = tuple(q for one in arrived.values() for q in one.positions)
-        largest = max(one.error for one in arrived.values())
-        ends = given[-1]["q"]
+        positions = tuple(q for arrival in arrived.values() for q in arrival.positions)
+        largest = max(arrival.error for arrival in arrived.values())
+        ends = copies[-1]["q"]
         for i, (name, allowed) in enumerate(zip(self._names, goal_tolerance, strict=False)):
             if allowed and abs(positions[i] - ends[i]) > allowed:
                 fields = {"axis": i, "error": abs(positions[i] - ends[i]), "limit": allowed}
@@ -261,18 +266,15 @@ class GroupRobot:
         """Begin a stream of all joints in step."""
         motion = time.monotonic_ns()
 
-        async def open_one(name: str) -> Stream:
-            partners = [other for other in self._arms if other != name]
-            found = await self._arms[name].command("open_stream", motion=motion, partners=partners)
-            return Stream.from_json(found)
-
         opened: dict[str, Stream] = {}
 
-        async def keep(name: str) -> None:
-            opened[name] = await open_one(name)
+        async def open_arm(name: str) -> None:
+            partners = [partner for partner in self._arms if partner != name]
+            answer = await self._arms[name].command("open_stream", motion=motion, partners=partners)
+            opened[name] = Stream.from_json(answer)
 
         try:
-            await _gather({name: keep(name) for name in self._arms})
+            await _gather({name: open_arm(name) for name in self._arms})
         except BaseException:
             for stream in opened.values():
                 stream.close()
@@ -280,7 +282,7 @@ class GroupRobot:
         return GroupStream(CellStream({name: opened[name] for name in self._arms}), self._counts)
 
     async def open_trajectory(self, points: Sequence[Mapping[str, Any]], replace: bool = False) -> None:
-        """Refuse: a trajectory in step is planned whole."""
+        """Refuse: a trajectory in step is planned as a whole."""
         raise RtcpError("refused", "a cell takes no open trajectories: leave --buffer out", "unsupported")
 
     async def append(self, points: Sequence[Mapping[str, Any]]) -> None:
@@ -288,12 +290,12 @@ class GroupRobot:
         await self.open_trajectory(points)
 
     def _by_arm(self, points: Sequence[Mapping[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-        found: dict[str, list[dict[str, Any]]] = {name: [] for name in self._counts}
+        by_arm: dict[str, list[dict[str, Any]]] = {name: [] for name in self._counts}
         for point in points:
             parts = {key: split(point[key], self._counts) for key in ("q", "v", "a") if key in point}
-            for name, some in found.items():
-                some.append({"t": point["t"], **{key: part[name] for key, part in parts.items()}})
-        return found
+            for name, of_arm in by_arm.items():
+                of_arm.append({"t": point["t"], **{key: part[name] for key, part in parts.items()}})
+        return by_arm
 
     async def _all(self, call: Callable[[AsyncRobot], Coroutine[Any, Any, T]]) -> dict[str, T]:
         return await _gather({name: call(robot) for name, robot in self._arms.items()})
@@ -305,7 +307,7 @@ async def _enable(robot: AsyncRobot) -> None:
 
 
 async def _gather(calls: Mapping[str, Coroutine[Any, Any, T]]) -> dict[str, T]:
-    """Await all; raise the error that says most, with the arm's name, when all have ended. Cancelled, all are."""
+    """Await all calls. Then raise the most telling error, if any, with its arm's name; a cancellation cancels all."""
     tasks = {name: asyncio.ensure_future(call) for name, call in calls.items()}
     try:
         if tasks:
@@ -325,14 +327,14 @@ async def _gather(calls: Mapping[str, Coroutine[Any, Any, T]]) -> dict[str, T]:
 
 
 class GroupStates:
-    """Follows all arms, and tells a sink of them as of one robot.
+    """Follows all arms and publishes them to a sink as one robot.
 
     Args:
-        sink: who publishes.
-        name: of this node as commander.
-        rate_hz: joint samples a second.
-        describe: called with the URDF of all arms once they are reached.
-        directory: as of `GroupRobot`.
+        sink: publishes the group.
+        name: name of this node as commander.
+        rate_hz: joint samples per second.
+        describe: called with the URDF of all arms when they are connected.
+        directory: as in `GroupRobot`.
     """
 
     def __init__(
@@ -362,24 +364,24 @@ class GroupStates:
             publisher.step(wait_s / len(self._publishers))
 
     def close(self) -> None:
-        """Let go of the records."""
+        """Close the connections to the records."""
         for publisher in self._publishers:
             publisher.close()
 
     def joints(self, part: _Part) -> None:
-        """Publish a sample of all, when the first arm has a new one; an arm that is silent is left out."""
+        """Publish the merged sample when the first arm has a new one; an arm with a sample 0.5 s older is left out."""
         newest = part.sample
         if part is not self._parts[0] or newest is None:
             return
         fresh = [
-            (one.names, sample)
-            for one in self._parts
-            if (sample := one.sample) is not None and abs(sample.stamp_ns - newest.stamp_ns) < _STALE_NS
+            (part.names, sample)
+            for part in self._parts
+            if (sample := part.sample) is not None and abs(sample.stamp_ns - newest.stamp_ns) < _STALE_NS
         ]
         names = tuple(name for of_arm, _ in fresh for name in of_arm)
 
-        def joined(which: str) -> tuple[float, ...]:
-            return tuple(number for _, sample in fresh for number in getattr(sample, which))
+        def joined(field: str) -> tuple[float, ...]:
+            return tuple(number for _, sample in fresh for number in getattr(sample, field))
 
         self._sink.joints(
             names,
@@ -387,26 +389,26 @@ class GroupStates:
         )
 
     def status(self) -> None:
-        """Publish the status of all: an error or a motion of one is the group's, possible is what all can."""
-        found = [one.robot for one in self._parts if one.robot is not None]
-        if len(found) < len(self._parts):
+        """Publish the merged status: in motion or in error if any arm is, motion possible if it is for all arms."""
+        statuses = [part.robot for part in self._parts if part.robot is not None]
+        if len(statuses) < len(self._parts):
             return
 
-        def any_of(which: str) -> TriState:
-            values = {getattr(one, which) for one in found}
-            return next(one for one in (TriState.TRUE, TriState.UNKNOWN, TriState.FALSE) if one in values)
+        def any_of(field: str) -> TriState:
+            values = {getattr(status, field) for status in statuses}
+            return next(state for state in (TriState.TRUE, TriState.UNKNOWN, TriState.FALSE) if state in values)
 
-        def all_of(which: str) -> TriState:
-            values = {getattr(one, which) for one in found}
-            return next(one for one in (TriState.FALSE, TriState.UNKNOWN, TriState.TRUE) if one in values)
+        def all_of(field: str) -> TriState:
+            values = {getattr(status, field) for status in statuses}
+            return next(state for state in (TriState.FALSE, TriState.UNKNOWN, TriState.TRUE) if state in values)
 
-        modes = {one.mode for one in found}
+        modes = {status.mode for status in statuses}
         self._sink.status(
             RobotStatus(
-                max(one.stamp_ns for one in found), modes.pop() if len(modes) == 1 else RobotMode.UNKNOWN,
+                max(status.stamp_ns for status in statuses), modes.pop() if len(modes) == 1 else RobotMode.UNKNOWN,
                 any_of("e_stopped"), all_of("drives_powered"), all_of("motion_possible"), any_of("in_motion"),
-                any_of("in_error"), next((one.error_code for one in found if one.error_code), 0),
-                min(one.speed_override for one in found),
+                any_of("in_error"), next((status.error_code for status in statuses if status.error_code), 0),
+                min(status.speed_override for status in statuses),
             )
         )  # fmt: skip
 
@@ -416,13 +418,13 @@ class GroupStates:
 
     def channels(self, sample: ChannelSample, prefix: str) -> None:
         """Publish the channels of an arm, its name before those of the slaves."""
-        values = {prefix + slave: found for slave, found in sample.values.items()}
+        values = {prefix + slave: channels for slave, channels in sample.values.items()}
         settable = [(prefix + slave, name) for slave, name in sample.settable]
         self._sink.channels(ChannelSample(sample.stamp_ns, values, settable))
 
 
 class _Part:
-    """The newest that one arm has said."""
+    """Sink of one arm: keeps its newest sample and status, with prefixed names, and notifies the group."""
 
     def __init__(self, group: GroupStates, prefix: str) -> None:
         self._group, self._prefix = group, prefix
@@ -434,22 +436,22 @@ class _Part:
         """Do nothing: the group describes itself."""
 
     def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
-        """Take a sample."""
+        """Store a sample."""
         self.names = tuple(self._prefix + name for name in names)
         self.sample = sample
         self._group.joints(self)
 
     def status(self, status: RobotStatus) -> None:
-        """Take a status."""
+        """Store a status."""
         self.robot = status
         self._group.status()
 
     def diagnostics(self, diagnostics: Diagnostics) -> None:
-        """Pass them on."""
+        """Publish diagnostics."""
         self._group.diagnostics(diagnostics, self._prefix)
 
     def channels(self, sample: ChannelSample) -> None:
-        """Pass them on."""
+        """Publish channels."""
         self._group.channels(sample, self._prefix)
 
 
@@ -458,7 +460,7 @@ def _opens(directory: Path) -> Callable[[], Feed]:
 
 
 def connects(name: str, group: bool) -> Connect:
-    """Return what connects a commander: to the platform of the environment, or to all arms of its cell."""
+    """Return the function that connects a commander to the platform of the environment, or to all arms of its cell."""
     if group:
         return lambda: cast(contextlib.AbstractAsyncContextManager[AsyncRobot], GroupRobot(name))
     return lambda: connect_async(name, disable_when_lost=True)

@@ -1,4 +1,4 @@
-"""Whether this process ran all the time: what came while it did not is in its queues, and its senders may be gone."""
+"""Detects suspensions of this process: commands queued meanwhile are stale, and their senders may be gone."""
 
 from __future__ import annotations
 
@@ -7,32 +7,32 @@ import time
 from collections.abc import Callable
 
 HELD_UP_S = 1.0
-"""Longest time without a look that passes for running."""
+"""Interval between two checks above which the process counts as suspended, s."""
 _DRAINED_S = 0.5
-"""Time after that in which commands of then arrive."""
+"""Time after a suspension during which queued commands arrive, s."""
 
 
 class HeldUp:
-    """Notices that the process was suspended or swapped out; `look` several times a second.
+    """Detects that the process was suspended or swapped out; call `check` several times a second.
 
     Args:
-        noticed: called at the first look after that, with the time that it did not run, s.
+        noticed: called at the first check after a suspension, with its duration, s.
     """
 
     def __init__(self, noticed: Callable[[float], None]) -> None:
         self._noticed = noticed
-        self._looked_s = time.monotonic()
+        self._checked_s = time.monotonic()
         self._drained_s = -math.inf
 
-    def look(self) -> None:
-        """Compare with the last look."""
+    def check(self) -> None:
+        """Report a suspension since the last check."""
         now = time.monotonic()
-        gap_s, self._looked_s = now - self._looked_s, now
+        gap_s, self._checked_s = now - self._checked_s, now
         if gap_s > HELD_UP_S:
             self._drained_s = now + _DRAINED_S
             self._noticed(gap_s)
 
     def is_timely(self) -> bool:
-        """Whether a command that comes now did not wait in a queue meanwhile."""
-        self.look()
+        """Whether a command that arrives now was not queued during a suspension."""
+        self.check()
         return time.monotonic() >= self._drained_s

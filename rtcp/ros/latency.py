@@ -1,8 +1,8 @@
-"""The latency of a joint_command of ROS 2, or a real-time point of Simple Message, until its frame has left.
+"""Latency of a joint_command of ROS 2, or of a real-time point of Simple Message, until its frame is sent.
 
-`python -m rtcp.ros.latency dds|zenoh|simple-message [COUNT]` measures it on the platform that runs, whose drives are
-enabled: with the node in a process of its own, over the loopback interface. It prints the cycles of each command as
-JSON. At the end of Simple Message the drives are disabled, since its link is lost.
+`python -m rtcp.ros.latency dds|zenoh|simple-message [COUNT]` measures it on the running platform, with enabled drives:
+the node runs in a separate process, over the loopback interface. It prints the latency of each command, cycles, as
+JSON. Simple Message leaves the drives disabled, since its connection ends.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _ON_LOOPBACK = (
 )
 _PROBE_INTERVAL_S = 0.15
 _STEP_RAD = 1e-5
-"""Way of each command, there and back: the arm rests again long before the next."""
+"""Step of each command, back and forth, rad: the arm rests again long before the next."""
 _SILENCE_S = 30.0
-"""Longest wait for a command that the node passes on."""
+"""Longest wait for a command that the node passes on, s."""
 _POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
 
 
@@ -138,9 +138,9 @@ def _measure(publish: Publish, arguments: Sequence[str], count: int) -> list[flo
 
 
 def _cycles_until_it_moves(feed: Feed, publish: Callable[[], None]) -> list[float]:
-    """Return the cycles from the publishing until the frame with the first other position has left; nothing: none has.
+    """Return the time from `publish` until the frame with the first new position is sent, cycles; empty: no such frame.
 
-    The arm is at rest before, and has time to come to rest again.
+    The arm is at rest before the call and afterwards.
     """
     before, _ = feed.records()
     published_ns = time.monotonic_ns()
@@ -150,7 +150,7 @@ def _cycles_until_it_moves(feed: Feed, publish: Callable[[], None]) -> list[floa
     if not len(before) or not len(records):
         return []
     moved = np.flatnonzero(records["sent_position"][:, 0] != before["sent_position"][-1, 0])
-    # What a record calls sent leaves with the beginning of the next cycle.
+    # The outputs of a record leave at the beginning of the next cycle.
     if not len(moved) or moved[0] + 1 >= len(records):
         return []
     return [(int(records["time_ns"][moved[0] + 1]) - published_ns) / feed.period_ns]

@@ -1,6 +1,6 @@
-"""ROS 1: the node on rospy, a thin skin on `rtcp.ros.state` and `rtcp.ros.commands`.
+"""ROS 1: the node on rospy, a thin layer over `rtcp.ros.state` and `rtcp.ros.commands`.
 
-The only file that imports ROS; `ros1_messages.make_importable` goes before.
+The only file that imports ROS; call `ros1_messages.make_importable` before its import.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus,
 
 T = TypeVar("T")
 
-_TURN_S = 0.005
+_STEP_S = 0.005
 _MASTER_S = 1.0
-"""Interval between two looks at the master, s."""
+"""Interval between two checks of the master, s."""
 _MASTER_TIMEOUT_S = 2.0
 _CLOSE_S = 2.0
 """Longest wait for the end of the connection; the end of the process ends it too."""
@@ -63,13 +63,13 @@ _CLOSE_S = 2.0
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """What `rtcp ros` was asked for."""
+    """Options of `rtcp ros`."""
 
     name: str = "rtcp"
     rate_hz: float = 100.0
-    """Of joint_states, feedback_states and /tf."""
+    """Rate of joint_states, feedback_states and /tf, Hz."""
     has_link_frames: bool = False
-    """/tf has the frames of the links too: no robot_state_publisher runs."""
+    """Whether /tf includes the frames of the links, where no robot_state_publisher runs."""
     arguments: Sequence[str] = ()
     """Remappings and private parameters as roslaunch passes them: `joint_states:=/left/joint_states`."""
     commands: CommandOptions = field(default_factory=CommandOptions)
@@ -79,7 +79,7 @@ class NodeOptions:
 
 def run(options: NodeOptions) -> None:
     """Run the node until SIGINT, SIGTERM or SIGHUP; wait for the master and the platform. From the main thread only."""
-    # A flag and no exception: rospy has bare `except` clauses, which would swallow one.
+    # A flag instead of an exception, which bare `except` clauses of rospy would swallow.
     ends = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: ends.set())
@@ -87,7 +87,7 @@ def run(options: NodeOptions) -> None:
     while not (identity := master.identity()):
         if ends.wait(_MASTER_S):
             return
-    # Without disable_signals rospy would take SIGINT and SIGTERM for itself.
+    # Without disable_signals rospy would install handlers of SIGINT and SIGTERM.
     rospy.init_node(options.name, argv=[options.name, *options.arguments], disable_signals=True)
     watch = threading.Thread(target=master.wait_for_another, args=(identity,), daemon=True)
     watch.start()
@@ -98,25 +98,25 @@ def run(options: NodeOptions) -> None:
         publisher = GroupStates(publications, rospy.get_name(), options.rate_hz, publications.describe)
     else:
         publisher = StatePublisher(publications, rate_hz=options.rate_hz, name=rospy.get_name())
-    # Another master is not followed in the middle of a motion, which the end of its connection would stop.
+    # Change to another master only at rest: the end of the connection would stop a motion.
     while not ends.is_set() and (watch.is_alive() or commands.commander.is_moving):
-        publisher.step(_TURN_S)
+        publisher.step(_STEP_S)
     publisher.close()
     commands.close()
     if not ends.is_set():
-        # rospy registers its topics once, with the master of its start: for another one the process begins anew.
+        # rospy registers its topics only with the master of its start: for another one the process restarts.
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     rospy.signal_shutdown("the node ends")
 
 
 class Master:
-    """The ROS master, and whether it is still the same one."""
+    """The ROS master; detects its replacement by another one."""
 
     def __init__(self) -> None:
         self._server: Any = xmlrpc.client.ServerProxy(rosgraph.get_master_uri(), transport=_Transport())
 
     def identity(self) -> tuple[Any, ...]:
-        """Return process id and run_id of the master; nothing: none answers."""
+        """Return process id and run_id of the master; empty: no answer."""
         try:
             _, _, pid = self._server.getPid("/rtcp")
             code, _, run_id = self._server.getParam("/rtcp", "/run_id")
@@ -131,7 +131,7 @@ class Master:
 
 
 class _Transport(xmlrpc.client.Transport):
-    """HTTP that gives up: a master whose machine is gone would hold the caller for minutes."""
+    """HTTP with a timeout: without it an unreachable master would block the caller for minutes."""
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         connection = super().make_connection(host)
@@ -140,12 +140,12 @@ class _Transport(xmlrpc.client.Transport):
 
 
 class Publications:
-    """Publishes what the core says (`rtcp.ros.state.Sink`)."""
+    """Publishes the samples of the core (`rtcp.ros.state.Sink`)."""
 
     def __init__(self, commands: Commands, has_link_frames: bool) -> None:
         self._commands, self._has_link_frames = commands, has_link_frames
         self._models: Sequence[ArmModel] = ()
-        # A queue each: no subscriber that reads slowly holds the node.
+        # Each with a queue, so that a slow subscriber does not block the node.
         self._joint_states = rospy.Publisher("joint_states", JointState, queue_size=100, tcp_nodelay=True)
         self._feedback = rospy.Publisher(
             "feedback_states", FollowJointTrajectoryFeedback, queue_size=100, tcp_nodelay=True
@@ -157,18 +157,18 @@ class Publications:
         self._channels: dict[tuple[str, str], rospy.Publisher] = {}
 
     def connected(self, config: ArmConfig) -> None:
-        """Set robot_description, where the geometry is known and nobody has set it."""
+        """Set robot_description, where the geometry is known and it is not yet set."""
         rospy.loginfo("connected to %s", config.name)
         self._models = config.models
         if config.arm is not None:
             self.describe(to_urdf(config.arm, [joint.torque for joint in config.joints]))
 
     def describe(self, urdf: str) -> None:
-        """Set robot_description, where nobody has set it."""
+        """Set robot_description, where it is not yet set."""
         try:
             if not rospy.has_param("robot_description"):
                 rospy.set_param("robot_description", urdf)
-        except (OSError, rospy.ROSException) as error:  # the master is gone; another one starts the process anew
+        except (OSError, rospy.ROSException) as error:  # the master is gone; another one restarts the process
             rospy.logwarn("robot_description was not set: %s", error)
 
     def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
@@ -190,10 +190,10 @@ class Publications:
             return
         message, model = TFMessage(), self._models[sample.tool]
         for name, (position, (w, x, y, z)) in transforms_of(model, sample.position, self._has_link_frames).items():
-            one = TransformStamped(child_frame_id=name)
-            one.header.stamp, one.header.frame_id = states.header.stamp, "base_link"
-            one.transform.translation, one.transform.rotation = Vector3(*position), Quaternion(x, y, z, w)
-            message.transforms.append(one)
+            transform = TransformStamped(child_frame_id=name)
+            transform.header.stamp, transform.header.frame_id = states.header.stamp, "base_link"
+            transform.transform.translation, transform.transform.rotation = Vector3(*position), Quaternion(x, y, z, w)
+            message.transforms.append(transform)
         self._tf.publish(message)
 
     def status(self, status: RobotStatus) -> None:
@@ -221,7 +221,7 @@ class Publications:
         self._diagnostics.publish(message)
 
     def channels(self, sample: ChannelSample) -> None:
-        """Publish each channel on a topic of its own, and take commands for those that can be set."""
+        """Publish each channel on a separate topic, and subscribe to commands of settable ones."""
         for slave, values in sample.values.items():
             for name, value in values.items():
                 if (slave, name) not in self._channels:
@@ -233,14 +233,14 @@ class Publications:
 
 
 class Commands:
-    """Takes topics, services and the action; the core carries them out on an event loop in a thread of its own."""
+    """Receives topics, services and the action; the core executes them on an event loop in a separate thread."""
 
     def __init__(self, options: CommandOptions, group: bool = False) -> None:
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         self.commander = self._wait(self._make(options, group))
         self._goals: dict[str, tuple[Any, asyncio.Task[None]]] = {}
-        """Of the action: handle and what carries it out, by its id."""
+        """Id of a goal of the action -> its handle and task."""
         for topic, kind, carry_out in (
             ("joint_path_command", JointTrajectory, lambda m: self.commander.begin_trajectory(_trajectory(m))),
             ("joint_command", JointTrajectoryPoint, lambda m: self.commander.command_point(_point(m))),
@@ -258,7 +258,7 @@ class Commands:
         self._action.start()
 
     def close(self) -> None:
-        """Close the connection to the platform: what it moves comes to a controlled stop."""
+        """Close the connection to the platform: its motion comes to a controlled stop."""
         with contextlib.suppress(concurrent.futures.TimeoutError, RtcpError):
             asyncio.run_coroutine_threadsafe(self.commander.close(), self._loop).result(_CLOSE_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -268,7 +268,7 @@ class Commands:
         self._loop.call_soon_threadsafe(self.commander.note_stop)
 
     def take_output(self, topic: str, slave: str, name: str) -> None:
-        """Set an output by a topic from now on."""
+        """Subscribe to a topic whose messages set an output."""
 
         def carry_out(message: Any) -> Coroutine[Any, Any, None]:
             return self.commander.set_outputs([(slave, name, message.data)])
@@ -276,7 +276,7 @@ class Commands:
         rospy.Subscriber(topic, Float64, self._begin, (topic, carry_out), queue_size=100)
 
     def publish_feedback(self, feedback: Any) -> None:
-        """Publish it to the clients of the goals under way."""
+        """Publish the feedback to the clients of the active goals."""
         for handle, _ in list(self._goals.values()):
             handle.publish_feedback(feedback)
 
@@ -287,14 +287,14 @@ class Commands:
     def _wait(self, coroutine: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
 
-    def _begin(self, message: Any, how: tuple[str, Callable[[Any], Coroutine[Any, Any, None]]]) -> None:
-        """Carry a message out; nobody waits for the outcome, so a refusal is logged."""
-        topic, carry_out = how
+    def _begin(self, message: Any, receiver: tuple[str, Callable[[Any], Coroutine[Any, Any, None]]]) -> None:
+        """Execute a message in the background; a refusal is logged. `receiver`: topic and function."""
+        topic, carry_out = receiver
 
         async def logged() -> None:
             try:
                 await carry_out(message)
-            except Exception as error:  # a programming error too: nothing else would report it
+            except Exception as error:  # also programming errors, which would be lost otherwise
                 rospy.logerr("%s: %s", topic, error)
 
         asyncio.run_coroutine_threadsafe(logged(), self._loop)
@@ -310,7 +310,7 @@ class Commands:
         return response
 
     def _served(self, coroutine: Coroutine[Any, Any, None]) -> int:
-        """Return ServiceReturnCode.SUCCESS. FAILURE has no room for a reason: an error reply has."""
+        """Return ServiceReturnCode.SUCCESS; a failure raises, since only an error reply contains a reason."""
         try:
             self._wait(coroutine)
         except RtcpError as error:
@@ -327,7 +327,7 @@ class Commands:
 
     # -- the action ---------------------------------------------------------------------------------------------------
 
-    # actionlib holds its lock while it calls back, and its handles take it: nothing here may wait for the loop.
+    # actionlib holds its lock during callbacks, and its handles need it: callbacks must not wait for the loop.
 
     def _on_goal(self, handle: Any) -> None:
         number = handle.get_goal_id().id
@@ -368,11 +368,11 @@ class Commands:
         except Replaced as error:
             handle.set_canceled(result, str(error))
             return
-        except Exception as error:  # no code of the action says it; a goal always ends with a result
+        except Exception as error:  # the action has no code for it; a goal always ends with a result
             code, text = FollowCode.INVALID_GOAL, str(error)
         result.error_code, result.error_string = int(code), text
         if code is FollowCode.SUCCESSFUL:
-            if not has_begun:  # there already
+            if not has_begun:  # the arm is already at the goal
                 handle.set_accepted()
             handle.set_succeeded(result, text)
         else:
@@ -391,7 +391,7 @@ def _point(message: Any) -> TrajectoryPoint:
 
 
 def _tolerances(messages: Any) -> tuple[Tolerance, ...]:
-    return tuple(Tolerance(one.name, one.position, one.velocity, one.acceleration) for one in messages)
+    return tuple(Tolerance(entry.name, entry.position, entry.velocity, entry.acceleration) for entry in messages)
 
 
 def _time(stamp_ns: int) -> Any:

@@ -1,4 +1,4 @@
-"""How long commands of a ROS 1 client take until the frame has left, on the platform that runs.
+"""Latency of commands of a ROS 1 client until their frame is sent, on the running platform.
 
 `python -m rtcp.ros.ros1_latency PROBES` runs a master, a node and, by itself again, a client: processes as a user's. It
 prints JSON: s from the call of rospy to the frame, for `topic` joint_command and `service` joint_path_command. The arm
@@ -25,11 +25,11 @@ from rtcp.ros import ros1_messages
 
 _MASTER = "/usr/bin/rosmaster"
 _INTERVAL_S = {"topic": 0.08, "service": 0.3}
-"""In which what was sent before has come to rest."""
+"""Interval between two commands, s: the motion before has ended."""
 _STEP_RAD, _MOVE_S = 1e-5, 0.1
 _LONGEST_S = 180.0
 _PAUSE_S = 2.0
-"""After which a stream has ended."""
+"""Pause that ends a stream, s."""
 
 
 def _measure(probes: str) -> str:
@@ -48,14 +48,14 @@ def _measure(probes: str) -> str:
             running.callback(begun.terminate)
         client = [sys.executable, "-m", "rtcp.ros.ros1_latency", probes, "client"]
         try:
-            done = subprocess.run(
+            process = subprocess.run(
                 client, env=environment, capture_output=True, text=True, check=False, timeout=_LONGEST_S
             )
         except subprocess.TimeoutExpired:
             raise SystemExit(f"the ROS client has not ended within {_LONGEST_S:g} s") from None
-    if done.returncode:
-        raise SystemExit(f"the ROS client failed: {done.stderr.strip().rpartition(chr(10))[2]}")
-    return done.stdout.strip().rpartition("\n")[2]
+    if process.returncode:
+        raise SystemExit(f"the ROS client failed: {process.stderr.strip().rpartition(chr(10))[2]}")
+    return process.stdout.strip().rpartition("\n")[2]
 
 
 def _probe(count: int) -> dict[str, list[float]]:
@@ -75,34 +75,34 @@ def _probe(count: int) -> dict[str, list[float]]:
     feed = Feed()
     feed.wait(_PAUSE_S)
     here = feed.records()[0]["commanded_position"][-1].tolist()
-    rest = [JointTrajectoryPoint(positions=here, time_from_start=rospy.Duration(t)) for t in (0.0, _MOVE_S)]
-    path = JointTrajectory(joint_names=names, points=rest)
+    points_at_rest = [JointTrajectoryPoint(positions=here, time_from_start=rospy.Duration(t)) for t in (0.0, _MOVE_S)]
+    path = JointTrajectory(joint_names=names, points=points_at_rest)
     beside = [here[0] + _STEP_RAD, *here[1:]]
-    points = itertools.cycle([JointTrajectoryPoint(positions=beside), rest[0]])
+    points = itertools.cycle([JointTrajectoryPoint(positions=beside), points_at_rest[0]])
 
-    def latencies(way: str, send: Callable[[], object], has_begun: Callable[[Any], Any]) -> list[float]:
-        found = []
+    def latencies(kind: str, send: Callable[[], object], has_begun: Callable[[Any], Any]) -> list[float]:
+        seconds = []
         for _ in range(count):
             feed.records()
             sent_ns = time.monotonic_ns()
             send()
-            time.sleep(_INTERVAL_S[way])
+            time.sleep(_INTERVAL_S[kind])
             records, _ = feed.records()
             begun = np.flatnonzero(has_begun(records))
-            # What a cycle computes leaves with the beginning of the next one.
+            # The outputs of a cycle leave at the beginning of the next one.
             if begun.size and begun[0] + 1 < len(records):
-                found.append(1e-9 * float(records["time_ns"][begun[0] + 1] - sent_ns))
-        return found
+                seconds.append(1e-9 * float(records["time_ns"][begun[0] + 1] - sent_ns))
+        return seconds
 
     def moves(records: Any) -> Any:
         return records["commanded_position"][:, 0] != records["commanded_position"][0, 0]
 
-    publisher.publish(rest[0])  # opens the stream
+    publisher.publish(points_at_rest[0])  # opens the stream
     time.sleep(0.5)
-    found = {"topic": latencies("topic", lambda: publisher.publish(next(points)), moves)}
+    by_kind = {"topic": latencies("topic", lambda: publisher.publish(next(points)), moves)}
     time.sleep(_PAUSE_S)
-    found["service"] = latencies("service", lambda: call(path), lambda records: records["state"] == State.MOVING)
-    return found
+    by_kind["service"] = latencies("service", lambda: call(path), lambda records: records["state"] == State.MOVING)
+    return by_kind
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ class RosMissing(Exception):
 
 
 def missing() -> str:
-    """Return which of ROS 1 is missing and how to install it, one sentence; empty: nothing."""
+    """Return a sentence on the missing part of ROS 1 and how to install it; empty: nothing is missing."""
     for path in _NEEDED:
         if not path.exists():
             return f"ROS 1 is not installed ({path} is missing): apt install {PACKAGES}"
@@ -50,7 +50,7 @@ def missing() -> str:
 def make_importable() -> None:
     """Put ROS 1 and our own messages at the end of `sys.path`, where our own packages come first.
 
-    A sourced ROS environment, whose rospy can be imported already, is left in its place.
+    If rospy can be imported already, from a sourced ROS environment, that one is used.
 
     Raises:
         RosMissing: it is not installed, or the classes cannot be generated.
@@ -83,10 +83,10 @@ def generated() -> Path:
         raise RosMissing(problem)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
-        made = Path(scratch) / "python"
-        _generate(Path(scratch), made)
+        package = Path(scratch) / "python"
+        _generate(Path(scratch), package)
         try:
-            made.rename(folder)  # whole or not at all, also where two processes do it at once
+            package.rename(folder)  # whole or not at all, also where two processes do it at once
         except OSError:
             if not folder.exists():
                 raise
@@ -115,6 +115,8 @@ def _generate(scratch: Path, out: Path) -> None:
 
 
 def _run(generator: Path, *arguments: str | Path) -> None:
-    done = subprocess.run([_DEBIAN_PYTHON, generator, *arguments], capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RosMissing(f"{generator} failed: {(done.stderr or done.stdout).strip()}: reinstall its Debian package")
+    process = subprocess.run([_DEBIAN_PYTHON, generator, *arguments], capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise RosMissing(
+            f"{generator} failed: {(process.stderr or process.stdout).strip()}: reinstall its Debian package"
+        )

@@ -1,7 +1,6 @@
-"""The server of an action without ROS: three services and two topics, as ROS 2's design of actions has them.
+"""An action server without ROS: three services and two topics, by the design of actions in ROS 2.
 
-Each goal is accepted, and a goal that is refused is aborted at once: ROS 2 carries no reason with a rejection, and a
-result has one.
+Every goal is accepted, and a refused one is aborted at once: in ROS 2 a rejection has no reason, but a result has one.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from rtcp.ros.ros2_node import ACTION, Commands, Make, time_of
 from rtcp.ros.ros2_types import CANCEL, FOLLOW
 
 _KEPT = 16
-"""Goals that have ended and whose result can still be asked for."""
+"""Most ended goals whose results are kept for requests."""
 _UNKNOWN_GOAL, _TERMINATED = 2, 3
 """Return codes of CancelGoal."""
 
@@ -40,7 +39,7 @@ _ACTIVE = (GoalState.EXECUTING, GoalState.CANCELING)
 @dataclass
 class _Goal:
     stamp_ns: int
-    """When it was accepted, CLOCK_REALTIME."""
+    """Instant of its acceptance, CLOCK_REALTIME, ns."""
     task: asyncio.Task[tuple[FollowCode, str]]
     ended: asyncio.Future[Any]
     """Its result message."""
@@ -48,10 +47,10 @@ class _Goal:
 
 
 class ActionServer:
-    """FollowJointTrajectory; used from the loop of `Commands`, but for `publish_feedback`.
+    """FollowJointTrajectory; used from the loop of `Commands`, except `publish_feedback`.
 
     Args:
-        commands: carries the goals out.
+        commands: executes the goals.
         make: makes messages.
         publish: publishes on a topic of `ACTION_TOPICS`.
     """
@@ -59,17 +58,17 @@ class ActionServer:
     def __init__(self, commands: Commands, make: Make, publish: Callable[[str, Any], None]) -> None:
         self._commands, self._make, self._publish = commands, make, publish
         self._goals: dict[bytes, _Goal] = {}
-        """By id, oldest first."""
+        """Id -> goal, oldest first."""
 
     async def respond(self, service: str, request: Any) -> Any:
-        """Carry out a service of `ACTION_SERVICES` and return its response."""
+        """Execute a service of `ACTION_SERVICES` and return its response."""
         kind = service.rpartition("/")[2]
         if kind == "send_goal":
             return self._begin(request)
         return self._cancel(request) if kind == "cancel_goal" else await self._result(request)
 
     def publish_feedback(self, feedback: Any) -> None:
-        """Publish the feedback of each goal under way; from any thread."""
+        """Publish the feedback of each active goal; from any thread."""
         for key, goal in list(self._goals.items()):
             if goal.state in _ACTIVE:
                 message = self._make(f"{FOLLOW}_FeedbackMessage", goal_id=self._uuid(key), feedback=feedback)
@@ -101,12 +100,12 @@ class ActionServer:
         key, stamp = _key(request.goal_info.goal_id), request.goal_info.stamp
         until_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
         has_key = any(key)
-        asked = {
-            one: goal
-            for one, goal in self._goals.items()
-            if one == key or (goal.stamp_ns <= until_ns if until_ns else not has_key)
+        matching = {
+            goal_key: goal
+            for goal_key, goal in self._goals.items()
+            if goal_key == key or (goal.stamp_ns <= until_ns if until_ns else not has_key)
         }
-        canceling = {one: goal for one, goal in asked.items() if goal.state in _ACTIVE}
+        canceling = {number: goal for number, goal in matching.items() if goal.state in _ACTIVE}
         for goal in canceling.values():
             goal.state = GoalState.CANCELING
             goal.task.cancel()
@@ -115,7 +114,7 @@ class ActionServer:
         code = 0
         if has_key and key not in canceling:
             code = _TERMINATED if key in self._goals else _UNKNOWN_GOAL
-        infos = [self._info(one, goal) for one, goal in canceling.items()]
+        infos = [self._info(goal_key, goal) for goal_key, goal in canceling.items()]
         return self._make(f"{CANCEL}_Response", return_code=code, goals_canceling=infos)
 
     async def _result(self, request: Any) -> Any:

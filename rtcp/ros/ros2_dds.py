@@ -1,7 +1,7 @@
-"""ROS 2 over DDS without ROS: topics as rmw_cyclonedds and rmw_fastrtps have them.
+"""ROS 2 over DDS without ROS: topics compatible with rmw_cyclonedds and rmw_fastrtps.
 
-The only file that imports cyclonedds. Services and actions are not served: each of those two puts the client's identity
-of a request elsewhere.
+The only file that imports cyclonedds. Services and actions are not supported: the two middlewares encode the identity
+of a request's client differently.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _LOG = logging.getLogger("rtcp.ros")
 
 @cache
 def struct_of(name: str) -> type[IdlStruct]:
-    """Return the class of a message for cyclonedds; final, since ROS 2 appends nothing."""
+    """Return the class of a message for cyclonedds; final, since ROS 2 has no appendable types."""
     fields = {field.name: _type_of(field) for field in fields_of(name)}
     fields = fields or {"structure_needs_at_least_one_member": types.uint8}
     typename = dds_type(name).replace("::", ".")
-    made: type[IdlStruct] = final(make_idl_struct(typename.rpartition(".")[2], typename, fields))
-    return made
+    struct: type[IdlStruct] = final(make_idl_struct(typename.rpartition(".")[2], typename, fields))
+    return struct
 
 
 def _type_of(field: Field) -> Any:
@@ -57,7 +57,7 @@ make = Family(struct_of, lambda values, base: list(values)).make
 
 
 def qos_of(topic: str, kind: str) -> Qos:
-    """Return the quality of service of a topic, with the hash of its type where rmw looks for it."""
+    """Return the quality of service of a topic, with the hash of its type in the user data, for rmw."""
     depth = Policy.History.KeepLast(1 if topic in LATCHED else DEPTH)
     policies = [
         Policy.Reliability.Reliable(duration(seconds=_BLOCKED_S)),
@@ -68,14 +68,14 @@ def qos_of(topic: str, kind: str) -> Qos:
         Policy.Userdata(f"typehash={type_hash(kind)};".encode()),
     ]
     if topic in LATCHED:
-        # Without it one sample is kept whatever the history says.
+        # Without it one sample is kept, regardless of the history.
         policies.append(Policy.DurabilityService(0, depth, -1, -1, -1))
     return Qos(*policies)
 
 
 @contextlib.contextmanager
 def open_wire(options: Ros2Options, commands: Commands, ends: threading.Event) -> Iterator[DdsWire]:
-    """Open the wire; it needs nobody else."""
+    """Open the wire; it needs no router."""
     wire = DdsWire(options, commands)
     try:
         yield wire
@@ -108,7 +108,7 @@ class DdsWire:
         """See `Wire`: there are no goals."""
 
     def close(self) -> None:
-        """End the reading."""
+        """Stop reading."""
         self._ends.set(True)
         self._reading.join()
 
@@ -116,12 +116,12 @@ class DdsWire:
         return Topic(self._participant, f"rt/{self._options.resolved(topic)}", struct_of(kind))
 
     def _read(self) -> None:
-        """Hand over what comes, until `close`."""
+        """Pass received messages to the commands, until `close`."""
         waiting = WaitSet(self._participant)
         waiting.attach(self._ends)
         readers: dict[str, Any] = {}
         for topic, kind in IN.items():
-            # Best effort takes what reliable writers write too.
+            # Best effort also receives from reliable writers.
             qos = Qos(Policy.Reliability.BestEffort, base=qos_of(topic, kind))
             readers[topic] = DataReader(self._participant, self._topic(topic, kind), qos)
             waiting.attach(ReadCondition(readers[topic], _ANY))
@@ -130,7 +130,7 @@ class DdsWire:
             for topic, reader in readers.items():
                 try:
                     for message in reader.take(DEPTH):
-                        if isinstance(message, struct_of(IN[topic])):  # and not the end of a writer
+                        if isinstance(message, struct_of(IN[topic])):  # not the end of a writer
                             self._commands.receive(topic, message)
-                except Exception as error:  # the thread goes on; foreign bytes cyclonedds drops by itself
+                except Exception as error:  # the thread continues; cyclonedds itself drops invalid bytes
                     _LOG.error("%s: %s", topic, error)

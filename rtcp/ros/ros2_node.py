@@ -1,6 +1,6 @@
-"""The ROS 2 node without its wire: which topics and services there are, what they carry, what becomes of commands.
+"""The ROS 2 node without its wire: topics, services, their contents, and the execution of commands.
 
-A wire (`ros2_zenoh`, `ros2_dds`, `ros2_rclpy`) makes messages of its own classes, and carries them.
+A wire (`ros2_zenoh`, `ros2_dds`, `ros2_rclpy`) creates messages of its own classes, and transports them.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from rtcp.ros.ros2_types import CANCEL, FOLLOW, GROUP_VALUES, PATH_COMMAND, STOP
 from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus, StatePublisher
 
 Make = Callable[..., Any]
-"""Makes a message from the name of its type and its fields."""
+"""Creates a message from the name of its type and its fields."""
 
 ACTION = "joint_trajectory_action"
 _FEEDBACK = f"{FOLLOW}_Feedback"
@@ -56,7 +56,7 @@ OUT: Mapping[str, str] = {
     "speed_override_state": "std_msgs/msg/Float64",
     "gpio_controller/gpio_states": GROUP_VALUES,
 }
-"""Topics that are published, with their types."""
+"""Published topic -> type."""
 IN: Mapping[str, str] = {
     "joint_command": _POINT,
     "joint_path_command": _TRAJECTORY,
@@ -64,7 +64,7 @@ IN: Mapping[str, str] = {
     "speed_override": "std_msgs/msg/Float64",
     "gpio_controller/commands": GROUP_VALUES,
 }
-"""Topics that are taken."""
+"""Subscribed topic -> type."""
 SERVICES: Mapping[str, str] = {
     "joint_path_command": PATH_COMMAND,
     "stop_motion": STOP_MOTION,
@@ -81,9 +81,9 @@ ACTION_TOPICS: Mapping[str, str] = {
     f"{ACTION}/_action/status": "action_msgs/msg/GoalStatusArray",
 }
 LATCHED = ("robot_description", f"{ACTION}/_action/status")
-"""Topics whose last message a late reader receives too: reliable, transient local, keep last 1."""
+"""Topics whose last message late readers also receive: reliable, transient local, keep last 1."""
 DEPTH = 10
-"""Of all others: reliable, volatile, keep last 10."""
+"""History depth of all other topics: reliable, volatile, keep last 10."""
 RETRY_S = 1.0
 _STEP_S = 0.005
 _CLOSE_S = 2.0
@@ -93,11 +93,11 @@ _LOG = logging.getLogger("rtcp.ros")
 
 @dataclass(frozen=True)
 class Ros2Options:
-    """What `rtcp ros` was asked for."""
+    """Options of `rtcp ros`."""
 
     name: str = "rtcp"
     rate_hz: float = 100.0
-    """Of joint_states, feedback_states and tf."""
+    """Rate of joint_states, feedback_states and tf, Hz."""
     domain: int = 0
     """ROS_DOMAIN_ID."""
     commands: CommandOptions = field(default_factory=CommandOptions)
@@ -106,10 +106,10 @@ class Ros2Options:
     group: bool = False
     """Whether all arms of the cell are one group of joints."""
     namespace: str = ""
-    """Of topics, services and the action, but `diagnostics`: `left`; empty: none."""
+    """Namespace of topics, services and the action, except `diagnostics`: `left`; empty: none."""
 
     def resolved(self, name: str) -> str:
-        """Return the name of a topic or service with its namespace, without the slash before it."""
+        """Return the name of a topic or service with its namespace, without a leading slash."""
         return f"{self.namespace}/{name}" if self.namespace and name != "diagnostics" else name
 
 
@@ -120,21 +120,21 @@ class Wire(Protocol):
 
     @property
     def topics(self) -> Collection[str]:
-        """Those of `OUT` that can be published."""
+        """Topics of `OUT` that can be published."""
 
     def publish(self, topic: str, message: Any) -> None:
-        """Publish on one of them."""
+        """Publish on one of `topics`."""
 
     def publish_feedback(self, feedback: Any) -> None:
-        """Publish it to the clients of the goals under way."""
+        """Publish the feedback to the clients of the active goals."""
 
 
 class Commands:
-    """Carries out what comes in, on an event loop in a thread of its own, which a wire's threads call.
+    """Executes incoming messages on an event loop in a separate thread, called by a wire's threads.
 
     Args:
-        options: name of this commander, and how commands are taken.
-        connect: connects to the platform; None: to that of this process' environment.
+        options: name of this commander, and options of the commands.
+        connect: connects to the platform; None: to the one of this process' environment.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class Commands:
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop)
 
     def receive(self, topic: str, message: Any) -> None:
-        """Carry out a message on a topic of `IN`; nobody waits for the outcome, so a refusal is logged."""
+        """Execute a message on a topic of `IN` in the background; a refusal is logged."""
         if topic == "joint_command":
             command = self.commander.command_point(point_of(message))
         elif topic == "joint_trajectory":
@@ -185,13 +185,13 @@ class Commands:
         async def logged() -> None:
             try:
                 await command
-            except Exception as error:  # a programming error too: nothing else would report it
+            except Exception as error:  # also programming errors, which would be lost otherwise
                 _LOG.error("%s: %s", topic, error)
 
         self.submit(logged())
 
     async def respond(self, make: Make, service: str, request: Any) -> Any:
-        """Carry out a service of `SERVICES` and return its response."""
+        """Execute a service of `SERVICES` and return its response."""
         kind = SERVICES[service]
         commander = self.commander
         has_succeeded, text = True, ""
@@ -204,23 +204,23 @@ class Commands:
                 await commander.stop()
             else:
                 await commander.begin_trajectory(trajectory_of(request.trajectory))
-        except Exception as error:  # a client would wait for ever for a service that does not answer
+        except Exception as error:  # without a response the client would wait for ever
             _LOG.error("%s: %s", service, error)
             has_succeeded, text = False, str(error)
         if kind == TRIGGER:
             return make(f"{kind}_Response", success=has_succeeded, message=text)
-        # These responses have no room for the reason, and ROS 2 knows no error reply: it is in the log.
+        # These responses have no field for the reason, and ROS 2 has no error reply: the reason is logged.
         code = make("industrial_msgs/msg/ServiceReturnCode", val=1 if has_succeeded else -1)
         return make(f"{kind}_Response", code=code)
 
     async def follow(self, goal: Any) -> tuple[FollowCode, str]:
-        """Run a goal of the action; return how it ended. Cancelled, the arm brakes on its path."""
+        """Run a goal of the action; return its code and message. When cancelled, the arm brakes on its path."""
         tolerances = Tolerances(
             _tolerances(goal.path_tolerance), _tolerances(goal.goal_tolerance), seconds(goal.goal_time_tolerance)
         )
         try:
             code, text = await self.commander.follow(trajectory_of(goal.trajectory), tolerances, lambda: None)
-        except Exception as error:  # no code of the action says it; a goal always ends with a result
+        except Exception as error:  # the action has no code for it; a goal always ends with a result
             code, text = FollowCode.INVALID_GOAL, str(error)
         if code is not FollowCode.SUCCESSFUL:
             _LOG.error("%s: %s", ACTION, text)
@@ -228,11 +228,11 @@ class Commands:
 
 
 class Publications:
-    """Publishes what the core says (`rtcp.ros.state.Sink`).
+    """Publishes the samples of the core (`rtcp.ros.state.Sink`).
 
     Args:
-        wire: carries it.
-        name: of the node.
+        wire: transports the messages.
+        name: name of the node.
         note_stop: called with each status in error.
     """
 
@@ -317,8 +317,8 @@ class Publications:
         if "gpio_controller/gpio_states" not in self._wire.topics:
             return
         values = [
-            self._make("control_msgs/msg/InterfaceValue", interface_names=list(found), values=list(found.values()))
-            for found in sample.values.values()
+            self._make("control_msgs/msg/InterfaceValue", interface_names=list(group), values=list(group.values()))
+            for group in sample.values.values()
         ]
         self._publish(
             "gpio_controller/gpio_states",
@@ -334,7 +334,7 @@ class Publications:
         return self._make("std_msgs/msg/Header", stamp=time_of(self._make, stamp_ns), frame_id=frame)
 
     def _transforms(self, arm: ArmModel, sample: JointSample) -> list[Any]:
-        """Return the links of the URDF, each in the frame of the one before: what robot_state_publisher says."""
+        """Return the transforms of the URDF's links, each in its parent's frame, as robot_state_publisher does."""
         make = self._make
         poses = (IDENTITY, *frames(arm, sample.position))
         links = ["base_link", *(f"link{number}" for number in range(1, len(poses) - 1)), "tool0"]
@@ -388,7 +388,7 @@ def seconds(time: Any) -> float:
 
 
 def trajectory_of(message: Any) -> Trajectory:
-    """Return a trajectory_msgs/JointTrajectory as the core has it."""
+    """Convert a trajectory_msgs/JointTrajectory."""
     points = [point_of(point) for point in message.points]
     return Trajectory(list(message.joint_names), points, seconds(message.header.stamp))
 
@@ -397,18 +397,18 @@ def outputs_of(message: Any) -> Iterator[tuple[str, str, float]]:
     """Yield slave, name and value of each output of a control_msgs/DynamicInterfaceGroupValues.
 
     Raises:
-        RtcpError: a list is longer than the one that belongs to it.
+        RtcpError: the lists of names and values differ in length.
     """
     try:
-        for slave, one in zip(message.interface_groups, message.interface_values, strict=True):
-            for name, value in zip(one.interface_names, one.values, strict=True):
+        for slave, group in zip(message.interface_groups, message.interface_values, strict=True):
+            for name, value in zip(group.interface_names, group.values, strict=True):
                 yield slave, name, value
     except ValueError:
         raise refusal("wrong_count", "found lists of different lengths, allowed is a value for each name") from None
 
 
 def point_of(message: Any) -> TrajectoryPoint:
-    """Return a trajectory_msgs/JointTrajectoryPoint as the core has it."""
+    """Convert a trajectory_msgs/JointTrajectoryPoint."""
     return TrajectoryPoint(
         seconds(message.time_from_start),
         _numbers(message.positions),
@@ -422,4 +422,4 @@ def _numbers(values: Iterable[Any]) -> tuple[float, ...]:
 
 
 def _tolerances(messages: Iterable[Any]) -> tuple[Tolerance, ...]:
-    return tuple(Tolerance(one.name, one.position, one.velocity, one.acceleration) for one in messages)
+    return tuple(Tolerance(entry.name, entry.position, entry.velocity, entry.acceleration) for entry in messages)

@@ -1,6 +1,6 @@
 """ROS 2 with rclpy, from a sourced ROS environment; the only file that imports it.
 
-A topic or service whose package of messages is not installed (industrial_msgs, control_msgs) is left out, and logged.
+A topic or service whose message package is not installed (industrial_msgs, control_msgs) is omitted, and logged.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from rtcp.ros.ros2_node import ACTION, DEPTH, IN, LATCHED, OUT, SERVICES, Comman
 from rtcp.ros.ros2_types import FOLLOW
 
 _THREADS = 8
-"""Goals and services under way at the same time: each waits in one."""
-_TURN_S = 0.01
-"""Interval between two looks whether a goal is to be cancelled."""
-_TAKEN = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""It matches reliable writers too."""
+"""Number of threads: each goal or service in progress occupies one."""
+_POLL_S = 0.01
+"""Polling interval of a goal's cancellation, s."""
+_SUBSCRIPTION_QOS = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Quality of service of subscriptions: it also matches reliable writers."""
 _LOG = logging.getLogger("rtcp.ros")
 
 
 def class_of(name: str) -> Any:
-    """Return the class of a type: of `std_srvs/srv/Trigger_Response` that is `std_srvs.srv.Trigger.Response`.
+    """Return the class of a type: of `std_srvs/srv/Trigger_Response` it is `std_srvs.srv.Trigger.Response`.
 
     Raises:
         ImportError: its package is not installed.
     """
     package, folder, last = name.split("/")
     base, _, part = last.partition("_")
-    found = get_interface(f"{package}/{folder}/{base}")
-    return getattr(found, part) if part else found
+    message_class = get_interface(f"{package}/{folder}/{base}")
+    return getattr(message_class, part) if part else message_class
 
 
 def make(name: str, /, **fields: Any) -> Any:
     """Return a message."""
     if "level" in fields:
-        fields["level"] = bytes([fields["level"]])  # the type byte
+        fields["level"] = bytes([fields["level"]])  # its type is byte
     return class_of(name)(**{key: list(value) if isinstance(value, tuple) else value for key, value in fields.items()})
 
 
@@ -84,15 +84,16 @@ class RclpyWire:
     def __init__(self, node: Any, commands: Commands) -> None:
         self._commands = commands
         self._goals: dict[bytes, Any] = {}
-        together = {"callback_group": ReentrantCallbackGroup()}
+        group = {"callback_group": ReentrantCallbackGroup()}
         self._publishers = {
             topic: node.create_publisher(class_of(kind), topic, _qos(topic)) for topic, kind in _known(OUT).items()
         }
         self.topics = tuple(self._publishers)
         for topic, kind in _known(IN).items():
-            node.create_subscription(class_of(kind), topic, partial(commands.receive, topic), _TAKEN, **together)
+            receive = partial(commands.receive, topic)
+            node.create_subscription(class_of(kind), topic, receive, _SUBSCRIPTION_QOS, **group)
         for service, kind in _known(SERVICES).items():
-            node.create_service(class_of(kind), service, partial(self._respond, service), **together)
+            node.create_service(class_of(kind), service, partial(self._respond, service), **group)
         if _known({ACTION: FOLLOW}):
             self._action = ActionServer(
                 node,
@@ -100,7 +101,7 @@ class RclpyWire:
                 ACTION,
                 execute_callback=self._execute,
                 cancel_callback=lambda goal: CancelResponse.ACCEPT,
-                **together,
+                **group,
             )
 
     def publish(self, topic: str, message: Any) -> None:
@@ -120,7 +121,7 @@ class RclpyWire:
         following = self._commands.submit(self._commands.follow(goal.request))
         self._goals[key] = goal
         while not following.done():
-            concurrent.futures.wait([following], _TURN_S)
+            concurrent.futures.wait([following], _POLL_S)
             if goal.is_cancel_requested:
                 following.cancel()
         del self._goals[key]
@@ -140,7 +141,7 @@ def _qos(topic: str) -> Any:
 
 
 def _known(types: Mapping[str, str]) -> dict[str, str]:
-    """Return those whose messages are installed."""
+    """Return the topics or services whose message packages are installed."""
     known = {}
     for name, kind in types.items():
         try:

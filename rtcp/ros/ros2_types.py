@@ -1,7 +1,7 @@
 """The messages of ROS 2 that the arm uses, without ROS: their definitions, encoding (XCDR1) and type hashes (REP 2011).
 
-The common interfaces are those of rosbags; what it lacks is written here, or read from `messages` where ROS 1 has the
-same. Names are those of ROS: `sensor_msgs/msg/JointState`. The only file that imports rosbags.
+The common interfaces are from rosbags; missing ones are defined here, or read from `messages` where ROS 1 has the same.
+Names are those of ROS: `sensor_msgs/msg/JointState`. The only file that imports rosbags.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Field:
 
     name: str
     type: str
-    """A basic type, as `float64`, or a message, whose name has slashes."""
+    """A basic type, like `float64`, or a message type, whose name has slashes."""
     length: int | None
     """Length of an array; 0: a sequence, None: a single value."""
 
@@ -45,7 +45,7 @@ PATH_COMMAND = "industrial_msgs/srv/CmdJointTrajectory"
 _AS_IN_ROS_1 = ("control_msgs/msg/JointTolerance", "industrial_msgs/msg/RobotMode",
                 "industrial_msgs/msg/ServiceReturnCode", "industrial_msgs/msg/TriState")  # fmt: skip
 _MESSAGES = {
-    # rosbags has the type char for its client_gid, whose code of the hash is another one than that of a .msg file.
+    # In rosbags client_gid has the type char, which gives another hash than the .msg file.
     "service_msgs/msg/ServiceEventInfo": """
         uint8 event_type
         builtin_interfaces/Time stamp
@@ -109,12 +109,12 @@ _SERVICES = {
     ),
     f"{FOLLOW}_GetResult": ("unique_identifier_msgs/UUID goal_id", f"int8 status\n{FOLLOW}_Result result"),
 }
-"""Request and response."""
+"""Service -> definitions of request and response."""
 
 
 @cache
 def _store() -> Typestore:
-    # Here: with rclpy nobody needs it, and it is not installed there.
+    # Imported here: with rclpy it is not needed, and not installed.
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -131,7 +131,7 @@ def _store() -> Typestore:
 
 
 def _service(name: str, request: str, response: str) -> dict[str, Any]:
-    """Return the types of a service; that of its introspection events counts for its hash."""
+    """Return the types of a service, with its introspection events, which are part of its hash."""
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import get_types_from_msg
 
@@ -152,8 +152,8 @@ def fields_of(name: str) -> list[Field]:
     fields = []
     defined: list[tuple[str, Any]] = list(_store().fielddefs[name][1])
     for field, definition in defined:
-        kind, what = definition
-        inner, length = what if kind in (Nodetype.SEQUENCE, Nodetype.ARRAY) else (definition, None)
+        kind, detail = definition
+        inner, length = detail if kind in (Nodetype.SEQUENCE, Nodetype.ARRAY) else (definition, None)
         basic_or_name = inner[1][0] if inner[0] is Nodetype.BASE else inner[1]
         fields.append(Field(field, basic_or_name, 0 if kind is Nodetype.SEQUENCE else length))
     return fields
@@ -162,12 +162,12 @@ def fields_of(name: str) -> list[Field]:
 @cache
 def type_hash(name: str) -> str:
     """Return the hash of a message or service, `RIHS01_` and 64 hexadecimal digits."""
-    found: str = _store().hash_rihs01(name)
-    return found
+    digest: str = _store().hash_rihs01(name)
+    return digest
 
 
 def dds_type(name: str) -> str:
-    """Return the name that a type has in DDS and Zenoh: `sensor_msgs::msg::dds_::JointState_`."""
+    """Return the name of a type in DDS and Zenoh: `sensor_msgs::msg::dds_::JointState_`."""
     *modules, last = name.split("/")
     return "::".join((*modules, "dds_", f"{last}_"))
 
@@ -178,23 +178,23 @@ def encode(name: str, message: Any) -> bytes:
 
 
 def decode(name: str, data: bytes) -> Any:
-    """Return the message; in either byte order.
+    """Return the message of XCDR1 data, in either byte order.
 
     Raises:
-        ValueError: it is none of this type.
+        ValueError: no message of this type.
     """
     try:
         return _store().deserialize_cdr(data, name)
-    except Exception as error:  # whatever a walk over foreign bytes meets
+    except Exception as error:  # invalid bytes may raise any exception
         raise ValueError(f"{len(data)} bytes are no {name}: {error}") from None
 
 
 class Family:
-    """Makes messages of one kind of Python classes; a field that is not given is zero or empty.
+    """Creates messages of one family of Python classes; fields without a value are zero or empty.
 
     Args:
         class_of: returns the class of a type.
-        numbers: returns a sequence of numbers as these classes have it, from numbers and the name of their type.
+        numbers: converts numbers of a type to the sequence that these classes use.
     """
 
     def __init__(self, class_of: Callable[[str], Any], numbers: Callable[[Iterable[Any], str], Any]) -> None:
@@ -208,12 +208,12 @@ class Family:
             zeros = {field.name: self._zero(field) for field in defined}
             numbers = {field.name: field.type for field in defined if field.has_numbers}
             self._made[name] = self._class_of(name), zeros, numbers
-        made, zeros, numbers = self._made[name]
-        given = {
+        kind, zeros, numbers = self._made[name]
+        values = {
             field: self._numbers(value, numbers[field]) if field in numbers else value
             for field, value in fields.items()
         }
-        return made(**{**zeros, **given})
+        return kind(**{**zeros, **values})
 
     def _zero(self, field: Field) -> Any:
         if field.length is not None:
@@ -226,4 +226,4 @@ def _array(values: Iterable[Any], base: str) -> Any:
 
 
 make = Family(lambda name: _store().types[name], _array).make
-"""Makes messages that `encode` takes."""
+"""Creates messages for `encode`."""

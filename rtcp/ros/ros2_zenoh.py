@@ -1,4 +1,4 @@
-"""ROS 2 over Zenoh without ROS: topics, services and the action as rmw_zenoh has them.
+"""ROS 2 over Zenoh without ROS: topics, services and the action, compatible with rmw_zenoh.
 
 Keys, liveliness tokens and attachments are those of rmw_zenoh_cpp from 2025 on (its docs/design.md). The session is a
 client: ROS's router does not forward between peers. The only file that imports zenoh.
@@ -39,10 +39,10 @@ from rtcp.ros.ros2_types import dds_type, decode, encode, make, type_hash
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
 ATTACHMENT = struct.Struct("<qqB16s")
-"""Number of the message, instant of sending (ns since 1970), length and id of the endpoint (gid)."""
+"""Number of the message, instant of sending (ns since 1970), length of the endpoint's id (gid), and the id."""
 _NODE, _PUBLISHER, _SUBSCRIBER, _SERVER = "NN", "MP", "MS", "SS"
 _QOS = f"::,{DEPTH}:,:,:,,"
-"""Reliability, durability, history, deadline, lifespan, liveliness; what is left out is rmw_zenoh's default."""
+"""Reliability, durability, history, deadline, lifespan, liveliness; empty ones are rmw_zenoh's defaults."""
 _LATCHED_QOS = ":1:,1:,:,:,,"
 _LOG = logging.getLogger("rtcp.ros")
 
@@ -53,24 +53,24 @@ def key_of(domain: int, topic: str, kind: str) -> str:
 
 
 def open_session(router: str, is_router: bool = False) -> zenoh.Session:
-    """Return a session as client of a router, or as a router of its own that listens there.
+    """Return a session as client of a router, or as a router that listens at this address.
 
     Raises:
-        zenoh.ZError: it does not answer, or the address is in use.
+        zenoh.ZError: the router does not answer, or the address is in use.
     """
     config = zenoh.Config()
     for key, value in {
         "mode": "router" if is_router else "client",
         "listen/endpoints" if is_router else "connect/endpoints": [router],
         "scouting/multicast/enabled": False,
-        "timestamping/enabled": True,  # the cache of a latched topic needs it
+        "timestamping/enabled": True,  # required by the cache of a latched topic
     }.items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
 
 
 def open_wire(router: str) -> OpenWire:
-    """Return what opens the wire; it waits for the router."""
+    """Return the function that opens the wire; it waits for the router."""
 
     @contextlib.contextmanager
     def opened(options: Ros2Options, commands: Commands, ends: threading.Event) -> Iterator[ZenohWire]:
@@ -81,7 +81,7 @@ def open_wire(router: str) -> OpenWire:
                 break
             except zenoh.ZError as error:
                 if not has_failed:
-                    # Behind " at " zenoh names its own source files.
+                    # After " at " zenoh names its own source files.
                     reason = str(error).partition(" at ")[0].strip()
                     _LOG.warning("%s: waiting for the router (`rmw_zenohd`): %s", router, reason)
                 has_failed = True
@@ -106,7 +106,7 @@ class ZenohWire:
         self._space = f"/{options.namespace}".replace("/", "%")
         self._prefix = f"@ros2_lv/{options.domain}/{session.info.zid()}/0"
         self._action = ActionServer(commands, make, self.publish)
-        # What is declared ends with the last reference to it.
+        # A declaration ends with its last reference.
         self._declared: list[Any] = [
             session.liveliness().declare_token(f"{self._prefix}/0/{_NODE}/%/{self._space}/{options.name}")
         ]
@@ -167,7 +167,7 @@ class ZenohWire:
                 response = encode(f"{kind}_Response", await respond(request))
                 attachment = None if query.attachment is None else query.attachment.to_bytes()
                 if attachment is not None and len(attachment) == ATTACHMENT.size:
-                    # A client knows its answer by its own number and id.
+                    # A client identifies its answer by its own number and id.
                     number, _, length, gid = ATTACHMENT.unpack(attachment)
                     attachment = ATTACHMENT.pack(number, time.time_ns(), length, gid)
                 query.reply(key, response, attachment=attachment)
@@ -175,12 +175,12 @@ class ZenohWire:
         def receive(query: zenoh.Query) -> None:
             self._commands.submit(answer(query))
 
-        # rmw_zenoh asks only those that are complete.
+        # rmw_zenoh queries only complete queryables.
         self._declared.append(self._session.declare_queryable(key, receive, complete=True))
         self._announce(_SERVER, service, kind)
 
     def _announce(self, entity: str, topic: str, kind: str) -> bytes:
-        """Make a topic or service appear in lists; return the id of the endpoint."""
+        """Announce a topic or service for discovery; return the id of the endpoint."""
         qos = _LATCHED_QOS if topic in LATCHED else _QOS
         name = f"/{self._options.resolved(topic)}".replace("/", "%")
         key = (

@@ -1,7 +1,7 @@
-"""What the node says of the arm, and when: from cycle records alone, without ROS types.
+"""Samples of the arm for the node, from cycle records alone, without ROS types.
 
-Every stamp is the instant of a cycle, as CLOCK_REALTIME has it now: what is old keeps its stamp and is not said again.
-Joints come from cycles in which every slave answered; in the others the record repeats older values.
+Every stamp is the instant of a cycle, converted to CLOCK_REALTIME; no sample is published twice. Joint samples are from
+cycles in which every slave answered; in the others the record repeats older values.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from rtcp.fieldbus.simple_message.messages import RobotMode, TriState
 from rtcp.motion.planning.interpolation import Quaternion, quaternion
 
 TOOL_FRAME = "tool0_controller"
-"""As other drivers name it: `tool0` itself hangs at the last link of the URDF."""
+"""Frame of the tool, named as by other drivers; `tool0` is a fixed child of the URDF's last link."""
 RECONNECT_S = 1.0
-"""Interval between two tries to reach the platform (ROS-Industrial driver specification, 1.2.2)."""
+"""Interval between two attempts to reach the platform (ROS-Industrial driver specification, 1.2.2)."""
 _SECOND_NS = 1_000_000_000
 _STATUS_NS = _SECOND_NS // 10
-"""Longest interval between two statuses, where a change comes at once, and between two samples of the channels."""
+"""Longest interval between two statuses, beside one at each change, and interval of the channels' samples, ns."""
 _DIAGNOSTICS_NS = _SECOND_NS
 _STALE_NS = _SECOND_NS // 2
-"""Age at which a record, or a measured value in one, says nothing about now: far beyond the stalls of a busy host."""
+"""Age above which a record, or a measured value in one, is stale, ns: far beyond the stalls of a busy host."""
 _AT_REST = 0.01
 """Measured speed below which a joint stands, rad/s: drives report some counts of noise."""
 _CHANGES = ("state", "flags", "control_mode", "fault", "limit", "speed_override")
@@ -61,7 +61,7 @@ class JointSample:
 
 @dataclass(frozen=True)
 class RobotStatus:
-    """industrial_msgs/RobotStatus; `stamp_ns`: CLOCK_REALTIME. Without fields: nothing is known, no motion possible."""
+    """industrial_msgs/RobotStatus; `stamp_ns`: CLOCK_REALTIME. The defaults mean: unknown, and no motion possible."""
 
     stamp_ns: int
     mode: RobotMode = RobotMode.UNKNOWN
@@ -73,7 +73,7 @@ class RobotStatus:
     error_code: int = 0
     """Number of the event (`docs/machine.md`); 0: no error."""
     speed_override: float = 0.0
-    """Fraction of its speed at which the arm moves; of a group the smallest; 0: nothing is known."""
+    """Speed override, 0 to 1; of a group the smallest one; 0: unknown."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Diagnostics:
 
 @dataclass(frozen=True)
 class ChannelSample:
-    """Inputs and outputs of IO boxes that have a name, and channels of slaves, in one cycle, by slave and name."""
+    """Named inputs and outputs of IO boxes, and channels of slaves, in one cycle, by slave and name."""
 
     stamp_ns: int
     values: Mapping[str, Mapping[str, float]]
@@ -98,7 +98,7 @@ class ChannelSample:
 
 
 class Sink(Protocol):
-    """Who publishes it."""
+    """Publisher of the samples."""
 
     def connected(self, config: Any) -> None:
         """A platform was reached: its configuration (`rtcp.config.model.ArmConfig`)."""
@@ -120,59 +120,59 @@ def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: boo
     """Return the status that a cycle record shows.
 
     Args:
-        record: of the cycle.
-        age_ns: how much older the measured values in it are than itself.
+        record: the cycle record.
+        age_ns: age of its measured values at its instant, ns.
         stamp_ns: its instant, CLOCK_REALTIME.
-        is_held_by_others: another commander has the arm, so that a motion would be refused.
+        is_held_by_others: whether another commander holds the lease, so that a motion would be refused.
     """
-    found, state = api.RobotStatus.of_record(record), State(record["state"])
+    status, state = api.RobotStatus.of_record(record), State(record["state"])
     is_fresh = age_ns < _STALE_NS
     # A drive that was last seen without torque does not get it back while no frame reaches it.
-    powered = TriState.UNKNOWN if found.drives_powered and not is_fresh else TriState(found.drives_powered)
-    if found.in_motion:
+    powered = TriState.UNKNOWN if status.drives_powered and not is_fresh else TriState(status.drives_powered)
+    if status.in_motion:
         in_motion = TriState.TRUE
     elif state in _AT_REST_STATES or (not is_fresh and powered is TriState.FALSE):
         in_motion = TriState.FALSE
-    elif is_fresh:  # a quick stop decelerates in the state that it led to
+    elif is_fresh:  # in a fault or an emergency stop the arm may still decelerate
         in_motion = TriState(bool(np.abs(record["actual_velocity"]).max(initial=0.0) > _AT_REST))
     else:
         in_motion = TriState.UNKNOWN
     takes_motions = int(record["control_mode"]) in _TAKES_MOTIONS and is_fresh and not is_held_by_others
     return RobotStatus(
         stamp_ns,
-        RobotMode.MANUAL if found.mode == "manual" else RobotMode.AUTO,
-        TriState(found.e_stopped),
+        RobotMode.MANUAL if status.mode == "manual" else RobotMode.AUTO,
+        TriState(status.e_stopped),
         powered,
-        TriState(found.motion_possible and takes_motions),
+        TriState(status.motion_possible and takes_motions),
         in_motion,
-        TriState(found.in_error),
-        found.error_code,
+        TriState(status.in_error),
+        status.error_code,
         float(record["speed_override"]),
     )
 
 
 def transforms_of(arm: ArmModel, q: Numbers, has_links: bool) -> dict[str, tuple[Vector, Quaternion]]:
-    """Return position, m, and orientation (w, x, y, z) in `base_link` of the tool, as `TOOL_FRAME`, by its name.
+    """Return frames by name, each with its position, m, and orientation (w, x, y, z) in `base_link`.
 
     Args:
         arm: the geometry.
-        q: rad
-        has_links: also of the links and `tool0`, which a robot_state_publisher publishes else.
+        q: joint positions, rad, one number for each joint.
+        has_links: whether to return the links and `tool0` beside `TOOL_FRAME`: without a robot_state_publisher.
     """
     poses = frames(arm, q)
     names = [*(f"link{number}" for number in range(1, len(poses))), "tool0"] if has_links else []
-    found = dict(zip([*names, TOOL_FRAME], [*poses, poses[-1]] if has_links else poses[-1:], strict=True))
-    return {name: (pose.position, quaternion(pose.rotation)) for name, pose in found.items()}
+    poses_of = dict(zip([*names, TOOL_FRAME], [*poses, poses[-1]] if has_links else poses[-1:], strict=True))
+    return {name: (pose.position, quaternion(pose.rotation)) for name, pose in poses_of.items()}
 
 
 class StatePublisher:
-    """Follows the platform while there is one, and tells a sink; tries again at 1 Hz while there is none.
+    """Reads the records of the platform and publishes samples to a sink; tries to connect once a second.
 
     Args:
-        sink: who publishes.
+        sink: publishes the samples.
         open_feed: returns the records of the platform; raises NotRunning.
-        rate_hz: joint samples a second, at most one a cycle.
-        name: of this node as commander: the lease is another's unless it is this one's.
+        rate_hz: joint samples per second; at most one per cycle.
+        name: name of this node as commander; a lease with another name is held by others.
     """
 
     def __init__(
@@ -183,7 +183,7 @@ class StatePublisher:
         self._names: tuple[str, ...] = ()
         self._feed: Feed | None = None
         self._why = ""
-        """Why there is no feed."""
+        """Reason for the missing feed."""
         self._retry_ns = self._status_ns = self._diagnostics_ns = 0
         """When each is due, CLOCK_MONOTONIC."""
         self._joints_ns = 0
@@ -207,7 +207,7 @@ class StatePublisher:
         if feed is None:
             time.sleep(wait_s)
         else:
-            # Between two samples it rests: not each of up to 2000 records a second has to wake it.
+            # Sleep until the next sample is due: waking up for each of up to 2000 records a second costs too much.
             rest_s = (self._joints_ns - feed.period_ns - now_ns) * 1e-9
             has_ended = feed.ended(min(max(rest_s, 0.0), wait_s))
             feed.wait(wait_s)
@@ -217,7 +217,7 @@ class StatePublisher:
         self._publish_due(time.monotonic_ns())
 
     def close(self) -> None:
-        """Let go of the records."""
+        """Close the records."""
         if self._feed is not None:
             self._feed.close()
             self._feed = None
@@ -247,7 +247,7 @@ class StatePublisher:
             if whole:
                 self._measured_ns = instant
                 if instant >= self._joints_ns - half_cycle:
-                    # From when it was due, so that the rate holds; after a pause from now: nothing is caught up.
+                    # One period after this sample was due, so that the rate is kept; after a pause one from now.
                     due = self._joints_ns + self._period_ns
                     self._joints_ns = due if due > instant else instant + self._period_ns
                     self._sink.joints(self._names, _sample(records[at], instant + ahead_ns))
@@ -286,7 +286,7 @@ class StatePublisher:
 
 
 def _ahead_ns() -> int:
-    """Return CLOCK_REALTIME less CLOCK_MONOTONIC, ns: of three readings the one that was held up least."""
+    """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, ns: of three readings the one with the least delay."""
     readings = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(3)]
     before, wall, after = min(readings, key=lambda reading: reading[2] - reading[0])
     return wall - (before + after) // 2
@@ -308,9 +308,9 @@ def _sample(record: Any, stamp_ns: int) -> JointSample:
 
 def _channels(feed: Feed, record: Any, stamp_ns: int) -> ChannelSample:
     values: dict[str, dict[str, float]] = {}
-    for one in feed.channels:
-        values.setdefault(one.slave, {})[one.local_name] = float(one.value(record))
-    return ChannelSample(stamp_ns, values, [(one.slave, one.local_name) for one in feed.channels if one.settable])
+    for item in feed.channels:
+        values.setdefault(item.slave, {})[item.local_name] = float(item.value(record))
+    return ChannelSample(stamp_ns, values, [(item.slave, item.local_name) for item in feed.channels if item.settable])
 
 
 def _diagnostics(feed: Feed, record: Any, ahead_ns: int) -> Diagnostics:
@@ -327,11 +327,11 @@ def _diagnostics(feed: Feed, record: Any, ahead_ns: int) -> Diagnostics:
         "ticks skipped": str(record["missed"]),
         "error code": str(record["fault"] or record["limit"]),
     }
-    # Processes, and slaves of which nothing is known but their channels.
-    shown = {one.name for one in feed.config.processes}
-    shown |= {slave.name for slave in feed.config.slaves if slave.device.has_channels}
+    # Processes, and slaves that the platform knows by their channels alone.
+    parts = {process.name for process in feed.config.processes}
+    parts |= {slave.name for slave in feed.config.slaves if slave.device.has_channels}
     for field in feed.schema.fields:
-        if field.part in shown:
+        if field.part in parts:
             unit = f" {field.unit}" if field.unit else ""
             values[f"{field.part} {field.local_name}"] = f"{record[field.name]}{unit}"
     return Diagnostics(int(record["time_ns"]) + ahead_ns, level, state.words, tuple(values.items()))

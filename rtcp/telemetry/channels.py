@@ -1,4 +1,4 @@
-"""What people and tools see of the cycle records: the same channels in a recording and in the live view.
+"""Channels of the cycle records for people and tools: the same in a recording and in the live view.
 
 | topic | schema | how often |
 |---|---|---|
@@ -7,14 +7,14 @@
 | `/joint_commands`, `/joint_targets` | the same: commanded; sent | each record |
 | `/tf` | `tf2_msgs/msg/TFMessage`: the frames from base_link to tool0 | up to 100 Hz |
 | `/machine` | JSON: state, modes, drive states, inputs and outputs in words | each change |
-| `/log` | `foxglove.Log`: events and messages | each |
+| `/log` | `foxglove.Log`: events | each |
 | `/robot_description` | `std_msgs/msg/String`: the arm as URDF | once |
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from typing import Any
@@ -28,20 +28,14 @@ from kinematics.urdf import to_urdf
 from rtcp.api.feed import Records
 from rtcp.config.model import ArmConfig
 from rtcp.ipc import schema as record
-from rtcp.ipc.recording import (
-    INFORMATION,
-    LOG_SCHEMA,
-    cycle_messages,
-    cycle_type,
-    log_entry,
-)
+from rtcp.ipc.cdr import CdrTemplate, stamps
+from rtcp.ipc.cycle_channels import CycleChannels, send
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import ControlMode, DriveMode, DriveState, State
 from rtcp.motion.planning.interpolation import quaternion
-from rtcp.telemetry.cdr import CdrTemplate, stamps
 
 TF_S = 0.01
-"""Between two transforms."""
+"""Interval between two transforms, s."""
 _HEADER = "std_msgs/Header header\n"
 _RULE = "=" * 80 + "\nMSG: "
 _HEADER_TYPES = _RULE + "std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" + _RULE + (
@@ -69,7 +63,7 @@ _WATCHED = ("state", "drive_mode", "control_mode", "flags")
 
 
 class UnknownSignal(ValueError):
-    """A signal that no record has: the message names it and those that there are."""
+    """A signal that no record has; the message lists the existing ones."""
 
     def __init__(self, signal: str, allowed: Sequence[str]) -> None:
         super().__init__(f"{signal}: there is no such signal; allowed are {', '.join(allowed)}")
@@ -77,11 +71,11 @@ class UnknownSignal(ValueError):
 
 
 def fields_of(schema: RecordSchema, signals: Sequence[str]) -> list[str]:
-    """Return the names of the fields of a record that match; none given: all.
+    """Return the names of the record's fields that match.
 
     Args:
-        schema: of the record.
-        signals: names of fields or patterns (`*_position`); number and time are always there.
+        schema: schema of the record.
+        signals: names of fields or patterns (`*_position`), none: all; number and time are always included.
 
     Raises:
         UnknownSignal: no field matches.
@@ -93,16 +87,14 @@ def fields_of(schema: RecordSchema, signals: Sequence[str]) -> list[str]:
     return [name for name in schema.names if any(fnmatchcase(name, signal) for signal in wanted)]
 
 
-class Channels:
-    """Publishes cycle records and messages into a context: files and live views listen to that.
+class Channels(CycleChannels):
+    """Channels of an arm: cycles, messages, joint states, targets, frames and changes of its machine.
 
     Args:
         config: the arm.
-        schema: of its records.
-        offset_ns: CLOCK_REALTIME less CLOCK_MONOTONIC, ns: one for the whole recording, so that setting the clock
-            does not tear it.
-        signals: of `/cycle`; see `fields_of`.
-        context: where to.
+        schema: schema of its records.
+        offset_ns, context: see `CycleChannels`.
+        signals: signals of `/cycle`; see `fields_of`.
     """
 
     def __init__(
@@ -113,12 +105,8 @@ class Channels:
         signals: Sequence[str] = (),
         context: foxglove.Context | None = None,
     ) -> None:
+        super().__init__(schema.subset(fields_of(schema, signals)), offset_ns, context)
         self._config = config
-        self._offset_ns = offset_ns
-        self._context = context or foxglove.Context()
-        chosen = schema.subset(fields_of(schema, signals))
-        self._cycle = self._ros_channel("/cycle", "rtcp_msgs/msg/Cycle", chosen.definition().decode())
-        self._cycle_type = cycle_type(chosen)
         names = [joint.name for joint in config.joints]
         self._joints = {
             topic: (
@@ -132,31 +120,14 @@ class Channels:
         self._tf = self._ros_channel("/tf", "tf2_msgs/msg/TFMessage", _TF)
         self._tf_ns = 0
         self._machine = self._json_channel("/machine", {"type": "object", "title": "rtcp.Machine"})
-        self._log = self._json_channel("/log", LOG_SCHEMA)
         self._last: npt.NDArray[np.int64] | None = None
         self._inputs, self._outputs = config.terminals(config.inputs), config.terminals(config.outputs)
         self._outputs.pop("heartbeat", None)  # it changes in every cycle
         for places, which in ((self._inputs, "inputs"), (self._outputs, "outputs")):
             for name in [name for name, (box, _) in places.items() if box_field(box, which) not in schema.names]:
-                del places[name]  # of a recording that lacks its box
+                del places[name]  # the recording lacks its box
         self._boxes = _masks(self._inputs, "inputs") | _masks(self._outputs, "outputs")
         self._description = self._ros_channel("/robot_description", "std_msgs/msg/String", "string data\n")
-
-    def _ros_channel(self, topic: str, name: str, definition: str) -> foxglove.Channel:
-        schema = foxglove.Schema(name=name, encoding="ros2msg", data=definition.encode())
-        return foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=self._context)
-
-    def _json_channel(self, topic: str, schema: Mapping[str, Any]) -> foxglove.Channel:
-        return foxglove.Channel(topic, schema=dict(schema), message_encoding="json", context=self._context)
-
-    @property
-    def context(self) -> foxglove.Context:
-        """Where the channels are."""
-        return self._context
-
-    def wall_ns(self, monotonic_ns: int) -> int:
-        """Return an instant of CLOCK_MONOTONIC as these channels have it."""
-        return monotonic_ns + self._offset_ns
 
     def describe(self, time_ns: int) -> None:
         """Publish the arm's URDF, where its geometry is known; `/machine` follows with the next record."""
@@ -166,32 +137,31 @@ class Channels:
             self._description.log(message, log_time=time_ns)
 
     def repeat(self, topic: str) -> None:
-        """Publish again what came once or with a change, for one who has just subscribed to `topic`."""
+        """Publish the last message of a topic without regular messages again, for a new subscriber."""
         if topic == self._description.topic():
             self.describe(self.wall_ns(time.monotonic_ns()))
         elif topic == self._machine.topic():
-            self._last = None  # the next record is a change
+            self._last = None  # the next record counts as a change
 
     def publish(self, records: Records, chosen: Records | None = None) -> None:
-        """Publish cycle records, oldest first; a channel that nobody listens to costs nothing.
+        """Publish cycle records, oldest first; a channel without listeners costs nothing.
 
         Args:
-            records: all: changes come from these.
-            chosen: those whose numbers are wanted; None: all.
+            records: all records, for the changes.
+            chosen: records whose values are published; None: all.
         """
         if len(records) and self._machine.has_sinks():
             self._publish_changes(records, (records["time_ns"] + self._offset_ns).tolist())
         records = records if chosen is None else chosen
         if not len(records):
             return
+        super().publish(records)
         time_ns = records["time_ns"] + self._offset_ns
         instants = time_ns.tolist()
-        if self._cycle.has_sinks():
-            _send(self._cycle, instants, cycle_messages(records, self._cycle_type))
         for channel, sources, template in self._joints.values():
             if channel.has_sinks():
                 values = {name: records[name] for name in sources if name}
-                _send(channel, instants, template.fill(len(records), {**stamps(time_ns), **values}))
+                send(channel, instants, template.fill(len(records), {**stamps(time_ns), **values}))
         if self._frames is not None and self._tf.has_sinks():
             self._publish_frames(records, time_ns)
 
@@ -200,12 +170,12 @@ class Channels:
         chosen = []
         for at, instant in enumerate(time_ns.tolist()):
             if instant - self._tf_ns >= TF_S * 1e9:
-                # From when it was due: the cycle's jitter does not add up.
+                # Count from the due time, so that the cycle's jitter does not accumulate.
                 self._tf_ns = max(self._tf_ns + round(TF_S * 1e9), instant - round(TF_S * 1e9))
                 chosen.append(at)
         if chosen:
-            some, instants = records[chosen], time_ns[chosen]
-            _send(self._tf, instants.tolist(), self._frames.messages(some["actual_position"], some["tool"], instants))
+            due, instants = records[chosen], time_ns[chosen]
+            send(self._tf, instants.tolist(), self._frames.messages(due["actual_position"], due["tool"], instants))
 
     def _publish_changes(self, records: Records, instants: Sequence[int]) -> None:
         columns = [
@@ -235,10 +205,6 @@ class Channels:
             "outputs": {name: _level(boxes, place, "outputs") for name, place in self._outputs.items()},
         }
 
-    def log(self, time_ns: int, message: str, level: int = INFORMATION) -> None:
-        """Publish a message; `level` as in `foxglove.Log`: 2 information, 3 warning, 4 error."""
-        self._log.log(log_entry(time_ns, message, level), log_time=time_ns)
-
 
 def urdf_of(config: ArmConfig) -> str:
     """Return the arm as URDF; the geometry must be known."""
@@ -251,7 +217,7 @@ Terminal = tuple[str, int]
 
 
 def box_field(box: str, which: str) -> str:
-    """Return the field of the record with the `inputs` or the `outputs` of a box."""
+    """Return the name of the record's field with the `inputs` or the `outputs` of a box."""
     return f"{record.identifier(box)}_{which}"
 
 
@@ -270,12 +236,6 @@ def _level(words: Mapping[str, int], place: Terminal, which: str) -> bool:
 
 def _name(kind: Any, value: int) -> str:
     return str(kind(value).name).lower() if value in kind._value2member_map_ else str(value)
-
-
-def _send(channel: foxglove.Channel, instants: Sequence[int], messages: Sequence[bytes]) -> None:
-    log: Callable[..., None] = channel.log
-    for instant, message in zip(instants, messages, strict=True):
-        log(message, log_time=instant)
 
 
 def _joint_template(names: Sequence[str], sources: Sequence[str | None]) -> CdrTemplate:

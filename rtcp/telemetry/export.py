@@ -19,17 +19,17 @@ from rtcp.telemetry.recorder import CSV_NAMES, CsvWriter, McapWriter
 
 
 def export(reader: Reader, out: Path, replace: bool = False) -> int:
-    """Write what a reader gives to a file, whole or not at all, and return the number of records.
+    """Write the recording of a reader to a file, whole or not at all, and return the number of records.
 
-    CSV and MCAP are written part by part; npz, which holds `seconds` and each signal by its name, at once.
+    CSV and MCAP are written part by part; npz, with `seconds` and each signal by its name, at once.
 
     Args:
-        reader: nobody has read from it.
-        out: its ending is the format: .csv, .mcap or .npz.
-        replace: a file that exists.
+        reader: an unread reader.
+        out: path whose ending is the format: .csv, .mcap or .npz.
+        replace: whether to replace an existing file.
 
     Raises:
-        RecordingError: the recording is damaged or lacks what the format needs; the file exists or cannot be written.
+        RecordingError: the recording is damaged or lacks data of the format; the file exists or cannot be written.
     """
     new = out.with_name(f".{out.stem}-{secrets.token_hex(4)}{out.suffix}")
     try:
@@ -47,7 +47,7 @@ def export(reader: Reader, out: Path, replace: bool = False) -> int:
 
 
 def _to_csv(reader: Reader, new: Path) -> int:
-    """Write the columns of the recorder's CSV where no signals were chosen and the recording has them."""
+    """Write CSV, with the recorder's columns where no signals were chosen and the recording has them."""
     columns: Sequence[str] = reader.names if reader.signals or not set(CSV_NAMES) <= set(reader.names) else ()
     writer, count = CsvWriter(reader.schema, columns), 0
     writer.open(new)

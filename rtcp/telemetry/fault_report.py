@@ -1,4 +1,4 @@
-"""A recording of the black box in numbers, and its picture: positions, targets, velocities, frames and events."""
+"""Summary and picture of a black box recording: positions, targets, velocities, frames and events."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from rtcp.ipc.states import State
 from rtcp.telemetry.reading import target_steps
 
 COLOURS = ("#1c6dd0", "#e07a1f", "#2f9e44", "#d1322d", "#7b4fb3", "#8a5a33", "#d264a6", "#6b7280", "#a39b1e", "#1fa5b5")
-"""One for each joint."""
+"""Colour of each joint."""
 _PLOTS = {"position, rad": 3.0, "velocity, rad/s": 2.0, "wkc": 0.8, "lost cycles": 0.8}
 """Plots from top to bottom and their relative heights."""
 _EVENTS = 12
-"""Number of events in the legend; those nearest to the fault."""
+"""Number of events in the legend: those nearest to the fault."""
 _DETAIL_S = (-0.1, 0.4)
 """Time around the fault in the enlarged column, s."""
 _LINE_INCH, _LINE_LETTERS = 0.155, 150
@@ -32,7 +32,7 @@ _STATES = {int(state): state.name.lower().replace("_", " ") for state in State}
 
 
 class Entry(NamedTuple):
-    """An entry of the timeline: when, s after the fault, and what."""
+    """An entry of the timeline: instant, s after the fault, and message."""
 
     at_s: float
     message: str
@@ -48,21 +48,21 @@ def seconds(recording: FaultRecording) -> npt.NDArray[np.float64]:
 def timeline(recording: FaultRecording) -> list[Entry]:
     """Return the messages and each change of the machine's state, ordered by time."""
     about = recording.about
-    found = [Entry((moment.time_ns - about.time_ns) * 1e-9, moment.message) for moment in about.timeline]
+    entries = [Entry((moment.time_ns - about.time_ns) * 1e-9, moment.message) for moment in about.timeline]
     if about.at >= 0:
         states, times = recording.records["state"], seconds(recording)
         names = [_STATES.get(int(state), str(state)) for state in states]
-        found += [
+        entries += [
             Entry(float(times[i + 1]), f"state: {names[i]} -> {names[i + 1]}")
             for i in np.flatnonzero(np.diff(states.astype(np.int64)))
         ]
-    return sorted(found, key=lambda entry: entry.at_s)
+    return sorted(entries, key=lambda entry: entry.at_s)
 
 
 def summary(recording: FaultRecording) -> dict[str, Any]:
     """Return a recording in SI units, without its cycles."""
     about, records = recording.about, recording.records
-    found = {
+    head = {
         "number": about.number,
         "time": about.when.isoformat(timespec="milliseconds"),
         "what": about.what,
@@ -76,9 +76,9 @@ def summary(recording: FaultRecording) -> dict[str, Any]:
         "joint_names": list(about.joints),
     }
     if about.at < 0:
-        return found
+        return head
     at, times = about.at, seconds(recording)
-    return found | {
+    return head | {
         "begins_s": round(float(times[0]), 4),
         "ends_s": round(float(times[-1]), 4),
         "cycles": len(times),
@@ -128,8 +128,8 @@ def draw(recording: FaultRecording, out: Path) -> None:
     legend_inch = _LINE_INCH * (legend.count("\n") + 1)
     height = 8.8 + legend_inch
     figure = Figure(figsize=(13.0, height))
-    what = textwrap.shorten(about.what.partition(";")[0], 95, placeholder=" ...")
-    figure.text(0.065, 1 - 0.3 / height, f"fault {about.number}: {what}", fontsize=13, weight="bold")
+    title = textwrap.shorten(about.what.partition(";")[0], 95, placeholder=" ...")
+    figure.text(0.065, 1 - 0.3 / height, f"fault {about.number}: {title}", fontsize=13, weight="bold")
     head = f"{about.when:%Y-%m-%d %H:%M:%S}, {about.arm} on {about.bus}, every {about.period_ns / 1000:g} us"
     head += f", {about.before} before; targets dashed; gaps: no data"
     figure.text(0.065, 1 - 0.55 / height, head, fontsize=10)
@@ -146,21 +146,21 @@ def draw(recording: FaultRecording, out: Path) -> None:
             _curves(axes, recording, max(begin, first), max(min(end, last), begin + 1e-3))
         for row in (0, 2, 3):
             detail[row].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8.5, frameon=False)
-    for one, name in zip(whole, _PLOTS, strict=True):
-        one.set_ylabel(name)
+    for plot, name in zip(whole, _PLOTS, strict=True):
+        plot.set_ylabel(name)
     for axes in (whole, detail):
-        for one in axes[:-1]:
-            one.tick_params(labelbottom=False)
+        for plot in axes[:-1]:
+            plot.tick_params(labelbottom=False)
         axes[-1].set_xlabel("s after the fault")
         _mark(axes, events)
-    for one in detail:
-        one.tick_params(labelleft=False)
+    for plot in detail:
+        plot.tick_params(labelleft=False)
     figure.text(0.065, 0.15 / height, legend, fontsize=8.5, va="bottom", linespacing=1.25)
     save(figure, out)
 
 
 def save(figure: Figure, out: Path) -> None:
-    """Write a picture to a new file and rename it: the target of a link at that place is not overwritten.
+    """Write a picture to a new file and rename it, which does not overwrite the target of a link at that path.
 
     Raises:
         OSError: it cannot be written.
@@ -179,7 +179,7 @@ def save(figure: Figure, out: Path) -> None:
 def _curves(axes: Sequence[Any], recording: FaultRecording, begin: float, end: float) -> None:
     records, times = recording.records, seconds(recording)
     positions, velocities, counter, lost = axes
-    # Drive data is valid only with the expected working counter: otherwise the last value would be drawn on.
+    # Drive data is valid only with the expected working counter; elsewhere the record repeats the last value.
     valid = records["lost"] == 0
     for at, name in enumerate(recording.about.joints):
         actual, speed = (np.where(valid, records[key][:, at], np.nan) for key in ("actual_position", "actual_velocity"))
@@ -192,19 +192,19 @@ def _curves(axes: Sequence[Any], recording: FaultRecording, begin: float, end: f
     missed = np.diff(records["missed"].astype(np.int64), prepend=int(records["missed"][0])) > 0
     if missed.any():
         lost.plot(times[missed], np.zeros(np.count_nonzero(missed)), "|", color=COLOURS[4], ms=9, label="no frame sent")
-    for one in (counter, lost):
-        one.yaxis.get_major_locator().set_params(integer=True, nbins=4)
-    for one in axes:
-        one.set_xlim(begin, end)
-        one.grid(alpha=0.25)
+    for plot in (counter, lost):
+        plot.yaxis.get_major_locator().set_params(integer=True, nbins=4)
+    for plot in axes:
+        plot.set_xlim(begin, end)
+        plot.grid(alpha=0.25)
 
 
 def _mark(axes: Sequence[Any], events: Sequence[Entry]) -> None:
     """Draw a line for each event; numbers that would overlap are joined."""
-    for one in axes:
-        one.axvline(0.0, color="#d1322d", lw=1.4, alpha=0.8)
+    for plot in axes:
+        plot.axvline(0.0, color="#d1322d", lw=1.4, alpha=0.8)
         for event in events:
-            one.axvline(event.at_s, color="black", lw=0.6, alpha=0.35)
+            plot.axvline(event.at_s, color="black", lw=0.6, alpha=0.35)
     left, right = axes[0].get_xlim()
     groups: list[list[tuple[int, float]]] = []
     for number, (at_s, _) in enumerate(events, 1):

@@ -1,10 +1,9 @@
-"""A running platform with its segment, for fault injection: commands, faults, and every cycle that follows."""
+"""A running platform with its segment, for fault injection: commands, faults, and every later cycle."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -29,16 +28,8 @@ _RESETS, _RESET_PAUSE_S = 5, 1.0
 _MOVES, _SPEED = 3, 0.4
 
 
-@dataclass(frozen=True)
-class Moment:
-    """An instant, and the last event and text of the platform before it."""
-
-    event: int
-    text: int
-
-
 class TrialFailed(Exception):
-    """The platform does not do what a trial needs in order to continue; the message says what."""
+    """The platform does not reach a condition of a trial; the message names it."""
 
 
 class Harness:
@@ -53,7 +44,7 @@ class Harness:
         self.directory = directory
         self.config = config
         self.robot = Robot(CLIENT_NAME, control_socket(directory))
-        # The session knows the socket: another segment may have the usual one.
+        # The socket is in the session: another segment may have the default one.
         self.segment = SegmentClient(read_session(directory).segment_control or segment_control(directory))
         self.observer = Observer(blackboard_file(directory))
         self._names = Names(config)
@@ -69,10 +60,10 @@ class Harness:
         self.wrong = 0
         """Cycles without the expected working counter."""
         self.largest_step = 0.0
-        """Largest step of a target between cycles with enabled drives, as a fraction of what its speed limit allows."""
+        """Largest step of a target between cycles with enabled drives, as a fraction of its speed limit's step."""
 
     def __enter__(self) -> Harness:
-        self.segment.clear_peaks()  # from the first request on the segment observes its joints
+        self.segment.clear_peaks()  # the segment observes its joints from the first request on
         return self
 
     def __exit__(
@@ -86,15 +77,15 @@ class Harness:
 
     def read_cycles(self) -> None:
         """Read the cycles since the last call; must be called every few seconds."""
-        found, torn = self.observer.since(self._seen)
+        records, torn = self.observer.since(self._seen)
         self.torn += torn
-        if not len(found):
+        if not len(records):
             return
-        self._seen = int(found[-1]["number"])
-        self.records += len(found)
-        self.wrong += int((found["wkc"] != found["wkc_expected"]).sum())
-        joined = found if self._last is None else np.concatenate([self._last, found])
-        self._last = found[-1:].copy()
+        self._seen = int(records[-1]["number"])
+        self.records += len(records)
+        self.wrong += int((records["wkc"] != records["wkc_expected"]).sum())
+        joined = records if self._last is None else np.concatenate([self._last, records])
+        self._last = records[-1:].copy()
         _, steps = target_steps(joined)
         if len(steps):
             allowed = self._speeds * self.observer.period_ns * 1e-9
@@ -111,18 +102,13 @@ class Harness:
         latest = self.observer.latest()
         return 0.0 if latest is None else float(np.abs(latest[0]["actual_velocity"]).max())
 
-    def moment(self) -> Moment:
-        """Return this moment, for `messages_since`."""
-        events, texts = self.observer.events_since(0), self.observer.texts_since(0)
-        return Moment(events[-1].number if events else 0, texts[-1].number if texts else 0)
+    def moment(self) -> int:
+        """Return the number of the last event, the argument of `messages_since`."""
+        return self.observer.last_event
 
-    def messages_since(self, moment: Moment) -> list[str]:
-        """Return the platform's messages since a moment, in their order."""
-        found = [
-            (record.time_ns, self._names.message(record.event)) for record in self.observer.events_since(moment.event)
-        ]
-        found += [(text.time_ns, text.sentence) for text in self.observer.texts_since(moment.text)]
-        return [sentence for _, sentence in sorted(found)]
+    def messages_since(self, moment: int) -> list[str]:
+        """Return the platform's messages since a moment, in order."""
+        return [self._names.message(record.event) for record in self.observer.events_since(moment)]
 
     def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait for a condition while reading cycles; return whether it was met in time."""
@@ -140,9 +126,9 @@ class Harness:
 
     def drives(self) -> list[dict[str, Any]]:
         """Return the segment's ground truth of each joint's drive, as `position_rad`, `torque_on`."""
-        found = {slave["position"]: slave for slave in self.segment.truth()["slaves"]}
+        by_position = {slave["position"]: slave for slave in self.segment.truth()["slaves"]}
         positions = {slave.name: at for at, slave in enumerate(self.config.slaves, 1)}
-        slaves = [(found[positions[joint.slave]], joint.axis) for joint in self.config.joints]
+        slaves = [(by_position[positions[joint.slave]], joint.axis) for joint in self.config.joints]
         return [slave["axes"][axis - 1] if "axes" in slave else slave for slave, axis in slaves]
 
     def joint_positions(self) -> list[float]:
@@ -157,7 +143,7 @@ class Harness:
         """
 
         def moved_ns() -> int:
-            drives = (one for slave in self.segment.truth()["slaves"] for one in slave.get("axes", [slave]))
+            drives = (axis for slave in self.segment.truth()["slaves"] for axis in slave.get("axes", [slave]))
             return max((drive["moved_ns"] for drive in drives if "moved_ns" in drive), default=0)
 
         standstill_ns = round(_STANDSTILL_S * 1e9)
@@ -193,9 +179,9 @@ class Harness:
         return _RESETS, refusal
 
     def move(self, q: Sequence[float]) -> str:
-        """Enable and move to `q`, rad; return why that was not possible, empty where it was.
+        """Enable and move to `q`, rad; return the refusal, empty after success.
 
-        It is repeated: a host that delays the gateway for longer than `lease_s` ends a move, as it must.
+        Repeats, as a host that delays the gateway for longer than `lease_s` ends a move.
         """
         refusal = ""
         for _ in range(_MOVES):

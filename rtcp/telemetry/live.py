@@ -1,7 +1,7 @@
 """The live view: the channels of a recording over WebSocket, for Foxglove and Lichtblick (subprotocol foxglove.sdk.v1).
 
-A process of its own reads the blackboard as a recorder does. Clients only watch. Each has a queue of its own: one that
-reads too slowly loses its oldest messages, one that does not read at all is dropped, and nobody else waits for it.
+A separate process reads the blackboard as a recorder does. Clients are read-only, with a queue each: a slow client
+loses its oldest messages, one that does not read at all is disconnected; neither delays the others.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from rtcp.api.feed import Feed
 from rtcp.ipc.errors import RtcpError
 from rtcp.telemetry.channels import Channels
 
-_TURN_S = 0.025
+_POLL_S = 0.025
 _QUEUE = 8192
-"""Messages that wait for one client: 1 s of every signal at 500 us, some MB."""
+"""Most waiting messages of a client: 1 s of every signal at 500 us, some MB."""
 _HANGS_MS = 10_000
 """Time without progress after which a client is disconnected, ms."""
 
 
 class _Subscriptions(ServerListener):
-    """Topics that somebody has subscribed to since they were last asked for; the server calls it on its thread."""
+    """Collects newly subscribed topics; the server calls it from its thread."""
 
     def __init__(self) -> None:
         self.topics: SimpleQueue[str] = SimpleQueue()
@@ -44,11 +44,11 @@ class LiveView:
     Args:
         directory: the runtime directory.
         host: address to listen at.
-        port: its port; 0: a free one.
-        every: N: every Nth cycle.
+        port: port to listen at; 0: a free one.
+        every: N publishes every Nth cycle.
 
     Raises:
-        RtcpError: `not running`: no platform runs there; `refused`: nothing can listen at that address.
+        RtcpError: `not running`: no platform runs there; `refused`: the address is not available.
     """
 
     def __init__(self, directory: Path, host: str, port: int, every: int = 1) -> None:
@@ -74,13 +74,13 @@ class LiveView:
     def run(self) -> None:
         """Publish until the platform ends."""
         try:
-            while not self._feed.ended(_TURN_S):
-                self._turn()
-            self._turn()
+            while not self._feed.ended(_POLL_S):
+                self._publish_new()
+            self._publish_new()
         finally:
             self._server.stop()
 
-    def _turn(self) -> None:
+    def _publish_new(self) -> None:
         while not self._subscriptions.topics.empty():
             self._channels.repeat(self._subscriptions.topics.get())
         records, _ = self._feed.records()
@@ -90,10 +90,10 @@ class LiveView:
 
 
 def _drop_stalled_clients(port: int) -> None:
-    """Have the kernel close stalled connections: accepted sockets inherit the option of the listening one."""
-    # The SDK offers no setting for this, nor for the errors that it logs then.
+    """Let the kernel close stalled connections: accepted sockets inherit the option of the listening one."""
+    # The SDK has no setting for this, nor for the errors that it then logs.
     logging.getLogger("foxglove").setLevel(logging.CRITICAL)
-    for one in psutil.Process().net_connections("tcp"):
-        if one.status == psutil.CONN_LISTEN and one.laddr.port == port:
-            with socket.socket(fileno=os.dup(one.fd)) as listening:
+    for connection in psutil.Process().net_connections("tcp"):
+        if connection.status == psutil.CONN_LISTEN and connection.laddr.port == port:
+            with socket.socket(fileno=os.dup(connection.fd)) as listening:
                 listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _HANGS_MS)

@@ -1,6 +1,6 @@
-"""Recordings read back: of the recorder (MCAP, CSV) and of the black box, whole or chunk by chunk.
+"""Reads recordings of the recorder (MCAP, CSV) and of the black box, whole or part by part.
 
-A file that is cut off, as that of a recorder that was killed, is read as far as it is whole, and says so.
+A truncated file, as of a killed recorder, is read up to its damage and marked as `truncated`.
 """
 
 from __future__ import annotations
@@ -22,17 +22,8 @@ from numpy.lib.recfunctions import repack_fields
 
 from rtcp.config.model import ArmConfig
 from rtcp.config.serialization import from_json
-from rtcp.ipc.recording import (
-    ABOUT,
-    Batch,
-    ChunkDecoder,
-    Moment,
-    RecordingError,
-    contents,
-    cycle_type,
-    is_complete,
-    opened,
-)
+from rtcp.ipc.cycle_channels import ABOUT
+from rtcp.ipc.recording import Batch, ChunkDecoder, Moment, RecordingError, contents, cycle_type, is_complete, opened
 from rtcp.ipc.schema import FLAG_ENABLED, PER_JOINT, Field, RecordSchema, SchemaError, arm_schema
 from rtcp.telemetry.recorder import CSV_NAMES
 
@@ -49,26 +40,26 @@ class Part(NamedTuple):
 
 
 class Reader:
-    """A recording that is read once, from its beginning, part by part: `for part in Reader(path): ...`.
+    """Reads a recording once, from its beginning, part by part: `for part in Reader(path): ...`.
 
     Args:
         path: MCAP of a recorder or of the black box, or CSV (`.csv`) of a recorder.
-        signals: names of fields or patterns (`*_position`); none: all that the file has. number and
-            time_ns are always there.
-        start_s: from the first record; None: from it.
-        end_s: from the first record; None: to the last one.
+        signals: names of fields or patterns (`*_position`), none: all in the file; number and time_ns are always
+            included.
+        start_s: begin of the span, s from the first record; None: the first record.
+        end_s: end of the span, s from the first record; None: the last record.
 
     Attributes:
-        about: what the file says about itself, by name: arm, joints, period_us, versions; of a fault also `fault`.
-        config: the arm at that time; None where the file has none, or that of another version.
-        signals, names: those that were asked for; the fields that its records have.
-        schema: of its records; joints: how many.
+        about: metadata of the file: arm, joints, period_us, versions; of a fault also `fault`.
+        config: configuration of the recorded arm; None: not in the file, or of an incompatible version.
+        signals, names: the chosen signals; the fields of the returned records.
+        schema: schema of its records; joints: number of joints.
         first_ns: time_ns of the first record of the file.
-        offset_ns: CLOCK_REALTIME less time_ns; 0 in CSV, which has no date.
-        truncated: whether its end is missing or something in it is damaged; known when all parts are read.
+        offset_ns: CLOCK_REALTIME minus time_ns; 0 in CSV, which has no date.
+        truncated: whether its end is missing or a part is damaged; valid after all parts are read.
 
     Raises:
-        RecordingError: the file is none, has no record, or none of these signals; while reading: no record in the span.
+        RecordingError: the file is no recording, is empty or lacks a signal; during iteration: no record in the span.
     """
 
     def __init__(
@@ -86,28 +77,28 @@ class Reader:
         self._last_s = 0.0
         self._decoder = ChunkDecoder()
         self._parts = self._read()
-        # The head is read now: what the caller has to know first.
+        # Read the head now, for the attributes.
         self._first = next(self._parts, None)
 
     def __iter__(self) -> Iterator[Part]:
-        """Return the parts; they have what is between start and end."""
-        found = 0
+        """Return the parts, with the records and messages of the span."""
+        count = 0
         for part in chain(() if self._first is None else (self._first,), self._parts):
-            found += len(part.records)
+            count += len(part.records)
             if len(part.records) or part.log:
                 yield part
-        if not found:
+        if not count:
             span = f"{self._start_s:g} to {self._end_s:g} s"
             raise RecordingError("empty", self.path, f"it has no record from {span}; it ends at {self._last_s:.3f} s")
 
     @property
     def joints(self) -> int:
-        """Joints of the arm."""
+        """Number of joints of the arm."""
         return self.schema.joints
 
     @property
     def period_s(self) -> float:
-        """Cycle, s; 0: not known."""
+        """Period of the cycle, s; 0: unknown."""
         with suppress(KeyError, ValueError):
             return float(self.about["period_us"]) * 1e-6
         return 0.0
@@ -123,7 +114,7 @@ class Reader:
             for batch in batches:
                 early += batch.log
                 if not self.names and not len(batch.cycles):
-                    continue  # when that was is known with the first cycle
+                    continue  # its time is unknown before the first cycle
                 if not self.names:
                     self._begin(batch)
                 yield self._cut(batch.cycles, early)
@@ -136,23 +127,23 @@ class Reader:
             raise RecordingError("empty", self.path, "the recording has no cycle")
 
     def _begin(self, batch: Batch) -> None:
-        """Note what the first records tell."""
+        """Set the attributes that depend on the first records."""
         self.first_ns = int(batch.cycles["time_ns"][0])
         self.offset_ns = batch.time_ns - self.first_ns if batch.time_ns else 0
-        has = batch.cycles.dtype.names or ()
+        recorded = batch.cycles.dtype.names or ()
         for signal in self.signals:
-            if not any(fnmatchcase(name, signal) for name in has):
-                defect = f"there is no signal {signal} in it; it has {', '.join(has)}"
-                raise RecordingError("signals", self.path, defect, found=signal, allowed=has)
+            if not any(fnmatchcase(name, signal) for name in recorded):
+                defect = f"there is no signal {signal} in it; it has {', '.join(recorded)}"
+                raise RecordingError("signals", self.path, defect, found=signal, allowed=recorded)
         wanted = (*self.signals, *_ALWAYS) if self.signals else ("*",)
-        self.names = [name for name in has if any(fnmatchcase(name, one) for one in wanted)]
+        self.names = [name for name in recorded if any(fnmatchcase(name, pattern) for pattern in wanted)]
 
     def _cut(self, cycles: Records, log: list[Moment]) -> Part:
         seconds = (cycles["time_ns"] - self.first_ns) * 1e-9
         if len(seconds):
             self._last_s = float(seconds[-1])
         inside = cycles[(seconds >= self._start_s) & (seconds <= self._end_s)]
-        # A copy: the fields that nobody asked for do not stay in memory.
+        # A copy, so that the other fields do not stay in memory.
         records = repack_fields(inside[self.names], align=True)
         return Part(records, [moment for moment in log if self._start_s <= self.at_s(moment) <= self._end_s])
 
@@ -182,7 +173,7 @@ class Reader:
         with opened(self.path) as file:
             header = file.readline(_CSV_HEADER).decode().rstrip("\r\n").split(",")
             self.schema, columns = _columns(header)
-            kind, count = cycle_type(self.schema), 0
+            dtype, count = cycle_type(self.schema), 0
             while lines := list(islice(file, _CSV_ROWS)):
                 if not lines[-1].endswith(b"\n"):
                     self.truncated = True
@@ -192,53 +183,56 @@ class Reader:
                 values = np.loadtxt(lines, delimiter=",", ndmin=2)
                 if values.shape[1] != len(header) or not np.isfinite(values).all():
                     raise ValueError(f"a row in the {len(lines)} after row {count} does not have {len(header)} numbers")
-                rows = np.zeros(len(values), kind)
+                rows = np.zeros(len(values), dtype)
                 rows["number"] = np.arange(count, count + len(rows)) + 1
                 rows["time_ns"] = np.round(values[:, 0] * 1e9)
-                for name, places in columns.items():
-                    rows[name] = values[:, places if rows[name].ndim == 2 else places[0]]
+                for name, indices in columns.items():
+                    rows[name] = values[:, indices if rows[name].ndim == 2 else indices[0]]
                 count += len(rows)
                 yield Batch(rows, 0, [])
 
 
 def _about(metadata: dict[str, str]) -> dict[str, str]:
-    """Return the metadata of a recorder as they are, those of the black box by the same names."""
+    """Return the metadata, those of the black box converted to the recorder's names."""
     if "json" not in metadata:
         return metadata
-    found: dict[str, Any] = json.loads(metadata["json"])
+    fault: dict[str, Any] = json.loads(metadata["json"])
     return {
-        "arm": str(found["arm"]),
-        "joints": ", ".join(map(str, found["joints"])),
-        "period_us": f"{found['period_ns'] * 1e-3:g}",
-        "fault": str(found["what"]),
-        **{str(name): str(version) for name, version in found["versions"].items()},
+        "arm": str(fault["arm"]),
+        "joints": ", ".join(map(str, fault["joints"])),
+        "period_us": f"{fault['period_ns'] * 1e-3:g}",
+        "fault": str(fault["what"]),
+        **{str(name): str(version) for name, version in fault["versions"].items()},
     }
 
 
 def _columns(header: Sequence[str]) -> tuple[RecordSchema, dict[str, list[int]]]:
-    """Return the schema of a recorder's CSV, and the places of each field in its columns; raises ValueError.
+    """Return the schema of a recorder's CSV, and the column indices of each field; raises ValueError.
 
-    A CSV tells no types: those of an arm's fields are known, what a device publishes is float64.
+    A CSV has no types: the types of an arm's fields are known, fields of devices are float64.
     """
-    full, known = {short: name for name, short in CSV_NAMES.items()}, arm_schema(1)
-    found: dict[str, list[int]] = {}
-    for at, column in enumerate(header):
-        match = fullmatch(r"J\d+_(\w+)", column)
-        if at:
-            found.setdefault(full.get(match[1], match[1]) if match else column, []).append(at)
-    joints = {len(places) for name, places in found.items() if name in PER_JOINT}
+    long_names, known = {short: name for name, short in CSV_NAMES.items()}, arm_schema(1)
+    columns: dict[str, list[int]] = {}
+    vectors: set[str] = set()
+    for index, column in enumerate(header[1:], 1):
+        of_joint = fullmatch(r"J\d+_(\w+)", column)
+        name = long_names.get(of_joint[1], of_joint[1]) if of_joint else column
+        columns.setdefault(name, []).append(index)
+        if of_joint:
+            vectors.add(name)
+    joint_counts = {len(indices) for name, indices in columns.items() if name in PER_JOINT}
     try:
-        if header[0] != "Time" or not set(found) & set(known.names) or len(joints) > 1:
+        if header[0] != "Time" or not set(columns) & set(known.names) or len(joint_counts) > 1:
             raise SchemaError
         fields = [known[name] for name in _ALWAYS]
-        for name, places in found.items():
-            vector = fullmatch(r"J\d+_\w+", header[places[0]])
-            field = known[name] if name in known.names else Field(name)
-            fields += [replace(field, shape=(len(places),) if vector else ())] if name not in _ALWAYS else []
-        return RecordSchema(tuple(fields)), found
+        for name, indices in columns.items():
+            if name not in _ALWAYS:
+                field = known[name] if name in known.names else Field(name)
+                fields.append(replace(field, shape=(len(indices),) if name in vectors else ()))
+        return RecordSchema(tuple(fields)), columns
     except SchemaError as error:
-        begin = ", ".join(header)[:60]
-        raise ValueError(f"its columns begin with {begin}, those of a recording with Time, J1_pos") from error
+        first_columns = ", ".join(header)[:60]
+        raise ValueError(f"its columns begin with {first_columns}, those of a recording with Time, J1_pos") from error
 
 
 @dataclass(frozen=True)
@@ -246,11 +240,11 @@ class Recorded:
     """A recording, or a span of it, in memory.
 
     Attributes:
-        path, about, config, truncated: as of `Reader`.
-        records: structured array of the fields asked for, oldest first; SI units.
-        seconds: of each record from the first one of the file, s.
-        period_s: between two records, where none is missing, s; of every Nth cycle it is that of N.
-        missing: records that are not there, by the numbers of the others.
+        path, about, config, truncated: as in `Reader`.
+        records: structured array of the chosen fields, oldest first; SI units.
+        seconds: instants of the records, s from the first record of the file.
+        period_s: interval of consecutive records, s: N periods of the cycle where every Nth is recorded.
+        missing: number of missing records, from gaps in their numbers.
         log: messages and their levels.
         log_s: their instants, s from the first record of the file.
     """
@@ -268,7 +262,7 @@ class Recorded:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Their names, base to tool; CSV has none."""
+        """Names of the joints, base to tool; CSV has none."""
         return tuple(self.about["joints"].split(", ")) if "joints" in self.about else ()
 
     def column(self, name: str) -> npt.NDArray[np.float64]:
@@ -277,17 +271,17 @@ class Recorded:
 
 
 def read(path: Path, signals: Sequence[str] = (), start_s: float | None = None, end_s: float | None = None) -> Recorded:
-    """Read a recording; arguments and errors as of `Reader`. Only the fields asked for are held in memory."""
+    """Read a recording; arguments and errors as in `Reader`. Only the chosen fields are held in memory."""
     reader = Reader(path, signals, start_s, end_s)
     parts = list(reader)
     records = np.concatenate([part.records for part in parts])
     log = tuple(moment for part in parts for moment in part.log)
     seconds = (records["time_ns"] - reader.first_ns) * 1e-9
     steps = np.diff(records["number"].astype(np.int64))
-    every = max(1, int(steps.min())) if len(steps) else 1
-    period_s = reader.period_s * every or (float(np.median(np.diff(seconds))) if len(steps) else 0.0)
+    stride = max(1, int(steps.min())) if len(steps) else 1
+    period_s = reader.period_s * stride or (float(np.median(np.diff(seconds))) if len(steps) else 0.0)
     return Recorded(
-        path, reader.about, reader.config, records, seconds, period_s, int((steps // every - 1).sum()), log,
+        path, reader.about, reader.config, records, seconds, period_s, int((steps // stride - 1).sum()), log,
         tuple(map(reader.at_s, log)), reader.truncated,
     )  # fmt: skip
 

@@ -1,7 +1,7 @@
-"""The recorder: a process that reads the ring of cycle records, as any onlooker may, and writes it to the disk.
+"""The recorder: a process that observes the ring of cycle records and writes it to the disk.
 
-It ends with SIGTERM, after `seconds`, with the platform, or when the disk refuses or has only its reserve left. What it
-is doing stands in a file of the runtime directory, so that a gateway that was started anew finds it.
+It ends at SIGTERM, after `seconds`, with the platform, or when the disk fails or has only its reserve left. Its status
+is a file in the runtime directory, which a restarted gateway finds.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import errno
 import glob
-import io
 import json
 import os
 import shutil
@@ -23,14 +22,12 @@ from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Protocol, get_args
-
-import foxglove
-from foxglove.mcap import MCAPWriteOptions
+from typing import Any, Protocol, get_args
 
 from rtcp.api.feed import Feed, Records
 from rtcp.config.model import ArmConfig, RecordingConfig, RecordingFormat
 from rtcp.config.serialization import from_json, to_json
+from rtcp.ipc.cycle_channels import McapFile, check_linked
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.recording import versions
 from rtcp.ipc.schema import RecordSchema
@@ -39,24 +36,24 @@ from rtcp.telemetry.channels import Channels, UnknownSignal, fields_of, urdf_of
 
 FORMATS = get_args(RecordingFormat)
 FLUSH_S = 0.5
-"""What a killed recorder has not written yet is younger than this and one turn."""
-_TURN_S = 0.1
+"""Interval of flushes, s: a killed recorder loses at most this and one poll."""
+_POLL_S = 0.1
 _BATCH = 1024
-"""Records at a time: after a stall the whole ring is there."""
+"""Most records written at once: after a stall the whole ring is waiting."""
 CSV_NAMES = {"actual_position": "pos", "actual_velocity": "vel", "actual_torque": "tor", "sent_position": "tpos"}
-"""The columns of the source's logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
+"""Columns of the thesis' logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
 
 
 @dataclass
 class RecorderStatus:
-    """What a recorder is doing; the file `recorder-PID.json` of the runtime directory has these fields."""
+    """Status of a recorder, the content of the file `recorder-PID.json` in the runtime directory."""
 
     pid: int
     identity: int
     files: list[str]
-    """Those that are being written, or were written last: one a format."""
+    """Present or last file of each format."""
     rotations: int = 0
-    """How many files of each format came before them."""
+    """Number of earlier files of each format."""
     records: int = 0
     missing: int = 0
     """Cycles that were overwritten in the ring before they were read."""
@@ -67,79 +64,36 @@ class RecorderStatus:
 
 
 def status_file(directory: Path, pid: int) -> Path:
-    """Return the file that says what the recorder `pid` is doing."""
+    """Return the status file of the recorder `pid`."""
     return directory / f"recorder-{pid}.json"
 
 
 class Writer(Protocol):
-    """The files of one format, one after the other."""
+    """Writes the consecutive files of one format."""
 
     path: Path | None
-    """The file that is being written, or was last."""
+    """Present or last file."""
 
     def open(self, path: Path) -> None:
-        """Begin a new file, the one before it being closed; raises OSError, ValueError."""
+        """Begin a new file, after the former one was closed; raises OSError, ValueError."""
 
     def write(self, records: Records, chosen: Records) -> None:
-        """Append what changed in the records, and the numbers of the chosen ones; raises OSError."""
+        """Append the changes in the records, and the values of the chosen ones; raises OSError."""
 
     def flush(self) -> None:
-        """Hand over to the system what was written; raises OSError."""
+        """Pass buffered data to the system; raises OSError."""
 
     def close(self) -> None:
         """Complete the file; raises OSError."""
-
-
-class _Disk(io.RawIOBase):
-    """A file for the MCAP writer, which goes back to the beginning of a chunk when it ends one.
-
-    Only whole chunks reach the disk, by `commit`: the file can be read at any time, after a kill and on a full disk.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self._file = open(path, "xb", buffering=0)  # noqa: SIM115
-        self._pending = io.BytesIO()
-        self._written = 0
-
-    def write(self, data: Any) -> int:
-        return self._pending.write(data)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._written + self._pending.seek(offset - self._written if whence == os.SEEK_SET else offset, whence)
-
-    def commit(self) -> None:
-        """Write what has come since the last time; raises OSError, and leaves the file as it was."""
-        data = memoryview(self._pending.getvalue())
-        check_linked(self._file)
-        try:
-            left = data
-            while len(left):
-                left = left[self._file.write(left) or 0 :]
-        except OSError:
-            self._file.truncate(self._written)
-            raise
-        self._written += len(data)
-        self._pending = io.BytesIO()
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
-
-
-def check_linked(file: IO[Any]) -> None:
-    """Raise OSError where a file has been removed: what is written to it is for nobody."""
-    if os.fstat(file.fileno()).st_nlink == 0:
-        raise OSError(errno.ENOENT, "it has been removed")
 
 
 class McapWriter:
     """A recording as MCAP.
 
     Args:
-        channels: what is published in their context.
-        config: the arm; it goes into each file whole.
-        began_ns: CLOCK_REALTIME at its beginning; None: now.
+        channels: the channels to record.
+        config: the arm; each file contains it.
+        began_ns: CLOCK_REALTIME at its begin, ns; None: now.
     """
 
     def __init__(self, channels: Channels, config: ArmConfig, began_ns: int | None = None) -> None:
@@ -147,12 +101,10 @@ class McapWriter:
         self._channels, self._config, self._began_ns = channels, config, began_ns
 
     def open(self, path: Path) -> None:
-        """Begin a file with all that explains it."""
-        self._disk = _Disk(path)
+        """Begin a file with metadata and configuration."""
+        config = self._config
+        self._file = McapFile(path, self._channels.context, about(config))
         self.path = path
-        config, options = self._config, MCAPWriteOptions(profile="ros2", compression_level=1, compression_threads=0)
-        self._writer = foxglove.open_mcap(self._disk, context=self._channels.context, writer_options=options)
-        self._writer.write_metadata("rtcp/about", about(config))
         text = json.dumps(to_json(config), indent=1).encode()
         self._attach("configuration.json", "application/json", text)
         if config.arm is not None:
@@ -162,36 +114,31 @@ class McapWriter:
 
     def _attach(self, name: str, media_type: str, data: bytes) -> None:
         now = self._now()
-        self._writer.attach(log_time=now, create_time=now, name=name, media_type=media_type, data=data)
+        self._file.attach(log_time=now, create_time=now, name=name, media_type=media_type, data=data)
 
     def _now(self) -> int:
-        """Return the time as the channels have it: setting the clock does not reach the next file either."""
+        """Return the time of the channels, which a change of the system's clock does not affect."""
         return self._channels.wall_ns(time.monotonic_ns()) if self._began_ns is None else self._began_ns
 
     def write(self, records: Records, chosen: Records) -> None:
-        """Publish the records: the writer listens."""
+        """Publish the records; the file receives all channels."""
         self._channels.publish(records, chosen)
 
     def flush(self) -> None:
-        """End the chunk, so that a reader finds all of it."""
-        self._writer.flush()
-        self._disk.commit()
+        """End the chunk, so that it is readable."""
+        self._file.commit()
 
     def close(self) -> None:
         """Write the index."""
-        self._writer.close()
-        try:
-            self._disk.commit()
-        finally:
-            self._disk.close()
+        self._file.complete()
 
 
 class CsvWriter:
     """A recording as CSV.
 
     Args:
-        schema: of the records.
-        names: of the records' fields, in the order of the columns; none: those of the source.
+        schema: schema of the records.
+        names: fields in the order of the columns; none: those of the thesis.
     """
 
     def __init__(self, schema: RecordSchema, names: Sequence[str] = ()) -> None:
@@ -211,7 +158,7 @@ class CsvWriter:
         self._file.write(",".join(header) + "\n")
 
     def write(self, records: Records, chosen: Records) -> None:
-        """Append a line a chosen record; times count from the first of the recording, s."""
+        """Append a line for each chosen record, with its time from the first record, s."""
         if not len(chosen):
             return
         if self._began_ns is None:
@@ -219,14 +166,14 @@ class CsvWriter:
         columns = [((chosen["time_ns"] - self._began_ns) * 1e-9).tolist()]
         forms = ["%.9f"]
         for name in self._names:
-            found = chosen[name]
-            columns += found.T.tolist() if found.ndim == 2 else [found.tolist()]
-            forms += ["%.9g" if found.dtype.kind == "f" else "%d"] * (len(columns) - len(forms))
+            values = chosen[name]
+            columns += values.T.tolist() if values.ndim == 2 else [values.tolist()]
+            forms += ["%.9g" if values.dtype.kind == "f" else "%d"] * (len(columns) - len(forms))
         form = ",".join(forms) + "\n"
         self._file.write("".join(form % row for row in zip(*columns, strict=True)))
 
     def flush(self) -> None:
-        """Hand it to the system."""
+        """Pass buffered lines to the system."""
         check_linked(self._file)
         self._file.flush()
 
@@ -236,7 +183,7 @@ class CsvWriter:
 
 
 def about(config: ArmConfig) -> dict[str, str]:
-    """Return what a recording says about itself: arm, joints, cycle and versions."""
+    """Return the metadata of a recording: arm, joints, cycle and versions."""
     return {
         "arm": config.name,
         "joints": ", ".join(joint.name for joint in config.joints),
@@ -246,14 +193,14 @@ def about(config: ArmConfig) -> dict[str, str]:
 
 
 class Recorder:
-    """Reads a blackboard and writes it down.
+    """Reads a blackboard and records it.
 
     Args:
         directory: the runtime directory.
-        options: what is recorded; `out` is given.
+        options: options of the recording, with `out`.
 
     Raises:
-        RtcpError: it cannot be recorded; reasons and fields are those of `Robot.record_start`.
+        RtcpError: it cannot be recorded; reasons and fields as in `Robot.record_start`.
         UnknownSignal: a signal that no record has.
         NotRunning: no platform runs there.
     """
@@ -270,7 +217,7 @@ class Recorder:
             message = f"keep: found {options.keep} without max_file_mb or max_file_seconds, which begin new files"
             raise RtcpError("invalid", message, "keep_without_limit", {"keep": options.keep})
         self._stem, formats = _place(options)
-        more = [one for one in fields_of(schema, options.signals) if one not in CSV_NAMES] if options.signals else []
+        more = [key for key in fields_of(schema, options.signals) if key not in CSV_NAMES] if options.signals else []
         self._writers: dict[str, Writer] = {
             name: McapWriter(self._channels, config) if name == "mcap" else CsvWriter(schema, [*CSV_NAMES, *more])
             for name in formats
@@ -291,41 +238,41 @@ class Recorder:
         self._write_status()
 
     def end(self) -> None:
-        """Ask for the end of `run`; from a signal handler too."""
+        """Request the end of `run`; safe from a signal handler."""
         self._ended = True
 
     def run(self) -> int:
         """Record until the end; return the exit code."""
-        made, began = self.status, time.monotonic()
+        status, began = self.status, time.monotonic()
         until = None if self._options.seconds is None else began + self._options.seconds
         try:
             while not self._ended and (until is None or time.monotonic() < until):
-                self._turn()
-                made.seconds = time.monotonic() - began
-                if self._feed.ended(_TURN_S):
+                self._write_new()
+                status.seconds = time.monotonic() - began
+                if self._feed.ended(_POLL_S):
                     break
-            self._turn()
+            self._write_new()
         except Exception as error:
             self._failed(error)
-        # Each by itself: a disk that is full for one may have room for the index of the other.
+        # Each separately: a disk that is full for one may have room for the index of the other.
         for writer in self._writers.values():
             try:
                 writer.close()
             except Exception as error:
                 self._failed(error)
-        made.ended = True
+        status.ended = True
         self._write_status()
-        return 1 if made.problem else 0
+        return 1 if status.problem else 0
 
     def _failed(self, error: Exception) -> None:
-        """Note why the recording ends early; the first reason counts."""
+        """Store the reason of an early end; the first one stays."""
         if isinstance(error, OSError):
             error = _not_writable(error, self._stem)
         reason = str(error) if isinstance(error, RtcpError) else f"{type(error).__name__} {error}"
         self.status.problem = self.status.problem or f"the recording has ended: {reason}"
 
-    def _turn(self) -> None:
-        """Write what is new."""
+    def _write_new(self) -> None:
+        """Write new records and messages."""
         records, missing = self._feed.records()
         self.status.missing += missing
         for begin in range(0, len(records), _BATCH):
@@ -339,7 +286,7 @@ class Recorder:
             self._flush()
 
     def _flush(self) -> None:
-        """Hand over what was written; go on in new files where these are full, end where the disk is nearly."""
+        """Flush the files; rotate them at their limits; raises RtcpError where the disk has only its reserve left."""
         self._flushed = time.monotonic()
         self._each(methodcaller("flush"))
         self._check_space()
@@ -347,7 +294,7 @@ class Recorder:
             (max(self._sizes()) / 1e6, self._options.max_file_mb),
             (self._flushed - self._opened, self._options.max_file_seconds),
         )
-        if any(limit is not None and found >= limit for found, limit in reached):
+        if any(limit is not None and value >= limit for value, limit in reached):
             self._rotate()
         self._write_status()
 
@@ -360,13 +307,13 @@ class Recorder:
             raise RtcpError("refused", message, "disk_reserve", fields)
 
     def _check_place(self) -> None:
-        """Refuse a place where files of another rotating recording would be met later."""
+        """Refuse a path at which files of another rotating recording would follow."""
         for name in self._writers if self._rotates else ():
             for path in self._stem.parent.glob(f"{glob.escape(self._stem.name)}-[0-9]*.{name}"):
                 raise FileExistsError(errno.EEXIST, "File exists", str(path))
 
     def _rotate(self) -> None:
-        """Complete the files, begin the next ones, and remove the oldest beyond those that are kept."""
+        """Complete the files, begin the next ones, and remove the oldest beyond `keep`."""
         self._each(methodcaller("close"))
         self._finished_bytes += sum(self._sizes())
         self.status.rotations += 1
@@ -382,14 +329,14 @@ class Recorder:
         self._opened = self._flushed = time.monotonic()
 
     def _path(self, name: str, number: int) -> Path:
-        """Return the file of a format; numbers have a width, so that names sort by age."""
+        """Return the file of a format; numbers are zero-padded, so that names sort by age."""
         return self._stem.with_name(f"{self._stem.name}{f'-{number:06d}' if self._rotates else ''}.{name}")
 
     def _sizes(self) -> list[int]:
         return [writer.path.stat().st_size for writer in self._writers.values() if writer.path is not None]
 
     def _each(self, do: Callable[[Writer], None]) -> None:
-        """Do something with the file of every format; an error names its file."""
+        """Call `do` for the writer of every format; an error names its file."""
         for writer in self._writers.values():
             try:
                 do(writer)
@@ -398,22 +345,22 @@ class Recorder:
                 raise
 
     def _write_status(self) -> None:
-        """Write down what it is doing, whole or not at all; a full disk there loses the status, not the recording."""
-        made = self.status
+        """Write the status file, whole or not at all; a full disk there loses the status, not the recording."""
+        status = self.status
         with contextlib.suppress(OSError):
-            made.bytes = self._finished_bytes + sum(self._sizes())
-        path = status_file(self._directory, made.pid)
+            status.bytes = self._finished_bytes + sum(self._sizes())
+        path = status_file(self._directory, status.pid)
         new = path.with_suffix(".new")
         with contextlib.suppress(OSError):
-            new.write_text(json.dumps(dataclasses.asdict(made)))
+            new.write_text(json.dumps(dataclasses.asdict(status)))
             os.replace(new, path)
 
 
 def _place(options: RecordingConfig) -> tuple[Path, tuple[str, ...]]:
-    """Return the files' path without number and ending, and the formats: those given, else the file's ending, or mcap.
+    """Return the path without number and ending, and the formats: from the options, else the path's ending, or mcap.
 
     Raises:
-        RtcpError: the ending of `out` and the formats are not the same.
+        RtcpError: the ending of `out` contradicts the formats.
     """
     assert options.out is not None
     out, formats = Path(options.out), tuple(dict.fromkeys(options.formats))
@@ -434,11 +381,11 @@ def _not_writable(error: OSError | ValueError, place: Path) -> RtcpError:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the recorder's process: a line of JSON once it records, or with what stands in the way."""
+    """Run the recorder's process; it prints a line of JSON once it records, or with the error that prevents it."""
     parser = argparse.ArgumentParser(prog="rtcp.telemetry.recorder")
     parser.add_argument("--directory", type=Path, required=True)
     parser.add_argument("--options", type=json.loads, required=True)
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     recorder: Recorder | None = None
     wanted = False
 
@@ -451,9 +398,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, end)
     with contextlib.suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("0")  # memory that runs short costs the recording, not the loop
+        Path("/proc/self/oom_score_adj").write_text("0")  # a lack of memory kills the recorder, not the loop
     try:
-        recorder = Recorder(given.directory, from_json(RecordingConfig, given.options))
+        recorder = Recorder(options.directory, from_json(RecordingConfig, options.options))
     except UnknownSignal as error:
         fields = {"signal": error.signal, "allowed": error.allowed}
         return _refuse(RtcpError("invalid", str(error), "unknown_signal", fields))
@@ -471,7 +418,7 @@ def _refuse(error: RtcpError) -> int:
 
 
 def _answer(line: dict[str, Any]) -> None:
-    """Tell the gateway; it may have gone meanwhile."""
+    """Print a line for the gateway, which may have exited meanwhile."""
     with contextlib.suppress(BrokenPipeError):
         print(json.dumps(line), flush=True)
 

@@ -1,4 +1,4 @@
-"""The picture of a recording: one plot a signal over time, all joints in it; peaks of a single cycle stay visible."""
+"""Picture of a recording: a plot over time for each signal, with all joints; peaks of a single cycle stay visible."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from rtcp.ipc.recording import WARNING, RecordingError
+from rtcp.ipc.observer import WARNING
+from rtcp.ipc.recording import RecordingError
 from rtcp.ipc.states import State
 from rtcp.telemetry.fault_report import COLOURS
 from rtcp.telemetry.reading import Part, Reader
@@ -17,19 +18,19 @@ from rtcp.telemetry.reading import Part, Reader
 Array = npt.NDArray[np.float64]
 FOLLOWING_ERROR = "following_error"
 SIGNALS = ("sent_position", "actual_position", FOLLOWING_ERROR, "actual_velocity", "actual_torque", "wakeup_ns")
-"""Drawn where none are chosen; `following_error` is made of the first two."""
+"""Default signals; `following_error` is the difference of the first two."""
 _BINS = 4096
-"""More than a picture has pixels across."""
+"""Most spans of time in a plot: more than a picture's width in pixels."""
 _MARKS = 30
 _STATES = {int(state): state.words for state in State}
 
 
 class Envelope:
-    """Least and greatest value in each of up to 4096 spans of time; the spans grow with what is added.
+    """Least and greatest value in each of up to 4096 spans of time; the spans grow with the data.
 
     Args:
-        width_s: the first width of a span.
-        columns: values at each instant.
+        width_s: initial width of a span, s.
+        columns: number of values at each instant.
     """
 
     def __init__(self, width_s: float, columns: int) -> None:
@@ -37,7 +38,7 @@ class Envelope:
         self._low, self._high = np.full((_BINS, columns), np.inf), np.full((_BINS, columns), -np.inf)
 
     def add(self, seconds: Array, values: Array) -> None:
-        """Add values, shape (n, columns), at rising instants, shape (n,), s, none of them negative."""
+        """Add values, shape (n, columns), at rising instants of 0 or more, shape (n,), s."""
         while seconds[-1] >= self._width_s * _BINS:
             empty = np.full((_BINS // 2, values.shape[1]), np.inf)
             self._low = np.vstack((np.minimum(self._low[::2], self._low[1::2]), empty))
@@ -50,17 +51,17 @@ class Envelope:
         self._high[touched] = np.maximum(self._high[touched], np.maximum.reduceat(values, starts))
 
     def curve(self) -> tuple[Array, Array]:
-        """Return instants, shape (m,), s, and values, shape (m, columns): of each span the least and the greatest."""
+        """Return instants, shape (m,), s, and values, shape (m, columns): least and greatest of each span."""
         filled = np.flatnonzero(self._low[:, 0] <= self._high[:, 0])
         values = np.stack((self._low[filled], self._high[filled]), axis=1)
         return np.repeat((filled + 0.5) * self._width_s, 2), values.reshape(-1, values.shape[2])
 
 
 def figure(reader: Reader) -> Figure:
-    """Return the picture of what a reader gives: its signals, or `SIGNALS` where none were chosen.
+    """Return the picture of a reader's recording: its signals, or `SIGNALS` where none were chosen.
 
     Raises:
-        RecordingError: none of them can be drawn; while the recording is read.
+        RecordingError: none of them can be drawn, or the recording cannot be read.
     """
     names = [name for name in reader.names if name not in ("number", "time_ns")] if reader.signals else list(SIGNALS)
     envelopes: dict[str, Envelope] = {}
@@ -68,7 +69,7 @@ def figure(reader: Reader) -> Figure:
     state, begin_s = -1, -1.0
     following = _FollowingError()
     for part in reader:
-        marks += [(reader.at_s(one), one.message, COLOURS[3]) for one in part.log if one.level >= WARNING]
+        marks += [(reader.at_s(moment), moment.message, COLOURS[3]) for moment in part.log if moment.level >= WARNING]
         if not len(part.records):
             continue
         seconds = (part.records["time_ns"] - reader.first_ns) * 1e-9
@@ -91,14 +92,14 @@ def figure(reader: Reader) -> Figure:
 
 
 class _FollowingError:
-    """Where the drives were told to be less where they were: a frame brings back what the one before it caused."""
+    """Sent minus actual position: the answer to a frame shows the effect of the frame before."""
 
     def __init__(self) -> None:
         self._number = -1
         self._sent: Array = np.empty((0, 0))
 
     def of(self, part: Part) -> Array | None:
-        """Return it, shape (records, joints), 0 after a gap; None: the recording does not have both positions."""
+        """Return the following error, rad, shape (records, joints), 0 after a gap; None: a position is missing."""
         records = part.records
         if not {"number", "sent_position", "actual_position"} <= set(records.dtype.names or ()):
             return None
@@ -110,7 +111,7 @@ class _FollowingError:
 
 
 def _values(part: Part, name: str) -> Array | None:
-    """Return a signal, shape (records, columns); None: the recording does not have it."""
+    """Return a signal, shape (records, columns); None: not in the recording."""
     records = part.records
     return records[name].astype(np.float64).reshape(len(records), -1) if name in (records.dtype.names or ()) else None
 
@@ -118,8 +119,8 @@ def _values(part: Part, name: str) -> Array | None:
 def _draw(
     reader: Reader, envelopes: dict[str, Envelope], marks: Sequence[tuple[float, str, str]], begin_s: float
 ) -> Figure:
-    made = Figure(figsize=(13.0, 1.0 + 2.2 * len(envelopes)), layout="constrained")
-    plots: Any = made.subplots(len(envelopes), 1, sharex=True, squeeze=False)[:, 0]
+    picture = Figure(figsize=(13.0, 1.0 + 2.2 * len(envelopes)), layout="constrained")
+    plots: Any = picture.subplots(len(envelopes), 1, sharex=True, squeeze=False)[:, 0]
     joints = reader.about.get("joints", "").split(", ")
     for axes, (name, envelope) in zip(plots, envelopes.items(), strict=True):
         times, values = envelope.curve()
@@ -139,5 +140,5 @@ def _draw(
     if handles := plots[0].get_legend_handles_labels()[0]:
         plots[0].legend(handles=handles, ncols=len(handles), fontsize=8, loc="upper right")
     plots[-1].set_xlabel("s from the first record")
-    made.suptitle(f"{reader.path.name}   {reader.about.get('arm', '')}", fontsize=11)
-    return made
+    picture.suptitle(f"{reader.path.name}   {reader.about.get('arm', '')}", fontsize=11)
+    return picture

@@ -1,4 +1,4 @@
-"""A recorded joint motion as the few points of a trajectory, which the planner checks like any other."""
+"""Converts a recorded joint motion to the few points of a trajectory, which the planner checks like any other."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from rtcp.telemetry.reading import Recorded
 
 Array = npt.NDArray[np.float64]
 POSITIONS = ("sent_position", "commanded_position", "actual_position")
-"""The first of them that a recording has is replayed."""
+"""Fields in order of preference: the first one in a recording is replayed."""
 TOLERANCES_RAD = (1e-4, 3e-4, 9e-4)
-"""Largest distance of the trajectory from the recorded positions; the first whose points are not too many."""
+"""Largest distance of the trajectory from the recorded positions, rad; the first that needs few enough points."""
 _ROUNDING = 1e-10
 _SLOPE_S, _SHORTEST_S = 5e-3, 2e-3
-"""Time before and after a sample over which its velocity is taken; shortest time between two points."""
+"""Time before and after a sample for its velocity, s; shortest time between two points, s."""
 _RESTING_RAD = 1e-3
-"""A hand-guided arm that turns by less rests."""
+"""Largest motion of a joint of a hand-guided arm at rest, rad."""
 _SIGMAS = 4.0
 _AT_REST = 5e-3
-"""Below this velocity, rad/s, the motion counts as at rest where it begins and ends."""
+"""Velocity, rad/s, below which the motion counts as at rest at its begin and end."""
 
 
 def trajectory(
     recorded: Recorded, scale: float = 1.0, smooth_hz: float | None = None, rest_s: float | None = None
 ) -> list[dict[str, Any]]:
-    """Return the points `{"t": s, "q": [rad], "v": [rad/s]}` of what moves in a recording; rest around it is left out.
+    """Return the points `{"t": s, "q": [rad], "v": [rad/s]}` of the motion in a recording, without rest around it.
 
     Args:
-        recorded: at least one of `POSITIONS`.
-        scale: of the speed; 0.5 takes twice the time.
-        smooth_hz: cutoff of `smoothed`; None: as it was recorded.
-        rest_s: rests in the motion that last longer last so long, s; None: as they were.
+        recorded: with at least one of `POSITIONS`.
+        scale: factor of the speed; 0.5 takes twice the time.
+        smooth_hz: cutoff of `smoothed`, Hz; None: no smoothing.
+        rest_s: longest rest within the motion, s, to which longer ones are shortened; None: unchanged.
 
     Raises:
-        RecordingError: nothing moves in it, cycles of the motion are missing, the drives were not enabled in all of it,
-            or it is too long for a request.
+        RecordingError: no motion, missing cycles in it, drives not enabled during all of it, or too many points for a
+            request.
     """
     name = next(name for name in POSITIONS if name in (recorded.records.dtype.names or ()))
     q = recorded.column(name)
@@ -50,7 +50,7 @@ def trajectory(
     if not len(moving):
         raise RecordingError("empty", recorded.path, f"nothing moves in it ({name}, {recorded.seconds[-1]:.3f} s)")
     span = slice(moving[0], moving[-1] + 1)
-    # By their numbers: a setpoint is one cycle after the one before, however late a loaded host ran that cycle.
+    # Times from cycle numbers: setpoints are one cycle apart, however late a loaded host ran the cycle.
     cycles = np.diff(recorded.column("number"))
     cycles = cycles[span] / max(1.0, cycles.min())
     if gaps := int((cycles > 1.0).sum()):
@@ -72,7 +72,7 @@ def trajectory(
     v = _velocities(t, q, max(1, round(_SLOPE_S / recorded.period_s)))
     low, high = q.min(axis=0), q.max(axis=0)
     rounded = np.clip(np.round(q, 6), low, high)
-    # There a joint rests or turns, perhaps at its limit: what is left of a speed would lead beyond.
+    # There a joint rests or reverses, perhaps at its limit: a remaining speed would lead beyond.
     v[(rounded == low) | (rounded == high)] = 0.0
     least = ceil(_SHORTEST_S * scale / recorded.period_s)
     points: list[dict[str, Any]] = []
@@ -88,28 +88,28 @@ def trajectory(
 
 
 def smoothed(t: Array, q: Array, cutoff_hz: float, scale: float = 1.0) -> tuple[Array, Array]:
-    """Return times and positions without what is faster than a cutoff: a Gaussian of no delay, at half power there.
+    """Return low-pass filtered times and positions: a Gaussian without delay, half power at the cutoff.
 
-    Its weights are positive: no joint goes beyond what was recorded of it. The motion begins and ends at rest, and
-    takes a little more time for it.
+    Its weights are positive, so no joint exceeds its recorded range. The motion begins and ends at rest, which makes it
+    slightly longer.
 
     Args:
-        t: s, at equal steps, the recorded ones over `scale`.
+        t: s, at equal steps, the recorded times divided by `scale`.
         q: rad, shape (len(t), n).
-        cutoff_hz: of the recorded motion.
-        scale: of the speed.
+        cutoff_hz: cutoff frequency in the recorded motion, Hz.
+        scale: factor of the speed.
     """
     from scipy.ndimage import gaussian_filter1d
 
     step = (t[-1] - t[0]) / (len(t) - 1)
     sigma = sqrt(log(2.0)) / (2.0 * pi * cutoff_hz * scale * step)
     rest = ceil(_SIGMAS * sigma)
-    held = np.pad(q, ((rest, rest), (0, 0)), mode="edge")
-    return t[0] + step * np.arange(len(held)), gaussian_filter1d(held, sigma, axis=0, mode="nearest", truncate=_SIGMAS)
+    wide = np.pad(q, ((rest, rest), (0, 0)), mode="edge")
+    return t[0] + step * np.arange(len(wide)), gaussian_filter1d(wide, sigma, axis=0, mode="nearest", truncate=_SIGMAS)
 
 
 def deviation(recorded: Recorded, smooth_hz: float) -> float:
-    """Return by how much `smoothed` differs from what was recorded, at most, rad."""
+    """Return the largest difference of `smoothed` from the recording, rad."""
     q = recorded.column(next(name for name in POSITIONS if name in (recorded.records.dtype.names or ())))
     t = recorded.period_s * np.arange(len(q), dtype=np.float64)
     whole = smoothed(t, q, smooth_hz)[1]
@@ -118,7 +118,7 @@ def deviation(recorded: Recorded, smooth_hz: float) -> float:
 
 
 def _shortened(q: Array, longest: int) -> npt.NDArray[np.bool_]:
-    """Return which samples are kept: a rest begins where no joint leaves `_RESTING_RAD` for `longest` samples."""
+    """Return the mask of samples to keep: a rest begins where no joint leaves `_RESTING_RAD` for `longest` samples."""
     kept = np.ones(len(q), bool)
     begin = 0
     for at in range(1, len(q)):
@@ -130,28 +130,28 @@ def _shortened(q: Array, longest: int) -> npt.NDArray[np.bool_]:
 
 
 def _sent_again(speeds: Array) -> npt.NDArray[np.int64]:
-    """Return the steps without motion, rad/s, before or after which a joint moves: they are no rest.
+    """Return the indices of steps without motion within a motion; `speeds` in rad/s. They are no rest.
 
-    Without an answer of the slaves a setpoint is sent again, and the motion goes on afterwards as if nothing had been.
+    Without an answer of the slaves a setpoint is repeated, and the motion then continues.
     """
     moving, still = np.flatnonzero(speeds), np.flatnonzero(speeds == 0.0)
     after = np.searchsorted(moving, still)
     around = np.maximum(speeds[moving[after - 1]], speeds[moving[after]])
-    found: npt.NDArray[np.int64] = still[around > _AT_REST]
-    return found
+    repeated: npt.NDArray[np.int64] = still[around > _AT_REST]
+    return repeated
 
 
 def _velocities(t: Array, q: Array, reach: int) -> Array:
     at = np.arange(len(t))
     before, after = np.maximum(at - reach, 0), np.minimum(at + reach, len(t) - 1)
-    found: Array = (q[after] - q[before]) / (t[after] - t[before])[:, None]
+    velocities: Array = (q[after] - q[before]) / (t[after] - t[before])[:, None]
     for end in (0, -1):
-        found[end, np.abs(found[end]) < _AT_REST] = 0.0
-    return found
+        velocities[end, np.abs(velocities[end]) < _AT_REST] = 0.0
+    return velocities
 
 
 def _knots(t: Array, q: Array, v: Array, least: int, tolerance: float) -> list[int]:
-    """Return the samples that cubics join which stay within `tolerance`, each as far from the one before as it goes."""
+    """Return indices of samples, as far apart as possible, between which cubics stay within `tolerance`, rad."""
     knots, last = [0], len(t) - 1
     while (at := knots[-1]) < last:
         low = least
@@ -161,17 +161,17 @@ def _knots(t: Array, q: Array, v: Array, least: int, tolerance: float) -> list[i
         while low < high:
             middle = (low + high + 1) // 2
             low, high = (middle, high) if _fits(t, q, v, at, middle, tolerance) else (low, middle - 1)
-        # What is left is long enough for a piece of its own, or part of this one.
+        # The rest is long enough for another piece, or becomes part of this one.
         knots.append(low if low == last or last - low >= least else max(at + 1, last - least))
     return knots
 
 
 def _fits(t: Array, q: Array, v: Array, begin: int, end: int, tolerance: float) -> bool:
-    """Return whether one cubic stays within `tolerance` of the samples and within the range of them all."""
+    """Return whether one cubic stays within `tolerance` of the samples and within their range."""
     length = t[end] - t[begin]
     x = ((t[begin : end + 1] - t[begin]) / length)[:, None]
-    way = q[end] - q[begin]
-    bend = v[begin] * length * (1 - x) - v[end] * length * x + way * (2 * x - 1)
-    curve = q[begin] + way * x + x * (1 - x) * bend
+    change = q[end] - q[begin]
+    bend = v[begin] * length * (1 - x) - v[end] * length * x + change * (2 * x - 1)
+    curve = q[begin] + change * x + x * (1 - x) * bend
     inside = (curve >= q.min(axis=0) - _ROUNDING).all() and (curve <= q.max(axis=0) + _ROUNDING).all()
     return bool(inside and np.abs(curve - q[begin : end + 1]).max() <= tolerance)

@@ -19,18 +19,18 @@ from rtcp.virtual.request_socket import RequestRefused, ServerAway
 
 SETTLE_S = 60.0
 RECORDINGS = 8
-"""After this time and so many stops, each of which the black box records, a process has allocated all that it keeps:
-its memory must not grow."""
+"""Number of recorded stops after which, with the settling time, a process has allocated all that it keeps: then its
+memory must not grow."""
 READINGS = 5
-"""Trials whose least memory counts: a recording that is being written takes some 30 MiB until it is."""
+"""Number of trials whose least memory counts: a recording takes some 30 MiB while it is written."""
 GROWTH = 2 << 20
-"""Growth of a process after that, bytes, that is the allocator's noise and not a leak."""
+"""Largest growth of a process after that, bytes, that is noise of the allocator and not a leak."""
 _WATCH_S = 1.0
 _ON_FRAMES = frozenset({"cable", "power", "loss", "delay", "duplicate", "reorder", "corrupt", "wkc", "noise"})
-"""Faults that show in the working counter; for others a wrong counter means nothing."""
+"""Faults that affect the working counter; for others a wrong counter is not evaluated."""
 _PROCESSES = ("loop", "gateway", "segment")
 _VARIABLE = frozenset({"gateway"})
-"""Processes whose threads and files vary with their connections, and mean no leak."""
+"""Processes whose threads and files vary with their connections, without a leak."""
 Log = Callable[[str], None]
 
 
@@ -45,7 +45,7 @@ class Resources:
 
 
 def resources(pid: int) -> Resources | None:
-    """Return the present resources of a process; None where it has ended or is another user's."""
+    """Return the present resources of a process; None where it has ended or belongs to another user."""
     try:
         process = psutil.Process(pid)
         return Resources(process.memory_info().rss, process.num_threads(), process.num_fds())
@@ -57,23 +57,23 @@ def grown(first: Mapping[str, Resources], last: Mapping[str, Resources], *, sett
     """Return a message for each resource of a process that has grown, and for each process that has ended.
 
     Args:
-        first: resources at first, by name of the process.
-        last: present resources; a process that is missing has ended.
-        settled: `first` was taken when memory had settled: it is compared too.
+        first: process name -> first resources.
+        last: process name -> present resources; a missing process has ended.
+        settled: whether `first` was read after memory had settled, so that memory is compared too.
     """
-    found = []
+    messages = []
     for name, before in first.items():
         now = last.get(name)
         if now is None:
-            found.append(f"the {name} has ended")
+            messages.append(f"the {name} has ended")
             continue
         if name not in _VARIABLE:
             for count, unit in (("threads", "threads"), ("files", "open files")):
                 if getattr(now, count) > getattr(before, count):
-                    found.append(f"the {name} has {getattr(now, count)} {unit}, {getattr(before, count)} before")
+                    messages.append(f"the {name} has {getattr(now, count)} {unit}, {getattr(before, count)} before")
         if settled and now.rss - before.rss > GROWTH:
-            found.append(f"the {name} uses {now.rss / 2**20:.1f} MiB, {before.rss / 2**20:.1f} at first")
-    return found
+            messages.append(f"the {name} uses {now.rss / 2**20:.1f} MiB, {before.rss / 2**20:.1f} at first")
+    return messages
 
 
 def least(readings: Iterable[Mapping[str, Resources]]) -> dict[str, Resources]:
@@ -98,7 +98,7 @@ def random_fault(random: Random, slaves: int, drives: tuple[int, ...]) -> dict[s
         ({"burst": random.randint(1, 200)}, {"rate": random.choice((0.002, 0.02, 0.2))})
     )
     seed = random.randrange(1 << 16)
-    some: tuple[dict[str, Any], ...] = (
+    candidates: tuple[dict[str, Any], ...] = (
         {"fault": "cable", "after": cable},
         {"fault": "power", "slave": slave},
         {"fault": "al_fall", "slave": slave, "state": random.choice(("SAFE-OP", "PRE-OP"))},
@@ -124,7 +124,7 @@ def random_fault(random: Random, slaves: int, drives: tuple[int, ...]) -> dict[s
         {"fault": "joystick_code", "value": random.randrange(64)},
         {"fault": "noise", "rate_hz": random.choice((50, 500))},
     )
-    fault = random.choice(some)
+    fault = random.choice(candidates)
     if fault["fault"] not in ("al_fall", "clock_jump"):
         fault["lasts"] = round(random.choice((0.02, 0.2, 1.0, 3.0)), 3)
     return fault
@@ -181,7 +181,7 @@ class Soak:
         self.summary = Summary(seed)
 
     def run(self, minutes: float) -> Summary:
-        """Run for this time; the trial that is running then is finished."""
+        """Run for this time; the last trial is completed."""
         begun = time.monotonic()
         summary = self.summary
         summary.first = self._resources()
@@ -236,5 +236,5 @@ class Soak:
         self._log(f"{trial}: {result.state.name.lower().replace('_', ' ')}; {result.message or 'no message'}")
 
     def _resources(self) -> dict[str, Resources]:
-        found = {name: resources(pid) for name, pid in self._pids.items()}
-        return {name: held for name, held in found.items() if held is not None}
+        readings = {name: resources(pid) for name, pid in self._pids.items()}
+        return {name: reading for name, reading in readings.items() if reading is not None}

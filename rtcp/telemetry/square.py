@@ -1,4 +1,4 @@
-"""The square of the thesis, 200 x 200 mm in the X-Y or Y-Z plane: where it is, how well it was driven, its picture."""
+"""The square of the thesis, 200 x 200 mm in the X-Y or Y-Z plane: its place, its deviation when driven, its picture."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PLANES = {"xy": (0, 1), "yz": (1, 2), "xz": (0, 2)}
 SIDE_M = 0.2
 SPEED_M_S = 0.05
 _ROOM_M = 0.03
-"""The square keeps so far from every box."""
+"""Least distance of the square from every box, m."""
 _SHOULDERS = (-0.3, 0.0, -0.6, 0.3, -0.9)
 _ELBOWS = (1.9, 1.6, 1.3, 1.0, -1.6)
 _WRISTS = (1.6, 1.2, -1.6, -1.2, 0.8)
@@ -36,12 +36,12 @@ _COMMANDED, _ACTUAL, _WANTED = "#1c6dd0", "#e07a1f", "#9aa5b8"
 
 
 class NoSquare(Exception):
-    """The arm has no room for the square: a sentence."""
+    """The arm has no room for the square, or did not drive it; the message is a sentence."""
 
 
 @dataclass(frozen=True)
 class Square:
-    """Where it is: joints at its first corner (rad), its corners in turn, the first again at the end (m), as poses."""
+    """Place of a square: joints at its first corner (rad), its corners in order, closed (m), and the orientation."""
 
     plane: str
     start: tuple[float, ...]
@@ -50,17 +50,17 @@ class Square:
 
     @property
     def poses(self) -> list[list[float]]:
-        """The four poses that the lines from the first corner lead to: x, y, z, rx, ry, rz."""
+        """Poses at the ends of the four lines from the first corner: x, y, z, rx, ry, rz."""
         return [[*corner, *self.rpy] for corner in self.corners[1:]]
 
 
 def place(config: ArmConfig, plane: str) -> Square:
     """Return a square that the arm can drive, far from singularities, ends of ranges and boxes.
 
-    Looked for around configurations with a bent elbow and wrist; each is planned as the platform will plan it.
+    Candidates are around configurations with a bent elbow and wrist; each is planned as the platform will plan it.
 
     Raises:
-        NoSquare: none was found.
+        NoSquare: no candidate is suitable.
     """
     model = config.arm
     if model is None:
@@ -97,11 +97,11 @@ def _around(model: ArmModel, q: Sequence[float], plane: str) -> Square | None:
         corner[across] += 0.5 * u * SIDE_M
         corner[up] += 0.5 * v * SIDE_M
         corners.append((corner[0], corner[1], corner[2]))
-    found = InverseKinematics(model).solve_near(Pose(corners[0], middle.rotation), q)
-    if found.q is None:
+    solution = InverseKinematics(model).solve_near(Pose(corners[0], middle.rotation), q)
+    if solution.q is None:
         return None
-    # The pose of the joints as they are sent, so that the first line begins exactly there.
-    start = tuple(round(angle, 6) for angle in found.q)
+    # The pose of the rounded joints, so that the first line begins exactly there.
+    start = tuple(round(angle, 6) for angle in solution.q)
     first = forward(model, start)
     offset = [a - b for a, b in zip(first.position, corners[0], strict=True)]
     moved = [tuple(a + b for a, b in zip(corner, offset, strict=True)) for corner in corners]
@@ -110,7 +110,7 @@ def _around(model: ArmModel, q: Sequence[float], plane: str) -> Square | None:
 
 @dataclass(frozen=True)
 class Driven:
-    """A square as it was driven; arrays over the cycles: s, m, rad, rad/s, Nm.
+    """A driven square; arrays over the cycles: s, m, rad, rad/s, Nm.
 
     `commanded` and `actual` (cycles, 3): the tool. `off_commanded`, `off_actual` (cycles,): distance from the square.
     """
@@ -133,7 +133,7 @@ class Driven:
 
 
 def judge(model: ArmModel, square: Square, recorded: Recorded) -> Driven:
-    """Return what a recording of the square's lines tells; the records before and after the motion are left out.
+    """Return the evaluation of a recording of the square's lines, without the records before and after the motion.
 
     Raises:
         NoSquare: nothing moved in the recording.

@@ -18,9 +18,9 @@ from rtcp.telemetry.harness import CLIENT_NAME, Harness, TrialFailed
 CONTINUES = frozenset({State.HOLDING, State.MOVING, State.STOPPING})
 """States of a machine without a fault."""
 LARGEST_STEP = 1.0 + 1e-6
-"""Largest step of a target, as a fraction of what its speed limit allows in a cycle; the rest is round-off."""
+"""Largest step of a target, as a fraction of its speed limit's step in a cycle; above 1 is round-off."""
 START = (0.0, 0.2, 1.57, 0.0, 0.4, 0.0)
-"""Where a trial begins, rad: away from limits and singularities, so that jogs in each direction are possible."""
+"""Joint positions at the begin of a trial, rad: away from limits and singularities, for jogs in each direction."""
 _SWING = (0.35, 0.25, -0.25, 0.35, 0.35, 0.35)
 """Amplitude of a moving arm around `START`, rad."""
 _SPEED, _JOG_M_S, _REVERSE_S = 0.4, 0.06, 1.2
@@ -29,20 +29,20 @@ _JOG_INTERVAL_S, _JOG_HOLD_S = 0.05, 0.25
 _JOYSTICK_HOLD_S, _NEUTRAL = 0.5, 63
 _WATCH_INTERVAL_S = 0.005
 _MESSAGE_S = 0.3
-"""Time after a stop in which messages about the fault still arrive."""
+"""Time after a stop in which messages about the fault still arrive, s."""
 _RESET_GIVEN_UP_S = 10.0
 _UNEXPECTED_S, _MOVED_RAD = 0.4, 0.003
-"""Time after clearing a fault in which nothing may move or get torque, and what counts as motion."""
+"""Time after clearing a fault in which no joint may move or get torque, s; least motion, rad."""
 _CHECK_RAD = 0.02
-"""Move of every joint that proves the arm's recovery."""
+"""Move of every joint that proves the arm's recovery, rad."""
 
 
 class Workload:
-    """What the arm does when a fault is injected; this one: it holds. A subclass commands from a thread of its own."""
+    """The arm's activity when a fault is injected; here it holds. A subclass commands from a separate thread."""
 
     name = "holding"
     mode = "joint"
-    """The control mode that it needs."""
+    """Required control mode."""
     moves = False
 
     def __init__(self, harness: Harness) -> None:
@@ -50,10 +50,10 @@ class Workload:
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self.refusal = ""
-        """The refusal that ended it; empty while it runs and after `end`."""
+        """Refusal that ended it; empty while it runs and after `end`."""
 
     def begin(self) -> None:
-        """Begin; return when the arm moves, if it is to.
+        """Begin; return at once, or when the arm moves.
 
         Raises:
             TrialFailed: it is refused, or the arm does not move.
@@ -152,7 +152,7 @@ WORKLOADS: dict[str, type[Workload]] = {kind.name: kind for kind in (Workload, M
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What a trial measured."""
+    """Measurements of a trial."""
 
     fault: str
     workload: str
@@ -163,7 +163,7 @@ class TrialResult:
     travel: float
     """True travel of a joint until standstill as a fraction of `stopping_bounds`; 0 where the arm continued."""
     largest_step: float
-    """Largest step of a target with enabled drives, as a fraction of what its speed limit allows in a cycle."""
+    """Largest step of a target with enabled drives, as a fraction of its speed limit's step in a cycle."""
     wrong_cycles: int
     """Cycles without the expected working counter."""
     messages: tuple[str, ...]
@@ -171,37 +171,37 @@ class TrialResult:
     early_reset_refusal: str
     """Refusal of a reset before the fault was cleared; empty where none was tried or it succeeded."""
     unexpected: str
-    """What moved or got torque after the fault was cleared and before a reset; must be empty."""
+    """Joints that moved or got torque after the fault was cleared and before a reset; must be empty."""
     resets: int
     """Resets needed after the fault was cleared."""
     refusal: str
-    """Why the arm could not be enabled and moved again; empty where it could."""
+    """Refusal of enabling and moving the arm again; empty after success."""
     recovery_s: float
     """Time from clearing the fault until the arm held again."""
 
     @property
     def continued(self) -> bool:
-        """Whether the machine met no fault."""
+        """Whether the machine had no fault."""
         return self.state in CONTINUES
 
     @property
     def recovered(self) -> bool:
-        """Whether the arm works again."""
+        """Whether the arm was enabled and moved again."""
         return not self.refusal
 
     @property
     def violations(self) -> list[str]:
-        """A message for each promise that was broken, whatever the fault."""
-        found = []
+        """A message for each violation of a bound that holds for any fault."""
+        messages = []
         if self.largest_step > LARGEST_STEP:
-            found.append(f"a target stepped {self.largest_step:.4f} of what its speed limit allows")
+            messages.append(f"a target stepped {self.largest_step:.4f} of what its speed limit allows")
         if self.travel > 1.0:
-            found.append(f"a joint travelled {self.travel:.2f} of its stopping bound")
+            messages.append(f"a joint travelled {self.travel:.2f} of its stopping bound")
         if self.unexpected:
-            found.append(f"without a reset {self.unexpected}")
+            messages.append(f"without a reset {self.unexpected}")
         if self.refusal:
-            found.append(f"the arm did not recover: {self.refusal}")
-        return found
+            messages.append(f"the arm did not recover: {self.refusal}")
+        return messages
 
     @property
     def message(self) -> str:
@@ -210,7 +210,7 @@ class TrialResult:
 
 
 def named(faults: Sequence[Mapping[str, Any]]) -> str:
-    """Return faults as they are written on the command line."""
+    """Return faults in the syntax of the command line."""
     words = []
     for fault in faults:
         own = " ".join(f"{key}={value}" for key, value in fault.items() if key != "fault")
@@ -219,9 +219,9 @@ def named(faults: Sequence[Mapping[str, Any]]) -> str:
 
 
 def stopping_bounds(config: ArmConfig) -> list[float]:
-    """Return how far each joint may travel (rad) from any fault until standstill.
+    """Return the largest travel of each joint (rad) from any fault until standstill.
 
-    Full speed while lost cycles are held, then the longer of the two stops; or the drive's own watchdog.
+    Full speed during the tolerated lost cycles, then the longer of the two stops; or the drive's own watchdog.
     """
     hold, stop, quick = (
         bounds(config, reaction)
@@ -241,10 +241,10 @@ def run_trial(
 
     Args:
         harness: the platform.
-        faults: injected in this order, each a mapping as `rtcp.virtual.faults.registry` has it.
+        faults: injected in this order, each a mapping as in `rtcp.virtual.faults.registry`.
         workload: one of `WORKLOADS`.
-        watch_s: how long a machine that continues is observed.
-        reset_first: ask for a reset while the fault is active: it must not lead to an enabled arm.
+        watch_s: time of observation of a machine that continues, s.
+        reset_first: whether to reset while the fault is active, which must not lead to an enabled arm.
 
     Raises:
         TrialFailed: the arm does not reach the start, does not begin to move, or does not come to standstill.
@@ -269,7 +269,7 @@ def _inject(
     begun_ns, start = time.monotonic_ns(), harness.joint_positions()
     for fault in faults:
         harness.inject(fault)
-    # Undetected bit errors do nothing until one hits a value that matters: until then the arm moves as commanded.
+    # Undetected bit errors have no effect until one hits a relevant value; until then the arm moves as commanded.
     strikes_late = any("bits" in fault for fault in faults)
     end = time.monotonic() + watch_s
     while harness.state() in CONTINUES and time.monotonic() < end:
@@ -278,7 +278,7 @@ def _inject(
         harness.wait(_WATCH_INTERVAL_S)
     state = harness.state()
     standstill_s, travel = None, 0.0
-    # Between two moves an arm holds for a moment only.
+    # Between two moves an arm holds only for a moment.
     rests = workload.moves and not harness.wait_for(lambda: harness.state() is not State.HOLDING, _MESSAGE_S)
     if state not in CONTINUES or rests:
         standstill_s = max(0.0, (harness.wait_standstill() - begun_ns) * 1e-9)
@@ -291,7 +291,7 @@ def _inject(
             harness.robot.reset()
         except RtcpError as error:
             early_reset_refusal = error.message
-        # A slow host may have ended the wait for the reset before the machine gave it up.
+        # On a slow host the wait for the reset may end before the machine gives it up.
         harness.wait_for(lambda: harness.state() is not State.RESETTING, _RESET_GIVEN_UP_S)
         state = harness.state()
     messages = tuple(harness.messages_since(moment))
@@ -312,18 +312,18 @@ def _inject(
 
 
 def _clear(harness: Harness, *, watched: bool) -> str:
-    """Clear all faults; with a machine in a fault, return what moved or got torque without a command."""
+    """Clear all faults; with a machine in a fault, return the joints that moved or got torque without a command."""
     before, state = harness.drives(), harness.state()
     harness.segment.clear()
     if not watched:
         return ""
     harness.wait(_UNEXPECTED_S)
-    found = []
+    changes = []
     for joint, then, now in zip(harness.config.joints, before, harness.drives(), strict=True):
         if (moved := abs(now["position_rad"] - then["position_rad"])) > _MOVED_RAD:
-            found.append(f"{joint.name} moved by {moved:.4f} rad")
+            changes.append(f"{joint.name} moved by {moved:.4f} rad")
         if now["torque_on"] and not then["torque_on"]:
-            found.append(f"{joint.name} got torque")
+            changes.append(f"{joint.name} got torque")
     if harness.state() is not state:
-        found.append(f"the machine went from {state.name} to {harness.state().name}")
-    return "; ".join(found)
+        changes.append(f"the machine went from {state.name} to {harness.state().name}")
+    return "; ".join(changes)

@@ -1,1 +1,1 @@
-"""The segment in software: slaves that speak EtherCAT frames, over a virtual cable or stepped without one."""
+"""The virtual segment: EtherCAT slaves in software, over a virtual cable or stepped in process."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import IntEnum
 from itertools import pairwise
+from typing import Final
 
 from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.esc import Esc, SyncManager
@@ -17,7 +18,7 @@ MINIMUM_CYCLE = (0x1C32, 5)
 
 
 class AlStatusCode(IntEnum):
-    """AL status codes that these slaves report."""
+    """AL status codes of these slaves."""
 
     NO_ERROR = 0x0000
     INVALID_STATE_CHANGE = 0x0011
@@ -44,7 +45,7 @@ def _in_ram(manager: SyncManager, size: int, esc: Esc) -> bool:
 
 
 def check_mailboxes(esc: Esc, device: DeviceModel) -> bool:
-    """The mailboxes must be mailboxes, out and in, long enough and apart; a slave without mailbox needs none."""
+    """Both sync managers of a mailbox must be in mailbox mode, long enough and separate."""
     if device.roles.mailboxes is None:
         return True
     out, in_ = (esc.sync_managers[index] for index in device.roles.mailboxes)
@@ -60,7 +61,7 @@ def check_mailboxes(esc: Esc, device: DeviceModel) -> bool:
 
 
 def _fits(esc: Esc, device: DeviceModel, index: int, master_writes: bool) -> bool:
-    """Whether a sync manager lies where and as its device has it, as long as its PDOs; an empty one needs none."""
+    """Whether a sync manager has its device's address and mode and the length of its PDOs; if empty, it is unused."""
     manager, own, image = esc.sync_managers[index], device.sync_managers[index], device.image(index)
     if image is None or not image.byte_length:
         return image is not None and not manager.enabled
@@ -74,30 +75,30 @@ def _fits(esc: Esc, device: DeviceModel, index: int, master_writes: bool) -> boo
 
 
 def check_outputs(esc: Esc, device: DeviceModel) -> bool:
-    """Each sync manager of outputs must be a buffer that the master writes, as long as its RxPDOs."""
+    """Each output sync manager must be a buffer that the master writes, with the length of its RxPDOs."""
     return all(_fits(esc, device, index, True) for index in device.roles.outputs)
 
 
 def check_inputs(esc: Esc, device: DeviceModel) -> bool:
-    """Each sync manager of inputs must be a buffer that the master reads, as long as its TxPDOs."""
+    """Each input sync manager must be a buffer that the master reads, with the length of its TxPDOs."""
     return all(_fits(esc, device, index, False) for index in device.roles.inputs)
 
 
 def check_areas(esc: Esc, device: DeviceModel) -> bool:
-    """No two sync managers may share memory; a buffer takes its length three times."""
+    """Sync managers must not overlap; a buffered one occupies three times its length."""
     areas = sorted((m.start, m.start + m.length * m.buffers) for m in esc.sync_managers if m.enabled)
     return device.shares_memory or all(first[1] <= second[0] for first, second in pairwise(areas))
 
 
 def check_watchdog(esc: Esc, device: DeviceModel) -> bool:
-    """A watchdog that outputs trigger and that has a time must have a divider to count it with."""
+    """A watchdog with a trigger and a time must have a divider."""
     triggered = any(esc.sync_managers[index].watchdog_trigger for index in device.roles.outputs)
     wanted = triggered and esc.get(Register.WATCHDOG_PROCESS_DATA, 2)
     return not wanted or bool(esc.get(Register.WATCHDOG_DIVIDER, 2))
 
 
 def check_sync0(esc: Esc, device: DeviceModel) -> bool:
-    """Where SYNC pulses are on there must be SYNC0, or what the device has instead."""
+    """Active SYNC pulses must include SYNC0 or the device's own alternative."""
     dc = esc.dc
     if dc is None or not dc.cyclic or esc.memory[Register.DC_ACTIVATION] in device.sync_activations:
         return True
@@ -105,15 +106,15 @@ def check_sync0(esc: Esc, device: DeviceModel) -> bool:
 
 
 def check_cycle(esc: Esc, device: DeviceModel) -> bool:
-    """SYNC0 must have a cycle that the device can keep."""
+    """The SYNC0 cycle must be one that the device supports."""
     minimum = device.objects[MINIMUM_CYCLE].value if MINIMUM_CYCLE in device.objects else 0
     return esc.dc is None or not esc.dc.sync0_active or not isinstance(minimum, int) or esc.dc.sync0.cycle >= minimum
 
 
 def check_pulses(esc: Esc, device: DeviceModel) -> bool:
-    """SYNC0 that has come must still come.
+    """A SYNC0 that has started must still be running.
 
-    It was left on by the last master where the time base was set anew since: it came and comes no more (SOEM#60).
+    It stops if the last master left it on and the time base has since been set again (SOEM#60).
     """
     dc = esc.dc
     return dc is None or not dc.cyclic or not (dc.sync0.lost and dc.sync0.pulses)
@@ -124,7 +125,7 @@ def _mapped(device: DeviceModel, indices: tuple[int, ...]) -> bool:
 
 
 Check = tuple[Callable[[Esc, DeviceModel], bool], AlStatusCode]
-"""What must hold, and the code of a slave where it does not."""
+"""A condition, and the AL status code of its failure."""
 _MAILBOXES: tuple[Check, ...] = ((check_mailboxes, AlStatusCode.INVALID_MAILBOX_PREOP),)
 _BUFFERS: tuple[Check, ...] = (
     (check_outputs, AlStatusCode.INVALID_OUTPUTS),
@@ -137,7 +138,7 @@ _SYNC: tuple[Check, ...] = (
     (check_pulses, AlStatusCode.FATAL_SYNC_ERROR),
 )
 
-# Steps up, and what must hold for them. A step down is always allowed; any other pair is 0x0011.
+# Conditions of the steps up. A step down is always allowed; any other pair is 0x0011.
 UPWARD: dict[tuple[AlState, AlState], tuple[Check, ...]] = {
     (AlState.INIT, AlState.PRE_OP): _MAILBOXES,
     (AlState.INIT, AlState.BOOTSTRAP): ((check_mailboxes, AlStatusCode.INVALID_MAILBOX_BOOT),),
@@ -153,7 +154,7 @@ UPWARD: dict[tuple[AlState, AlState], tuple[Check, ...]] = {
 }
 
 _PROCESS_DATA = ((_MAILBOXES, AlState.INIT), (_BUFFERS, AlState.PRE_OP))
-# What must go on to hold in a state when sync managers are written, and where the slave falls to otherwise.
+# Conditions that must stay true in a state when sync managers are written, and the state after a failure.
 HELD: dict[AlState, tuple[tuple[tuple[Check, ...], AlState], ...]] = {
     AlState.INIT: (),
     AlState.PRE_OP: _PROCESS_DATA[:1],
@@ -164,12 +165,12 @@ HELD: dict[AlState, tuple[tuple[tuple[Check, ...], AlState], ...]] = {
 
 
 def first_failure(checks: tuple[Check, ...], esc: Esc, device: DeviceModel) -> AlStatusCode:
-    """The code of the first check that fails, or NO_ERROR."""
+    """Return the code of the first failing check, or NO_ERROR."""
     return next((code for holds, code in checks if not holds(esc, device)), AlStatusCode.NO_ERROR)
 
 
 def judge(state: AlState, wanted: int, esc: Esc, device: DeviceModel) -> AlStatusCode:
-    """Whether a slave in `state` may go to `wanted`, the value of AL control's low four bits."""
+    """Return the result for a slave in `state` that is asked for `wanted`, the low four bits of AL control."""
     if wanted not in AlState.__members__.values():
         return AlStatusCode.UNKNOWN_STATE
     if wanted == AlState.BOOTSTRAP and state == AlState.INIT and device.bootstrap is None:
@@ -180,33 +181,34 @@ def judge(state: AlState, wanted: int, esc: Esc, device: DeviceModel) -> AlStatu
     return AlStatusCode.INVALID_STATE_CHANGE if checks is None else first_failure(checks, esc, device)
 
 
-MISSED, MET = 3, 1
-"""A SYNC0 window without outputs adds MISSED to the sync error counter, one with outputs subtracts MET."""
+MISSED: Final = 3
+MET: Final = 1
+"""Change of the sync error counter by a SYNC0 window: plus MISSED without outputs, minus MET with outputs."""
 SYNC_TYPE, CYCLE_TIME, MISSED_COUNTER, SYNC_ERROR = 1, 2, 11, 32
 TYPE_SM_EVENT, TYPE_SYNC0 = 1, 2
 OUTPUT_PARAMETERS, INPUT_PARAMETERS = 0x1C32, 0x1C33
 
 
 class SyncMonitor:
-    """Supervises SYNC0: counts the windows between two pulses that bring no outputs (ETG.1020, 21.2)."""
+    """Supervises SYNC0: counts the windows between two pulses without outputs (ETG.1020, 21.2)."""
 
     def __init__(self, esc: Esc, device: DeviceModel) -> None:
         self._dc = esc.dc
         self._device = device
-        self._came = 0
+        self._buffers = 0
         self._counter = 0
         self._limit = 0
         self._missed = 0
         self.active = False
-        """Whether SYNC0 steps the device."""
+        """True: SYNC0 steps the device."""
 
     @property
     def running(self) -> bool:
-        """Whether SYNC0 pulses have come and will continue."""
+        """Whether SYNC0 pulses have started and will continue."""
         return self._dc is not None and self._dc.sync0.pulses > 0 and self._dc.sync0.due is not None
 
     def configure(self) -> None:
-        """Read from the DC activation register whether SYNC0 is used; show it in 0x1C32 and 0x1C33."""
+        """Read the use of SYNC0 from the DC activation register; report it in 0x1C32 and 0x1C33."""
         sync0 = None if self._dc is None or not self._dc.sync0_active else self._dc.sync0
         self.active = sync0 is not None and self._device.uses_sync0
         cycle = 0 if sync0 is None or not self.active else sync0.cycle
@@ -215,30 +217,30 @@ class SyncMonitor:
             self._show(index, CYCLE_TIME, cycle)
 
     def start(self) -> None:
-        """The slave enters OP: count from zero, with the limit of now (0: no limit)."""
+        """Enter OP: count from zero, with the present limit (0: no limit)."""
         self._limit = self._device.sync_error_limit
         self._counter = 0
-        self._came = 1
+        self._buffers = 1
         self._show(OUTPUT_PARAMETERS, SYNC_ERROR, 0)
 
     def stop(self) -> None:
-        """The slave left SAFE-OP."""
+        """Stop when the slave leaves SAFE-OP."""
         self.active = False
 
-    def outputs_came(self) -> None:
+    def outputs_arrived(self) -> None:
         """A complete buffer of outputs arrived."""
-        self._came += 1
+        self._buffers += 1
 
     def pulse(self, on_time: bool) -> bool:
-        """SYNC0 has come; return whether the error counter is above its limit.
+        """Handle a SYNC0 pulse; return whether the error counter is above its limit.
 
-        A pulse noticed late (the process was stopped) consumes one of the buffers that came meanwhile and is no miss.
+        A pulse noticed late (the process was stopped) consumes one of the buffers received meanwhile and is no miss.
         """
         if not on_time:
-            self._came = max(0, self._came - 1)
+            self._buffers = max(0, self._buffers - 1)
             return False
-        if self._came:
-            self._came = 0
+        if self._buffers:
+            self._buffers = 0
             self._counter = max(0, self._counter - MET)
             return False
         self._counter += MISSED

@@ -1,12 +1,14 @@
-"""The arm that the drives of a segment turn: its weight at each joint, and what pushes at the tool do to them.
+"""The arm moved by the drives of a segment: joint torques of its weight and of forces at the tool.
 
-Each drive's model knows its own joint alone. Here are the torques that depend on all of them: the links' weights, and
-a force and torque at the tool through the transpose of the Jacobian.
+Each drive's model knows only its own joint. This module computes the torques that depend on all joints: the weight of
+the links, and a force and torque at the tool through the transposed Jacobian.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
 
 from kinematics.forward import frames
 from kinematics.gravity import gravity_torques
@@ -19,16 +21,16 @@ from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.models.servo import ServoAxis
 
 PERIOD = 5_000_000
-"""ns between two looks at where the joints are: at 0.5 rad/s a weight changes by less than 0.1 Nm."""
+"""Update interval, ns: at 0.5 rad/s a weight torque changes by less than 0.1 Nm."""
 _SAME_RAD = 1e-4
-"""Joints that turned by less feel what they felt."""
+"""Joint motion below which the torques are kept, rad."""
 
 
 class VirtualArm:
-    """Adds to each drive's `external_torque` what the arm and pushes at its tool exert, Nm.
+    """Adds the torques of the arm's weight and of forces at its tool to each drive's `external_torque`, Nm.
 
     Args:
-        model: the geometry; without masses of its links it has no weight.
+        model: the geometry; without link masses there is no weight.
         drives: of joints 1 to 6.
     """
 
@@ -36,13 +38,13 @@ class VirtualArm:
         self._model = model
         self._mechanics = [drive.mechanics for drive in drives]
         self._wrench = [0.0] * 6
-        self._given = [0.0] * JOINTS
+        self._applied = [0.0] * JOINTS
         self._at: list[float] | None = None
         self._next = 0
         self.update(0)
 
     def push(self, wrench: Sequence[float]) -> Callable[[int], None]:
-        """Push the tool from now on, also where others push; return what ends it.
+        """Apply a wrench at the tool, in addition to others; return the function that ends it.
 
         Args:
             wrench: force, N, and torque, Nm, along the axes of the base: x, y, z, rx, ry, rz.
@@ -56,7 +58,7 @@ class VirtualArm:
         self._next = 0
 
     def update(self, now: int) -> None:
-        """Let the joints feel what belongs to where they are; does nothing most of the time."""
+        """Update the joint torques if the interval is over and a joint has moved."""
         if now < self._next:
             return
         self._next = now + PERIOD
@@ -69,20 +71,25 @@ class VirtualArm:
         if any(self._wrench):
             for i, column in enumerate(jacobian_columns(frames(model, q))):
                 torques[i] += sum(a * b for a, b in zip(column, self._wrench, strict=True))
-        # What others have set, a test or a collision, stays.
-        for mechanics, torque, before in zip(self._mechanics, torques, self._given, strict=True):
+        # Keep torques of other origin, as of a test or a collision.
+        for mechanics, torque, before in zip(self._mechanics, torques, self._applied, strict=True):
             mechanics.external_torque += torque - before
-        self._given = torques
+        self._applied = torques
 
 
 def make_arm(config: SegmentConfig, devices: Sequence[DeviceModel]) -> VirtualArm | None:
-    """Return the arm of a segment's file; None: it names none, or one without geometry.
+    """Return the arm of a segment's file; None: no arm, or one without geometry.
 
     Raises:
-        ConfigError: of the arm's file.
+        ConfigError: in the arm's file.
     """
     drives: list[ServoAxis] = [servo for device in devices for servo in device.servos]
     file = config.arm
-    if file is None or len(drives) < JOINTS or "kinematics" not in read(file).data:
-        return None
-    return VirtualArm(load_kinematics(file), drives[:JOINTS])
+    model = None if file is None or len(drives) < JOINTS else _model_of(file, file.stat().st_mtime_ns)
+    return None if model is None else VirtualArm(model, drives[:JOINTS])
+
+
+@lru_cache(maxsize=4)
+def _model_of(file: Path, changed_ns: int) -> ArmModel | None:
+    """Return the geometry in an arm's file; simulations of many episodes read it once."""
+    return load_kinematics(file) if "kinematics" in read(file).data else None

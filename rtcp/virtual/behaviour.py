@@ -1,6 +1,6 @@
-"""What a described device does: the base class of behaviours, and how a segment calls them without trusting them.
+"""Behaviours of described devices: their base class, and how a segment runs their untrusted code.
 
-A behaviour is named in the segment's file, as `behaviour: cia402` or `behaviour: mymodule:MyDrive`:
+The segment's file names a behaviour, as `behaviour: cia402` or `behaviour: mymodule:MyDrive`:
 
     class Heater(Behaviour):
         options = {"ambient": Option(20.0, -40.0, 80.0, "temperature at power-on, C")}
@@ -30,8 +30,8 @@ from importlib.metadata import EntryPoint
 from types import FrameType, MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-from rtcp.config.document import shown
 from rtcp.config.find import load_class
+from rtcp.config.findings import Finding, shown
 from rtcp.config.model import PluginError
 from rtcp.virtual.device import DeviceModel, Emergency, Option, OptionError
 from rtcp.virtual.objects import LARGEST, Entry, SdoAbort, Value, bounds, check_whole
@@ -46,13 +46,13 @@ BUILT_IN = {
 }
 """Behaviours by their short names."""
 GENERAL_ERROR = 0x08000000
-"""Abort code of an SDO whose hook failed (ETG.1000.6, table 41)."""
+"""SDO abort code after a failed hook (ETG.1000.6, table 41)."""
 UNSPECIFIED_ERROR = 0x0001
-"""AL status code of a slave whose behaviour failed (ETG.1000.6, table 11)."""
+"""AL status code after a failed hook (ETG.1000.6, table 11)."""
 
 
 class FoeError(IntEnum):
-    """Error codes (ETG.1000.6, table 92)."""
+    """FoE error codes (ETG.1000.6, table 92)."""
 
     NOT_DEFINED = 0x8000
     NOT_FOUND = 0x8001
@@ -69,7 +69,7 @@ class FoeError(IntEnum):
 
 
 class FileRefused(Exception):
-    """A file that a behaviour refuses, with an error code and a text for the master."""
+    """The behaviour refuses a file, with an error code and a text for the master."""
 
     def __init__(self, code: int = FoeError.ACCESS_DENIED, text: str = "") -> None:
         check_whole("code of FileRefused", code, 0xFFFFFFFF)
@@ -81,7 +81,7 @@ class FileRefused(Exception):
 
 
 class FileBusy(Exception):
-    """A behaviour is not ready: the master asks again; `done` of `entire`, 0 to 65535, is shown to it."""
+    """The behaviour is busy: the master asks again; `done` of `entire`, 0 to 65535, is its progress."""
 
     def __init__(self, done: int = 0, entire: int = 0) -> None:
         check_whole("done of FileBusy", done, 0xFFFF)
@@ -92,57 +92,57 @@ class FileBusy(Exception):
 
 
 class Behaviour:
-    """What a device does with its objects. Each hook may be left out.
+    """Function of a device: hooks that read and write its objects, all optional.
 
     `self[index, subindex]`, or `self[index]` for subindex 0, is the value of an object: int, float, or bytes. A hook
-    that raises something else than it may, or takes too long, ends OP with AL status code 0x0001; it is tried again
-    when the slave goes to OP again.
+    that takes too long or raises any other error than documented ends OP with AL status code 0x0001; it runs again at
+    the next change to OP.
     """
 
     options: ClassVar[Mapping[str, Option]] = MappingProxyType({})
-    """Numbers that the segment's file may set under `options`; read with `option`."""
+    """Numbers that the segment's file can set under `options`; read them with `option`."""
     keeps_outputs: ClassVar[bool] = False
-    """Whether outputs keep their values when they become invalid (below OP); else they are 0 then."""
+    """True: outputs keep their values below OP; False: they become 0."""
 
     def __init__(self, device: DeviceModel) -> None:
         self.device = device
         self.files: dict[str, bytes] = {}
-        """What a master has written over FoE, by name, and may read."""
+        """Files that a master has written over FoE and can read, by name."""
 
     # -- hooks ------------------------------------------------------------------------------------------------------
 
     def on_start(self) -> None:
-        """Power comes on; every object has its default."""
+        """Called at power-on; every object has its default."""
 
     def on_outputs(self, dt: float) -> None:
-        """`dt` seconds pass, in every state: read outputs, write inputs. In OP the outputs are those of the master."""
+        """Called every `dt` seconds, in all states: read outputs, write inputs. In OP the outputs are the master's."""
 
     def on_sdo_read(self, index: int, subindex: int) -> Value | None:
-        """The master reads an object: return its value, None for the present one. May raise SdoAbort(code)."""
+        """Called when the master reads an object: return its value; None: the stored one. May raise SdoAbort(code)."""
 
     def on_sdo_write(self, index: int, subindex: int, value: Value) -> None:
-        """The master writes `value`, which is in range, to an object. May raise SdoAbort(code) to refuse it."""
+        """Called when the master writes `value`, already in range, to an object. May raise SdoAbort(code)."""
 
     def on_state(self, old: AlState, new: AlState) -> None:
-        """The slave went to another AL state."""
+        """Called after a change of the AL state."""
 
     def on_file(self, name: str, data: bytes) -> None:
-        """A master has written a file over FoE. May raise FileRefused, or FileBusy to be asked again."""
+        """Called when a master has written a file over FoE. May raise FileRefused, or FileBusy to be called again."""
         self.files[name] = data
 
     def read_file(self, name: str) -> bytes | None:
-        """Return a file that a master reads over FoE; None: there is none. May raise as `on_file`."""
+        """Return a file that a master reads over FoE; None: no such file. May raise as `on_file`."""
         return self.files.get(name)
 
-    # -- what it can use ----------------------------------------------------------------------------------------------
+    # -- services ----------------------------------------------------------------------------------------------
 
     @property
     def outputs_valid(self) -> bool:
-        """Whether outputs count: the slave is in OP and the master sends."""
+        """Whether the outputs are valid: the slave is in OP and receives process data."""
         return self.device.outputs_valid
 
     def option(self, name: str, otherwise: float = 0.0) -> float:
-        """Return the value of an option, `otherwise` where it has none."""
+        """Return the value of an option, or `otherwise` if it has none."""
         return self.device.option(name, otherwise)
 
     def __contains__(self, key: tuple[int, int] | int) -> bool:
@@ -161,7 +161,7 @@ class Behaviour:
         return self.device.objects[at]
 
     def emergency(self, code: int, register: int = 0x01, data: bytes = bytes(5)) -> None:
-        """Send an emergency message: error code, error register, five bytes of the manufacturer."""
+        """Send an emergency message: error code, error register, five manufacturer-specific bytes."""
         self.device.emergencies.append(Emergency(code & 0xFFFF, register & 0xFF, data[:5].ljust(5, b"\0")))
 
     def fail(self, code: int = UNSPECIFIED_ERROR) -> None:
@@ -173,7 +173,7 @@ def set_value(entry: Entry, value: Value) -> None:
     """Store a value in an object.
 
     Raises:
-        ValueError: it is of another kind, or outside what its bits hold.
+        ValueError: the value has the wrong type or exceeds the object's bits.
     """
     where = f"0x{entry.index:04X}:{entry.subindex} {entry.name}"
     if entry.is_bytes:
@@ -191,53 +191,53 @@ def set_value(entry: Entry, value: Value) -> None:
 
 
 class HookHangs(BaseException):
-    """Raised inside a hook that takes too long; no `except Exception` of the hook catches it."""
+    """Raised inside a hook that takes too long; an `except Exception` does not catch it."""
 
-    def __init__(self, said: str, where: str) -> None:
-        super().__init__(f"{said}, at {where}")
-        self.said = said
+    def __init__(self, reason: str, where: str) -> None:
+        super().__init__(f"{reason}, at {where}")
+        self.reason = reason
 
 
 class Patience(NamedTuple):
-    """How long a behaviour's code may run."""
+    """Time limits for a behaviour's code."""
 
     cpu_ns: int
-    """CPU time: a process that waits for the CPU is no fault of the code."""
+    """CPU time, ns: waiting for the CPU does not count."""
     ns: int
-    """Time, for code that waits for something else."""
+    """Elapsed time, ns, for code that waits."""
 
 
 HOOK = Patience(20_000_000, 200_000_000)
-"""Of a hook: it stops all other slaves while it runs."""
+"""Of a hook, which blocks all other slaves."""
 MAKING = Patience(5_000_000_000, 9_000_000_000)
-"""Of a behaviour's module, its `__init__` and its first `on_start`, before the segment runs."""
+"""Of importing a behaviour, its `__init__` and its first `on_start`, before the segment runs."""
 EXIT_HANGING = 5
-"""Exit code of a process that a hook keeps, as that of a command that failed."""
+"""Exit code of a process that a hook blocks, as that of a failed command."""
 
 
 class HookWatch:
-    """Ends hooks that take too long, by a signal, and where they do not let themselves be ended, the process."""
+    """Ends a hook that takes too long by a signal; ends the process if the hook does not end."""
 
     PERIOD_S = 0.01
     MOST_RAISED = 20
-    """How many times `HookHangs` is raised in one call, once a period, before the process ends."""
+    """Upper bound on `HookHangs` raised in one call, once a period, before the process ends."""
     LONGEST_IN_C_S = 3.0
-    """CPU time of one call into C; the process then ends, for Python sees no signal before the call returns."""
+    """Upper bound on the CPU time of a call into C, s; then the process ends, as Python handles no signal during it."""
 
     def __init__(self) -> None:
         self.patience: Patience | None = None
-        """That with what runs now; None: no code of a behaviour's."""
+        """Limits of the running code; None: no behaviour runs."""
         self.call = 0
-        self._seen = -1
+        self._timed_call = -1
         self._since = self._since_cpu = self._raised = 0
 
     @contextmanager
     def started(self) -> Iterator[None]:
-        """Watch in this block; outside of the main thread, which alone gets signals, do nothing."""
+        """Watch in this block; no effect outside the main thread, which alone receives signals."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        handler = signal.signal(signal.SIGALRM, self._look)
+        handler = signal.signal(signal.SIGALRM, self._on_timer)
         faulthandler.register(signal.SIGPROF, 2, all_threads=False, chain=True)
         timer = signal.setitimer(signal.ITIMER_REAL, self.PERIOD_S, self.PERIOD_S)
         try:
@@ -249,45 +249,45 @@ class HookWatch:
             faulthandler.unregister(signal.SIGPROF)
 
     def run(self, patience: Patience, call: Callable[..., T], *arguments: object) -> T:
-        """Call code of a behaviour's, for as long as `patience` allows; raises HookHangs, and what the code raises."""
+        """Call a behaviour's code within the limits `patience`; raises HookHangs, and what the code raises."""
         try:
             self.call += 1
             self.patience = patience
             result = call(*arguments)
             self.patience = None
         except BaseException:
-            # First: between the code and this line nothing is called, so no signal is looked at.
+            # First statement: no call before it could handle a signal.
             self.patience = None
             raise
         return result
 
-    def _look(self, number: int, frame: FrameType | None) -> None:
-        # What C does not return from in this time ends the process, with the lines that called it.
+    def _on_timer(self, number: int, frame: FrameType | None) -> None:
+        # A call into C that lasts longer ends the process with a traceback.
         signal.setitimer(signal.ITIMER_PROF, self.LONGEST_IN_C_S)
         patience = self.patience
         if patience is None:
             return
         now, cpu = time.monotonic_ns(), time.thread_time_ns()
-        if self._seen != self.call:
-            self._seen, self._since, self._since_cpu, self._raised = self.call, now, cpu, 0
+        if self._timed_call != self.call:
+            self._timed_call, self._since, self._since_cpu, self._raised = self.call, now, cpu, 0
         elif cpu - self._since_cpu >= patience.cpu_ns or now - self._since >= patience.ns:
-            said = f"it has not returned for {(now - self._since) / 1e6:.0f} ms"
+            reason = f"it has not returned for {(now - self._since) / 1e6:.0f} ms"
             where = "?" if frame is None else f"{frame.f_code.co_filename}:{frame.f_lineno}"
             self._raised += 1
             if self._raised > self.MOST_RAISED:
                 caught = "it catches what is raised to end it, as a bare `except:` does"
-                # Not by `print`, which the hook may be in, and past all handlers of exceptions: it has its own.
-                os.write(2, f"a behaviour cannot be ended at {where}: {said}, {caught}; this process ends\n".encode())
+                # Neither `print`, which the hook may be inside of, nor an exception, which it catches.
+                os.write(2, f"a behaviour cannot be ended at {where}: {reason}, {caught}; this process ends\n".encode())
                 os._exit(EXIT_HANGING)
-            raise HookHangs(said, where)
+            raise HookHangs(reason, where)
 
 
 WATCH = HookWatch()
-"""Of this process; it watches while it is started."""
+"""The watch of this process, active while started."""
 
 
 class HookFailed(Exception):
-    """A hook raised what it may not, or hung; it has been reported."""
+    """A hook raised an undocumented error or hung; already reported."""
 
 
 def _complain(sentence: str) -> None:
@@ -295,35 +295,35 @@ def _complain(sentence: str) -> None:
 
 
 class Runner:
-    """Calls the hooks of a device's behaviour, and reports each failure in one sentence."""
+    """Calls the hooks of a device's behaviour and reports each failure in one sentence."""
 
     def __init__(self, device: DeviceModel, kind: type[Behaviour] | None) -> None:
-        """Make the behaviour; None: the device answers by its dictionary and keeps files.
+        """Create the behaviour; None: the device only serves its dictionary and keeps files.
 
         Raises:
-            OptionError: it cannot be made.
+            OptionError: the behaviour cannot be created.
         """
         self._device = device
         self.report: Callable[[str], None] = _complain
         self.place = device.identity.name
-        """What a sentence calls the device."""
+        """Name of the device in messages."""
         self._broken = False
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._steps: Callable[[float], None] | None = None
         if kind is None:
             kind = Behaviour
         try:
             self.behaviour = WATCH.run(MAKING, kind, device)
             self.keeps_outputs = WATCH.run(MAKING, lambda: bool(self.behaviour.keeps_outputs))
-            """Whether outputs keep their values when they become invalid."""
+            """True: outputs keep their values when they become invalid."""
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # whatever a behaviour raises, and HookHangs
-            raise OptionError((("behaviour",), f"{_place_of(error, kind, '__init__')}: {_said(error)}")) from error
+            raise _error(f"{_place_of(error, kind, '__init__')}: {_text_of(error)}") from error
         if _overrides(kind, "on_outputs"):
             self._steps = self.behaviour.on_outputs
-        for found in device.objects:
-            for entry in found.entries.values():
+        for obj in device.objects:
+            for entry in obj.entries.values():
                 if _overrides(kind, "on_sdo_read"):
                     entry.on_read = self._read
                 if _overrides(kind, "on_sdo_write") and entry.on_write is None:
@@ -331,7 +331,7 @@ class Runner:
         self.start(MAKING)
 
     def start(self, patience: Patience = HOOK) -> None:
-        """Power has come on."""
+        """Power on."""
         self._broken = False
         self._try("on_start", self.behaviour.on_start, patience=patience)
 
@@ -350,21 +350,21 @@ class Runner:
             self.fail("on_outputs", error)
 
     def outputs_valid(self, valid: bool) -> None:
-        """Outputs count from now on, or do not; a behaviour that failed is tried again."""
+        """Set whether the outputs are valid; a failed behaviour is tried again."""
         if valid:
             self._broken = False
 
     def state_changed(self, before: int, after: int) -> None:
-        """The slave went to another AL state."""
+        """Report a change of the AL state to the behaviour."""
         if _overrides(type(self.behaviour), "on_state"):
             self._try("on_state", self.behaviour.on_state, AlState(before), AlState(after))
 
     def on_file(self, name: str, data: bytes) -> None:
-        """Hand a file over; raises HookFailed, and what `Behaviour.on_file` may raise."""
+        """Pass a file to the behaviour; raises HookFailed, and the errors of `Behaviour.on_file`."""
         self._call("on_file", self.behaviour.on_file, name, data, allowed=(FileBusy, FileRefused))
 
     def read_file(self, name: str) -> bytes | None:
-        """Return a file, None where there is none; raises as `on_file`."""
+        """Return a file, or None; raises as `on_file`."""
         return self._call("read_file", self._file, name, allowed=(FileBusy, FileRefused))
 
     def _file(self, name: str) -> bytes | None:
@@ -374,7 +374,7 @@ class Runner:
         return None if data is None else bytes(data)
 
     def _try(self, hook: str, call: Callable[..., object], *arguments: object, patience: Patience = HOOK) -> None:
-        """Call a hook whose failure takes the slave out of OP."""
+        """Call a hook; a failure ends OP."""
         try:
             self._call(hook, call, *arguments, patience=patience)
         except HookFailed:
@@ -401,7 +401,7 @@ class Runner:
 
     def _call(self, hook: str, call: Callable[..., T], *arguments: object, allowed: tuple[type[Exception], ...] = (),
               patience: Patience = HOOK) -> T:  # fmt: skip
-        """Call a hook, which may raise what is `allowed`; report anything else and raise HookFailed."""
+        """Call a hook; pass on errors of the types `allowed`, report any other and raise HookFailed."""
         try:
             return WATCH.run(patience, call, *arguments)
         except BaseException as error:  # whatever a behaviour raises, and HookHangs
@@ -411,41 +411,41 @@ class Runner:
             raise HookFailed from None
 
     def fail(self, hook: str, error: BaseException) -> None:
-        """Take the slave out of OP for a failure, and report that."""
+        """Leave OP because of a failure, and report it."""
         self._broken = True
         self._device.failure = UNSPECIFIED_ERROR
         self._tell(hook, error)
 
     def _tell(self, hook: str, error: BaseException) -> None:
-        sentence = f"{self.place}: {hook} failed at {_place_of(error, type(self.behaviour), hook)}: {_said(error)}"
-        if sentence not in self._told and len(self._told) < _MOST_SENTENCES:
-            self._told.add(sentence)
+        sentence = f"{self.place}: {hook} failed at {_place_of(error, type(self.behaviour), hook)}: {_text_of(error)}"
+        if sentence not in self._reported and len(self._reported) < _MOST_SENTENCES:
+            self._reported.add(sentence)
             self.report(sentence)
 
 
 _SUSPENDED = inspect.CO_GENERATOR | inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR
-"""Of functions whose call runs nothing of them."""
+"""Flags of functions whose call does not run their code."""
 HOOKS = ("on_start", "on_outputs", "on_sdo_read", "on_sdo_write", "on_state", "on_file", "read_file")
 _MOST_SENTENCES = 20
-"""Different failures of a behaviour that are reported."""
+"""Upper bound on the different failures reported per behaviour."""
 
 
 def _overrides(kind: type[Behaviour], hook: str) -> bool:
     return getattr(kind, hook) is not getattr(Behaviour, hook)
 
 
-def _said(error: BaseException) -> str:
+def _text_of(error: BaseException) -> str:
     if isinstance(error, HookHangs):
-        return error.said
+        return error.reason
     try:
         text = str(error)
-    except Exception:  # its class is the behaviour's own
+    except Exception:  # the error's class is foreign code
         text = "its text cannot be made"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def _place_of(error: BaseException, kind: type, hook: str) -> str:
-    """Return file and line of an error: the innermost of the behaviour's own file, else where the hook begins."""
+    """Return file and line of an error: the innermost line in the behaviour's file, else the start of the hook."""
     try:
         own = inspect.getsourcefile(kind)
     except TypeError:
@@ -456,38 +456,42 @@ def _place_of(error: BaseException, kind: type, hook: str) -> str:
 
 
 def _beginning(kind: type, hook: str) -> str | None:
-    """Return file and line where a hook begins; None: it is no function of Python's."""
+    """Return file and line of a hook's start; None: not a Python function."""
     code = getattr(getattr(kind, hook, None), "__code__", None)
     return None if code is None else f"{code.co_filename}:{code.co_firstlineno}"
 
 
 def find_behaviour(name: str) -> type[Behaviour]:
-    """Return the behaviour of a name of `BUILT_IN`, or of `module:Class`.
+    """Return the behaviour of a name in `BUILT_IN` or of `module:Class`.
 
     Raises:
-        OptionError: there is none, it cannot be loaded, its options are none, or a hook of it would never run.
+        OptionError: unknown name, import error, invalid options, or a hook that would never run.
     """
     target = BUILT_IN.get(name, name)
     if ":" not in target:
-        text = f'found the text "{name}", allowed is one of {", ".join(BUILT_IN)}, or module:Class'
-        raise OptionError((("behaviour",), text))
+        allowed = f"one of {', '.join(BUILT_IN)}, or module:Class"
+        raise OptionError(Finding(("behaviour",), "choice", found=name, allowed=allowed))
     try:
-        found = WATCH.run(MAKING, load_class, EntryPoint(name, target, "behaviour"), Behaviour)
+        loaded = WATCH.run(MAKING, load_class, EntryPoint(name, target, "behaviour"), Behaviour)
     except (PluginError, HookHangs) as error:
-        raise OptionError((("behaviour",), str(error))) from error
-    _check(found)
-    return found
+        raise _error(str(error)) from error
+    _check(loaded)
+    return loaded
+
+
+def _error(text: str) -> OptionError:
+    return OptionError(Finding(("behaviour",), "behaviour", text=text))
 
 
 def _check(kind: type[Behaviour]) -> None:
     where, options = f"{kind.__module__}:{kind.__qualname__}", kind.options
-    given = {"": options} if not isinstance(options, Mapping) else options
-    for name, option in given.items():
+    mapping = {"": options} if not isinstance(options, Mapping) else options
+    for name, option in mapping.items():
         if not isinstance(option, Option):
             text = f"found {shown(option)}, allowed is Option(default, low, high, meaning)"
-            raise OptionError((("behaviour",), f"options of {where}{name and f', {name}'}: {text} by its name"))
+            raise _error(f"options of {where}{name and f', {name}'}: {text} by its name")
     for hook in HOOKS:
         code = getattr(getattr(kind, hook), "__code__", None)
         if code is not None and code.co_flags & _SUSPENDED:
             text = f"{hook} would never run, for it has a `yield` or is `async`"
-            raise OptionError((("behaviour",), f"{_beginning(kind, hook) or where}: {text}"))
+            raise _error(f"{_beginning(kind, hook) or where}: {text}")

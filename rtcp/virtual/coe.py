@@ -30,28 +30,28 @@ _READ = {2: Access.READ_PREOP, 4: Access.READ_SAFEOP, 8: Access.READ_OP}
 _WRITE = {2: Access.WRITE_PREOP, 4: Access.WRITE_SAFEOP, 8: Access.WRITE_OP}
 _STATE = 0x0F
 _COUNT_BITS = 16
-"""Subindex 0 and a byte of padding, at the head of a complete access that begins with subindex 0."""
+"""Bits of subindex 0 and its padding at the start of a complete access from subindex 0."""
 
 
 def read(objects: ObjectDictionary, index: int, subindex: int, complete: bool, state: int) -> bytes:
-    """Return the bytes of one entry, or (`complete`) of an object from `subindex` 0 or 1 on.
+    """Return the bytes of an entry, or (`complete`) of an object from `subindex` 0 or 1.
 
-    Complete access returns as many entries as subindex 0 tells; those that may not be read are sent as zero. `state` is
-    the AL state (2 PRE-OP, 4 SAFE-OP, 8 OP), its error flag ignored.
+    Complete access returns the number of entries in subindex 0; unreadable ones are sent as zero. `state` is the AL
+    state (2 PRE-OP, 4 SAFE-OP, 8 OP), without its error flag.
 
     Raises:
-        SdoAbort: absent, write-only, or not to be read in the AL state `state`.
+        SdoAbort: absent, write-only, or not readable in the AL state `state`.
     """
-    found = objects.object(index)
-    if not complete or found.code == ObjectCode.VARIABLE:
+    obj = objects.object(index)
+    if not complete or obj.code == ObjectCode.VARIABLE:
         entry = objects[index, subindex]
         _check_right(entry, Access.RO, _READ.get(state & _STATE, Access(0)), AbortCode.WRITE_ONLY)
         if entry.on_read is not None:
             entry.on_read(entry)
         return encode(entry, entry.value)
     _check_first(subindex)
-    entries = [found.entries[0]] if subindex == 0 else []
-    entries += _members(found, int(found.entries[0].value))
+    entries = [obj.entries[0]] if subindex == 0 else []
+    entries += _members(obj, int(obj.entries[0].value))
     right = _READ.get(state & _STATE, Access(0))
     if entries and not any(entry.access & right for entry in entries):
         known = next((entry for entry in entries if entry.access & Access.RO), entries[0])
@@ -67,52 +67,52 @@ def read(objects: ObjectDictionary, index: int, subindex: int, complete: bool, s
 
 
 def check_download(objects: ObjectDictionary, index: int, subindex: int, complete: bool, state: int, size: int) -> None:
-    """Refuse a download of `size` bytes that cannot succeed whatever the bytes are.
+    """Refuse a download of `size` bytes that cannot succeed for any data.
 
     Raises:
-        SdoAbort: absent, read-only, not to be written in the AL state `state`, or a size that does not fit.
+        SdoAbort: absent, read-only, not writable in the AL state `state`, or the wrong size.
     """
-    found = objects.object(index)
-    if not complete or found.code == ObjectCode.VARIABLE:
+    obj = objects.object(index)
+    if not complete or obj.code == ObjectCode.VARIABLE:
         entry = objects[index, subindex]
         _check_right(entry, Access.WO, _WRITE.get(state & _STATE, Access(0)), AbortCode.READ_ONLY)
         if size > byte_size(entry):
             raise SdoAbort(AbortCode.TOO_LONG)
-        # Strings have a largest length, all others one length.
+        # Strings have a maximum length, all other types a fixed length.
         if size < byte_size(entry) and not entry.is_bytes:
             raise SdoAbort(AbortCode.TOO_SHORT)
         return
     _check_first(subindex)
-    entries = [entry for entry in found.entries.values() if entry.access & Access.WO]
-    for entry in entries or [found.entries[0]]:
+    entries = [entry for entry in obj.entries.values() if entry.access & Access.WO]
+    for entry in entries or [obj.entries[0]]:
         _check_right(entry, Access.WO, _WRITE.get(state & _STATE, Access(0)), AbortCode.READ_ONLY)
-    whole = sum(entry.bit_length for entry in _members(found, found.highest_subindex))
+    whole = sum(entry.bit_length for entry in _members(obj, obj.highest_subindex))
     if size > ((_COUNT_BITS if subindex == 0 else 0) + whole + 7) // 8:
         raise SdoAbort(AbortCode.TOO_LONG)
 
 
 def write(objects: ObjectDictionary, index: int, subindex: int, complete: bool, state: int, data: bytes) -> None:
-    """Store `data` in one entry, or (`complete`) in an object from `subindex` 0 or 1 on.
+    """Store `data` in an entry, or (`complete`) in an object from `subindex` 0 or 1.
 
-    Complete access is all or nothing; read-only entries in its data are passed over. Where subindex 0 can be written
-    (PDO assignment and mapping) it is cleared first and written last.
+    Complete access is all or nothing and skips read-only entries in its data. A writable subindex 0 (PDO assignment and
+    mapping) is cleared first and written last.
 
     Raises:
-        SdoAbort: as `check_download`, or a value out of its range, or refused by the entry's `on_write`.
+        SdoAbort: as `check_download`, a value out of range, or refused by the entry's `on_write`.
     """
     check_download(objects, index, subindex, complete, state, len(data))
-    found = objects.object(index)
-    if complete and found.code != ObjectCode.VARIABLE:
-        _write_object(found, subindex, data)
+    obj = objects.object(index)
+    if complete and obj.code != ObjectCode.VARIABLE:
+        _write_object(obj, subindex, data)
     else:
         entry = objects[index, subindex]
         _store(entry, decode(entry, data))
 
 
-def _write_object(found: DictionaryObject, first: int, data: bytes) -> None:
-    count = found.entries[0]
+def _write_object(obj: DictionaryObject, first: int, data: bytes) -> None:
+    count = obj.entries[0]
     counted = bool(count.access & Access.WO)
-    members = _members(found, found.highest_subindex if counted else int(count.value))
+    members = _members(obj, obj.highest_subindex if counted else int(count.value))
     offset = 0
     if first == 0:
         if len(data) < _COUNT_BITS // 8:
@@ -120,7 +120,7 @@ def _write_object(found: DictionaryObject, first: int, data: bytes) -> None:
         offset = _COUNT_BITS
         if counted:
             _check_range(count, data[0])
-            members = _members(found, data[0])
+            members = _members(obj, data[0])
     elif counted:
         members = _that_fit(members, 8 * len(data))
     size = (offset + sum(entry.bit_length for entry in members) + 7) // 8
@@ -134,7 +134,7 @@ def _write_object(found: DictionaryObject, first: int, data: bytes) -> None:
         offset += entry.bit_length
     if counted and first == 0:
         values.append((count, data[0]))
-    before = [(entry, entry.value) for entry in found.entries.values()]
+    before = [(entry, entry.value) for entry in obj.entries.values()]
     try:
         for entry, value in values:
             _store(entry, value)
@@ -144,20 +144,20 @@ def _write_object(found: DictionaryObject, first: int, data: bytes) -> None:
         raise
 
 
-def _members(found: DictionaryObject, last: int) -> list[Entry]:
+def _members(obj: DictionaryObject, last: int) -> list[Entry]:
     """Return the entries of subindices 1 to `last`, in order."""
-    return [found.entries[subindex] for subindex in sorted(found.entries) if 0 < subindex <= last]
+    return [obj.entries[subindex] for subindex in sorted(obj.entries) if 0 < subindex <= last]
 
 
 def _that_fit(entries: list[Entry], bits: int) -> list[Entry]:
-    """Return as many of `entries`, from the first on, as have room in `bits`."""
-    taken = []
+    """Return the first of `entries`, as many as fit in `bits`."""
+    fitting = []
     for entry in entries:
         bits -= entry.bit_length
         if bits < 0:
             break
-        taken.append(entry)
-    return taken
+        fitting.append(entry)
+    return fitting
 
 
 def _check_first(subindex: int) -> None:
@@ -167,7 +167,7 @@ def _check_first(subindex: int) -> None:
 
 
 def _check_right(entry: Entry, any_state: Access, right: Access, never: AbortCode) -> None:
-    """Refuse with `never` what no AL state allows, with 0x08000022 what another one would."""
+    """Refuse with `never` if no AL state allows the access, with 0x08000022 if another one does."""
     if not entry.access & any_state:
         raise SdoAbort(never)
     if not entry.access & right:
@@ -175,7 +175,7 @@ def _check_right(entry: Entry, any_state: Access, right: Access, never: AbortCod
 
 
 def _check_range(entry: Entry, value: Value) -> None:
-    """Refuse a number beyond the entry's limits, or beyond its bits where these do not fill bytes (BOOLEAN)."""
+    """Refuse a number outside the entry's limits, or larger than its bits if these do not fill bytes (BOOLEAN)."""
     if isinstance(value, bytes):
         return
     if entry.maximum is not None and value > entry.maximum:
@@ -194,7 +194,7 @@ def _store(entry: Entry, value: Value) -> None:
 
 
 MAILBOX_AND_COE_HEADER = 8
-"""Bytes of a mailbox message before the SDO: six of the mailbox header, two of the CoE header."""
+"""Bytes before the SDO: six of the mailbox header, two of the CoE header."""
 
 
 class CoeService(IntEnum):
@@ -211,7 +211,7 @@ class CoeService(IntEnum):
 
     @property
     def header(self) -> bytes:
-        """The two bytes of a CoE header with this service and number 0."""
+        """Return the two bytes of a CoE header with this service and number 0."""
         return bytes((0, self << 4))
 
 
@@ -242,7 +242,7 @@ _TOGGLE = 0x10
 _LAST = 0x01
 _SDO = struct.Struct("<BHBI")
 _SEGMENT_MINIMUM = 7
-"""A segment has at least seven bytes of data, unused ones counted in bits 1 to 3 of the command."""
+"""Least data bytes of a segment; bits 1 to 3 of the command count the unused ones."""
 _EMERGENCY = struct.Struct("<HB5s")
 
 
@@ -270,7 +270,7 @@ class _Download:
 
 
 ABORT = int(Response.ABORT)
-"""First byte of an answer that is an abort."""
+"""First byte of an abort."""
 
 
 class SdoServer:
@@ -290,15 +290,15 @@ class SdoServer:
         self._transfer: _Upload | _Download | None = None
 
     def answer(self, request: bytes, state: int) -> bytes | None:
-        """Return the answer to `request` (eight bytes or more), both without CoE header; None to an abort.
+        """Return the answer to `request` (eight bytes or more), both without CoE header; None for an abort.
 
-        `state` is the AL state that decides on access rights.
+        `state`: AL state, for the access rights.
         """
         command, index, subindex, number = _SDO.unpack_from(request)
         specifier = command >> 5
         transfer = self._transfer
         if specifier in (Request.UPLOAD_SEGMENT, Request.DOWNLOAD_SEGMENT) and transfer is not None:
-            # A segment carries data where other requests carry index and subindex.
+            # A segment has data in place of index and subindex.
             index, subindex = transfer.index, transfer.subindex
         else:
             self._transfer = None
@@ -344,19 +344,19 @@ class SdoServer:
             self._transfer = None
         return answer
 
-    def _download(self, command: int, index: int, subindex: int, number: int, rest: bytes, state: int) -> bytes:
+    def _download(self, command: int, index: int, subindex: int, number: int, content: bytes, state: int) -> bytes:
         complete = bool(command & _COMPLETE)
         if command & _EXPEDITED:
             size = 4 - (command >> 2 & 3) if command & _SIZE_INDICATED else 4
             write(self._objects, index, subindex, complete, state, number.to_bytes(4, "little")[:size])
         else:
-            if len(rest) > number:
+            if len(content) > number:
                 raise SdoAbort(AbortCode.LENGTH)
-            if len(rest) < number:
+            if len(content) < number:
                 check_download(self._objects, index, subindex, complete, state, number)
-                self._transfer = _Download(index, subindex, complete, number, bytearray(rest))
+                self._transfer = _Download(index, subindex, complete, number, bytearray(content))
             else:
-                write(self._objects, index, subindex, complete, state, rest)
+                write(self._objects, index, subindex, complete, state, content)
         return _SDO.pack(Response.DOWNLOAD | command & _COMPLETE, index, subindex, 0)
 
     def _download_segment(self, command: int, transfer: _Download, data: bytes, state: int) -> bytes:
@@ -378,7 +378,7 @@ class SdoServer:
 
 
 def _check_toggle(command: int, transfer: _Upload | _Download) -> None:
-    """Refuse a segment whose toggle bit is not the other of the segment before (ETG.1000.6, 5.6.2.3)."""
+    """Refuse a segment whose toggle bit equals that of the segment before (ETG.1000.6, 5.6.2.3)."""
     if command & _TOGGLE != transfer.toggle:
         raise SdoAbort(AbortCode.TOGGLE_BIT)
 
@@ -407,18 +407,18 @@ class ListType(IntEnum):
     """Lists of objects (ETG.1000.6, 5.6.3.3)."""
 
     COUNTS = 0
-    """How many objects each of the five lists has."""
+    """Lengths of the five lists."""
     ALL = 1
     RXPDO = 2
     TXPDO = 3
     REPLACEMENT = 4
-    """Objects to be stored for the replacement of a device."""
+    """Objects to store for a device replacement."""
     STARTUP = 5
     """Start-up parameters."""
 
 
 class ValueInfo(IntFlag):
-    """What an entry description tells beside type and length (ETG.1000.6, 5.6.3.6)."""
+    """Optional contents of an entry description (ETG.1000.6, 5.6.3.6)."""
 
     ACCESS = 0x01
     CATEGORY = 0x02
@@ -430,7 +430,7 @@ class ValueInfo(IntFlag):
 
 
 _HIGHEST_INDEX = 0xFFFF
-"""Above it stand PDOs without an index of their own."""
+"""Highest CoE index; numbers above it are PDOs without their own index."""
 _ALWAYS_REPORTED = ValueInfo.ACCESS | ValueInfo.CATEGORY | ValueInfo.MAPPABLE
 _RECORD_TYPES = {
     **dict.fromkeys(range(0x1600, 0x1800), DataType.PDO_MAPPING),
@@ -449,7 +449,7 @@ class SdoInformation:
     def __init__(self, objects: ObjectDictionary, send_size: int) -> None:
         """Describe `objects` through a send mailbox of `send_size` bytes."""
         self._objects = objects
-        # Even, so that no index is torn between two fragments.
+        # Even, so that no index is split between two fragments.
         self._fragment_size = (send_size - MAILBOX_AND_COE_HEADER - _HEADER.size) & ~1
         self._services: dict[int, tuple[Operation, Callable[[bytes], bytes]]] = {
             Operation.LIST_REQUEST: (Operation.LIST_RESPONSE, self._list),
@@ -458,7 +458,7 @@ class SdoInformation:
         }
 
     def answer(self, request: bytes) -> list[bytes]:
-        """Return the fragments that answer `request` (six bytes or more), all without CoE header."""
+        """Return the fragments of the answer to `request` (six bytes or more), without CoE header."""
         operation = request[0] & ~_INCOMPLETE
         try:
             if operation not in self._services:
@@ -471,10 +471,10 @@ class SdoInformation:
     def _fragments(self, operation: Operation, data: bytes) -> list[bytes]:
         size = self._fragment_size
         parts = [data[start : start + size] for start in range(0, len(data), size)]
-        left = range(len(parts) - 1, -1, -1)
+        remaining = range(len(parts) - 1, -1, -1)
         return [
             _HEADER.pack(operation | (_INCOMPLETE if after else 0), 0, after) + part
-            for part, after in zip(parts, left, strict=True)
+            for part, after in zip(parts, remaining, strict=True)
         ]
 
     def _list(self, request: bytes) -> bytes:
@@ -489,47 +489,45 @@ class SdoInformation:
         return struct.pack(f"<H{len(numbers)}H", kind, *numbers)
 
     def _indices(self, kind: ListType) -> list[int]:
-        """Return the indices of one list; no entry can be marked for replacement or start-up: those lists are empty."""
+        """Return the indices of a list; the lists for replacement and start-up are always empty."""
         if kind == ListType.ALL:
-            return [found.index for found in self._objects if found.index <= _HIGHEST_INDEX]
+            return [obj.index for obj in self._objects if obj.index <= _HIGHEST_INDEX]
         wanted = {ListType.RXPDO: Access.RXPDO, ListType.TXPDO: Access.TXPDO}.get(kind, Access(0))
-        return [
-            found.index for found in self._objects if any(entry.access & wanted for entry in found.entries.values())
-        ]
+        return [obj.index for obj in self._objects if any(entry.access & wanted for entry in obj.entries.values())]
 
     def _object(self, request: bytes) -> bytes:
         """Return index, data type, highest subindex, object code and name."""
         (index,) = struct.unpack_from("<H", request)
-        found = self._objects.object(index)
-        head = _OBJECT.pack(index, _data_type(found), found.highest_subindex, found.code)
-        return head + found.name.encode("ascii", "replace")
+        obj = self._objects.object(index)
+        head = _OBJECT.pack(index, _data_type(obj), obj.highest_subindex, obj.code)
+        return head + obj.name.encode("ascii", "replace")
 
     def _entry(self, request: bytes) -> bytes:
-        """Return the description of an entry with as much of the value information asked for as there is."""
+        """Return the description of an entry with the available part of the requested value information."""
         if len(request) < _ENTRY_REQUEST.size:
             raise SdoAbort(AbortCode.LENGTH)
-        index, subindex, asked = _ENTRY_REQUEST.unpack_from(request)
+        index, subindex, requested = _ENTRY_REQUEST.unpack_from(request)
         if 0 < subindex < self._objects.object(index).highest_subindex and (index, subindex) not in self._objects:
-            # A gap in a record has no type, no bits and no rights: masters read on, where an abort is a fault to them.
-            return _ENTRY.pack(index, subindex, asked & _ALWAYS_REPORTED, 0, 0, 0)
+            # A gap in a record has no type, bits or rights: masters continue after it, but treat an abort as a fault.
+            return _ENTRY.pack(index, subindex, requested & _ALWAYS_REPORTED, 0, 0, 0)
         entry = self._objects[index, subindex]
-        reported, limits = _limits(entry, ValueInfo(asked & 0x7F))
+        reported, limits = _limits(entry, ValueInfo(requested & 0x7F))
         head = _ENTRY.pack(index, subindex, reported, entry.data_type, entry.bit_length, entry.access)
         return head + limits + entry.name.encode("ascii", "replace")
 
 
-def _limits(entry: Entry, asked: ValueInfo) -> tuple[ValueInfo, bytes]:
-    """Return which of `asked` is reported, and the bytes of minimum and maximum where they are."""
-    reported, data = asked & _ALWAYS_REPORTED, b""
+def _limits(entry: Entry, requested: ValueInfo) -> tuple[ValueInfo, bytes]:
+    """Return the reported part of `requested`, and the bytes of minimum and maximum."""
+    reported, data = requested & _ALWAYS_REPORTED, b""
     for flag, limit in ((ValueInfo.MINIMUM, entry.minimum), (ValueInfo.MAXIMUM, entry.maximum)):
-        if flag & asked and limit is not None:
+        if flag & requested and limit is not None:
             reported |= flag
             data += encode(entry, limit).ljust(byte_size(entry), b"\0")
     return reported, data
 
 
-def _data_type(found: DictionaryObject) -> int:
-    """Return the data type of an object: of a variable or an array that of its elements, of a record its own."""
-    if found.code == ObjectCode.RECORD:
-        return _RECORD_TYPES.get(found.index, 0)
-    return found.entries[found.highest_subindex].data_type
+def _data_type(obj: DictionaryObject) -> int:
+    """Return the data type of a variable, of an array's elements, or of a record."""
+    if obj.code == ObjectCode.RECORD:
+        return _RECORD_TYPES.get(obj.index, 0)
+    return obj.entries[obj.highest_subindex].data_type

@@ -1,6 +1,6 @@
-"""A slave by its description, an ESI file or an SII image: objects, PDOs, sync managers, clock and mailbox protocols.
+"""Slaves made from an ESI file or an SII image: objects, PDOs, sync managers, clock and mailbox protocols.
 
-What it does with its objects is its behaviour's; without one it answers by its dictionary.
+A behaviour gives the device its function; without one it only serves its dictionary.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from rtcp.virtual.pdo import (
 from rtcp.virtual.protocol import RAM_SIZE, REGISTER_SPACE, MailboxType
 
 LARGEST_RAM = 0xF000
-"""Bytes: addresses have 16 bits."""
+"""Upper bound on the RAM, bytes: addresses have 16 bits."""
 _LONGEST_GAP = 248
 _FIRST_OBJECT = 0x1000
-"""Below it stand data types, which a PDO maps as padding (ETG.1000.6, table 64)."""
+"""Lowest object index; a PDO maps the data types below it as padding (ETG.1000.6, table 64)."""
 _BEYOND = 0x1_0000
-"""Internal numbers of PDOs that have no index, or the same as another one."""
+"""First internal number of PDOs without an index, or with the same one as another PDO."""
 _WRITE = {"P": Access.WRITE_PREOP, "S": Access.WRITE_SAFEOP, "O": Access.WRITE_OP}
 _COMPATIBILITY = 0x06040043
 """Abort code: general parameter incompatibility."""
@@ -52,13 +52,13 @@ _MAPPED = Access.RXPDO | Access.TXPDO
 
 
 class DescribedDevice(DeviceModel):
-    """A device made of its description.
+    """A device made from its description.
 
     Args:
-        device: the description, its modules put in.
-        image: its EEPROM image; `alias` and checksum are set in it.
-        behaviour: class of what it does; None: nothing.
-        options: of the behaviour, and those that every model has.
+        device: the description, with its modules.
+        image: its EEPROM image; `alias` and checksum are inserted.
+        behaviour: class of its behaviour, or None.
+        options: of the behaviour, and those of every model.
     """
 
     def __init__(self, device: Device, image: Callable[[int], bytes], behaviour: type[Behaviour] | None = None,
@@ -77,7 +77,7 @@ class DescribedDevice(DeviceModel):
             self.bootstrap = _bootstrap(device.bootstrap)
         self.options = {} if behaviour is None else behaviour.options
         self._assignments: dict[int, list[int]] = {}
-        """Numbers of the PDOs that each sync manager has by default."""
+        """Numbers of the default PDOs of each sync manager."""
         super().__init__(**options)
         self.runner = Runner(self, behaviour)
         self.files = None if mailbox is None or not mailbox.foe else FoeServer(self.runner)
@@ -85,7 +85,7 @@ class DescribedDevice(DeviceModel):
             self.mailbox_protocols[MailboxType.FOE] = self.files
 
     def make_identity(self) -> Identity:
-        """Return the identity of the description; the serial number is an option."""
+        """Return the identity from the description; the serial number is an option."""
         device = self.description
         identity = device.identity
         return Identity(
@@ -100,7 +100,7 @@ class DescribedDevice(DeviceModel):
     # -- objects ----------------------------------------------------------------------------------------------------
 
     def define(self, objects: ObjectDictionary) -> None:
-        """Add the objects of the dictionary, and those that the PDOs need."""
+        """Add the objects of the dictionary and those required by the PDOs."""
         device = self.description
         identity = objects.object(0x1018)
         for item in device.objects:
@@ -118,7 +118,7 @@ class DescribedDevice(DeviceModel):
             self._define_assignment(objects, index, numbers)
 
     def _define_pdos(self, objects: ObjectDictionary) -> dict[int, Pdo]:
-        """Add the mapping object of every PDO, and what it maps; return the PDOs by the number of this object."""
+        """Add the mapping object of every PDO and its mapped entries; return the PDOs by the number of this object."""
         numbers: dict[int, Pdo] = {}
         pdos = [(pdo, Access.RXPDO) for pdo in self.description.rx_pdos]
         pdos += [(pdo, Access.TXPDO) for pdo in self.description.tx_pdos]
@@ -142,11 +142,11 @@ class DescribedDevice(DeviceModel):
         free = not pdo.fixed and self._writable(described, "pdo_configuration")
         values = [*mapped, *[0] * (max(places, 16 if free else 0) - len(mapped))]
         entries = [Entry(number, n, f"Mapped object {n}", DataType.UNSIGNED32, v) for n, v in enumerate(values, 1)]
-        made = objects.record(number, pdo.name or f"PDO mapping 0x{number:04X}", entries)
-        restrict(made, len(mapped), not free, lambda value: mapped_bits(objects, value, wanted), LARGEST_RAM)
+        mapping = objects.record(number, pdo.name or f"PDO mapping 0x{number:04X}", entries)
+        restrict(mapping, len(mapped), not free, lambda value: mapped_bits(objects, value, wanted), LARGEST_RAM)
 
     def _writable(self, described: DictionaryObject | None, feature: str) -> bool:
-        """Whether the master may change a mapping or an assignment: by the dictionary, or as the mailbox says."""
+        """Whether the master may change a mapping or an assignment, by the dictionary or the mailbox description."""
         mailbox = self.description.mailbox
         if mailbox is None or mailbox.coe is None:
             return False
@@ -154,7 +154,7 @@ class DescribedDevice(DeviceModel):
         return in_dictionary or bool(getattr(mailbox.coe, feature))
 
     def _define_assignment(self, objects: ObjectDictionary, manager: int, numbers: Mapping[int, Pdo]) -> None:
-        """Add the PDO assignment of a sync manager, which keeps what is mandatory and what excludes each other."""
+        """Add the PDO assignment of a sync manager, with its rules on mandatory and mutually exclusive PDOs."""
         index = ASSIGN + manager
         outputs = manager in self.roles.outputs
         pdos = self.description.rx_pdos if outputs else self.description.tx_pdos
@@ -166,7 +166,7 @@ class DescribedDevice(DeviceModel):
         room = max(len(assigned), len(own) if free else 0, 0 if described is None else described.highest_subindex)
         values = [*assigned, *[0] * (room - len(assigned))]
         entries = [Entry(index, n, f"Assigned PDO {n}", DataType.UNSIGNED16, v) for n, v in enumerate(values, 1)]
-        made = objects.record(index, f"PDO assignment of SM{manager}", entries, code=ObjectCode.ARRAY)
+        assignment = objects.record(index, f"PDO assignment of SM{manager}", entries, code=ObjectCode.ARRAY)
         default = frozenset(assigned)
 
         def bits_of(number: int) -> int:
@@ -181,16 +181,16 @@ class DescribedDevice(DeviceModel):
             if not others:
                 return
             for number in chosen:
-                # What excludes each other by default, as some descriptions have it, may stay together.
+                # Some descriptions have mutually exclusive default PDOs; these are accepted.
                 if (own[number].excludes & others) - (default if number in default else frozenset()):
                     raise SdoAbort(_COMPATIBILITY)
             if any(own[number].mandatory and number not in others for number in assigned):
                 raise SdoAbort(_COMPATIBILITY)
 
-        restrict(made, len(assigned), not free, bits_of, LARGEST_RAM, accept)
+        restrict(assignment, len(assigned), not free, bits_of, LARGEST_RAM, accept)
 
     def _make_room(self, objects: ObjectDictionary) -> None:
-        """Find how much memory the sync managers need, and whether they share it."""
+        """Determine the memory of the sync managers, and whether they overlap."""
         areas = []
         for n, manager in enumerate(self.sync_managers):
             if manager.type in (SyncManagerType.OUTPUTS, SyncManagerType.INPUTS):
@@ -214,24 +214,24 @@ class DescribedDevice(DeviceModel):
         )
 
     def lay_out(self, index: int) -> PdoImage:
-        """Return the process image of sync manager `index`; where they share memory all may fill it."""
+        """Return the process image of sync manager `index`; with overlapping ones, each may fill the whole memory."""
         if not self.shares_memory:
             return super().lay_out(index)
         return PdoImage.from_assignment(self.objects, ASSIGN + index, index in self.roles.outputs, self.ram_size)
 
-    # -- what it does -----------------------------------------------------------------------------------------------
+    # -- function -----------------------------------------------------------------------------------------------
 
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass for the behaviour."""
         self.runner.step(dt)
 
     def power_on(self) -> None:
-        """The supply comes back: the objects have their defaults, and the behaviour begins anew."""
+        """Power on: reset the objects to their defaults and restart the behaviour."""
         super().power_on()
         self.runner.start()
 
     def set_outputs_valid(self, valid: bool) -> None:
-        """Outputs become valid, or invalid: then they are 0."""
+        """Set whether the outputs are valid; invalid ones become 0 unless the behaviour keeps them."""
         super().set_outputs_valid(valid)
         if not valid and not self.runner.keeps_outputs:
             try:
@@ -247,21 +247,21 @@ class DescribedDevice(DeviceModel):
                 entry.value = bytes(len(entry.value)) if isinstance(entry.value, bytes) else 0
 
     def failed(self, error: Exception) -> None:
-        """An error of the behaviour, which has changed something past the methods that it has for that."""
+        """Report a failure caused by the behaviour, which changed something without its methods."""
         self.runner.fail("the slave", error)
 
     def open_mailbox(self, receive_size: int, send_size: int) -> None:
-        """No transfer of a file is under way."""
+        """Reset FoE: no transfer is in progress."""
         if self.files is not None:
             self.files.open(receive_size)
 
     def state_changed(self, before: int, after: int) -> None:
-        """Let the behaviour know."""
+        """Notify the behaviour."""
         self.runner.state_changed(before, after)
 
 
 def _ports(physics: str) -> str:
-    """Return the ports; a device with one alone has a second, so that any can stand anywhere in a chain."""
+    """Return the ports; a device with a single port gets a second one, to fit anywhere in a chain."""
     if any(kind != " " for kind in physics[1:]):
         return physics
     return (physics.strip() or "Y")[0] * 2
@@ -272,16 +272,16 @@ def _is_mailbox(manager: SyncManager) -> bool:
 
 
 def _layout(device: Device) -> tuple[SyncManager, ...]:
-    """Return the sync managers; those that stand for registers, and the mailboxes of a device without, have no use."""
+    """Return the sync managers; virtual ones, and mailboxes of a device without mailbox protocols, are unused."""
     process_data = (SyncManagerType.OUTPUTS, SyncManagerType.INPUTS)
     assigned = [{pdo.sync_manager for pdo in pdos if not pdo.virtual} for pdos in (device.rx_pdos, device.tx_pdos)]
 
-    def kind(n: int, found: SyncManagerType, virtual: bool) -> SyncManagerType:
-        if virtual or (device.mailbox is None and found not in process_data):
+    def kind(n: int, manager_type: SyncManagerType, virtual: bool) -> SyncManagerType:
+        if virtual or (device.mailbox is None and manager_type not in process_data):
             return SyncManagerType.UNUSED
         carries = [wanted for wanted, managers in zip(process_data, assigned, strict=True) if n in managers]
-        # Some descriptions call inputs outputs.
-        return carries[0] if found in process_data and len(carries) == 1 else found
+        # Some descriptions declare inputs as outputs.
+        return carries[0] if manager_type in process_data and len(carries) == 1 else manager_type
 
     return tuple(
         SyncManager(m.start, m.length, m.control, kind(n, SyncManagerType(m.type), m.virtual), int(m.enabled))
@@ -304,7 +304,7 @@ def _data_type(base: types.BaseType) -> DataType:
 
 
 def _number(base: types.BaseType, data: bytes | None) -> float | None:
-    """Return a limit; None: none is given, or it is no number."""
+    """Return a limit; None: missing or not a number."""
     value = None if data is None else types.decode(base, data)
     return value if isinstance(value, int | float) else None
 
@@ -332,25 +332,25 @@ def _entry(index: int, entry: ObjectEntry) -> Entry:
     if low is not None and high is not None and low > high:
         low = high = None
     data_type = _data_type(base)
-    made = Entry(
+    new = Entry(
         index, entry.sub_index, entry.name, data_type, _value(base, entry.default, bits), access,
         bit_length=bits, minimum=low, maximum=high,
     )  # fmt: skip
-    if base.kind in (types.Kind.TEXT, types.Kind.BYTES) and not made.is_bytes:
-        made.data_type = DataType.OCTET_STRING
-    return made
+    if base.kind in (types.Kind.TEXT, types.Kind.BYTES) and not new.is_bytes:
+        new.data_type = DataType.OCTET_STRING
+    return new
 
 
 def _mappings(objects: ObjectDictionary, entry: PdoEntry, wanted: Access, pdos: frozenset[int]) -> Iterable[int]:
-    """Yield the mappings of a PDO's entry, one but for long gaps; add the object that it maps where there is none.
+    """Yield the mappings of a PDO's entry, several for a long gap; add a missing mapped object.
 
-    What maps the mapping object of one of the `pdos`, as some descriptions do, holds a value of its own.
+    An entry that maps the mapping object of one of the `pdos`, as in some descriptions, gets its own value.
     """
     if entry.index < _FIRST_OBJECT or entry.bits > 0xFF:
-        left = entry.bits
-        while left > 0:
-            yield min(left, _LONGEST_GAP)
-            left -= _LONGEST_GAP
+        remaining = entry.bits
+        while remaining > 0:
+            yield min(remaining, _LONGEST_GAP)
+            remaining -= _LONGEST_GAP
         return
     word = entry.index << 16 | entry.sub_index << 8 | entry.bits
     if entry.index in pdos:
@@ -367,32 +367,32 @@ def _mappings(objects: ObjectDictionary, entry: PdoEntry, wanted: Access, pdos: 
 
 
 def _mapped_entry(objects: ObjectDictionary, entry: PdoEntry, wanted: Access) -> Entry:
-    """Return the entry that is mapped, which is made where the dictionary lacks it."""
+    """Return the mapped entry; created if the dictionary lacks it."""
     index, subindex = entry.index, entry.sub_index
     if (index, subindex) not in objects:
         base = types.resolve(entry.type, entry.bits)
         access = Access.RO if wanted == Access.TXPDO else Access.RW
-        made = Entry(index, subindex, entry.name, _data_type(base), _value(base, None, entry.bits), access,
+        new = Entry(index, subindex, entry.name, _data_type(base), _value(base, None, entry.bits), access,
                      bit_length=entry.bits)  # fmt: skip
         if (index, 0) in objects:
-            found = objects.object(index)
-            found.entries[subindex] = made
-            found.code = ObjectCode.RECORD
-            found.entries = dict(sorted(found.entries.items()))
+            obj = objects.object(index)
+            obj.entries[subindex] = new
+            obj.code = ObjectCode.RECORD
+            obj.entries = dict(sorted(obj.entries.items()))
         elif subindex:
-            objects.record(index, entry.name, [made])
+            objects.record(index, entry.name, [new])
         else:
-            objects.add(DictionaryObject(index, entry.name, ObjectCode.VARIABLE, {0: made}))
-        found = objects.object(index)
-        if found.code != ObjectCode.VARIABLE and not found.entries[0].access & _MAPPED:
-            found.entries[0].value = max(int(found.entries[0].value or 0), found.highest_subindex)
+            objects.add(DictionaryObject(index, entry.name, ObjectCode.VARIABLE, {0: new}))
+        obj = objects.object(index)
+        if obj.code != ObjectCode.VARIABLE and not obj.entries[0].access & _MAPPED:
+            obj.entries[0].value = max(int(obj.entries[0].value or 0), obj.highest_subindex)
     target = objects[index, subindex]
     target.access |= wanted
     return target
 
 
 def with_alias(image: bytes, alias: int) -> bytes:
-    """Return an EEPROM image with a station alias and its checksum; 0: as it is."""
+    """Return an EEPROM image with a station alias and its checksum; alias 0: unchanged."""
     if not alias:
         return image
     head = bytearray(image[:16])

@@ -1,4 +1,4 @@
-"""The devices of a segment's file: models, and slaves described by ESI files and SII images."""
+"""Devices of a segment's file: models, and slaves described by ESI files and SII images."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from rtcp.config.document import KeyPath
+from rtcp.config.findings import Finding, KeyPath
 from rtcp.config.segment import SegmentSlave
 from rtcp.esi.model import Device, DeviceFile, EsiError
 from rtcp.esi.modules import assemble
@@ -20,18 +20,18 @@ from rtcp.virtual.device import DeviceModel, OptionError, create
 
 
 class Descriptions:
-    """Makes the devices of a segment's file; a description that several slaves name is read once."""
+    """Makes the devices of a segment's file; reads each description once."""
 
     def __init__(self, folder: Path) -> None:
-        """Names of files and modules are relative to `folder`."""
+        """File and module names are relative to `folder`."""
         self._folder = folder
         self._files: dict[str, DeviceFile] = {}
 
     def make(self, slave: SegmentSlave) -> DeviceModel:
-        """Return the device of a slave, of a model or described.
+        """Return the device of a slave.
 
         Raises:
-            OptionError: a mistake with its key.
+            OptionError: with the key of the mistake.
         """
         if slave.model is not None:
             return create(slave.model, **slave.options)
@@ -78,4 +78,4 @@ class Descriptions:
 
 def _mistake(key: str, error: EsiError) -> OptionError:
     where: KeyPath = (key,)
-    return OptionError((where, str(error)))
+    return OptionError(Finding(where, "description", text=str(error)))

@@ -1,7 +1,7 @@
-"""What a device model is to the slave that carries it: objects, an identity, options, and time that passes.
+"""Base class of device models: objects, identity, options and time steps.
 
-A model is a subclass of `DeviceModel`: class attributes say what it is, `define` adds its objects, `step` passes time.
-It is found by name among the entry points `rtcp.virtual_models`, or as `module:Class` of the segment file.
+A model is a subclass of `DeviceModel`: class attributes describe it, `define` adds its objects, `step` advances time.
+The segment's file names it by an entry point of `rtcp.virtual_models` or as `module:Class`.
 """
 
 from __future__ import annotations
@@ -12,40 +12,40 @@ from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from math import isfinite
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Protocol, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
-from rtcp.config.document import Finding, shown
 from rtcp.config.find import load_class, registered
+from rtcp.config.findings import Finding
 from rtcp.config.model import PluginError
 from rtcp.virtual.objects import DataType, Entry, ObjectDictionary, SdoAbort
 from rtcp.virtual.pdo import ASSIGN, PdoImage, SyncManager, SyncManagerLayout, SyncManagerType, room
 from rtcp.virtual.protocol import RAM_SIZE, REGISTER_SPACE, MailboxType
 
 MailboxHandler = Callable[[bytes, int], Iterable[bytes]]
-"""Answers a mailbox message: it gets the message without its mailbox header, and the most bytes of an answer."""
+"""Answers a mailbox message: takes the message without mailbox header and the largest size of an answer."""
 ENTRY_POINTS = "rtcp.virtual_models"
-"""Entry points of device models, by the name that a segment's file uses."""
+"""Entry point group of device models."""
 LONGEST_QUEUE = 16
-"""Emergency messages that wait; the oldest are dropped where nobody reads the mailbox."""
+"""Upper bound on queued emergency messages; the oldest are dropped."""
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity of a device as in its SII and object 0x1018."""
+    """Identity of a device, for its SII and object 0x1018."""
 
     vendor_id: int
     product_code: int
     revision: int
     serial: int
     name: str
-    """Name of the device, as in SII string 1 and object 0x1008."""
+    """Name of the device, for SII string 1 and object 0x1008."""
     group: str
     order_code: str
 
 
 @dataclass(frozen=True)
 class Emergency:
-    """An emergency message (ETG.1000.6, 5.6.4): error code, error register, five bytes of the manufacturer."""
+    """An emergency message (ETG.1000.6, 5.6.4): error code, error register, five manufacturer-specific bytes."""
 
     error_code: int
     error_register: int
@@ -54,7 +54,7 @@ class Emergency:
 
 @dataclass(frozen=True)
 class Option:
-    """A number in `options` of the segment's file: default (None: it follows from the model), range and meaning."""
+    """A number in `options` of the segment's file: default (None: set by the model), range and meaning."""
 
     default: float | None
     low: float
@@ -62,23 +62,23 @@ class Option:
     meaning: str
     whole: bool = False
     listed: bool = True
-    """Whether a sentence on what there is names it."""
+    """True: messages that list the options include it."""
 
 
 class OptionError(ValueError):
-    """A model or an option that does not exist or is out of range; `findings` hold the key and the sentence of each."""
+    """A model or an option that does not exist or is out of range, with the `findings`."""
 
     def __init__(self, *findings: Finding) -> None:
-        super().__init__("; ".join(text for _, text in findings))
+        super().__init__("; ".join(finding.text for finding in findings))
         self.findings = findings
 
 
 @dataclass
 class SlaveFaults:
-    """Faults of a slave's firmware and clock; they stay with the slave while it has no supply."""
+    """Faults of a slave's firmware and clock; they outlast a power cycle."""
 
     refusals: list[tuple[int, int]] = field(default_factory=list)
-    """AL states that the slave refuses to enter, and the AL status code it reports."""
+    """AL states that the slave refuses to enter, with the AL status code."""
     hangs: int = 0
     """Above 0: the firmware ignores AL control."""
     sdo_delays: list[int] = field(default_factory=list)
@@ -86,34 +86,34 @@ class SlaveFaults:
     sdo_aborts: list[tuple[int, int]] = field(default_factory=list)
     """Objects (index, 0: all) whose services are aborted, and the abort code."""
     sync0_losses: int = 0
-    """Above 0: no SYNC0 comes."""
+    """Above 0: no SYNC0 pulses."""
     drift_ppm: float = 0.0
-    """Drift of the clock beyond its own."""
+    """Additional drift of the clock."""
 
     def refusal(self, state: int) -> int:
-        """AL status code with which the slave refuses to enter `state`; 0: it does not refuse."""
+        """Return the AL status code with which the slave refuses to enter `state`; 0: no refusal."""
         return next((code for refused, code in self.refusals if refused == state), 0)
 
     def sdo_abort(self, index: int) -> int:
-        """Abort code for services of object `index`; 0: they are served."""
+        """Return the abort code for services of object `index`; 0: none."""
         return next((code for refused, code in self.sdo_aborts if refused in (0, index)), 0)
 
     def sdo_delay(self) -> int:
-        """Delay of the answer to an SDO, ns."""
+        """Return the delay of SDO answers, ns."""
         return max(self.sdo_delays, default=0)
 
 
 class Roles(NamedTuple):
-    """Numbers of the sync managers of a slave by their use; virtual ones, which stand for registers, have none."""
+    """Numbers of the sync managers of a slave by use; without virtual ones, which have no registers."""
 
     mailboxes: tuple[int, int] | None
-    """The one that the master writes and the one that it reads; None: no mailbox."""
+    """Sync managers written and read by the master; None: no mailbox."""
     outputs: tuple[int, ...]
     inputs: tuple[int, ...]
 
 
 def roles_of(layout: Sequence[SyncManager]) -> Roles:
-    """Return the use of each sync manager of `layout`."""
+    """Return the roles of the sync managers in `layout`."""
 
     def of(wanted: SyncManagerType) -> tuple[int, ...]:
         return tuple(n for n, manager in enumerate(layout) if manager.type == wanted)
@@ -125,7 +125,7 @@ def roles_of(layout: Sequence[SyncManager]) -> Roles:
 
 @dataclass(frozen=True)
 class CoeFeatures:
-    """What a device's CoE can do beside single SDOs (ETG.1000.6, table 21)."""
+    """Optional CoE services of a device (ETG.1000.6, table 21)."""
 
     sdo_information: bool = True
     complete_access: bool = True
@@ -134,32 +134,21 @@ class CoeFeatures:
 FULL_COE = CoeFeatures()
 
 
-class Number(Protocol):
-    """An entry whose value is known to be an int."""
-
-    value: int
-
-
-def number(objects: ObjectDictionary, index: int, subindex: int = 0) -> Number:
-    """Return an entry that a model keeps for its steps; raises SdoAbort where it does not exist."""
-    return cast(Number, objects[index, subindex])
-
-
 class FreezableInputs:
-    """Mixed into a model whose inputs can be frozen."""
+    """Mixin of models whose inputs can be frozen."""
 
     freezes = 0
     """Above 0: the inputs keep their values."""
 
 
 class DeviceModel:
-    """Base of all device models. It knows objects by index and subindex and nothing of frames.
+    """Base of all device models. A model works with objects only; the slave handles frames.
 
-    The slave copies RxPDO-mapped entries in before `step` and TxPDO-mapped ones out after it. A subclass with an
-    `__init__` calls this one first.
+    The slave updates RxPDO-mapped entries before `step` and sends TxPDO-mapped ones after it. A subclass with its own
+    `__init__` must call this one first.
 
     Raises:
-        OptionError: an option that does not exist or is out of range.
+        OptionError: an option is unknown or out of range.
     """
 
     vendor_id: ClassVar[int] = 0
@@ -171,58 +160,58 @@ class DeviceModel:
     group: ClassVar[str] = ""
     order_code: ClassVar[str] = ""
     options: Mapping[str, Option] = MappingProxyType({})
-    """Options beside those that every model has (`COMMON_OPTIONS`)."""
+    """Options in addition to `COMMON_OPTIONS`."""
     supports_dc: bool = True
     """Whether the slave has a distributed clock."""
     uses_sync0: ClassVar[bool] = True
-    """Whether active SYNC0 steps the device and is supervised; else process data step it."""
+    """True: an active SYNC0 steps the device and is supervised; otherwise process data step it."""
     sync_managers: Sequence[SyncManager] = SyncManagerLayout()
     bootstrap: tuple[int, int, int, int] | None = None
-    """Mailboxes in BOOT: start and length of the one that the master writes, and of the other; None: no BOOT."""
+    """Mailboxes in BOOT: start and length of the written and of the read one; None: no BOOT."""
     coe: CoeFeatures | None = FULL_COE
-    """None: its mailbox, if it has one, carries other protocols alone."""
+    """CoE services; None: no CoE."""
     smallest_mailbox: int = 34
-    """Fewest bytes of a mailbox; a CoE slave needs 34 for SDO information (ETG.1020, 8.1)."""
+    """Least size of a mailbox, bytes; SDO information needs 34 (ETG.1020, 8.1)."""
     physics: str = "YY"
-    """Ports 0, 1, 2, 3: Y MII, K E-bus, H MII for fast hot connect, blank none (ETG.2000)."""
+    """Ports 0 to 3: Y MII, K E-bus, H MII for fast hot connect, blank none (ETG.2000)."""
     ram_size: int = RAM_SIZE
     """Bytes of process data RAM."""
     shares_memory: bool = False
-    """Whether its own sync managers overlap: then nobody checks that they do not."""
+    """True: its sync managers overlap by design, and the check is off."""
     sync_activations: frozenset[int] = frozenset()
-    """Values of the DC activation register 0x0981 that are allowed beside those with SYNC0."""
+    """Allowed values of the DC activation register 0x0981 in addition to those with SYNC0."""
 
-    def __init__(self, **given: object) -> None:
-        self.chosen = _read_options({**COMMON_OPTIONS, **self.options}, given)
+    def __init__(self, **options: object) -> None:
+        self.chosen = _read_options({**COMMON_OPTIONS, **self.options}, options)
         """Value of every option."""
         self.identity = self.make_identity()
         self.emergencies: deque[Emergency] = deque(maxlen=LONGEST_QUEUE)
-        """Emergency messages that wait to be sent; the slave's mailbox takes them from the left."""
+        """Queue of emergency messages; the slave's mailbox takes them from the left."""
         self.mailbox_protocols: dict[MailboxType, MailboxHandler] = {}
-        """Mailbox protocols beside CoE, as FoE, that a subclass adds in its `__init__`; its SII lists them."""
+        """Further mailbox protocols, as FoE; a subclass adds them in its `__init__`, and the SII lists them."""
         self.outputs_valid = False
         self.servos: Sequence[Any] = ()
         """Axes of a drive: `rtcp.virtual.models.servo.ServoAxis`."""
         self.failure = 0
-        """AL status code with which the slave is to leave OP for SAFE-OP now; 0: none."""
+        """AL status code that makes the slave leave OP for SAFE-OP; 0: none."""
         self.roles = roles_of(self.sync_managers)
         self.objects = ObjectDictionary()
         self._define_identity()
         self.define(self.objects)
-        self._defaults = [(entry, entry.value) for found in self.objects for entry in found.entries.values()]
+        self._defaults = [(entry, entry.value) for obj in self.objects for entry in obj.entries.values()]
 
     def join(self, devices: Sequence[DeviceModel]) -> None:
-        """Get to know all devices of the segment, in the order of the cable; called once, before time passes."""
+        """Receive all devices of the segment, in the order of the cable; called once before the first step."""
 
     def make_identity(self) -> Identity:
-        """Return its identity: that of the class, with the serial number of the options."""
+        """Return the identity of the class with the serial number of the options."""
         return Identity(
             self.vendor_id, self.product_code, self.revision, int(self.option("serial")),
             self.name, self.group, self.order_code,
         )  # fmt: skip
 
     def option(self, name: str, otherwise: float = 0.0) -> float:
-        """Return the value of an option, `otherwise` where it follows from the model."""
+        """Return the value of an option, or `otherwise` if it has no value."""
         value = self.chosen[name]
         return otherwise if value is None else value
 
@@ -242,47 +231,47 @@ class DeviceModel:
         ])  # fmt: skip
 
     def define(self, objects: ObjectDictionary) -> None:
-        """Add the model's objects and PDOs; their values now are those at power-on."""
+        """Add the model's objects and PDOs with their power-on values."""
         raise NotImplementedError
 
     def step(self, dt: float) -> None:
-        """Let `dt` seconds pass: read the RxPDO objects, move, write the TxPDO objects."""
+        """Advance by `dt` seconds: read the RxPDO objects, move, write the TxPDO objects."""
         raise NotImplementedError
 
     def truth(self) -> dict[str, Any]:
-        """Return what tests ask for past the bus, by name, as JSON has it."""
+        """Return the true state for tests, by name, as JSON values."""
         return {}
 
     def power_off(self) -> None:
-        """The supply goes: no torque, outputs off; `step` advances only the mechanics."""
+        """Power off: no torque, outputs off; `step` advances only the mechanics."""
         self.set_outputs_valid(False)
 
     def power_on(self) -> None:
-        """The supply comes back: every object has its value of power-on, past access rights and checks."""
+        """Power on: reset every object to its power-on value, without access checks."""
         for entry, value in self._defaults:
             entry.value = value
         self.emergencies.clear()
 
     def set_outputs_valid(self, valid: bool) -> None:
-        """Process data outputs become valid (OP), or must be ignored (the safe state)."""
+        """Set whether the outputs are valid (OP) or ignored (safe state)."""
         self.outputs_valid = valid
 
     def eeprom(self, alias: int) -> bytes:
-        """Return its EEPROM image with the station alias; empty: it is made of its objects."""
+        """Return its EEPROM image with the station alias; empty: the slave builds it from the objects."""
         return b""
 
     def failed(self, error: Exception) -> None:
-        """Something of the slave outside of its hooks has failed, as inputs that do not fit: an error of the model."""
+        """Report a failure of the model outside its hooks, as inputs that do not fit their objects."""
         raise error
 
     def open_mailbox(self, receive_size: int, send_size: int) -> None:
-        """The mailbox opens: what the master writes at once, and reads, in bytes with all headers."""
+        """Called when the mailbox opens, with its receive and send sizes in bytes, including headers."""
 
     def state_changed(self, before: int, after: int) -> None:
-        """The slave went from AL state `before` to `after`."""
+        """Called after a change of the AL state from `before` to `after`."""
 
     def image(self, index: int) -> PdoImage | None:
-        """Return the process image of sync manager `index` by its PDO assignment; None where it cannot be laid out."""
+        """Return the process image of sync manager `index` by its PDO assignment; None if it is invalid."""
         try:
             return self.lay_out(index)
         except (SdoAbort, ValueError):
@@ -292,17 +281,17 @@ class DeviceModel:
         """Return the process image of sync manager `index` by its PDO assignment.
 
         Raises:
-            SdoAbort: it maps what does not exist or may not be mapped.
-            ValueError: it is longer than the memory has room for.
+            SdoAbort: a mapped object does not exist or is not mappable.
+            ValueError: it exceeds the memory.
         """
         most = room(self.sync_managers, index, REGISTER_SPACE + self.ram_size)
         return PdoImage.from_assignment(self.objects, ASSIGN + index, index in self.roles.outputs, most)
 
     @property
     def sync_error_limit(self) -> int:
-        """Sync error counter limit: 0x10F1:02 (ETG.1020, 21.2) where it exists, else the option; 0: no limit."""
+        """Sync error counter limit: 0x10F1:02 (ETG.1020, 21.2) if it exists, else the option; 0: no limit."""
         if (0x10F1, 2) in self.objects:
-            return number(self.objects, 0x10F1, 2).value
+            return int(self.objects[0x10F1, 2].value)
         return int(self.option("sync_error_limit"))
 
 
@@ -314,13 +303,14 @@ COMMON_OPTIONS: Mapping[str, Option] = MappingProxyType({
 })  # fmt: skip
 
 
-def _read_options(table: Mapping[str, Option], given: Mapping[str, object]) -> dict[str, float | None]:
+def _read_options(table: Mapping[str, Option], options: Mapping[str, object]) -> dict[str, float | None]:
     chosen = {name: option.default for name, option in table.items()}
     findings: list[Finding] = []
-    for name, value in given.items():
+    for name, value in options.items():
         option = table.get(name)
         if option is None:
-            findings.append((("options", name), f"the model has no option {name!r}; it has: {_names(table)}"))
+            text = f"the model has no option {name!r}; it has: {_names(table)}"
+            findings.append(Finding(("options", name), "unknown_option", text=text))
             continue
         kind = int if option.whole else (int, float)
         sound = isinstance(value, kind) and not isinstance(value, bool)
@@ -328,7 +318,7 @@ def _read_options(table: Mapping[str, Option], given: Mapping[str, object]) -> d
             chosen[name] = cast(float, value)
             continue
         allowed = f"{'a whole number' if option.whole else 'a number'} from {option.low:g} to {option.high:g}"
-        findings.append((("options", name), f"found {shown(value)}, allowed is {allowed} ({option.meaning})"))
+        findings.append(Finding(("options", name), "range", found=value, allowed=f"{allowed} ({option.meaning})"))
     if findings:
         raise OptionError(*findings)
     return chosen
@@ -347,15 +337,16 @@ def create(model: str, **options: object) -> DeviceModel:
     """Return a new device, powered on; `model` is an installed name or `module:Class`.
 
     Raises:
-        OptionError: an unknown model, or an option that does not exist or is out of range.
+        OptionError: unknown model or option, or a value out of range.
     """
     installed = models()
-    found = EntryPoint(model, model, ENTRY_POINTS) if ":" in model else installed.get(model)
-    if found is None:
+    entry_point = EntryPoint(model, model, ENTRY_POINTS) if ":" in model else installed.get(model)
+    if entry_point is None:
         names = ", ".join(sorted(installed))
-        raise OptionError((("model",), f'found the text "{model}", allowed is one of {names}, or module:Class'))
+        allowed = f"one of {names}, or module:Class"
+        raise OptionError(Finding(("model",), "choice", found=model, allowed=allowed))
     try:
-        made = load_class(found, DeviceModel)
+        model_class = load_class(entry_point, DeviceModel)
     except PluginError as error:
-        raise OptionError((("model",), str(error))) from error
-    return made(**options)
+        raise OptionError(Finding(("model",), "plugin", text=str(error))) from error
+    return model_class(**options)

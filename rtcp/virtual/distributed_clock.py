@@ -5,23 +5,23 @@ from __future__ import annotations
 from rtcp.virtual.protocol import Register
 
 PROPORTIONAL = 40.0
-"""Share of a phase error taken away a second; with INTEGRAL a critically damped loop, settled within half a second."""
+"""Proportional gain of the phase, 1/s; with INTEGRAL a critically damped loop that settles within half a second."""
 INTEGRAL = 400.0
 LONGEST_STEP = 0.02
-"""Longest time between two references, in s, that the loop counts: rarer references are followed more slowly."""
+"""Upper bound on the time between two references in the loop, s: rarer references are followed more slowly."""
 SLEW_LIMIT = 1e-3
-"""The phase moves by no more than this share of the time passed: time never runs backwards."""
+"""Upper bound on a phase correction, as a share of the elapsed time: time never runs backwards."""
 RATE_LIMIT = 500e-6
 INTEGRATED_ERROR_LIMIT = 20_000.0
-"""Phase errors, in ns, above this do not drive the rate: they are offsets not set yet, not drift."""
+"""Phase error above which the rate is not adjusted, ns: it is an offset not set yet, not drift."""
 HALF_RANGE = 1 << 31
 RANGE_32 = 1 << 32
 
 
 class Clock:
-    """A free-running local time with a drift, steered by drift compensation when references arrive.
+    """A free-running local clock with drift, steered by drift compensation at each reference.
 
-    All instants `t` are those of the slave's place on the wire, in ns of the host's monotonic clock. `offset` (0x0920)
+    All instants `t` are at the slave's place on the wire, in ns of the host's monotonic clock. `offset` (0x0920)
     and `delay` (0x0928) are the registers' values in ns; system time is local time plus offset.
     """
 
@@ -30,7 +30,7 @@ class Clock:
     )  # fmt: skip
 
     def __init__(self, drift_ppm: float, start: int, t: int) -> None:
-        """A clock that shows `start` ns at instant `t` and runs fast by `drift_ppm` millionths."""
+        """The clock shows `start` ns at instant `t` and runs fast by `drift_ppm` ppm."""
         self._natural = drift_ppm * 1e-6
         self._rate = self._natural
         self._t = t
@@ -40,7 +40,7 @@ class Clock:
         self.offset = 0
         self.delay = 0
         self.difference = 0
-        """Last measured system time minus the reference's, in ns (0x092C)."""
+        """Last difference of the system time from the reference, ns (0x092C)."""
 
     def local(self, t: int) -> int:
         """Local time at `t`, in ns."""
@@ -52,16 +52,16 @@ class Clock:
         return self.local(t) + self.offset
 
     def instant(self, system: int) -> int:
-        """The instant at which the system time is or was `system`, as far as the present rate tells."""
+        """Return the instant at which the system time is `system`, at the present rate."""
         passed = system - self.offset - self._local
         return self._t + passed - int((passed * self._rate + self._fraction) / (1.0 + self._rate))
 
     def jump(self, ns: int) -> None:
-        """Show `ns` more from now on."""
+        """Advance the clock by `ns`."""
         self._local += ns
 
     def change_drift(self, ppm: float, t: int) -> None:
-        """Run fast by `ppm` millionths more than before, from `t` on."""
+        """Increase the drift by `ppm` at instant `t`."""
         passed = t - self._t
         moved = passed * self._rate + self._fraction
         self._t, self._local, self._fraction = t, self._local + passed + int(moved), moved - int(moved)
@@ -69,12 +69,12 @@ class Clock:
         self._rate += ppm * 1e-6
 
     def reset_control(self) -> None:
-        """Forget what drift compensation has learnt (a write to 0x0930 does it)."""
+        """Reset drift compensation (by a write to 0x0930)."""
         self._rate = self._natural
         self.difference = 0
 
     def follow(self, t: int, reference: int) -> None:
-        """Steer towards `reference`, the low 32 bits of the reference's system time that passed this slave at `t`."""
+        """Steer towards `reference`, the low 32 bits of the reference's system time at instant `t`."""
         passed = t - self._t
         moved = passed * self._rate + self._fraction
         whole = int(moved)
@@ -104,10 +104,10 @@ class Clock:
 
 
 class SyncGenerator:
-    """SYNC0: a pulse whenever the system time reaches the start time plus a multiple of the cycle (0x0981..0x09A3).
+    """SYNC0: a pulse at the start time plus each multiple of the cycle, in system time (0x0981..0x09A3).
 
-    The hardware compares for equality: where the system time has already passed the next pulse, because the start time
-    lay in the past or the offset was rewritten while running, no pulse comes any more.
+    The hardware compares for equality: if the system time has passed the next pulse, because the start time was in the
+    past or the offset was rewritten while running, there are no further pulses.
     """
 
     __slots__ = ("_clock", "_suspended", "cycle", "due", "next", "pulses", "running")
@@ -116,23 +116,23 @@ class SyncGenerator:
         self._clock = clock
         self._suspended = False
         self.cycle = 0
-        """Period in ns; 0: a single pulse."""
+        """Period, ns; 0: a single pulse."""
         self.next = 0
         """System time of the next pulse."""
         self.due: int | None = None
-        """Instant of the next pulse; None while none will come."""
+        """Instant of the next pulse; None: no pulse."""
         self.pulses = 0
         """Pulses since activation."""
         self.running = False
-        """Whether SYNC0 is activated."""
+        """True: SYNC0 is activated."""
 
     @property
     def lost(self) -> bool:
-        """Whether SYNC0 is activated but no pulse will come."""
+        """Whether SYNC0 is activated but no pulse will follow."""
         return self.running and self.due is None
 
     def activate(self, start: int, cycle: int, t: int) -> None:
-        """Begin at system time `start` with period `cycle` ns."""
+        """Start at system time `start` with period `cycle` ns."""
         self.running = True
         self.cycle = cycle
         self.next = start
@@ -140,24 +140,24 @@ class SyncGenerator:
         self.schedule(t)
 
     def deactivate(self) -> None:
-        """No more pulses."""
+        """Stop the pulses."""
         self.running = False
         self.due = None
 
     def schedule(self, t: int) -> None:
-        """Find the instant of the next pulse anew; the pulse is lost where the system time has passed it."""
+        """Compute the instant of the next pulse; it is lost if the system time has passed it."""
         if not self.running or self._suspended:
             return
         due = self._clock.instant(self.next)
         self.due = due if due >= t else None
 
     def suspend(self) -> None:
-        """Let no pulse come, whatever is activated, until `resume`."""
+        """Suppress all pulses until `resume`."""
         self._suspended = True
         self.due = None
 
     def resume(self, t: int) -> None:
-        """Let pulses come again from `t` on, in the grid in which they would have come all the time."""
+        """Restart the pulses at `t` in their original grid."""
         self._suspended = False
         late = self._clock.system(t) - self.next
         if self.cycle and late >= 0:
@@ -165,7 +165,7 @@ class SyncGenerator:
         self.schedule(t)
 
     def fire(self) -> None:
-        """The next pulse has come: count it and find the one after it."""
+        """Count the due pulse and compute the next one."""
         self.pulses += 1
         if not self.cycle:
             self.due = None
@@ -174,7 +174,7 @@ class SyncGenerator:
         self.due = self._clock.instant(self.next)
 
     def skip_to(self, t: int) -> None:
-        """Let the pulses before `t` pass without anybody looking, keeping to the grid."""
+        """Skip the pulses before `t`; the grid stays."""
         if self.due is None or not self.cycle:
             return
         late = self._clock.system(t) - self.next
@@ -200,11 +200,11 @@ class DistributedClockUnit:
         self.clock = clock
         self.sync0 = SyncGenerator(clock)
         self.returns: dict[int, int] = {}
-        """Time, ns, from a frame's arrival at port 0 to its return at each port behind which it has been."""
+        """Time from a frame's arrival at port 0 to its return at each other port that it used, ns."""
 
     @property
     def cyclic(self) -> bool:
-        """Whether SYNC pulses are asked for at all (0x0981 bit 0)."""
+        """Whether SYNC pulses are requested (0x0981 bit 0)."""
         return bool(self._memory[Register.DC_ACTIVATION] & CYCLIC)
 
     @property
@@ -214,11 +214,11 @@ class DistributedClockUnit:
 
     @property
     def sync0_cycle(self) -> int:
-        """SYNC0 cycle time in ns (0x09A0)."""
+        """SYNC0 cycle time, ns (0x09A0)."""
         return self._get(Register.DC_SYNC0_CYCLE, 4)
 
     def latch(self, t: int) -> None:
-        """A write to 0x0900 passed at `t`: latch the receive times of the ports and of the processing unit."""
+        """Latch the receive times of the ports and the processing unit, for a write to 0x0900 at `t`."""
         local = self.clock.local(t)
         self._put(Register.DC_RECEIVE_TIME, local, 4)
         for port in (1, 2, 3):
@@ -227,7 +227,7 @@ class DistributedClockUnit:
         self._put(Register.DC_RECEIVE_TIME_UNIT, local, 8)
 
     def before_read(self, t: int) -> None:
-        """Bring the registers that follow the time up to date for a frame that arrives at `t`."""
+        """Update the time-dependent registers for a frame that arrives at `t`."""
         clock, sync0 = self.clock, self.sync0
         self._put(Register.DC_SYSTEM_TIME, clock.system(t), 8)
         difference = clock.difference
@@ -238,7 +238,7 @@ class DistributedClockUnit:
             self._memory[Register.DC_ACTIVATION_STATUS] = pending
 
     def wrote(self, first: int, end: int, t: int) -> None:
-        """The master wrote registers from `first` up to `end` with a frame that arrived at `t`."""
+        """Handle the master's write to the registers `first` to `end` (excluded), at instant `t`."""
 
         def touched(register: int, size: int) -> bool:
             return first < register + size and end > register

@@ -1,8 +1,9 @@
-"""A slave controller: sync managers, and its memory as the master and the device see it (ETG.1000.4, clause 6)."""
+"""EtherCAT slave controller: sync managers and memory, from master's and device's side (ETG.1000.4, clause 6)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Final
 
 from rtcp.virtual.distributed_clock import Clock, DistributedClockUnit
 from rtcp.virtual.pdo import BUFFERS
@@ -29,40 +30,40 @@ from rtcp.virtual.protocol import (
 from rtcp.virtual.sii import EepromInterface
 
 IO_SPACE = 0x0F00
-"""Digital outputs, general purpose IO and user RAM lie from here on; a sync manager may cover them."""
+"""Start of digital outputs, general purpose IO and user RAM; a sync manager may cover them."""
 PORTS = range(4)
-DEVICE_EMULATION = 0x01
-"""Bit of 0x0141: the controller follows AL control without any firmware."""
+DEVICE_EMULATION: Final = 0x01
+"""Bit of 0x0141: the controller follows AL control without firmware."""
 ALIAS_ENABLE = 0x01
-"""Bit of 0x0103 that lets the alias serve as station address."""
+"""Bit of 0x0103: the alias is a valid station address."""
 LINK = 0x0010
-"""Bit of the DL status (ETG.1000.4, table 34) for a physical link at port 0; that of port n is n places further up."""
+"""DL status bit (ETG.1000.4, table 34) of a physical link at port 0; shifted left by n for port n."""
 LOOP_CLOSED = 0x0100
 COMMUNICATION = 0x0200
-"""Bits of the DL status for port 0: the frame turns round there, or continues; those of port n are 2n further up."""
+"""DL status bits of port 0: loop closed, communication established; shifted left by 2n for port n."""
 LOOP_AUTO_CLOSE, LOOP_OPEN, LOOP_ALWAYS_CLOSED = 1, 2, 3
 """Loop settings of a port, two bits each in 0x0101 (ETG.1000.4, 6.1.3); 0: automatic."""
 PDI_RUNS = 0x0001
 WATCHDOG_OK = 0x0002
 WATCHDOG_CLOCK_NS = 40
-"""The watchdog divider counts periods of 25 MHz (ETG.1000.4, 6.3)."""
+"""Period of the watchdog divider's 25 MHz clock (ETG.1000.4, 6.3)."""
 RESET_SEQUENCE = b"RES"
-"""Three consecutive writes to 0x0040 that reset the controller and its device."""
+"""Values of three consecutive writes to 0x0040 that reset the controller and its device."""
 
 # Bits of a sync manager's control, activation, PDI control and status registers (ETG.1000.4, 6.7.2).
-CONTROL_MODE = 0x03
-MODE_MAILBOX = 0x02
-CONTROL_DIRECTION = 0x0C
-DIRECTION_MASTER_WRITES = 0x04
-CONTROL_ECAT_EVENT = 0x10
-CONTROL_WATCHDOG = 0x40
+CONTROL_MODE: Final = 0x03
+MODE_MAILBOX: Final = 0x02
+CONTROL_DIRECTION: Final = 0x0C
+DIRECTION_MASTER_WRITES: Final = 0x04
+CONTROL_ECAT_EVENT: Final = 0x10
+CONTROL_WATCHDOG: Final = 0x40
 ACTIVATE = 0x01
 REPEAT_REQUEST = 0x02
 PDI_DEACTIVATE = 0x01
 REPEAT_ACKNOWLEDGE = 0x02
-STATUS_WRITTEN = 0x01
-STATUS_READ = 0x02
-STATUS_FULL = 0x08
+STATUS_WRITTEN: Final = 0x01
+STATUS_READ: Final = 0x02
+STATUS_FULL: Final = 0x08
 # Offsets of the bytes within a sync manager's registers.
 CONTROL, STATUS, ACTIVATION, PDI = 4, 5, 6, 7
 
@@ -72,16 +73,16 @@ def _nothing() -> None:
 
 
 def port_descriptor(physics: str) -> int:
-    """Return register 0x0007 for the ports that `physics` names: two bits each (ETG.1000.4, 6.1.1)."""
+    """Return register 0x0007 for the ports in `physics`, two bits each (ETG.1000.4, 6.1.1)."""
     kinds = {"Y": 0b11, "H": 0b11, "K": 0b10}
     return sum(kinds.get(kind, 0) << 2 * port for port, kind in zip(PORTS, physics.upper(), strict=False))
 
 
 class SyncManager:
-    """One sync manager. `memory` is the controller's whole memory, `writable` its map of bytes open to the master.
+    """A sync manager. `memory` is the controller's whole memory, `writable` its map of bytes open to the master.
 
-    A buffered area is held as the last complete buffer in `buffer`; what the master writes in parts gathers in the RAM
-    and is handed over with its last byte, as with three buffers. A mailbox is the RAM itself and the full flag.
+    For a buffered area `buffer` has the last complete buffer; partial writes of the master collect in the RAM and
+    become the new buffer with the last byte, as with three buffers. A mailbox is the RAM itself and the full flag.
     """
 
     __slots__ = (
@@ -96,13 +97,13 @@ class SyncManager:
         self._writable = writable
         self._open = False
         self.buffer: memoryview = memoryview(bytearray())
-        """The last complete buffer of a buffered sync manager: what the other side sees. Set by the segment."""
+        """Last complete buffer, visible to the other side. Set by the segment."""
         self.on_event: Callable[[], None] = _nothing
-        """Called when the event of a sync manager with `ecat_event` may have changed."""
+        """Called when the event of a sync manager with `ecat_event` may change."""
         self.process_data = False
-        """Whether the device has process data here, with one buffer (as a mailbox) or three."""
+        """True: process data, with one buffer (mailbox mode) or three."""
         self.virtual = False
-        """Whether it has no registers: an FMMU maps the device's own ones without it."""
+        """True: it has no registers; FMMUs map the device's memory directly."""
         self.start = self.end = self.length = self.control = 0
         self.enabled = False
         self.locked = False
@@ -110,12 +111,12 @@ class SyncManager:
 
     @property
     def mailbox(self) -> bool:
-        """Whether it works as a mailbox (full or empty) and not as a buffer."""
+        """Whether it is in mailbox mode, not buffered mode."""
         return self.control & CONTROL_MODE == MODE_MAILBOX
 
     @property
     def buffers(self) -> int:
-        """How many times its length lies in the memory."""
+        """Number of buffers in the memory."""
         return 1 if self.mailbox else BUFFERS
 
     @property
@@ -125,7 +126,7 @@ class SyncManager:
 
     @property
     def watchdog_trigger(self) -> bool:
-        """Whether a complete write feeds the process data watchdog."""
+        """Whether a complete write triggers the process data watchdog."""
         return bool(self.control & CONTROL_WATCHDOG)
 
     @property
@@ -135,7 +136,7 @@ class SyncManager:
 
     @property
     def pending(self) -> bool:
-        """Whether the device has written what the master reads, or read what the master has written."""
+        """Whether its ECAT event is pending: the device has written the inputs or read the outputs."""
         wanted = STATUS_READ if self.master_writes else STATUS_WRITTEN
         return self.enabled and self.ecat_event and bool(self._memory[self.base + STATUS] & wanted)
 
@@ -146,12 +147,12 @@ class SyncManager:
 
     @property
     def repeat_wanted(self) -> bool:
-        """Whether the master has requested the last message again and has no acknowledgement yet."""
+        """Whether the master has requested a repeat that is not acknowledged yet."""
         memory, base = self._memory, self.base
         return bool((memory[base + ACTIVATION] & REPEAT_REQUEST) ^ (memory[base + PDI] & REPEAT_ACKNOWLEDGE))
 
     def load(self) -> None:
-        """Read the settings from the registers after these were written."""
+        """Load the settings from the written registers."""
         memory, base = self._memory, self.base
         was_enabled, length = self.enabled, self.length
         self.start = int.from_bytes(memory[base : base + 2], "little")
@@ -160,7 +161,7 @@ class SyncManager:
         self.control = memory[base + CONTROL]
         self.enabled = bool(memory[base + ACTIVATION] & ACTIVATE) and self.length > 0
         self.locked = bool(memory[base + PDI] & PDI_DEACTIVATE)
-        # Start, length and control are open only while the sync manager is off (ETG.1000.4, table 58).
+        # Start, length and control are writable only while the sync manager is off (ETG.1000.4, table 58).
         closed = self.virtual or memory[base + ACTIVATION] & ACTIVATE
         self._writable[base : base + 5] = bytes(5) if closed else b"\x01" * 5
         self._writable[base + STATUS] = self._writable[base + PDI] = 0
@@ -172,7 +173,7 @@ class SyncManager:
         self.on_event()
 
     def lock(self, locked: bool) -> None:
-        """The device closes the area to the master (`locked`) or opens it; closing empties it."""
+        """Close the area to the master (`locked`) or open it, from the device's side; closing empties it."""
         pdi = self.base + PDI
         self._memory[pdi] = self._memory[pdi] & ~PDI_DEACTIVATE | locked
         if locked:
@@ -187,7 +188,7 @@ class SyncManager:
             self.on_event()
 
     def write(self, address: int, data: bytes) -> bool | None:
-        """The master writes within the area. Returns None if refused, True if the buffer is complete, else False."""
+        """Write, from the master's side, within the area. Return whether the buffer is complete; None if refused."""
         if self.locked or not self.master_writes:
             return None
         if address == self.start:
@@ -208,9 +209,9 @@ class SyncManager:
         return True
 
     def read(self, address: int, length: int) -> tuple[bytes, bool] | None:
-        """The master reads within the area. Returns None if refused, else the data and whether the last byte was read.
+        """Read, from the master's side, within the area. Return data and whether they end it; None if refused.
 
-        The last byte empties a mailbox.
+        Reading the last byte empties a mailbox.
         """
         if self.locked or self.master_writes:
             return None
@@ -231,30 +232,30 @@ class SyncManager:
         return data, last
 
     def take(self) -> bytes:
-        """The device reads a message from a mailbox that the master writes; the mailbox is empty then."""
+        """Take a message from a mailbox written by the master, from the device's side."""
         self._set_status(STATUS_READ, STATUS_FULL | STATUS_WRITTEN)
         return bytes(self._memory[self.start : self.end])
 
     def put(self, message: bytes) -> None:
-        """The device puts a message into a mailbox that the master reads; the rest of the area is zeroed."""
+        """Put a message into a mailbox read by the master, from the device's side; zero the rest of the area."""
         self._memory[self.start : self.end] = message.ljust(self.length, b"\0")[: self.length]
         self._set_status(STATUS_FULL | STATUS_WRITTEN, STATUS_READ)
 
     def exchanged(self) -> None:
-        """The device has read (outputs) or written (inputs) the buffer: raise the event where there is one."""
+        """Raise the ECAT event, if any, after the device has read (outputs) or written (inputs) the buffer."""
         self._set_status(*((STATUS_READ, STATUS_WRITTEN) if self.master_writes else (STATUS_WRITTEN, STATUS_READ)))
 
     def acknowledge_repeat(self) -> None:
-        """The device has put the last message there again: make the acknowledge bit equal to the request."""
+        """Set the acknowledge bit to the request bit after the device has repeated the last message."""
         memory, base = self._memory, self.base
         memory[base + PDI] = memory[base + PDI] & ~REPEAT_ACKNOWLEDGE | memory[base + ACTIVATION] & REPEAT_REQUEST
 
 
 class Esc:
-    """The memory of one slave controller, read and written by address.
+    """The memory of a slave controller, read and written by address.
 
-    `clock` is None for a slave without distributed clocks. `physics` names its ports, `links` says which of them have a
-    link. Instants `t` are those of the frame's arrival at this slave, in ns of the host's monotonic clock.
+    `clock` is None for a slave without distributed clocks. `physics` names its ports, `links` tells which have a link.
+    Instants `t` are arrivals of the frame at this slave, in ns of the host's monotonic clock.
     """
 
     def __init__(self, eeprom: bytes, clock: Clock | None, links: Sequence[bool] = (False,) * 4, physics: str = "YY",
@@ -276,42 +277,42 @@ class Esc:
         self.memory[Register.PORT_DESCRIPTOR] = port_descriptor(physics)
         self.put(Register.FEATURES, features, 2)
         self.put(Register.DL_STATUS, self._dl_status(links), 2)
-        # The link comes up after power-on: the first change of the DL status (ET1100, 0x0210.2).
+        # Link-up after power-on is the first change of the DL status (ET1100, 0x0210.2).
         self.put(Register.EVENT_REQUEST, EcatEvent.DL_STATUS, 2)
         self.eeprom = EepromInterface(self.memory, self.writable, eeprom)
         self.sync_managers = tuple(SyncManager(n, self.memory, self.writable) for n in range(SM_COUNT))
         self.watchdog_ns = 0
-        """Time of the process data watchdog in ns; 0: off."""
+        """Time of the process data watchdog, ns; 0: off."""
         self._load_watchdog()
         self.event = 0
-        """ECAT event request and mask, as it is ORed into a datagram's event field."""
+        """ECAT event request AND mask, ORed into a datagram's event field."""
         self.al_control_written = False
-        """The master wrote AL control; the device has not looked yet."""
+        """True: the master wrote AL control and the device has not read it yet."""
         self.sync_managers_written = False
         self.mailbox_touched = False
-        """A mailbox was filled or emptied; the device has not looked yet."""
+        """True: the master filled or emptied a mailbox and the device has not reacted yet."""
         self.loops_written = False
         self._io_managed = False
-        """Whether a sync manager covers addresses below the RAM."""
+        """True: a sync manager covers addresses below the RAM."""
         self.reset_requested = False
-        """The master completed the reset sequence (0x0040)."""
+        """True: the master completed the reset sequence (0x0040)."""
         self._reset_progress = 0
         self.detach()
         for manager in self.sync_managers:
             manager.on_event = self._mirror_sync_managers
 
     def detach(self) -> None:
-        """Drop all callbacks: another controller replaces this one."""
+        """Drop all callbacks before another controller replaces this one."""
         self.on_layout: Callable[[], None] = _nothing
-        """Called when FMMUs or sync managers have changed."""
+        """Called after a change of FMMUs or sync managers."""
         self.on_address: Callable[[], None] = _nothing
-        """Called when the station address or the use of the alias may have changed."""
+        """Called when the station address or the use of the alias may change."""
         self.on_attention: Callable[[], None] = _nothing
-        """Called when device or segment have to look: AL control, sync managers, mailboxes, loops, reset."""
+        """Called for changes that device or segment handle: AL control, sync managers, mailboxes, loops, reset."""
         self.on_event: Callable[[], None] = _nothing
-        """Called when `event` has changed."""
+        """Called after a change of `event`."""
         self.on_outputs: Callable[[SyncManager, int], None] = lambda manager, t: None
-        """Called with the sync manager and the instant when a buffer of outputs is complete."""
+        """Called with the sync manager and the instant of a complete output buffer."""
         for manager in self.sync_managers:
             manager.on_event = _nothing
 
@@ -320,10 +321,10 @@ class Esc:
         return self.memory[Register.DL_CONTROL + 1] >> 2 * port & 3
 
     def closed(self, port: int, linked: bool) -> bool:
-        """Whether the loop of a port is closed, so that frames turn round there."""
+        """Whether the loop of a port is closed: frames return there."""
         setting = self.loop(port)
         if setting == LOOP_AUTO_CLOSE and not self.get(Register.DL_STATUS, 2) & COMMUNICATION << 2 * port:
-            # It closed when the link was lost, and opens only by a write to 0x0101.
+            # It closed at the loss of the link and opens only by a write to 0x0101.
             return not (linked and self.loops_written)
         return setting == LOOP_ALWAYS_CLOSED or (setting != LOOP_OPEN and not linked)
 
@@ -335,7 +336,7 @@ class Esc:
         return status
 
     def set_links(self, links: Sequence[bool]) -> None:
-        """Show which of the four ports have a link now; a port that has lost it counts that."""
+        """Update the links of the four ports; count lost links."""
         before, after = self.get(Register.DL_STATUS, 2), self._dl_status(links)
         if before == after:
             return
@@ -346,37 +347,37 @@ class Esc:
         self.raise_event(EcatEvent.DL_STATUS)
 
     def count(self, register: int) -> None:
-        """Count an error in a register of one byte, which stops at its end."""
+        """Increment an error counter of one byte, which saturates."""
         self.memory[register] = min(self.memory[register] + 1, 0xFF)
 
     def get(self, register: int, size: int) -> int:
-        """An unsigned register of `size` bytes."""
+        """Return an unsigned register of `size` bytes."""
         return int.from_bytes(self.memory[register : register + size], "little")
 
     def put(self, register: int, value: int, size: int) -> None:
-        """Set a register of `size` bytes, from the device's side: no access rights, no side effects."""
+        """Set a register of `size` bytes from the device's side, without access checks or side effects."""
         self.memory[register : register + size] = value.to_bytes(size, "little")
 
     def answers_to(self, station: int) -> bool:
-        """Whether `station` is this slave's configured station address, or its alias while that is enabled (0x0103)."""
+        """Whether `station` is this slave's configured station address or its enabled alias (0x0103)."""
         memory = self.memory
         if memory[0x10] | memory[0x11] << 8 == station:
             return True
         return bool(memory[0x103] & ALIAS_ENABLE) and memory[0x12] | memory[0x13] << 8 == station
 
     def set_al_status(self, state: int, code: int) -> None:
-        """The device reports its AL state (with the error flag, if any) and AL status code."""
+        """Set the AL state, with its error flag, and the AL status code, from the device's side."""
         self.put(Register.AL_STATUS, state, 2)
         self.put(Register.AL_STATUS_CODE, code, 2)
         self.raise_event(EcatEvent.AL_STATUS)
 
     @property
     def state(self) -> AlState:
-        """The AL state that the device reports."""
+        """AL state without the error flag."""
         return AlState(self.memory[Register.AL_STATUS] & 0x0F)
 
     def raise_event(self, event: int, cleared: int = 0) -> None:
-        """Set bits of the ECAT event request register, and clear others."""
+        """Set some bits of the ECAT event request register, clear others."""
         self.put(Register.EVENT_REQUEST, self.get(Register.EVENT_REQUEST, 2) & ~cleared | event, 2)
         event = self.get(Register.EVENT_REQUEST, 2) & self.get(Register.EVENT_MASK, 2)
         if event != self.event:
@@ -388,7 +389,7 @@ class Esc:
         self.raise_event(pending, 0x0FF0)
 
     def read(self, address: int, length: int, t: int) -> bytes | None:
-        """The master reads; None where the access is refused, and the working counter does not count it."""
+        """Read from the master's side; None if refused, which the working counter does not count."""
         end = address + length
         if not length or end > len(self.memory):
             return None
@@ -411,7 +412,7 @@ class Esc:
         return data
 
     def write(self, address: int, data: bytes, t: int) -> bool:
-        """The master writes; False where nothing could be written, and the working counter does not count it."""
+        """Write from the master's side; False if nothing is writable, which the working counter does not count."""
         end = address + len(data)
         if not data or end > len(self.memory):
             return False
@@ -436,7 +437,7 @@ class Esc:
         return True
 
     def _after_write(self, first: int, end: int, t: int) -> None:
-        """Let the units behind the registers from `first` up to `end` act on their new values."""
+        """Apply the new values of the registers `first` to `end` (excluded)."""
         memory = self.memory
         if first < Register.AL_CONTROL + 2 and end > Register.AL_CONTROL:
             self.al_control_written = True
@@ -455,7 +456,7 @@ class Esc:
         elif Register.RX_ERRORS <= first < Register.LOST_LINKS + 4:
             for start, behind in ERROR_COUNTERS:
                 if first < behind and end > start:
-                    memory[start:behind] = bytes(behind - start)  # a write of any value clears the group
+                    memory[start:behind] = bytes(behind - start)  # any write clears the group
         elif Register.WATCHDOG_COUNTERS <= first < Register.WATCHDOG_COUNTERS + 2:
             memory[Register.WATCHDOG_COUNTERS : Register.WATCHDOG_COUNTERS + 2] = bytes(2)
         elif Register.WATCHDOG_DIVIDER <= first <= Register.WATCHDOG_PROCESS_DATA + 1:
@@ -473,7 +474,7 @@ class Esc:
             self.dc.wrote(first, end, t)
 
     def _reset(self, byte: int) -> None:
-        """Advance the reset sequence; the register then reads how many of its bytes have come."""
+        """Advance the reset sequence; the register then shows the number of matching bytes."""
         self._reset_progress = self._reset_progress + 1 if byte == RESET_SEQUENCE[self._reset_progress] else 0
         if self._reset_progress == len(RESET_SEQUENCE):
             self._reset_progress = 0

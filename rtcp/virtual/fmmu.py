@@ -1,7 +1,7 @@
-"""Logical addressing: FMMUs, and the copies that a logical datagram needs (ETG.1000.4, 6.6).
+"""Logical addressing: FMMUs, and the copies of a logical datagram (ETG.1000.4, 6.6).
 
-What a datagram means is defined by `transfer`, bit by bit where an FMMU asks for it. `compile_plan` finds the datagrams
-that are nothing but whole process images, once, and turns them into slice copies.
+`transfer` is the definition: it applies a datagram slave by slave, bit by bit where an FMMU requires that.
+`compile_plan` analyses a cyclic datagram once and reduces it to slice copies where FMMUs map whole buffers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ WRITES = frozenset((DatagramCommand.LWR, DatagramCommand.LRW))
 
 @dataclass(frozen=True)
 class Fmmu:
-    """One active FMMU: `bits` bits from logical bit `logical` on stand for those from physical bit `physical` on."""
+    """An active FMMU: maps `bits` bits from logical bit `logical` to physical bit `physical`."""
 
     logical: int
     physical: int
@@ -30,7 +30,7 @@ class Fmmu:
 
 @dataclass(frozen=True)
 class Overlap:
-    """The bits of an FMMU that a datagram touches, from bit `at` in its data and bit `physical` in the memory on."""
+    """The part of an FMMU in a datagram, from bit `at` of its data and bit `physical` of the memory."""
 
     at: int
     physical: int
@@ -38,18 +38,18 @@ class Overlap:
 
     @property
     def aligned(self) -> bool:
-        """Whether it is whole bytes on both sides."""
+        """Whether it consists of whole bytes on both sides."""
         return not (self.at | self.physical | self.bits) & 7
 
     @property
     def last(self) -> int:
-        """Its last bit in the memory."""
+        """Last bit in the memory."""
         return self.physical + self.bits - 1
 
 
 def active_fmmus(esc: Esc) -> list[Fmmu]:
-    """The active FMMUs of a slave in the order of their numbers."""
-    found = []
+    """Return the active FMMUs of a slave in numerical order."""
+    active = []
     for number in range(FMMU_COUNT):
         base = Register.FMMU + FMMU_SIZE * number
         raw = esc.memory[base : base + FMMU_SIZE]
@@ -57,18 +57,18 @@ def active_fmmus(esc: Esc) -> list[Fmmu]:
         if not raw[12] & 1 or not length:
             continue
         bits = 8 * (length - 1) + (raw[7] & 7) + 1 - (raw[6] & 7)
-        found.append(Fmmu(
+        active.append(Fmmu(
             logical=8 * int.from_bytes(raw[0:4], "little") + (raw[6] & 7),
             physical=8 * int.from_bytes(raw[8:10], "little") + (raw[10] & 7),
             bits=bits,
             readable=bool(raw[11] & 1),
             writable=bool(raw[11] & 2),
         ))  # fmt: skip
-    return found
+    return active
 
 
 def overlap(fmmu: Fmmu, address: int, length: int) -> Overlap | None:
-    """The part of `fmmu` that a datagram of `length` bytes at logical `address` touches."""
+    """Return the part of `fmmu` in a datagram of `length` bytes at logical `address`."""
     first = max(fmmu.logical, 8 * address)
     last = min(fmmu.logical + fmmu.bits, 8 * (address + length))
     if last <= first:
@@ -77,7 +77,7 @@ def overlap(fmmu: Fmmu, address: int, length: int) -> Overlap | None:
 
 
 def copy_bits(source: bytes | bytearray, source_bit: int, target: bytearray, target_bit: int, bits: int) -> None:
-    """Copy `bits` bits, least significant first within a byte; the bits around them stay."""
+    """Copy `bits` bits, least significant first within a byte; other bits stay."""
     first, end = source_bit >> 3, source_bit + bits + 7 >> 3
     mask = (1 << bits) - 1
     value = int.from_bytes(source[first:end], "little") >> (source_bit & 7) & mask
@@ -87,18 +87,18 @@ def copy_bits(source: bytes | bytearray, source_bit: int, target: bytearray, tar
 
 
 def touched(esc: Esc, address: int, length: int) -> Parts:
-    """Return what a datagram of `length` bytes at logical `address` touches of a slave's FMMUs."""
+    """Return the parts of a slave's FMMUs in a datagram of `length` bytes at logical `address`."""
     return [(fmmu, part) for fmmu in active_fmmus(esc) if (part := overlap(fmmu, address, length)) is not None]
 
 
 def transfer(esc: Esc, command: int, parts: Parts, data: bytearray, t: int) -> int:
-    """Let one slave handle a logical datagram's `data`; return what it adds to the working counter."""
+    """Apply a logical datagram's `data` to a slave; return its share of the working counter."""
     incoming = bytes(data)
     read = wrote = False
     for fmmu, part in parts:
         first, end = part.physical // 8, (part.physical + part.bits + 7) // 8
         if end > len(esc.memory):
-            # An FMMU that reaches beyond the memory maps nothing there.
+            # Nothing is mapped beyond the memory.
             continue
         if command in READS and fmmu.readable:
             content = esc.read(first, end - first, t)
@@ -113,11 +113,11 @@ def transfer(esc: Esc, command: int, parts: Parts, data: bytearray, t: int) -> i
 
 
 Parts = list[tuple[Fmmu, Overlap]]
-"""FMMUs and the part of each that a datagram touches."""
+"""FMMUs and their parts in a datagram."""
 
 
 class Copy(NamedTuple):
-    """Copy `size` bytes between `at` in the datagram's data and `image` in the segment's process image."""
+    """Copy of `size` bytes between `at` in the datagram's data and `image` in the segment's process image."""
 
     at: int
     image: int
@@ -125,42 +125,42 @@ class Copy(NamedTuple):
 
 
 class BitCopy(NamedTuple):
-    """Copy some bits of one byte, `at` in the datagram's data, to or from one byte, `image` in the process image."""
+    """Copy of some bits between byte `at` of the datagram's data and byte `image` of the process image."""
 
     at: int
     shift: int
-    """Place of the lowest bit in the datagram's byte."""
+    """Position of the lowest bit in the datagram's byte."""
     mask: int
     """The bits, from bit 0 on."""
     image: int
     image_shift: int
     image_others: int
-    """The bits of the image's byte that are not copied."""
+    """Mask of the image byte's other bits."""
 
 
 @dataclass
 class Plan:
-    """What a logical datagram does while FMMUs, sync managers and AL states stay as they are."""
+    """Compiled effect of a logical datagram, valid until FMMUs, sync managers or AL states change."""
 
     outputs: list[Copy] = field(default_factory=list)
-    """From the frame into the image of outputs."""
+    """Copies from the frame to the output image."""
     inputs: list[Copy] = field(default_factory=list)
-    """From the image of inputs into the frame, after all outputs were taken out."""
+    """Copies from the input image to the frame, after all outputs."""
     output_bits: list[BitCopy] = field(default_factory=list)
-    """As `outputs`, of slaves that share a byte of the datagram with their neighbours."""
+    """As `outputs`, for slaves that share a byte of the datagram."""
     input_bits: list[BitCopy] = field(default_factory=list)
     counter: int = 0
     """What the copies add to the working counter."""
     shares: list[tuple[Esc, int]] = field(default_factory=list)
-    """What each slave has in `counter`."""
+    """Share of each slave in `counter`."""
     written: list[tuple[Esc, SyncManager]] = field(default_factory=list)
-    """Buffers that the copies complete."""
-    others: list[tuple[Esc, Parts]] = field(default_factory=list)
+    """Buffers completed by the copies."""
+    by_transfer: list[tuple[Esc, Parts]] = field(default_factory=list)
     """Slaves, in the order of the wire, that need `transfer`."""
 
 
 def _exact_buffer(esc: Esc, part: Overlap) -> SyncManager | None:
-    """The buffered sync manager whose whole area `part` is, or some bits of its only byte, if it is one."""
+    """Return the buffered sync manager whose area is `part`, or whose single byte contains `part`; None: none."""
     for manager in esc.sync_managers:
         if not manager.enabled or manager.mailbox or manager.ecat_event:
             continue
@@ -179,7 +179,7 @@ def _bit_copy(part: Overlap, image: int) -> BitCopy:
 
 def _join(copies: list[Copy]) -> list[Copy]:
     joined: list[Copy] = []
-    for copy in sorted(copies, key=lambda found: found.at):
+    for copy in sorted(copies, key=lambda copy: copy.at):
         last = joined[-1] if joined else None
         if last is not None and last.at + last.size == copy.at and last.image + last.size == copy.image:
             joined[-1] = last._replace(size=last.size + copy.size)
@@ -190,30 +190,30 @@ def _join(copies: list[Copy]) -> list[Copy]:
 
 def compile_plan(slaves: Sequence[Esc], images: dict[SyncManager, int], command: int, address: int,
                  length: int) -> Plan:  # fmt: skip
-    """Work out the copies of a logical datagram; `images` gives each buffer's place in the image of its direction."""
+    """Return the plan of a logical datagram; `images`: offset of each buffer in the process image of its direction."""
     plan = Plan()
     used: list[tuple[Esc, Parts]] = []
-    taken: list[tuple[int, int, int]] = []
+    touched_bits: list[tuple[int, int, int]] = []
     for position, esc in enumerate(slaves):
         parts = touched(esc, address, length)
         if not parts:
             continue
         used.append((esc, parts))
-        taken += [(part.at, part.at + part.bits, position) for _, part in parts]
+        touched_bits += [(part.at, part.at + part.bits, position) for _, part in parts]
         if not _fast(plan, esc, parts, images, command):
-            plan.others.append((esc, parts))
-    # Where slaves share bits of the datagram their order matters: then all go the exact way, one after another.
-    if _shared(taken):
-        return Plan(others=used)
+            plan.by_transfer.append((esc, parts))
+    # Slaves that share bits of the datagram need `transfer` in their order.
+    if _shared(touched_bits):
+        return Plan(by_transfer=used)
     plan.outputs = _join(plan.outputs)
     plan.inputs = _join(plan.inputs)
     return plan
 
 
-def _shared(taken: list[tuple[int, int, int]]) -> bool:
-    """Whether two slaves touch the same bits; `taken` holds first bit, end and slave of each part."""
+def _shared(touched_bits: list[tuple[int, int, int]]) -> bool:
+    """Whether two slaves share bits; `touched_bits` has first bit, end and slave of each part."""
     end, owner = 0, -1
-    for first, last, slave in sorted(taken):
+    for first, last, slave in sorted(touched_bits):
         if slave == owner:
             end = max(end, last)
         elif first < end:
@@ -225,7 +225,7 @@ def _shared(taken: list[tuple[int, int, int]]) -> bool:
 
 def _fast(plan: Plan, esc: Esc, parts: Parts, images: dict[SyncManager, int],
           command: int) -> bool:  # fmt: skip
-    """Add one slave's part to `plan` if whole buffers are all it has; otherwise leave the plan alone."""
+    """Add a slave's parts to `plan` if each has an exact buffer; otherwise leave the plan unchanged."""
     outputs: list[Copy | BitCopy] = []
     inputs: list[Copy | BitCopy] = []
     written: list[tuple[Esc, SyncManager]] = []

@@ -12,7 +12,7 @@ _HEADER = struct.Struct("<BxI")
 """Operation code and password, packet number or error code."""
 _BUSY = struct.Struct("<BxHH")
 LARGEST_FILE = 1 << 26
-"""Bytes of a file that a master may write."""
+"""Upper bound on a file written by a master, bytes."""
 _MAILBOX_HEADER = 6
 
 
@@ -28,28 +28,28 @@ class Operation(IntEnum):
 
 
 class FoeServer:
-    """Answers the FoE messages of a slave; files go to its behaviour and come from there."""
+    """The FoE server of a slave; its behaviour receives and provides the files."""
 
     def __init__(self, runner: Runner) -> None:
         self._runner = runner
         self.open(0)
 
     def open(self, receive_size: int) -> None:
-        """The mailbox opens; the master writes `receive_size` bytes at once, all headers included."""
+        """Reset for a mailbox of `receive_size` bytes, including headers."""
         self._most_received = receive_size - _MAILBOX_HEADER - _HEADER.size
         self._end()
 
     def _end(self) -> None:
-        """No transfer is under way."""
+        """Reset the transfer."""
         self._name: str | None = None
-        """File that is being written."""
+        """Name of the file being written."""
         self._received = bytearray()
-        self._rest: bytes | None = None
-        """What of a file that is being read has not been acknowledged."""
+        self._unacknowledged: bytes | None = None
+        """Part of a file being read that is not acknowledged yet."""
         self._packet = 0
 
     def __call__(self, message: bytes, room: int) -> Iterator[bytes]:
-        """Yield the answer to a message, where there is one; `room` is the most bytes of it."""
+        """Yield the answer to a message, if any, of at most `room` bytes."""
         try:
             answer = self._answer(message, room - _HEADER.size)
         except FileRefused as refused:
@@ -71,7 +71,7 @@ class FoeServer:
         content = message[_HEADER.size :]
         if operation == Operation.READ:
             return self._begin_read(content, most)
-        if operation == Operation.ACKNOWLEDGE and self._rest is not None:
+        if operation == Operation.ACKNOWLEDGE and self._unacknowledged is not None:
             return self._continue_read(number, most)
         if operation == Operation.WRITE:
             self._end()
@@ -81,28 +81,28 @@ class FoeServer:
             return self._continue_write(number, content)
         if operation not in (Operation.ERROR, Operation.ACKNOWLEDGE):
             raise FileRefused(FoeError.ILLEGAL)
-        # An error of the master's, or the acknowledgement of what is over.
+        # An error message of the master, or a late acknowledgement.
         self._end()
         return None
 
     def _begin_read(self, content: bytes, most: int) -> bytes:
         self._name = None
-        found = self._runner.read_file(_name(content))
-        if found is None:
+        file = self._runner.read_file(_name(content))
+        if file is None:
             raise FileRefused(FoeError.NOT_FOUND, "file not found")
-        self._rest, self._packet = found, 1
-        return _HEADER.pack(Operation.DATA, 1) + self._rest[:most]
+        self._unacknowledged, self._packet = file, 1
+        return _HEADER.pack(Operation.DATA, 1) + self._unacknowledged[:most]
 
     def _continue_read(self, number: int, most: int) -> bytes | None:
-        assert self._rest is not None
+        assert self._unacknowledged is not None
         if number != self._packet:
             raise FileRefused(FoeError.PACKET_NUMBER, f"packet {number} acknowledged, {self._packet} was sent")
-        if len(self._rest) < most:
+        if len(self._unacknowledged) < most:
             self._end()  # that was the last packet
             return None
-        self._rest = self._rest[most:]
+        self._unacknowledged = self._unacknowledged[most:]
         self._packet += 1
-        return _HEADER.pack(Operation.DATA, self._packet) + self._rest[:most]
+        return _HEADER.pack(Operation.DATA, self._packet) + self._unacknowledged[:most]
 
     def _continue_write(self, number: int, content: bytes) -> bytes:
         assert self._name is not None
@@ -111,7 +111,7 @@ class FoeServer:
         if len(self._received) + len(content) > LARGEST_FILE:
             raise FileRefused(FoeError.DISK_FULL, f"at most {LARGEST_FILE} bytes")
         if len(content) < self._most_received:
-            # A busy behaviour is offered the file again when the master repeats the packet.
+            # A busy behaviour gets the file again when the master repeats the packet.
             self._runner.on_file(self._name, bytes(self._received) + content)
             self._name = None
         else:

@@ -1,6 +1,6 @@
 """A Nitinol rod between two cold chucks, heated by its own current: temperature, phase, resistance and set shape.
 
-One dimension along the rod. SI units, temperatures in C. `rtcp.virtual.heater_circuit` makes the current.
+One-dimensional. SI units, temperatures in C. `rtcp.virtual.heater_circuit` provides the current.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ GRAVITY = 9.80665
 STEFAN_BOLTZMANN = 5.670374e-8
 GAS_CONSTANT = 8.314463
 REFERENCE_TEMPERATURE = 20.0
-"""Temperature of the resistivities, C."""
+"""Reference temperature of the resistivities, C."""
 MELTING_TEMPERATURE = 1310.0
-"""The rod parts here, C (usual value for NiTi; not in the thesis)."""
+"""Temperature at which the rod melts through, C (usual value for NiTi; not in the thesis)."""
 
 SETTING_STARTS, SETTING_FULL = 450.0, 500.0
-"""No shape setting below the first temperature; the rate law holds in full above the second, C."""
+"""Temperatures below which no shape is set and above which the rate law applies in full, C."""
 STRUCTURE_LOST = 600.0
-"""A cell that was hotter has lost its structure, C (Kellogg; industrialheating)."""
+"""Temperature above which a cell loses its structure, C (Kellogg; industrialheating)."""
 _SETTING_TIME, _SETTING_TEMPERATURE = 10.0, 525.0
-"""Time constant (s) at a temperature (C): 95 % set after 30 s, the shortest time that the sources give."""
+"""Time constant (s) at a temperature (C): 95 % set after 30 s, the shortest published time."""
 _SETTING_ENERGY = 150e3
 """Activation energy of shape setting, J/mol (assumed: the rate doubles every 25 K)."""
 
 _UPDATE_INTERVAL = 0.005
-"""Longest interval at which heat exchange, stress and set shape are worked out anew, s."""
+"""Upper bound on the update interval of heat exchange, stress and set shape, s."""
 _STABLE_SHARE = 0.25
-"""Largest share of a cell's time constant for which its heat exchange is kept (explicit scheme)."""
+"""Upper bound on that interval as a share of a cell's time constant (explicit scheme)."""
 _GRADING = 10.0
-"""Length of a cell in the middle over one at a chuck: the cold end of a thin rod is only 5 mm long."""
+"""Ratio of the cell lengths in the middle and at a chuck: the cold end of a thin rod is only 5 mm long."""
 _FIBRES = (np.arange(8) + 0.5) / 8
 _FIBRE_WEIGHTS = np.sqrt(1.0 - _FIBRES**2) / np.sqrt(1.0 - _FIBRES**2).sum()
-"""Distance of fibres from the neutral plane, radii, and their share of a circular section."""
+"""Distances of fibres from the neutral plane, radii, and their shares of a circular section."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ _RESISTIVITIES = ((100e-8, 80e-8), (82e-8, 76e-8), (89e-8, 102e-8))
 
 
 def draw(random: Random) -> HeatedRod:
-    """Return a rod drawn from the ranges of `Alloy`'s sources, 0.5 to 3.2 mm thick and 0.2 to 0.4 m long.
+    """Return a random rod within the published ranges of `Alloy`, 0.5 to 3.2 mm thick and 0.2 to 0.4 m long.
 
     Assumed: 3 % on a source's resistivities, 25 % on the temperature coefficients, Af from -15 to 45 C.
     """
@@ -150,8 +150,8 @@ def radiation(temperature: Floats, ambient: float, emissivity: float) -> Floats:
 class HeatedRod:
     """A clamped rod (`diameter`, `length` in m) in air and chucks of `ambient` C, cooled from above Af, straight.
 
-    Arrays have one row a cell, from the first chuck to the second. State is the enthalpy and the share of martensite:
-    the share stays between the two branches of the loop (a play operator), so that latent heat costs no iteration.
+    Arrays have one row per cell, from the first chuck to the second. The state is enthalpy and share of martensite; the
+    share stays between the two branches of the hysteresis loop (a play operator), so latent heat needs no iteration.
     """
 
     def __init__(self, alloy: Alloy, *, diameter: float, length: float, ambient: float = 20.0, cells: int = 48) -> None:
@@ -163,36 +163,36 @@ class HeatedRod:
         self.ambient = ambient
         half = _GRADING ** np.linspace(0.0, 1.0, cells // 2)
         self.cell_lengths: Floats = np.concatenate((half, half[::-1])) * (length / 2 / half.sum())
-        """Length of each cell, m: short at the chucks."""
+        """Length of each cell, m; shorter near the chucks."""
         self.positions: Floats = np.cumsum(self.cell_lengths) - self.cell_lengths / 2
-        """Middle of each cell along the rod, m."""
+        """Centre of each cell along the rod, m."""
         self.area = np.pi / 4 * diameter**2
         """Cross section, m^2."""
         self.mass = alloy.density * self.area * length
-        """kg."""
+        """Mass, kg."""
         self.shape: Floats = np.zeros((cells, 3))
         """Imposed twist rate and two curvatures, 1/m; set by `bend`."""
         self.set_shape: Floats = np.zeros((cells, 3))
         """Twist rate and curvatures of the unloaded rod, 1/m."""
         self.set_fraction: Floats = np.zeros(cells)
-        """Share of the bend that has become the rod's own shape, 0 to 1, since the last `bend`."""
+        """Share of the last `bend` that has become the rod's own shape, 0 to 1."""
         self.temperature: Floats = np.full(cells, ambient)
         """C."""
         self.highest_temperature: Floats = np.full(cells, ambient)
-        """Highest temperature that each cell ever had, C."""
+        """Highest temperature that each cell has had, C."""
         cooling = (alloy.martensite_start - ambient) / (alloy.martensite_start - alloy.martensite_finish)
         self.martensite: Floats = np.full(cells, min(1.0, max(0.0, cooling)))
         """Share of martensite, 0 to 1."""
         self.resistance = 0.0
-        """From chuck to chuck, without contacts, ohm; infinite once the rod has melted."""
+        """Resistance between the chucks, without contacts, ohm; infinite once the rod has melted."""
         self.joule_energy = self.air_energy = self.chuck_energy = 0.0
-        """Heat made by the current, given to the air and to the chucks, J."""
+        """Heat generated by the current, lost to the air, and lost to the chucks, J."""
         self._prepare(cells)
         self._update()
         self._transform()
 
     def _prepare(self, cells: int) -> None:
-        """Make the buffers and the coefficients of a step."""
+        """Allocate the buffers and compute the coefficients of a step."""
         alloy = self.alloy
         c, latent = alloy.specific_heat, alloy.latent_heat
         self._enthalpy = c * self.temperature - latent * self.martensite
@@ -225,42 +225,42 @@ class HeatedRod:
 
     @property
     def mean_temperature(self) -> float:
-        """Mean along the rod, C: what the ratio of resistances shows."""
+        """Mean temperature along the rod, C, as a resistance measurement shows it."""
         return float(self.temperature @ self.cell_lengths) / self.length
 
     @property
     def middle_temperature(self) -> float:
-        """Temperature in the middle of the rod, C."""
+        """Temperature at the centre of the rod, C."""
         middle = len(self.temperature) // 2
         return float(self.temperature[middle - 1] + self.temperature[middle]) / 2
 
     @property
     def stored_energy(self) -> float:
-        """Enthalpy above austenite at 0 C, J."""
+        """Enthalpy relative to austenite at 0 C, J."""
         return float(self._enthalpy @ self._cell_masses)
 
     @property
     def structure_lost(self) -> NDArray[np.bool_]:
-        """Cells that have been hotter than 600 C."""
+        """Mask of the cells that exceeded 600 C."""
         return np.asarray(self.highest_temperature > STRUCTURE_LOST)
 
     @property
     def strain(self) -> Floats:
-        """Bending strain at the surface, by the curvature beyond the set shape."""
+        """Bending strain at the surface, from the curvature beyond the set shape."""
         return np.asarray(self.diameter / 2 * np.hypot(*(self.shape - self.set_shape)[:, 1:].T))
 
     def bend(self, shape: Floats) -> None:
-        """Impose twist rate and two curvatures (1/m), one row a cell: what the arms hold."""
+        """Impose twist rate and two curvatures (1/m), one row per cell, as held by the arms."""
         self.shape[:] = shape
         self.set_fraction[:] = 0.0
         self._update_stress()
 
     def release(self) -> None:
-        """Let the rod spring back to its set shape."""
+        """Release the rod, which springs back to its set shape."""
         self.bend(self.set_shape)
 
     def step(self, dt: float, current: float) -> None:
-        """Let `dt` seconds pass under `current` A; a long time is cut into stable steps of 5 ms or less."""
+        """Advance by `dt` seconds at `current` A, in stable steps of 5 ms or less."""
         while dt > self._interval:
             self._advance(self._interval, current)
             dt -= self._interval
@@ -280,10 +280,10 @@ class HeatedRod:
             self._update()
 
     def _transform(self) -> None:
-        """Find share of martensite, temperature and resistance from the enthalpy."""
+        """Compute share of martensite, temperature and resistance from the enthalpy."""
         alloy, enthalpy, share, temperature = self.alloy, self._enthalpy, self.martensite, self.temperature
         upper, lower, resistivity = self._upper, self._lower, self._resistivity
-        # A branch of the loop is a straight line over the enthalpy too, latent heat included.
+        # Including latent heat, a branch of the loop is a straight line over the enthalpy too.
         np.subtract(self._heating[0], enthalpy, out=upper)
         upper *= self._heating[1]
         np.maximum(upper, self._stress_kept, out=upper)
@@ -306,7 +306,7 @@ class HeatedRod:
             self.resistance = float(resistivity @ self._ohm_per_resistivity)
 
     def _update(self) -> None:
-        """Work out what changes slowly: heat to air, neighbours and chucks; highest temperature, set shape, stress."""
+        """Update the slow quantities: heat to air, neighbours and chucks; highest temperature, set shape, stress."""
         alloy, temperature = self.alloy, self.temperature
         elapsed, self._elapsed = self._elapsed, 0.0
         self.air_energy += self._air_power * elapsed
@@ -337,7 +337,7 @@ class HeatedRod:
             self._update_stress()
 
     def _update_stress(self) -> None:
-        """Find the least and the largest share of martensite that bending makes and keeps."""
+        """Compute the least and largest share of martensite under the bending stress."""
         alloy = self.alloy
         strains = np.outer(self.strain, _FIBRES)
         for share, start in (
@@ -352,7 +352,8 @@ class HeatedRod:
 def setting_rate(temperature: Floats) -> Floats:
     """Return the rate at which a shape is set, 1/s: 0 to 450 C, 1/20 at 500 C, 1/10 at 525 C.
 
-    Assumed law: no source gives one. It meets "half a minute and more at 500 to 550 C" (Kellogg; industrialheating).
+    Assumed law, for lack of a published one. It meets "half a minute and more at 500 to 550 C" (Kellogg;
+    industrialheating).
     """
     reference = 1.0 / (_SETTING_TEMPERATURE + KELVIN)
     arrhenius = np.exp(_SETTING_ENERGY / GAS_CONSTANT * (reference - 1.0 / (temperature + KELVIN))) / _SETTING_TIME

@@ -1,7 +1,7 @@
-"""The circuit that heats a rod: battery, fuse, relay, MOSFET, shunt, rod; what is measured in it, and its faults.
+"""The circuit that heats a rod: battery, fuse, relay, MOSFET, shunt and rod; its measurements and its faults.
 
-Values come from chapter 4 of the thesis (12 V battery of 1000 A cranking current, fuse 300 A, relay 500 A in series,
-MOSFET 200 A, shunt 1000 A, two channels of 24 bit) where they stand there; the others are said to be assumed.
+Values are from chapter 4 of the thesis (12 V battery of 1000 A cranking current, fuse 300 A, relay 500 A in series,
+MOSFET 200 A, shunt 1000 A, two channels of 24 bit) unless marked as assumed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ FULL_SCALE = (1 << 23) - 1
 
 
 class SensePoint(Enum):
-    """Where the voltage is tapped."""
+    """Sense point of the voltage."""
 
     ROD = auto()
     """Four-wire, on the rod between the chucks: no contact resistance in u."""
@@ -25,16 +25,16 @@ class SensePoint(Enum):
 
 
 class Sampling(Enum):
-    """How the two channels are converted."""
+    """Sampling of the two channels."""
 
     SIMULTANEOUS = auto()
-    """u and i of one instant, every step."""
+    """u and i together, in every step."""
     ALTERNATING = auto()
-    """u in one step, i in the next, as a converter that is switched over; a channel keeps its count meanwhile."""
+    """u and i in alternate steps, as with a multiplexed converter; a channel keeps its count in between."""
 
 
 class CircuitFault(Enum):
-    """What goes wrong in the circuit on command."""
+    """Faults of the circuit."""
 
     CONTACT_LOOSE = auto()
     """The first chuck's contact changes at random between 5 and 50 mohm."""
@@ -42,10 +42,10 @@ class CircuitFault(Enum):
     SENSE_WIRE_BROKEN = auto()
     """u reads zero."""
     GATE_STUCK_ON = auto()
-    """The MOSFET conducts without a command: shorted, the usual way it fails."""
+    """The MOSFET conducts without a command: shorted, its usual failure."""
     GATE_STUCK_OFF = auto()
     RELAY_WELDED = auto()
-    """The main contact stays closed, and the mirror contact open with it."""
+    """The main contact stays closed and therefore the mirror contact open."""
     BATTERY_WEAK = auto()
     """Six times the internal resistance, 1.5 V less."""
     VOLTAGE_OFFSET = auto()
@@ -57,21 +57,21 @@ class CircuitFault(Enum):
     INSULATION_BROKEN = auto()
     """100 ohm from chuck to robot frame."""
     FUSE_BLOWN = auto()
-    """Also set when the fuse blows by itself; clearing it puts in a new fuse."""
+    """Also set when the fuse blows by itself; clearing it replaces the fuse."""
 
 
 @dataclass(frozen=True)
 class CircuitData:
-    """Values of the parts. Assumed where the thesis has none; together 12 V and 12 mohm, as the facts' table has it."""
+    """Values of the parts, assumed if the thesis has none; together 12 V and 12 mohm."""
 
     open_voltage: float = 12.0
-    """Of the full battery, V."""
+    """Open-circuit voltage of the full battery, V."""
     voltage_drop: float = 1.0
-    """Fall of the open voltage to the empty battery, V."""
+    """Drop of the open-circuit voltage from full to empty, V."""
     capacity: float = 70.0
     """Ah."""
     charger_current: float = 10.0
-    """The charger stays on, A."""
+    """Current of the permanently connected charger, A."""
     battery_resistance: float = 6.0e-3
     """ohm."""
     lead_resistance: float = 2.94e-3
@@ -103,7 +103,7 @@ class CircuitData:
     current_offset: float = 0.0
     """A."""
     monitor_voltage: float = 5.0
-    """The insulation monitor puts this between the floating circuit and the robot frame, V."""
+    """Voltage of the insulation monitor between the floating circuit and the robot frame, V."""
     monitor_resistance: float = 100e3
     """ohm."""
     insulation: float = 10e6
@@ -118,7 +118,7 @@ _BROKEN_INSULATION = 100.0
 
 
 class Circuit:
-    """The circuit, stepped with the commands in force; gate and rod count as constant within a step."""
+    """The circuit; gate and rod are constant within a step."""
 
     def __init__(
         self,
@@ -132,7 +132,7 @@ class Circuit:
         self.sense_point = sense_point
         self.sampling = sampling
         self.faults: set[CircuitFault] = set()
-        """Faults present; `inject` and `clear` change them."""
+        """Present faults; changed by `inject` and `clear`."""
         self.charge = 1.0
         """Of the battery, 0 to 1."""
         self.current = 0.0
@@ -142,13 +142,13 @@ class Circuit:
         self.battery_voltage = self.data.open_voltage
         """At the battery's poles, V."""
         self.relay_closed = False
-        """Whether the main contact is closed."""
+        """True: the main contact is closed."""
         self.mirror_closed = True
-        """Whether the mirror contact is closed (IEC 60947-4-1, annex F): never together with the main contact."""
+        """True: the mirror contact is closed (IEC 60947-4-1, annex F), never together with the main contact."""
         self.voltage_count = self.current_count = 0
         """Last converted samples of u and i, 24 bit, signed."""
         self.voltage_step = self.current_step = 0
-        """Step in which each sample was converted, from 1; u and i belong together where these are equal."""
+        """Number of the step in which each sample was converted, from 1; equal for u and i of one instant."""
         self._steps = 0
         self._relay_moved = 0.0
         self._fuse_heat = 0.0
@@ -156,31 +156,31 @@ class Circuit:
 
     @property
     def fuse_intact(self) -> bool:
-        """Whether voltage is behind the fuse."""
+        """Whether the fuse conducts."""
         return CircuitFault.FUSE_BLOWN not in self.faults
 
     @property
     def chuck_to_frame_voltage(self) -> float:
-        """Reading of the insulation monitor, V: about 5, near 0 where the insulation is broken."""
+        """Reading of the insulation monitor, V: about 5; near 0 with broken insulation."""
         data = self.data
         broken = CircuitFault.INSULATION_BROKEN in self.faults
         insulation = _BROKEN_INSULATION if broken else data.insulation
         return data.monitor_voltage * insulation / (insulation + data.monitor_resistance)
 
     def inject(self, fault: CircuitFault) -> None:
-        """Let a fault be there from the next step."""
+        """Add a fault, effective from the next step."""
         self.faults.add(fault)
 
     def clear(self, fault: CircuitFault) -> None:
-        """Repair a fault, if it is there."""
+        """Remove a fault, if present."""
         self.faults.discard(fault)
         if fault is CircuitFault.FUSE_BLOWN:
             self._fuse_heat = 0.0
 
     def step(self, dt: float, gate: bool, relay: bool, rod_resistance: float) -> float:
-        """Let `dt` seconds pass under the two commands; return the current through the rod, A.
+        """Advance by `dt` seconds with the two commands; return the current through the rod, A.
 
-        `rod_resistance` (ohm) is that between the chucks, infinite for a rod that has parted.
+        `rod_resistance`: between the chucks, ohm; infinite for a melted rod.
         """
         data, faults = self.data, self.faults
         self._steps += 1
@@ -254,6 +254,6 @@ class Circuit:
             self.current_step = self._steps
 
     def _count(self, share: float) -> int:
-        """Return the count of a share of the range, with noise, cut to 24 bit."""
+        """Return the count of a share of the range, with noise, limited to 24 bit."""
         count = round(share * FULL_SCALE + self._random.gauss(0.0, self.data.noise))
         return max(-FULL_SCALE - 1, min(FULL_SCALE, count))

@@ -1,4 +1,4 @@
-"""The mailbox of a slave: headers, counters, error replies, and what waits to be sent (ETG.1000.4, 5.6 and 6.7)."""
+"""The mailbox of a slave: headers, counters, error replies and the send queue (ETG.1000.4, 5.6 and 6.7)."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ _SERVICES = frozenset(CoeService)
 MINIMUM_SIZE = 16
 """Smallest mailbox: header, CoE header and an expedited SDO."""
 MAX_WAITING = 64
-"""Answers that may wait before the mailbox has no more memory."""
+"""Upper bound on queued answers; beyond it the mailbox reports no memory."""
 
 
 class MailboxError(IntEnum):
-    """Why a mailbox message was refused (ETG.1000.4, table 30)."""
+    """Mailbox error codes (ETG.1000.4, table 30)."""
 
     SYNTAX = 0x0001
     """The six bytes of the mailbox header are wrong."""
     UNSUPPORTED_PROTOCOL = 0x0002
     INVALID_CHANNEL = 0x0003
     SERVICE_NOT_SUPPORTED = 0x0004
-    """The protocol knows the service, this slave does not."""
+    """The slave lacks this service of the protocol."""
     INVALID_HEADER = 0x0005
     """The header of the protocol (not the mailbox header) is wrong."""
     SIZE_TOO_SHORT = 0x0006
     NO_MORE_MEMORY = 0x0007
     INVALID_SIZE = 0x0008
-    """The length in the header does not fit the data."""
+    """The length in the header does not match the data."""
 
 
 class Mailbox:
-    """The mailbox service of a slave: what the master writes to SM0, and what it finds in SM1."""
+    """The mailbox service of a slave: requests in SM0, answers in SM1."""
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class Mailbox:
     ) -> None:
         """Serve `objects` over mailboxes of `receive_size` (SM0) and `send_size` (SM1) bytes, and further `protocols`.
 
-        `coe` says what CoE can do; None: there is none.
+        `coe`: optional CoE services; None: no CoE.
 
         Raises:
             ValueError: a mailbox smaller than 16 bytes.
@@ -77,15 +77,15 @@ class Mailbox:
         self._own_counter = 0
 
     def receive(self, data: bytes, state: int, t: int = 0) -> None:
-        """Process what the master wrote to SM0 (the whole buffer) by instant `t`; `state` decides on access rights.
+        """Process the master's message in SM0 (the whole buffer) at instant `t`; `state` determines the access rights.
 
-        Malformed messages are answered with a mailbox error; a message with the counter of the one before is the
-        master's repetition of it and not answered twice.
+        A malformed message gets a mailbox error; a message with the same counter as the last one is a repetition and
+        gets no second answer.
         """
         if len(data) < _HEADER.size:
             self._refuse(0, MailboxError.SYNTAX)
             return
-        # What waits by now goes out before the answer, an emergency that the service causes after it.
+        # Queued emergencies go out before the answer, an emergency caused by the service after it.
         self._queue_emergencies()
         length, address, channel, kind = _HEADER.unpack_from(data)
         counter = kind >> 4 & 0x7
@@ -109,16 +109,15 @@ class Mailbox:
                 self._of_model(address, MailboxType(protocol), content)
 
     def pending(self, t: int = 0) -> bool:
-        """Return whether a message waits to be put in SM1 at instant `t`."""
+        """Return whether a message for SM1 is due at instant `t`."""
         if self._waiting:
             return self._waiting[0][3] <= t
         return bool(self._emergencies)
 
     def next_message(self, t: int = 0) -> bytes | None:
-        """Return the next message for SM1, with its mailbox header, at most `send_size` bytes; None when none waits.
+        """Return the next message for SM1 with its mailbox header, at most `send_size` bytes; None: none is queued.
 
-        Answers and emergencies go out in the order in which they arose. What follows the message in SM1's buffer has no
-        meaning.
+        Answers and emergencies go out in their order of origin. Bytes after the message in SM1's buffer are undefined.
         """
         if not self.pending(t):
             return None
@@ -136,7 +135,7 @@ class Mailbox:
         self._waiting.append((MailboxType.ERROR, address, _error(error), 0))
 
     def _coe(self, address: int, content: bytes, state: int, t: int) -> None:
-        """Serve a CoE message; its header holds a number of 9 bits and above it the service (ETG.1000.6, 5.6.1)."""
+        """Serve a CoE message; its header has a 9-bit number and above it the service (ETG.1000.6, 5.6.1)."""
         if len(content) < 2:
             self._refuse(address, MailboxError.SIZE_TOO_SHORT)
             return
@@ -151,7 +150,7 @@ class Mailbox:
             self._refuse(address, MailboxError.INVALID_HEADER)
 
     def _of_model(self, address: int, protocol: MailboxType, content: bytes) -> None:
-        """Let the device model answer a message of a protocol that it has added."""
+        """Let the device model answer a message of one of its protocols."""
         for answer in self._protocols[protocol](content, self._room):
             if len(answer) > self._room:
                 self._refuse(address, MailboxError.INVALID_SIZE)
@@ -164,7 +163,7 @@ class Mailbox:
             return
         answer = self._sdo.answer(content[2:], state)
         if answer is not None:
-            # An abort is a request of the server's to the client (ETG.1000.6, 5.6.2.7): masters tell it by that.
+            # An abort is an SDO request of the server (ETG.1000.6, 5.6.2.7); masters recognize it by that.
             service = CoeService.SDO_REQUEST if answer[0] == ABORT else CoeService.SDO_RESPONSE
             self._waiting.append((MailboxType.COE, address, service.header + answer, t + self._faults.sdo_delay()))
 
@@ -182,11 +181,11 @@ def _error(error: MailboxError) -> bytes:
 
 
 class MailboxService:
-    """Carries messages between sync managers and `Mailbox`, and repeats the last one when the master lost it."""
+    """Carries messages between sync managers and `Mailbox`; repeats the last one on request."""
 
     def __init__(self, device: DeviceModel, out: SyncManager, in_: SyncManager, faults: SlaveFaults,
                  boot: bool = False) -> None:  # fmt: skip
-        """The master writes `out` and reads `in_`, both configured by now. In BOOT there is FoE alone."""
+        """The master writes `out` and reads `in_`, both already configured. In BOOT only FoE is served."""
         self._out = out
         self._in = in_
         device.emergencies.clear()
@@ -204,7 +203,7 @@ class MailboxService:
         self._last: bytes | None = None
 
     def serve(self, state: int, t: int) -> None:
-        """Take what the master wrote, in AL state `state` at instant `t`, and put the next message where it reads."""
+        """Process the master's message in AL state `state` at instant `t`, and put the next message into SM1."""
         if self._out.full:
             self._mailbox.receive(self._out.take(), state, t)
         reader = self._in
@@ -219,11 +218,11 @@ class MailboxService:
                 reader.put(message)
 
     def pending(self, t: int) -> bool:
-        """Whether a message waits at instant `t` and SM1 has room for it."""
+        """Whether a message is due at instant `t` and SM1 is empty."""
         return self._mailbox.pending(t) and not self._in.full
 
     def _repeat(self) -> None:
-        """Put the last message that was read there again, and what stands there now after it."""
+        """Put the last read message into SM1 again, and the present one after it."""
         if self._present is not None:
             self._outbox.appendleft(self._present)
             self._present = None

@@ -1,6 +1,6 @@
-"""The cable: a veth pair, or the loopback, in a network namespace that holds nothing else, with or without root.
+"""The cable: a veth pair or the loopback in its own network namespace, with or without root.
 
-The kernel removes both when the last process in the namespace is gone, also after SIGKILL.
+The kernel removes both with the last process in the namespace, also after SIGKILL.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 MASTER_END = "ecat0"
 SEGMENT_END = "ecat0-seg"
-"""Names of the two ends inside the segment's own namespace."""
+"""Names of both ends inside the segment's namespace."""
 LOOPBACK = "lo"
 LONGEST_NAME = 15
 CLONE_NEWUSER = 0x10000000
@@ -32,7 +32,7 @@ WHAT_TO_ALLOW = (
 
 
 class NetworkError(Exception):
-    """The cable could not be made; the message is one sentence that says what to do."""
+    """The cable cannot be created; the message is a sentence with the remedy."""
 
 
 def _unshare(flags: int) -> None:
@@ -49,7 +49,7 @@ def _forbidden(error: OSError) -> NetworkError:
 
 
 def _own_namespace() -> None:
-    """Leave the caller's network for one of this process's own; with a user namespace where rights are missing.
+    """Move this process to a new network namespace, with a user namespace if rights are missing.
 
     Raises:
         NetworkError: the system forbids both.
@@ -73,7 +73,7 @@ def _own_namespace() -> None:
 
 def _without_ipv6(name: str) -> None:
     """Switch IPv6 off on an interface: only EtherCAT frames travel on it."""
-    # Where the kernel has no IPv6 or /proc is read-only, a stray router solicitation does no harm.
+    # Without IPv6 in the kernel, or with a read-only /proc, a stray router solicitation does no harm.
     with suppress(OSError):
         Path(f"/proc/sys/net/ipv6/conf/{name}/disable_ipv6").write_text("1", encoding="ascii")
 
@@ -94,15 +94,15 @@ def _refused(error: Exception) -> NetworkError:
 
 
 Pair = tuple[str, str, Callable[[], None]]
-"""Names of the master's end and the segment's end, and the function that brings the master's end up."""
+"""Name of the master's end, name of the segment's end, function that brings the master's end up."""
 
 
 @contextmanager
 def private_pair() -> Iterator[Pair]:
-    """Move this process into a namespace of its own and make a veth pair there.
+    """Move this process to a new namespace and create a veth pair there.
 
     A master reaches its end by joining this process's namespaces (/proc/PID/ns/user and /proc/PID/ns/net). Must be
-    called while the process has one thread.
+    called while the process has a single thread.
 
     Raises:
         NetworkError: the system forbids it.
@@ -121,9 +121,9 @@ def private_pair() -> Iterator[Pair]:
 
 
 def private_loopback() -> str:
-    """Move this process into a namespace of its own and bring the loopback up there; return the loopback's name.
+    """Move this process to a new namespace and bring up its loopback; return the loopback's name.
 
-    Another process reaches it as it reaches a private pair. Must be called while the process has one thread.
+    Another process reaches it as it reaches a private pair. Must be called while the process has a single thread.
 
     Raises:
         NetworkError: the system forbids it.
@@ -141,7 +141,7 @@ def private_loopback() -> str:
 
 @contextmanager
 def public_pair(name: str) -> Iterator[Pair]:
-    """Leave the master's end in the caller's network as `name`, move this process and the other end out of it.
+    """Create the master's end as `name` in the caller's network; move this process and the other end out of it.
 
     The pair is removed at the end. Needs the right to administer the network.
 
@@ -165,9 +165,9 @@ def public_pair(name: str) -> Iterator[Pair]:
                 f"--interface {name} needs the right to administer the network ({error}): run as root or with "
                 "CAP_NET_ADMIN, CAP_NET_RAW and CAP_SYS_ADMIN"
             ) from error
-        # Until the other end is in a namespace that ends with this process, it has to be removed here.
+        # Until the other end is in a namespace that ends with this process, it must be removed here.
         try:
-            # In the caller's namespace: the process leaves it below, and its /proc/sys/net with it.
+            # Still in the caller's namespace, whose /proc/sys/net is not reachable later.
             _without_ipv6(name)
             index = outside.link_lookup(ifname=temporary)[0]
             _unshare(CLONE_NEWNET)

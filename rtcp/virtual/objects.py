@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
+from typing import Any
 
 
 class DataType(IntEnum):
@@ -83,10 +84,11 @@ class Access(IntFlag):
     WRITE_OP = 0x20
     RXPDO = 0x40
     TXPDO = 0x80
-    RO = READ_PREOP | READ_SAFEOP | READ_OP
-    WO = WRITE_PREOP | WRITE_SAFEOP | WRITE_OP
-    RW = RO | WO
-    RW_PREOP = RO | WRITE_PREOP
+    # Numbers, because the compiler refuses members in the terms of others.
+    RO = 0x07
+    WO = 0x38
+    RW = 0x3F
+    RW_PREOP = 0x0F
 
 
 class SdoAbort(Exception):
@@ -98,10 +100,10 @@ class SdoAbort(Exception):
         self.code = code
 
 
-def check_whole(name: str, found: object, most: int) -> None:
-    """Raise ValueError for what is no whole number from 0 to `most`."""
-    if not isinstance(found, int) or not 0 <= found <= most:
-        raise ValueError(f"{name}: found {found!r}, allowed is a whole number from 0 to {most}")
+def check_whole(name: str, number: object, most: int) -> None:
+    """Raise ValueError unless `number` is a whole number from 0 to `most`."""
+    if not isinstance(number, int) or not 0 <= number <= most:
+        raise ValueError(f"{name}: found {number!r}, allowed is a whole number from 0 to {most}")
 
 
 Value = int | float | bytes
@@ -125,7 +127,7 @@ STRUCT_CODES = {
     DataType.REAL32: "f",
     DataType.REAL64: "d",
 }
-"""Codes of the `struct` module for the types that fill whole bytes."""
+"""`struct` codes of the types that fill whole bytes."""
 BITS = {DataType.BOOLEAN: 1, **{data_type: 8 * struct.calcsize(code) for data_type, code in STRUCT_CODES.items()}}
 BITS |= {
     DataType.INTEGER24: 24, DataType.INTEGER40: 40, DataType.INTEGER48: 48, DataType.INTEGER56: 56,
@@ -137,21 +139,30 @@ SIGNED = frozenset(data_type for data_type, code in STRUCT_CODES.items() if code
 }  # fmt: skip
 _FLOATS = (DataType.REAL32, DataType.REAL64)
 LARGEST = {DataType.REAL32: (2.0 - 2.0**-23) * 2.0**127, DataType.REAL64: sys.float_info.max}
-"""Largest finite number of the types that have a point."""
+"""Largest finite number of the floating-point types."""
 _BYTES = (DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType.UNICODE_STRING, DataType.GUID)
 
 
-class Entry:
+class Number:
+    """Holder of a value that a model reads and writes every step: an entry, or the place of one that a drive lacks."""
+
+    __slots__ = ("value",)
+
+    def __init__(self, value: Value) -> None:
+        # Not `Value`: the type follows from an entry's data type, unknown to mypy.
+        self.value: Any = value
+
+
+class Entry(Number):
     """One entry of the object dictionary.
 
-    `value` is an int, a float or (strings) bytes, in the entry's own counts. `minimum` and `maximum` bound what an SDO
-    may write; `on_write` is called with the entry and the new value before it is stored, `on_read` with the entry
-    before an SDO reads its value; both may raise `SdoAbort`.
+    `value` is an int, a float or (strings) bytes, in the entry's own counts. `minimum` and `maximum` bound SDO writes.
+    `on_write` is called with the entry and the new value before it is stored, `on_read` with the entry before an SDO
+    reads its value; both may raise `SdoAbort`.
     """
 
     __slots__ = (
         "access", "bit_length", "data_type", "index", "maximum", "minimum", "name", "on_read", "on_write", "subindex",
-        "value",
     )  # fmt: skip
 
     def __init__(
@@ -168,12 +179,11 @@ class Entry:
         maximum: float | None = None,
         on_write: WriteHook | None = None,
     ) -> None:
+        super().__init__(value)
         self.index = index
         self.subindex = subindex
         self.name = name
         self.data_type = data_type
-        # Any, in effect: the type of a value follows from data_type, which mypy cannot see.
-        self.value: Value = value
         self.access = access
         if bit_length is None:
             bit_length = BITS[data_type] if data_type in BITS else 8 * len(value)  # type: ignore[arg-type]
@@ -213,12 +223,12 @@ class DictionaryObject:
 
 
 class ObjectDictionary:
-    """The objects of one slave by index and subindex."""
+    """The objects of a slave by index and subindex."""
 
     def __init__(self) -> None:
         self._objects: dict[int, DictionaryObject] = {}
         self.mappings: dict[int, tuple[Entry, int]] = {}
-        """Mappings that hold though they have another length than their object: that, and the bits of it."""
+        """Accepted mappings with another length than their object: the entry and the mapped bits."""
 
     def variable(self, index: int, name: str, data_type: DataType, value: Value = 0, access: Access = Access.RO,
                  *, minimum: int | None = None, maximum: int | None = None,
@@ -230,51 +240,51 @@ class ObjectDictionary:
 
     def record(self, index: int, name: str, entries: list[Entry], *, code: ObjectCode = ObjectCode.RECORD,
                count_access: Access = Access.RO) -> DictionaryObject:  # fmt: skip
-        """Add a record or an array of `entries` (subindex 1 upwards); subindex 0, their number, is made here."""
+        """Add a record or an array of `entries` (subindex 1 upwards) with their number in subindex 0."""
         count = Entry(index, 0, "Number of entries", DataType.UNSIGNED8, len(entries), count_access, maximum=255)
-        made = DictionaryObject(index, name, code, {0: count, **{entry.subindex: entry for entry in entries}})
-        self.add(made)
-        return made
+        obj = DictionaryObject(index, name, code, {0: count, **{entry.subindex: entry for entry in entries}})
+        self.add(obj)
+        return obj
 
-    def add(self, made: DictionaryObject) -> None:
-        """Add an object, in place of one with its index."""
-        self._objects[made.index] = made
+    def add(self, obj: DictionaryObject) -> None:
+        """Add an object; it replaces one with the same index."""
+        self._objects[obj.index] = obj
 
     def __getitem__(self, key: tuple[int, int]) -> Entry:
         """Return the entry.
 
         Raises:
-            SdoAbort: 0x06020000 where the object does not exist, 0x06090011 where the subindex does not.
+            SdoAbort: 0x06020000 for an unknown object, 0x06090011 for an unknown subindex.
         """
-        found = self.object(key[0])
+        obj = self.object(key[0])
         try:
-            return found.entries[key[1]]
+            return obj.entries[key[1]]
         except KeyError:
             raise SdoAbort(0x06090011) from None
 
     def object(self, index: int) -> DictionaryObject:
-        """Return the object; raises SdoAbort 0x06020000 where it does not exist."""
+        """Return the object; raises SdoAbort 0x06020000 if it does not exist."""
         try:
             return self._objects[index]
         except KeyError:
             raise SdoAbort(0x06020000) from None
 
     def __contains__(self, key: tuple[int, int]) -> bool:
-        found = self._objects.get(key[0])
-        return found is not None and key[1] in found.entries
+        obj = self._objects.get(key[0])
+        return obj is not None and key[1] in obj.entries
 
     def __iter__(self) -> Iterator[DictionaryObject]:
         """Iterate over the objects in the order of their indices."""
-        return iter(sorted(self._objects.values(), key=lambda found: found.index))
+        return iter(sorted(self._objects.values(), key=lambda obj: obj.index))
 
 
 def byte_size(entry: Entry) -> int:
-    """Return the number of bytes that `entry` takes in an SDO; of a string, the largest number."""
+    """Return the size of `entry` in an SDO, bytes; of a string, its maximum."""
     return (entry.bit_length + 7) // 8
 
 
 def encode(entry: Entry, value: Value) -> bytes:
-    """Return `value` as the bytes of `entry`'s type; an integer out of range is cut to the type's bits."""
+    """Return `value` as bytes of `entry`'s type; an integer out of range is truncated to the type's bits."""
     if isinstance(value, bytes):
         return value
     if entry.is_float:
@@ -283,10 +293,10 @@ def encode(entry: Entry, value: Value) -> bytes:
 
 
 def decode(entry: Entry, data: bytes) -> Value:
-    """Return the value that `data` means for `entry`.
+    """Return the value of `data` for `entry`.
 
     Raises:
-        struct.error: a floating-point entry whose data has another length than its type.
+        struct.error: wrong length of `data` for a floating-point entry.
     """
     if entry.is_bytes:
         return bytes(data)
@@ -297,7 +307,7 @@ def decode(entry: Entry, data: bytes) -> Value:
 
 
 def bounds(entry: Entry) -> tuple[int, int]:
-    """Return the lowest and the highest number that the bits of an entry hold."""
+    """Return the lowest and the highest number in the bits of an entry."""
     if entry.data_type in SIGNED:
         return -(1 << entry.bit_length - 1), (1 << entry.bit_length - 1) - 1
     return 0, (1 << entry.bit_length) - 1
@@ -309,7 +319,7 @@ def to_bits(entry: Entry) -> int:
 
 
 def from_bits(entry: Entry, bits: int) -> Value:
-    """Return the value that the unsigned integer `bits` of `entry.bit_length` bits means for `entry`."""
+    """Return the value of the unsigned integer `bits`, of `entry.bit_length` bits, for `entry`."""
     if entry.data_type in SIGNED:
         sign = 1 << (entry.bit_length - 1)
         return (bits ^ sign) - sign
@@ -319,7 +329,7 @@ def from_bits(entry: Entry, bits: int) -> Value:
 
 
 def struct_code(entry: Entry) -> str | None:
-    """Return the `struct` code of `entry`, None where it does not fill the bytes of its type."""
+    """Return the `struct` code of `entry`; None: it does not fill the bytes of its type."""
     if entry.is_bytes:
         return f"{byte_size(entry)}s" if entry.bit_length % 8 == 0 else None
     if entry.bit_length != BITS.get(entry.data_type):
@@ -328,7 +338,7 @@ def struct_code(entry: Entry) -> str | None:
 
 
 class AbortCode(IntEnum):
-    """Why an SDO service was refused (ETG.1000.6, table 41)."""
+    """SDO abort codes (ETG.1000.6, table 41)."""
 
     TOGGLE_BIT = 0x05030000
     """Toggle bit not changed."""

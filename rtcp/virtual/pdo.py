@@ -6,7 +6,6 @@ import struct
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from operator import attrgetter
 from typing import NamedTuple
 
 from rtcp.virtual.objects import (
@@ -32,26 +31,25 @@ TX_ASSIGN = 0x1C13
 RX_MAPPINGS = range(0x1600, 0x1800)
 TX_MAPPINGS = range(0x1A00, 0x1C00)
 BUFFERS = 3
-"""Buffers of a sync manager that is no mailbox (ETG.1000.4, 6.7.1)."""
+"""Number of buffers in buffered mode (ETG.1000.4, 6.7.1)."""
 MAX_BYTES = 256
-"""Largest process image of SM2 of `SyncManagerLayout`: three buffers of it fit before SM3."""
+"""Upper bound on the process image of SM2 in `SyncManagerLayout`: three buffers fit before SM3."""
 MAX_INPUT_BYTES = (REGISTER_SPACE + RAM_SIZE - 0x1400) // BUFFERS
 """The same for SM3, up to the memory's end."""
 MAX_MAPPED = 16
-"""Entries that a free mapping object of a model has room for at least."""
+"""Least capacity of a writable mapping object of a model, entries."""
 MAX_ASSIGNED = 4
-"""PDOs that a free assignment object of a model has room for at least."""
+"""Least capacity of a writable assignment object of a model, PDOs."""
 ASSIGN = 0x1C10
-"""0x1C10 + n assigns the PDOs of sync manager n (ETG.1000.6, 5.6.7.4)."""
+"""0x1C10 + n is the PDO assignment of sync manager n (ETG.1000.6, 5.6.7.4)."""
 
 Mapped = tuple[int, int, int]
 """A mapped entry: index (0: a gap), subindex, bits."""
 Buffer = bytes | bytearray | memoryview
-_VALUE = attrgetter("value")
 
 
 class SyncManagerType(IntEnum):
-    """What a sync manager carries (ETG.1000.6, 5.6.7.4; the same numbers in the SII, ETG.2010)."""
+    """Use of a sync manager (ETG.1000.6, 5.6.7.4; same numbers in the SII, ETG.2010)."""
 
     UNUSED = 0
     MAILBOX_RECEIVE = 1
@@ -67,7 +65,7 @@ class SyncManager:
     start: int
     """Physical start address in the ESC's memory."""
     length: int
-    """Bytes; 0 where the PDO assignment decides."""
+    """Bytes; 0: by the PDO assignment."""
     control: int
     """Mode (0: three buffers, 2: mailbox), direction (4: the master writes), interrupt 0x20, watchdog trigger 0x40."""
     type: SyncManagerType
@@ -75,12 +73,12 @@ class SyncManager:
 
     @property
     def buffers(self) -> int:
-        """How many times its length lies in the memory: once as a mailbox or in one-buffer mode."""
+        """Number of buffers in the memory: one as a mailbox or in one-buffer mode."""
         return 1 if self.control & 0x03 == 0x02 else BUFFERS
 
 
 class SyncManagerLayout(NamedTuple):
-    """The four sync managers of a slave with mailbox, as its SII tells them."""
+    """The four sync managers of a slave with mailbox, for its SII."""
 
     mailbox_receive: SyncManager = SyncManager(0x1000, 128, 0x26, SyncManagerType.MAILBOX_RECEIVE)
     """SM0: the master writes, the slave receives."""
@@ -93,22 +91,22 @@ class SyncManagerLayout(NamedTuple):
 
 
 def room(layout: Sequence[SyncManager], index: int, memory_end: int) -> int:
-    """Return the most bytes that sync manager `index` can have: up to the next one in the memory, or its end."""
+    """Return the bytes available to sync manager `index`: up to the next one in the memory, or its end."""
     own = layout[index]
-    ends = [other.start for n, other in enumerate(layout) if n != index and other.start > own.start]
+    ends = [manager.start for n, manager in enumerate(layout) if n != index and manager.start > own.start]
     return max(0, min([*ends, memory_end]) - own.start) // own.buffers
 
 
 class PdoImage:
-    """The process image of one sync manager: which entries stand at which bits.
+    """The process image of a sync manager: the bit positions of its entries.
 
-    Made by `from_assignment`, it stays as it was when objects are mapped anew.
+    Later changes of the mapping do not affect it.
     """
 
     __slots__ = ("_bits", "_struct", "bit_length", "byte_length", "entries")
 
     def __init__(self, fields: Sequence[tuple[Entry | None, int]]) -> None:
-        """Lay out `fields`, each an entry (None: a gap) and its number of bits, from bit 0 upwards."""
+        """Lay out `fields`, each an entry (None: a gap) and its number of bits, from bit 0."""
         self.bit_length = sum(bits for _, bits in fields)
         self.byte_length = (self.bit_length + 7) // 8
         self.entries = tuple(entry for entry, _ in fields if entry is not None)
@@ -123,14 +121,14 @@ class PdoImage:
     @classmethod
     def from_assignment(cls, objects: ObjectDictionary, assignment: int, outputs: bool | None = None,
                         most: int | None = None) -> PdoImage:  # fmt: skip
-        """Return the image of the PDOs that `assignment` lists.
+        """Return the image of the PDOs listed in `assignment`.
 
-        `outputs` tells their direction (None: 0x1C12 has outputs), `most` the bytes allowed (None: those of
+        `outputs`: their direction (None: 0x1C12 has outputs); `most`: upper bound on its size, bytes (None: that of
         `SyncManagerLayout`).
 
         Raises:
-            SdoAbort: an object, a subindex or a mapping that does not exist or may not be mapped.
-            ValueError: the image is longer than that.
+            SdoAbort: an object, a subindex or a mapping does not exist or is not mappable.
+            ValueError: the image exceeds `most`.
         """
         if outputs is None:
             outputs = assignment == RX_ASSIGN
@@ -146,10 +144,10 @@ class PdoImage:
         return image
 
     def unpack(self, data: Buffer, offset: int = 0) -> None:
-        """Store the values in `data` (`byte_length` bytes from `offset`) in the entries.
+        """Store the values of `data` (`byte_length` bytes from `offset`) in the entries.
 
         Raises:
-            struct.error: `data` is shorter than that (of an image whose entries all fill whole bytes).
+            struct.error: `data` is too short (for an image of whole bytes).
         """
         if self._struct is not None:
             for entry, value in zip(self.entries, self._struct.unpack_from(data, offset)):  # noqa: B905
@@ -160,13 +158,13 @@ class PdoImage:
             entry.value = from_bits(entry, image >> shift & mask)
 
     def pack(self, target: bytearray | memoryview, offset: int = 0) -> None:
-        """Write the entries' values to `target` from `offset` on; gaps become zero.
+        """Write the entries' values to `target` at `offset`; gaps become zero.
 
         Raises:
             struct.error: a value out of its type's range, or `target` too short.
         """
         if self._struct is not None:
-            self._struct.pack_into(target, offset, *map(_VALUE, self.entries))
+            self._struct.pack_into(target, offset, *[entry.value for entry in self.entries])
             return
         image = 0
         for entry, shift, mask in self._bits:
@@ -175,7 +173,7 @@ class PdoImage:
 
 
 def _compile(fields: Sequence[tuple[Entry | None, int]]) -> struct.Struct | None:
-    """Return one struct for all of `fields`, None where any of them is not made of whole bytes."""
+    """Return one struct for all of `fields`; None: some are not whole bytes."""
     codes = []
     for entry, bits in fields:
         if entry is not None and entry.bit_length != bits:
@@ -188,10 +186,10 @@ def _compile(fields: Sequence[tuple[Entry | None, int]]) -> struct.Struct | None
 
 
 def listed(objects: ObjectDictionary, index: int) -> list[int]:
-    """Return what the used subindices of an assignment or mapping object hold.
+    """Return the values of the used subindices of an assignment or mapping object.
 
     Raises:
-        SdoAbort: there is no such object, or subindex 0 counts more than there are.
+        SdoAbort: the object does not exist, or subindex 0 exceeds its entries.
     """
     count = int(objects[index, 0].value)
     return [int(objects[index, subindex].value) for subindex in range(1, count + 1)]
@@ -208,7 +206,7 @@ def _field(objects: ObjectDictionary, mapping: int, wanted: Access) -> tuple[Ent
     if mapping in objects.mappings:
         return objects.mappings[mapping]
     if index == 0:
-        # A gap; without bits it is an unused place of the mapping object.
+        # A gap; with 0 bits, an unused subindex of the mapping object.
         if subindex or not bits:
             raise SdoAbort(AbortCode.NO_OBJECT)
         return None, bits
@@ -230,10 +228,10 @@ def define_pdo_objects(
 ) -> None:
     """Add the mapping objects `rx` (0x1600..) and `tx` (0x1A00..), 0x1C00, 0x1C12 and 0x1C13 to `objects`.
 
-    Written by SDO, they keep these rules: only in PRE-OP (else 0x08000022); subindex 0 must be 0 before another one is
-    written (0x06010003); a mapped entry exists (0x06020000, 0x06090011), may be mapped in this direction (0x06040041),
-    has the bits that the mapping tells and fits in the sync manager with the others (0x06040042); an assigned PDO
-    exists (0x06020000) and has this direction (0x06040041). With `fixed` nothing can be written (0x06010002).
+    Rules for SDO writes, with the abort code: only in PRE-OP (0x08000022); subindex 0 must be 0 before another one is
+    written (0x06010003); a mapped entry must exist (0x06020000, 0x06090011), be mappable in this direction
+    (0x06040041), have the length of the mapping and fit in the sync manager (0x06040042); an assigned PDO must exist
+    (0x06020000) and have this direction (0x06040041). With `fixed` all are read-only (0x06010002).
     """
     define_sync_manager_types(objects, SyncManagerLayout())
     for index, mapped in rx.items():
@@ -245,7 +243,7 @@ def define_pdo_objects(
 
 
 def define_sync_manager_types(objects: ObjectDictionary, layout: Sequence[SyncManager]) -> None:
-    """Add 0x1C00: what each sync manager carries."""
+    """Add 0x1C00: use of each sync manager."""
     types = [Entry(SM_TYPES, n, f"Type of SM{n - 1}", DataType.UNSIGNED8, int(m.type)) for n, m in enumerate(layout, 1)]
     objects.record(SM_TYPES, "Sync manager type", types, code=ObjectCode.ARRAY)
 
@@ -258,13 +256,13 @@ def _define_mapping(
 
     values = [at << 16 | subindex << 8 | bits for at, subindex, bits in mapped]
     places = values if fixed else values + [0] * (MAX_MAPPED - len(values))
-    made = objects.record(index, name, [entry_at(n, value) for n, value in enumerate(places, 1)])
+    mapping = objects.record(index, name, [entry_at(n, value) for n, value in enumerate(places, 1)])
     most = MAX_BYTES if wanted == Access.RXPDO else MAX_INPUT_BYTES
-    restrict(made, len(values), fixed, lambda value: mapped_bits(objects, value, wanted), most)
+    restrict(mapping, len(values), fixed, lambda value: mapped_bits(objects, value, wanted), most)
 
 
 def mapped_bits(objects: ObjectDictionary, mapping: int, wanted: Access) -> int:
-    """Return the bits of a mapping; raises SdoAbort where it may not be mapped in the direction `wanted`."""
+    """Return the bits of a mapping; raises SdoAbort if it is not mappable in the direction `wanted`."""
     return _field(objects, mapping, wanted)[1]
 
 
@@ -288,14 +286,14 @@ def _define_assignment(
     restrict(objects.record(index, name, entries, code=ObjectCode.ARRAY), len(assigned), fixed, bits_of, most)
 
 
-def restrict(made: DictionaryObject, used: int, fixed: bool, bits_of: Callable[[int], int], most: int,
+def restrict(obj: DictionaryObject, used: int, fixed: bool, bits_of: Callable[[int], int], most: int,
              accept: Callable[[Sequence[int]], None] | None = None) -> None:  # fmt: skip
-    """Let a mapping or an assignment, `used` of whose places count, be written by the rules of `define_pdo_objects`.
+    """Apply the rules of `define_pdo_objects` to writes of a mapping or an assignment with `used` valid subindices.
 
-    `bits_of` returns the bits that a place takes, or refuses what stands there; all take at most `most` bytes. `accept`
-    refuses what the places hold together.
+    `bits_of` returns the bits of a value, or refuses it; all together take at most `most` bytes. `accept` refuses an
+    invalid combination.
     """
-    count, *places = made.entries.values()
+    count, *places = obj.entries.values()
 
     def check_entry(_: Entry, value: Value) -> None:
         if count.value:
@@ -313,5 +311,5 @@ def restrict(made: DictionaryObject, used: int, fixed: bool, bits_of: Callable[[
     count.value, count.maximum, count.on_write = used, len(places), check_count
     for place in places:
         place.on_write = check_entry
-    for entry in made.entries.values():
+    for entry in obj.entries.values():
         entry.access = Access.RO if fixed else Access.RW_PREOP

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum, IntFlag
+from typing import Final
 
 REGISTER_SPACE = 0x1000
-"""Registers lie below this address, the process data RAM from it on."""
+"""End of the registers and start of the process data RAM."""
 RAM_SIZE = 0x2000
-"""Bytes of process data RAM: 8 KiB, as register 0x0006 tells in KiB."""
+"""Process data RAM, bytes: 8 KiB; register 0x0006 has it in KiB."""
 FMMU_COUNT = 8
 SM_COUNT = 8
 FMMU_SIZE = 16
@@ -16,7 +17,7 @@ SM_SIZE = 8
 
 
 class Register(IntEnum):
-    """Start addresses of the registers that this controller has."""
+    """Start addresses of this controller's registers."""
 
     TYPE = 0x0000
     FMMUS = 0x0004
@@ -82,9 +83,9 @@ class AlState(IntEnum):
     OP = 8
 
 
-STATE_MASK = 0x0F
-ERROR_FLAG = 0x10
-"""AL status: the last request was refused or the state was left on an error; AL control: acknowledge it."""
+STATE_MASK: Final = 0x0F
+ERROR_FLAG: Final = 0x10
+"""In AL status: a request was refused or the state was left on an error; in AL control: acknowledgement."""
 
 
 class EcatEvent(IntFlag):
@@ -94,10 +95,10 @@ class EcatEvent(IntFlag):
     DL_STATUS = 0x0004
     AL_STATUS = 0x0008
     SYNC_MANAGER_0 = 0x0010
-    """SM n mirrors its event into bit 4 + n."""
+    """Event of SM 0; SM n has bit 4 + n."""
 
 
-# (first, last) addresses that the master may write; all others are read-only (ETG.1000.4, clause 6, access types).
+# (first, last) addresses writable by the master; all others are read-only (ETG.1000.4, clause 6, access types).
 # Sync managers and the EEPROM interface restrict it further, see esc.py and sii.py.
 WRITABLE = (
     (0x0010, 0x0011),
@@ -116,7 +117,7 @@ WRITABLE = (
     (Register.SYNC_MANAGER, Register.SYNC_MANAGER + SM_COUNT * SM_SIZE - 1),
     (0x0F80, 0x0FFF),
 )
-# The same for the distributed clock unit, which a slave may lack.
+# The same for the optional distributed clock unit.
 WRITABLE_DC = (
     (0x0900, 0x0903),
     (0x0910, 0x0917),
@@ -128,7 +129,7 @@ WRITABLE_DC = (
     (0x09A0, 0x09A9),
 )
 ERROR_COUNTERS = ((0x0300, 0x030C), (0x030C, 0x030D), (0x030D, 0x030E), (0x0310, 0x0314))
-"""Groups of error counters, ends excluded: a write to one of a group clears the group (ET1100, 0x0300 to 0x0313)."""
+"""Groups of error counters, ends excluded: a write to any one clears its group (ET1100, 0x0300 to 0x0313)."""
 DC_SPACE = (0x0900, 0x0A00)
 """Addresses of the distributed clock unit, end excluded."""
 
@@ -138,7 +139,7 @@ DEFAULTS: tuple[tuple[int, bytes], ...] = (
     (Register.FMMUS, bytes((FMMU_COUNT,))),
     (Register.SYNC_MANAGERS, bytes((SM_COUNT,))),
     (Register.RAM, bytes((RAM_SIZE // 1024,))),
-    (Register.PORT_DESCRIPTOR, bytes((0x0F,))),  # ports 0 and 1 are MII, 2 and 3 not there
+    (Register.PORT_DESCRIPTOR, bytes((0x0F,))),  # ports 0 and 1 are MII, 2 and 3 absent
     (Register.DL_CONTROL, bytes((0x01, 0x00, 0x07, 0x00))),
     (Register.AL_STATUS, bytes((AlState.INIT, 0x00))),
     (Register.PDI_CONTROL, bytes((0x08, 0x00))),  # 16-bit asynchronous microcontroller interface
@@ -157,21 +158,21 @@ FEATURE_DC_SYNC_ENHANCED = 0x0100
 
 
 ETHERTYPE = 0x88A4
-ETHERNET_HEADER = 14
-VLAN_TAG = 4
+ETHERNET_HEADER: Final = 14
+VLAN_TAG: Final = 4
 """Bytes of an IEEE 802.1Q tag before the EtherType."""
-FRAME_HEADER = 2
+FRAME_HEADER: Final = 2
 """Bytes of the EtherCAT header: 11 bits length, 1 reserved, 4 bits type (1: datagrams)."""
-FIRST_DATAGRAM = ETHERNET_HEADER + FRAME_HEADER
-DATAGRAM_HEADER = 10
-COUNTER = 2
-"""Bytes of the working counter behind a datagram's data."""
-LENGTH_MASK = 0x07FF
-MORE_FOLLOWS = 0x8000
-TYPE_DATAGRAMS = 0x1
+FIRST_DATAGRAM: Final = ETHERNET_HEADER + FRAME_HEADER
+DATAGRAM_HEADER: Final = 10
+COUNTER: Final = 2
+"""Bytes of the working counter after a datagram's data."""
+LENGTH_MASK: Final = 0x07FF
+MORE_FOLLOWS: Final = 0x8000
+TYPE_DATAGRAMS: Final = 0x1
 MAX_FRAME = 1514
-LOCAL_BIT = 0x02
-"""Bit of the source address' first byte that the first slave sets: locally administered."""
+LOCAL_BIT: Final = 0x02
+"""Locally administered bit in the first byte of the source address; the first slave sets it."""
 
 HEADER = struct.Struct("<BBHHHH")
 """Command, index, address (position or station), offset, length and flags, event request."""

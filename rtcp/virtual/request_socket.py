@@ -1,7 +1,7 @@
-"""Requests of other processes to a virtual device: a Unix socket of packets, both ends.
+"""Requests to a virtual device from other processes: client and server of a Unix packet socket.
 
-One JSON object each: `{"do": "fault", "fault": {...}}` is answered by `{"ok": true, "result": ...}` or by
-`{"ok": false, "error": "a sentence"}`. The device's own work comes first: nothing here waits for a client.
+Messages are JSON objects: the answer to `{"do": "fault", "fault": {...}}` is `{"ok": true, "result": ...}` or
+`{"ok": false, "error": "a sentence"}`. The server never waits for a client, as the device's own work has priority.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
-from rtcp.config.document import shown
-from rtcp.config.validation import unknown_key
+from rtcp.config.findings import shown
+from rtcp.config.validation import unknown
 
 LONGEST_REQUEST = 1024
 MOST_CLIENTS = 16
-"""When another comes, the one that has been silent longest has to go."""
+"""Upper bound on clients; another one replaces the one that has been silent longest."""
 BACKLOG = 16
 ANSWER_TIMEOUT_S = 10.0
 LONGEST_ANSWER = 1 << 20
@@ -32,18 +32,18 @@ _Client = TypeVar("_Client", bound="RequestClient")
 
 
 class RequestRefused(Exception):
-    """The device will not do this: a sentence."""
+    """The device refuses the request; the message is a sentence."""
 
 
 class ServerAway(Exception):
-    """No device answers: a sentence that says where one was looked for."""
+    """No device answers; the message is a sentence with the path of the socket."""
 
 
 def choose(verbs: Mapping[str, tuple[tuple[str, ...], _T]], request: dict[str, Any]) -> _T:
-    """Take "do" out of a request and return what stands beside this verb; `verbs` has the keys of each.
+    """Remove "do" from a request and return the value of this verb; `verbs` has keys and value of each.
 
     Raises:
-        RequestRefused: there is no such verb, or it has no such key.
+        RequestRefused: unknown verb or key.
     """
     verb = request.pop("do", None)
     if not isinstance(verb, str) or verb not in verbs:
@@ -51,16 +51,16 @@ def choose(verbs: Mapping[str, tuple[tuple[str, ...], _T]], request: dict[str, A
     keys, chosen = verbs[verb]
     for key in request:
         if key not in keys:
-            raise RequestRefused(f"{key}: {unknown_key(key, ['do', *keys])}")
+            raise RequestRefused(str(unknown((key,), key, ["do", *keys])))
     return chosen
 
 
 @contextmanager
 def control_socket(path: Path) -> Iterator[socket.socket]:
-    """Listen at `path`, for this user alone; the file is removed at the end. One that nobody listens at is replaced.
+    """Listen at `path`, for this user only; remove the file at the end. An abandoned file is replaced.
 
     Raises:
-        ValueError: the path is in use, of something else, or cannot be made; the message is a sentence.
+        ValueError: the path is in use, not a socket, or cannot be created; the message is a sentence.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.setblocking(False)
@@ -107,7 +107,7 @@ def _in_use(path: Path) -> bool:
 
 
 class RequestSocket:
-    """Answers one request a look, so that a client that floods takes no more of the time than one that asks."""
+    """Answers one request per `poll`, so that a flooding client takes no more time than any other."""
 
     def __init__(self, listener: socket.socket, answer: Callable[[dict[str, Any]], Any]) -> None:
         """`answer` returns the result of a request as plain values, or raises RequestRefused."""
@@ -118,13 +118,13 @@ class RequestSocket:
         self._epoll.register(listener, select.EPOLLIN)
 
     def close(self) -> None:
-        """Let all clients go."""
+        """Disconnect all clients."""
         self._epoll.close()
         for client in self._clients.values():
             client.close()
 
-    def look(self) -> None:
-        """Take a new client, or answer one request, where there is one."""
+    def poll(self) -> None:
+        """Accept a waiting client or answer one request, if any."""
         for descriptor, _ in self._epoll.poll(0, 1):
             client = self._clients.get(descriptor)
             if client is None:
@@ -136,7 +136,7 @@ class RequestSocket:
         try:
             client, _ = self._listener.accept()
         except OSError:
-            return  # it has gone already
+            return  # it has disconnected already
         client.setblocking(False)
         if len(self._clients) >= MOST_CLIENTS:
             self._dismiss(next(iter(self._clients.values())))
@@ -153,7 +153,7 @@ class RequestSocket:
         if not packet or not self._send(client, self._answer(packet)):
             self._dismiss(client)
             return
-        # The one that has been silent longest stands first.
+        # Keep the longest silent client first.
         self._clients[client.fileno()] = self._clients.pop(client.fileno())
 
     def _dismiss(self, client: socket.socket) -> None:
@@ -163,7 +163,7 @@ class RequestSocket:
 
     @staticmethod
     def _send(client: socket.socket, answer: dict[str, Any]) -> bool:
-        """Send an answer; False to a client that does not fetch its answers, or has gone."""
+        """Send an answer; return False if the client does not read its answers or has disconnected."""
         try:
             client.send(json.dumps(answer).encode(), socket.MSG_NOSIGNAL)
         except OSError:
@@ -193,12 +193,12 @@ class RequestClient:
     """A connection to the device whose control socket is at `path`.
 
     Raises:
-        ServerAway: by each method, where there is no device, or it has gone, or does not answer.
-        RequestRefused: by each method, with the device's sentence.
+        ServerAway: by each method, if no device answers.
+        RequestRefused: by each method, with the device's message.
     """
 
     def __init__(self, path: Path, server: str) -> None:
-        """`server` names the device in sentences, as "segment"."""
+        """`server`: name of the device in messages, as "segment"."""
         self._path = path
         self._server = server
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -217,7 +217,7 @@ class RequestClient:
         self.close()
 
     def close(self) -> None:
-        """Leave; what was asked for stays as it is."""
+        """Disconnect; the effects of requests stay."""
         self._socket.close()
 
     def ask(self, request: dict[str, Any]) -> Any:

@@ -1,13 +1,14 @@
-"""A chain of virtual slaves: frames in and out, and the events that time brings."""
+"""A chain or tree of virtual slaves: processing of frames, and timed events."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-from rtcp.config.document import Finding, read
+from rtcp.config.document import read
+from rtcp.config.findings import Finding
 from rtcp.config.model import ConfigError
 from rtcp.config.segment import SegmentConfig, load_segment, place_of
 from rtcp.virtual.arm import VirtualArm, make_arm
@@ -21,30 +22,30 @@ from rtcp.virtual.wire import Miscount, Wire
 
 
 class Connection(NamedTuple):
-    """Where a slave hangs: behind which slave (its place, from 0; None: the master), at which of its ports."""
+    """Connection of a slave: index of the slave before it (None: the master), and that slave's port."""
 
     parent: int | None
     port: int = 1
 
 
 def chain(count: int) -> list[Connection]:
-    """Return the connections of slaves that hang one behind the other."""
+    """Return the connections of a chain of slaves."""
     return [Connection(None if place == 0 else place - 1) for place in range(count)]
 
 
 BRANCHES = (3, 1, 2)
-"""Ports behind which a frame goes after it came in at port 0 and was processed, in this order (ETG.1000.4, 4.3)."""
+"""Order of the ports that a frame takes after port 0 and processing (ETG.1000.4, 4.3)."""
 
 
 class Topology:
     """The slaves as a tree, in the order in which frames reach them.
 
-    Cable n leads to the slave at place n, from 0; in a chain it lies behind slave n, from 1. What is broken twice must
-    be joined twice.
+    Cable n leads to the slave at index n, from 0; in a chain it is the cable after slave n, counted from 1. Faults
+    count: a cable cut twice must be joined twice.
     """
 
     def __init__(self, slaves: Sequence[Slave], connections: Sequence[Connection]) -> None:
-        """Connect `slaves`; their `delay` is that of a frame that passes all of them."""
+        """Connect `slaves`; their `delay` is for a frame that passes all of them."""
         self._slaves = tuple(slaves)
         self._parents = [connection.parent for connection in connections]
         self._ports = [connection.port for connection in connections]
@@ -56,26 +57,26 @@ class Topology:
         self._outages = [0] * len(self._slaves)
         self._times = [cable.time for cable in lay_cables([slave.delay for slave in slaves], connections)]
         self.reached: tuple[Slave, ...] = ()
-        """Slaves that a frame reaches, in this order."""
+        """Slaves reached by a frame, in order."""
         self.returns = True
-        """Whether frames come back: False where the loop of a port without a link is open."""
+        """Whether frames return: False if the loop of a port without a link is open."""
         self.update()
 
     def cable_behind(self, place: int, port: int) -> int | None:
-        """Return the cable at a port of a slave; None: nothing hangs there."""
+        """Return the cable at a port of a slave, or None."""
         return self._children[place].get(port)
 
-    def way_to(self, cable: int) -> list[tuple[int, int]]:
-        """Return place and port of every slave between `cable` and the master, from the cable on."""
-        way: list[tuple[int, int]] = []
+    def path_to(self, cable: int) -> list[tuple[int, int]]:
+        """Return index and port of every slave from `cable` to the master."""
+        path: list[tuple[int, int]] = []
         place = cable
         while (parent := self._parents[place]) is not None:
-            way.append((parent, self._ports[place]))
+            path.append((parent, self._ports[place]))
             place = parent
-        return way
+        return path
 
     def last_behind(self, cable: int) -> int:
-        """Return the place of the last slave that a frame passes before it comes back over `cable`."""
+        """Return the index of the last slave that a frame passes before it returns over `cable`."""
         last = cable
         while self._children[last]:
             last = max(self._children[last].values())
@@ -106,7 +107,7 @@ class Topology:
         self.update()
 
     def _linked(self, cable: int | None) -> bool:
-        """Whether there is a cable, it is whole, and what is at both of its ends has supply."""
+        """Whether a cable exists, is whole, and has powered slaves at both ends."""
         if cable is None:
             return False
         if self._cuts[cable] or self._outages[cable]:
@@ -115,7 +116,7 @@ class Topology:
         return parent is None or not self._outages[parent]
 
     def update(self) -> None:
-        """Update ports and delays to the state of cables and supplies."""
+        """Update ports and delays after a change of cables or supplies."""
         for place, slave in enumerate(self._slaves):
             if not self._outages[place]:
                 children = self._children[place]
@@ -129,11 +130,11 @@ class Topology:
             slave.esc.loops_written = False
 
     def _passes(self, cable: int) -> bool:
-        """Whether the slave behind `cable` lets in what comes over it."""
+        """Whether the slave at the end of `cable` accepts frames from it."""
         return self._linked(cable) and not self._slaves[cable].esc.closed(0, True)
 
     def _visit(self, place: int, t: int, reached: list[Slave]) -> int | None:
-        """Follow a frame that comes to a slave at `t`; return when it leaves again at port 0, None: it is lost."""
+        """Trace a frame that reaches a slave at `t`; return the time at which it leaves port 0, None: it is lost."""
         slave = self._slaves[place]
         slave.delay = arrival = t
         reached.append(slave)
@@ -147,45 +148,45 @@ class Topology:
                 return None
             if not self._passes(cable):
                 continue
-            left = self._visit(cable, t + self._times[cable], reached)
-            if left is None:
+            left_at = self._visit(cable, t + self._times[cable], reached)
+            if left_at is None:
                 return None
-            t = left + self._times[cable]
+            t = left_at + self._times[cable]
             returns[port] = t - arrival
         if slave.esc.dc is not None:
             slave.esc.dc.returns = returns
         return t
 
     def restart(self, slave: Slave, t: int) -> None:
-        """Reset a slave's controller and device, as its supply going and coming back would."""
+        """Reset a slave's controller and device, as by a power cycle."""
         slave.power_off(t)
         slave.power_on(t)
         self.update()
 
 
 class Cable(NamedTuple):
-    """How long, ns, a frame takes over a cable, and when it comes to the slave at its end."""
+    """Delay of a cable, ns, and the arrival of a frame at its end."""
 
     time: int
     arrival: int
 
 
 def lay_cables(arrivals: Sequence[int | None], connections: Sequence[Connection]) -> list[Cable]:
-    """Return the cables to slaves at which a frame arrives at these instants, ns from the master.
+    """Return the cables for given arrivals of a frame at the slaves, ns from the master.
 
-    Where none is given (None) a cable takes `FURTHER_DELAY`, the first one none. A negative time: the frame would come
-    before it left the branches that it passes earlier.
+    Without an arrival (None) the delay is `FURTHER_DELAY`, or 0 for the first cable. A negative delay is invalid: the
+    frame would arrive before it left an earlier branch.
     """
     cables: list[Cable] = []
     leaves: list[int] = []
     for place, (parent, _) in enumerate(connections):
-        left = 0 if parent is None else leaves[parent]
+        leaves_at = 0 if parent is None else leaves[parent]
         usual = FURTHER_DELAY if place else 0
-        given = arrivals[place]
-        arrival = left + usual if given is None else given
-        cables.append(Cable(arrival - left, arrival))
+        arrival = arrivals[place]
+        arrival = leaves_at + usual if arrival is None else arrival
+        cables.append(Cable(arrival - leaves_at, arrival))
         leaves.append(arrival)
-        # From here it would go back to every slave before it, unless another one follows.
+        # The time at which the frame is back at each slave before it, unless another branch follows.
         t, child = arrival, place
         while (above := connections[child].parent) is not None:
             t += cables[child].time
@@ -195,53 +196,53 @@ def lay_cables(arrivals: Sequence[int | None], connections: Sequence[Connection]
 
 
 DELAYS = (0, 820, 1660, 2500, 3320, 4160, 5020)
-"""Propagation delays in ns from the master to the slaves of the robot."""
+"""Propagation delays from the master to the slaves of the robot, ns."""
 FURTHER_DELAY = 840
-"""What every slave after these adds, in ns."""
-IDLE_TICK = 1_000_000
-"""Longest time in ns between two looks at watchdogs and devices."""
-TOGETHER = 2_000
-"""SYNC0 pulses that lie within this many ns are handled at once."""
-REPLAYED_PULSES = 20
-"""SYNC0 pulses made up for after the process was stopped; older ones pass unseen."""
-BREATH = 50_000
-"""SYNC0 that comes faster than it can be followed is looked at again after so many ns: frames come first."""
+"""Additional delay of every further slave, ns."""
+IDLE_TICK: Final = 1_000_000
+"""Upper bound on the interval of checks of watchdogs and devices, ns."""
+TOGETHER: Final = 2_000
+"""SYNC0 pulses within this time are handled together, ns."""
+REPLAYED_PULSES: Final = 20
+"""Upper bound on SYNC0 pulses replayed after the process was stopped; older ones are skipped."""
+BREATH: Final = 50_000
+"""Pause of a SYNC0 that is too fast to follow, ns: frames have priority."""
 
 
 class Damage(NamedTuple):
-    """A cable that damages a frame when `strikes` says so; see `Topology` for its number."""
+    """A cable that damages a frame if `strikes` returns True; numbered as in `Topology`."""
 
     cable: int
     strikes: Callable[[], bool]
     back: bool = False
-    """Whether frames are damaged on their way back to the master."""
+    """True: frames are damaged on the return path to the master."""
 
 
 class Segment:
     """The slaves of a segment, driven by three calls.
 
-    `process` answers a frame in place, `settle` does what the frame asked of the slaves once the answer is on its way,
-    `tick` lets events in time happen. What takes long, the steps of the devices, waits in `step_one`, one at a time, so
-    that frames come in between. Instants are ns of the host's monotonic clock.
+    `process` answers a frame in place; `settle` executes its effects on the slaves after the answer is sent; `tick`
+    handles timed events. `step_one` executes queued steps of the devices, which take long, one at a time, so that
+    frames are answered in between. Instants are ns of the host's monotonic clock.
     """
 
     def __init__(self, slaves: Sequence[Slave], t: int, connections: Sequence[Connection] | None = None) -> None:
-        """Connect `slaves`; None: one behind the other."""
+        """Connect `slaves`; None: as a chain."""
         self.slaves = tuple(slaves)
         self.topology = Topology(self.slaves, chain(len(self.slaves)) if connections is None else connections)
         self.miscounts: list[Miscount] = []
         self.damages: list[Damage] = []
         self.arm: VirtualArm | None = None
-        """What the drives turn; None: each has its own load alone."""
+        """The arm moved by the drives; None: each drive has its own load."""
         self._attention: list[Slave] = []
         self._waiting: deque[Slave] = deque()
         self._next_tick = t + IDLE_TICK
         self.next_event = t + IDLE_TICK
-        """Instant of the next call of `tick` that is needed."""
+        """Instant of the next necessary call of `tick`."""
         self.rewire()
 
     def rewire(self) -> None:
-        """Route frames to the slaves that they reach now."""
+        """Route frames to the slaves that are reachable now."""
         self._wire = Wire(self.topology.reached, self.miscounts)
         for slave in self.slaves:
             slave.esc.on_attention = self._attention_of(slave)
@@ -254,13 +255,13 @@ class Segment:
         return call
 
     def process(self, frame: bytearray, size: int, t: int) -> bool:
-        """Answer a frame in place, see `Wire.process`; False: nothing comes back of it."""
+        """Answer a frame in place, see `Wire.process`; False: no answer."""
         if self.damages or not self._wire.slaves or not self.topology.returns:
             return self._process_faulty(frame, size, t)
         return self._wire.process(frame, size, t)
 
     def _process_faulty(self, frame: bytearray, size: int, t: int) -> bool:
-        """Answer a frame that may not come back, or not come far."""
+        """Answer a frame under faults of cables and slaves."""
         reached, returns = self.topology.reached, self.topology.returns
         damages = [damage for damage in tuple(self.damages) if self.slaves[damage.cable] in reached]
         struck = [damage for damage in damages if damage.strikes()]
@@ -275,7 +276,7 @@ class Segment:
             first.count(Register.RX_ERRORS + 1)
             self._forward_from(far + 1)
         else:
-            # The first that the frame meets on its way back.
+            # The first one on the frame's return path.
             last, cable = min((self.topology.last_behind(damage.cable), -damage.cable) for damage in struck)
             self._process_until(last + 1, frame, size, t)
             self._count_back(-cable)
@@ -283,7 +284,7 @@ class Segment:
         return False
 
     def _process_until(self, far: int, frame: bytearray, size: int, t: int) -> None:
-        """Let a frame be sound for the slaves before place `far` only."""
+        """Process a frame that is valid only for the slaves before index `far`."""
         sound = [slave for slave in self.topology.reached if slave in self.slaves[:far]]
         whole, self._wire = self._wire, Wire(sound, self.miscounts, passing=True)
         self._wire.process(frame, size, t)
@@ -291,14 +292,14 @@ class Segment:
         self._wire = whole
 
     def _forward_from(self, place: int) -> None:
-        """Let the slaves from `place` on count a frame that was damaged before it came to them."""
+        """Count a damaged frame at the slaves from index `place`."""
         for slave in self.topology.reached:
             if slave in self.slaves[place:]:
                 slave.esc.count(Register.FORWARDED_RX_ERRORS)
 
     def _count_back(self, cable: int) -> None:
-        """Let the slaves count a frame that was damaged on its way back over `cable`, each at the port it comes to."""
-        for n, (place, port) in enumerate(self.topology.way_to(cable)):
+        """Count a frame damaged on its return over `cable` at each slave's receiving port."""
+        for n, (place, port) in enumerate(self.topology.path_to(cable)):
             esc = self.slaves[place].esc
             if n:
                 esc.count(Register.FORWARDED_RX_ERRORS + port)
@@ -307,20 +308,20 @@ class Segment:
                 esc.count(Register.RX_ERRORS + 2 * port + 1)
 
     def settle(self, t: int) -> None:
-        """Do what the frames since the last call, the last of which arrived at `t`, asked of the slaves."""
+        """Execute the effects of the frames since the last call; the last one arrived at `t`."""
         for followers, reference, at in self._wire.references:
             for slave in followers:
                 if slave.clock is not None:
                     slave.clock.follow(at + slave.delay, reference)
         self._wire.references.clear()
-        if self._wire.done:
-            # A SYNC0 before this frame that nobody has noticed yet comes first.
+        if self._wire.completed:
+            # A pending SYNC0 before this frame comes first.
             if self.next_event <= t:
                 self.tick(t)
-            for plan in self._wire.done:
+            for plan in self._wire.completed:
                 for esc, manager in plan.written:
                     esc.on_outputs(manager, t)
-            self._wire.done.clear()
+            self._wire.completed.clear()
             for slave in self._wire.slaves:
                 if not slave.application.by_sync0:
                     slave.application.latch()
@@ -338,15 +339,15 @@ class Segment:
                 elif slave.esc.loops_written:
                     self.topology.update()
                     self.rewire()
-            self.look_at(t)
+            self.wake_at(t)
 
-    def look_at(self, t: int) -> None:
-        """See to it that a `tick` comes at `t`: something has changed that it has to follow."""
+    def wake_at(self, t: int) -> None:
+        """Request a `tick` at `t`, after a change that it must handle."""
         self._next_tick = min(self._next_tick, t)
         self.next_event = min(self.next_event, self._next_tick)
 
     def tick(self, now: int) -> None:
-        """Handle every SYNC0 up to `now`, and once a millisecond watchdogs and the devices that no SYNC0 steps."""
+        """Handle every SYNC0 up to `now`, and once a millisecond watchdogs and devices without SYNC0."""
         earliest = now + IDLE_TICK
         idle = now >= self._next_tick
         for slave in self.slaves:
@@ -369,7 +370,7 @@ class Segment:
         self.next_event = min(earliest, self._next_tick)
 
     def _pulse(self, slave: Slave, now: int) -> int | None:
-        """Handle the SYNC0 pulses of `slave` that are due at `now`; return the instant of its next one."""
+        """Handle the due SYNC0 pulses of `slave` at `now`; return the instant of its next one."""
         dc = slave.esc.dc
         if dc is None:
             return None
@@ -394,11 +395,11 @@ class Segment:
 
     @property
     def busy(self) -> bool:
-        """Whether devices wait to be stepped."""
+        """Whether steps of devices are queued."""
         return bool(self._waiting)
 
     def step_one(self) -> Slave | None:
-        """Step the device that has waited longest; return its slave."""
+        """Step the longest waiting device; return its slave."""
         if not self._waiting:
             return None
         slave = self._waiting.popleft()
@@ -412,17 +413,17 @@ class Segment:
 
 
 def default_delays(count: int) -> tuple[int, ...]:
-    """Propagation delays in ns for a chain of `count` slaves."""
+    """Return the propagation delays for a chain of `count` slaves, ns."""
     further = range(max(0, count - len(DELAYS)))
     return (DELAYS + tuple(DELAYS[-1] + FURTHER_DELAY * (n + 1) for n in further))[:count]
 
 
 def make_segment(config: SegmentConfig, t: int) -> Segment:
-    """Build the slaves that `config` lists; their clocks start at instant `t` (ns, CLOCK_MONOTONIC).
+    """Build the slaves of `config`; their clocks start at instant `t` (ns, CLOCK_MONOTONIC).
 
     Raises:
-        ConfigError: one sentence for each mistake: an unknown model or option, process data that are too long or map
-            what does not exist, or delays that fall along the chain.
+        ConfigError: one sentence for each mistake: unknown model or option, process data too long or with unknown
+            objects, delays that decrease along the chain.
     """
     devices: list[DeviceModel] = []
     findings: list[Finding] = []
@@ -435,23 +436,24 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
                 device.lay_out(index)
             devices.append(device)
         except OptionError as error:
-            findings += [(("slaves", i, *where), text) for where, text in error.findings]
+            findings += [finding.below("slaves", i) for finding in error.findings]
         except (SdoAbort, ValueError) as error:
-            findings.append((("slaves", i, key), f"the process data of {entry.label} cannot be laid out: {error}"))
+            text = f"the process data of {entry.label} cannot be laid out: {error}"
+            findings.append(Finding(("slaves", i, key), "process_data", text=text))
     connections, misplaced = _connections(config, devices if len(devices) == len(config.slaves) else None)
     findings += misplaced
     arrivals: list[int | None] = [entry.delay_ns for entry in config.slaves]
     if [connection.parent for connection in connections] == [None, *range(len(arrivals) - 1)]:
         usual = default_delays(len(arrivals))
-        arrivals = [own if given is None else given for given, own in zip(arrivals, usual, strict=True)]
+        arrivals = [own if arrival is None else arrival for arrival, own in zip(arrivals, usual, strict=True)]
     cables = [] if misplaced else lay_cables(arrivals, connections)
     for i, cable in enumerate(cables):
         if cable.time < 0:
             before = cable.arrival - cable.time
             text = f"found {cable.arrival} ns, allowed is at least the {before} ns of the slave before it"
-            findings.append((("slaves", i, "delay_ns"), text))
+            findings.append(Finding(("slaves", i, "delay_ns"), "delay_falls", text=text))
     if findings:
-        raise ConfigError(read(config.source).sentences(findings))
+        raise ConfigError(read(config.source).placed(findings))
     drifts = [entry.drift_ppm for entry in config.slaves]
     aliases = [entry.alias for entry in config.slaves]
     slaves = make_slaves(devices, drifts, [cable.arrival for cable in cables], aliases, t)
@@ -467,10 +469,10 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
 def _connections(
     config: SegmentConfig, devices: Sequence[DeviceModel] | None
 ) -> tuple[list[Connection], list[Finding]]:
-    """Return where each slave hangs, and what is wrong with that; without `devices` ports are not looked at."""
+    """Return the connection of each slave, and the mistakes; without `devices` ports are not checked."""
     connections: list[Connection] = []
     findings: list[Finding] = []
-    taken: dict[Connection, int] = {}
+    places: dict[Connection, int] = {}
     for i, entry in enumerate(config.slaves):
         parent = i - 1 if entry.after is None else place_of(entry.after, config.slaves[:i])
         if parent is None or i == 0:
@@ -479,19 +481,20 @@ def _connections(
         label = f"slave {parent + 1} ({config.slaves[parent].label})"
         physics = "" if devices is None else devices[parent].physics[:4]
         ports = [port for port, kind in enumerate(physics) if port and kind != " "]
-        made = Connection(parent, entry.port or (1 if 1 in ports or not ports else ports[0]))
-        connections.append(made)
-        if devices is not None and made.port not in ports:
-            text = f"found {made.port}, but {label} has {_listed(ports)} to hang something at"
-            findings.append((("slaves", i, "port"), text))
-        elif taken.setdefault(made, i) != i:
-            text = f"found {made.port} of {label}, where slave {taken[made] + 1} hangs already"
-            findings.append((("slaves", i, "port"), text))
+        connection = Connection(parent, entry.port or (1 if 1 in ports or not ports else ports[0]))
+        connections.append(connection)
+        if devices is not None and connection.port not in ports:
+            text = f"found {connection.port}, but {label} has {_listed(ports)} to hang something at"
+            findings.append(Finding(("slaves", i, "port"), "no_port", text=text))
+        elif places.setdefault(connection, i) != i:
+            text = f"found {connection.port} of {label}, where slave {places[connection] + 1} hangs already"
+            findings.append(Finding(("slaves", i, "port"), "port_taken", text=text))
     if not findings:
         for expected, place in enumerate(_wire_order(connections)):
             if place != expected:
                 text = f"frames come to this slave before slave {expected + 1} ({config.slaves[expected].label})"
-                return connections, [(("slaves", place, "after"), f"{text}: list it before that one")]
+                text = f"{text}: list it before that one"
+                return connections, [Finding(("slaves", place, "after"), "order", text=text)]
     return connections, findings
 
 
@@ -500,21 +503,21 @@ def _listed(ports: Sequence[int]) -> str:
 
 
 def _wire_order(connections: Sequence[Connection]) -> list[int]:
-    """Return the places of the slaves in the order in which frames come to them."""
+    """Return the indices of the slaves in the order of a frame's path."""
     order: list[int] = []
     waiting = [0]
     while waiting:
         place = waiting.pop()
         order.append(place)
-        children = [other for other, connection in enumerate(connections) if connection.parent == place]
-        waiting += sorted(children, key=lambda other: BRANCHES.index(connections[other].port), reverse=True)
+        children = [child for child, connection in enumerate(connections) if connection.parent == place]
+        waiting += sorted(children, key=lambda child: BRANCHES.index(connections[child].port), reverse=True)
     return order
 
 
 def check_segment(path: Path) -> None:
-    """Check that a segment can be made of the file.
+    """Check that a segment can be built from the file.
 
     Raises:
-        ConfigError: one sentence for each mistake: file, line, key, what was found and what is allowed.
+        ConfigError: one sentence for each mistake: file, line, key, value, allowed values.
     """
     make_segment(load_segment(path), 0)

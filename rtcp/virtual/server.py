@@ -1,4 +1,4 @@
-"""The segment's process: a raw socket on its end of the cable, and a loop that answers first and works after."""
+"""The segment's process: a raw socket on its end of the cable, and a loop that answers frames before other work."""
 
 from __future__ import annotations
 
@@ -36,50 +36,50 @@ SOL_PACKET = 263
 PACKET_IGNORE_OUTGOING = 23
 PACKET_AUXDATA = 8
 VLAN_AT = 12
-"""Place of a VLAN tag: before the EtherType."""
+"""Offset of a VLAN tag: before the EtherType."""
 AUXDATA = struct.Struct("=IIIHHHH")
 """`struct tpacket_auxdata`: status, lengths, offsets, VLAN TCI and TPID (packet(7))."""
 TP_STATUS_VLAN_VALID = 0x10
 ANCILLARY = socket.CMSG_SPACE(TIMESPEC.size) + socket.CMSG_SPACE(AUXDATA.size)
 BUFFER = 2048
 OLDEST = 1_000_000_000
-"""A receive time stamp more than this many ns old, or from the future, means that the wall clock was set: not used."""
+"""Upper bound on the age of a receive time stamp, ns; an older or future one means that the wall clock was set."""
 RECEIVE_BUFFER = 1 << 20
 STALE = 4_000_000
-"""A frame that waited this many ns, because the process was stopped, reaches the slaves but does not come back: SOEM
-has 16 frame numbers, would take an answer from the last round for the present one, and stay a round behind for ever."""
+"""Age above which a frame (the process was stopped) reaches the slaves but gets no answer, ns: SOEM has 16 frame
+numbers, would take an answer of the last round for the present one, and stay a round behind for ever."""
 REST_WINDOW = 2_000_000
 REST_MARGIN = 1.5
-"""The kernel stops a SCHED_FIFO thread that takes more than `sched_rt_runtime_us` of the CPU for the rest of each
-`sched_rt_period_us`. The server therefore sleeps in each window (ns) for the share that is left, times this margin."""
+"""Margin factor on the sleep in each window of REST_WINDOW ns: the kernel stops a SCHED_FIFO thread that uses more than
+`sched_rt_runtime_us` of each `sched_rt_period_us` of the CPU, so the server itself sleeps for the remaining share."""
 RT_LIMITS = Path("/proc/sys/kernel")
 SILENCE = 20_000_000
-"""Without frames for this many ns polling stops until the next one comes."""
+"""Time without frames after which polling stops until the next one, ns."""
 LOOK = 1_000_000
-"""The control socket is looked at no more often than once in so many ns."""
+"""Shortest interval between polls of the control socket, ns."""
 
 Ancillary = list[tuple[int, int, bytes]]
 Ready = Callable[[dict[str, int | str | bool]], None]
 
 
 class StopRequest:
-    """A handler of signals that remembers that one came."""
+    """A signal handler that stores a request to stop."""
 
     def __init__(self) -> None:
-        self.came = False
+        self.requested = False
 
     def __call__(self, number: int, at: FrameType | None) -> None:
-        """The signal has come."""
-        self.came = True
+        """Handle the signal."""
+        self.requested = True
 
 
 class Server:
-    """Answers frames on one interface, but for what the faults of its `registry` do to them."""
+    """Answers frames on an interface, subject to the faults of its `registry`."""
 
     def __init__(self, segment: Segment, interface: str, truth: GroundTruth, script: Sequence[Planned] = ()) -> None:
         self.segment = segment
         self._truth = truth
-        # A socket for one EtherType gets tagged frames without their tag; this one gets everything.
+        # A socket for one EtherType receives tagged frames without their tag; this one receives everything.
         self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETH_P_ALL))
         self._socket.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
         self._socket.setblocking(False)
@@ -94,14 +94,14 @@ class Server:
         self._socket.close()
 
     def _send(self, frame: bytes | memoryview) -> None:
-        # A full queue of the interface loses the frame, as a cable would.
+        # A full queue of the interface loses the frame, like a cable.
         with suppress(BlockingIOError):
             self._socket.send(frame)
 
-    def serve(self, stop: StopRequest, poll: bool, control: Control | None = None, rest: float = 0.0) -> None:
-        """Answer frames until `stop` came; with `poll` wait for the next frame without sleeping.
+    def serve(self, stop: StopRequest, poll: bool, control: Control | None = None, sleep_share: float = 0.0) -> None:
+        """Answer frames until `stop` is requested; with `poll` wait for frames without sleeping.
 
-        `rest` is the share of the time that the process sleeps at least, see `rest_share`.
+        `sleep_share`: least share of the time to sleep, see `rest_share`.
         """
         segment, registry, truth = self.segment, self.registry, self._truth
         frames = registry.frames
@@ -111,10 +111,10 @@ class Server:
         descriptors = [self._socket.fileno()]
         monotonic, wait = time.monotonic_ns, select.select
         arrived = 0
-        look_at = FOR_EVER if control is None else 0
-        budget = RestBudget(rest, monotonic())
+        poll_at = FOR_EVER if control is None else 0
+        budget = RestBudget(sleep_share, monotonic())
         window_end = budget.window_end
-        while not stop.came:
+        while not stop.requested:
             try:
                 size, ancillary, _, _ = receive([view], ANCILLARY)
             except BlockingIOError:
@@ -139,23 +139,23 @@ class Server:
             due = segment.next_event
             if due <= now:
                 segment.tick(now)
-                # At least once in segment.IDLE_TICK, and never before a frame that waits.
-                if control is not None and look_at <= now:
-                    look_at = now + LOOK
-                    control.look()
+                # At least once per segment.IDLE_TICK, and never before a waiting frame.
+                if control is not None and poll_at <= now:
+                    poll_at = now + LOOK
+                    control.poll()
             elif segment.busy:
                 stepped = segment.step_one()
                 if truth.watching and stepped is not None:
-                    truth.look(stepped, now)
+                    truth.update(stepped, now)
             elif not poll or now - arrived > SILENCE:
                 wait(descriptors, (), (), max(0, min(due, registry.due) - now) * 1e-9)
                 budget.slept += monotonic() - now
             elif now > window_end + REST_WINDOW:
-                # Only where frames are rare: right after a frame the sleep delays none.
+                # Only if frames are rare: right after a frame the sleep delays none.
                 window_end = budget.rest(now)
 
     def _answer_slowly(self, frame: bytearray, size: int, arrived: int, ancillary: Ancillary) -> None:
-        """Answer a frame that faults act on, or one with a VLAN tag, which the kernel keeps apart from the frame."""
+        """Answer a frame under faults, or one with a VLAN tag, which the kernel delivers separately."""
         content, tag = frame, _tagged(ancillary)
         if tag:
             content = frame[:VLAN_AT] + tag + frame[VLAN_AT:size]
@@ -168,9 +168,9 @@ class Server:
 
 
 class RestBudget:
-    """Time that the process must sleep so that the kernel does not throttle it. Instants in ns.
+    """Bookkeeping of the sleep that avoids throttling by the kernel. Instants in ns.
 
-    `slept` counts the time asleep in the window that ends at `window_end`.
+    `slept`: time asleep in the window that ends at `window_end`.
     """
 
     def __init__(self, share: float, now: int) -> None:
@@ -179,7 +179,7 @@ class RestBudget:
         self.window_end = now + REST_WINDOW if self._least else FOR_EVER
 
     def rest(self, now: int) -> int:
-        """Sleep for what is missing at the end of a window; return the end of the next one."""
+        """Sleep the missing time at the end of a window; return the end of the next one."""
         passed = now - self.window_end + REST_WINDOW
         missing = min(self._least * passed // REST_WINDOW, REST_WINDOW) - self.slept
         if missing > 0:
@@ -190,7 +190,7 @@ class RestBudget:
 
 
 def rest_share() -> float:
-    """Return the share of the time that this process must sleep: 0 without SCHED_FIFO or without throttling."""
+    """Return the share of the time to sleep: 0 without SCHED_FIFO or without throttling."""
     if os.sched_getscheduler(0) != os.SCHED_FIFO:
         return 0.0
     try:
@@ -207,9 +207,9 @@ def _complain(sentence: str) -> None:
 
 
 def arrival(ancillary: Ancillary, previous: int) -> int:
-    """The instant (CLOCK_MONOTONIC, ns) at which a frame arrived, by the kernel's receive time stamp.
+    """Return the arrival of a frame (CLOCK_MONOTONIC, ns) from the kernel's receive time stamp.
 
-    Never before that of the frame before it: a process that stalls between its two clocks finds an instant too early.
+    Never before that of the previous frame: a stall between reading the two clocks gives too early an instant.
     """
     now = time.monotonic_ns()
     if ancillary:
@@ -221,7 +221,7 @@ def arrival(ancillary: Ancillary, previous: int) -> int:
 
 
 def _tagged(ancillary: Ancillary) -> bytes:
-    """The VLAN tag (IEEE 802.1Q) that the kernel has taken out of a frame; empty where there was none."""
+    """Return the VLAN tag (IEEE 802.1Q) that the kernel has removed from a frame; empty: none."""
     if len(ancillary) < 2 or not ancillary[1][2][0] & TP_STATUS_VLAN_VALID:
         return b""
     tci: int = AUXDATA.unpack_from(ancillary[1][2])[5]
@@ -236,12 +236,12 @@ def _run_on(cpu: int) -> None:
 
 
 def request_prompt_scheduling() -> None:
-    """Ask for SCHED_FIFO and locked memory; without the right to them the process runs on as it is."""
+    """Request SCHED_FIFO and locked memory; no effect without the rights."""
     libc = ctypes.CDLL(None)
     libc.prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    # Reclaimed pages of the interpreter's own text would cost milliseconds to read back; refused, it does without.
+    # Reading back reclaimed pages of the interpreter's text would take milliseconds. Refusal is harmless.
     libc.mlockall(MCL_CURRENT | MCL_FUTURE)
     gc.collect()
     gc.freeze()
@@ -252,10 +252,10 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
         control_path: Path | None = None, script_path: Path | None = None) -> None:  # fmt: skip
     """Run a segment until SIGTERM or SIGINT.
 
-    `interface` names the master's end in the caller's network; None: everything in a namespace of the segment's own.
-    `poll` hardly sleeps while frames come, best with a `cpu` of its own. `ready` is called once with "pid",
-    "interface", "namespace" and "slaves" when frames are answered. At `control_path` faults can be asked for; those of
-    the script begin by themselves.
+    `interface` names the master's end in the caller's network; None: both ends in the segment's own namespace. `poll`
+    hardly sleeps during traffic, best with a dedicated `cpu`. `ready` is called once with "pid", "interface",
+    "namespace" and "slaves" when frames are answered. `control_path` accepts requests for faults; those of the script
+    begin by themselves.
 
     Raises:
         ConfigError, ValueError, NetworkError: with sentences for the user.
@@ -265,23 +265,23 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
     if cpu is not None:
         _run_on(cpu)
     stop = StopRequest()
-    with ExitStack() as kept:
+    with ExitStack() as resources:
         if any(slave.behaviour is not None for slave in config.slaves):
-            kept.enter_context(WATCH.started())
+            resources.enter_context(WATCH.started())
         segment = make_segment(config, time.monotonic_ns())
         signal.signal(signal.SIGTERM, stop)
         signal.signal(signal.SIGINT, stop)
-        listener = None if control_path is None else kept.enter_context(control_socket(control_path))
+        listener = None if control_path is None else resources.enter_context(control_socket(control_path))
         pair = private_pair() if interface is None else public_pair(interface)
-        master_end, segment_end, bring_up = kept.enter_context(pair)
+        master_end, segment_end, bring_up = resources.enter_context(pair)
         truth = GroundTruth(segment, [slave.label for slave in config.slaves])
         server = Server(segment, segment_end, truth, script)
-        kept.callback(server.close)
+        resources.callback(server.close)
         control = None if listener is None else Control(listener, server.registry, truth)
         if control is not None:
-            kept.callback(control.close)
+            resources.callback(control.close)
         request_prompt_scheduling()
-        # A master that finds its interface up finds the slaves answering.
+        # Last, so that a master with its interface up finds answering slaves.
         bring_up()
         ready({
             "pid": os.getpid(),

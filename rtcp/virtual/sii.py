@@ -29,7 +29,7 @@ _END = 0xFFFF
 _ERASED = b"\xff"
 _CONFIG = struct.Struct("<5H4x")
 _CONTROL = 0x0080
-"""PDI control: on-chip bus, for there is no other processor interface here (ETG.2010, table 2)."""
+"""PDI control: on-chip bus, for lack of a processor interface (ETG.2010, table 2)."""
 _SYNC_PULSE = 100
 """Length of a SYNC pulse in units of 10 ns."""
 _IDENTITY = struct.Struct("<4L")
@@ -43,7 +43,7 @@ _VERSION = 1
 _SMALLEST_KBIT = 16
 _GENERAL = struct.Struct("<4Bx5BxBhxx2H12x")
 _PORTS = 0x0011
-"""Ports 0 and 1 are MII, the others absent; one nibble a port."""
+"""Ports 0 and 1 are MII, the others absent; one nibble per port."""
 _SYNC_MANAGER = struct.Struct("<HHBBBB")
 _PDO = struct.Struct("<HBBBBH")
 _PDO_ENTRY = struct.Struct("<HBBBBH")
@@ -67,7 +67,7 @@ class Category(IntEnum):
 
 
 class CoeDetail(IntFlag):
-    """What a device can do over CoE (ETG.1000.6, table 21)."""
+    """CoE details (ETG.1000.6, table 21)."""
 
     SDO = 0x01
     SDO_INFORMATION = 0x02
@@ -78,7 +78,7 @@ class CoeDetail(IntFlag):
 
 
 class FmmuUse(IntEnum):
-    """What an FMMU is for (ETG.1000.6, table 23)."""
+    """Use of an FMMU (ETG.1000.6, table 23)."""
 
     OUTPUTS = 1
     INPUTS = 2
@@ -96,14 +96,14 @@ class _Strings:
         self._numbers: dict[bytes, int] = {}
 
     def number(self, text: str) -> int:
-        """Return the number of `text`, which becomes a string of the image; 0 where there is no room for another."""
+        """Add `text` to the strings of the image and return its number; 0: no room for another."""
         encoded = text.encode("ascii", "replace")[:255]
         if not encoded or (encoded not in self._numbers and len(self._numbers) == 255):
             return 0
         return self._numbers.setdefault(encoded, len(self._numbers) + 1)
 
     def content(self) -> bytes:
-        """Return the category: the number of strings, and each with its length before it."""
+        """Return the category: the number of strings, then each with a leading length."""
         parts = (bytes((len(text),)) + text for text in self._numbers)
         return bytes((len(self._numbers),)) + b"".join(parts)
 
@@ -111,12 +111,12 @@ class _Strings:
 def build_sii(device: DeviceModel, layout: SyncManagerLayout, alias: int) -> bytes:
     """Return the whole EEPROM image of `device`, a power of two of bytes; words are little endian.
 
-    The PDO categories and the lengths of SM2 and SM3 are those of the PDO assignment at the time of the call.
-    `alias` is the configured station alias.
+    The PDO categories and the lengths of SM2 and SM3 follow the PDO assignment at the time of the call. `alias` is the
+    configured station alias.
 
     Raises:
-        SdoAbort: the device's PDO objects name objects that do not exist or may not be mapped.
-        ValueError: its process data are longer than a sync manager's buffer.
+        SdoAbort: a PDO object refers to an unknown or unmappable object.
+        ValueError: the process data exceed a sync manager's buffer.
     """
     categories = b"".join(_category(number, content) for number, content in _contents(device, layout))
     body = categories + struct.pack("<H", _END)
@@ -133,7 +133,7 @@ def _head(device: DeviceModel, layout: SyncManagerLayout, alias: int, kbit: int)
     identity = device.identity
     receive, send = layout.mailbox_receive, layout.mailbox_send
     protocols = sum(_PROTOCOLS[protocol] for protocol in {MailboxType.COE, *device.mailbox_protocols})
-    # The bootstrap mailboxes are 0: there is no BOOT state.
+    # The bootstrap mailboxes are 0: no BOOT state.
     head = (
         configuration
         + struct.pack("<H", crc(configuration))
@@ -144,13 +144,13 @@ def _head(device: DeviceModel, layout: SyncManagerLayout, alias: int, kbit: int)
 
 
 def _category(number: Category, content: bytes) -> bytes:
-    """Return a category with its header; its length counts words."""
+    """Return a category with its header, which has its length in words."""
     content += bytes(len(content) % 2)
     return struct.pack("<HH", number, len(content) // 2) + content
 
 
 def _contents(device: DeviceModel, layout: SyncManagerLayout) -> Iterable[tuple[Category, bytes]]:
-    """Return the categories in order; those of a device without PDOs of a direction or without DC are left out."""
+    """Return the categories in order, without those of absent PDOs or DC."""
     strings = _Strings()
     # SOEM and others take string 1 as the name.
     strings.number(device.identity.name)
@@ -182,34 +182,34 @@ def _general(device: DeviceModel, strings: _Strings) -> bytes:
 
 
 def _coe_details(objects: ObjectDictionary) -> CoeDetail:
-    """Return what the device can do over CoE; its PDOs can be assigned and configured where they can be written."""
+    """Return the CoE details; writable PDO objects count as assignable and configurable."""
     details = _COE_DETAILS
     if any(objects[index, 0].access & Access.WO for index in (RX_ASSIGN, TX_ASSIGN)):
         details |= CoeDetail.PDO_ASSIGN
-    for found in objects:
-        if (found.index in RX_MAPPINGS or found.index in TX_MAPPINGS) and found.entries[0].access & Access.WO:
+    for obj in objects:
+        if (obj.index in RX_MAPPINGS or obj.index in TX_MAPPINGS) and obj.entries[0].access & Access.WO:
             details |= CoeDetail.PDO_CONFIGURATION
     return details
 
 
 def _sync_manager(objects: ObjectDictionary, sm: SyncManager) -> bytes:
-    """Return one sync manager (ETG.1000.6, table 24), the length of process data by the assignment."""
+    """Return a sync manager (ETG.1000.6, table 24), with the length of the assigned process data."""
     assignment = {SyncManagerType.OUTPUTS: RX_ASSIGN, SyncManagerType.INPUTS: TX_ASSIGN}.get(sm.type)
     length = sm.length if assignment is None else PdoImage.from_assignment(objects, assignment).byte_length
     return _SYNC_MANAGER.pack(sm.start, length, sm.control, 0, sm.activate, sm.type)
 
 
 def _pdos(objects: ObjectDictionary, mappings: range, assignment: int, strings: _Strings) -> bytes:
-    """Return the PDOs of one direction, by their mapping objects (ETG.1000.6, table 25)."""
+    """Return the PDOs of a direction from their mapping objects (ETG.1000.6, table 25)."""
     assigned = listed(objects, assignment)
     content = b""
-    for found in objects:
-        if found.index not in mappings:
+    for obj in objects:
+        if obj.index not in mappings:
             continue
-        mapped = listed(objects, found.index)
-        # 0x1C10 + n assigns the PDOs of sync manager n.
-        sync_manager = assignment - 0x1C10 if found.index in assigned else _NOT_ASSIGNED
-        content += _PDO.pack(found.index, len(mapped), sync_manager, 0, strings.number(found.name), 0)
+        mapped = listed(objects, obj.index)
+        # 0x1C10 + n is the PDO assignment of sync manager n.
+        sync_manager = assignment - 0x1C10 if obj.index in assigned else _NOT_ASSIGNED
+        content += _PDO.pack(obj.index, len(mapped), sync_manager, 0, strings.number(obj.name), 0)
         for mapping in mapped:
             index, subindex, bits = split_mapping(mapping)
             name, data_type = 0, 0
@@ -221,7 +221,7 @@ def _pdos(objects: ObjectDictionary, mappings: range, assignment: int, strings: 
 
 
 def _dc(strings: _Strings) -> bytes:
-    """Return the operation modes with SYNC0 and without it (ETG.2010, table 15); the master chooses the cycle."""
+    """Return the operation modes with and without SYNC0 (ETG.2010, table 15); the master chooses the cycle."""
     synchron = _DC_MODE.pack(0, 0, 0, 0, _DC_SYNC0, 1, strings.number("DC Synchron"), 0)
     free = _DC_MODE.pack(0, 0, 0, 0, 0, 0, strings.number("SM Synchron"), 0)
     return synchron + free
@@ -230,7 +230,7 @@ def _dc(strings: _Strings) -> bytes:
 READ_8_BYTES = 0x0040
 TWO_ADDRESS_BYTES = 0x0080
 LARGEST_OF_ONE_ADDRESS_BYTE = 2048
-"""Bytes of an EEPROM of 16 kbit; larger ones take addresses of two bytes (ETG.1000.4, 0x0502 bit 7)."""
+"""Size of a 16 kbit EEPROM, bytes; larger ones have two address bytes (ETG.1000.4, 0x0502 bit 7)."""
 WRITE_ENABLE = 0x0001
 COMMAND_MASK = 0x0700
 READ = 0x0100
@@ -241,20 +241,20 @@ COMMAND_ERROR = 0x2000
 WRITE_ENABLE_ERROR = 0x4000
 BUSY = 0x8000
 BUSY_NS = {READ: 20_000, RELOAD: 20_000, WRITE: 500_000}
-"""How long a command keeps the interface busy, in ns."""
+"""Duration of each command, ns."""
 CONFIGURATION_BYTES = 14
-"""Bytes that the checksum in word 7 covers (ETG.1000.6, table 16)."""
+"""Bytes covered by the checksum in word 7 (ETG.1000.6, table 16)."""
 ALIAS_WORD = 4
 
 
 class EepromInterface:
-    """Serves the EEPROM registers in `memory`; `writable` opens and closes them for the master with their ownership."""
+    """Serves the EEPROM registers in `memory`; their ownership sets the master's rights in `writable`."""
 
     def __init__(self, memory: bytearray, writable: bytearray, image: bytes) -> None:
         self._memory = memory
         self._writable = writable
         self.image = bytearray(image)
-        """The EEPROM's content, word addressed, little endian; kept through the life of the process."""
+        """Content of the EEPROM, word addressed, little endian; kept for the life of the process."""
         self._busy_until = 0
         self._command = 0
         self._errors = 0
@@ -262,7 +262,7 @@ class EepromInterface:
         self._store_status()
 
     def write_config(self) -> None:
-        """0x0500 was written: the interface is the master's (0) or the device's (1); bit 1 takes it back by force."""
+        """Handle a write to 0x0500: owner is the master (0) or the device (1); bit 1 forces it back."""
         config = self._memory[Register.EEPROM_CONFIG]
         if config & 0x02:
             self._memory[Register.EEPROM_PDI_ACCESS] = 0
@@ -277,14 +277,14 @@ class EepromInterface:
         self._memory[high] = self._memory[high] & ~((BUSY | COMMAND_MASK) >> 8) | running
 
     def write_control(self, t: int) -> None:
-        """0x0502 was written at instant `t`: carry the command out."""
+        """Execute the command written to 0x0502 at instant `t`."""
         memory = self._memory
         control = int.from_bytes(memory[Register.EEPROM_CONTROL : Register.EEPROM_CONTROL + 2], "little")
         command = control & COMMAND_MASK
         word = int.from_bytes(memory[Register.EEPROM_ADDRESS : Register.EEPROM_ADDRESS + 4], "little")
         self._errors &= CHECKSUM_ERROR
         if t < self._busy_until:
-            # The command that runs continues; a new one is lost.
+            # A running command continues; a new one is lost.
             self._errors |= COMMAND_ERROR if command else 0
         else:
             self._command = command
@@ -302,7 +302,7 @@ class EepromInterface:
 
     def _read(self, word: int) -> None:
         data = self.image[2 * word : 2 * word + 8]
-        # An EEPROM answers every address; erased cells read as ones.
+        # An EEPROM answers to every address; erased cells read as ones.
         self._memory[Register.EEPROM_DATA : Register.EEPROM_DATA + 8] = bytes(data).ljust(8, b"\xff")
 
     def _write(self, word: int, enabled: bool) -> None:
@@ -314,7 +314,7 @@ class EepromInterface:
             self.image[2 * word : 2 * word + 2] = self._memory[Register.EEPROM_DATA : Register.EEPROM_DATA + 2]
 
     def _reload(self) -> None:
-        """Load PDI control and station alias from the EEPROM, if its checksum is right."""
+        """Load PDI control and station alias from the EEPROM if its checksum is correct."""
         self._errors = 0
         if len(self.image) < 16 or self.image[CONFIGURATION_BYTES] != crc(bytes(self.image[:CONFIGURATION_BYTES])):
             self._errors = CHECKSUM_ERROR

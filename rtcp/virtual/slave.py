@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
+from typing import Final
 
 from rtcp.virtual.al_state import HELD, AlStatusCode, SyncMonitor, first_failure, judge
 from rtcp.virtual.device import DeviceModel, SlaveFaults
@@ -14,29 +15,32 @@ from rtcp.virtual.pdo import PdoImage, SyncManagerLayout
 from rtcp.virtual.protocol import ERROR_FLAG, SM_SIZE, STATE_MASK, AlState, Register
 from rtcp.virtual.sii import build_sii
 
+_OP: Final = int(AlState.OP)
+_SAFE_OP: Final = int(AlState.SAFE_OP)
+"""Plain ints: comparisons of enums are too slow for every step."""
 OP_TIMEOUT = 1_000_000_000
-"""How long, in ns, a slave asked for OP waits in SAFE-OP for its first outputs and SYNC0 before it refuses."""
-LONGEST_STEP = 2_000_000
-"""Longest time in ns that a device is let pass in one step."""
-MOST_STEPS = 20
-"""Steps made up for after the process was stopped; what is older than these is dropped."""
+"""Upper bound on the wait in SAFE-OP for the first outputs and SYNC0 after a request for OP, ns."""
+LONGEST_STEP: Final = 2_000_000
+"""Upper bound on a step of a device, ns."""
+MOST_STEPS: Final = 20
+"""Upper bound on steps replayed after the process was stopped; older time is dropped."""
 _EMPTY = PdoImage(())
 
 
 class ProcessData:
-    """A sync manager of process data with its image and, of outputs, what the device has taken over last."""
+    """A sync manager of process data with its image and, for outputs, the last latched buffer."""
 
     __slots__ = ("image", "latched", "manager", "single")
 
     def __init__(self, manager: SyncManager, single: bool) -> None:
         self.manager = manager
         self.single = single
-        """Whether it has one buffer, which is empty once it was read, and not three."""
+        """True: a single buffer, empty after it was read; False: three buffers."""
         self.image = _EMPTY
         self.latched = b""
 
     def pack(self) -> None:
-        """Put the inputs where the master reads them; into a single buffer once it was read."""
+        """Write the inputs to the buffer; a single buffer only after it was read."""
         manager, image = self.manager, self.image
         if manager.length != image.byte_length:
             return
@@ -49,7 +53,7 @@ class ProcessData:
 
 
 class Application:
-    """One slave's firmware. Everything it does happens in `attend`, `watch`, `pulse` and `advance`.
+    """A slave's firmware, called by `attend`, `watch`, `pulse` and `advance`.
 
     Instants are ns of the host's monotonic clock.
     """
@@ -66,17 +70,17 @@ class Application:
             for indices in (roles.outputs, roles.inputs)
         )
         self._emulated = not self._mailboxes and bool(esc.memory[Register.PDI_CONTROL + 1] & DEVICE_EMULATION)
-        """Whether there is no firmware: the controller itself follows every request (ETG.1000.4, 6.1.4)."""
+        """True: no firmware; the controller itself follows every request (ETG.1000.4, 6.1.4)."""
         self._fed: int | None = None
         self._missing: set[int] = set()
-        """Sync managers of outputs that nothing has been written to."""
+        """Output sync managers not written yet."""
         self._op_wanted_at: int | None = None
         self._error = False
         self._stepped_at = t
         self.outputs_watch: Callable[[memoryview, int], None] | None = None
-        """Called with the outputs and their arrival in OP."""
+        """Called in OP with the outputs and their arrival."""
         self.sync = SyncMonitor(esc, device)
-        self.state = AlState.INIT
+        self._level: int = AlState.INIT
         esc.on_outputs = self.outputs_written
         for data in self._outputs + self._inputs:
             data.manager.process_data = True
@@ -91,14 +95,19 @@ class Application:
                 esc.sync_managers[index].lock(True)
 
     @property
-    def by_sync0(self) -> bool:
-        """Whether the device is stepped by SYNC0 now."""
-        return self.state >= AlState.SAFE_OP and self.sync.active
+    def state(self) -> AlState:
+        """The AL state."""
+        return AlState(self._level)
 
-    # What the master did
+    @property
+    def by_sync0(self) -> bool:
+        """Whether SYNC0 steps the device."""
+        return self._level >= _SAFE_OP and self.sync.active
+
+    # Actions of the master
 
     def attend(self, t: int) -> None:
-        """Look at what the master wrote or read: AL control, sync managers, mailboxes."""
+        """React to accesses of the master: AL control, sync managers, mailboxes."""
         esc = self.esc
         if esc.sync_managers_written:
             esc.sync_managers_written = False
@@ -112,14 +121,14 @@ class Application:
                 self._mailbox.serve(self.state, t)
 
     def outputs_written(self, manager: SyncManager, t: int) -> None:
-        """A buffer of outputs was completed by a frame that arrived at `t`."""
+        """Handle a complete output buffer from a frame that arrived at `t`."""
         if not manager.process_data:
             return
         if self._missing:
             self._missing.discard(manager.index)
         if self._outputs and manager is self._outputs[0].manager:
-            self.sync.outputs_came()
-            if self.outputs_watch is not None and self.state == AlState.OP:
+            self.sync.outputs_arrived()
+            if self.outputs_watch is not None and self._level == _OP:
                 self.outputs_watch(manager.buffer, t)
         if manager.watchdog_trigger:
             if self._fed is None:
@@ -136,7 +145,7 @@ class Application:
             self._follow(request)
             return
         if self._error:
-            # Until it is acknowledged an error keeps the slave where it is, but for INIT (ETG.1000.6, 6.4.1.4).
+            # An unacknowledged error keeps the slave in its state, except for INIT (ETG.1000.6, 6.4.1.4).
             if not request & ERROR_FLAG and wanted != AlState.INIT:
                 return
             self._error = False
@@ -157,25 +166,27 @@ class Application:
         self._report(AlStatusCode.NO_ERROR)
 
     def _follow(self, request: int) -> None:
-        """Show what is requested, acknowledgement included, as AL status: nobody checks it."""
+        """Copy the request, with its acknowledge bit, to AL status without any check."""
         if request & STATE_MASK in AlState.__members__.values():
-            before, self.state = self.state, AlState(request & STATE_MASK)
-            if AlState.OP in (before, self.state):
-                self.device.set_outputs_valid(self.state == AlState.OP)
+            before, after = self.state, AlState(request & STATE_MASK)
+            self._level = after
+            if AlState.OP in (before, after):
+                self.device.set_outputs_valid(after == AlState.OP)
             self.sync.configure()
-            self.device.state_changed(before, self.state)
+            self.device.state_changed(before, after)
         self.esc.set_al_status(request & (STATE_MASK | ERROR_FLAG), AlStatusCode.NO_ERROR)
 
     def _enter(self, wanted: AlState) -> None:
-        """Start or stop what lies between the present state and `wanted`."""
-        before, self.state = self.state, wanted
+        """Start or stop the functions between the present state and `wanted`."""
+        before = self.state
+        self._level = wanted
         if before == AlState.OP and wanted < AlState.OP:
             self.device.set_outputs_valid(False)
         if before >= AlState.SAFE_OP > wanted:
             self._lock_process_data(True)
             self.sync.stop()
         if before >= AlState.PRE_OP > wanted:
-            # With it go messages, transfers and counters.
+            # This also drops messages, transfers and counters.
             self._mailbox = None
             self._lock(True, self._mailboxes)
         if before < AlState.PRE_OP <= wanted and self._mailboxes:
@@ -218,11 +229,11 @@ class Application:
         self._report(code)
 
     def fall(self, state: AlState, code: int) -> None:
-        """Leave the state on an error of one's own; the working counter shows it, for the outputs are closed."""
+        """Leave the state on an internal error; the outputs close, which shows in the working counter."""
         self._op_wanted_at = None
         self._enter(state)
         if state == AlState.SAFE_OP:
-            # What the master sent before does not count any more.
+            # Earlier outputs are void.
             self._missing = {data.manager.index for data in self._outputs if data.image.byte_length}
             self._lock(True, tuple(self._missing) or self.device.roles.inputs)
         self._refuse(code)
@@ -238,9 +249,9 @@ class Application:
                 return
 
     def _try_op(self, t: int) -> None:
-        """Go to OP as soon as outputs and SYNC0 are there; give up after a while."""
-        asked = self._op_wanted_at
-        if asked is None or self._faults.hangs:
+        """Go to OP once outputs and SYNC0 have arrived; refuse after OP_TIMEOUT."""
+        wanted_at = self._op_wanted_at
+        if wanted_at is None or self._faults.hangs:
             return
         have_outputs = not self._missing
         have_sync = self.sync.running or not self.sync.active
@@ -248,18 +259,19 @@ class Application:
             self._op_wanted_at = None
             self.latch()
             self.sync.start()
-            before, self.state = self.state, AlState.OP
+            before = self.state
+            self._level = _OP
             self.device.set_outputs_valid(True)
             self._report(AlStatusCode.NO_ERROR)
             self.device.state_changed(before, AlState.OP)
-        elif t - asked > OP_TIMEOUT:
+        elif t - wanted_at > OP_TIMEOUT:
             self._op_wanted_at = None
             self._refuse(AlStatusCode.NO_SYNC if have_outputs else AlStatusCode.SYNC_MANAGER_WATCHDOG)
 
-    # What time does
+    # Timed events
 
     def watch(self, t: int) -> None:
-        """Look after watchdog, SYNC0 and a pending request for OP; called at least every millisecond."""
+        """Check watchdog, SYNC0 and a pending request for OP; called at least every millisecond."""
         esc = self.esc
         fed = self._fed
         if fed is not None and 0 < esc.watchdog_ns < t - fed:
@@ -268,25 +280,25 @@ class Application:
             count = esc.memory[Register.WATCHDOG_COUNTERS]
             esc.memory[Register.WATCHDOG_COUNTERS] = min(count + 1, 0xFF)
             if self._emulated:
-                # Nobody leaves OP: the outputs are off until frames come again.
+                # Stay in OP: the outputs are off until frames return.
                 self.device.set_outputs_valid(False)
             elif self.state == AlState.OP:
                 self.fall(AlState.SAFE_OP, AlStatusCode.SYNC_MANAGER_WATCHDOG)
             else:
                 self._missing = {data.manager.index for data in self._outputs if data.image.byte_length}
-        if self.state == AlState.OP and self.sync.active and not self.sync.running and not self._emulated:
+        if self._level == _OP and self.sync.active and not self.sync.running and not self._emulated:
             self.fall(AlState.SAFE_OP, AlStatusCode.FATAL_SYNC_ERROR)
         if self._op_wanted_at is not None:
             self._try_op(t)
 
     def pulse(self, on_time: bool) -> None:
-        """SYNC0 has come: take over the outputs. `on_time` tells that this process was not late in noticing it."""
+        """Handle SYNC0: latch the outputs. `on_time`: this process was not late."""
         self.latch()
-        if self.state == AlState.OP and self.sync.pulse(on_time):
+        if self._level == _OP and self.sync.pulse(on_time):
             self.fall(AlState.SAFE_OP, AlStatusCode.SYNC_ERROR)
 
     def latch(self) -> None:
-        """Take over the outputs: the frame that brought them has passed, or SYNC0 has come."""
+        """Latch the outputs, after their frame has passed or at SYNC0."""
         for data in self._outputs:
             if not data.single:
                 data.latched = bytes(data.manager.buffer)
@@ -294,64 +306,64 @@ class Application:
                 data.latched = data.manager.take()
 
     def due(self, t: int, interval: int) -> bool:
-        """Whether the device was last stepped `interval` ns before `t` or earlier."""
+        """Whether the last step was `interval` ns before `t` or earlier."""
         return t - self._stepped_at >= interval
 
     def advance(self, t: int) -> None:
-        """Let the device's time pass up to `t`: outputs in (in OP), steps, inputs out (from SAFE-OP on)."""
+        """Advance the device to `t`: outputs in (in OP), steps, inputs out (from SAFE-OP)."""
         passed = t - self._stepped_at
         self._stepped_at = max(t, self._stepped_at)
-        if self.state == AlState.OP:
+        if self._level == _OP:
             for data in self._outputs:
                 image = data.image
-                if len(data.latched) == image.byte_length:  # the master may have changed the sync manager just now
+                if len(data.latched) == image.byte_length:  # the master may just have changed the sync manager
                     image.unpack(data.latched)
                 if data.manager.control & CONTROL_ECAT_EVENT:
                     data.manager.exchanged()
-        step = self.device.step
+        device = self.device
         for _ in range(MOST_STEPS):
             if passed <= 0:
                 break
             part = min(passed, LONGEST_STEP)
-            step(part * 1e-9)
+            device.step(part * 1e-9)
             passed -= part
-        if self.device.failure and not self._emulated:
-            code, self.device.failure = self.device.failure, 0
-            if self.state == AlState.OP:
+        if device.failure and not self._emulated:
+            code, device.failure = device.failure, 0
+            if self._level == _OP:
                 self.fall(AlState.SAFE_OP, code)
-            elif self.state == AlState.SAFE_OP and not self._error:
+            elif self._level == _SAFE_OP and not self._error:
                 self._refuse(code)
-        if self.state >= AlState.SAFE_OP or self._emulated:
+        if self._level >= _SAFE_OP or self._emulated:
             try:
                 for data in self._inputs:
                     data.pack()
                     if data.manager.control & CONTROL_ECAT_EVENT:
                         data.manager.exchanged()
             except (struct.error, ArithmeticError, TypeError, AttributeError) as error:
-                # A behaviour has put something into an object that its bits do not hold.
-                self.device.failed(error)
+                # A behaviour stored a value that exceeds the object's bits.
+                device.failed(error)
         mailbox = self._mailbox
         if mailbox is not None and mailbox.pending(t):
             mailbox.serve(self.state, t)
 
 
 FIRST_LOCAL_TIME = 1_000_000_000
-"""Slave n shows n times this at the start, as if powered one second after its neighbour: no clocks agree by chance."""
+"""Initial time of slave n is n times this, ns: no clocks agree by chance."""
 
 
 class Slave:
-    """A controller with its firmware and its place on the wire: `delay` ns after the master's port."""
+    """A controller with its firmware, at `delay` ns from the master's port."""
 
     __slots__ = ("_drift_ppm", "application", "clock", "delay", "device", "esc", "faults", "queued_until")
 
     def __init__(self, device: DeviceModel, eeprom: bytes, drift_ppm: float, start: int, delay: int, t: int) -> None:
-        """Power on at instant `t`, the clock showing `start` ns; the segment connects it."""
+        """Power on at instant `t` with the clock at `start` ns; the segment connects it."""
         self.device = device
         self.delay = delay
         self.faults = SlaveFaults()
         self._drift_ppm = drift_ppm
         self.queued_until: int | None = None
-        """Instant up to which the device is to be stepped; None while it does not wait for that."""
+        """Instant up to which the device must be stepped; None: not queued."""
         self._start(eeprom, drift_ppm, start, t)
 
     def _start(self, eeprom: bytes, drift_ppm: float, start: int, t: int) -> None:
@@ -361,17 +373,17 @@ class Slave:
         self.application = Application(self.esc, device, self.faults, t)
 
     def power_off(self, t: int) -> None:
-        """The supply goes: the device stops, nothing that controller and firmware held is left."""
+        """Power off: the device stops; controller and firmware lose their state."""
         self.device.power_off()
         self._restart(t)
 
     def power_on(self, t: int) -> None:
-        """The supply comes back: all is as at power-on, but for what the EEPROM has kept."""
+        """Power on: everything is reset but the EEPROM."""
         self.device.power_on()
         self._restart(t)
 
     def _restart(self, t: int) -> None:
-        # The collector of garbage is off in a segment's process: no ring of references may be left.
+        # The garbage collector is off in a segment's process: leave no reference cycle.
         self.esc.detach()
         self._start(bytes(self.esc.eeprom.image), self._drift_ppm + self.faults.drift_ppm, 0, t)
         if self.esc.dc is not None and self.faults.sync0_losses:
@@ -380,7 +392,7 @@ class Slave:
 
 def make_slaves(devices: Sequence[DeviceModel], drifts_ppm: Sequence[float], delays: Sequence[int],
                 aliases: Sequence[int], t: int) -> list[Slave]:  # fmt: skip
-    """Make a slave of every device, in the order of the wire; `delays` are ns from the master."""
+    """Return a slave for every device, in the order of the wire; `delays` are ns from the master."""
     slaves = []
     for device in devices:
         device.join(devices)

@@ -1,4 +1,4 @@
-"""What a chain of slaves makes of a frame: datagrams, addressing, working counters (ETG.1000.4, clause 5)."""
+"""Processing of a frame by the slaves: datagrams, addressing, working counters (ETG.1000.4, clause 5)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rtcp.virtual.protocol import (
 from rtcp.virtual.slave import Slave
 
 MOST_KNOWN = 256
-"""What is worked out for an address is kept for so many of them: what a master may send knows no end."""
+"""Upper bound on cached addresses, as a master may use any number."""
 _AUTO = frozenset((DatagramCommand.APRD, DatagramCommand.APWR, DatagramCommand.APRW, DatagramCommand.ARMW))
 _STATION = frozenset((DatagramCommand.FPRD, DatagramCommand.FPWR, DatagramCommand.FPRW, DatagramCommand.FRMW))
 _BROADCAST = frozenset((DatagramCommand.BRD, DatagramCommand.BWR, DatagramCommand.BRW))
@@ -53,14 +53,14 @@ _WRITES = frozenset(
 _READ_WRITES = frozenset((DatagramCommand.APRW, DatagramCommand.FPRW, DatagramCommand.BRW))
 
 Miscount = tuple[Slave, Callable[[], bool]]
-"""A slave that does not count itself in the working counter of a logical datagram when the second says so."""
+"""A slave that omits itself from the working counter of a logical datagram if the function returns True."""
 
 
 class Wire:
-    """Answers frames in place. What frames ask of clocks and firmware is noted for `Segment.settle`."""
+    """Answers frames in place; collects their effects on clocks and firmware for `Segment.settle`."""
 
     def __init__(self, slaves: Sequence[Slave], miscounts: Sequence[Miscount] = (), passing: bool = False) -> None:
-        """Connect `slaves`; `miscounts` may change later. A `passing` wire serves one frame beside the lasting one."""
+        """Connect `slaves`; `miscounts` may change later. A `passing` wire serves a single frame."""
         self.slaves = tuple(slaves)
         self._miscounts = miscounts
         self._passing = passing
@@ -73,9 +73,9 @@ class Wire:
         self._stations: dict[int, tuple[Slave, ...]] = {}
         self._orders: dict[tuple[int, int, bool], list[tuple[list[Slave], Slave | None]]] = {}
         self.references: list[tuple[list[Slave], int, int]] = []
-        """Clocks to steer: the slaves, the time they got (32 bits), the frame's arrival at the first slave."""
-        self.done: list[Plan] = []
-        """Logical datagrams that completed buffers of outputs, or may have done so."""
+        """Clocks to steer: the slaves, the received time (32 bits), the frame's arrival at the first slave."""
+        self.completed: list[Plan] = []
+        """Logical datagrams that completed, or may have completed, output buffers."""
         if passing:
             return
         for esc in self._escs:
@@ -94,9 +94,9 @@ class Wire:
             self._event |= esc.event
 
     def process(self, frame: bytearray, size: int, t: int) -> bool:
-        """Answer in place the frame of `size` bytes that arrived at `t`; False if it is no EtherCAT frame of datagrams.
+        """Answer in place the frame of `size` bytes that arrived at `t`; False: not an EtherCAT frame of datagrams.
 
-        A datagram that does not fit the frame ends the work: it and what follows go back as they came.
+        Processing ends at a datagram that exceeds the frame: it and the rest return unchanged.
         """
         at = FIRST_DATAGRAM
         if size > FIRST_DATAGRAM + VLAN_TAG and frame[12] == 0x81 and not frame[13]:
@@ -141,21 +141,21 @@ class Wire:
         image = self._outputs
         for at, place, size in plan.outputs:
             image[place : place + size] = frame[data + at : data + at + size]
-        for at, shift, mask, place, image_shift, others in plan.output_bits:
-            image[place] = image[place] & others | (frame[data + at] >> shift & mask) << image_shift
+        for at, shift, mask, place, image_shift, kept_bits in plan.output_bits:
+            image[place] = image[place] & kept_bits | (frame[data + at] >> shift & mask) << image_shift
         image = self._inputs
         for at, place, size in plan.inputs:
             frame[data + at : data + at + size] = image[place : place + size]
         for at, shift, mask, place, image_shift, _ in plan.input_bits:
             byte = frame[data + at] & ~(mask << shift) | (image[place] >> image_shift & mask) << shift
             frame[data + at] = byte
-        if plan.written or plan.others:
-            self.done.append(plan)
+        if plan.written or plan.by_transfer:
+            self.completed.append(plan)
         count = plan.counter
         miscounts = self._miscounts
-        if plan.others:
+        if plan.by_transfer:
             content = frame[data : data + length]
-            for esc, parts in plan.others:
+            for esc, parts in plan.by_transfer:
                 share = transfer(esc, command, parts, content, t)
                 count += share - self._kept_back(esc, share) if miscounts else share
             frame[data : data + length] = content
@@ -164,7 +164,7 @@ class Wire:
         return count
 
     def _kept_back(self, esc: Esc, share: int) -> int:
-        """What a slave does not add to the working counter of its share, on a fault."""
+        """Return the part of a slave's working counter share that a fault omits."""
         if share:
             for slave, strikes in self._miscounts:
                 if slave.esc is esc and strikes():
@@ -173,8 +173,8 @@ class Wire:
 
     def _make_plan(self, command: int, address: int, length: int) -> Plan:
         if self._passing:
-            # The images belong to the lasting wire.
-            return Plan(others=[(esc, touched(esc, address, length)) for esc in self._escs])
+            # The images belong to the permanent wire.
+            return Plan(by_transfer=[(esc, touched(esc, address, length)) for esc in self._escs])
         if len(self._plans) >= MOST_KNOWN:
             self._plans.clear()
         if not self._plans:
@@ -184,7 +184,7 @@ class Wire:
         return plan
 
     def _lay_out_images(self) -> None:
-        """Put all buffers of a direction, in the order of the wire, into one image, so that neighbours are one copy."""
+        """Put all buffers of a direction, in the order of the wire, into one image: neighbours need a single copy."""
         images = {True: bytearray(), False: bytearray()}
         self._places = {}
         buffered = [m for esc in self._escs for m in esc.sync_managers if m.enabled and not m.mailbox]
@@ -199,7 +199,7 @@ class Wire:
 
     def _physical(self, frame: bytearray, command: int, at: int, address: int, offset: int, length: int,
                   t: int) -> int:  # fmt: skip
-        """Handle a datagram by position, station or broadcast; return what it adds to the working counter."""
+        """Process a datagram by position, station or broadcast; return the increment of the working counter."""
         if command in _AUTO or command in _BROADCAST:
             self._pass_position(frame, at, address)
         data = at + DATAGRAM_HEADER
@@ -214,42 +214,42 @@ class Wire:
                 if content is not None:
                     count += 1
                     if command in _BROADCAST:
-                        both = int.from_bytes(content, "little") | int.from_bytes(incoming, "little")
-                        content = both.to_bytes(length, "little")
+                        merged = int.from_bytes(content, "little") | int.from_bytes(incoming, "little")
+                        content = merged.to_bytes(length, "little")
                     frame[data:end] = content
             if command in _WRITES and slave.esc.write(offset, incoming, here):
                 count += write_weight
         return count
 
     def _pass_position(self, frame: bytearray, at: int, address: int) -> None:
-        """Every slave adds one to the position in the datagram."""
+        """Add one to the position in the datagram for every slave."""
         after = address + len(self.slaves)
         frame[at + 2], frame[at + 3] = after & 0xFF, after >> 8 & 0xFF
 
     def _addressed(self, command: int, address: int) -> Sequence[Slave]:
-        """The slaves that a datagram by position, station or broadcast means."""
+        """Return the slaves addressed by position, station or broadcast."""
         if command in _BROADCAST:
             return self.slaves
         if command in _AUTO:
             position = -address & 0xFFFF
             return self.slaves[position : position + 1]
         if command in _STATION:
-            found = self._stations.get(address)
-            if found is None:
-                found = tuple(slave for slave in self.slaves if slave.esc.answers_to(address))
+            addressed = self._stations.get(address)
+            if addressed is None:
+                addressed = tuple(slave for slave in self.slaves if slave.esc.answers_to(address))
                 if len(self._stations) >= MOST_KNOWN:
                     self._stations.clear()
-                self._stations[address] = found
-            return found
+                self._stations[address] = addressed
+            return addressed
         return ()
 
     def _multiple(self, frame: bytearray, command: int, at: int, address: int, offset: int, length: int,
                   t: int) -> int:  # fmt: skip
-        """ARMW and FRMW: the addressed slave reads, all others write what the datagram holds when it passes them."""
+        """Process ARMW and FRMW: the addressed slave reads, all others write the datagram's present data."""
         data = at + DATAGRAM_HEADER
         end = data + length
         count = 0
-        # The clocks are steered after the answer has left: nothing in it depends on that.
+        # The clocks are steered after the answer is sent; it does not depend on them.
         steering = offset == Register.DC_SYSTEM_TIME and length in _TIME_LENGTHS
         for followers, reader in self._order(command, address, steering):
             if steering:
@@ -273,7 +273,7 @@ class Wire:
         return count
 
     def _order(self, command: int, address: int, steering: bool) -> list[tuple[list[Slave], Slave | None]]:
-        """Who writes and who then reads, group by group along the wire; a slave without clock follows no time."""
+        """Return groups of writing slaves and the reading one after each; for steering only slaves with a clock."""
         key = (command, address, steering)
         groups = self._orders.get(key)
         if groups is not None:

@@ -71,11 +71,11 @@ def test_every_procedure_that_is_called_exists(path: Path) -> None:
 def test_no_name_of_the_shared_module_is_declared_again() -> None:
     shared = (RAPID / "stream_shared.sys").read_text(encoding="utf-8")
     kinds = ("CONST", "PERS", "VAR", "PROC", "FUNC")
-    taken = {name.lower() for kind in kinds for name in names(shared, kind)}
+    shared_names = {name.lower() for kind in kinds for name in names(shared, kind)}
     for path in STREAMING:
         if path.suffix == ".mod":
             own = {name.lower() for kind in kinds for name in names(path.read_text(encoding="utf-8"), kind)}
-            assert own & taken == set(), path.name
+            assert own & shared_names == set(), path.name
 
 
 @pytest.mark.parametrize(("joints", "length"), [(10, 64), (12, 72)])
@@ -83,9 +83,9 @@ def test_the_server_reads_the_duration_where_the_message_has_it(joints: int, len
     text = (RAPID / "stream_server.mod").read_text(encoding="utf-8")
     message = struct.pack(f"<4i{joints + 2}f", 11, 2, 0, 7, *[0.5] * joints, 1.0, 0.25)  # without the length before it
     assert len(message) == length
-    found = re.search(r"at := length - (\d+);\n +UnpackRawBytes message, at, duration", text)
-    assert found is not None
-    assert struct.unpack_from("<f", message, length - int(found[1]) - 1) == (0.25,)  # RAPID counts bytes from 1
+    deadline = re.search(r"at := length - (\d+);\n +UnpackRawBytes message, at, duration", text)
+    assert deadline is not None
+    assert struct.unpack_from("<f", message, length - int(deadline[1]) - 1) == (0.25,)  # RAPID counts bytes from 1
 
 
 def test_no_arm_moves_after_a_stop_before_every_motion_task_has_forgotten_its_queue() -> None:

@@ -1,4 +1,4 @@
-"""A gateway's process in front of a fake loop, as the tests of the gateway have it."""
+"""A gateway process in front of a fake loop, as in the tests of the gateway."""
 
 from tests.gateway.conftest import client, directory, loop, served_loop
 

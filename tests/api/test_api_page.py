@@ -29,11 +29,17 @@ assert ("yaml", (DOCS / "motion.yaml").read_text()) in FILES
 
 @pytest.fixture(scope="module")
 def platform() -> Iterator[Platform]:
-    made = Platform()
-    made.be_patient(2000)
-    made.rtcp("start", "--detach")
-    yield made
-    made.end()
+    started = Platform()
+    started.be_patient(2000)
+    started.rtcp("start", "--detach")
+    yield started
+    started.end()
+
+
+def enable(platform: Platform) -> None:
+    """Each example starts enabled, because `--longest` may leave out the example before it."""
+    if platform.status()["state"] == "ready":
+        platform.call("enable")
 
 
 def output_of(platform: Platform, program: str) -> str:
@@ -52,6 +58,7 @@ def test_the_first_program_has_ten_lines_and_prints_what_its_page_shows(platform
 
 @pytest.mark.parametrize("number", range(len(API)))
 def test_an_example_of_the_api_runs(platform: Platform, number: int) -> None:
+    enable(platform)
     output_of(platform, API[number])
 
 
@@ -59,8 +66,7 @@ def test_an_example_of_the_api_runs(platform: Platform, number: int) -> None:
 def test_an_example_of_a_motion_file_runs(platform: Platform, tmp_path: Path, number: int) -> None:
     ending, text = FILES[number]
     (tmp_path / f"motion.{ending}").write_text(text)
-    if platform.status()["state"] == "ready":
-        platform.call("enable")
+    enable(platform)
     if "program:" in text:
         # tests/e2e/test_paths.py runs it; its input and output are not in the default configuration.
         assert platform.rtcp("run", str(tmp_path / "motion.yaml"), "--dry").stdout.endswith("nothing has moved\n")

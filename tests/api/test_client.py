@@ -32,7 +32,7 @@ def listener(path: Path) -> Iterator[socket.socket]:
 
 
 class Peer:
-    """Answers the first request with these bytes, a packet each, and closes; `received` is what came.
+    """Answers the first request with these bytes, a packet each, and closes; `received` holds the requests.
 
     Of several `requests` each has one packet; without a packet it reads on.
     """

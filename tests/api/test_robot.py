@@ -26,14 +26,14 @@ from tests.gateway.fake_loop import JOINTS, FakeLoop
 
 Q = [0.1] * JOINTS
 LONG = 1_000_000
-METHODS = {name: one.describe for name, one in vars(Methods).items() if isinstance(one, Method)}
+METHODS = {name: method.describe for name, method in vars(Methods).items() if isinstance(method, Method)}
 
 
 @pytest.fixture
 def robot(directory: Path, loop: FakeLoop) -> Iterator[Robot]:
     loop.state = State.HOLDING
-    with rtcp.connect("a test", control_socket(directory)) as made:
-        yield made
+    with rtcp.connect("a test", control_socket(directory)) as connected:
+        yield connected
 
 
 def run(directory: Path, work: Callable[[AsyncRobot], Coroutine[Any, Any, Any]]) -> Any:
@@ -70,10 +70,10 @@ def test_a_subclass_of_a_robot_keeps_the_methods_that_it_overrides(robot: Any) -
     assert Own.enable is robot.enable
 
 
-@pytest.mark.parametrize("shown", [Robot, AsyncRobot, Methods])
-def test_python_helps_with_a_robot_and_its_methods(shown: type) -> None:
-    assert "Move to joint positions and return when the arm is there." in pydoc.render_doc(shown)
-    assert "move_joints" in dict(inspect.getmembers(shown))
+@pytest.mark.parametrize("kind", [Robot, AsyncRobot, Methods])
+def test_python_helps_with_a_robot_and_its_methods(kind: type) -> None:
+    assert "Move to joint positions and return when the arm is there." in pydoc.render_doc(kind)
+    assert "move_joints" in dict(inspect.getmembers(kind))
 
 
 def test_the_package_shows_the_names_of_the_api() -> None:
@@ -82,7 +82,7 @@ def test_the_package_shows_the_names_of_the_api() -> None:
     assert {*rtcp.__all__} <= {*dir(rtcp)}
     assert {*api.__all__} <= {*dir(api)}
     with pytest.raises(AttributeError):
-        _ = rtcp.nothing  # type: ignore[attr-defined]
+        _ = rtcp.nothing
 
 
 def test_a_motion_returns_its_arrival_and_reports_progress(robot: Robot, loop: FakeLoop) -> None:
@@ -90,7 +90,7 @@ def test_a_motion_returns_its_arrival_and_reports_progress(robot: Robot, loop: F
     arrival = robot.move_joints(Q, speed=0.2, synchronized=False, progress=seen.append)
     assert arrival == Arrival(tuple(Q), 0.0)
     assert loop.commands == [MoveJoints(tuple(Q), 0.2, False)]
-    assert all(len(one.positions) == JOINTS for one in seen)
+    assert all(len(update.positions) == JOINTS for update in seen)
     assert seen
 
 
@@ -129,9 +129,11 @@ def test_a_method_sends_its_command_and_returns_its_type(
     assert type(call(robot)) is result
     sent = loop.commands
     if isinstance(command, Jog):
-        # What is left of the time that the call was made with.
-        assert 0.0 < sent[0].hold_s <= command.hold_s
-        sent = [dataclasses.replace(sent[0], hold_s=command.hold_s)]
+        # The time that is left of the call's.
+        [jog] = sent
+        assert isinstance(jog, Jog)
+        assert 0.0 < jog.hold_s <= command.hold_s
+        sent = [dataclasses.replace(jog, hold_s=command.hold_s)]
     assert sent == ([] if command is None else [command])
 
 
@@ -145,8 +147,8 @@ def test_errors_have_classes_and_fields(robot: Robot, directory: Path) -> None:
     with pytest.raises(rtcp.Invalid, match="q: found 1 numbers"):
         robot.move_joints([0.0])
     robot.jog([0.1] * 6)
-    with rtcp.connect("another", control_socket(directory)) as other, pytest.raises(rtcp.Refused) as raised:
-        other.move_joints(Q)
+    with rtcp.connect("another", control_socket(directory)) as second, pytest.raises(rtcp.Refused) as raised:
+        second.move_joints(Q)
     assert (raised.value.reason, raised.value.fields) == ("lease_held", {"holder": "a test"})
 
 
@@ -154,9 +156,9 @@ def test_errors_have_classes_and_fields(robot: Robot, directory: Path) -> None:
 
 
 def test_async_calls_return_the_same_and_may_overlap(robot: Robot, directory: Path, loop: FakeLoop) -> None:
-    async def work(other: AsyncRobot) -> tuple[Arrival, State, api.Status]:
-        move = asyncio.create_task(other.move_joints(Q))
-        return await move, await other.state(), await other.status()
+    async def work(second: AsyncRobot) -> tuple[Arrival, State, api.Status]:
+        move = asyncio.create_task(second.move_joints(Q))
+        return await move, await second.state(), await second.status()
 
     arrival, state, status = run(directory, work)
     assert (arrival, state) == (Arrival(tuple(Q), 0.0), State.HOLDING)
@@ -328,8 +330,8 @@ def test_pose_fk_and_ik_are_the_same_in_both_robots(directory: Path, robot: Robo
     assert robot.status().tool_velocity == (0.0,) * 6
     assert robot.ik(pose) == pytest.approx(loop.q, abs=1e-9)
 
-    async def asked(other: AsyncRobot) -> Any:
-        return await other.pose(), await other.positions(), await other.ik(await other.fk(loop.q), near=loop.q)
+    async def asked(second: AsyncRobot) -> Any:
+        return await second.pose(), await second.positions(), await second.ik(await second.fk(loop.q), near=loop.q)
 
-    found = run(directory, asked)
-    assert [found[0], found[1], found[2]] == [pytest.approx(one, abs=1e-6) for one in (pose, loop.q, loop.q)]
+    answers = run(directory, asked)
+    assert [answers[0], answers[1], answers[2]] == [pytest.approx(value, abs=1e-6) for value in (pose, loop.q, loop.q)]

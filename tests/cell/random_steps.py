@@ -17,15 +17,15 @@ from rtcp.config.model import ArmConfig
 from rtcp.ipc.commands import Disable, Enable, Halt, MoveJoints, Reset, RunInStep
 from rtcp.ipc.events import MotionEnded
 from rtcp.ipc.states import State
-from rtcp.launch.cell_simulation import CellSimulation
-from rtcp.launch.simulation import Simulation
 from rtcp.motion.guards.neighbours import body_of
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.in_step import Curve, Way, plan_brakes, plan_moves
 from rtcp.motion.planning.plan import COLUMNS, PlanTooFast
 from rtcp.motion.planning.trajectories import plan_trajectory
-from tests.sessions.driver import bounds_of, is_free
-from tests.sessions.frame_checker import FrameChecker
+from rtcp.testing.cell import CellSimulation
+from rtcp.testing.sessions.checker import Bounds, FrameChecker
+from rtcp.testing.simulation import Simulation
+from tests.sessions.oracle import checker_of, is_free
 
 NAMES = ("left", "right")
 EMERGENCY_STOP_BIT = 0x0200
@@ -34,15 +34,15 @@ STANDS_RAD_S = 1e-9
 QUIET_INPUTS = 0x033F
 LEAVING = (State.MOVING, State.STOPPING, State.DISABLING)
 ON_PATH = ("halt", "halt at both", "disable", "lease ends")
-"""After these both arms brake along their paths."""
+"""Mishaps after which both arms brake along their paths."""
 
 
 def cell_of(periods_us: tuple[float, float] = (1000.0, 2000.0), apart_m: float = 2.0, **settings: object) -> CellConfig:
     """Return a cell of two EtherCAT arms with cycles of their own, side by side."""
     config = load(default_config())
-    # Boxes are the planner's of each arm, which is not asked here.
+    # Boxes matter to the planner of each arm, which is not used here.
     config = replace(config, cartesian=replace(config.cartesian, keep_out=(), box=None))
-    arms = [replace(config, cycle=replace(config.cycle, period_us=one)) for one in periods_us]
+    arms = [replace(config, cycle=replace(config.cycle, period_us=period_us)) for period_us in periods_us]
     members = tuple(
         Member(name, arm, Base((0.0, y, 0.0)))
         for name, arm, y in zip(NAMES, arms, (0.5 * apart_m, -0.5 * apart_m), strict=True)
@@ -52,7 +52,7 @@ def cell_of(periods_us: tuple[float, float] = (1000.0, 2000.0), apart_m: float =
 
 @dataclass
 class Motion:
-    """A motion in step under way, as the test sees it."""
+    """A motion in step and its measured times."""
 
     plan: dict[str, Curve]
     goal: dict[str, list[float]]
@@ -64,8 +64,8 @@ class Motion:
 
     @property
     def duration_s(self) -> float:
-        """How long it takes."""
-        return max(one.duration_s for one in self.plan.values())
+        """Duration of the motion, s."""
+        return max(motion.duration_s for motion in self.plan.values())
 
 
 class Pair:
@@ -80,7 +80,7 @@ class Pair:
         self.random = Random(seed)
         self.cell = cell_of() if cell is None else cell
         self.simulation = CellSimulation(self.cell, seed)
-        self.configs: dict[str, ArmConfig] = {one.name: one.config for one in self.cell.arms}
+        self.configs: dict[str, ArmConfig] = {arm.name: arm.config for arm in self.cell.arms}
         self.limits = {name: Limits(config) for name, config in self.configs.items()}
         self.checkers = {name: self._watch(name) for name in NAMES}
         self.slowest_ns = round(1e9 * self.cell.slowest_s)
@@ -92,27 +92,25 @@ class Pair:
 
     def _watch(self, name: str) -> FrameChecker:
         arm, config = self.simulation.arms[name], self.configs[name]
-        slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
-        drives = [slots[joint.slave] for joint in config.joints]
-        checker = FrameChecker(bounds_of(config), arm.period_ns * 1e-9, drives, arm.data.expected_wkc)
+        checker = checker_of(config, arm.period_ns * 1e-9, arm.data.expected_wkc)
         arm.on_frame = checker.check
         return checker
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Release the shared memory."""
         self.simulation.__exit__(None, None, None)
 
     @property
     def violations(self) -> list[str]:
-        """What the checkers of the frames have found."""
-        return [f"{name}: {one}" for name, checker in self.checkers.items() for one in checker.violations]
+        """Violations that the checkers of the frames found."""
+        return [f"{name}: {violation}" for name, checker in self.checkers.items() for violation in checker.violations]
 
     def arm(self, name: str) -> Simulation:
         """Return an arm."""
         return self.simulation.arms[name]
 
     def commanded(self, name: str) -> list[float]:
-        """Return where an arm is commanded, rad."""
+        """Return the commanded position of an arm, rad."""
         return list(self.arm(name).loop.arm.state.commanded)
 
     def speed(self, name: str) -> float:
@@ -120,18 +118,18 @@ class Pair:
         return max(map(abs, self.arm(name).loop.arm.state.commanded_velocity))
 
     def path_s(self, name: str) -> float:
-        """Return how far an arm has got on its path."""
+        """Return the time of an arm on its path, s."""
         return self.simulation.partners[name].group.path_s
 
     # -- motions ------------------------------------------------------------------------------------------------------
 
     def _target(self, name: str) -> list[float]:
-        bounds, here = bounds_of(self.configs[name]), self.commanded(name)
+        bounds, here = Bounds.configured(self.configs[name]), self.commanded(name)
         reach = self.random.choice((0.05, 0.4, 1.2))
         for _ in range(100):
             q = [
-                min(max(one + self.random.uniform(-reach, reach), low), high)
-                for one, low, high in zip(here, bounds.low, bounds.high, strict=True)
+                min(max(angle + self.random.uniform(-reach, reach), low), high)
+                for angle, low, high in zip(here, bounds.low, bounds.high, strict=True)
             ]
             middle = [0.5 * (a + b) for a, b in zip(q, here, strict=True)]
             if is_free(bounds, q, 0.05) and is_free(bounds, middle, 0.05):
@@ -164,9 +162,9 @@ class Pair:
         return Motion(curves, goal, start)
 
     def follow(self, motion: Motion, until: Callable[[], bool], seconds: float = 60.0) -> bool:
-        """Let time pass until a condition; note begin, end and how far the paths are apart."""
+        """Run until a condition; record begin, end and the difference of the paths' times."""
 
-        def look() -> bool:
+        def tracked() -> bool:
             for name in NAMES:
                 arm = self.arm(name)
                 if name not in motion.begun_ns and self.speed(name) > STANDS_RAD_S:
@@ -178,7 +176,7 @@ class Pair:
                 motion.apart_s = max(motion.apart_s, abs(times["left"] - times["right"]))
             return until()
 
-        return self.simulation.until(look, seconds)
+        return self.simulation.until(tracked, seconds)
 
     def rests_after(self, motion: Motion) -> bool:
         """Whether both arms hold, and the motion has begun and ended."""
@@ -186,19 +184,21 @@ class Pair:
         return begun and self.simulation.all_in(State.HOLDING)
 
     def events(self, name: str) -> list[str]:
-        """Return the names of what happened to an arm, oldest first."""
-        return [type(one.event).__name__ for one in self.arm(name).events]
+        """Return the names of an arm's events, oldest first."""
+        return [type(record.event).__name__ for record in self.arm(name).events]
 
     def last_end(self, name: str) -> str:
         """Return the name of the last event that ended a motion early."""
-        ends = [type(one.event).__name__ for one in self.arm(name).events if isinstance(one.event, MotionEnded)]
+        ends = [
+            type(record.event).__name__ for record in self.arm(name).events if isinstance(record.event, MotionEnded)
+        ]
         return ends[-1] if ends else ""
 
     # -- what happens to one arm --------------------------------------------------------------------------------------
 
     @property
     def mishaps(self) -> Mapping[str, Callable[[str], object]]:
-        """What may happen to an arm, by name; what it does is undone by `recover`."""
+        """Mishaps of an arm by name; `recover` undoes them."""
         return {
             "halt": lambda name: self.simulation.send(name, Halt()),
             "halt at both": self._halt_both,
@@ -224,7 +224,7 @@ class Pair:
         box.inputs = box.inputs & ~EMERGENCY_STOP_BIT if pressed else box.inputs | EMERGENCY_STOP_BIT
 
     def recover(self) -> bool:
-        """Put all in order, reset and enable; return whether both arms hold."""
+        """Undo the mishaps, reset and enable; return whether both arms hold."""
         self.simulation.silent.clear()
         for name in NAMES:
             self._press(name, False)
@@ -245,7 +245,7 @@ class Pair:
 
 @dataclass
 class Outcome:
-    """What random motions came to; times in ns, angles in rad."""
+    """Results of random motions; times in ns, angles in rad."""
 
     motions: int = 0
     begin_apart_ns: int = 0
@@ -253,7 +253,7 @@ class Outcome:
     apart_s: float = 0.0
     off_goal: float = 0.0
     off_path: float = 0.0
-    """Of an arm that stands after a stop from its path."""
+    """Largest distance from its path of an arm at rest after a stop, rad."""
     rest_apart_s: float = 0.0
     """Difference of the paths' times at rest, where both braked on their paths."""
     reaction_ns: dict[str, int] = field(default_factory=dict)
@@ -261,7 +261,7 @@ class Outcome:
     problems: list[str] = field(default_factory=list)
 
     def add(self, other: Outcome) -> None:
-        """Take in another."""
+        """Add another outcome."""
         self.motions += other.motions
         self.problems += other.problems
         for name in ("begin_apart_ns", "end_apart_ns", "apart_s", "off_goal", "off_path", "rest_apart_s"):
@@ -272,31 +272,31 @@ class Outcome:
 
 def run_motions(seed: int, count: int) -> Outcome:
     """Run random motions to their ends."""
-    pair, found = Pair(seed), Outcome()
+    pair, outcome = Pair(seed), Outcome()
     for number in range(count):
         motion = pair.begin()
         if not pair.follow(motion, lambda: pair.rests_after(motion)):  # noqa: B023
-            found.problems.append(f"motion {number} does not end")
+            outcome.problems.append(f"motion {number} does not end")
             break
-        found.motions += 1
+        outcome.motions += 1
         for name in NAMES:
             if ended := pair.last_end(name):
-                found.problems.append(f"motion {number}: {name}: {ended}")
+                outcome.problems.append(f"motion {number}: {name}: {ended}")
             off = max(abs(a - b) for a, b in zip(pair.commanded(name), motion.goal[name], strict=True))
-            found.off_goal = max(found.off_goal, off)
+            outcome.off_goal = max(outcome.off_goal, off)
         if len(motion.begun_ns) == len(NAMES):
             begun, ended_ns = motion.begun_ns, motion.ended_ns
-            found.begin_apart_ns = max(found.begin_apart_ns, abs(begun["left"] - begun["right"]))
-            found.end_apart_ns = max(found.end_apart_ns, abs(ended_ns["left"] - ended_ns["right"]))
-            found.apart_s = max(found.apart_s, motion.apart_s)
-    found.problems += pair.violations
+            outcome.begin_apart_ns = max(outcome.begin_apart_ns, abs(begun["left"] - begun["right"]))
+            outcome.end_apart_ns = max(outcome.end_apart_ns, abs(ended_ns["left"] - ended_ns["right"]))
+            outcome.apart_s = max(outcome.apart_s, motion.apart_s)
+    outcome.problems += pair.violations
     pair.close()
-    return found
+    return outcome
 
 
 def run_mishaps(seed: int, count: int, kinds: Sequence[str] = ()) -> Outcome:
-    """Let something happen to one arm at a random instant of random motions, and see what the other does."""
-    pair, found = Pair(seed), Outcome()
+    """Cause a mishap of one arm at a random instant of random motions and record what the other does."""
+    pair, outcome = Pair(seed), Outcome()
     for number in range(count):
         kind = kinds[number % len(kinds)] if kinds else pair.random.choice(list(pair.mishaps))
         who = pair.random.choice(NAMES)
@@ -311,28 +311,28 @@ def run_mishaps(seed: int, count: int, kinds: Sequence[str] = ()) -> Outcome:
         reaction = pair.simulation.now_ns - began
         pair.simulation.until(lambda: pair.arm(other).state is not State.STOPPING, 30.0)  # noqa: B023
         pair.simulation.until(lambda: who in pair.simulation.silent or pair.arm(who).state not in LEAVING, 30.0)  # noqa: B023
-        found.motions += 1
+        outcome.motions += 1
         if not stopped or pair.arm(other).state in (State.MOVING, State.STOPPING):
-            found.problems.append(f"{number}: {kind} of {who}: {other} does not stop")
+            outcome.problems.append(f"{number}: {kind} of {who}: {other} does not stop")
         if both_move:
-            found.reaction_ns[kind] = max(found.reaction_ns.get(kind, 0), reaction)
+            outcome.reaction_ns[kind] = max(outcome.reaction_ns.get(kind, 0), reaction)
         if pair.arm(other).state is State.HOLDING:
             place, _, _ = motion.plan[other].at(np.array([pair.path_s(other)]))
             off = max(abs(a - b) for a, b in zip(pair.commanded(other), place[0], strict=True))
-            found.off_path = max(found.off_path, off)
+            outcome.off_path = max(outcome.off_path, off)
             if kind in ON_PATH:
-                found.rest_apart_s = max(found.rest_apart_s, abs(pair.path_s(who) - pair.path_s(other)))
+                outcome.rest_apart_s = max(outcome.rest_apart_s, abs(pair.path_s(who) - pair.path_s(other)))
         if not pair.recover():
-            found.problems.append(f"{number}: {kind} of {who}: no recovery, {pair.events(who)} {pair.events(other)}")
+            outcome.problems.append(f"{number}: {kind} of {who}: no recovery, {pair.events(who)} {pair.events(other)}")
             break
-    found.problems += pair.violations
+    outcome.problems += pair.violations
     pair.close()
-    return found
+    return outcome
 
 
 @dataclass
 class Nearness:
-    """How near two arms came that know nothing of each other's targets."""
+    """Least distance of two arms that do not know each other's targets."""
 
     stops: int = 0
     """Motions that the guard between them ended."""
@@ -343,13 +343,13 @@ class Nearness:
 
 def run_near(seed: int, count: int, clearance: float = 0.02) -> Nearness:
     """Let two arms move at random where they reach each other, until each was commanded `count` times."""
-    pair, found = Pair(seed, cell_of(apart_m=0.55, clearance=clearance)), Nearness()
-    bodies = {one.name: body_of(one) for one in pair.cell.arms}
+    pair, nearness = Pair(seed, cell_of(apart_m=0.55, clearance=clearance)), Nearness()
+    bodies = {arm.name: body_of(arm) for arm in pair.cell.arms}
     left, right = bodies["left"], bodies["right"]
     assert left is not None
     assert right is not None
     commanded = dict.fromkeys(NAMES, 0)
-    turn = 0
+    step = 0
     while min(commanded.values()) < count:
         for name in NAMES:
             arm = pair.arm(name)
@@ -360,16 +360,16 @@ def run_near(seed: int, count: int, clearance: float = 0.02) -> Nearness:
                 goal, speed = pair._target(name), pair.random.uniform(0.1, 1.5)
                 pair.simulation.send(name, MoveJoints(tuple(goal), speed, pair.random.random() < 0.5))
         pair.simulation.cycle()
-        turn += 1
-        if turn % 4 == 0:
+        step += 1
+        if step % 4 == 0:
             left.place(pair.commanded("left"))
             right.place(pair.commanded("right"))
-            found.least_m = min(found.least_m, distance(left.placed, right.placed)[0])
+            nearness.least_m = min(nearness.least_m, distance(left.placed, right.placed)[0])
     for name in NAMES:
-        found.stops += pair.events(name).count("PartnerNear")
-        found.arrivals += pair.events(name).count("Arrived")
-    if found.least_m < clearance:
-        found.problems.append(f"the arms came as near as {found.least_m:.4f} m")
-    found.problems += pair.violations
+        nearness.stops += pair.events(name).count("PartnerNear")
+        nearness.arrivals += pair.events(name).count("Arrived")
+    if nearness.least_m < clearance:
+        nearness.problems.append(f"the arms came as near as {nearness.least_m:.4f} m")
+    nearness.problems += pair.violations
     pair.close()
-    return found
+    return nearness

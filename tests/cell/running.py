@@ -30,7 +30,7 @@ MIXED = PAIR.replace("{name: left, config: assistive_arm.yaml", "{name: left, co
 
 
 class RunningCell:
-    """A cell of a file, its directories, and the commands that a user would type."""
+    """A cell of a file, its directories, and the commands of a user."""
 
     def __init__(self, file: Path | str) -> None:
         self.platform = platform = Platform()
@@ -58,7 +58,7 @@ class RunningCell:
 
 
 def put_in_order(operator: RequestClient) -> None:
-    """Do at the controller what an operator does after a stop."""
+    """Perform the operator's steps at the controller after a stop."""
     requests = [{"do": "release", "circuit": "emergency"}, {"do": "clear"}, {"do": "motors_on"}, {"do": "start_rapid"}]
     for request in requests:
         operator.ask(request)
@@ -94,11 +94,11 @@ class Records:
         return {name: observer.since(self._from[name])[0] for name, observer in self._observers.items()}
 
     def await_speed(self, least: float) -> None:
-        """Wait until every arm moves so fast, rad/s."""
+        """Wait until every arm is faster than `least`, rad/s."""
         until = time.monotonic() + 10.0
         while time.monotonic() < until:
             newest = [observer.latest() for observer in self._observers.values()]
-            if all(one is not None and np.abs(one["commanded_velocity"]).max() > least for one in newest):
+            if all(record is not None and np.abs(record["commanded_velocity"]).max() > least for record in newest):
                 return
             time.sleep(0.002)
         raise AssertionError("the arms do not move")
@@ -108,14 +108,14 @@ class Records:
         return {name: observer.latest() for name, observer in self._observers.items()}
 
     def paths(self) -> dict[str, float]:
-        """Return how far each arm has got on its path, s."""
-        return {name: float(one["step_path_s"][0]) for name, one in self.newest().items()}
+        """Return the time of each arm on its path, s."""
+        return {name: float(record["step_path_s"][0]) for name, record in self.newest().items()}
 
 
 def instants(records: dict[str, Any]) -> dict[str, tuple[int, int]]:
     """Return when each arm began to move and came to rest, CLOCK_MONOTONIC."""
-    found = {}
+    spans = {}
     for name, rows in records.items():
         moves = np.flatnonzero(np.abs(rows["commanded_velocity"]).max(axis=1) > 0.0)
-        found[name] = int(rows["time_ns"][moves[0]]), int(rows["time_ns"][moves[-1]])
-    return found
+        spans[name] = int(rows["time_ns"][moves[0]]), int(rows["time_ns"][moves[-1]])
+    return spans

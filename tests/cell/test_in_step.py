@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
 
 import pytest
 
@@ -11,47 +11,47 @@ from rtcp.config.model import MOST_AXES
 from rtcp.ipc.commands import Disable, Enable, MoveGripper, MoveJoints, OpenStream, Reset, RunInStep
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Simulation
+from rtcp.testing.simulation import Simulation
 from tests.cell.random_steps import Pair, run_mishaps, run_motions, run_near
 
 SLOWEST_NS = 2_000_000
 
 
 def test_random_motions_begin_and_end_together() -> None:
-    found = run_motions(seed=1, count=6)
-    assert found.problems == []
-    assert found.motions == 6
-    assert found.off_goal < 1e-9
+    outcome = run_motions(seed=1, count=6)
+    assert outcome.problems == []
+    assert outcome.motions == 6
+    assert outcome.off_goal < 1e-9
     # Each begins in its own first cycle after the instant, and ends in its own.
-    assert found.begin_apart_ns <= SLOWEST_NS
-    assert found.end_apart_ns <= 2 * SLOWEST_NS
-    assert found.apart_s <= SLOWEST_NS * 1e-9
+    assert outcome.begin_apart_ns <= SLOWEST_NS
+    assert outcome.end_apart_ns <= 2 * SLOWEST_NS
+    assert outcome.apart_s <= SLOWEST_NS * 1e-9
 
 
 @pytest.mark.parametrize("kind", ["halt", "halt at both", "disable", "lease ends"])
 def test_both_brake_on_one_time_scale(kind: str) -> None:
-    found = run_mishaps(2, 3, [kind])
-    assert found.problems == []
-    assert found.off_path < 1e-7
-    assert found.rest_apart_s < 1e-5
+    outcome = run_mishaps(2, 3, [kind])
+    assert outcome.problems == []
+    assert outcome.off_path < 1e-7
+    assert outcome.rest_apart_s < 1e-5
 
 
 @pytest.mark.parametrize("kind", ["drive fault", "emergency stop", "frames lost", "loop hangs"])
 def test_the_other_brakes_along_its_path(kind: str) -> None:
-    found = run_mishaps(3, 3, [kind])
-    assert found.problems == []
-    assert found.off_path < 1e-7
-    # What is found out at once is answered within two cycles of the slower arm; silence takes as long as it may last,
-    # an emergency stop is debounced.
+    outcome = run_mishaps(3, 3, [kind])
+    assert outcome.problems == []
+    assert outcome.off_path < 1e-7
+    # The other arm reacts within two cycles of the slower arm; to silence after its time limit,
+    # to an emergency stop after the debounce time.
     most = {"drive fault": 2, "emergency stop": 6, "frames lost": 6, "loop hangs": 4}[kind]
-    assert found.reaction_ns[kind] <= most * SLOWEST_NS
+    assert outcome.reaction_ns[kind] <= most * SLOWEST_NS
 
 
 def test_arms_that_know_nothing_of_each_others_targets_keep_apart() -> None:
-    found = run_near(seed=3, count=12)
-    assert found.problems == []
-    assert found.stops > 0
-    assert found.arrivals > 0
+    nearness = run_near(seed=3, count=12)
+    assert nearness.problems == []
+    assert nearness.stops > 0
+    assert nearness.arrivals > 0
 
 
 def test_no_arm_begins_alone() -> None:
@@ -238,8 +238,8 @@ def test_a_record_that_no_loop_writes_makes_its_sender_silent_and_ends_no_other_
     publish = board.publish
     at = _index_of(board.schema, field)
 
-    def spoiled(values: list[Any]) -> None:
-        publish([value if index == at else one for index, one in enumerate(values)])
+    def spoiled(values: Sequence[float]) -> None:
+        publish([value if index == at else other for index, other in enumerate(values)])
 
     board.publish = spoiled  # type: ignore[method-assign]
     pair.simulation.run(0.02)
@@ -252,7 +252,7 @@ def test_a_record_that_no_loop_writes_makes_its_sender_silent_and_ends_no_other_
 
 
 def _index_of(schema: RecordSchema, name: str) -> int:
-    """Return the index of a field's first number among the values that are published: all but the record's number."""
+    """Return the index of a field's first number among the published values, without the record's number."""
     at = -1
     for field in schema.fields:
         if field.name == name:
@@ -269,7 +269,7 @@ def test_in_a_stream_no_arm_moves_before_each_has_its_first_setpoint() -> None:
     begin = {name: pair.commanded(name) for name in ("left", "right")}
 
     def send(name: str, number: int) -> None:
-        q = [one + 0.01 for one in begin[name]]
+        q = [angle + 0.01 for angle in begin[name]]
         numbers = (*q, *[0.0] * (3 * MOST_AXES - len(q)))
         pair.arm(name).observer.setpoint(number, 0, pair.simulation.now_ns * 1e-9, numbers)
 
@@ -292,7 +292,7 @@ def test_a_stream_whose_partner_gets_no_setpoint_ends_where_it_began() -> None:
         pair.simulation.send(name, OpenStream(number, 7, 1))
     begin = pair.commanded("left")
     for _ in range(150):
-        numbers = (*[one + 0.01 for one in begin], *[0.0] * (3 * MOST_AXES - len(begin)))
+        numbers = (*[angle + 0.01 for angle in begin], *[0.0] * (3 * MOST_AXES - len(begin)))
         pair.arm("left").observer.setpoint(1, 0, pair.simulation.now_ns * 1e-9, numbers)
         pair.simulation.run(0.01)
     assert pair.last_end("left") == "PartnerNotReady"

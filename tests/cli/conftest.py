@@ -315,13 +315,13 @@ def processes_of() -> Callable[[Path], list[int]]:
     """Find the processes whose command line contains a path; a zombie has none."""
 
     def find(place: Path) -> list[int]:
-        found = []
+        pids = []
         for line in Path("/proc").glob("[0-9]*/cmdline"):
             try:
                 if str(place).encode() in line.read_bytes():
-                    found.append(int(line.parent.name))
+                    pids.append(int(line.parent.name))
             except OSError:
                 continue  # it has ended meanwhile
-        return found
+        return pids
 
     return find

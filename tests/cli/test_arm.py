@@ -51,8 +51,8 @@ def test_at_zero_the_arm_points_straight_up(rtcp: Rtcp) -> None:
 
 
 def test_another_arm_is_chosen_by_its_name_or_its_file(rtcp: Rtcp, arm_files: Path) -> None:
-    for given in ("abb_irb120", str(arm_files / "abb_irb120.yaml")):
-        assert forward(rtcp, [0.0] * 6, "--arm", given) == pytest.approx([0.374, 0.0, 0.630, 0.0, HALF, 0.0], abs=1e-12)
+    for name in ("abb_irb120", str(arm_files / "abb_irb120.yaml")):
+        assert forward(rtcp, [0.0] * 6, "--arm", name) == pytest.approx([0.374, 0.0, 0.630, 0.0, HALF, 0.0], abs=1e-12)
 
 
 def test_the_arm_is_that_of_the_platforms_configuration(
@@ -103,13 +103,13 @@ def test_every_solution_leads_back_to_the_pose_and_one_is_where_it_came_from(
     answer = json.loads(ended.out)
     assert answer.keys() == {"solutions", "reason"}
     assert answer["reason"] is None
-    assert all(one.keys() == {"q", "branch", "within_limits"} for one in answer["solutions"])
-    assert {one["branch"] for one in answer["solutions"]} == BRANCHES
+    assert all(entry.keys() == {"q", "branch", "within_limits"} for entry in answer["solutions"])
+    assert {entry["branch"] for entry in answer["solutions"]} == BRANCHES
     assert len(answer["solutions"]) == 8
-    for one in answer["solutions"]:
-        assert forward(rtcp, one["q"], *arm) == pytest.approx(pose, abs=1e-9)
-    found = [one for one in answer["solutions"] if one["q"] == pytest.approx(q, abs=1e-9)]
-    assert [one["within_limits"] for one in found] == [True]
+    for entry in answer["solutions"]:
+        assert forward(rtcp, entry["q"], *arm) == pytest.approx(pose, abs=1e-9)
+    origin = [entry for entry in answer["solutions"] if entry["q"] == pytest.approx(q, abs=1e-9)]
+    assert [entry["within_limits"] for entry in origin] == [True]
 
 
 def test_the_table_shows_branch_joints_limits_and_distances(rtcp: Rtcp) -> None:
@@ -132,7 +132,7 @@ def test_no_solution_inside_the_limits_is_reported(rtcp: Rtcp, arm_files: Path) 
     ended = rtcp("arm", "ik", *pose)
     assert ended.code == 0
     assert "no solution is inside the joints' limits" in ended.out
-    assert not any(one["within_limits"] for one in json.loads(rtcp("arm", "ik", *pose, "--json").out)["solutions"])
+    assert not any(entry["within_limits"] for entry in json.loads(rtcp("arm", "ik", *pose, "--json").out)["solutions"])
 
 
 def test_on_a_singularity_the_free_joints_stay_near_the_given_ones(rtcp: Rtcp) -> None:
@@ -140,8 +140,8 @@ def test_on_a_singularity_the_free_joints_stay_near_the_given_ones(rtcp: Rtcp) -
     ended = rtcp("arm", "ik", *straight_up, "--json", "--near", "-0.3", "0", "0", "-.2", "0", "0")
     (solution,) = json.loads(ended.out)["solutions"]
     assert solution["q"] == pytest.approx([-0.3, 0.0, 0.0, -0.2, 0.0, 0.5], abs=1e-9)
-    shown = " ".join(rtcp("arm", "ik", *straight_up).out.split())
-    assert "shoulder, elbow, wrist" in shown
+    output = " ".join(rtcp("arm", "ik", *straight_up).out.split())
+    assert "shoulder, elbow, wrist" in output
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)])
@@ -310,7 +310,7 @@ def test_every_facet_has_four_corners() -> None:
 
     start, end = _array([0.0, 0.0, 0.0]), _array([0.0, 0.1, 0.3])
     shapes = {facet.shape for facet in (*_tube(start, end, 0.02, closed=True), *_ball(end, 0.02))}
-    assert shapes == {(4, 3)}  # others are filled up with corners that are nowhere
+    assert shapes == {(4, 3)}  # matplotlib pads other facets with undefined corners
 
 
 def test_only_a_picture_loads_what_draws_it() -> None:
@@ -338,9 +338,9 @@ def test_the_urdf_goes_to_standard_output_or_into_a_file(rtcp: Rtcp, tmp_path: P
 def test_the_urdf_has_the_limits_of_the_joints(rtcp: Rtcp, arm_files: Path) -> None:
     for options in ((), ("--arm", str(arm_files / "assistive_arm.yaml"))):
         limits = ET.fromstring(rtcp("arm", "urdf", *options).out).findall("joint/limit")
-        found = [[float(limit.get(key, "nan")) for key in ("lower", "upper", "velocity", "effort")] for limit in limits]
-        assert found[0] == [-3.1, 3.1, 0.5, 49.0]
-        assert found[5] == [-3.1, 3.1, 0.5, 7.7]
+        rows = [[float(limit.get(key, "nan")) for key in ("lower", "upper", "velocity", "effort")] for limit in limits]
+        assert rows[0] == [-3.1, 3.1, 0.5, 49.0]
+        assert rows[5] == [-3.1, 3.1, 0.5, 7.7]
     irb = ET.fromstring(rtcp("arm", "urdf", *IRB).out).findall("joint/limit")
     assert float(irb[2].get("upper", "nan")) == 1.22
 

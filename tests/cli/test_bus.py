@@ -18,12 +18,12 @@ from rtcp.config.model import BITS
 def test_a_scan_shows_identity_state_pdo_map_clock_and_delay(platform: Any, rtcp: Callable[..., Any]) -> None:
     ended = rtcp("scan")
     assert ended.code == 0
-    for shown in (
+    for text in (
         "virtual: 1 slave", "DIEWU 16DI16DO", "vendor 0x00000D1E", "product 0x00161602", "revision 0x00010000",
         "serial 7", "PRE-OP", "CoE", "0x1080 128 bytes", "SM0 0x1000", "RxPDO 0x1600", "0x7000:1", "TxPDO 0x1A00",
         "(padding)", "2.4", "820", "0 open", "behind the master", "1 no link (3 damaged frames, 1 lost link)",
     ):  # fmt: skip
-        assert shown in ended.out
+        assert text in ended.out
     assert max(len(line) for line in ended.out.splitlines()) <= 80
 
 
@@ -125,11 +125,11 @@ def test_bytes_of_another_length_than_the_type_are_refused(platform: Any, rtcp: 
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
+    ("text", "address"),
     [("0x6041", (0x6041, 0)), ("6041H", (0x6041, 0)), ("0x1018:0x0A", (0x1018, 10)), ("1c12h:1", (0x1C12, 1))],
 )
-def test_an_object_is_written_in_hex_with_its_subindex(text: str, found: tuple[int, int]) -> None:
-    assert parse_object(text) == found
+def test_an_object_is_written_in_hex_with_its_subindex(text: str, address: tuple[int, int]) -> None:
+    assert parse_object(text) == address
 
 
 @given(type_name=st.sampled_from([name for name in BITS if "int" in name]), number=st.integers(-(1 << 64), 1 << 65))

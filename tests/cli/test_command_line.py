@@ -78,8 +78,8 @@ def test_status_loads_nothing_that_starts_slowly() -> None:
 
 
 def test_a_command_without_standard_output_says_nothing_and_succeeds() -> None:
-    asked = [sys.executable, "-m", "rtcp.cli", "arm", "fk", *"000000"]
-    ended = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *asked], stderr=subprocess.PIPE, check=False)
+    command = [sys.executable, "-m", "rtcp.cli", "arm", "fk", *"000000"]
+    ended = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *command], stderr=subprocess.PIPE, check=False)
     assert (ended.returncode, ended.stderr) == (0, b"")
 
 

@@ -1,4 +1,4 @@
-"""Where the demo moves the arm, and what it tells at the end."""
+"""Poses of the demo, and its figures at the end."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def test_from_the_middle_every_joint_moves() -> None:
 def test_the_table_shows_every_figure(platform: Any, capsys: pytest.CaptureFixture[str]) -> None:
     platform.status["dc"] |= {"filtered_us": {"p50": 1, "p99": 7.25, "max": 9}, "offset_us": {"p99": 44.0}}
     show(figures(platform.status, started_s=1.234, mean_ns=500_010.0))
-    shown = capsys.readouterr().out
+    output = capsys.readouterr().out
     for figure in ("holding", "500.000 us", "500.010 us (+0.0020 %)", "123456, 2", "24.0 / 61.0 / 105.5 us",
                    "locked, filtered p99 7.2 us, raw p99 44.0 us", "1.50 s", "FIFO 80"):  # fmt: skip
-        assert figure in shown
-    assert max(len(line) for line in shown.splitlines()) <= 80
+        assert figure in output
+    assert max(len(line) for line in output.splitlines()) <= 80
 
 
 def test_a_demo_of_a_wrong_configuration_is_exit_code_2(rtcp: Callable[..., Any]) -> None:

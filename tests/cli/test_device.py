@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -31,9 +30,9 @@ def test_a_file_is_listed_with_its_devices_modules_and_what_is_hidden(rtcp: Call
     assert "0x00000100   Cyclic position" in listed.out
     assert "Sample Drives, vendor 0x00000E51" in listed.out
     hidden = json.loads(rtcp("device", "list", str(DRIVE), "--all", "--json").out)["devices"]
-    shown = json.loads(rtcp("device", "list", str(DRIVE), "--json").out)["devices"]
-    assert len(hidden) == len(shown) + 1
-    assert {device["kind"] for device in shown} == {"cia402"}
+    devices = json.loads(rtcp("device", "list", str(DRIVE), "--json").out)["devices"]
+    assert len(hidden) == len(devices) + 1
+    assert {device["kind"] for device in devices} == {"cia402"}
 
 
 def test_a_drive_becomes_a_file_that_the_platform_reads(rtcp: Callable[..., Any], tmp_path: Path) -> None:
@@ -135,17 +134,18 @@ def test_a_drive_that_bounds_itself_by_process_data_is_not_sent_0_and_holds_afte
     write_esi(tmp_path / "drive.xml", bounding, {0x6872: ("UINT", 800)})
     out = tmp_path / "drive.yaml"
     out.write_text(text := file_text(find_device(read_esi(tmp_path / "drive.xml"))))
-    made = load_device(out)
-    assert {entry.index: entry.safe for entry in made.outputs[-2:]} == {0x6872: 1000, 0x6880: 2**31 - 1}
-    assert [made.startup(0x605A, axis) for axis in (1, 2)] == [6, 6]
+    device = load_device(out)
+    assert {entry.index: entry.safe for entry in device.outputs[-2:]} == {0x6872: 1000, 0x6880: 2**31 - 1}
+    assert [device.startup(0x605A, axis) for axis in (1, 2)] == [6, 6]
     assert text.count("CHECK: always sent; at 0 the drive has no torque") == 2
 
 
 def test_names_that_mean_something_to_others_are_names_here(rtcp: Callable[..., Any], tmp_path: Path) -> None:
     text, file, out = TERMINALS.read_text(), tmp_path / "named.xml", tmp_path / "named.yaml"
     for pair in (("1", "null"), ("1e5", "padding"), ("true", "No")):
-        names = iter(pair)
-        renamed = re.sub("<Name>Output</Name>", lambda _, names=names: f"<Name>{next(names)}</Name>", text)
+        renamed = text
+        for name in pair:
+            renamed = renamed.replace("<Name>Output</Name>", f"<Name>{name}</Name>", 1)
         file.write_text(renamed.replace("2 digital outputs", "[/bold]"))
         out.write_text(file_text(read_esi(file).devices[0]))
         assert len(load_device(out).outputs) == 2
@@ -171,8 +171,8 @@ def test_a_watchdog_that_the_eeprom_leaves_off_is_named_in_the_file_and_by_its_c
     arm = str(config / default_config().name)
     done = rtcp("device", "check", str(out), "--bus", "virtual", "--config", arm)
     assert "slave 1 (Terminal 30): " in done.out
-    said = "watchdog: its EEPROM leaves the process-data watchdog of sync manager 2 and 3 and 4 off; it is switched on"
-    assert said in " ".join(done.out.split())
+    text = "watchdog: its EEPROM leaves the process-data watchdog of sync manager 2 and 3 and 4 off; it is switched on"
+    assert text in " ".join(done.out.split())
 
 
 def test_a_device_file_is_checked_alone(rtcp: Callable[..., Any], tmp_path: Path) -> None:
@@ -193,16 +193,16 @@ def test_a_slave_that_is_there_becomes_a_file_and_each_difference_from_it_is_nam
     out, config = arm.parent / "devices" / "drive.yaml", ("--config", str(arm))
     done = rtcp("device", "new", "--from-bus", "virtual", "--slave", "2", "--out", str(out), *config)
     assert done.code == 0, done.trouble
-    shipped, made = load_device(arm.parent / "devices" / "cubemars-orh.yaml"), load_device(out)
-    assert (made.kind, made.vendor_id, made.product_id, made.coe) == (
+    shipped, written = load_device(arm.parent / "devices" / "cubemars-orh.yaml"), load_device(out)
+    assert (written.kind, written.vendor_id, written.product_id, written.coe) == (
         "cia402",
         shipped.vendor_id,
         shipped.product_id,
         True,
     )
     for direction in ("outputs", "inputs"):
-        assert [(one.index, one.sub_index, one.length) for one in getattr(made, direction)] == [
-            (one.index, one.sub_index, one.length) for one in getattr(shipped, direction)
+        assert [(entry.index, entry.sub_index, entry.length) for entry in getattr(written, direction)] == [
+            (entry.index, entry.sub_index, entry.length) for entry in getattr(shipped, direction)
         ]
     same = rtcp("device", "check", str(out), "--bus", "virtual", *config)
     assert (same.code, "slave 2 (Cubemars ORH70): as the file says" in same.out) == (0, True), same.out + same.trouble

@@ -19,7 +19,7 @@ CPUS = "sys/devices/system/cpu"
 
 @pytest.fixture
 def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, str]], None]:
-    """Let the doctor look at a host that is these files and nothing else."""
+    """Let the doctor examine a host of these files alone."""
     root = tmp_path / "host"
     root.mkdir()
     monkeypatch.setattr(doctor, "Host", lambda: Host(root))

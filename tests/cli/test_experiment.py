@@ -1,4 +1,4 @@
-"""`rtcp experiment` and `rtcp report` around experiments that are made up: folders, tables, pages and exit codes."""
+"""`rtcp experiment` and `rtcp report` with fake experiments: folders, tables, pages and exit codes."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def experiments(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("experiments")
 @pytest.mark.parametrize(
-    ("name", "code", "said"), [("good", 0, "met"), ("bad", 1, "MISSED"), ("failing", 5, "failing: there is no arm")]
+    ("name", "code", "text"), [("good", 0, "met"), ("bad", 1, "MISSED"), ("failing", 5, "failing: there is no arm")]
 )
 def test_an_experiment_ends_with_1_where_a_figure_misses_its_aim(
-    rtcp: Callable[..., Any], tmp_path: Path, name: str, code: int, said: str
+    rtcp: Callable[..., Any], tmp_path: Path, name: str, code: int, text: str
 ) -> None:
     ended = rtcp("experiment", name, "--out", str(tmp_path / "out"))
-    assert (ended.code, said in ended.out + ended.trouble) == (code, True)
+    assert (ended.code, text in ended.out + ended.trouble) == (code, True)
     assert read_result(tmp_path / "out").met is (code == 0)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from rtcp.cli import faults
 from rtcp.ipc.observer import record_type
-from rtcp.ipc.recording import About, FaultRecording, Moment, faults_directory, write
+from rtcp.ipc.recording import About, FaultRecording, Moment, faults_directory, read, write
 from rtcp.ipc.schema import FLAG_ENABLED, arm_schema
 from rtcp.ipc.states import State
 
@@ -31,21 +31,21 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def recording() -> FaultRecording:
     """An arm that moves for 0.8 s and faults; after the fault no frame comes for 40 cycles."""
     schema = arm_schema(JOINTS)
-    whole = np.zeros(CYCLES, dtype=record_type(schema))
+    records = np.zeros(CYCLES, dtype=record_type(schema))
     cycles = np.arange(CYCLES)
-    whole["number"] = cycles + 5
-    whole["time_ns"] = (cycles + 7) * PERIOD_NS
-    whole["state"] = np.where(cycles < AT, State.MOVING, State.FAULT)
-    whole["wkc_expected"] = 10
-    whole["wkc"] = np.where((cycles > AT) & (cycles <= AT + 40), -1, 10)
-    whole["lost"] = np.where((cycles > AT) & (cycles <= AT + 40), cycles - AT, 0)
-    whole["flags"] = FLAG_ENABLED
-    whole["missed"] = np.where(cycles < 100, 2, 5)
-    whole["sent_position"] = np.minimum(cycles, AT)[:, None] * 1e-4 * np.array([1, 2, -1])
-    whole["sent_position"][300:, 1] += 0.01
-    whole["actual_position"] = whole["sent_position"] - 0.001
-    whole["actual_velocity"][:AT] = (0.1, 0.2, -0.1)
-    whole["actual_torque"][AT] = (1.0, -2.0, 3.0)
+    records["number"] = cycles + 5
+    records["time_ns"] = (cycles + 7) * PERIOD_NS
+    records["state"] = np.where(cycles < AT, State.MOVING, State.FAULT)
+    records["wkc_expected"] = 10
+    records["wkc"] = np.where((cycles > AT) & (cycles <= AT + 40), -1, 10)
+    records["lost"] = np.where((cycles > AT) & (cycles <= AT + 40), cycles - AT, 0)
+    records["flags"] = FLAG_ENABLED
+    records["missed"] = np.where(cycles < 100, 2, 5)
+    records["sent_position"] = np.minimum(cycles, AT)[:, None] * 1e-4 * np.array([1, 2, -1])
+    records["sent_position"][300:, 1] += 0.01
+    records["actual_position"] = records["sent_position"] - 0.001
+    records["actual_velocity"][:AT] = (0.1, 0.2, -0.1)
+    records["actual_torque"][AT] = (1.0, -2.0, 3.0)
     about = About(
         number=0, time_ns=WHEN_NS, what=WHAT, before="moving", arm="arm", bus="virtual", period_ns=PERIOD_NS,
         joints=("base", "elbow", "wrist"), versions={"rtcp": "9.9"}, began_ns=5, event=7, at=AT,
@@ -53,7 +53,7 @@ def recording() -> FaultRecording:
         timeline=(Moment(WHEN_NS - 500_000_000, "a sentence before"), Moment(WHEN_NS, WHAT),
                   Moment(WHEN_NS + 20_000_000, "slave 3 sent emergency 0x8611")),
     )  # fmt: skip
-    return FaultRecording(about, {name: whole[name] for name in schema.names}, schema)
+    return FaultRecording(about, records, schema)
 
 
 def test_without_a_recording_the_list_says_so(rtcp: Callable[..., Any], state: Path) -> None:
@@ -68,13 +68,13 @@ def test_the_list_has_number_time_first_sentence_state_before_and_the_length_rec
     write(faults_directory(), recording())
     write(faults_directory(), recording())
     ended = rtcp("faults")
-    shown = " ".join(ended.out.split())
+    output = " ".join(ended.out.split())
     when = recording().about.when
-    assert f"2 {when:%Y-%m-%d %H:%M:%S} joint2: the drive is in" in shown
-    assert "moving 1.2 s" in shown
-    assert "recorded" in shown
-    assert "duration" not in shown
-    assert "1: 0.8 s before the fault instead of 10 s" in shown
+    assert f"2 {when:%Y-%m-%d %H:%M:%S} joint2: the drive is in" in output
+    assert "moving 1.2 s" in output
+    assert "recorded" in output
+    assert "duration" not in output
+    assert "1: 0.8 s before the fault instead of 10 s" in output
     assert max(len(line) for line in ended.out.splitlines()) <= 80
     rows = json.loads(rtcp("faults", "--json").out)["faults"]
     assert [row["number"] for row in rows] == [1, 2]
@@ -91,17 +91,17 @@ def test_a_file_that_is_none_is_a_sentence_in_the_list_and_the_others_are_shown(
     assert "is cut off, damaged or no recording" in " ".join(ended.out.split())
     assert "moving" in ended.out
     assert "error" in json.loads(rtcp("faults", "--json").out)["faults"][0]
-    shown = rtcp("faults", "show", "1")
-    assert (shown.code, shown.out) == (5, "")
-    assert "cut off" in shown.trouble
+    result = rtcp("faults", "show", "1")
+    assert (result.code, result.out) == (5, "")
+    assert "cut off" in result.trouble
 
 
 def test_one_fault_is_shown_with_what_happened_the_joints_steps_and_frames(rtcp: Callable[..., Any]) -> None:
     _, path = write(faults_directory(), recording())
     ended = rtcp("faults", "show", "1")
     assert ended.code == 0
-    shown = " ".join(ended.out.split())
-    for told in (
+    output = " ".join(ended.out.split())
+    for text in (
         "FAULT 1", "arm on virtual", "[red]; `rtcp reset` goes on", "before: moving; rtcp 9.9",
         "-0.500 a sentence before", "+0.000 state: moving -> fault", "+0.020 slave 3 sent emergency 0x8611",
         "elbow +0.1690 +0.1700 +0.0000 -2.0000", "1200 cycles, -0.8 s to +0.4 s",
@@ -109,7 +109,7 @@ def test_one_fault_is_shown_with_what_happened_the_joints_steps_and_frames(rtcp:
         "working counter 10 of 10 at the fault; 40 wrong, 40 without an answer",
         "0.8 s before the fault instead of 10 s",
     ):  # fmt: skip
-        assert told in shown, told
+        assert text in output, text
     assert max(len(line) for line in ended.out.split("\nrecording:")[0].splitlines()) <= 80
     picture = path.with_suffix(".png")
     assert ended.out.endswith(f"recording: {path}\npicture: {picture}\n")
@@ -120,18 +120,18 @@ def test_the_json_of_a_fault_has_the_same_in_numbers_and_draws_only_when_asked(
     rtcp: Callable[..., Any], tmp_path: Path
 ) -> None:
     _, path = write(faults_directory(), recording())
-    told = json.loads(rtcp("faults", "show", "1", "--json").out)
-    assert told["largest_step"] == {
+    answer = json.loads(rtcp("faults", "show", "1", "--json").out)
+    assert answer["largest_step"] == {
         "joint": "elbow", "rad": pytest.approx(0.0102), "rad_per_s": pytest.approx(10.2), "t_s": -0.5,
     }  # fmt: skip
-    assert told["wkc"] == {"expected": 10, "actual": 10, "wrong_cycles": 40, "without_answer": 40}
-    assert told["missed"] == 3
-    assert told["joints"]["actual_torque"] == [1.0, -2.0, 3.0]
-    assert [one["t_s"] for one in told["timeline"]] == [-0.5, 0.0, 0.0, 0.02]
+    assert answer["wkc"] == {"expected": 10, "actual": 10, "wrong_cycles": 40, "without_answer": 40}
+    assert answer["missed"] == 3
+    assert answer["joints"]["actual_torque"] == [1.0, -2.0, 3.0]
+    assert [event["t_s"] for event in answer["timeline"]] == [-0.5, 0.0, 0.0, 0.02]
     assert not path.with_suffix(".png").exists()
     out = tmp_path / "mine.svg"
-    told = json.loads(rtcp("faults", "show", "1", "--json", "--plot", str(out)).out)
-    assert told["picture"] == str(out)
+    answer = json.loads(rtcp("faults", "show", "1", "--json", "--plot", str(out)).out)
+    assert answer["picture"] == str(out)
     assert "<svg" in out.read_text()
 
 
@@ -139,13 +139,13 @@ def test_the_json_of_a_fault_has_the_same_in_numbers_and_draws_only_when_asked(
 def test_a_step_counts_only_where_the_drives_are_enabled_on_both_of_its_cycles(
     rtcp: Callable[..., Any], disabled: int
 ) -> None:
-    made = recording()
-    made.records["flags"][disabled] = 0
-    write(faults_directory(), made)
+    edited = recording()
+    edited.records["flags"][disabled] = 0
+    write(faults_directory(), edited)
     step = json.loads(rtcp("faults", "show", "1", "--json").out)["largest_step"]
     assert (step["joint"], step["rad"]) == ("elbow", pytest.approx(2e-4))
-    made.records["flags"][:] = 0
-    write(faults_directory(), made)
+    edited.records["flags"][:] = 0
+    write(faults_directory(), edited)
     assert json.loads(rtcp("faults", "show", "2", "--json").out)["largest_step"] is None
     assert rtcp("faults", "show", "2").code == 0
 
@@ -160,7 +160,7 @@ def test_a_picture_replaces_a_link_and_leaves_what_that_leads_to(rtcp: Callable[
     assert precious.read_text() == "precious"
     assert not picture.is_symlink()
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert [one.name for one in path.parent.iterdir() if one.name.startswith(".") and one.suffix == ".png"] == []
+    assert [file.name for file in path.parent.iterdir() if file.name.startswith(".") and file.suffix == ".png"] == []
 
 
 def test_who_has_recorded_nothing_is_referred_to_where_the_service_records(
@@ -176,8 +176,9 @@ def test_who_has_recorded_nothing_is_referred_to_where_the_service_records(
 
 def test_a_fault_without_a_single_cycle_is_shown(rtcp: Callable[..., Any]) -> None:
     made = recording()
-    none = {name: array[:0] for name, array in made.records.items()}
-    write(faults_directory(), FaultRecording(replace(made.about, at=-1), none, made.schema))
+    none = made.records[:0]
+    _, path = write(faults_directory(), FaultRecording(replace(made.about, at=-1), none, made.schema))
+    assert read(path).records["number"].shape == (0,)
     ended = rtcp("faults", "show", "1")
     assert ended.code == 0
     assert "slave 3 sent emergency" in ended.out
@@ -223,12 +224,12 @@ def test_a_state_directory_that_is_a_file_is_a_sentence(
 
 
 def test_two_faults_that_begin_alike_are_distinct_at_80_columns(rtcp: Callable[..., Any]) -> None:
-    made = recording()
+    original = recording()
     for end in ("drive1 with statusword 0x0218", "drive2 with statusword 0x0208"):
-        what = f"a long sentence about something that went wrong with the drive {end}"
-        write(faults_directory(), replace(made, about=replace(made.about, what=what)))
+        text = f"a long sentence about something that went wrong with the drive {end}"
+        write(faults_directory(), replace(original, about=replace(original.about, what=text)))
     ended = rtcp("faults")
-    shown = " ".join(ended.out.split())
-    assert "0x0218" in shown
-    assert "0x0208" in shown
+    output = " ".join(ended.out.split())
+    assert "0x0218" in output
+    assert "0x0208" in output
     assert max(len(line) for line in ended.out.splitlines()) <= 80

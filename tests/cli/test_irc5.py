@@ -33,17 +33,17 @@ def pc() -> Iterator[socket.socket]:
 
 @pytest.fixture
 def begin(rtcp_process: Callable[..., Any], tmp_path: Path, pc: socket.socket) -> Callable[[], Started]:
-    """Start `rtcp irc5`; return its process and what it said."""
+    """Start `rtcp irc5`; return its process and its first lines."""
     config = tmp_path / "irc5.yaml"
     config.write_text(f"units:\n  - {{name: ROB_1, port: {pc.getsockname()[1]}}}\n")
 
     def start() -> Started:
         process = rtcp_process("irc5", "--config", str(config))
-        said: list[str] = []
-        while not said or said[-1] != "Ctrl-C ends it\n":
-            said.append(process.stdout.readline())
-            assert said[-1], process.stderr.read()
-        return process, said
+        lines: list[str] = []
+        while not lines or lines[-1] != "Ctrl-C ends it\n":
+            lines.append(process.stdout.readline())
+            assert lines[-1], process.stderr.read()
+        return process, lines
 
     return start
 
@@ -51,13 +51,13 @@ def begin(rtcp_process: Callable[..., Any], tmp_path: Path, pc: socket.socket) -
 def test_it_says_what_it_does_speaks_to_its_pc_and_ends_by_ctrl_c(
     begin: Callable[[], Started], pc: socket.socket, directory: Path
 ) -> None:
-    process, said = begin()
-    assert said[0] == f"virtual IRC5 (process {process.pid})\n"
-    assert said[1] == "mode auto, motors on, enabling device released, open stops: none\n"
-    assert said[2].startswith(
+    process, lines = begin()
+    assert lines[0] == f"virtual IRC5 (process {process.pid})\n"
+    assert lines[1] == "mode auto, motors on, enabling device released, open stops: none\n"
+    assert lines[2].startswith(
         f"ROB_1 speaks to 127.0.0.1:{pc.getsockname()[1]}: RAPID runs, EGM is running, joints 0.00"
     )
-    assert f"control socket {directory / 'irc5.sock'}" in said[3]
+    assert f"control socket {directory / 'irc5.sock'}" in lines[3]
     assert pc.recv(2048)
     process.send_signal(signal.SIGINT)
     assert (process.communicate(), process.returncode) == (("ended\n", ""), 0)
@@ -99,7 +99,7 @@ def test_faults_begin_and_are_cleared(rtcp: Rtcp, begin: Callable[[], Started]) 
     ("command", "sentence"),
     [
         (("fault", "tired"), 'fault: found the text "tired", allowed is one of seqno_restart, rapid_stop'),
-        (("fault", "lost", "--value", "2"), "value: found 2.0, allowed is a number from 0 to 1"),
+        (("fault", "lost", "--value", "2"), "value: found 2, allowed is a number from 0 to 1"),
         (("clear", "ROB_2"), 'unit: found the text "ROB_2", allowed is one of ROB_1'),
         (("mode", "manual"), 'mode: found the text "manual", allowed is one of hand, auto'),
     ],

@@ -46,15 +46,15 @@ class Terminal:
 
 @pytest.fixture
 def terminal(rtcp_process: Callable[..., Any]) -> Iterator[Callable[..., Terminal]]:
-    made: list[Terminal] = []
+    terminals: list[Terminal] = []
 
     def start(*arguments: str) -> Terminal:
-        made.append(Terminal(rtcp_process, *arguments))
-        return made[-1]
+        terminals.append(Terminal(rtcp_process, *arguments))
+        return terminals[-1]
 
     yield start
-    for one in made:
-        os.close(one.master)
+    for terminal in terminals:
+        os.close(terminal.master)
 
 
 # -- held keys ------------------------------------------------------------------------------------------------------
@@ -116,12 +116,12 @@ def test_a_command_that_was_suspended_ends_and_does_not_move_the_arm_again(
     last: str,
     words: str,
 ) -> None:
-    held = rtcp_process(*command, "--seconds", "8")
+    command_process = rtcp_process(*command, "--seconds", "8")
     wait_until(lambda: len(platform.asked(verb)) > 2)
     counts: list[int] = []
-    suspend(held, 0.6, lambda: counts.append(settled(lambda: len(platform.asked(verb)))))
-    _, trouble = held.communicate()
-    assert held.returncode == 5
+    suspend(command_process, 0.6, lambda: counts.append(settled(lambda: len(platform.asked(verb)))))
+    _, trouble = command_process.communicate()
+    assert command_process.returncode == 5
     assert f"the {command[0]} was not renewed for 0." in trouble
     assert words in trouble
     assert len(platform.asked(verb)) == counts[0]
@@ -137,7 +137,7 @@ def settled(count: Callable[[], int]) -> int:
 def test_a_jog_carries_the_instant_at_which_it_was_requested(platform: Any, rtcp: Callable[..., Any]) -> None:
     before = time.monotonic()
     rtcp("jog", "x", "0.1", "--seconds", "0.1")
-    instants = [one["sent_s"] for one in platform.asked("jog")]
+    instants = [jog["sent_s"] for jog in platform.asked("jog")]
     assert before < instants[0] < instants[-1] < time.monotonic()
 
 
@@ -165,9 +165,9 @@ def test_keys_typed_while_the_process_was_suspended_move_nothing(
     suspend(keyboard.process, 0.6, meanwhile)
     wait_until(lambda: bool(platform.asked("halt")))
     time.sleep(0.4)
-    # One may have been on its way: the platform refuses it by its instant.
+    # One jog may have been under way: the platform refuses it by its instant.
     assert len(platform.asked("jog")) <= counts[0] + 1
-    assert all(one["sent_s"] < suspended + 0.1 for one in platform.asked("jog"))
+    assert all(jog["sent_s"] < suspended + 0.1 for jog in platform.asked("jog"))
     assert "the keyboard was not read for" in keyboard.process.stdout.readline()
     hold_until(keyboard, b" ", lambda: len(platform.asked("jog")) > counts[0])
     assert keyboard.quit() == 0
@@ -186,7 +186,7 @@ def test_arrows_typed_while_the_process_was_suspended_are_ignored(
 
     suspend(keyboard.process, 0.8, meanwhile)
     wait_until(lambda: len(platform.asked("joystick")) > counts[0] + 4)
-    assert all(one["pressed"] == [] for one in platform.asked("joystick"))
+    assert all(inputs["pressed"] == [] for inputs in platform.asked("joystick"))
     assert keyboard.quit() == 0
 
 
@@ -207,9 +207,9 @@ def test_a_jog_for_a_time_is_renewed_and_ends_in_a_halt(
     ended = rtcp("jog", *arguments, "--seconds", "0.4")
     assert ended.code == 0
     assert ended.out.startswith("stopped at 0.1000 -0.2000")
-    asked = platform.asked("jog")
-    assert 5 <= len(asked) <= 9
-    assert all(one == {"velocity": speeds, "frame": frame, "hold_s": 0.25, "sent_s": one["sent_s"]} for one in asked)
+    requests = platform.asked("jog")
+    assert 5 <= len(requests) <= 9
+    assert all(jog == {"velocity": speeds, "frame": frame, "hold_s": 0.25, "sent_s": jog["sent_s"]} for jog in requests)
     assert platform.methods[-2] == "halt"
 
 
@@ -258,11 +258,11 @@ def test_without_a_terminal_a_duration_or_position_is_required(
 def test_a_suspended_joystick_is_released_and_ends(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
-    held = rtcp_process("joystick", "forward", "--seconds", "50")
+    joystick = rtcp_process("joystick", "forward", "--seconds", "50")
     wait_until(lambda: bool(platform.asked("joystick")))
-    held.send_signal(signal.SIGTSTP)
-    _, trouble = held.communicate()
-    assert (held.returncode, trouble) == (148, "rtcp: interrupted: the joystick is released\n")
+    joystick.send_signal(signal.SIGTSTP)
+    _, trouble = joystick.communicate()
+    assert (joystick.returncode, trouble) == (148, "rtcp: interrupted: the joystick is released\n")
 
 
 def test_an_interrupted_jog_closes_its_connection_and_reports_the_stop(
@@ -287,7 +287,7 @@ def test_the_arm_moves_while_a_key_is_held_and_stops_when_it_is_released(
     keyboard.hold(ARROW_LEFT, 1.0)
     wait_until(lambda: len(platform.asked("halt")) == 2, 2.0)
     assert keyboard.quit() == 0
-    directions = [one["velocity"][1] for one in platform.asked("jog")]
+    directions = [jog["velocity"][1] for jog in platform.asked("jog")]
     assert set(directions[:forward]) == {0.1}
     assert set(directions[forward:]) == {-0.1}
 
@@ -330,9 +330,9 @@ def test_a_position_is_held_for_a_time_by_renewal(
         assert "was not renewed for" in ended.trouble
         ended = rtcp("joystick", *words, "--seconds", "0.4")
     assert (ended.code, ended.out) == (0, "the joystick is released\n")
-    asked = platform.asked("joystick")
-    assert len(asked) >= 2
-    assert all(one == {"pressed": pressed, "byte": byte, "hold_s": 0.4, "sent_s": one["sent_s"]} for one in asked)
+    requests = platform.asked("joystick")
+    assert len(requests) >= 2
+    assert all(item == {"pressed": pressed, "byte": byte, "hold_s": 0.4, "sent_s": item["sent_s"]} for item in requests)
 
 
 @pytest.mark.parametrize(
@@ -361,8 +361,8 @@ def test_arrows_are_the_joystick_and_letters_its_switches(
     keyboard = terminal("joystick")
 
     def last() -> list[str]:
-        asked = platform.asked("joystick")
-        return asked[-1]["pressed"] if asked else ["none"]
+        requests = platform.asked("joystick")
+        return requests[-1]["pressed"] if requests else ["none"]
 
     wait_until(lambda: last() == [])
     keyboard.hold(ARROW_UP, 0.8)
@@ -389,6 +389,6 @@ def test_a_killed_joystick_sends_nothing_more(
     wait_until(lambda: bool(platform.asked("joystick")))
     playing.kill()
     playing.wait()
-    asked = len(platform.asked("joystick"))
+    count = len(platform.asked("joystick"))
     time.sleep(0.3)
-    assert len(platform.asked("joystick")) <= asked + 1
+    assert len(platform.asked("joystick")) <= count + 1

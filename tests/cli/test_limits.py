@@ -14,16 +14,16 @@ JOINTS = 6
 
 @pytest.fixture
 def limits(platform: Any) -> dict[str, Any]:
-    """What the platform answers: joint 2 narrowed to 1.25 rad, the user's box made higher."""
+    """The answer of the platform: joint 2 narrowed to 1.25 rad, the user's box made higher."""
     numbers = {"min": -3.0, "max": 3.0, "velocity": 0.5, "acceleration": 2.0, "jerk": 20.0, "torque": 49.0}
     configured = {name: [value] * JOINTS for name, value in numbers.items()} | {
         "box": {"min": [-1.2, -1.0, -0.4], "max": [0.8, 1.0, 1.4]},
         "keep_out": {"user": {"min": [0.4, -0.3, -0.1], "max": [1.1, 0.3, 0.85]}},
     }
     now = copy.deepcopy(configured)
-    now["max"][1] = 1.25  # type: ignore[index, call-overload]
-    now["keep_out"]["user"]["max"][2] = 0.95  # type: ignore[index, call-overload]
-    made = {
+    now["max"][1] = 1.25  # type: ignore[index]
+    now["keep_out"]["user"]["max"][2] = 0.95  # type: ignore[index]
+    answer = {
         "joint_names": [f"joint{n}" for n in range(1, JOINTS + 1)],
         "limits": now,
         "configured": configured,
@@ -32,8 +32,8 @@ def limits(platform: Any) -> dict[str, Any]:
             "angular_jerk": 10.0, "singularity": {"shoulder": 0.03, "elbow": 0.08, "wrist": 0.07},
         },
     }  # fmt: skip
-    platform.answers |= {"limits": made, "set_limits": made}
-    return made
+    platform.answers |= {"limits": answer, "set_limits": answer}
+    return answer
 
 
 def test_all_limits_and_boxes_are_shown_and_what_was_changed_is_marked(
@@ -44,8 +44,8 @@ def test_all_limits_and_boxes_are_shown_and_what_was_changed_is_marked(
     assert "1.25 *" in rows["joint2"]
     assert "*" not in rows["joint1"]
     assert "-0.1 to 0.95 *" in ended.out
-    for shown in ("tool inside", "-1.2 to 0.8", "keep out: user", "0.25 m/s", "singularity: wrist", "0.07 rad"):
-        assert shown in ended.out
+    for text in ("tool inside", "-1.2 to 0.8", "keep out: user", "0.25 m/s", "singularity: wrist", "0.07 rad"):
+        assert text in ended.out
     assert max(len(line) for line in ended.out.splitlines()) <= 80
 
 

@@ -124,7 +124,7 @@ def test_an_output_is_switched_by_number(platform: Any, rtcp: Callable[..., Any]
 
 
 @pytest.mark.parametrize(
-    ("word", "answer", "said"),
+    ("word", "answer", "text"),
     [
         ("OPEN", {}, "gripper output set to open"),
         ("close", {"position": 0.0, "holds": False}, "the gripper is closed: it rests at 0.0000 rad"),
@@ -134,11 +134,11 @@ def test_an_output_is_switched_by_number(platform: Any, rtcp: Callable[..., Any]
     ids=["on an output", "closed", "open", "holding"],
 )
 def test_it_is_shown_where_a_gripper_with_a_drive_has_come_to_rest(
-    platform: Any, rtcp: Callable[..., Any], word: str, answer: dict[str, Any], said: str
+    platform: Any, rtcp: Callable[..., Any], word: str, answer: dict[str, Any], text: str
 ) -> None:
     platform.answers["move_gripper"] = answer
     ended = rtcp("gripper", word)
-    assert (ended.code, ended.out) == (0, f"{said}\n")
+    assert (ended.code, ended.out) == (0, f"{text}\n")
     assert platform.asked("move_gripper") == [{"open": word.lower() == "open"}]
 
 
@@ -194,7 +194,7 @@ def test_help_is_help_among_the_numbers_too(rtcp: Callable[..., Any], help_optio
 
 
 @pytest.mark.parametrize(
-    ("number", "code", "what"),
+    ("number", "code", "text"),
     [
         (signal.SIGINT, 130, "interrupted"),
         (signal.SIGTERM, 143, "interrupted"),
@@ -210,7 +210,7 @@ def test_an_interrupted_move_closes_its_connection_and_says_that_the_arm_stops(
     wait_until: Callable[..., None],
     number: signal.Signals,
     code: int,
-    what: str,
+    text: str,
 ) -> None:
     platform.move_steps, platform.step_s = 10_000, 0.01
     moving = rtcp_process("move", *HOME)
@@ -218,7 +218,7 @@ def test_an_interrupted_move_closes_its_connection_and_says_that_the_arm_stops(
     moving.send_signal(number)
     _, trouble = moving.communicate()
     assert moving.returncode == code
-    assert trouble == f"rtcp: {what}: the connection is closed, the arm comes to a controlled stop\n"
+    assert trouble == f"rtcp: {text}: the connection is closed, the arm comes to a controlled stop\n"
     wait_until(platform.left_while_moving.is_set)
 
 
@@ -245,16 +245,16 @@ def test_on_a_terminal_a_move_draws_a_bar(platform: Any, rtcp_process: Callable[
     mine, its = pty.openpty()
     moving = rtcp_process("move", *HOME, stdout=its, env={**os.environ, "TERM": "xterm", "COLUMNS": "80"})
     os.close(its)
-    shown = b""
+    output = b""
     try:
         while chunk := os.read(mine, 4096):
-            shown += chunk
+            output += chunk
     except OSError:
         pass  # EIO: the terminal's last writer has gone
     os.close(mine)
     assert moving.wait() == 0
-    assert "━".encode() in shown
-    assert b"arrived, largest error" in shown
+    assert "━".encode() in output
+    assert b"arrived, largest error" in output
 
 
 @pytest.mark.parametrize("terminal", [False, True])
@@ -262,12 +262,12 @@ def test_while_a_motion_is_planned_and_may_be_refused_no_progress_is_shown(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, terminal: bool
 ) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
-    with contextlib.suppress(Refused), progress() as shown:
-        shown(Progress(fraction=0.0, remaining_s=0.0))
+    with contextlib.suppress(Refused), progress() as show_progress:
+        show_progress(Progress(fraction=0.0, remaining_s=0.0))
         raise Refused("refused", "outside its range")
     assert capsys.readouterr().out == ""
-    with progress() as shown:
-        shown(Progress(fraction=0.0, remaining_s=1.5))
+    with progress() as show_progress:
+        show_progress(Progress(fraction=0.0, remaining_s=1.5))
     assert "moving" in capsys.readouterr().out
 
 
@@ -284,9 +284,9 @@ def test_a_pose_is_passed_on_with_fractions_of_pi_as_numbers(
     platform: Any, rtcp: Callable[..., Any], options: tuple[str, ...], line: bool, speed: float | None
 ) -> None:
     assert rtcp("move", "--pose", *POSE, *options).code == 0
-    (asked,) = platform.asked("move_pose")
-    assert asked["pose"] == pytest.approx([-0.4, -0.1, 0.8, 1.5707963, -0.7853982, 0.0])
-    assert (asked["line"], asked["speed"]) == (line, speed)
+    (request,) = platform.asked("move_pose")
+    assert request["pose"] == pytest.approx([-0.4, -0.1, 0.8, 1.5707963, -0.7853982, 0.0])
+    assert (request["line"], request["speed"]) == (line, speed)
 
 
 def at_joint_3(value: str) -> tuple[str, ...]:
@@ -374,5 +374,5 @@ def test_the_end_of_a_path_shows_its_length_and_whether_joints_slowed_it(
         "slowed": 0.5,
     }
     ended = rtcp("move", "--pose", *POSE, "--line")
-    said = "arrived, largest error 0.000100 rad, 0.200 m, in 4.2 s, slowed to 50% of its speed by the joints' limits\n"
-    assert ended.out == said
+    line = "arrived, largest error 0.000100 rad, 0.200 m, in 4.2 s, slowed to 50% of its speed by the joints' limits\n"
+    assert ended.out == line

@@ -78,9 +78,9 @@ def test_a_segment_says_where_the_masters_end_is_and_ends_on_a_signal(
     rtcp_process: Callable[..., Any], arm: Path, number: signal.Signals
 ) -> None:
     running = rtcp_process("segment", "--config", str(arm.parent / "segment.yaml"))
-    said = [running.stdout.readline() for _ in range(5)]
-    assert f"segment of 7 slaves (process {running.pid})" in said[0]
-    assert f"nsenter -t {running.pid}" in said[2]
+    lines = [running.stdout.readline() for _ in range(5)]
+    assert f"segment of 7 slaves (process {running.pid})" in lines[0]
+    assert f"nsenter -t {running.pid}" in lines[2]
     running.send_signal(number)
     out, trouble = running.communicate()
     assert (running.returncode, out, trouble) == (0, "ended\n", "")

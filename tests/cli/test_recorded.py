@@ -18,8 +18,8 @@ def test_a_recording_is_exported_beside_itself_and_drawn(rtcp: Callable[..., Any
     assert (ended.code, ended.out) == (0, f"500 records in {tmp_path}/a.csv\n")
     ended = rtcp("export", str(path), "--out", str(tmp_path / "b.npz"), "--signals", "wkc,*_position", "--start", "0.1")
     assert ended.out == f"300 records in {tmp_path}/b.npz\n"
-    with np.load(tmp_path / "b.npz") as found:
-        assert "commanded_position" in found
+    with np.load(tmp_path / "b.npz") as arrays:
+        assert "commanded_position" in arrays
     assert rtcp("plot", str(path), "--end", "0.1").out == f"picture: {tmp_path}/a.png\n"
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     assert rtcp("plot", str(path), "--out", str(tmp_path / "b.svg"), "--signals", "wkc").code == 0
@@ -47,7 +47,7 @@ def test_of_a_recording_that_is_cut_off_the_rest_is_exported_and_that_is_said(
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "text"),
     [
         (["export", "a.mcap"], "--to: found nothing, allowed are csv, mcap, npz"),
         (["export", "a.mcap", "--to", "wav"], "--to: found wav, allowed are csv, mcap, npz"),
@@ -68,7 +68,7 @@ def test_of_a_recording_that_is_cut_off_the_rest_is_exported_and_that_is_said(
     ],
 )
 def test_what_cannot_be_done_is_one_message(
-    rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str], said: str
+    rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str], text: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     mcap(Path("a.mcap"), cycles(500))
@@ -80,6 +80,6 @@ def test_what_cannot_be_done_is_one_message(
     before = sorted(tmp_path.iterdir())
     ended = rtcp(*command)
     assert (ended.code, ended.out) == (2, "")
-    assert said in ended.trouble
+    assert text in ended.trouble
     assert len(ended.trouble.splitlines()) == 1
     assert sorted(tmp_path.iterdir()) == before

@@ -31,15 +31,15 @@ def config(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def begin(rtcp_process: Callable[..., Any], config: Path) -> Callable[..., Segment]:
-    """Start `rtcp segment`; return its process and what it said."""
+    """Start `rtcp segment`; return its process and its first lines."""
 
     def start(*options: str, **more: Any) -> Segment:
         process = rtcp_process("segment", "--config", str(config), *options, **more)
-        said = []
-        while not said or said[-1] != "Ctrl-C ends it\n":
-            said.append(process.stdout.readline())
-            assert said[-1], process.stderr.read()
-        return process, said
+        lines: list[str] = []
+        while not lines or lines[-1] != "Ctrl-C ends it\n":
+            lines.append(process.stdout.readline())
+            assert lines[-1], process.stderr.read()
+        return process, lines
 
     return start
 
@@ -55,12 +55,12 @@ def test_a_segment_leaves_the_last_cpu_to_the_masters_cycle_unless_one_is_chosen
 def test_faults_are_made_listed_and_cleared_on_the_segment_that_runs(
     rtcp: Rtcp, begin: Callable[..., Segment], directory: Path
 ) -> None:
-    process, said = begin()
-    assert f"inject faults with `rtcp segment fault NAME`; control socket {directory / 'segment.sock'}\n" in said
+    process, printed = begin()
+    assert f"inject faults with `rtcp segment fault NAME`; control socket {directory / 'segment.sock'}\n" in printed
 
-    made = rtcp("segment", "fault", "cable", "after=1")
-    assert (made.code, made.err) == (0, "")
-    assert made.out == "fault 1: cable after=1 port=1, until it is cleared; to clear it: rtcp segment clear 1\n"
+    injected = rtcp("segment", "fault", "cable", "after=1")
+    assert (injected.code, injected.err) == (0, "")
+    assert injected.out == "fault 1: cable after=1 port=1, until it is cleared; to clear it: rtcp segment clear 1\n"
     assert rtcp("segment", "fault", "sdo_abort", "slave=2", "code=0x06090030", "--lasts", "60").out == (
         "fault 2: sdo_abort slave=2 code=0x6090030 index=0x0000, for 60 s; to clear it: rtcp segment clear 2\n"
     )
@@ -70,7 +70,7 @@ def test_faults_are_made_listed_and_cleared_on_the_segment_that_runs(
     )
 
     listed = json.loads(rtcp("segment", "faults", "--json").out)
-    assert [(each["id"], each["fault"]["fault"]) for each in listed] == [(1, "cable"), (2, "sdo_abort"), (3, "loss")]
+    assert [(fault["id"], fault["fault"]["fault"]) for fault in listed] == [(1, "cable"), (2, "sdo_abort"), (3, "loss")]
     lines = rtcp("segment", "faults").out.splitlines()
     assert re.fullmatch(r"fault 1: cable after=1 port=1, for \d+\.\d s, until it is cleared", lines[0])
     assert re.fullmatch(r"fault 2: .*, for \d+\.\d s, \d\d\.\d s left", lines[1])
@@ -95,15 +95,15 @@ def test_a_second_segment_has_a_socket_of_its_own_and_has_to_be_chosen(
     rtcp: Rtcp, begin: Callable[..., Segment], directory: Path
 ) -> None:
     begin()
-    second, said = begin()
+    second, lines = begin()
     own = directory / f"segment-{second.pid}.sock"
-    assert f"inject faults with `rtcp segment fault NAME --segment {own}`; control socket {own}\n" in said
+    assert f"inject faults with `rtcp segment fault NAME --segment {own}`; control socket {own}\n" in lines
 
     unclear = rtcp("segment", "faults")
     assert unclear.code == 2
     assert f"--segment {directory / 'segment.sock'} or {own}" in unclear.trouble
-    made = rtcp("segment", "fault", "cable", "after=1", "--segment", str(own))
-    assert made.out.endswith(f"to clear it: rtcp segment clear 1 --segment {own}\n")
+    injected = rtcp("segment", "fault", "cable", "after=1", "--segment", str(own))
+    assert injected.out.endswith(f"to clear it: rtcp segment clear 1 --segment {own}\n")
     assert len(json.loads(rtcp("segment", "faults", "--json", "--segment", str(own)).out)) == 1
     assert json.loads(rtcp("segment", "faults", "--json", "--segment", str(directory / "segment.sock")).out) == []
 
@@ -126,13 +126,13 @@ def test_objects_of_a_described_slave_are_shown_and_set(
     config.write_text(f"slaves:\n- {{esi: {vendor}, product: 0x30, name: box}}\n- {{esi: {vendor}, product: 0x11}}\n")
     begin()
     assert rtcp("segment", "set", "2", "0x6000:1", "1").out == "0x6000:1 Input: 1\n"
-    shown = rtcp("segment", "get", "2")
-    assert shown.out == "0x6000:1 Input: 1\n0x6010:1 Input: 0\n"
+    objects = rtcp("segment", "get", "2")
+    assert objects.out == "0x6000:1 Input: 1\n0x6010:1 Input: 0\n"
     rtcp("segment", "set", "box", "0x6000:2", "-2.5")
     rtcp("segment", "set", "box", "0x7010", "0x0102ff")
     assert json.loads(rtcp("segment", "get", "box", "0x6000:2", "--json").out)[0]["value"] == -2.5
     assert rtcp("segment", "get", "box", "0x7010").out.endswith(" Text: 0x0102ff\n")
-    for arguments, said in (
+    for arguments, text in (
         (("set", "2", "0x6000:1", "2"), "value: 0x6000:1 Input takes 0 to 1, not 2"),
         (("set", "2", "0x6000:1", "1e400"), "value: 0x6000:1 Input takes a whole number, not inf"),
         (("set", "box", "0x6000:2", "1e400"), "e+38, not inf"),
@@ -143,7 +143,7 @@ def test_objects_of_a_described_slave_are_shown_and_set(
     ):
         refused = rtcp("segment", *arguments)
         assert refused.code != 0
-        assert said in refused.err
+        assert text in refused.err
 
 
 @pytest.mark.parametrize("command", [("fault", "cable", "after=1"), ("clear",), ("clear", "3"), ("faults",)])
@@ -168,7 +168,7 @@ def test_without_a_segment_that_runs_the_exit_code_is_4(rtcp: Rtcp, directory: P
         (("fault", "cable", "after=0xFFFF"), "after: found 65535, allowed is an integer"),
         (("fault", "cable", "after=1", "after=2"), "after is given twice"),
         (("fault", "cable", "after=1", "lasts=2", "--lasts", "2"), "lasts is given twice"),
-        (("fault", "cable", "after=1", "--lasts", "-1"), "lasts: found -1.0, allowed is a number from 0.001"),
+        (("fault", "cable", "after=1", "--lasts", "-1"), "lasts: found -1, allowed is a number from 0.001"),
         (("fault", "cable", "after=1", "--lasts", "nan"), "lasts: found nan"),
         (("fault", "cable", "after=1", "at=3"), "at: a fault of the command line begins at once"),
         (("fault", "cable", "after=1", "fault=power"), "fault is given twice"),
@@ -178,7 +178,7 @@ def test_without_a_segment_that_runs_the_exit_code_is_4(rtcp: Rtcp, directory: P
         (("fault", "clock_jump", "slave=1", "us=3", "--lasts", "1"), "clock_jump happens once and is over"),
         (("push", "1", "2"), "2 numbers are no push: 3 (X Y Z, N) or 6 (and RX RY RZ, Nm)"),
         (("push", "1", "2", "nan"), "Z"),
-        (("push", "1", "600", "0"), "y: found 600.0, allowed is a number from -500 to 500"),
+        (("push", "1", "600", "0"), "y: found 600, allowed is a number from -500 to 500"),
         (("push", "1", "2", "3", "--seconds", "0"), "--seconds 0 is not allowed"),
         (("--config", "x.yaml", "faults"), "--config is an option of a segment that starts, not of faults"),
         ((), "--config FILE is missing"),
@@ -215,8 +215,8 @@ def test_the_page_lists_the_kinds_as_the_code_has_them() -> None:
         f"| `{kind.name}` | {'; '.join(f'`{key}`: {allowed}' for key, allowed in kind.keys.items())} | {kind.says} |"
         for kind in kinds()
     ]
-    found = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
-    assert [row for row in rows if row not in found] == []
+    listed = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    assert [row for row in rows if row not in listed] == []
 
 
 def test_the_script_of_the_page_is_one(tmp_path: Path) -> None:

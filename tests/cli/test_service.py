@@ -16,9 +16,9 @@ UNIT = "etc/systemd/system/rtcp@.service"
 PANEL_UNIT = "etc/systemd/system/rtcp-panel@.service"
 PLACES = {UNIT, PANEL_UNIT, "etc/sysusers.d/rtcp.conf", "etc/tmpfiles.d/rtcp.conf", "etc/sysctl.d/80-rtcp.conf"}
 PROGRAM = "/usr/bin/env"
-"""Stands for rtcp: systemd-analyze wants a program that exists."""
+"""A program in place of rtcp: systemd-analyze requires one that exists."""
 EXPOSURE = 2.7
-"""Of 10, the upper bound; systemd 252 says 2.5."""
+"""Upper bound of the exposure level, of 10; systemd 252 computes 2.5."""
 
 
 def files(root: Path) -> set[str]:
@@ -119,12 +119,12 @@ def test_uninstall_names_what_it_leaves(
     configuration.mkdir()
     runtime = tmp_path / "run/rtcp"
     runtime.mkdir(parents=True)
-    shown = uninstall("--dry-run").out
+    output = uninstall("--dry-run").out
     assert (tmp_path / UNIT).exists()
     done = uninstall()
     assert files(tmp_path) == {"etc/sysctl.d/80-rtcp.conf"}
     for path in (edited, wants / "rtcp@eth0.service", configuration, runtime):
-        assert f"left {path}" in shown
+        assert f"left {path}" in output
         assert f"left {path}" in done.out
 
 
@@ -175,13 +175,13 @@ def test_where_it_may_not_write_uninstall_says_so_and_removes_nothing(
 
 
 def settings(unit: Path) -> dict[str, list[str]]:
-    """Return what the unit sets, each key's values in their order; systemd takes the last one of most."""
-    found: dict[str, list[str]] = {}
+    """Return the settings of the unit, each key with its values in order; for most keys the last counts."""
+    values: dict[str, list[str]] = {}
     for line in unit.read_text().splitlines():
         key, is_one, value = line.partition("=")
         if is_one and not key.startswith("#"):
-            found.setdefault(key, []).append(value)
-    return found
+            values.setdefault(key, []).append(value)
+    return values
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_the_unit_leaves_the_next_start_what_it_records_a_death_from_and_outlive
 
 
 def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run systemd-analyze; it needs no systemd that runs."""
+    """Run systemd-analyze, which needs no running systemd."""
     return subprocess.run(["systemd-analyze", *arguments], capture_output=True, text=True, check=False)
 
 

@@ -1,4 +1,4 @@
-"""`rtcp shape-set`: what it says at its end, whatever ends it; the run itself is fake."""
+"""`rtcp shape-set`: its messages at any end; the run itself is fake."""
 
 from __future__ import annotations
 
@@ -94,9 +94,9 @@ def test_a_complete_run_without_a_report_prints_its_figures_and_fails(
 ) -> None:
     monkeypatch.setattr(report, "write_report", fail_to_write)
     assert main(["shape-set", JOB, "--out", str(tmp_path / "a")]) == 1
-    said = capfd.readouterr()
-    assert "mm rms" in said.out
-    assert "no report" in said.err
+    output = capfd.readouterr()
+    assert "mm rms" in output.out
+    assert "no report" in output.err
 
 
 def test_a_signal_while_the_report_is_written_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,16 +118,16 @@ def test_a_suspended_run_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert main(["shape-set", JOB, "--out", str(tmp_path / "a")]) == 128 + signal.SIGTSTP
 
 
-@pytest.mark.parametrize("given", [b"", b"\xff\xfe\n"], ids=["ended", "no text"])
+@pytest.mark.parametrize("typed", [b"", b"\xff\xfe\n"], ids=["ended", "no text"])
 def test_an_end_of_the_input_at_a_question_is_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], given: bytes
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], typed: bytes
 ) -> None:
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(given), "utf-8"))
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(typed), "utf-8"))
     let(monkeypatch, ends=lambda run: run.confirm("grip the rod"))
     assert main(["shape-set", JOB, "--out", str(tmp_path / "a")]) == 2
-    said = capfd.readouterr()
-    assert "grip the rod; then press Enter\n" in said.out
-    assert "standard input has ended at a question: answer it, or pass --yes" in said.err
+    output = capfd.readouterr()
+    assert "grip the rod; then press Enter\n" in output.out
+    assert "standard input has ended at a question: answer it, or pass --yes" in output.err
 
 
 def test_an_answer_at_a_question_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

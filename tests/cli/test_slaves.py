@@ -28,7 +28,7 @@ FILES, BITS4 = "slave 1 (Terminal 40, serial 140)", "slave 2 (Terminal 14, seria
 
 @pytest.fixture
 def lasting(arm: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], int]]:
-    """Return a function that starts the arm's segment, which then lasts from command to command; it returns a pid."""
+    """Return a function that starts the arm's segment for several commands; it returns a pid."""
     monkeypatch.setattr(offline, "SEGMENT_TIMEOUT_S", 120.0)  # for a host that is busy
     with contextlib.ExitStack() as stack:
 
@@ -76,7 +76,7 @@ def test_an_image_goes_into_the_eeprom_only_where_it_is_sound_and_of_this_device
     image.write_bytes(bytes((changed[0] ^ 1,)) + changed[1:])
     damaged = rtcp("eeprom", "write", "1", str(image), "--yes", *files)
     assert damaged.code == 2
-    assert f"the checksum in word 7 of the image is 0x{crc(changed[:14]):02X}" in damaged.trouble
+    assert f"the checksum in word 7 of the image is 0x{crc(bytes(changed[:14])):02X}" in damaged.trouble
 
 
 def test_an_image_of_a_sister_leaves_serial_number_and_alias_as_they_are_unless_asked(
@@ -127,11 +127,11 @@ def test_a_write_that_is_interrupted_says_what_is_half_written_and_another_one_r
 
     @contextlib.contextmanager
     def interrupted(*arguments: object, **more: object) -> Iterator[Callable[[float], None]]:
-        def look(done: float) -> None:
+        def progress(done: float) -> None:
             if done > 0.6:
                 raise KeyboardInterrupt
 
-        yield look
+        yield progress
 
     with monkeypatch.context() as ctrl_c:
         ctrl_c.setattr(slaves, "transfer", interrupted)
@@ -152,8 +152,8 @@ def test_a_write_that_is_interrupted_says_what_is_half_written_and_another_one_r
 def test_a_dump_shows_what_the_eeprom_says(rtcp: Rtcp, files: tuple[str, ...]) -> None:
     ended = rtcp("eeprom", "dump", "2", *files)
     assert ended.code == 0
-    for part in ("Terminal 14", "product 0x0000000E", "alias 5", "SM0", "0x0F00", "RxPDO 0x1601", "BIT4", "value 1"):
-        assert part in ended.out
+    for text in ("Terminal 14", "product 0x0000000E", "alias 5", "SM0", "0x0F00", "RxPDO 0x1601", "BIT4", "value 1"):
+        assert text in ended.out
 
 
 def test_an_alias_is_written_under_the_checksum_and_none_twice(rtcp: Rtcp, files: tuple[str, ...]) -> None:
@@ -180,13 +180,13 @@ def test_a_state_is_left_as_it_was_requested(rtcp: Rtcp, arm: Path, lasting: Cal
         "enter(int(sys.argv[1])); port = RegisterPort('ecat0')\n"
         "print([port.read(station, 0x0130, 1)[0] for station in (0x1001, 0x1002)])"
     )
-    look = (sys.executable, "-c", program, str(lasting()))
+    query = (sys.executable, "-c", program, str(lasting()))
     options = ("--config", str(arm), "--bus", "virtual")
-    for state, (left, shown) in {"preop": (2, "PRE-OP"), "boot": (3, "BOOT"), "INIT": (1, "INIT")}.items():
-        assert rtcp("state", "1", state, *options).out == f"{FILES}: {shown}\n"
-        assert json.loads(subprocess.check_output(look)) == [left, 1]
+    for state, (number, name) in {"preop": (2, "PRE-OP"), "boot": (3, "BOOT"), "INIT": (1, "INIT")}.items():
+        assert rtcp("state", "1", state, *options).out == f"{FILES}: {name}\n"
+        assert json.loads(subprocess.check_output(query)) == [number, 1]
     assert rtcp("state", "2", "PRE-OP", *options).out == f"{BITS4}: PRE-OP\n"
-    assert json.loads(subprocess.check_output(look)) == [1, 2]
+    assert json.loads(subprocess.check_output(query)) == [1, 2]
     refused = rtcp("state", "2", "BOOT", *options)
     assert refused.code == 3
     assert "slave 2 (Terminal 14) did not reach BOOT" in refused.trouble
@@ -198,7 +198,7 @@ def test_a_name_is_the_slave_with_its_alias_and_of_its_device_and_no_other(
 ) -> None:
     segment = arm.parent / "segment.yaml"
     slaves = yaml.safe_load(segment.read_text())
-    # What the file calls drive1 and drive2 hangs the other way round.
+    # The wiring of drive1 and drive2 is swapped against the file.
     aliases = {"drive1": 11, "drive2": 12, "drive5": 15, "drive6": 99}
     for position, alias in ((1, 15), (2, 12), (3, 11)):
         slaves["slaves"][position - 1]["alias"] = alias
@@ -213,11 +213,11 @@ def test_a_name_is_the_slave_with_its_alias_and_of_its_device_and_no_other(
     assert rtcp("sdo", "read", "drive1", "0x1018:4", *options).out == rtcp("sdo", "read", "3", "0x1018:4", *options).out
     ended = rtcp("state", "drive1", "preop", *options)
     assert ended.out.startswith("slave 3 (Cubemars ORH70, serial "), ended.trouble
-    other = rtcp("state", "drive5", "preop", *options)
-    assert other.code == 5
-    assert "slave 1 (DIEWU 16DI16DO) has the station alias 15 of drive5, but is vendor" in other.trouble
+    refused = rtcp("state", "drive5", "preop", *options)
+    assert refused.code == 5
+    assert "slave 1 (DIEWU 16DI16DO) has the station alias 15 of drive5, but is vendor" in refused.trouble
     assert "drive6: no slave has the station alias 99" in rtcp("eeprom", "dump", "drive6", *options).trouble
-    # Without an alias it is one of several, whose places are not known while one is missing.
+    # Without an alias the missing slave cannot be told from the others of its kind.
     assert "no slave has the station alias 99" in rtcp("sdo", "read", "drive3", "0x1018:4", *options).trouble
 
 
@@ -269,13 +269,13 @@ def test_a_live_slave_describes_itself(rtcp: Rtcp, files: tuple[str, ...]) -> No
     (entry,) = device["tx_pdos"][0]["entries"]
     assert (entry["index"], entry["bits"], entry["type"], entry["name"]) == (0x6000, 16, "UINT", "value 1")
     assert [sm["start"] for sm in device["sync_managers"]] == [sm.start for sm in wanted.sync_managers]
-    assert {0x1000, 0x1018, 0x1C12, 0x1601, 0x6000} <= {one["index"] for one in device["objects"]}
+    assert {0x1000, 0x1018, 0x1C12, 0x1601, 0x6000} <= {item["index"] for item in device["objects"]}
     assert device["mailbox"]["foe"]
     plain = rtcp("scan", "--describe", "2", *files)
     assert "TxPDO 0x1A01" in plain.out
-    found = json.loads(rtcp("scan", "--json", *files).out)
-    assert [(one["output_bits"], one["input_bits"]) for one in found] == [(16, 16), (4, 4)]
-    assert found[0]["outputs"][0]["entries"][0]["name"] == "value 1"
+    slaves = json.loads(rtcp("scan", "--json", *files).out)
+    assert [(slave["output_bits"], slave["input_bits"]) for slave in slaves] == [(16, 16), (4, 4)]
+    assert slaves[0]["outputs"][0]["entries"][0]["name"] == "value 1"
 
 
 @pytest.mark.parametrize(

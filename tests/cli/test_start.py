@@ -13,12 +13,13 @@ from typing import Any
 import pytest
 
 from rtcp.cli import platform as start
+from rtcp.cli.output import report
 from rtcp.ipc.session import Pid, Processes, identify
 
 
 @pytest.fixture
 def loop(directory: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that the runtime directory names as the loop."""
+    """A process named as the loop in the runtime directory."""
     program = "import time; time.sleep(600)  # stands for rtcp.control.process"
     process = subprocess.Popen([sys.executable, "-c", program])
     Processes(loop=identify(process.pid)).write(directory)
@@ -87,7 +88,7 @@ def test_a_runtime_directory_that_cannot_be_made_is_named(
 
 @pytest.fixture
 def launched(platform: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A platform that `rtcp start` has brought up, as far as its processes are concerned."""
+    """The processes of a platform that `rtcp start` has started."""
     monkeypatch.setattr(start, "launch", lambda options: None)
     platform.status |= {"state": "ready", "message": "all slaves are in OP"}
     return platform
@@ -144,7 +145,7 @@ def test_a_start_in_the_foreground_shows_what_came_of_it_and_runs_on(
 ) -> None:
     def serve(options: object, announce: Callable[[], None]) -> int:
         announce()
-        start.report("it runs on")
+        report("it runs on")
         return 0
 
     monkeypatch.setattr(start, "serve", serve)
@@ -165,7 +166,7 @@ def test_stop_ends_a_loop_that_has_lost_its_gateway(
     rtcp: Callable[..., Any], loop: subprocess.Popen[bytes], directory: Path
 ) -> None:
     ended = rtcp("stop")
-    # It has no bus, so it tells nothing of its end.
+    # It has no bus, so it does not report its end.
     assert (ended.code, ended.out) == (5, "")
     assert f"stopped, but: the loop (process {loop.pid}) did not end in" in ended.trouble
     assert loop.wait(20) != 0
@@ -175,7 +176,7 @@ def test_stop_ends_a_loop_that_has_lost_its_gateway(
 def test_a_later_bearer_of_the_loops_pid_is_neither_taken_for_it_nor_signalled(
     rtcp: Callable[..., Any], loop: subprocess.Popen[bytes], directory: Path
 ) -> None:
-    # As if the loop had ended and its id gone round: what bears it now started at another instant.
+    # As if the loop had ended and its id were in use again: its present process started at another instant.
     Processes(loop=Pid(loop.pid, identify(loop.pid).identity - 1)).write(directory)
     assert rtcp("stop").code == 4
     assert "no platform is running" in rtcp("status").trouble
@@ -193,5 +194,5 @@ def test_a_loop_of_which_nobody_knows_how_it_was_started_is_given_no_gateway(
 def test_the_pids_stand_in_their_file_as_plain_numbers_by_name(
     loop: subprocess.Popen[bytes], directory: Path
 ) -> None:  # fmt: skip
-    found = json.loads((directory / "processes.json").read_text())
-    assert found == {"loop": loop.pid, "gateway": 0, "segment": 0, "identities": found["identities"]}
+    file = json.loads((directory / "processes.json").read_text())
+    assert file == {"loop": loop.pid, "gateway": 0, "segment": 0, "identities": file["identities"]}

@@ -18,12 +18,12 @@ from rtcp.ipc.session import Processes, identify
 def test_status_shows_state_joints_slaves_times_and_clocks(platform: Any, rtcp: Callable[..., Any]) -> None:
     ended = rtcp("status")
     assert ended.code == 0
-    for shown in (
+    for text in (
         "HOLDING", "csp on virtual", "every 500 us", "123 456 cycles, 2 missed", "enabled: the arm holds",
         "joint6", "-1.2346", "+3.0000", "drive6", "105.5", "working counter 21 of 21", "locked, offset -3.2 us",
         "filtered +0.4 us", "0000 0000 0011 1111", "1000 0000 0000 0001", "FIFO 80, memory locked, CPU 1", "loop 11",
     ):  # fmt: skip
-        assert shown in ended.out
+        assert text in ended.out
 
 
 def test_status_shows_the_pose_and_the_speeds_of_the_tool_where_the_geometry_is_known(
@@ -32,8 +32,8 @@ def test_status_shows_the_pose_and_the_speeds_of_the_tool_where_the_geometry_is_
     line = "+0.1000 -0.2000 +0.9000 m, +0.0000 +0.5000 -1.0000 rad, 0.050 m/s, 0.200 rad/s"
     assert line in " ".join(rtcp("status").out.split())
     platform.status["tool"] = None
-    shown = rtcp("status")
-    assert (shown.code, " m/s" in shown.out) == (0, False)
+    result = rtcp("status")
+    assert (result.code, " m/s" in result.out) == (0, False)
 
 
 def test_status_fits_eighty_columns_without_colour_in_a_pipe(platform: Any, rtcp: Callable[..., Any]) -> None:
@@ -104,10 +104,10 @@ def test_the_robot_status_and_the_states_are_reported_in_words(platform: Any, rt
         "robot": {"mode": "manual", "e_stopped": True, "drives_powered": True, "motion_possible": False,
                   "in_motion": False, "in_error": True, "error_code": 107},
     }  # fmt: skip
-    shown = " ".join(rtcp("status").out.split())
-    assert "STOPPED BY LIMIT joystick, csp on virtual" in shown
-    assert "robot manual, drives powered, no motion possible, not in motion, emergency stop, error 107" in shown
-    assert "joystick Z-yaw, controls the chair" in shown
+    output = " ".join(rtcp("status").out.split())
+    assert "STOPPED BY LIMIT joystick, csp on virtual" in output
+    assert "robot manual, drives powered, no motion possible, not in motion, emergency stop, error 107" in output
+    assert "joystick Z-yaw, controls the chair" in output
 
 
 def test_the_last_messages_are_shown_with_their_local_time(
@@ -118,11 +118,11 @@ def test_the_last_messages_are_shown_with_their_local_time(
     try:
         platform.status["messages"] = [f"message [{n}]" for n in range(7)]
         platform.status["message_times"] = [f"2026-11-21T14:37:2{n}.873+00:00" for n in range(7)]
-        shown = rtcp("status").out.splitlines()
+        lines = rtcp("status").out.splitlines()
     finally:
         monkeypatch.undo()
         time.tzset()
-    assert shown[-5:] == [f"16:37:2{n}.873  message [{n}]" for n in (2, 3, 4, 5, 6)]
+    assert lines[-5:] == [f"16:37:2{n}.873  message [{n}]" for n in (2, 3, 4, 5, 6)]
 
 
 def test_status_watch_goes_on_when_only_the_gateway_was_replaced(
@@ -157,17 +157,17 @@ def test_the_commanded_positions_are_shown_where_other_positions_were_sent(
 ) -> None:
     assert "commanded" not in rtcp("status").out
     platform.status["joints"]["sent_position"] = [0.05, *platform.status["joints"]["sent_position"][1:]]
-    shown = rtcp("status").out
-    assert "commanded" in shown
-    assert next(line for line in shown.splitlines() if "joint1" in line).split()[-2:] == ["+0.0500", "+0.1000"]
-    assert max(len(line) for line in shown.splitlines()) <= 80
+    output = rtcp("status").out
+    assert "commanded" in output
+    assert next(line for line in output.splitlines() if "joint1" in line).split()[-2:] == ["+0.0500", "+0.1000"]
+    assert max(len(line) for line in output.splitlines()) <= 80
 
 
 def test_cycles_without_an_answer_are_counted_over_the_last_second(platform: Any, rtcp: Callable[..., Any]) -> None:
     platform.status["last_second"] = {"cycles": 2000, "unanswered": 12, "incomplete": 3, "tracked": 1988}
-    shown = " ".join(rtcp("status").out.split())
-    assert "working counter 21 of 21, 12 of 2000 cycles unanswered, 3 of 2000 cycles incomplete" in shown
-    assert "clocks locked in 1988 of 2000 cycles, offset -3.2 us, filtered +0.4 us" in shown
+    output = " ".join(rtcp("status").out.split())
+    assert "working counter 21 of 21, 12 of 2000 cycles unanswered, 3 of 2000 cycles incomplete" in output
+    assert "clocks locked in 1988 of 2000 cycles, offset -3.2 us, filtered +0.4 us" in output
 
 
 def test_what_the_host_refuses_is_one_line_that_names_the_doctor(platform: Any, rtcp: Callable[..., Any]) -> None:
@@ -200,11 +200,11 @@ def test_without_an_answer_the_clocks_are_not_followed_and_no_counter_is_made_up
     platform: Any, rtcp: Callable[..., Any], actual: int
 ) -> None:
     platform.status["wkc"]["actual"] = actual
-    shown = rtcp("status").out
-    assert "no answer in the last second, 21 expected" in shown
-    assert "working counter" not in shown
-    assert "not tracked: no answer" in shown
-    assert "offset" not in shown
+    output = rtcp("status").out
+    assert "no answer in the last second, 21 expected" in output
+    assert "working counter" not in output
+    assert "not tracked: no answer" in output
+    assert "offset" not in output
 
 
 def test_what_the_joints_last_said_is_marked_as_old_where_they_are_not_heard(

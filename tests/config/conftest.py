@@ -1,4 +1,4 @@
-"""A copy of the shipped configuration that a test may spoil."""
+"""A copy of the shipped configuration that a test may change."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.config import ConfigError, load
+from rtcp.config import ConfigError, load, load_kinematics
+from rtcp.config.findings import Finding
 
 SHIPPED = Path(__file__).resolve().parents[2] / "config"
 
@@ -27,18 +28,19 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def problems_after(directory: Path) -> Callable[..., list[str]]:
-    """Replace the first `old` of a file by `new`, read it (devices by the arm's file) and return the sentences."""
+def findings_after(directory: Path) -> Callable[..., list[Finding]]:
+    """Replace the first `old` of a file by `new`, read it (devices by the arm's file) and return the findings."""
 
-    def spoil(file: str, *changes: tuple[str, str], reader: Callable[[Path], object] = load) -> list[str]:
+    def spoil(file: str, *changes: tuple[str, str]) -> list[Finding]:
         path = directory / file
         text = path.read_text()
         for old, new in changes:
             assert old in text
             text = text.replace(old, new, 1)
         path.write_text(text)
+        reader: Callable[[Path], object] = load_kinematics if file == "geometry.yaml" else load
         with pytest.raises(ConfigError) as caught:
             reader(Path("assistive_arm.yaml" if file.startswith("devices") else file))
-        return caught.value.problems
+        return caught.value.findings
 
     return spoil

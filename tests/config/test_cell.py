@@ -10,6 +10,7 @@ from rtcp.config import ConfigError, default_config
 from rtcp.config.cell import CellConfig, is_platform_name
 from rtcp.config.cell_file import load_cell
 from rtcp.config.serialization import from_json, to_json
+from tests.findings import assert_finds
 
 CONFIG = default_config().parent
 ARM = str(CONFIG / "assistive_arm.yaml")
@@ -44,26 +45,31 @@ def test_a_cell_is_told_from_another_by_what_its_files_say_not_by_where_they_are
     assert load_cell(written(tmp_path, text.replace("[0, 1, 0]", "[0, 1.1, 0]"))).digest != cell.digest
 
 
+A, B = f"{{name: a, config: {ARM}}}", f"{{name: b, config: {ARM}}}"
+
+
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("arms", "more", "expected"),
     [
-        (f"name: c\narms: [{{name: a, config: {ARM}}}]\n", "arms"),
-        (f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: a, config: {ARM}}}]\n", "the name of arms[0]"),
-        (f"name: c\narms: [{{name: ../a, config: {ARM}}}, {{name: b, config: {ARM}}}]\n", 'found the text "../a"'),
-        (f"name: c\narms: [{{name: a, config: none.yaml}}, {{name: b, config: {ARM}}}]\n", "arm a: "),
-        (f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: b, config: {ARM}, at: 1}}]\n", "at"),
-        (f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: b, config: {ARM}}}]\nsilence_s: 0\n", "silence_s"),
-        (f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: b, config: {ARM}}}]\nclearance: .nan\n", "clearance"),
-        (
-            f"name: c\narms: [{{name: a, config: {ARM}, base: {{rpy: [0, 0, 90]}}}}, {{name: b, config: {ARM}}}]\n",
-            "arms[0].base.rpy[2]",
-        ),
+        (A, "", "2 arms: size found=1"),
+        (f"{A}, {A}", "", "2 arms[1].name: repeated of=arms[0].name"),
+        (f"{A.replace(': a', ': ../a')}, {B}", "", "2 arms[0].name: platform_name"),
+        (f"{{name: a, config: none.yaml}}, {B}", "", ": no_file"),
+        (f"{A}, {B[:-1]}, at: 1}}", "", "2 arms[1].at: unknown"),
+        (f"{A}, {B}", "silence_s: 0", "3 silence_s: range"),
+        (f"{A}, {B}", "clearance: .nan", "3 clearance: range"),
+        (f"{A[:-1]}, base: {{rpy: [0, 0, 90]}}}}, {B}", "", "2 arms[0].base.rpy[2]: range"),
     ],
 )
-def test_every_mistake_is_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
-    with pytest.raises(ConfigError) as found:
-        load_cell(written(tmp_path, text))
-    assert sentence in str(found.value)
+def test_every_mistake_is_named(tmp_path: Path, arms: str, more: str, expected: str) -> None:
+    file = written(tmp_path, f"name: c\narms: [{arms}]\n{more}\n")
+    assert_finds(lambda: load_cell(file), expected)
+
+
+def test_a_mistake_in_the_file_of_an_arm_is_one_of_the_cells_with_the_arm(tmp_path: Path) -> None:
+    file = written(tmp_path, f"name: c\narms: [{{name: a, config: none.yaml}}, {B}]\n")
+    with pytest.raises(ConfigError, match=rf"^{file}: arm a: {tmp_path}/none.yaml: there is no such file$"):
+        load_cell(file)
 
 
 def test_an_arm_that_is_not_in_the_cell_is_named() -> None:

@@ -1,4 +1,4 @@
-"""The `kinematics:` part of an arm's file: what it says, and the sentence for each mistake in it."""
+"""The `kinematics:` part of an arm's file and the message for each mistake in it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from kinematics.forward import forward, frames
 from kinematics.model import Capsule, DhRow, JointLimit
 from kinematics.pose import IDENTITY, Pose
 from rtcp.config import ConfigError, default_config, load, load_kinematics
+from rtcp.config.findings import Finding
 from rtcp.config.loader import load_mechanics
 from rtcp.config.model import CartesianConfig
 from rtcp.config.numbers import angle
+from tests.findings import assert_finds, findings_of
 
 ARM, IRB = Path("assistive_arm.yaml"), Path("geometry.yaml")
 ROW1 = "{alpha: 0, a: 0, d: 0.290}"
@@ -38,7 +40,7 @@ def rewritten(file: Path, change: Callable[[dict[str, object]], object]) -> Path
 
 
 def without_kinematics(data: dict[str, object]) -> None:
-    """Take away the geometry, and with it the boxes, which need it."""
+    """Remove the geometry and the boxes, which need it."""
     del data["kinematics"], data["cartesian"]
 
 
@@ -111,7 +113,7 @@ def test_a_quarter_turn_of_a_joint_of_the_irb_120_moves(
 
 def test_the_irb_120_has_the_ranges_and_speeds_of_its_data_sheet() -> None:
     limits = load_mechanics(default_config().parent / "abb_irb120.yaml").limits
-    degrees = [tuple(round(math.degrees(v), 9) for v in (one.lower, one.upper, one.velocity)) for one in limits]
+    degrees = [tuple(round(math.degrees(v), 9) for v in (limit.lower, limit.upper, limit.velocity)) for limit in limits]
     assert degrees == [
         (-165, 165, 250), (-110, 110, 250), (-110, 70, 250), (-160, 160, 320), (-120, 120, 320), (-400, 400, 420),
     ]  # fmt: skip
@@ -206,27 +208,20 @@ def test_the_tool_is_a_position_and_three_angles(directory: Path, written: str, 
 
 
 def test_limits_are_needed_where_no_joints_have_them(directory: Path) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_kinematics(rewritten(IRB, lambda data: data["kinematics"].pop("limits")))  # type: ignore[attr-defined]
-    (problem,) = caught.value.problems
-    wanted = "in a file without joints it must be a list of 6 mappings with the keys min, max, velocity"
-    assert problem.endswith(f"kinematics: the key limits is missing; {wanted}")
+    file = rewritten(IRB, lambda data: data["kinematics"].pop("limits"))  # type: ignore[attr-defined]
+    assert_finds(lambda: load_kinematics(file), "kinematics: missing key=limits")
 
 
 def test_an_arm_without_kinematics_says_so_when_it_is_asked_for_them(directory: Path) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_kinematics(rewritten(ARM, without_kinematics))
-    wanted = "it must be a mapping with the keys dh, limits, links, tool, tools, bodies"
-    assert caught.value.problems == [f"{ARM}:1: the key kinematics is missing; {wanted}"]
+    file = rewritten(ARM, without_kinematics)
+    assert_finds(lambda: load_kinematics(file), "1 : missing key=kinematics")
 
 
-def test_a_mistake_elsewhere_in_a_whole_arm_is_named_too(problems_after: Callable[..., list[str]]) -> None:
-    (problem,) = problems_after(str(ARM), ("drive_mode: csp", "drive_mode: cps"), reader=load_kinematics)
-    assert problem.endswith('drive_mode: found the text "cps", allowed is one of csp, csv, cst')
-
-
-def test_the_start_of_the_platform_names_mistakes_in_the_kinematics_too(
-    problems_after: Callable[..., list[str]],
+def test_mistakes_in_the_kinematics_and_elsewhere_are_named_together(
+    directory: Path, findings_after: Callable[..., list[Finding]]
 ) -> None:
-    problems = problems_after(str(ARM), ("d: 0.140", "d: 140"), ("period_us: 500", "period_us: 5"))
-    assert [problem.split(": ")[1] for problem in problems] == ["cycle.period_us", "kinematics.dh[5].d"]
+    findings = findings_after(str(ARM), ("d: 0.140", "d: 140"), ("period_us: 500", "period_us: 5"))
+    assert [finding.key for finding in findings] == ["cycle.period_us", "kinematics.dh[5].d"]
+    assert [finding.key for finding in findings_of(lambda: load_kinematics(ARM))] == [
+        finding.key for finding in findings
+    ]

@@ -1,4 +1,4 @@
-"""What the shipped files say, what may be left out or written otherwise, and what commands change at a start."""
+"""The shipped files, optional keys and other spellings, and changes by commands at a start."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from rtcp.config.model import (
     CartesianConfig,
     CycleConfig,
     EmergencyStopConfig,
+    EthercatBus,
     GripperConfig,
     InputConfig,
     JogConfig,
@@ -217,9 +218,9 @@ def test_no_pose_of_the_arm_is_beyond_its_reach(shipped: ArmConfig) -> None:
     draw = random.Random(5)
     assert math.dist(frames(model, [0.0] * 6)[6].position, shoulder) == pytest.approx(reach)
     for _ in range(300):
-        found = frames(model, [draw.uniform(-3, 3) for _ in range(6)])
-        assert found[0].position == pytest.approx(shoulder)
-        assert max(math.dist(pose.position, shoulder) for pose in found) <= reach + 1e-9
+        poses = frames(model, [draw.uniform(-3, 3) for _ in range(6)])
+        assert poses[0].position == pytest.approx(shoulder)
+        assert max(math.dist(pose.position, shoulder) for pose in poses) <= reach + 1e-9
 
 
 def test_the_shoulder_is_found_also_where_the_base_is_tilted(directory: Path) -> None:
@@ -249,8 +250,8 @@ def test_the_shipped_arm_accepts_cycles_of_100_us_to_less_than_10_ms(shipped: Ar
 def test_another_period_is_checked_like_the_files(shipped: ArmConfig) -> None:
     with pytest.raises(ConfigError, match=r"cycle\.period_us: found 99, allowed is a number from 100 to 100000"):
         with_period(shipped, 99)
-    told = r"Cubemars ORH: watchdog_ms: found 20 ms, allowed is more than 2 cycles, 20 ms"
-    with pytest.raises(ConfigError, match=told):
+    message = r"Cubemars ORH: watchdog_ms: found 20 ms, allowed is more than 2 cycles, 20 ms"
+    with pytest.raises(ConfigError, match=message):
         with_period(shipped, 10_000)
 
 
@@ -278,14 +279,15 @@ def sync_error_limits(config: ArmConfig) -> list[float]:
 
 @pytest.mark.parametrize(("interface", "scale"), [("eth0", 25.0), ("virtual", 1.0)])
 def test_every_limit_is_the_one_that_is_written(shipped: ArmConfig, interface: str, scale: float) -> None:
-    found = widen(with_bus(shipped, interface, scale))
-    assert found == with_bus(shipped, interface, scale)
-    assert (found.bus.lost_cycles, found.slaves[1].device.watchdog_ms) == (40, 20.0)
-    assert sync_error_limits(found) == [120.0] * 6
+    widened = widen(with_bus(shipped, interface, scale))
+    assert widened == with_bus(shipped, interface, scale)
+    assert (widened.bus.lost_cycles, widened.slaves[1].device.watchdog_ms) == (40, 20.0)
+    assert sync_error_limits(widened) == [120.0] * 6
 
 
 def test_on_the_virtual_bus_limits_that_a_slow_host_exceeds_and_nothing_else_are_scaled(shipped: ArmConfig) -> None:
     widened = widen(with_bus(shipped, "virtual", 10.0))
+    assert isinstance(widened.bus, EthercatBus)
     assert (widened.bus.lost_cycles, widened.bus.clock_lost_s) == (400, 5.0)
     assert [slave.device.watchdog_ms for slave in widened.slaves] == [1000.0] + [200.0] * 6
     assert sync_error_limits(widened) == [0.0] * 6

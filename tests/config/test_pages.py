@@ -27,6 +27,9 @@ OWN = [
     "guiding.md",
     "conformance.md",
     "your_own_arm.md",
+    "stops.md",
+    "recovery.md",
+    "machine.md",
 ]
 KEYS = {
     "arm": list(keys_of(ArmFile)),
@@ -46,7 +49,8 @@ def test_the_generated_parts_of_a_page_are_up_to_date(page: Path) -> None:
 
 @pytest.mark.parametrize("file", KEYS)
 def test_every_key_of_a_file_is_on_exactly_one_page(file: str) -> None:
-    arm = "".join((FOLDER / name).read_text() for name in (*OWN[:5], "guiding.md", "kinematics.md", "processes.md"))
+    arm_pages = (*OWN[:5], "guiding.md", "kinematics.md", "processes.md", "stops.md")
+    arm = "".join((FOLDER / name).read_text() for name in arm_pages)
     device = "".join((FOLDER / name).read_text() for name in ("devices.md", "channels.md", "drives.md"))
     text = {"arm": arm, "device": device} | {
         kind: (FOLDER / page).read_text() for kind, page in (("segment", "segment.md"), ("motion", "motion.md"))
@@ -57,9 +61,9 @@ def test_every_key_of_a_file_is_on_exactly_one_page(file: str) -> None:
 
 
 def test_every_key_has_a_meaning_and_every_number_its_unit() -> None:
-    found = [key for keys in KEYS.values() for key in keys]
-    numbers = [key for key in found if key.allowed.startswith(("a number", "a list of 3 numbers"))]
-    assert [key.path for key in found if not key.meaning] == []
+    every_key = [key for keys in KEYS.values() for key in keys]
+    numbers = [key for key in every_key if key.allowed.startswith(("a number", "a list of 3 numbers"))]
+    assert [key.path for key in every_key if not key.meaning] == []
     assert [key.path for key in numbers if not re.search(f"{UNITS}|{WITHOUT_UNIT}", key.meaning)] == []
 
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from rtcp.config import ConfigError, default_config, load, load_device
+from rtcp.config import default_config, load, load_device
+from rtcp.config.findings import Finding
+from rtcp.config.model import ArmConfig, DeviceDescription
 from rtcp.ipc.stop_reactions import StopReaction, bounds
+from tests.findings import assert_finds, findings_of, summary
 
 ENTRIES = {
     "rpdo": (("controlword", 0x6040, "uint16"), ("target_position", 0x607A, "int32"),
@@ -40,9 +44,13 @@ def device(**changes: Any) -> dict[str, Any]:
     return {key: value for key, value in made.items() if value is not None}
 
 
+Write = Callable[..., DeviceDescription]
+Findings = Callable[..., list[Finding]]
+
+
 @pytest.fixture
-def written(tmp_path: Path):
-    def write(**changes: Any):
+def written(tmp_path: Path) -> Write:
+    def write(**changes: Any) -> DeviceDescription:
         file = tmp_path / "drive.yaml"
         file.write_text(yaml.safe_dump(device(**changes)))
         return load_device(file)
@@ -51,13 +59,8 @@ def written(tmp_path: Path):
 
 
 @pytest.fixture
-def problems(written):
-    def found(**changes: Any) -> list[str]:
-        with pytest.raises(ConfigError) as refused:
-            written(**changes)
-        return [text.split(": ", 1)[1] for text in refused.value.problems]
-
-    return found
+def findings(written: Write) -> Findings:
+    return lambda **changes: findings_of(lambda: written(**changes))
 
 
 TURN = 2 * math.pi
@@ -75,53 +78,59 @@ TURN = 2 * math.pi
         ({"encoder_increments": 524288, "rated_current": 4, "torque_constant": 2}, *2 * (TURN / 524288,), 8e-3),
     ],
 )  # fmt: skip
-def test_the_factors_follow_from_what_the_drive_counts_in(written, scaling, position, velocity, torque) -> None:
+def test_the_factors_follow_from_what_the_drive_counts_in(
+    written: Write, scaling: dict[str, Any], position: float, velocity: float, torque: float
+) -> None:
     made = written(scaling=[scaling])
     (_, at, speed, effort, _), (_, shown, moving, measured, _) = (pdo.channels for pdo in (made.rpdo[0], made.tpdo[0]))
-    assert [one.factor for one in (at, shown)] == [pytest.approx(position)] * 2
-    assert [one.factor for one in (speed, moving)] == [pytest.approx(velocity)] * 2
-    assert [one.factor for one in (effort, measured)] == [pytest.approx(torque)] * 2
+    assert [channel.factor for channel in (at, shown)] == [pytest.approx(position)] * 2
+    assert [channel.factor for channel in (speed, moving)] == [pytest.approx(velocity)] * 2
+    assert [channel.factor for channel in (effort, measured)] == [pytest.approx(torque)] * 2
     assert made.wire_range("target_torque") == (
         pytest.approx(min(-32768 * torque, 32767 * torque)), pytest.approx(max(-32768 * torque, 32767 * torque)),
     )  # fmt: skip
 
 
-def test_a_factor_that_contradicts_the_scaling_is_refused_with_both(written, problems) -> None:
+def test_a_factor_that_contradicts_the_scaling_is_refused_with_both(written: Write, findings: Findings) -> None:
     assert written(rpdo=pdos("rpdo", target_torque=0.05)).rpdo[0].channels[3].factor == 0.05
-    assert problems(rpdo=pdos("rpdo", target_torque=0.25)) == [
-        "rpdo[0].channels[3].factor: found 0.25, but from scaling follows 0.05: leave it out"
-    ]
+    (finding,) = findings(rpdo=pdos("rpdo", target_torque=0.25))
+    expected = "rpdo[0].channels[3].factor: unlike_scaling found=0.25 scaled=0.05"
+    assert summary(finding, expected) == expected
 
 
-def test_factors_of_one_axis_that_would_turn_it_another_way_than_it_shows_are_refused(written, problems) -> None:
-    agree = {"target_position": -1e-4, "position": -1e-4, "target_velocity": -1.0, "velocity": -2.0,
+def test_factors_of_one_axis_that_would_turn_it_another_way_than_it_shows_are_refused(
+    written: Write, findings: Findings
+) -> None:
+    agree: dict[str, Any] = {"target_position": -1e-4, "position": -1e-4, "target_velocity": -1.0, "velocity": -2.0,
              "target_torque": -0.1, "torque": -0.1}  # fmt: skip
     written(scaling=None, **{image: pdos(image, **agree) for image in ("rpdo", "tpdo")})
     for name, factor, said in (
-        ("position", 1e-4, "all positions of an axis have the same factor"),
-        ("position", -2e-4, "all positions of an axis have the same factor"),
-        ("target_velocity", 1.0, "all factors of an axis have the same sign"),
-        ("torque", 0.1, "all factors of an axis have the same sign"),
+        ("position", 1e-4, "positions of an axis have the same factor"),
+        ("position", -2e-4, "positions of an axis have the same factor"),
+        ("target_velocity", 1.0, "factors of an axis have the same sign"),
+        ("torque", 0.1, "factors of an axis have the same sign"),
     ):
         differ = {image: pdos(image, **agree | {name: factor}) for image in ("rpdo", "tpdo")}
-        (problem,) = problems(scaling=None, **differ)
-        assert problem.endswith(
-            f"found {factor:.10g} for {name}, and -0.0001 for target_position (rpdo[0].channels[1]); {said}"
+        (finding,) = findings(scaling=None, **differ)
+        assert summary(finding, " found= channel= first= alike=").split(": ")[1] == (
+            f"unlike found={factor} channel={name} first=-0.0001 alike={said}"
         )
 
 
 @pytest.mark.parametrize("index", [0x6072, 0x6080, 0x60E0, 0x60E1])
-def test_a_drive_is_not_sent_that_it_may_have_no_torque_or_speed(written, problems, index) -> None:
+def test_a_drive_is_not_sent_that_it_may_have_no_torque_or_speed(
+    written: Write, findings: Findings, index: int
+) -> None:
     outputs = pdos("rpdo", 2)
     outputs[0]["channels"].append({"index": index + 0x800, "sub_index": 0, "type": "uint16", "name": "most"})
     both = {"rpdo": [*pdos("rpdo"), *outputs], "tpdo": [*pdos("tpdo"), *pdos("tpdo", 2)]}
-    (problem,) = problems(**both)
-    assert problem.startswith("rpdo[1].channels[5].safe: found 0 for most (")
+    (finding,) = findings(**both)
+    assert summary(finding, " channel=") == "rpdo[1].channels[5].safe: safe_zero channel=most"
     outputs[0]["channels"][-1]["safe"] = 1000
     written(**both)
 
 
-def test_each_axis_has_its_own_scaling_or_all_have_one(written) -> None:
+def test_each_axis_has_its_own_scaling_or_all_have_one(written: Write) -> None:
     both = {image: [*pdos(image), *pdos(image, 2)] for image in ("rpdo", "tpdo")}
     made = written(**both, scaling=[SCALING, SCALING | {"gear_ratio": 50}])
     assert made.axes == (1, 2)
@@ -131,48 +140,40 @@ def test_each_axis_has_its_own_scaling_or_all_have_one(written) -> None:
     assert shared.of_axis(1).wire_range("target_position") == shared.of_axis(2).wire_range("target_position")
 
 
-def test_a_drive_without_a_mode_in_its_pdos_is_set_to_csp_by_a_start_up_sdo(written, problems) -> None:
+def test_a_drive_without_a_mode_in_its_pdos_is_set_to_csp_by_a_start_up_sdo(written: Write, findings: Findings) -> None:
     mode = ("modes_of_operation", "modes_of_operation_display")
     without = {image: pdos(image, without=mode) for image in ("rpdo", "tpdo")}
     assert written(**without, sdo=[CSP]).startup(0x6060) == 8
     for sdo in ([], [CSP | {"value": 9}], [CSP | {"index": 0x6860}]):
-        assert problems(**without, sdo=sdo) == [
-            "rpdo: found no channel named modes_of_operation; without it the start-up SDO {index: 0x6060, "
+        (finding,) = findings(**without, sdo=sdo)
+        assert finding.text == (
+            "found no channel named modes_of_operation; without it the start-up SDO {index: 0x6060, "
             "sub_index: 0, type: int8, value: 8} (CSP) must be in sdo"
-        ]
-    assert (
-        "tpdo: found no channel named modes_of_operation_display beside modes_of_operation in rpdo; "
-        in (problems(tpdo=pdos("tpdo", without=mode))[0])
-    )
+        )
+    assert summary(findings(tpdo=pdos("tpdo", without=mode))[0], "") == "tpdo: mode_not_shown"
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "expected"),
     [
-        ({"scaling": [SCALING | {"external_gear_ratio": 0}]},
-         "scaling[0].external_gear_ratio: found 0, allowed is any number but 0"),
-        ({"scaling": [SCALING | {"rated_current": 4}]},
-         "scaling[0]: the key torque_constant is missing: rated_current and torque_constant belong together"),
+        ({"scaling": [SCALING | {"external_gear_ratio": 0}]}, "scaling[0].external_gear_ratio: zero"),
+        ({"scaling": [SCALING | {"rated_current": 4}]}, "scaling[0]: missing key=torque_constant"),
         ({"scaling": [{"encoder_increments": 4096}], "rpdo": pdos("rpdo", target_torque=1.0)},
-         "tpdo[0].channels[3]: the key factor is missing; without it scaling needs rated_torque, or rated_current and "
-         "torque_constant"),
-        ({"scaling": [SCALING, SCALING]},
-         "scaling: found a list of 2, allowed is one for all axes, or one for each of 1"),
+         "tpdo[0].channels[3]: missing key=factor"),
+        ({"scaling": [SCALING, SCALING]}, "scaling: size found=2"),
         ({"rpdo": [*pdos("rpdo"), *pdos("rpdo", 3)], "tpdo": [*pdos("tpdo"), *pdos("tpdo", 3)]},
-         "found channels of axis 1 and 3; axes are counted from 1, without a gap"),
+         ": axes_with_gap axes=1 and 3"),
         ({"rpdo": [*pdos("rpdo"), *pdos("rpdo", 2, ("target_position",))], "tpdo": [*pdos("tpdo"), *pdos("tpdo", 2)]},
-         "rpdo: kind cia402 needs a channel named target_position of axis 2; its channels are controlword, "
-         "target_velocity, target_torque, modes_of_operation"),
-        ({"rpdo": [*pdos("rpdo"), *pdos("rpdo", 2)]},
-         "tpdo: found no channels of axis 2; an axis needs some in both directions"),
+         "rpdo: channels_lacking lacking=a channel named target_position of axis 2"),
+        ({"rpdo": [*pdos("rpdo"), *pdos("rpdo", 2)]}, "tpdo: one_direction of= of axis 2"),
     ],
 )  # fmt: skip
-def test_each_mistake_of_scaling_and_axes_is_named(problems, changes, sentence) -> None:
-    assert sentence in problems(**changes)
+def test_each_mistake_of_scaling_and_axes_is_named(findings: Findings, changes: dict[str, Any], expected: str) -> None:
+    assert expected in [summary(finding, expected) for finding in findings(**changes)]
 
 
-def arm_with(tmp_path: Path, joint: dict[str, Any], **changes: Any):
-    """The shipped arm whose joints hang on three two-axis drives."""
+def arm_with(tmp_path: Path, joint: dict[str, Any], **changes: Any) -> ArmConfig:
+    """The shipped arm with three two-axis drives."""
     arm = yaml.safe_load(default_config().read_text())
     io = arm["slaves"][0]
     (tmp_path / "devices").mkdir(exist_ok=True)
@@ -200,19 +201,17 @@ def test_three_drives_of_two_axes_move_six_joints(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("joint", "sentence"),
+    ("joint", "expected"),
     [
-        ({"axis": 1}, 'joints[1].slave: found the text "drive1", the slave of joints[0].slave; each needs its own'),
-        ({"axis": 3}, "joints[1].axis: found 3, allowed is 1 or 2, the axes of two-axes"),
-        ({"torque": 2000.0},
-         "joints[1].torque: found +-2000, allowed is -1638.4 to 1638.35: target_torque of a drive is int16 with "
-         "factor 0.05"),
+        ({"axis": 1}, "joints[1].slave: repeated of=joints[0].slave"),
+        ({"axis": 3}, "joints[1].axis: axis found=3"),
+        ({"torque": 2000.0}, "joints[1].torque: beyond_wire found=2000.0"),
     ],
-)  # fmt: skip
-def test_a_joint_that_names_a_wrong_axis_or_what_the_drive_cannot_express_is_refused(tmp_path, joint, sentence) -> None:
-    with pytest.raises(ConfigError) as refused:
-        arm_with(tmp_path, joint)
-    assert [problem.split(": ", 1)[1] for problem in refused.value.problems] == [sentence]
+)
+def test_a_joint_that_names_a_wrong_axis_or_what_the_drive_cannot_express_is_refused(
+    tmp_path: Path, joint: dict[str, Any], expected: str
+) -> None:
+    assert_finds(lambda: arm_with(tmp_path, joint), expected)
 
 
 def test_the_shipped_drives_count_as_their_makers_say() -> None:

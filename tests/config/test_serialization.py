@@ -55,9 +55,9 @@ def through_text(config: ArmConfig) -> ArmConfig:
 @given(CONFIGS)
 @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 def test_every_configuration_survives_json_exactly(config: ArmConfig) -> None:
-    found = through_text(config)
-    assert found == config
-    assert repr(found) == repr(config)
+    restored = through_text(config)
+    assert restored == config
+    assert repr(restored) == repr(config)
 
 
 def test_the_shipped_configuration_with_infinite_limits_survives_json_exactly() -> None:

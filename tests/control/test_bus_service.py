@@ -1,4 +1,4 @@
-"""The thread beside the cycle: what it reports of a slave that was lost, and whom it keeps waiting."""
+"""The service thread: lost slaves, recovery and parking, SDO requests beside them, repeated messages."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ import pytest
 from rtcp.control import bus_service
 from rtcp.control.bus_service import BusService
 from rtcp.fieldbus.al_state import AlState
-from rtcp.fieldbus.bus import SlaveState
-from rtcp.fieldbus.emergency import Emergency
+from rtcp.fieldbus.bus import PortErrors, SlaveState
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.port_errors import PortErrors
 from rtcp.fieldbus.recovery import MonitoredSlave
 from rtcp.fieldbus.registers import Steps
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.events import DriveErrorCode, EmergencyMessage, ErrorReported, Event
 from rtcp.ipc.observer import Health, Observer
 from tests.control import rig
 
@@ -29,12 +28,12 @@ GONE = "the interface does not take frames any more"
 
 
 class Watching:
-    """A watcher that sees what a test lets it see."""
+    """A watcher whose observations a test sets."""
 
     silent = False
 
     def __init__(self) -> None:
-        self.slaves = (MonitoredSlave(1, "io"), MonitoredSlave(2, "drive1"))
+        self.slaves = (MonitoredSlave(1), MonitoredSlave(2))
         self.errors = SimpleNamespace(of=[PortErrors(), PortErrors()])
         self.all_op = True
         self.parked = False
@@ -63,13 +62,15 @@ class Watching:
 
 
 class Bus:
-    """Two slaves in OP whose watcher a test holds; slave 2 takes `patience` turns for an object."""
+    """Two slaves in OP; slave 2 answers an SDO request after `patience` turns of the watcher."""
 
     def __init__(self) -> None:
         self.watching = Watching()
         self.patience = 0
-        self.waiting: list[Emergency] = []
+        self.waiting: list[EmergencyMessage] = []
         self.gone = False
+        self.answer = b"\x2a"
+        """Value of every object."""
 
     def request_state(self, state: AlState) -> None:
         pass
@@ -82,10 +83,10 @@ class Bus:
             raise BusError(GONE)
         return ()
 
-    def emergencies(self) -> tuple[Emergency, ...]:
+    def emergencies(self) -> tuple[EmergencyMessage, ...]:
         return tuple(self.waiting)
 
-    def watcher(self, say: Callable[[str], None]) -> Watching:
+    def watcher(self, report: Callable[[Event], None]) -> Watching:
         return self.watching
 
     def sdo(self, position: int) -> Bus:
@@ -95,7 +96,7 @@ class Bus:
         until = self.watching.turns + self.patience
         while self.watching.turns < until:
             yield
-        return b"\x2a"
+        return self.answer
 
     def reading_int(self, index: int, subindex: int) -> Steps[int]:
         return int.from_bytes((yield from self.reading(index, subindex)), "little")
@@ -107,7 +108,7 @@ def test_a_cycle_that_does_not_lock_under_fifo_names_the_cpu_that_it_keeps(
 ) -> None:
     monkeypatch.setattr(bus_service, "_LOCK_S", 0.0)
     monkeypatch.setattr(os, "sched_getscheduler", lambda pid: policy)
-    waiting = BusService(rig.master(bus), board, [(2, 1), (3, 1)], ["joint1", "joint2"], 5.0, 1, 80, watch_s=0.001)
+    waiting = BusService(rig.master(bus), board, [(2, 1), (3, 1)], 5.0, 1, 80, watch_s=0.001)
     refused = threading.Event()
     waiting.on_refused = refused.set
     waiting.start()
@@ -125,7 +126,7 @@ def bus() -> Bus:
 
 @pytest.fixture
 def service(bus: Bus, board: Blackboard) -> Iterator[BusService]:
-    made = BusService(rig.master(bus), board, [(2, 1), (3, 1)], ["joint1", "joint2"], 5.0, 0, 1, watch_s=0.001)
+    made = BusService(rig.master(bus), board, [(2, 1), (3, 1)], 5.0, 0, 1, watch_s=0.001)
     made.want_op()
     made.start()
     until(lambda: made.all_op)
@@ -147,35 +148,35 @@ def until(met: Callable[[], bool]) -> None:
         time.sleep(0.0005)
 
 
-def sentences(observer: Observer) -> list[str]:
-    return [text.sentence for text in observer.texts_since(0)]
+def events(observer: Observer) -> list[Event]:
+    return [record.event for record in observer.events_since(0)]
 
 
 def answer_of(observer: Observer) -> dict[str, Any]:
     """Wait for the service's answer."""
-    found: list[dict[str, Any]] = []
+    answers: list[dict[str, Any]] = []
 
     def answered() -> bool:
         answer = observer.service_answer()
-        found.extend([] if answer is None else [answer])
-        return bool(found)
+        answers.extend([] if answer is None else [answer])
+        return bool(answers)
 
     until(answered)
-    return found[0]
+    return answers[0]
 
 
 def hold_turn(bus: Bus) -> threading.Event:
-    """Hold the watcher in the middle of a turn until the event is set."""
-    held, inside = threading.Event(), threading.Event()
+    """Block the watcher in the middle of a turn until the returned event is set."""
+    release, inside = threading.Event(), threading.Event()
 
     def hold() -> None:
         bus.watching.hold = None
         inside.set()
-        held.wait(20)
+        release.wait(20)
 
     bus.watching.hold = hold
     assert inside.wait(20)
-    return held
+    return release
 
 
 def turns(bus: Bus, count: int = 20) -> None:
@@ -227,10 +228,10 @@ def test_of_recovery_and_parking_asked_within_one_turn_the_last_one_counts(bus: 
         (("recover", "park", "recover", "park"), True),
         (("recover",), False),
     ):
-        held = hold_turn(bus)
+        release = hold_turn(bus)
         for name in asked:
             getattr(service, name)()
-        held.set()
+        release.set()
         turns(bus)
         assert (bus.watching.parked, service.all_op) == (parked, not parked), asked
 
@@ -238,11 +239,11 @@ def test_of_recovery_and_parking_asked_within_one_turn_the_last_one_counts(bus: 
 def test_what_was_seen_before_a_recovery_was_asked_for_is_not_taken_for_its_success(
     bus: Bus, service: BusService
 ) -> None:
-    # Asked while the watcher is looking: it saw slaves in OP, and they are not when it has brought them back.
+    # The request comes in the middle of a turn: the watcher has read OP, and the recovery ends that state.
     bus.watching.resume = lambda: setattr(bus.watching, "all_op", False)  # type: ignore[method-assign]
-    held = hold_turn(bus)
+    release = hold_turn(bus)
     service.recover()
-    held.set()
+    release.set()
     seen = []
     until(lambda: seen.append(service.all_op) or len(seen) > 50)  # type: ignore[func-returns-value]
     assert True not in seen
@@ -261,8 +262,7 @@ def test_an_object_that_takes_its_time_holds_up_no_turn_of_the_watcher(
     bus.patience = 30
     before = bus.watching.turns
     observer.ask_service({"do": "sdo_read", "slave": 2, "index": 0x1000, "subindex": 0})
-    found = answer_of(observer)
-    assert found == {"hex": "2a"}
+    assert answer_of(observer) == {"hex": "2a"}
     assert bus.watching.turns >= before + 30
 
 
@@ -271,8 +271,7 @@ def test_a_request_of_another_form_is_answered_in_a_sentence(
     service: BusService, observer: Observer, request_: Any
 ) -> None:  # fmt: skip
     observer.ask_service(request_)
-    found = answer_of(observer)
-    assert "not of the service's form" in found["error"]
+    assert "not of the service's form" in answer_of(observer)["error"]
     assert service.is_alive()
 
 
@@ -291,14 +290,14 @@ def test_an_interface_that_is_gone_is_reported_once_and_not_in_every_turn(
 ) -> None:
     bus.watching.gone = True
     turns(bus, 100)
-    assert sentences(observer) == [GONE]
+    assert events(observer) == [ErrorReported(GONE)]
     assert service.is_alive()
 
 
 def test_an_end_without_the_interface_is_no_defect(bus: Bus, service: BusService, observer: Observer) -> None:
     bus.gone = True
     service.finish()
-    assert (service.refused, sentences(observer)) == ((), [GONE])
+    assert (service.refused, events(observer)) == ((), [ErrorReported(GONE)])
 
 
 def test_two_failures_that_take_turns_are_reported_once_each(bus: Bus, service: BusService, observer: Observer) -> None:
@@ -308,39 +307,41 @@ def test_two_failures_that_take_turns_are_reported_once_each(bus: Bus, service: 
 
     bus.watching.hold = alternate
     turns(bus, 100)
-    assert sorted(sentences(observer)) == ["failure 0", "failure 1"]
+    assert set(events(observer)) == {ErrorReported("failure 0"), ErrorReported("failure 1")}
+    assert len(events(observer)) == 2
 
 
 def test_emergencies_of_one_slave_without_an_end_leave_room_for_those_of_another(
     bus: Bus, service: BusService, observer: Observer
 ) -> None:
-    bus.waiting = [Emergency(1, "io", code, 0, bytes(5)) for code in (0x1000, *range(0x5000, 0x5030))]
-    bus.waiting += [Emergency(2, "drive1", 0x3210, 0, bytes(5))]
+    bus.waiting = [EmergencyMessage(1, code, 0, 0) for code in (0x1000, *range(0x5000, 0x5030))]
+    bus.waiting += [EmergencyMessage(2, 0x3210, 0, 0)]
     turns(bus, 500)
-    said = sentences(observer)
-    assert [sum(sentence.startswith(f"slave {position} ") for sentence in said) for position in (1, 2)] == [4, 1]
-    assert len(said) == 5
+    assert events(observer) == [*bus.waiting[:4], bus.waiting[-1]]
 
 
 def test_an_emergency_that_comes_again_after_a_reset_is_reported_again(
     bus: Bus, service: BusService, observer: Observer
 ) -> None:
-    bus.waiting = [Emergency(2, "drive1", 0x3210, 0, bytes(5))]
+    bus.waiting = [EmergencyMessage(2, 0x3210, 0, 0)]
     for _ in range(2):
         turns(bus, 300)
         service.recover()
         turns(bus)
     bus.waiting = []
     turns(bus, 200)
-    assert 2 <= len(sentences(observer)) <= 3
-    assert len(set(sentences(observer))) == 1
+    assert 2 <= len(events(observer)) <= 3
+    assert set(events(observer)) == {EmergencyMessage(2, 0x3210, 0, 0)}
 
 
-def test_drives_that_fail_together_are_all_explained(bus: Bus, service: BusService, observer: Observer) -> None:
-    bus.patience = 10
-    held = hold_turn(bus)
+@pytest.mark.parametrize(("answer", "code"), [(b"\x2a", 0x2A), (b"\xff" * 8, 0xFFFF)])
+def test_drives_that_fail_together_are_all_explained_whatever_they_answer(
+    bus: Bus, service: BusService, observer: Observer, answer: bytes, code: int
+) -> None:
+    bus.patience, bus.answer = 10, answer
+    release = hold_turn(bus)
     service.explain_drive(1)
     service.explain_drive(0)
-    held.set()
-    until(lambda: len(sentences(observer)) == 2)
-    assert [sentence.partition(":")[0] for sentence in sentences(observer)] == ["joint1 (slave 2)", "joint2 (slave 3)"]
+    release.set()
+    until(lambda: len(events(observer)) == 2)
+    assert events(observer) == [DriveErrorCode(0, 2, 1, code), DriveErrorCode(1, 3, 1, code)]

@@ -1,20 +1,22 @@
-"""A slave of which only its channels are known, through the whole loop in simulated time: read, set, made safe."""
+"""A slave of channels alone in the whole loop, in simulated time: read, set, made safe."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from rtcp.config import default_config, load, load_segment, segment_path
 from rtcp.config.model import ArmConfig, Pdo, PdoEntry, ProcessConfig, SlaveConfig
 from rtcp.config.segment import SegmentSlave
-from rtcp.ipc.commands import Disable, Enable, Reset, SetChannel
+from rtcp.ipc.commands import Disable, Reset, SetChannel
 from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import ChannelNotSettable, ChannelOutOfRange, NoLease, WrongState
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Simulation
+from rtcp.testing.simulation import Simulation
+from rtcp.virtual.models import DiewuIoBox
 
 SHIPPED = load(default_config())
 SAFE, LOW, HIGH = 4.0, 4.0, 20.0
@@ -27,7 +29,7 @@ SLOT = len(SHIPPED.slaves)
 POSITION = SLOT + 1
 
 
-def config(**more: object) -> ArmConfig:
+def config(**more: Any) -> ArmConfig:
     slaves = (*SHIPPED.slaves, SlaveConfig("valves", VALVES))
     return replace(SHIPPED, slaves=slaves, cycle=replace(SHIPPED.cycle, period_us=1000.0), **more)
 
@@ -37,16 +39,22 @@ def arm() -> Iterator[Simulation]:
     segment = load_segment(segment_path(SHIPPED))
     segment = replace(segment, slaves=(*segment.slaves, SegmentSlave("diewu-io")))
     with Simulation(config(), segment=segment, follow_clock=False) as made:
-        assert made.until(lambda: made.state is State.READY, 5.0)
+        made.bring_to(State.READY)
         made.run(0.1)
         made.acquire()
         yield made
 
 
+def valves(arm: Simulation) -> DiewuIoBox:
+    device = arm.bus.slaves[SLOT].device
+    assert isinstance(device, DiewuIoBox)
+    return device
+
+
 def sent(arm: Simulation) -> float:
-    """mA, as the slave has received it."""
+    """Current that the slave has received, mA."""
     arm.run(0.01)
-    return 0.001 * arm.bus.slaves[SLOT].device.outputs
+    return 0.001 * valves(arm).outputs
 
 
 def latest(arm: Simulation) -> dict[str, float]:
@@ -56,7 +64,7 @@ def latest(arm: Simulation) -> dict[str, float]:
 
 
 def test_channels_are_read_in_their_units_and_in_the_record(arm: Simulation) -> None:
-    model = arm.bus.slaves[SLOT].device
+    model = valves(arm)
     model.inputs = 350
     for counts, angle in ((400, 200.0), (800, 400.0), (5, 502.5), (990, 495.0)):  # begins anew at 1000
         model.objects[0x6010, 1].value = counts
@@ -68,28 +76,26 @@ def test_channels_are_read_in_their_units_and_in_the_record(arm: Simulation) -> 
 
 def test_an_output_begins_safe_is_set_within_its_range_and_is_safe_after_a_fault(arm: Simulation) -> None:
     assert sent(arm) == pytest.approx(SAFE)
-    assert arm.send(SetChannel(POSITION, 0, 12.5)).refusal is None
+    arm.do(SetChannel(POSITION, 0, 12.5))
     assert sent(arm) == pytest.approx(12.5)
     for value in (3.999, 20.001, float("nan"), float("inf")):
-        refusal = arm.send(SetChannel(POSITION, 0, value)).refusal
-        assert isinstance(refusal, ChannelOutOfRange)
-    assert Names(arm.config).message(replace(refusal, value=21.0)) == (
+        assert isinstance(arm.send(SetChannel(POSITION, 0, value)).refusal, ChannelOutOfRange)
+    assert Names(arm.config).message(arm.send(SetChannel(POSITION, 0, 21.0)).refusal) == (
         "valves.current: 21 cannot be set: allowed is 4 to 20 (min, max and type in the device file of slave valves)"
     )
     assert sent(arm) == pytest.approx(12.5)
-    assert arm.send(Enable()).refusal is None
-    assert arm.until(lambda: arm.state is State.HOLDING, 5.0)
+    arm.hold()
     assert sent(arm) == pytest.approx(12.5)
     arm.models[0].inject_fault(0x2310)
-    assert arm.until(lambda: arm.state is State.FAULT, 5.0)
+    arm.bring_to(State.FAULT)
     assert sent(arm) == pytest.approx(SAFE)
     assert isinstance(arm.send(SetChannel(POSITION, 0, 12.5)).refusal, WrongState)
-    assert arm.send(Reset()).refusal is None
-    assert arm.until(lambda: arm.state is State.READY, 5.0)
+    arm.do(Reset())
+    arm.bring_to(State.READY)
     assert sent(arm) == pytest.approx(SAFE)
-    assert arm.send(SetChannel(POSITION, 0, 5.0)).refusal is None
+    arm.do(SetChannel(POSITION, 0, 5.0))
     assert sent(arm) == pytest.approx(5.0)
-    assert arm.send(Disable()).refusal is None
+    arm.do(Disable())
     assert sent(arm) == pytest.approx(5.0)
 
 

@@ -4,31 +4,24 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
+from typing import TypeVar
 
 import pytest
 
 from rtcp.config import default_config, load, load_segment, segment_path
 from rtcp.config.model import ArmConfig, GripperConfig, InputConfig, Joint, Range, SlaveConfig
 from rtcp.config.segment import SegmentSlave
+from rtcp.devices.cia402 import Cia402Drive
+from rtcp.ipc import events
 from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, SetZero, Shutdown
-from rtcp.ipc.events import (
-    DriveFault,
-    FollowingError,
-    GripperAtRest,
-    Homed,
-    LeaseExpired,
-    OverSpeed,
-    PositionJumped,
-    ReturningToRange,
-    ZeroSet,
-)
+from rtcp.ipc.events import Event
 from rtcp.ipc.names import Names
-from rtcp.ipc.observer import Event
 from rtcp.ipc.refusals import GripperDisabled, NoLease, NotPermitted
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Frame, Simulation
 from rtcp.motion.guards.output_limiter import BACK_RAD_S
+from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
 
 SHIPPED = load(default_config())
@@ -47,25 +40,32 @@ ENABLED = b"\x0f\x00"
 EMERGENCY_STOP, ENABLING_SWITCH, TOGGLE = 1 << 9, 1 << 10, 1 << 8
 NEUTRAL, BACKWARD, PADDLE_UP = 63, 61, 47
 
+_Event = TypeVar("_Event", bound=Event)
 
-class Hand:
-    """The arm, enabled, with its gripper at `START`; remembers the set-points and what each frame sent to the drive."""
 
-    def __init__(self, simulation: Simulation) -> None:
-        self.simulation = simulation
-        self.gripper = simulation.loop.machine.context.gripper
-        model = simulation.bus.slaves[SLOT].device
+class Hand(Simulation):
+    """The arm, enabled, with its gripper at `START`; records its set-points and the outputs of its drive."""
+
+    def __init__(self, config: ArmConfig = CONFIG, start: float = START) -> None:
+        segment = load_segment(segment_path(SHIPPED))
+        fingers = SegmentSlave("cubemars-orh40", options={"load_inertia": 0.02, "initial_position": start})
+        segment = replace(segment, slaves=(*segment.slaves, fingers))
+        super().__init__(config, positions=BENT, segment=segment, follow_clock=False)
+        self.gripper = self.loop.machine.context.gripper
+        model = self.bus.slaves[SLOT].device
         assert self.gripper is not None
         assert isinstance(model, CubemarsDrive)
         self.model = model
-        self.path: list[float] = []
+        self.setpoints: list[float] = []
         self.sent: list[bytes] = []
         self.object_at: float | None = None
-        """Where something hard lies between the fingers, rad."""
-        simulation.on_frame = self._see
+        """Position of a hard object between the fingers, rad; None: there is none."""
+        self.on_frame = self._see
+        self.hold()
+        self.setpoints.clear()
 
     def _see(self, frame: Frame) -> None:
-        self.path.append(self.gripper.state.commanded[0])
+        self.setpoints.append(self.gripper.state.commanded[0])
         self.sent.append(frame.sent[SLOT])
         if self.object_at is not None:
             mechanics = self.model.mechanics
@@ -73,51 +73,49 @@ class Hand:
             mechanics.external_torque = 2000.0 * inside - (20.0 * mechanics.velocity if inside else 0.0)
 
     @property
-    def state(self) -> State:
-        return self.simulation.state
-
-    @property
     def moving(self) -> bool:
         return self.gripper.motion.moving
 
     @property
+    def controlwords(self) -> set[int]:
+        """Controlwords of all drives."""
+        return {drive.controlword for drive in self.loop.joints.drives if isinstance(drive, Cia402Drive)}
+
+    @property
     def position(self) -> float:
-        """Where the fingers really are, rad."""
+        """True position of the fingers, rad."""
         return self.model.mechanics.position
 
-    def reports_of(self, kind: type[Event]) -> list[Event]:
-        return [record.event for record in self.simulation.events if isinstance(record.event, kind)]
+    def reports_of(self, kind: type[_Event]) -> list[_Event]:
+        return [record.event for record in self.events if isinstance(record.event, kind)]
 
     def message(self, kind: type[Event]) -> str:
         (event,) = self.reports_of(kind)
         return Names(CONFIG).message(event)
 
-    def close(self) -> None:
-        assert self.simulation.send(MoveGripper(False)).refusal is None
+    def shut(self) -> None:
+        self.do(MoveGripper(False))
 
     def open(self) -> None:
-        assert self.simulation.send(MoveGripper(True)).refusal is None
+        self.do(MoveGripper(True))
 
     def on_its_way(self) -> None:
-        self.close()
-        self.simulation.run(0.4)
+        self.shut()
+        self.run(0.4)
         assert self.moving
         assert CLOSED + 0.2 < self.position < START - 0.05
 
     def rest(self, seconds: float = 5.0) -> None:
-        assert self.simulation.until(lambda: not self.moving, seconds)
-        self.simulation.run(0.1)
-
-    def until(self, state: State) -> None:
-        assert self.simulation.until(lambda: self.state is state, 10.0)
+        assert self.until(lambda: not self.moving, seconds)
+        self.run(0.1)
 
     def inputs(self, clear: int = 0, put: int = 0) -> None:
-        assert self.simulation.box is not None
-        self.simulation.box.inputs = self.simulation.box.inputs & ~clear | put
+        assert self.box is not None
+        self.box.inputs = self.box.inputs & ~clear | put
 
 
 def kept_to_its_limits(path: list[float]) -> bool:
-    """Whether no step of a set-point, and no change of step, was beyond the joint's limits."""
+    """Whether all set-points keep to the joint's speed and acceleration."""
     speeds = [(b - a) / PERIOD_S for a, b in itertools.pairwise(path)]
     changes = [(b - a) / PERIOD_S for a, b in itertools.pairwise(speeds)]
     return max(map(abs, speeds)) <= FINGER.velocity * 1.0001 and max(map(abs, changes)) <= FINGER.acceleration * 1.01
@@ -125,26 +123,8 @@ def kept_to_its_limits(path: list[float]) -> bool:
 
 @pytest.fixture
 def with_hand() -> Iterator[Callable[..., Hand]]:
-    begun: list[Simulation] = []
-
-    def begin(config: ArmConfig = CONFIG, start: float = START) -> Hand:
-        segment = load_segment(segment_path(SHIPPED))
-        fingers = SegmentSlave("cubemars-orh40", options={"load_inertia": 0.02, "initial_position": start})
-        segment = replace(segment, slaves=(*segment.slaves, fingers))
-        simulation = Simulation(config, positions=BENT, segment=segment, follow_clock=False)
-        begun.append(simulation)
-        hand = Hand(simulation)
-        hand.until(State.READY)
-        simulation.run(0.1)
-        simulation.acquire()
-        assert simulation.send(Enable()).refusal is None
-        hand.until(State.HOLDING)
-        hand.path.clear()
-        return hand
-
-    yield begin
-    for simulation in begun:
-        simulation.close()
+    with ExitStack() as stack:
+        yield lambda *args, **kwargs: stack.enter_context(Hand(*args, **kwargs))
 
 
 @pytest.fixture
@@ -152,63 +132,63 @@ def hand(with_hand: Callable[..., Hand]) -> Hand:
     return with_hand()
 
 
-# -- the way ----------------------------------------------------------------------------------------------------------
+# -- opening and closing ----------------------------------------------------------------------------------------------
 
 
 def test_it_closes_and_opens_under_the_lease_and_reports_each_time_where_it_rests(hand: Hand) -> None:
-    hand.close()
+    hand.shut()
     hand.rest()
     assert hand.position == pytest.approx(CLOSED, abs=2e-3)
     hand.open()
     hand.rest()
     assert hand.position == pytest.approx(OPEN, abs=2e-3)
-    reported = [(event.axis, event.position, event.holds) for event in hand.reports_of(GripperAtRest)]
+    reported = [(event.axis, event.position, event.holds) for event in hand.reports_of(events.GripperAtRest)]
     assert reported == [(AXIS, pytest.approx(CLOSED), False), (AXIS, pytest.approx(OPEN), False)]
-    assert kept_to_its_limits(hand.path)
+    assert kept_to_its_limits(hand.setpoints)
     assert hand.state is State.HOLDING
 
 
 def test_without_the_lease_it_does_not_begin(hand: Hand) -> None:
-    assert hand.simulation.send(MoveGripper(False), lease=hand.simulation.lease + 1).refusal == NoLease()
-    hand.simulation.run(0.2)
-    assert max(abs(position - START) for position in hand.path) < 1e-4
+    assert hand.send(MoveGripper(False), lease=hand.lease + 1).refusal == NoLease()
+    hand.run(0.2)
+    assert max(abs(position - START) for position in hand.setpoints) < 1e-4
 
 
 def test_where_it_already_is_it_reports_so_all_the_same(with_hand: Callable[..., Hand]) -> None:
     hand = with_hand(start=OPEN)
     hand.open()
-    hand.simulation.run(0.1)
+    hand.run(0.1)
     hand.open()
-    hand.simulation.run(0.1)
-    assert [event.position for event in hand.reports_of(GripperAtRest)] == [pytest.approx(OPEN, abs=2e-4)] * 2
+    hand.run(0.1)
+    assert [event.position for event in hand.reports_of(events.GripperAtRest)] == [pytest.approx(OPEN, abs=2e-4)] * 2
 
 
 def test_it_goes_on_and_ends_well_while_a_joint_homes(hand: Hand) -> None:
-    # The search for the next index pulse: slow enough to last longer than the gripper's way.
-    hand.simulation.models[0].objects[0x6098, 0].value = 34
-    hand.simulation.models[0].objects[0x6099, 2].value = 150
+    # The search for the next index pulse lasts longer than the gripper's motion.
+    hand.models[0].objects[0x6098, 0].value = 34
+    hand.models[0].objects[0x6099, 2].value = 150
     hand.on_its_way()
-    assert hand.simulation.send(Home(0)).refusal is None
+    hand.do(Home(0))
     hand.rest()
     assert hand.state is State.HOMING
     assert hand.position == pytest.approx(CLOSED, abs=2e-3)
-    assert [event.position for event in hand.reports_of(GripperAtRest)] == [pytest.approx(CLOSED)]
-    hand.until(State.HOLDING)
-    assert hand.reports_of(Homed)
-    assert kept_to_its_limits(hand.path)
+    assert [event.position for event in hand.reports_of(events.GripperAtRest)] == [pytest.approx(CLOSED)]
+    hand.bring_to(State.HOLDING)
+    assert hand.reports_of(events.Homed)
+    assert kept_to_its_limits(hand.setpoints)
 
 
 def test_what_it_grips_ends_its_way_and_is_no_emergency(hand: Hand) -> None:
     hand.object_at = 0.5
-    hand.close()
+    hand.shut()
     hand.rest()
-    hand.simulation.run(2.0)
+    hand.run(2.0)
     assert hand.state is State.HOLDING
-    (rest,) = hand.reports_of(GripperAtRest)
+    (rest,) = hand.reports_of(events.GripperAtRest)
     assert (rest.position, rest.holds) == (pytest.approx(0.5, abs=0.05), True)
-    assert hand.message(GripperAtRest) == f"finger rests at {rest.position:.6g} rad"
+    assert hand.message(events.GripperAtRest) == f"finger rests at {rest.position:.6g} rad"
     assert 0.5 * FINGER.torque < abs(hand.gripper.drive.torque) < 1.2 * FINGER.torque
-    assert kept_to_its_limits(hand.path[: hand.path.index(rest.position)])
+    assert kept_to_its_limits(hand.setpoints[: hand.setpoints.index(rest.position)])
     hand.open()
     hand.rest()
     assert hand.position == pytest.approx(OPEN, abs=2e-3)
@@ -219,39 +199,39 @@ def test_what_it_grips_ends_its_way_and_is_no_emergency(hand: Hand) -> None:
 
 
 def stopped_on_its_way(hand: Hand) -> None:
-    """It has come to rest under its limits, between where it was and where it should be, has said so, and stays."""
-    (rest,) = hand.reports_of(GripperAtRest)
+    """Assert that it stopped within its limits before its target, reported this once, and stays."""
+    (rest,) = hand.reports_of(events.GripperAtRest)
     assert CLOSED + 0.1 < rest.position < START - 0.05
     assert not rest.holds
-    assert kept_to_its_limits(hand.path)
-    hand.path.clear()
-    hand.simulation.run(1.0)
-    assert set(hand.path) == {rest.position}
+    assert kept_to_its_limits(hand.setpoints)
+    hand.setpoints.clear()
+    hand.run(1.0)
+    assert set(hand.setpoints) == {rest.position}
     assert hand.position == pytest.approx(rest.position, abs=2e-3)
 
 
 def hold_switch(hand: Hand) -> None:
-    assert hand.simulation.send(MoveGripper(False)).refusal == NotPermitted()
+    assert hand.send(MoveGripper(False)).refusal == NotPermitted()
     hand.inputs(put=ENABLING_SWITCH)
-    hand.simulation.run(0.05)
+    hand.run(0.05)
 
 
 def nothing(hand: Hand) -> None:
-    """Nothing is to be prepared, or to be undone."""
+    """There is nothing to prepare, or to undo."""
 
 
 WITH_SWITCH = replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=InputConfig(11)))
 STOPS: dict[str, tuple[Callable[[Hand], object], Callable[[Hand], object], Callable[[Hand], object]]] = {
-    "halt": (nothing, lambda hand: hand.simulation.send(Halt()), nothing),
-    "another holds the lease": (nothing, lambda hand: hand.simulation.acquire(), nothing),
-    "the lease is not renewed": (lambda hand: hand.simulation.fall_silent(), nothing, nothing),
+    "halt": (nothing, lambda hand: hand.send(Halt()), nothing),
+    "another holds the lease": (nothing, lambda hand: hand.acquire(), nothing),
+    "the lease is not renewed": (lambda hand: hand.fall_silent(), nothing, nothing),
     "the enabling switch is released": (
         hold_switch,
         lambda hand: hand.inputs(clear=ENABLING_SWITCH),
         lambda hand: hand.inputs(put=ENABLING_SWITCH),
     ),
 }
-"""What is done before it moves, what stops it, and what is undone then."""
+"""Preparation, cause of the stop, and what undoes the cause."""
 
 
 @pytest.mark.parametrize("stop", STOPS)
@@ -272,49 +252,49 @@ def test_where_a_lost_commander_means_a_quick_stop_it_ends_in_a_fault_with_the_a
 ) -> None:
     hand = with_hand(replace(CONFIG, stops=replace(CONFIG.stops, lease_ended="quick_stop")))
     hand.on_its_way()
-    hand.simulation.acquire()
-    hand.until(State.FAULT)
-    hand.simulation.run(0.2)
-    assert len(hand.reports_of(LeaseExpired)) == 1
+    hand.acquire()
+    hand.bring_to(State.FAULT)
+    hand.run(0.2)
+    assert len(hand.reports_of(events.LeaseExpired)) == 1
     assert not hand.moving
     assert abs(hand.model.mechanics.velocity) < 0.01
-    assert {drive.controlword for drive in hand.simulation.loop.joints.drives} == {0x0002}
+    assert hand.controlwords == {0x0002}
 
 
 def test_it_stops_while_a_joint_homes_when_its_commander_falls_silent(hand: Hand) -> None:
-    hand.simulation.models[0].objects[0x6098, 0].value = 34
-    hand.simulation.models[0].objects[0x6099, 2].value = 1
+    hand.models[0].objects[0x6098, 0].value = 34
+    hand.models[0].objects[0x6099, 2].value = 1
     hand.on_its_way()
-    assert hand.simulation.send(Home(0)).refusal is None
-    hand.simulation.run(0.1)
-    hand.simulation.acquire()
-    hand.simulation.run(0.02)
+    hand.do(Home(0))
+    hand.run(0.1)
+    hand.acquire()
+    hand.run(0.02)
     assert hand.state is State.HOMING
-    before, now = (hand.path[at] - hand.path[at + 1] for at in (-10, -2))
+    before, now = (hand.setpoints[at] - hand.setpoints[at + 1] for at in (-10, -2))
     assert now < 0.999 * before
     hand.rest()
     stopped_on_its_way(hand)
 
 
 def test_a_halt_before_its_first_step_is_a_halt_too(hand: Hand) -> None:
-    hand.simulation.data.lose(5, heard=True)
-    hand.close()
-    assert hand.simulation.send(Halt()).refusal is None
-    hand.simulation.run(0.5)
-    assert max(abs(position - START) for position in hand.path) < 1e-4
-    assert [event.position for event in hand.reports_of(GripperAtRest)] == [pytest.approx(START, abs=1e-4)]
+    hand.data.lose(5, heard=True)
+    hand.shut()
+    hand.do(Halt())
+    hand.run(0.5)
+    assert max(abs(position - START) for position in hand.setpoints) < 1e-4
+    assert [event.position for event in hand.reports_of(events.GripperAtRest)] == [pytest.approx(START, abs=1e-4)]
 
 
 @pytest.fixture
 def by_joystick(with_hand: Callable[..., Hand]) -> Hand:
     """The joystick closes it; nobody holds a lease."""
     hand = with_hand(replace(CONFIG, control_mode="joystick"))
-    hand.simulation.lease = 0
+    hand.lease = 0
     for code in [PADDLE_UP, NEUTRAL] * 3:
         hand.inputs(clear=0x3F, put=code)
-        hand.simulation.run(0.05)
+        hand.run(0.05)
     hand.inputs(clear=0x3F, put=BACKWARD)
-    hand.simulation.run(0.4)
+    hand.run(0.4)
     assert hand.moving
     return hand
 
@@ -337,44 +317,43 @@ def test_it_stops_when_the_joystick_no_longer_closes_it(by_joystick: Hand, clear
 
 
 @pytest.mark.parametrize("command", [Disable, Shutdown])
-def test_its_set_point_comes_to_rest_before_its_torque_goes(hand: Hand, command: Command) -> None:
+def test_its_set_point_comes_to_rest_before_its_torque_goes(hand: Hand, command: type[Command]) -> None:
     hand.on_its_way()
-    hand.path.clear()
+    hand.setpoints.clear()
     hand.sent.clear()
-    hand.simulation.send(command())
-    assert hand.simulation.until(lambda: hand.state is State.READY or hand.simulation.done, 10.0)
+    hand.send(command())
+    assert hand.until(lambda: hand.state is State.READY or hand.done, 10.0)
     off = next(at for at, sent in enumerate(hand.sent) if sent[:2] != ENABLED)
     assert off > 10
     assert hand.sent[off - 1][2:6] == hand.sent[off - 2][2:6]
-    (rest,) = hand.reports_of(GripperAtRest)
+    (rest,) = hand.reports_of(events.GripperAtRest)
     assert CLOSED + 0.1 < rest.position < START - 0.05
     assert not hand.model.powered
-    assert kept_to_its_limits(hand.path[:off])
+    assert kept_to_its_limits(hand.setpoints[:off])
 
 
 # -- faults and emergencies -------------------------------------------------------------------------------------------
 
 
 def goes_nowhere_by_itself(hand: Hand) -> None:
-    """Reset and enabled again it stays where it is; of what became of its way nobody was told that it had an end."""
+    """Assert that it reported no rest, and that it stays where it is after reset and enable."""
     assert not hand.moving
-    assert hand.reports_of(GripperAtRest) == []
-    assert hand.simulation.send(Reset()).refusal is None
-    hand.until(State.READY)
+    assert hand.reports_of(events.GripperAtRest) == []
+    hand.do(Reset())
+    hand.bring_to(State.READY)
     here = hand.position
-    assert hand.simulation.send(Enable()).refusal is None
-    hand.until(State.HOLDING)
-    hand.simulation.run(1.0)
+    hand.hold()
+    hand.run(1.0)
     assert hand.position == pytest.approx(here, abs=2e-3)
 
 
 @pytest.mark.parametrize("own", [True, False])
 def test_a_fault_of_any_drive_stops_it_and_the_arm(hand: Hand, own: bool) -> None:
     hand.on_its_way()
-    (hand.model if own else hand.simulation.models[2]).inject_fault(0x7305)
-    hand.until(State.FAULT)
-    assert hand.message(DriveFault).startswith(f"{'finger' if own else 'joint3'}: the drive is in fault")
-    hand.simulation.run(1.0)
+    (hand.model if own else hand.models[2]).inject_fault(0x7305)
+    hand.bring_to(State.FAULT)
+    assert hand.message(events.DriveFault).startswith(f"{'finger' if own else 'joint3'}: the drive is in fault")
+    hand.run(1.0)
     assert abs(hand.model.mechanics.velocity) < 1e-3 or own
     assert hand.position > CLOSED + 0.1 or own
     goes_nowhere_by_itself(hand)
@@ -383,12 +362,12 @@ def test_a_fault_of_any_drive_stops_it_and_the_arm(hand: Hand, own: bool) -> Non
 def test_the_emergency_stop_stops_it(hand: Hand) -> None:
     hand.on_its_way()
     hand.inputs(clear=EMERGENCY_STOP)
-    hand.until(State.EMERGENCY_STOP)
-    hand.simulation.run(1.5)
+    hand.bring_to(State.EMERGENCY_STOP)
+    hand.run(1.5)
     assert not hand.model.powered
     assert hand.position > CLOSED + 0.1
     hand.inputs(put=EMERGENCY_STOP)
-    hand.simulation.run(0.1)
+    hand.run(0.1)
     goes_nowhere_by_itself(hand)
 
 
@@ -396,55 +375,55 @@ def test_the_emergency_stop_stops_it(hand: Hand) -> None:
 def test_its_following_error_is_supervised_but_not_that_of_what_it_holds(hand: Hand, holds: bool) -> None:
     if holds:
         hand.object_at = 0.5
-        hand.close()
+        hand.shut()
         hand.rest()
         hand.object_at = None
     # Just more than the drive can hold: it yields slowly.
     hand.model.mechanics.external_torque = 19.6
     beyond = 0
     while hand.state is State.HOLDING and beyond < 2 * CONFIG.supervision.cycles:
-        hand.simulation.cycle()
+        hand.cycle()
         error = hand.gripper.drive.position - hand.gripper.state.commanded[0]
         beyond += abs(error) > CONFIG.supervision.following_error
     if holds:
         assert hand.state is State.HOLDING
     else:
         assert (hand.state, beyond) == (State.EMERGENCY_STOP, CONFIG.supervision.cycles)
-        assert hand.message(FollowingError).startswith("finger")
+        assert hand.message(events.FollowingError).startswith("finger")
 
 
 def test_too_fast_while_the_loop_closes_it_is_stopped_by_the_drives(hand: Hand) -> None:
     hand.on_its_way()
-    hand.simulation.send(Shutdown())
+    hand.send(Shutdown())
     hand.model.mechanics.external_torque = -60.0
-    assert hand.simulation.until(lambda: bool(hand.reports_of(OverSpeed)), 1.0)
-    hand.simulation.run(0.01)
-    assert {drive.controlword for drive in hand.simulation.loop.joints.drives} == {0x0002}
+    assert hand.until(lambda: bool(hand.reports_of(events.OverSpeed)), 1.0)
+    hand.run(0.01)
+    assert hand.controlwords == {0x0002}
 
 
 def disabled(hand: Hand) -> Hand:
-    assert hand.simulation.send(Disable()).refusal is None
-    hand.until(State.READY)
+    hand.do(Disable())
+    hand.bring_to(State.READY)
     return hand
 
 
 def test_disabled_it_is_not_to_be_moved(hand: Hand) -> None:
-    assert disabled(hand).simulation.send(MoveGripper(False)).refusal == GripperDisabled()
+    assert disabled(hand).send(MoveGripper(False)).refusal == GripperDisabled()
 
 
 def test_that_it_says_to_be_elsewhere_while_it_is_being_enabled_is_a_fault_that_names_its_joint(hand: Hand) -> None:
     disabled(hand)
-    assert hand.simulation.send(Enable()).refusal is None
+    hand.do(Enable())
     hand.model.mechanics.position += 0.1
-    hand.until(State.FAULT)
-    assert hand.message(PositionJumped).startswith("finger jumped from 1 to")
+    hand.bring_to(State.FAULT)
+    assert hand.message(events.PositionJumped).startswith("finger jumped from 1 to")
 
 
 def test_outside_its_range_it_returns_to_the_edge_gently_while_it_is_enabled(
     with_hand: Callable[..., Hand],
 ) -> None:
     hand = with_hand(start=1.515)
-    assert [event.axis for event in hand.reports_of(ReturningToRange)] == [AXIS]
+    assert [event.axis for event in hand.reports_of(events.ReturningToRange)] == [AXIS]
     targets = [int.from_bytes(sent[2:6], "little", signed=True) for sent in hand.sent if sent[:2] == ENABLED]
     assert (targets[0], targets[-1]) == (pytest.approx(15150, abs=2), 15000)
     assert max(abs(b - a) for a, b in itertools.pairwise(targets)) <= BACK_RAD_S * PERIOD_S * 1e4 + 1
@@ -452,15 +431,15 @@ def test_outside_its_range_it_returns_to_the_edge_gently_while_it_is_enabled(
 
 def test_further_outside_it_is_not_enabled(hand: Hand) -> None:
     disabled(hand).model.mechanics.position = 1.53
-    hand.simulation.run(0.1)
-    refusal = hand.simulation.send(Enable()).refusal
+    hand.run(0.1)
+    refusal = hand.send(Enable()).refusal
     assert refusal is not None
     assert Names(CONFIG).message(refusal).startswith("finger stands at 1.53 rad")
 
 
 def test_it_counts_from_its_own_zero_offset(with_hand: Callable[..., Hand]) -> None:
     hand = with_hand(replace(CONFIG, zero_offsets=(*[0.0] * 6, 0.25)))
-    hand.close()
+    hand.shut()
     hand.rest()
     assert hand.position == pytest.approx(0.25, abs=2e-3)
 
@@ -468,8 +447,8 @@ def test_it_counts_from_its_own_zero_offset(with_hand: Callable[..., Hand]) -> N
 def test_its_zero_is_set_and_the_loop_says_where_it_stands_then(hand: Hand) -> None:
     disabled(hand)
     zero = hand.gripper.drive.zero
-    assert hand.simulation.send(SetZero(AXIS, zero + START - 0.2)).refusal is None
-    event = hand.reports_of(ZeroSet)[-1]
+    hand.do(SetZero(AXIS, zero + START - 0.2))
+    event = hand.reports_of(events.ZeroSet)[-1]
     assert (event.axis, event.position) == (AXIS, pytest.approx(0.2, abs=2e-3))
-    hand.simulation.run(0.1)
+    hand.run(0.1)
     assert hand.gripper.drive.position == pytest.approx(0.2, abs=2e-3)

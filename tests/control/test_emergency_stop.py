@@ -7,18 +7,8 @@ from itertools import pairwise
 
 import pytest
 
+from rtcp.ipc import events
 from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
-from rtcp.ipc.events import (
-    EmergencyStopActivated,
-    FollowingError,
-    Homed,
-    HomingStillMoving,
-    JointLimitReached,
-    LeftRange,
-    SlavesParked,
-    StoppedByLimit,
-    TorqueRemoved,
-)
 from rtcp.ipc.refusals import WrongState
 from rtcp.ipc.states import State
 
@@ -53,12 +43,12 @@ def test_in_motion_the_drives_ramp_down_before_the_torque_goes_and_the_slaves_ar
     rig.press()
     rig.wait(lambda: bool(parked))
     seen = rig.log[begun:]
-    moving = [n for n, cycle in enumerate(seen) if any(abs(said.velocity) > 200 for said in cycle.drives)]
-    torque = [n for n, cycle in enumerate(seen) if any(said.has_torque for said in cycle.drives)]
+    moving = [n for n, cycle in enumerate(seen) if any(abs(drive.velocity) > 200 for drive in cycle.drives)]
+    torque = [n for n, cycle in enumerate(seen) if any(drive.has_torque for drive in cycle.drives)]
     assert moving
     assert max(moving) < max(torque) < len(seen)
     assert parked == [rig.context.cycle]
-    assert rig.kinds[-2:] == [EmergencyStopActivated, SlavesParked]
+    assert rig.kinds[-2:] == [events.EmergencyStopActivated, events.SlavesParked]
 
 
 def test_while_it_is_pressed_neither_reset_nor_enable_is_taken(rig: LoopRig) -> None:
@@ -68,7 +58,7 @@ def test_while_it_is_pressed_neither_reset_nor_enable_is_taken(rig: LoopRig) -> 
     assert rig.refused(rig.send(Reset())) == PRESSED_SAYS
     rig.press(False)
     rig.do(Reset())
-    rig.until(State.READY)
+    rig.bring_to(State.READY)
     rig.press()
     assert rig.refused(rig.send(Enable())) == PRESSED_SAYS
 
@@ -76,12 +66,12 @@ def test_while_it_is_pressed_neither_reset_nor_enable_is_taken(rig: LoopRig) -> 
 def test_released_while_the_parked_box_says_nothing_it_is_reset(rig: LoopRig) -> None:
     rig.hold().press()
     rig.run(1.0)
-    rig.data.carries = False
+    rig.lose_frames()
     rig.run(0.1)
     rig.press(False)
     rig.do(Reset())
-    rig.data.carries = True
-    rig.until(State.READY)
+    rig.lose_frames(False)
+    rig.bring_to(State.READY)
     rig.enable()
 
 
@@ -90,11 +80,11 @@ def test_still_pressed_when_the_parked_box_is_heard_again_it_is_an_emergency_sto
 ) -> None:
     rig.hold().press()
     rig.run(1.0)
-    rig.data.carries = False
+    rig.lose_frames()
     rig.run(0.1)
     at = len(rig.log)
     rig.do(Reset())
-    rig.data.carries = True
+    rig.lose_frames(False)
     rig.run(0.5)
     assert rig.state is State.EMERGENCY_STOP
     assert State.READY not in {cycle.state for cycle in rig.log[at:]}
@@ -117,10 +107,10 @@ def test_a_bounce_shorter_than_the_debounce_is_no_press(rig: LoopRig) -> None:
 
 def test_it_counts_while_frames_are_lost_as_soon_as_they_come_again(rig: LoopRig) -> None:
     rig.hold()
-    rig.data.carries = False
+    rig.lose_frames()
     rig.run(0.01)
     rig.put(EMERGENCY_STOP_INPUT, False)
-    rig.data.carries = True
+    rig.lose_frames(False)
     rig.run(0.02)
     assert rig.state is State.EMERGENCY_STOP
 
@@ -130,10 +120,10 @@ def test_it_counts_while_frames_are_lost_as_soon_as_they_come_again(rig: LoopRig
 
 def test_a_joint_that_does_not_follow_ends_in_the_emergency_stop(rig: LoopRig) -> None:
     rig.hold()
-    rig.data.misunderstood[1, 0x607A] = dict.fromkeys(range(-40000, 40000), 0)
+    rig.misunderstood[1, 0x607A] = dict.fromkeys(range(-40000, 40000), 0)
     rig.do(move_to(0.0, 0.4, speed=SPEED))
-    rig.until(State.EMERGENCY_STOP)
-    assert (rig.kinds[-1], rig.last.axis) == (FollowingError, 1)
+    rig.bring_to(State.EMERGENCY_STOP)
+    assert (rig.kinds[-1], rig.last_of(events.FollowingError).axis) == (events.FollowingError, 1)
     assert "supervision in assistive_arm.yaml" in rig.messages[-1]
 
 
@@ -161,20 +151,20 @@ def test_a_torque_beyond_its_limit_counts_after_five_cycles_in_a_row(rig: LoopRi
 
 
 def test_a_move_that_meets_a_limit_is_stopped_before_it_and_says_which(rig: LoopRig) -> None:
-    rig.bring_to(State.STOPPED_BY_LIMIT)
+    rig.lead_to(State.STOPPED_BY_LIMIT)
     limit = rig.arm.limits.high[0]
     assert max(cycle.drives[0].target for cycle in rig.log) <= limit * COUNTS
-    assert rig.kinds[-2:] == [JointLimitReached, StoppedByLimit]
-    assert rig.events[-2].event.axis == 0
+    assert rig.kinds[-2:] == [events.JointLimitReached, events.StoppedByLimit]
+    assert rig.last_of(events.JointLimitReached).axis == 0
     assert "`rtcp reset`" in rig.messages[-2]
     assert all(rig.longest_step(axis) <= LONGEST_STEP for axis in range(2))
 
 
 def test_stopped_by_a_limit_the_arm_holds_and_moves_again_only_after_reset(rig: LoopRig) -> None:
-    rig.bring_to(State.STOPPED_BY_LIMIT)
-    held = [cycle.target for cycle in rig.log[-1].drives]
+    rig.lead_to(State.STOPPED_BY_LIMIT)
+    targets = [drive.target for drive in rig.log[-1].drives]
     rig.run(0.2)
-    assert [said.target for said in rig.log[-1].drives] == held
+    assert [drive.target for drive in rig.log[-1].drives] == targets
     assert rig.joints.first_not_enabled() == -1
     answer = rig.send(move_to(0.0, 0.0))
     assert isinstance(answer.refusal, WrongState)
@@ -182,7 +172,7 @@ def test_stopped_by_a_limit_the_arm_holds_and_moves_again_only_after_reset(rig: 
     rig.do(Reset())
     assert rig.state is State.HOLDING
     rig.move(0.0, 0.0)
-    rig.until(State.HOLDING)
+    rig.bring_to(State.HOLDING)
     assert rig.arm.drives[0].position == pytest.approx(0.0, abs=1e-3)
 
 
@@ -199,7 +189,7 @@ def test_a_move_right_after_a_homing_beyond_the_range_begins_as_any_other(
     rig.models[0].objects[0x6098, 0].value = 37
     rig.models[0].objects[0x607C, 0].value = round((high + beyond) * COUNTS)
     rig.do(Home(0))
-    rig.until(State.HOLDING)
+    rig.bring_to(State.HOLDING)
     begun = len(rig.log) - 1
     rig.move(high - 0.8, rig.arm.drives[1].position, speed=speed)
     rig.run(1.2)
@@ -217,23 +207,23 @@ def test_a_drive_is_homed_where_it_stands_and_the_others_hold(rig: LoopRig) -> N
     rig.hold()
     rig.models[0].objects[0x6098, 0].value = 37
     rig.do(Home(0))
-    rig.until(State.HOLDING)
+    rig.bring_to(State.HOLDING)
     rig.run(0.1)
-    assert Homed in rig.kinds
+    assert events.Homed in rig.kinds
     assert rig.arm.drives[0].position == pytest.approx(0.0, abs=1e-3)
     assert rig.longest_step(1) <= 1
     rig.move(0.2, 0.0)
-    rig.until(State.HOLDING)
+    rig.bring_to(State.HOLDING)
     rig.run(0.2)
     assert rig.arm.drives[0].position == pytest.approx(0.2, abs=1e-3)
 
 
 def test_a_homing_that_is_stopped_leaves_the_arm_holding(rig: LoopRig) -> None:
-    rig.bring_to(State.HOMING)
+    rig.lead_to(State.HOMING)
     rig.run(0.2)
     rig.do(Halt())
-    rig.until(State.HOLDING)
-    assert [said.mode_display for said in rig.log[-1].drives] == [8, 8]
+    rig.bring_to(State.HOLDING)
+    assert [drive.mode_display for drive in rig.log[-1].drives] == [8, 8]
 
 
 @pytest.mark.parametrize(
@@ -246,26 +236,26 @@ def test_a_homing_that_is_stopped_leaves_the_arm_holding(rig: LoopRig) -> None:
     ids=["nothing", "emergency stop", "lost frames"],
 )
 def test_disabling_ends_a_homing_before_the_torque_goes(rig: LoopRig, meanwhile: Step, ends_in: State) -> None:
-    rig.bring_to(State.HOMING).run(0.1)
+    rig.lead_to(State.HOMING).run(0.1)
     rig.do(Disable())
     meanwhile(rig)
-    rig.until(ends_in)
+    rig.bring_to(ends_in)
     rig.run(1.0)
     assert rig.joints.first_with_torque() == -1 or ends_in is State.FAULT
-    assert (TorqueRemoved in rig.kinds) is (ends_in is State.FAULT)
+    assert (events.TorqueRemoved in rig.kinds) is (ends_in is State.FAULT)
 
 
 @pytest.mark.parametrize("command", [Disable, Shutdown])
 def test_a_joint_that_turns_on_after_its_homing_is_stopped_hard_whatever_ended_it(
-    rig: LoopRig, command: Command
+    rig: LoopRig, command: type[Command]
 ) -> None:
-    rig.bring_to(State.HOMING)
+    rig.lead_to(State.HOMING)
     rig.run(0.1)
     turned = rig.models[0].mechanics
     turned.inertia, turned.velocity, turned.external_torque = 1e5, 0.015, 117.0
     rig.do(command())
     rig.run(3.2)
-    assert HomingStillMoving in rig.kinds
+    assert events.HomingStillMoving in rig.kinds
     assert rig.log[-1].drives[0].controlword == QUICK_STOP
 
 
@@ -274,8 +264,8 @@ def test_a_drive_that_reads_a_place_outside_its_range_after_homing_is_a_fault(ri
     rig.models[1].objects[0x6098, 0].value = 37
     rig.models[1].objects[0x607C, 0].value = 30000
     rig.do(Home(1))
-    rig.until(State.FAULT)
-    assert (rig.kinds[-1], rig.last.axis) == (LeftRange, 1)
+    rig.bring_to(State.FAULT)
+    assert (rig.kinds[-1], rig.last_of(events.LeftRange).axis) == (events.LeftRange, 1)
 
 
 # -- the enabling switch --------------------------------------------------------------------------------------------
@@ -293,17 +283,17 @@ def test_without_the_enabling_switch_no_motion_begins(new_rig: Callable[..., Loo
 
 def test_the_lamps_show_torque_and_motion_and_the_heartbeat_changes_each_cycle(rig: LoopRig) -> None:
     rig.start()
-    assert rig.data.devices[0].outputs & 3 == 0
+    assert rig.box.outputs & 3 == 0
     rig.enable()
     rig.run(0.01)
-    assert rig.data.devices[0].outputs & 3 == 1
+    assert rig.box.outputs & 3 == 1
     rig.move(0.3, 0.3)
     rig.run(0.1)
-    assert rig.data.devices[0].outputs & 3 == 3
+    assert rig.box.outputs & 3 == 3
     beats = []
     for _ in range(6):
         rig.cycle()
-        beats.append(rig.data.devices[0].outputs >> 2 & 1)
+        beats.append(rig.box.outputs >> 2 & 1)
     assert beats in ([0, 1] * 3, [1, 0] * 3)
 
 
@@ -311,7 +301,7 @@ def test_the_gripper_opens_and_closes_on_its_output(rig: LoopRig) -> None:
     rig.hold()
     rig.do(MoveGripper(False))
     rig.run(0.005)
-    assert rig.data.devices[0].outputs >> 3 & 1 == 1
+    assert rig.box.outputs >> 3 & 1 == 1
     rig.do(MoveGripper(True))
     rig.run(0.005)
-    assert rig.data.devices[0].outputs >> 3 & 1 == 0
+    assert rig.box.outputs >> 3 & 1 == 0

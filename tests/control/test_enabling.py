@@ -1,4 +1,4 @@
-"""Enabling: what a drive shows meanwhile that is not so, what is measured meanwhile, and who leaves it again."""
+"""Enabling: false statuswords and positions, joints that move or stand beyond their range, drives that drop out."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from rtcp.ipc.commands import Disable, Enable, Reset
+from rtcp.ipc.commands import Disable, Enable
 from rtcp.ipc.events import DriveLeftEnabled, Enabled, OverSpeed, PositionJumped, ReturningToRange
 from rtcp.ipc.refusals import WrongState
 from rtcp.ipc.states import State
@@ -22,21 +22,22 @@ from .rig import (
     QUICK_STOP,
     SWITCH_ON,
     LoopRig,
+    about,
     move_to,
 )
 
 _INPUTS = struct.Struct("<Hiiib")
 ENABLED, SWITCHED_ON, NO_STATE = 0x0237, 0x0233, 0x0213
-"""Statuswords; the last is none that the standard defines."""
+"""Statuswords; the standard does not define the last."""
 
 
 def falsify(rig: LoopRig, axis: int = 0, word: int | None = None, position: float | None = None) -> Callable[[], None]:
-    """Let all frames from now on carry a false statusword or position (rad) of a drive; return what ends it."""
+    """Falsify a drive's statusword or position (rad) in all frames from now on; return a function that ends it."""
     real = rig.data.input
 
-    def read(slot: int) -> bytes:
-        data = real(slot)
-        if slot != axis + 1:
+    def read(index: int) -> bytes:
+        data = real(index)
+        if index != axis + 1:
             return data
         values = list(_INPUTS.unpack(data))
         values[0] = values[0] if word is None else word
@@ -51,21 +52,21 @@ def falsify(rig: LoopRig, axis: int = 0, word: int | None = None, position: floa
     return end
 
 
-def until_told_to_enable(rig: LoopRig, axis: int = 0) -> LoopRig:
-    """Enable, up to the cycle in which the drive has been told to and does not show it yet."""
+def until_enable_is_sent(rig: LoopRig, axis: int = 0) -> LoopRig:
+    """Enable, until the drive has been sent Enable Operation and does not show it yet."""
     rig.start().do(Enable())
     rig.wait(lambda: rig.log[-1].drives[axis].controlword == ENABLE_OPERATION)
     assert rig.log[-1].drives[axis].statusword & 0x6F == 0x23
     return rig
 
 
-def largest_way(rig: LoopRig, seconds: float) -> float:
+def largest_distance(rig: LoopRig, seconds: float) -> float:
     """Run; return the largest distance of the first joint from 0, where it began, rad."""
-    found = 0.0
+    distance = 0.0
     for _ in range(round(seconds / PERIOD_S)):
         rig.cycle()
-        found = max(found, abs(rig.models[0].mechanics.position))
-    return found
+        distance = max(distance, abs(rig.models[0].mechanics.position))
+    return distance
 
 
 @pytest.mark.parametrize("frames", [1, 4])
@@ -73,34 +74,34 @@ def largest_way(rig: LoopRig, seconds: float) -> float:
 def test_no_joint_follows_a_false_position_while_its_drive_is_being_enabled(
     rig: LoopRig, position: float, frames: int
 ) -> None:
-    end = falsify(until_told_to_enable(rig), word=SWITCHED_ON, position=position)
+    end = falsify(until_enable_is_sent(rig), word=SWITCHED_ON, position=position)
     rig.run(frames * PERIOD_S)
     end()
-    assert largest_way(rig, 0.5) < 1e-4
+    assert largest_distance(rig, 0.5) < 1e-4
     assert rig.state is State.HOLDING
-    assert {said.drives[0].target for said in rig.log if said.drives[0].controlword == ENABLE_OPERATION} == {0}
+    assert {cycle.drives[0].target for cycle in rig.log if cycle.drives[0].controlword == ENABLE_OPERATION} == {0}
 
 
 def test_a_position_that_stays_false_while_enabling_is_a_fault_that_names_both_places(rig: LoopRig) -> None:
-    falsify(until_told_to_enable(rig), word=SWITCHED_ON, position=0.1)
+    falsify(until_enable_is_sent(rig), word=SWITCHED_ON, position=0.1)
     rig.run((CONFIG.supervision.cycles - 1) * PERIOD_S)
     assert rig.state is State.ENABLING
     rig.cycle()
     assert (rig.state, rig.kinds[-1]) == (State.FAULT, PositionJumped)
-    assert rig.last == PositionJumped(0, pytest.approx(0.1), pytest.approx(0.0, abs=1e-4))
-    assert largest_way(rig, 0.5) < 1e-4
+    assert rig.last == PositionJumped(0, about(0.1), about(0.0, abs=1e-4))
+    assert largest_distance(rig, 0.5) < 1e-4
 
 
 def test_false_positions_that_do_not_follow_each_other_are_not_added_up(rig: LoopRig) -> None:
-    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
-    until_told_to_enable(rig)
+    rig.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    until_enable_is_sent(rig)
     for _ in range(2 * CONFIG.supervision.cycles):
         end = falsify(rig, axis=1, position=0.1)
         rig.cycle()
         end()
         rig.cycle()
-    rig.data.misunderstood.clear()
-    rig.until(State.HOLDING)
+    rig.misunderstood.clear()
+    rig.bring_to(State.HOLDING)
 
 
 def test_a_joint_that_sags_while_its_brake_opens_is_followed_and_enabled(rig: LoopRig) -> None:
@@ -109,60 +110,58 @@ def test_a_joint_that_sags_while_its_brake_opens_is_followed_and_enabled(rig: Lo
     while rig.log[-1].drives[1].statusword & 0x6F != 0x27:
         model.position -= 0.4 * PERIOD_S
         rig.cycle()
-    rig.until(State.HOLDING)
+    rig.bring_to(State.HOLDING)
     assert rig.longest_step(1) <= LONGEST_STEP
 
 
 def test_a_joint_that_runs_away_before_all_drives_are_enabled_is_an_emergency(rig: LoopRig) -> None:
-    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    rig.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
     rig.start().do(Enable())
     rig.wait(lambda: rig.log[-1].drives[0].statusword & 0x6F == 0x27)
     turned = rig.models[0].mechanics
     turned.inertia, turned.velocity = 1e5, 0.9
-    rig.until(State.EMERGENCY_STOP, (CONFIG.supervision.cycles + 3) * PERIOD_S)
+    rig.bring_to(State.EMERGENCY_STOP, (CONFIG.supervision.cycles + 3) * PERIOD_S)
     assert rig.kinds[-1] is OverSpeed
 
 
 def test_a_drive_that_leaves_operation_enabled_while_others_are_on_their_way_is_not_enabled_again(
     rig: LoopRig,
 ) -> None:
-    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    rig.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
     rig.start().do(Enable())
     rig.wait(lambda: rig.log[-1].drives[0].statusword & 0x6F == 0x27)
     rig.run(0.02)
-    rig.data.misunderstood[0, CONTROLWORD] = {ENABLE_OPERATION: 0}
-    rig.until(State.FAULT, 5 * PERIOD_S)
-    assert (rig.kinds[-1], rig.last.axis) == (DriveLeftEnabled, 0)
-    rig.data.misunderstood.clear()
+    rig.misunderstood[0, CONTROLWORD] = {ENABLE_OPERATION: 0}
+    rig.bring_to(State.FAULT, 5 * PERIOD_S)
+    assert (rig.kinds[-1], rig.last_of(DriveLeftEnabled).axis) == (DriveLeftEnabled, 0)
+    rig.misunderstood.clear()
     rig.run(0.3)
     assert rig.words(0).count(ENABLE_OPERATION) == 1
-    rig.do(Reset())
-    rig.until(State.READY)
-    rig.enable()
+    rig.recover()
 
 
 def enable_beyond(rig: LoopRig, beyond: float = 0.018) -> LoopRig:
-    """Enable with the second joint so far beyond its range, up to the cycle in which all drives are enabled."""
+    """Enable with the second joint `beyond` rad outside its range, until all drives are enabled."""
     rig.models[1].mechanics.position = CONFIG.joints[1].position.max + beyond
     rig.start().do(Enable())
-    rig.wait(lambda: all(said.statusword & 0x6F == 0x27 for said in rig.log[-1].drives))
+    rig.wait(lambda: all(drive.statusword & 0x6F == 0x27 for drive in rig.log[-1].drives))
     return rig
 
 
-@pytest.mark.parametrize(("velocity", "told"), [(0.5, 0.05), (0.02, 0.02)])
+@pytest.mark.parametrize(("velocity", "speed"), [(0.5, 0.05), (0.02, 0.02)])
 def test_a_joint_that_is_brought_back_into_its_range_is_reported_with_how_far_and_how_fast(
-    rig: LoopRig, velocity: float, told: float
+    rig: LoopRig, velocity: float, speed: float
 ) -> None:
     limits = rig.arm.limits
     limits.velocity[1] = velocity
     rig.arm.output_limiter.take(limits)
-    enable_beyond(rig).until(State.HOLDING)
+    enable_beyond(rig).bring_to(State.HOLDING)
     assert rig.kinds[-2:] == [ReturningToRange, Enabled]
-    assert rig.events[-2].event == ReturningToRange(1, pytest.approx(0.018, abs=1e-4), told)
+    assert rig.events[-2].event == ReturningToRange(1, about(0.018, abs=1e-4), speed)
 
 
 def test_what_a_joint_at_the_edge_sags_is_made_good_without_a_word(rig: LoopRig) -> None:
-    enable_beyond(rig, 0.0005).until(State.HOLDING)
+    enable_beyond(rig, 0.0005).bring_to(State.HOLDING)
     assert ReturningToRange not in rig.kinds
     assert rig.log[-1].drives[1].target == 20000
 
@@ -172,12 +171,12 @@ def test_no_motion_begins_before_a_joint_beyond_its_range_is_back(rig: LoopRig) 
     began = len(rig.log)
     while rig.state is State.ENABLING:
         answer = rig.send(move_to(0.0, 1.0))
-    # The last was taken in the cycle that ended it.
+    # The last command came in the cycle that ended enabling.
     assert (len(rig.log) - began) * PERIOD_S == pytest.approx(0.018 / 0.05, abs=0.04)
     assert isinstance(answer.refusal, WrongState)
     assert rig.log[-1].drives[1].target == 20000
     rig.move(0.0, 1.0)
-    rig.until(State.HOLDING)
+    rig.bring_to(State.HOLDING)
     assert rig.log[-1].drives[1].target == 10000
 
 
@@ -187,13 +186,13 @@ def test_a_joint_that_is_brought_back_stands_when_it_is_disabled_and_begins_anew
     assert 20100 < rig.log[-1].drives[1].target < 20180
     before = len(rig.log)
     rig.do(Disable())
-    rig.until(State.READY)
+    rig.bring_to(State.READY)
     assert not [cycle for cycle in rig.log[before + 1 :] if cycle.drives[1].obeys_target]
     rig.run(0.1)
     before = len(rig.log)
     rig.enable()
-    said = [cycle.drives[1] for cycle in rig.log[before:] if cycle.drives[1].controlword == ENABLE_OPERATION]
-    assert abs(said[0].target - said[0].position) <= 1
+    frames = [cycle.drives[1] for cycle in rig.log[before:] if cycle.drives[1].controlword == ENABLE_OPERATION]
+    assert abs(frames[0].target - frames[0].position) <= 1
     assert rig.log[-1].drives[1].target == 20000
     assert rig.kinds.count(ReturningToRange) == 2
 
@@ -201,22 +200,22 @@ def test_a_joint_that_is_brought_back_stands_when_it_is_disabled_and_begins_anew
 def test_a_drive_that_leaves_while_its_joint_is_brought_back_is_a_fault(rig: LoopRig) -> None:
     enable_beyond(rig).run(0.1)
     assert rig.state is State.ENABLING
-    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: 0}
-    rig.until(State.FAULT, 5 * PERIOD_S)
-    assert (rig.kinds[-1], rig.last.axis) == (DriveLeftEnabled, 1)
+    rig.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: 0}
+    rig.bring_to(State.FAULT, 5 * PERIOD_S)
+    assert (rig.kinds[-1], rig.last_of(DriveLeftEnabled).axis) == (DriveLeftEnabled, 1)
 
 
 def test_a_false_position_is_judged_by_where_a_joint_beyond_its_range_is_and_not_by_the_edge(rig: LoopRig) -> None:
     rig.models[1].mechanics.position = 2.015
-    end = falsify(until_told_to_enable(rig, 1), axis=1, word=SWITCHED_ON, position=1.98)
+    end = falsify(until_enable_is_sent(rig, 1), axis=1, word=SWITCHED_ON, position=1.98)
     before = len(rig.log)
     rig.run(4 * PERIOD_S)
     end()
     assert {cycle.drives[1].target for cycle in rig.log[before:]} == {20150}
     falsify(rig, axis=1, word=SWITCHED_ON, position=1.98)
-    rig.until(State.FAULT, 2 * CONFIG.supervision.cycles * PERIOD_S)
+    rig.bring_to(State.FAULT, 2 * CONFIG.supervision.cycles * PERIOD_S)
     assert rig.kinds[-1] is PositionJumped
-    assert rig.last == PositionJumped(1, pytest.approx(1.98), pytest.approx(2.015))
+    assert rig.last == PositionJumped(1, about(1.98), about(2.015))
 
 
 def test_one_garbled_statusword_stops_a_holding_joint_with_its_torque(rig: LoopRig) -> None:
@@ -225,9 +224,7 @@ def test_one_garbled_statusword_stops_a_holding_joint_with_its_torque(rig: LoopR
     rig.cycle()
     end()
     assert rig.state is State.FAULT
-    assert [said.controlword for said in rig.log[-1].drives] == [QUICK_STOP, QUICK_STOP]
+    assert [drive.controlword for drive in rig.log[-1].drives] == [QUICK_STOP, QUICK_STOP]
     rig.run(0.1)
     assert [model.powered for model in rig.models] == [True, True]
-    rig.do(Reset())
-    rig.until(State.READY)
-    rig.enable()
+    rig.recover()

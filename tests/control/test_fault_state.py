@@ -1,4 +1,4 @@
-"""A fault that lasts: whose torque goes although the fault's reaction would hold, and when."""
+"""A lasting fault: when the torque is removed although the fault's reaction holds the arm."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ UNOBSERVABLE_S = 2.0
 
 def lose_box(rig: LoopRig, state: int) -> None:
     """The IO box leaves OP, and no frame has its inputs any more."""
-    rig.data.away.add(0)
+    rig.away.add(0)
     rig.board.slave(BOX, state, 0)
     rig.service.lost_slave = BOX
 
@@ -38,8 +38,8 @@ def test_a_fault_while_disabling_ramps_down_and_then_takes_the_torque(rig: LoopR
     elif kind == "slave":
         rig.service.lost_slave = 3
     else:
-        rig.data.away.add(2)
-    rig.until(State.FAULT)
+        rig.away.add(2)
+    rig.bring_to(State.FAULT)
     begun = len(rig.log)
     assert abs(rig.models[0].mechanics.velocity) > 0.05
     rig.wait(lambda: not rig.powered[0])
@@ -55,7 +55,7 @@ def test_a_fault_while_disabling_ramps_down_and_then_takes_the_torque(rig: LoopR
 def test_a_box_that_stays_away_takes_the_button_with_it_which_then_counts_as_pressed(rig: LoopRig, state: int) -> None:
     rig.hold()
     lose_box(rig, state)
-    rig.until(State.FAULT)
+    rig.bring_to(State.FAULT)
     rig.run(UNOBSERVABLE_S - 0.05)
     assert rig.powered == [True, True]
     took_s = rig.wait(lambda: rig.powered == [False, False])
@@ -70,7 +70,7 @@ def test_a_box_that_comes_back_in_time_lets_the_arm_hold(rig: LoopRig) -> None:
     for _ in range(3):
         lose_box(rig, AlState.PREOP)
         rig.run(0.9 * UNOBSERVABLE_S)
-        rig.data.away.clear()
+        rig.away.clear()
         rig.board.slave(BOX, AlState.OP, 0)
         rig.run(0.05)
     assert rig.powered == [True, True]
@@ -91,12 +91,12 @@ def test_a_box_in_safe_op_that_answers_every_frame_is_heard(rig: LoopRig) -> Non
 
 
 def fail_to_reset(rig: LoopRig) -> list[int]:
-    """Reset although slaves do not come back; return the controlwords that the first drive was sent meanwhile."""
+    """Reset although slaves do not come back; return the controlwords sent to the first drive meanwhile."""
     begun = len(rig.log)
     rig.slaves_come_back = False
     rig.service.all_op = False
     rig.do(Reset())
-    rig.until(State.FAULT)
+    rig.bring_to(State.FAULT)
     rig.run(0.05)
     return [cycle.drives[0].controlword for cycle in rig.log[begun:]]
 
@@ -104,7 +104,7 @@ def fail_to_reset(rig: LoopRig) -> list[int]:
 def test_a_reset_that_fails_gives_no_torque_back(rig: LoopRig) -> None:
     rig.hold()
     rig.service.lost_slave = 3
-    rig.until(State.FAULT)
+    rig.bring_to(State.FAULT)
     rig.do(Disable())
     rig.run(0.1)
     assert set(fail_to_reset(rig)) == {VOLTAGE_OFF}
@@ -123,15 +123,13 @@ def test_a_reset_that_fails_out_of_the_emergency_stop_leaves_no_torque(rig: Loop
 
 
 def test_a_reset_before_the_emergency_stop_has_ramped_down_does_not_drop_a_joint_that_turns(rig: LoopRig) -> None:
-    # A fault before it whose torque was to go: that is over with its reset.
+    # The removal of torque in an earlier fault ends with its reset.
     rig.set_in_motion().do(Disable())
     rig.service.lost_slave = 3
-    rig.until(State.FAULT)
+    rig.bring_to(State.FAULT)
     rig.run(1.0)
     rig.service.lost_slave = 0
-    rig.do(Reset())
-    rig.until(State.READY)
-    rig.enable().move(1.8, 1.8)
+    rig.recover().move(1.8, 1.8)
     rig.run(0.6)
     rig.machine.change(OverSpeed(0, 1.0, 0.5))
     rig.run(0.012)
@@ -153,8 +151,8 @@ def slow(config: ArmConfig) -> ArmConfig:
     slaves = []
     for slave in config.slaves:
         sdo = tuple(
-            replace(one, value=int(one.value) // SLOWER) if one.index == QUICK_STOP_RAMP else one
-            for one in slave.device.sdo
+            replace(entry, value=int(entry.value) // SLOWER) if entry.index == QUICK_STOP_RAMP else entry
+            for entry in slave.device.sdo
         )
         slaves.append(replace(slave, device=replace(slave.device, sdo=sdo)))
     return replace(config, slaves=tuple(slaves))
@@ -163,16 +161,13 @@ def slow(config: ArmConfig) -> ArmConfig:
 @pytest.mark.parametrize("stop", ["disable", "press"])
 @pytest.mark.parametrize("away", [False, True])
 def test_the_torque_waits_for_the_drives_own_ramp(new_rig: Callable[..., LoopRig], stop: str, away: bool) -> None:
-    rig = new_rig(slow(CONFIG))
-    for model in rig.models:
-        model.objects[QUICK_STOP_RAMP, 0].value //= SLOWER
-    rig.set_in_motion()
+    rig = new_rig(slow(CONFIG)).set_in_motion()
     if stop == "disable":
         rig.do(Disable())
         rig.service.lost_slave = 3
-        rig.until(State.FAULT)
+        rig.bring_to(State.FAULT)
     if away:
-        rig.data.away.add(2)
+        rig.away.add(2)
     if stop == "press":
         rig.press()
     rig.wait(lambda: not rig.powered[0])
@@ -184,7 +179,7 @@ def test_the_torque_waits_for_the_drives_own_ramp(new_rig: Callable[..., LoopRig
 
 def test_a_press_while_it_closes_without_a_slave_takes_the_others_torque(rig: LoopRig) -> None:
     rig.set_in_motion()
-    rig.data.away.add(2)
+    rig.away.add(2)
     rig.do(Shutdown())
     rig.press()
     rig.finish()

@@ -13,35 +13,8 @@ from typing import get_args, get_type_hints
 import pytest
 
 from rtcp.config.model import StopsConfig
+from rtcp.ipc import events
 from rtcp.ipc.commands import Disable, Enable, Halt, MoveJoints, Reset, SetDriveMode
-from rtcp.ipc.events import (
-    ClockLost,
-    ControllerFailed,
-    DisableTimeout,
-    DriveFault,
-    DriveLeftEnabled,
-    DriveModeTimeout,
-    DriverFailed,
-    EmergencyStopActivated,
-    EnableTimeout,
-    Event,
-    GeneratorFailed,
-    HomingStillMoving,
-    LeaseExpired,
-    LeftRange,
-    MovedSinceFault,
-    OverSpeed,
-    PermissionWithdrawn,
-    PositionJumped,
-    ProcessDataLost,
-    ProcessFailed,
-    ResetTimeout,
-    ResetWhileMoving,
-    ResetWithoutController,
-    ResetWithoutFrames,
-    ResetWithoutSlaves,
-    SlaveLost,
-)
 from rtcp.ipc.states import DriveMode, State
 from rtcp.motion.state import ArmState, Setpoint
 
@@ -80,7 +53,7 @@ class Case:
     """
 
     name: str
-    kind: type[Event]
+    kind: type[events.Event]
     place: int
     says: tuple[str, ...]
     cause: Step
@@ -90,19 +63,19 @@ class Case:
     after_s: float | None = None
     """Time from the cause to the event."""
     stops: dict[str, str] = field(default_factory=dict)
-    """Of the configuration, where it is no default."""
+    """Stop reactions that differ from the default."""
 
 
 def understand_all(rig: LoopRig) -> None:
-    rig.data.misunderstood.clear()
+    rig.misunderstood.clear()
 
 
 def drive_understands(index: int, understood: dict[int, int], begin: Step, command: object = None) -> Step:
-    """The second drive takes one value for another from before the command on."""
+    """The second drive receives other values than it is sent, from before the command on."""
 
     def cause(rig: LoopRig) -> None:
         begin(rig)
-        rig.data.misunderstood[1, index] = understood
+        rig.misunderstood[1, index] = understood
         if command is not None:
             rig.do(command)  # type: ignore[arg-type]
 
@@ -111,7 +84,7 @@ def drive_understands(index: int, understood: dict[int, int], begin: Step, comma
 
 def drive_fault_lasts(rig: LoopRig) -> None:
     rig.start().models[1].condition.bus_voltage = 10.0
-    rig.until(State.FAULT)
+    rig.bring_to(State.FAULT)
     rig.do(Reset())
 
 
@@ -120,13 +93,13 @@ def voltage_returns(rig: LoopRig) -> None:
 
 
 def joint_turns_during_reset(rig: LoopRig) -> None:
-    rig.bring_to(State.FAULT)
+    rig.lead_to(State.FAULT)
     turn(rig, 1, 2000.0, 0.05, 117.0)
     rig.do(Reset())
 
 
 def joint_turns_after_homing(rig: LoopRig) -> None:
-    rig.bring_to(State.HOMING).run(0.1)
+    rig.lead_to(State.HOMING).run(0.1)
     turn(rig, 0, 1e5, 0.015, 117.0)
     rig.do(Halt())
 
@@ -148,7 +121,7 @@ def position_jumps(rig: LoopRig) -> None:
         values = _WIRE.unpack(sound(slot))
         return _WIRE.pack(values[0], 1000, *values[2:])
 
-    rig.data.input = lambda slot: false(slot) if slot == 2 else sound(slot)  # type: ignore[method-assign]
+    rig.data.input = lambda index: false(index) if index == 2 else sound(index)  # type: ignore[method-assign]
 
 
 def inputs_are_true(rig: LoopRig) -> None:
@@ -157,14 +130,14 @@ def inputs_are_true(rig: LoopRig) -> None:
 
 def box_cannot_be_read(rig: LoopRig) -> None:
     sound = rig.set_in_motion().data.input
-    rig.data.input = lambda slot: sound(slot) if slot else b""  # type: ignore[method-assign]
+    rig.data.input = lambda index: sound(index) if index else b""  # type: ignore[method-assign]
 
 
 def generator_fails(rig: LoopRig) -> None:
     generator = rig.set_in_motion().arm.controllers[MoveJoints]
 
     def fail(state: ArmState) -> Setpoint:
-        generator.ended = ControllerFailed()
+        generator.ended = events.ControllerFailed()
         target = Setpoint(2)
         target.position = list(state.commanded)
         return target
@@ -177,53 +150,58 @@ def generator_works(rig: LoopRig) -> None:
 
 
 FAULTS = (
-    Case("drive fault while ready", DriveFault, 1, ("joint2", "in fault", "statusword {word}", "`rtcp reset`"),
+    Case("drive fault while ready", events.DriveFault, 1, ("joint2", "in fault", "statusword {word}", "`rtcp reset`"),
          lambda rig: CAUSES["drive_fault"][0](rig.start())),
-    Case("drive leaves Operation Enabled", DriveLeftEnabled, 1,
+    Case("drive leaves Operation Enabled", events.DriveLeftEnabled, 1,
          ("joint2", "left Operation Enabled", "statusword {word}", "`rtcp reset`"),
          drive_understands(CONTROLWORD, {ENABLE_OPERATION: 0}, LoopRig.set_in_motion), understand_all),
-    Case("drive does not enable", EnableTimeout, 1,
+    Case("drive does not enable", events.EnableTimeout, 1,
          ("joint2", "did not reach Operation Enabled", "0.2 s", "{word}", "enable_timeout_s in assistive_arm.yaml"),
          drive_understands(CONTROLWORD, {ENABLE_OPERATION: SWITCH_ON}, LoopRig.start, Enable()), understand_all,
          after_s=ENABLE_TIMEOUT_S),
-    Case("drive does not disable", DisableTimeout, 1,
+    Case("drive does not disable", events.DisableTimeout, 1,
          ("joint2", "kept its torque", "statusword {word}", "enable_timeout_s"),
          drive_understands(CONTROLWORD, {SWITCH_ON: ENABLE_OPERATION}, LoopRig.set_in_motion, Disable()),
          understand_all),
-    Case("drive keeps its mode", DriveModeTimeout, 1, ("joint2", "mode 8", "instead of csv"),
+    Case("drive keeps its mode", events.DriveModeTimeout, 1, ("joint2", "mode 8", "instead of csv"),
          drive_understands(MODES_OF_OPERATION, {CSV: CSP}, LoopRig.hold, SetDriveMode(DriveMode.CSV)),
          understand_all, after_s=1.0),
-    Case("drive keeps another mode while enabling", DriveModeTimeout, 1, ("joint2", "mode 3", "instead of csp"),
+    Case("drive keeps another mode while enabling", events.DriveModeTimeout, 1, ("joint2", "mode 3", "instead of csp"),
          drive_understands(MODES_OF_OPERATION, {CSP: 3}, LoopRig.start, Enable()), understand_all),
-    Case("drive fault lasts through the reset", ResetTimeout, 1,
+    Case("drive fault lasts through the reset", events.ResetTimeout, 1,
          ("joint2", "in fault after the reset", "statusword {word}"), drive_fault_lasts, voltage_returns),
-    Case("joint turns during the reset", ResetWhileMoving, 1,
+    Case("joint turns during the reset", events.ResetWhileMoving, 1,
          ("joint2", "still turns", "rad/s", "3 s", "`rtcp disable`"), joint_turns_during_reset, let_go),
-    Case("joint turns after its homing", HomingStillMoving, 0,
+    Case("joint turns after its homing", events.HomingStillMoving, 0,
          ("joint1", "still turns", "rad/s", "3 s", "homing", "`rtcp reset`"), joint_turns_after_homing, let_go),
-    Case("slave does not come back", ResetWithoutSlaves, -1, ("reset", "3 s", "not all slaves are back in OP"),
-         lambda rig: rig.bring_to(State.RESETTING), lambda rig: setattr(rig, "slaves_come_back", True),
+    Case("slave does not come back", events.ResetWithoutSlaves, -1, ("reset", "3 s", "not all slaves are back in OP"),
+         lambda rig: rig.lead_to(State.RESETTING), lambda rig: setattr(rig, "slaves_come_back", True),
          after_s=3.0 + DEBOUNCE_S),
-    Case("joint outside its range while enabling", LeftRange, 1,
+    Case("joint outside its range while enabling", events.LeftRange, 1,
          ("joint2", "left its range", "2.1 rad", "joints[1].position in assistive_arm.yaml"),
          joint_out_of_range, joint_turned_by_hand(1.9)),
-    Case("position jumps while enabling", PositionJumped, 1,
+    Case("position jumps while enabling", events.PositionJumped, 1,
          ("joint2", "jumped from 0 to 0.1 rad", "5 cycles (supervision in assistive_arm.yaml)", "`rtcp reset`"),
          position_jumps, inputs_are_true),
-    Case("driver raises", DriverFailed, 1, ("slave 1 (io)", "raised an error", "outputs are safe", "`rtcp reset`"),
+    Case("driver raises", events.DriverFailed, 1,
+    ("slave 1 (io)", "raised an error", "outputs are safe", "`rtcp reset`"),
          box_cannot_be_read, inputs_are_true),
-    Case("trajectory generator fails", GeneratorFailed, -1, ("trajectory generator", "`rtcp reset`"),
+    Case("trajectory generator fails", events.GeneratorFailed, -1, ("trajectory generator", "`rtcp reset`"),
          generator_fails, generator_works),
 )  # fmt: skip
-STOPS: dict[str, tuple[type[Event], int, tuple[str, ...]]] = {
-    "lost_frames": (ProcessDataLost, -1, ("process data lost", "40 cycles", "bus.lost_cycles in assistive_arm.yaml")),
-    "slave_lost": (SlaveLost, 3, ("slave 3 (drive2)", "left OP")),
-    "drive_fault": (DriveFault, 1, ("joint2", "in fault", "statusword {word}")),
-    "clock_lost": (ClockLost, -1, ("reference clock", "1 s")),
-    "emergency_stop": (EmergencyStopActivated, -1, ("emergency stop",)),
-    "supervision": (OverSpeed, 1, ("joint2", "rad/s")),
-    "lease_ended": (LeaseExpired, -1, ()),
-    "enabling_switch": (PermissionWithdrawn, -1, ("enabling switch",)),
+STOPS: dict[str, tuple[type[events.Event], int, tuple[str, ...]]] = {
+    "lost_frames": (
+        events.ProcessDataLost,
+        -1,
+        ("process data lost", "40 cycles", "bus.lost_cycles in assistive_arm.yaml"),
+    ),
+    "slave_lost": (events.SlaveLost, 3, ("slave 3 (drive2)", "left OP")),
+    "drive_fault": (events.DriveFault, 1, ("joint2", "in fault", "statusword {word}")),
+    "clock_lost": (events.ClockLost, -1, ("reference clock", "1 s")),
+    "emergency_stop": (events.EmergencyStopActivated, -1, ("emergency stop",)),
+    "supervision": (events.OverSpeed, 1, ("joint2", "rad/s")),
+    "lease_ended": (events.LeaseExpired, -1, ()),
+    "enabling_switch": (events.PermissionWithdrawn, -1, ("enabling switch",)),
 }
 """For each key of `stops` one of its events, in motion at full speed."""
 ENDS = ("lease_ended", "enabling_switch")
@@ -248,18 +226,22 @@ CASES = (*FAULTS, *(stop_case(key, reaction) for key, reactions in REACTIONS.ite
 
 
 def test_every_fault_and_every_key_has_a_case() -> None:
-    own = {kind for kind in Event.kinds if kind.__module__ == "rtcp.ipc.events"}
+    own = {kind for kind in events.Event.kinds if kind.__module__ == "rtcp.ipc.events"}
     faults = {kind for kind in own if kind.is_fault and not kind.is_emergency}
     # A reset without frames: test_clock_lost.py; without a robot controller: tests/faults/egm.py; a process:
     # test_processes.py.
-    assert faults <= {case.kind for case in CASES} | {ResetWithoutFrames, ResetWithoutController, ProcessFailed}
+    assert faults <= {case.kind for case in CASES} | {
+        events.ResetWithoutFrames,
+        events.ResetWithoutController,
+        events.ProcessFailed,
+    }
     assert {entry.name for entry in fields(StopsConfig)} == {kind.stop_key for kind in own} - {""} == set(STOPS)
 
 
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(case, id=case.name, marks=[pytest.mark.interpreted] if case.kind is GeneratorFailed else [])
+        pytest.param(case, id=case.name, marks=[pytest.mark.interpreted] if case.kind is events.GeneratorFailed else [])
         for case in CASES
     ],
 )
@@ -277,13 +259,13 @@ def test_an_event_is_reported_takes_its_reaction_and_stays_until_reset_and_enabl
     event, message = rig.events[number].event, rig.messages[number]
     assert getattr(event, "axis", getattr(event, "slave", -1)) == case.place
     assert rig.machine.fault == (0 if case.ends_in is State.HOLDING else case.kind.number)
-    words = [f"0x{said.statusword:04X}" for said in rig.log[at].drives]
+    words = [f"0x{drive.statusword:04X}" for drive in rig.log[at].drives]
     parts = [part.format(word=words[case.place]) if "{" in part else part for part in case.says]
     assert [part for part in parts if part not in message] == []
     assert "\n" not in message
 
     # What the drives are commanded in the cycle of the event.
-    commanded = {said.controlword for said in rig.log[at].drives if said.has_torque}
+    commanded = {drive.controlword for drive in rig.log[at].drives if drive.has_torque}
     assert commanded <= {CONTROLWORDS[case.reaction]}
     assert commanded or not case.stops
 
@@ -299,17 +281,17 @@ def test_an_event_is_reported_takes_its_reaction_and_stays_until_reset_and_enabl
     ramp = 350 if case.reaction == "controlled_stop" else 0
     assert {cycle.state for cycle in rig.log[at + ramp :]} == {case.ends_in}
 
-    # The way back: nothing moves or is enabled before the next command.
+    # Recovery: nothing moves or is enabled before the next command.
     if case.ends_in is not State.HOLDING:
         rig.do(Reset())
-        rig.until(State.READY)
+        rig.bring_to(State.READY)
         rig.run(0.1)
-    sent = [said for cycle in rig.log[at + ramp :] for said in cycle.drives]
-    assert (ENABLE_OPERATION in {said.controlword for said in sent}) is (case.ends_in is State.HOLDING)
+    sent = [drive for cycle in rig.log[at + ramp :] for drive in cycle.drives]
+    assert (ENABLE_OPERATION in {drive.controlword for drive in sent}) is (case.ends_in is State.HOLDING)
     if case.ends_in is State.HOLDING:
         assert len({cycle.drives[0].target for cycle in rig.log[at + ramp :]}) == 1
     else:
-        assert {(said.speed, said.effort) for said in sent} == {(0, 0)}
+        assert {(drive.speed, drive.effort) for drive in sent} == {(0, 0)}
         rig.enable()
         rig.wait(lambda: not rig.machine.changing_mode)
     target = [drive.position - 0.1 for drive in rig.arm.drives]
@@ -317,5 +299,5 @@ def test_an_event_is_reported_takes_its_reaction_and_stays_until_reset_and_enabl
     rig.run(0.1)
     assert rig.state is State.MOVING
     assert [rig.longest_step(axis) <= LONGEST_STEP for axis in range(2)] == [True, True]
-    # Who came to rest by the reaction does not stand elsewhere.
-    assert MovedSinceFault not in rig.kinds or not case.stops
+    # An arm that its reaction stopped has not moved since the fault.
+    assert events.MovedSinceFault not in rig.kinds or not case.stops

@@ -1,4 +1,4 @@
-"""Jogs of the shipped arm on the in-process bus: the first one moves, and what slows one is said."""
+"""Jogs of the shipped arm on the in-process bus: the first one moves, and what slows one is reported."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from kinematics.forward import forward
 from kinematics.jacobian import singularity_distances
 from rtcp.config import default_config, load
 from rtcp.gateway.status_snapshot import StatusSnapshot
-from rtcp.ipc.commands import Enable, Jog
+from rtcp.ipc.commands import Jog
 from rtcp.ipc.session import Processes, Session
 from rtcp.ipc.states import JogFrame, State
-from rtcp.launch.simulation import Simulation
+from rtcp.testing.simulation import Simulation
 
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=2000.0))
@@ -24,21 +24,18 @@ ARM = CONFIG.arm
 
 
 class Jogged(Simulation):
-    """The arm, holding; `jog` moves it as a person does who holds a pad."""
+    """The arm, holding; `jog` sends jogs as a held stick does."""
 
     def __init__(self, positions: Sequence[float] | None = None) -> None:
         super().__init__(CONFIG, seed=3, positions=positions, follow_clock=False)
-        assert self.until(lambda: self.state is State.READY, 10.0)
-        self.acquire()
-        self.send(Enable())
-        assert self.until(lambda: self.state is State.HOLDING, 5.0)
+        self.hold()
 
     @property
     def q(self) -> list[float]:
         return list(self.loop.arm.state.commanded)
 
     def jog(self, seconds: float, at: int, speed: float, frame: JogFrame = JogFrame.BASE) -> None:
-        velocity = tuple(speed if one == at else 0.0 for one in range(6))
+        velocity = tuple(speed if axis == at else 0.0 for axis in range(6))
         for _ in range(round(seconds / 0.1)):
             answer = self.send(Jog(velocity, frame, 0.2))
             assert answer.refusal is None, answer
@@ -46,10 +43,9 @@ class Jogged(Simulation):
 
     @property
     def limits(self) -> dict[str, str]:
-        """What the status says limits the motion."""
+        """The status's `limited_by`."""
         snapshot = StatusSnapshot(self.observer, Session(CONFIG, "virtual", "ecat0", 0, 0), {})
-        found: dict[str, str] = snapshot.status(Processes(), None)["limited_by"]
-        return found
+        return snapshot.status(Processes(), None)["limited_by"]
 
 
 @pytest.fixture
@@ -76,7 +72,7 @@ def test_the_first_jog_of_the_shipped_arm_moves_the_tool_as_far_as_it_was_asked_
         arm.jog(1.5, at, 0.1 * sign)
         moved = [after - then for after, then in zip(forward(ARM, arm.q).position, before, strict=True)]
         assert moved[at] * sign > 0.13
-        assert sum(abs(one) for other, one in enumerate(moved) if other != at) < 1e-4
+        assert sum(abs(distance) for axis, distance in enumerate(moved) if axis != at) < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -118,7 +114,7 @@ def test_a_jog_that_reaches_its_speed_and_one_that_ends_say_nothing(shipped: Jog
         for frame in JogFrame:
             shipped.jog(0.8, at, 0.1, frame)
             assert shipped.limits == {}
-            assert shipped.until(lambda: shipped.state is State.HOLDING, 5.0)
+            shipped.bring_to(State.HOLDING)
             assert shipped.limits == {}
             shipped.jog(0.8, at, -0.1, frame)
-            assert shipped.until(lambda: shipped.state is State.HOLDING, 5.0)
+            shipped.bring_to(State.HOLDING)

@@ -1,4 +1,4 @@
-"""The IO box leaves OP: its outputs fall, and what comes back with it is not what was switched on before."""
+"""The IO box leaves OP: its outputs switch off, and stay off when it comes back."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config.model import GripperConfig
-from rtcp.fieldbus.al_state import ERROR_BIT, AlState
+from rtcp.fieldbus.al_state import AlState
+from rtcp.ipc.codes import ERROR_BIT
 from rtcp.ipc.commands import MoveGripper, Reset, SetOutput
 from rtcp.ipc.states import State
 
@@ -37,12 +38,12 @@ def switch_on(rig: LoopRig) -> None:
 
 
 def on(rig: LoopRig) -> int:
-    """Which of the two outputs the box is sent as on."""
-    return int.from_bytes(rig.data.output(0), "little") & BOTH
+    """Those of the two outputs that are sent as on."""
+    return int.from_bytes(rig.data.outputs[0], "little") & BOTH
 
 
 def shows(rig: LoopRig, position: int, state: int) -> None:
-    """Do what the service does when it has looked at a slave."""
+    """Do what the service does after it has read a slave's AL state."""
     rig.board.slave(position, state, 0)
     if state != AlState.OP:
         rig.service.lost_slave = rig.service.lost_slave or position
@@ -58,7 +59,7 @@ def test_a_box_that_comes_back_by_itself_is_sent_nothing_that_was_on_before(rig:
     rig.run(0.05)
     assert on(rig) == 0
     rig.do(Reset())
-    rig.until(State.READY)
+    rig.bring_to(State.READY)
     assert on(rig) == 0
     switch_on(rig)
 
@@ -101,7 +102,7 @@ def test_the_outputs_of_a_box_that_stays_in_op_outlast_the_fault_of_another_slav
     shows(rig, DRIVE, AlState.SAFEOP)
     rig.run(0.1)
     rig.do(Reset())
-    rig.until(State.READY)
+    rig.bring_to(State.READY)
     assert on(rig) == BOTH
 
 
@@ -113,7 +114,7 @@ def test_the_lamps_of_a_box_that_is_away_go_on_saying_what_is_so(rig: LoopRig) -
     beats = []
     for _ in range(4):
         rig.cycle()
-        beats.append(int.from_bytes(rig.data.output(0), "little") >> heartbeat - 1 & 1)
+        beats.append(int.from_bytes(rig.data.outputs[0], "little") >> heartbeat - 1 & 1)
     assert sorted(beats) == [0, 0, 1, 1]
 
 
@@ -121,7 +122,7 @@ def test_what_is_commanded_after_the_reset_counts_though_the_box_was_looked_at_b
     shows(rig, BOX, AlState.SAFEOP)
     rig.run(0.05)
     rig.do(Reset())
-    rig.until(State.READY)
+    rig.bring_to(State.READY)
     switch_on(rig)
     rig.run(0.05)
     assert on(rig) == BOTH

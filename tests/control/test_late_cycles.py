@@ -1,4 +1,4 @@
-"""When the next cycle begins after one that began, sent or ended late, and how many ticks are skipped. In periods."""
+"""Instant of the next cycle after a late one, and number of skipped ticks; times in periods."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ PERIOD_NS = round(PERIOD_S * 1e9)
 
 
 class Late:
-    """A rig whose cycles take the time that the test says.
+    """A rig with delays in its cycles.
 
     Args:
         phase: instant of the frame between two SYNC0.
     """
 
     def __init__(self, new_rig: NewRig, phase: float = 0.5) -> None:
-        config = replace(CONFIG, bus=replace(CONFIG.bus, send_phase=phase))
+        config = replace(CONFIG, bus=replace(CONFIG.ethercat, send_phase=phase))
         self.rig = rig = new_rig(config)
         self.sent: list[int] = []
         self.planned = rig.now_ns
@@ -54,7 +54,7 @@ class Late:
     [
         (0.0, 0.0, 0.5, 1, 0),
         (0.4, 0.0, 0.2, 1, 0),
-        # This frame comes after SYNC0, and the next tick's would come before the same one as it.
+        # This frame comes after SYNC0, and that of the next tick would come before the same SYNC0.
         (0.6, 0.0, 0.1, 2, 1),
         (0.0, 0.6, 0.1, 2, 1),
         # The frame of the next tick still comes to the drives before their SYNC0, half a period after the tick.
@@ -81,8 +81,8 @@ def test_no_drive_gets_two_frames_before_one_sync0_whatever_is_late(new_rig: New
     first = late.planned
     random = Random(1)
     for _ in range(3000):
-        one = [random.choice((0.0, 0.0, 0.0, random.random(), 3 * random.random())) for _ in range(3)]
-        late.cycle(*one)
+        delays = [random.choice((0.0, 0.0, 0.0, random.random(), 3 * random.random())) for _ in range(3)]
+        late.cycle(*delays)
     windows = [(sent - first - round((1 - phase) * PERIOD_NS)) // PERIOD_NS for sent in late.sent]
     assert all(after > before for before, after in pairwise(windows))
     assert min(b - a for a, b in pairwise(late.sent)) >= PERIOD_NS // 2
@@ -101,7 +101,7 @@ def test_of_several_sync0_the_first_after_the_frame_counts() -> None:
     assert sum(1 for slave in slaves if slave.device.assign_activate) >= 2
     last = slaves[-1]
     slaves[-1] = replace(last, device=replace(last.device, sync0_shift_us=-0.3 * PERIOD_NS / 1e3))
-    shifted = replace(CONFIG, slaves=tuple(slaves), bus=replace(CONFIG.bus, send_phase=0.5))
+    shifted = replace(CONFIG, slaves=tuple(slaves), bus=replace(CONFIG.ethercat, send_phase=0.5))
     assert ahead_of_sync0(shifted) == pytest.approx(0.2 * PERIOD_NS, abs=1)
     none = tuple(replace(slave, device=replace(slave.device, assign_activate=0)) for slave in slaves)
     assert ahead_of_sync0(replace(shifted, slaves=none)) == PERIOD_NS // 2

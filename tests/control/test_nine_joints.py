@@ -17,15 +17,15 @@ from ruamel.yaml import YAML
 
 from rtcp.config import default_config, load
 from rtcp.config.model import Point
-from rtcp.ipc.commands import Command, Enable, Jog, MoveJoints, RunTrajectory, SetLimits, StreamPosition
+from rtcp.ipc.commands import Jog, MoveJoints, RunTrajectory, SetLimits, StreamPosition
 from rtcp.ipc.refusals import PositionOutOfRange
 from rtcp.ipc.states import JogFrame, State
-from rtcp.launch.simulation import Simulation
 from rtcp.motion.limits import Values, rows
 from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.telemetry.channels import Channels
 from rtcp.telemetry.reading import read
 from rtcp.telemetry.recorder import McapWriter
+from rtcp.testing.simulation import Simulation
 
 JOINTS = 9
 TARGET = tuple(0.02 * (axis + 1) for axis in range(JOINTS))
@@ -35,15 +35,12 @@ TARGET = tuple(0.02 * (axis + 1) for axis in range(JOINTS))
 def arm(tmp_path: Path) -> Iterator[Simulation]:
     """Enabled at 0."""
     with Simulation(load(nine_joints(tmp_path)), follow_clock=False, positions=[0.0] * JOINTS) as made:
-        assert made.until(lambda: made.state is State.READY, 5.0)
-        made.acquire()
-        accept(made, Enable())
-        assert made.until(lambda: made.state is State.HOLDING, 5.0)
+        made.hold()
         yield made
 
 
 def nine_joints(directory: Path) -> Path:
-    """Write the configuration: three drives more, and no geometry; return the arm's file."""
+    """Write a configuration with three more drives and without geometry; return the arm's file."""
     shutil.copytree(default_config().parent, directory, dirs_exist_ok=True)
     yaml, file, segment_file = YAML(typ="safe"), directory / "assistive_arm.yaml", directory / "segment.yaml"
     arm, segment = yaml.load(file.read_text()), yaml.load(segment_file.read_text())
@@ -59,22 +56,18 @@ def nine_joints(directory: Path) -> Path:
     return file
 
 
-def accept(arm: Simulation, command: Command) -> None:
-    assert arm.send(command).refusal is None
-
-
 def arrive(arm: Simulation, target: tuple[float, ...]) -> None:
     """Let the motion end; assert that every drive stands at the target."""
-    assert arm.until(lambda: arm.state is State.HOLDING, 10.0)
+    arm.bring_to(State.HOLDING, 10.0)
     arm.run(0.2)
     assert arm.loop.arm.state.actual == pytest.approx(target, abs=2e-3)
 
 
 def test_all_nine_move_to_positions_and_a_jog_moves_the_ninth(arm: Simulation) -> None:
-    accept(arm, MoveJoints(TARGET, speed=0.3, synchronized=True))
+    arm.do(MoveJoints(TARGET, speed=0.3, synchronized=True))
     arrive(arm, TARGET)
-    accept(arm, Jog((0.0,) * 8 + (0.2,), JogFrame.JOINTS, 0.3))
-    assert arm.until(lambda: arm.state is State.HOLDING, 2.0)
+    arm.do(Jog((0.0,) * 8 + (0.2,), JogFrame.JOINTS, 0.3))
+    arm.bring_to(State.HOLDING, 2.0)
     *others, ninth = arm.loop.arm.state.commanded
     assert others == pytest.approx(TARGET[:8])
     assert ninth > TARGET[8] + 0.03
@@ -83,14 +76,14 @@ def test_all_nine_move_to_positions_and_a_jog_moves_the_ninth(arm: Simulation) -
 def test_a_planned_trajectory_leads_all_nine(arm: Simulation) -> None:
     points = [Point(0.0, (0.0,) * JOINTS), Point(1.0, TARGET)]
     plan = plan_trajectory(points, arm.loop.arm.limits, arm.loop.arm.state.commanded)
-    accept(arm, RunTrajectory(arm.observer.write_plan(plan.rows), len(plan.rows)))
+    arm.do(RunTrajectory(arm.observer.write_plan(plan.rows), len(plan.rows)))
     arrive(arm, TARGET)
 
 
 def test_a_stream_leads_all_nine(arm: Simulation) -> None:
     for step in range(200):
-        way = 0.5 - 0.5 * cos(pi * min(1.0, step / 150))
-        accept(arm, StreamPosition(tuple(way * q for q in TARGET), arm.now_ns * 1e-9))
+        fraction = 0.5 - 0.5 * cos(pi * min(1.0, step / 150))
+        arm.do(StreamPosition(tuple(fraction * q for q in TARGET), arm.now_ns * 1e-9))
         arm.run(0.01)
     arrive(arm, TARGET)
 
@@ -98,20 +91,20 @@ def test_a_stream_leads_all_nine(arm: Simulation) -> None:
 def test_the_limits_of_the_ninth_are_narrowed(arm: Simulation) -> None:
     widest = Values.configured(arm.config)
     narrow = rows(replace(widest, high=(*widest.high[:8], 0.1)))
-    accept(arm, SetLimits(arm.observer.write_plan(narrow), len(narrow)))
+    arm.do(SetLimits(arm.observer.write_plan(narrow), len(narrow)))
     assert arm.send(MoveJoints(TARGET, 0.3, True)).refusal == PositionOutOfRange(8, TARGET[8], 0.1)
-    accept(arm, MoveJoints((*TARGET[:8], 0.09), 0.3, True))
+    arm.do(MoveJoints((*TARGET[:8], 0.09), 0.3, True))
 
 
 def test_its_cycles_are_recorded_and_read_back(arm: Simulation, tmp_path: Path) -> None:
-    accept(arm, MoveJoints(TARGET, speed=0.3, synchronized=True))
+    arm.do(MoveJoints(TARGET, speed=0.3, synchronized=True))
     arrive(arm, TARGET)
     records, _ = arm.observer.since(0)
     writer = McapWriter(Channels(arm.config, arm.observer.schema, 0), arm.config)
     writer.open(tmp_path / "a.mcap")
     writer.write(records, records)
     writer.close()
-    found = read(tmp_path / "a.mcap")
-    assert len(found.joints) == JOINTS
-    assert np.array_equal(found.records["actual_position"], records["actual_position"])
-    assert found.records["sent_position"][-1] == pytest.approx(TARGET, abs=1e-6)
+    recording = read(tmp_path / "a.mcap")
+    assert len(recording.joints) == JOINTS
+    assert np.array_equal(recording.records["actual_position"], records["actual_position"])
+    assert recording.records["sent_position"][-1] == pytest.approx(TARGET, abs=1e-6)

@@ -1,4 +1,4 @@
-"""What holds for every part of the cycle: the faults that it reports, outputs that stay safe, inputs nobody ignores."""
+"""Parts of the cycle: their faults, outputs that stay safe, inputs that are never ignored."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ HEATER = SlaveConfig(
 
 
 class Regulator(Driver):
-    """Switches its output on in every cycle, whatever was said."""
+    """Switches its output on in every cycle, also after `safe`."""
 
     def update(self, state: State, now_ns: int) -> Event | None:
         self.targets["power"] = 7.0
         return None
 
 
-def heard() -> Any:
-    """A context that keeps what is published; its class replaces a method, which only the interpreter allows."""
+def recording_context() -> Any:
+    """A context that records events; its class replaces methods, which only the interpreter allows."""
 
-    class Heard(PartContext):
+    class RecordingContext(PartContext):
         def __init__(self) -> None:
             super().__init__(0.001)
             self.published: list[Event] = []
@@ -50,13 +50,14 @@ def heard() -> Any:
         def explain(self, what: str, error: Exception) -> None:
             self.explained.append((what, str(error)))
 
-    return Heard()
+    return RecordingContext()
 
 
 class Raising(Driver):
-    """Raises in the method that is named last."""
+    """Raises in one method."""
 
     method = ""
+    """Name of the method that raises."""
 
     def raise_in(self, method: str) -> None:
         if method == self.method:
@@ -100,7 +101,7 @@ class Image:
 
 @pytest.mark.interpreted
 def test_outputs_stay_safe_until_the_machine_is_ready_again_whatever_the_driver_does() -> None:
-    device, context, image = Device(0, Regulator(HEATER, 0.001)), heard(), Image()
+    device, context, image = Device(0, Regulator(HEATER, 0.001)), recording_context(), Image()
 
     def cycle(state: State) -> int:
         context.state = state
@@ -118,7 +119,7 @@ def test_outputs_stay_safe_until_the_machine_is_ready_again_whatever_the_driver_
 @pytest.mark.interpreted
 @pytest.mark.parametrize("method", ["decode", "accept", "update", "safe", "encode", "publish"])
 def test_a_driver_that_raises_is_a_fault_with_outputs_of_zero_and_is_tried_again_after_the_reset(method: str) -> None:
-    driver, context, image = Raising(HEATER, 0.001), heard(), Image()
+    driver, context, image = Raising(HEATER, 0.001), recording_context(), Image()
     device = Device(0, driver)
 
     def cycle(state: State) -> int:
@@ -137,7 +138,7 @@ def test_a_driver_that_raises_is_a_fault_with_outputs_of_zero_and_is_tried_again
     assert [cycle(State.HOLDING) for _ in range(3)][1:] == [0, 0]
     assert context.explained == [("driver of slave heater", method)]
     assert device.accept(Reset(), 0) == DriverRaised(1)
-    # Called by the machine on a fault, which is then the one that counts.
+    # The machine calls `safe` on a fault, which is reported already.
     assert context.reported == (None if method == "safe" else DriverFailed(1))
     driver.method = ""
     device.safe()
@@ -158,7 +159,7 @@ def test_a_value_that_a_driver_adds_is_not_in_the_record_and_moves_nothing() -> 
 @pytest.mark.interpreted
 @pytest.mark.parametrize("first", [0, 1])
 def test_of_several_faults_in_a_cycle_the_hardest_is_taken_and_the_other_published(first: int) -> None:
-    context, faults = heard(), [LeftRange(0, 1.0), OverSpeed(0, 2.0, 1.0)]
+    context, faults = recording_context(), [LeftRange(0, 1.0), OverSpeed(0, 2.0, 1.0)]
     for fault in (faults[first], faults[1 - first]):
         context.report(fault)
     assert context.reported == faults[1]
@@ -166,7 +167,7 @@ def test_of_several_faults_in_a_cycle_the_hardest_is_taken_and_the_other_publish
 
 
 def test_a_fault_that_is_reported_on_the_way_out_of_one_keeps_the_machine_in_it(rig: LoopRig) -> None:
-    rig.bring_to(State.FAULT)
+    rig.lead_to(State.FAULT)
     rig.do(Reset())
     while rig.state is State.RESETTING:
         rig.context.report(SlaveLost(3))

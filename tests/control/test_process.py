@@ -1,17 +1,18 @@
-"""What the loop's process does for the drives after a defect in its cycle: on the device models, frame by frame."""
+"""The stop of all drives after a defect in the cycle: on the device models, frame by frame."""
 
 from __future__ import annotations
 
 import struct
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from rtcp.config.model import ArmConfig, SlaveConfig
 from rtcp.control.cycle import make_drives
 from rtcp.control.process import stop_blindly
-from rtcp.devices.cia402 import Cia402Drive
+from rtcp.devices.drive import Drive
+from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.pdo import layout
 
 from .rig import CONFIG, CSP, CST, CSV, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
@@ -19,13 +20,13 @@ from .rig import CONFIG, CSP, CST, CSV, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopR
 DISABLE_OPERATION_OPTION = 0x605C
 STILL_RAD_S = 0.01
 RAMP_S = CONFIG.joints[0].velocity / 10.0
-"""From full speed, at what 0x6085 is set to."""
+"""Time from full speed to rest at the deceleration of 0x6085."""
 
 
 class Defective:
     """A drive of which one step raises."""
 
-    def __init__(self, drive: Cia402Drive, step: str) -> None:
+    def __init__(self, drive: Drive, step: str) -> None:
         self._drive, self._step = drive, step
 
     def __getattr__(self, name: str) -> Any:
@@ -35,7 +36,7 @@ class Defective:
 
 
 class Watched:
-    """What each frame of a process image finds: of every drive its true speed, and whether it has torque."""
+    """Records for each frame the true speed of every drive, and whether it has torque."""
 
     def __init__(self, rig: LoopRig) -> None:
         self.seen: list[list[tuple[float, bool]]] = []
@@ -45,6 +46,7 @@ class Watched:
 
     def receive(self) -> int:
         wkc = self._receive()
+        self._rig.bus.advance_to(self._rig.bus.now_ns + self._rig.period_ns)
         self.seen.append([(abs(model.mechanics.velocity), model.powered) for model in self._rig.models])
         return wkc
 
@@ -59,7 +61,7 @@ def set_in_motion(rig: LoopRig, mode: int = CSP) -> Watched:
 
 
 def ramps_down_under_torque(watched: Watched) -> bool:
-    """Whether all joints come to rest by their drives' torque, which goes then."""
+    """Whether all joints come to rest under torque, and lose it then."""
     moving = [powered for cycle in watched.seen for speed, powered in cycle if speed > STILL_RAD_S]
     at_rest = all(speed < STILL_RAD_S and not powered for speed, powered in watched.seen[-1])
     return len(moving) > 10 and all(moving) and at_rest
@@ -99,7 +101,7 @@ def test_a_frame_that_cannot_be_sent_is_followed_by_others(rig: LoopRig) -> None
 
 
 class Sent:
-    """A process image that keeps what is sent."""
+    """A process image that records sent frames."""
 
     def __init__(self, config: ArmConfig) -> None:
         self.outputs = dict.fromkeys(range(len(config.slaves)), b"")
@@ -118,17 +120,17 @@ class Sent:
         return -1
 
 
-def turned_round(slave: SlaveConfig) -> SlaveConfig:
-    """The same drive with its outputs mapped the other way round: the controlword last."""
+def with_reversed_outputs(slave: SlaveConfig) -> SlaveConfig:
+    """The same drive with its outputs mapped in reverse order: the controlword last."""
     pdos = [replace(pdo, channels=tuple(reversed(pdo.channels))) for pdo in slave.device.rpdo]
     return replace(slave, device=replace(slave.device, rpdo=tuple(reversed(pdos))))
 
 
 def test_the_controlword_of_a_drive_whose_driver_raises_is_at_its_place_in_its_own_image() -> None:
-    slaves = (*CONFIG.slaves[:2], turned_round(CONFIG.slaves[2]))
+    slaves = (*CONFIG.slaves[:2], with_reversed_outputs(CONFIG.slaves[2]))
     config = replace(CONFIG, slaves=slaves)
     data = Sent(config)
-    stop_blindly(data, config, make_drives(config))
+    stop_blindly(cast(ProcessData, data), config, make_drives(config))
     rest = layout(slaves[1].device.rpdo).bytes - 2
     ramp = [frame for frame in data.frames if struct.unpack_from("<H", frame[1])[0] == QUICK_STOP]
     assert len(ramp) * PERIOD_S >= RAMP_S

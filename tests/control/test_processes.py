@@ -12,12 +12,12 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, InputsConfig, OutputsConfig
 from rtcp.control.part import PartContext
-from rtcp.ipc.commands import AT_REST, Command, Disable, Enable, MoveJoints, Reset
+from rtcp.ipc.commands import AT_REST, Command, Disable, MoveJoints, Reset
 from rtcp.ipc.refusals import Refusal
 from rtcp.ipc.schema import Field
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Simulation
 from rtcp.processes import InputChannel, OutputChannel, Process, ProcessConfig, ProcessSetup
+from rtcp.testing.simulation import Simulation
 from rtcp.virtual.models.diewu import RELEASED
 
 
@@ -34,7 +34,7 @@ class Dark(Refusal):
 
 @dataclass(frozen=True)
 class LampConfig(ProcessConfig):
-    """Copies its pattern to the outputs of a box, while nobody presses anything there."""
+    """Copies its pattern to the outputs of a box, while none of its inputs is pressed."""
 
     PROCESS = "tests.control.test_processes:Lamp"
     COMMANDS = (Blink,)
@@ -78,14 +78,14 @@ def config(tmp_path: Path) -> ArmConfig:
     (tmp_path / "segment.yaml").write_text("slaves: [{model: diewu-io}]\n")
     box = load(default_config())
     slave = replace(box.slaves[0], device=replace(box.slaves[0].device, kind="generic"))
-    found = replace(box, joints=(), slaves=(slave,), arm=None, source=tmp_path / "lamp.yaml", gripper=None)
-    return replace(found, inputs=InputsConfig(), outputs=OutputsConfig(), processes=(LampConfig("lamp", "lamp"),))
+    platform = replace(box, joints=(), slaves=(slave,), arm=None, source=tmp_path / "lamp.yaml", gripper=None)
+    return replace(platform, inputs=InputsConfig(), outputs=OutputsConfig(), processes=(LampConfig("lamp", "lamp"),))
 
 
 @pytest.fixture
 def running(config: ArmConfig) -> Iterator[Simulation]:
     with Simulation(config) as made:
-        assert made.until(lambda: made.state is State.READY, 5.0)
+        made.bring_to(State.READY)
         made.acquire()
         yield made
 
@@ -98,7 +98,7 @@ def lamp(running: Simulation) -> Lamp:
 
 
 def shown(running: Simulation) -> int:
-    """Return the levels at the box' outputs two cycles later."""
+    """Return the levels at the box's outputs two cycles later."""
     for _ in range(2):
         running.cycle()
     assert running.box is not None
@@ -106,17 +106,16 @@ def shown(running: Simulation) -> int:
 
 
 def test_a_process_is_commanded_and_writes_its_channels_without_an_arm(running: Simulation) -> None:
-    assert running.send(Blink(5)).refusal is None
+    running.do(Blink(5))
     assert shown(running) == 5
     record = running.observer.latest()
     assert record is not None
     assert int(record["lamp_pattern"][0]) == 5
     assert running.send(Blink(0)).refusal == Dark()
-    assert running.send(Enable()).refusal is None
-    assert running.until(lambda: running.state is State.HOLDING, 1.0)
+    running.hold()
     assert shown(running) == 5
-    assert running.send(Disable()).refusal is None
-    assert running.until(lambda: running.state is State.READY, 1.0)
+    running.do(Disable())
+    running.bring_to(State.READY, 1.0)
 
 
 def test_what_it_reads_acts_within_two_cycles(running: Simulation) -> None:
@@ -128,8 +127,7 @@ def test_what_it_reads_acts_within_two_cycles(running: Simulation) -> None:
 
 
 def test_a_motion_command_of_a_platform_without_an_arm_is_refused(running: Simulation) -> None:
-    running.send(Enable())
-    assert running.until(lambda: running.state is State.HOLDING, 1.0)
+    running.hold()
     assert running.send(MoveJoints((), 0.5, True)).refusal is not None
     assert running.send(MoveJoints((0.1,), 0.5, True)).refusal is not None
 
@@ -137,10 +135,10 @@ def test_a_motion_command_of_a_platform_without_an_arm_is_refused(running: Simul
 def test_a_fault_makes_it_safe_until_it_is_commanded_again(running: Simulation) -> None:
     running.send(Blink(5))
     running.data.lose(running.config.bus.lost_cycles + 5)
-    assert running.until(lambda: running.state is State.FAULT, 1.0)
+    running.bring_to(State.FAULT, 1.0)
     assert shown(running) == 0
     running.send(Reset())
-    assert running.until(lambda: running.state is State.READY, 5.0)
+    running.bring_to(State.READY)
     assert shown(running) == 0
     running.send(Blink(6))
     assert shown(running) == 6
@@ -149,13 +147,13 @@ def test_a_fault_makes_it_safe_until_it_is_commanded_again(running: Simulation) 
 def test_one_that_raises_is_a_fault_with_outputs_of_zero(running: Simulation) -> None:
     running.send(Blink(5))
     lamp(running).raises = True
-    assert running.until(lambda: running.state is State.FAULT, 0.1)
+    running.bring_to(State.FAULT, 0.1)
     assert shown(running) == 0
     refusal = running.send(Blink(6)).refusal
     assert refusal is not None
     lamp(running).raises = False
     running.send(Reset())
-    assert running.until(lambda: running.state is State.READY, 5.0)
+    running.bring_to(State.READY)
     assert shown(running) == 0
     running.send(Blink(6))
     assert shown(running) == 6

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rtcp.ipc.commands import MoveJoints, SetZero
+from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.state import ArmState, Setpoint
 
 from .rig import COUNTS, CSP, CST, CSV, LoopRig
@@ -24,11 +25,11 @@ def test_a_record_says_what_left_on_the_wire(rig: LoopRig, mode: int) -> None:
         rig.cycle()
         frame = rig.log[-1].drives
         # The frame carries whole counts.
-        assert sent(rig, "sent_position") == pytest.approx([one.target for one in frame], abs=0.5)
+        assert sent(rig, "sent_position") == pytest.approx([drive.target for drive in frame], abs=0.5)
         if mode == CSV:
-            assert sent(rig, "sent_velocity") == pytest.approx([one.speed for one in frame], abs=0.5)
+            assert sent(rig, "sent_velocity") == pytest.approx([drive.speed for drive in frame], abs=0.5)
         if mode == CST:
-            assert sent(rig, "sent_torque") == pytest.approx([one.effort for one in frame], abs=0.5)
+            assert sent(rig, "sent_torque") == pytest.approx([drive.effort for drive in frame], abs=0.5)
 
 
 @pytest.mark.interpreted
@@ -40,7 +41,11 @@ def test_a_record_says_what_was_commanded_where_the_limiter_sends_less(rig: Loop
         setpoint.position = [0.002, 0.0]
         return setpoint
 
-    rig.arm.trajectory_guard.apply = lambda state, setpoint, tolerates: state.commanded.__setitem__(0, 0.1) or 0  # type: ignore[method-assign]
+    def command_far(state: ArmState, target: Setpoint, tolerates_saturation: bool) -> GuardResult:
+        state.commanded[0] = 0.1
+        return GuardResult.PASS
+
+    rig.arm.trajectory_guard.apply = command_far  # type: ignore[method-assign]
     rig.arm.controllers[MoveJoints].update = jump  # type: ignore[method-assign]
     rig.cycle()
     frame = rig.log[-1].drives[0]
@@ -49,10 +54,9 @@ def test_a_record_says_what_was_commanded_where_the_limiter_sends_less(rig: Loop
     assert frame.target <= rig.arm.limits.velocity[0] * rig.arm.period_s * COUNTS + 1
 
 
-@pytest.mark.parametrize("carries", [True, False])
-def test_a_record_of_the_cycle_in_which_a_zero_is_set_counts_all_positions_from_it(rig: LoopRig, carries: bool) -> None:
-    rig.start()
-    rig.data.carries = carries
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_record_of_the_cycle_in_which_a_zero_is_set_counts_all_positions_from_it(rig: LoopRig, lost: bool) -> None:
+    rig.start().lose_frames(lost)
     rig.do(SetZero(0, 0.3))
     assert sent(rig, "actual_position")[0] == pytest.approx(-0.3 * COUNTS, abs=1)
     assert sent(rig, "sent_position") == pytest.approx(sent(rig, "actual_position"), abs=0.5)

@@ -9,11 +9,11 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import Enable, Halt, MoveJoints, Reset
+from rtcp.ipc.commands import Halt, MoveJoints, Reset
 from rtcp.ipc.events import MovedSinceFault
 from rtcp.ipc.names import Names
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Frame, Simulation
+from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.protocol import AlState
 
 CONFIG = load(default_config())
@@ -23,11 +23,11 @@ SLAVE = 4
 """Position of the drive of joint 3, which is lost and comes back."""
 AXIS = 2
 TURNED_TO = 1.05
-"""Where it comes back from a loss of supply, rad."""
+"""Position of the joint after the loss of supply, rad."""
 EMERGENCY_STOP_INPUT = 9
 """Channel of the box, from 0."""
 OUTPUTS = struct.Struct("<Hiiib")
-"""Controlword, target position, target velocity, target torque, mode (the facts' table)."""
+"""Controlword, target position, target velocity, target torque, mode."""
 ENABLE_OPERATION, QUICK_STOP = 0x0F, 0x02
 ENABLED = (0x27, 0x6F)
 """Operation Enabled and its mask (CiA 402-2, object 0x6041)."""
@@ -36,11 +36,11 @@ FULL_SPEED = MoveJoints((1.0, -0.3, 1.2, 0.0, 0.9, 0.0), 0.5, True)
 
 
 class Seen:
-    """What went to one drive and what came from it, cycle by cycle."""
+    """Outputs and inputs of one drive, cycle by cycle."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.cycles: list[tuple[State, tuple[int, ...], int, int]] = []
-        """State of the machine, outputs, statusword and position that came."""
+        """State of the machine, outputs, received statusword and position."""
         self._simulation = simulation
         simulation.on_frame = self._see
 
@@ -53,18 +53,15 @@ class Seen:
 @pytest.fixture(params=["holding", "moving"])
 def arm(request: pytest.FixtureRequest) -> Iterator[Simulation]:
     with Simulation(CONFIG, seed=3, positions=BENT, follow_clock=False) as simulation:
-        simulation.acquire()
-        assert simulation.until(lambda: simulation.state is State.READY, 3.0)
-        assert simulation.send(Enable()).refusal is None
-        assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+        simulation.hold()
         if request.param == "moving":
-            assert simulation.send(FULL_SPEED).refusal is None
+            simulation.do(FULL_SPEED)
         simulation.run(0.5)
         yield simulation
 
 
 def bring_back(simulation: Simulation) -> None:
-    """What the watcher does: acknowledge, SAFE-OP, OP."""
+    """Do what the watcher does: acknowledge, SAFE-OP, OP."""
     bus, slave = simulation.bus, simulation.bus.slaves[SLAVE - 1]
     bus.acknowledge(SLAVE)
     for state in (AlState.SAFE_OP, AlState.OP):
@@ -76,19 +73,19 @@ def bring_back(simulation: Simulation) -> None:
 def out_of_op(simulation: Simulation) -> None:
     """It leaves OP on its watchdog, and is brought back."""
     simulation.bus.drop(SLAVE, AlState.SAFE_OP, SYNC_MANAGER_WATCHDOG)
-    assert simulation.until(lambda: simulation.state is State.FAULT, 1.0)
+    simulation.bring_to(State.FAULT, 1.0)
     simulation.run(0.3)
     bring_back(simulation)
 
 
 def without_supply(simulation: Simulation) -> None:
     """It loses its supply, is turned by hand, starts anew and is brought back."""
-    bus, slave = simulation.bus, simulation.bus.slaves[SLAVE - 1]
+    bus = simulation.bus
     bus.request_state(AlState.INIT, [SLAVE])
-    assert simulation.until(lambda: simulation.state is State.FAULT, 1.0)
+    simulation.bring_to(State.FAULT, 1.0)
     simulation.run(0.3)
     bus.restart(SLAVE)
-    slave.device.mechanics.position = TURNED_TO
+    simulation.models[AXIS].mechanics.position = TURNED_TO
     bus.set_up(SLAVE)
     bring_back(simulation)
 
@@ -97,15 +94,15 @@ def enabled_by_itself(simulation: Simulation) -> None:
     """It comes back in Operation Enabled, which a drive that follows the standard does not."""
     without_supply(simulation)
     simulation.run(0.4)
-    model = simulation.bus.slaves[SLAVE - 1].device
+    model = simulation.models[AXIS]
     model.objects[0x6060, 0].value = 8
     for word in (0x06, 0x07, 0x0F):
         model.objects[0x6040, 0].value = word
         model.step(0.001)
-    assert model.objects[0x6041, 0].value & ENABLED[1] == ENABLED[0]
+    assert int(model.objects[0x6041, 0].value) & ENABLED[1] == ENABLED[0]
 
 
-@pytest.mark.parametrize("comes_back", [out_of_op, without_supply, enabled_by_itself], ids=lambda way: way.__name__)
+@pytest.mark.parametrize("comes_back", [out_of_op, without_supply, enabled_by_itself], ids=lambda step: step.__name__)
 def test_a_drive_that_comes_back_is_sent_its_own_position_and_no_enable_until_reset_and_enable(
     arm: Simulation, comes_back: Callable[[Simulation], None]
 ) -> None:
@@ -116,9 +113,9 @@ def test_a_drive_that_comes_back_is_sent_its_own_position_and_no_enable_until_re
     words = {sent[0] for _, sent, _, _ in seen.cycles}
     assert ENABLE_OPERATION not in words
     assert {sent[2:4] for _, sent, _, _ in seen.cycles} == {(0, 0)}
-    # What a frame carries follows from the answer two before: it was decoded, and sent with the next.
-    told = zip(seen.cycles[2:], seen.cycles, strict=False)
-    assert all(abs(sent[1] - position) <= 20 for (_, sent, _, _), (_, _, _, position) in told)
+    # A target follows from the answer two frames before: it was decoded, and sent with the next.
+    pairs = zip(seen.cycles[2:], seen.cycles, strict=False)
+    assert all(abs(sent[1] - position) <= 20 for (_, sent, _, _), (_, _, _, position) in pairs)
     assert all(status & ENABLED[1] != ENABLED[0] for _, _, status, _ in seen.cycles[5:])
     stood = seen.cycles[-1][3]
     assert all(abs(position - stood) <= 20 for *_, position in seen.cycles[5:])
@@ -128,37 +125,36 @@ def test_after_reset_and_enable_it_is_enabled_where_it_stands(arm: Simulation) -
     without_supply(arm)
     arm.run(0.2)
     seen = Seen(arm)
-    assert arm.send(Reset()).refusal is None
-    assert arm.until(lambda: arm.state is State.READY, 4.0)
+    arm.do(Reset())
+    arm.bring_to(State.READY, 4.0)
     arm.run(0.1)
     assert ENABLE_OPERATION not in {sent[0] for _, sent, _, _ in seen.cycles}
-    assert arm.send(Enable()).refusal is None
-    assert arm.until(lambda: arm.state is State.HOLDING, 4.0)
+    arm.hold()
     arm.run(0.2)
-    told = {sent[1] for _, sent, _, _ in seen.cycles if sent[0] == ENABLE_OPERATION}
-    assert all(abs(target - 10500) <= 20 for target in told)
-    assert told
+    targets = {sent[1] for _, sent, _, _ in seen.cycles if sent[0] == ENABLE_OPERATION}
+    assert all(abs(target - 10500) <= 20 for target in targets)
+    assert targets
 
 
-# -- what is said of where it stands --------------------------------------------------------------------------------
+# -- reports of another position ------------------------------------------------------------------------------------
 
 
-def told(simulation: Simulation) -> list[str]:
+def moved(simulation: Simulation) -> list[str]:
     """The messages about joints that stand elsewhere than at the fault."""
     names = Names(CONFIG)
-    return [names.message(one.event) for one in simulation.events if isinstance(one.event, MovedSinceFault)]
+    return [names.message(record.event) for record in simulation.events if isinstance(record.event, MovedSinceFault)]
 
 
 def reset(simulation: Simulation) -> None:
-    assert simulation.send(Reset()).refusal is None
-    assert simulation.until(lambda: simulation.state is State.READY, 4.0)
+    simulation.do(Reset())
+    simulation.bring_to(State.READY, 4.0)
 
 
 def press(simulation: Simulation) -> None:
-    """The emergency stop, until the slaves are parked; and released."""
+    """Press the emergency stop until the slaves are parked, then release it."""
     assert simulation.box is not None
     simulation.box.set_input(EMERGENCY_STOP_INPUT, False)
-    assert simulation.until(lambda: simulation.state is State.EMERGENCY_STOP, 1.0)
+    simulation.bring_to(State.EMERGENCY_STOP, 1.0)
     simulation.run(1.0)
     simulation.box.set_input(EMERGENCY_STOP_INPUT, True)
 
@@ -170,30 +166,29 @@ def test_a_joint_that_comes_back_at_another_position_is_reported_with_both_when_
     without_supply(arm)
     arm.run(0.2)
     if pressed:
-        # What it stands at now is not where it stood at the fault.
+        # The position at the emergency stop is not that at the fault.
         press(arm)
-    assert not told(arm)
+    assert not moved(arm)
     reset(arm)
-    (said,) = told(arm)
-    assert said.startswith("joint3 stands at 1.05 rad, at the fault it stood at 1.2")
-    assert "its drive lost its zero; check that before `rtcp enable`" in said
-    # It is what was said last: `rtcp status` shows it.
+    (message,) = moved(arm)
+    assert message.startswith("joint3 stands at 1.05 rad, at the fault it stood at 1.2")
+    assert "its drive lost its zero; check that before `rtcp enable`" in message
+    # `rtcp status` shows the last event.
     assert type(arm.events[-1].event) is MovedSinceFault
-    # It is told once, and no refusal: it may have been turned by hand.
-    assert arm.send(Enable()).refusal is None
-    assert arm.until(lambda: arm.state is State.HOLDING, 4.0)
+    # It is reported once, and nothing is refused: the joint may have been turned by hand.
+    arm.hold()
     out_of_op(arm)
     reset(arm)
-    assert len(told(arm)) == 1
+    assert len(moved(arm)) == 1
 
 
-@pytest.mark.parametrize("comes_back", [out_of_op, press], ids=lambda way: way.__name__)
+@pytest.mark.parametrize("comes_back", [out_of_op, press], ids=lambda step: step.__name__)
 def test_a_joint_that_comes_back_where_it_stood_is_not_reported(
     arm: Simulation, comes_back: Callable[[Simulation], None]
 ) -> None:
     comes_back(arm)
     reset(arm)
-    assert not told(arm)
+    assert not moved(arm)
 
 
 @pytest.mark.parametrize("arm", ["moving"], indirect=True)
@@ -201,22 +196,22 @@ def test_a_joint_that_moved_when_its_supply_was_lost_is_reported_where_it_cannot
     arm: Simulation,
 ) -> None:
     arm.send(Halt())
-    assert arm.until(lambda: arm.state is State.HOLDING, 2.0)
-    assert arm.send(MoveJoints((0.0, -0.3, 2.4, 0.0, 0.9, 0.0), 0.5, True)).refusal is None
+    arm.bring_to(State.HOLDING, 2.0)
+    arm.do(MoveJoints((0.0, -0.3, 2.4, 0.0, 0.9, 0.0), 0.5, True))
     arm.run(1.6)
     assert arm.loop.arm.state.actual_velocity[AXIS] > 0.4
     stood = arm.loop.arm.state.actual[AXIS]
     without_supply(arm)
     reset(arm)
-    (said,) = told(arm)
-    assert said.startswith("joint3 stands at 1.05 rad")
+    (message,) = moved(arm)
+    assert message.startswith("joint3 stands at 1.05 rad")
     assert stood - TURNED_TO > 0.55
 
 
 @pytest.mark.parametrize("arm", ["moving"], indirect=True)
 def test_joints_that_run_on_while_nothing_is_heard_are_not_reported(arm: Simulation) -> None:
     arm.data.lose(400, heard=False)
-    assert arm.until(lambda: arm.state is State.FAULT, 1.0)
+    arm.bring_to(State.FAULT, 1.0)
     arm.run(0.5)
     reset(arm)
-    assert not told(arm)
+    assert not moved(arm)

@@ -1,7 +1,8 @@
-"""The kind of the error that an SDO request of a client ends with: an abort, a timeout, a wrong address."""
+"""Error kinds of a client's SDO request: an abort, a timeout, a wrong address."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from rtcp.ipc.observer import Observer
 
 
 class Bus:
-    """A bus with one slave, whose only object answers as a test has it."""
+    """A bus with one slave, each of whose objects is 0x2A or an error."""
 
     outcome: BusError | None = None
 
@@ -40,9 +41,9 @@ CASES: dict[str, tuple[BusError | None, dict[str, int], str]] = {
 
 @pytest.mark.parametrize(("outcome", "other", "kind"), CASES.values(), ids=CASES.keys())
 def test_the_kind_of_an_error_reaches_the_client(
-    rig_board: tuple[Blackboard, Observer], outcome: BusError | None, other: dict[str, int], kind: str
+    board: Blackboard, path: Path, outcome: BusError | None, other: dict[str, int], kind: str
 ) -> None:
-    board, observer = rig_board
+    observer = Observer(path)
     bus = Bus()
     bus.outcome = outcome
     requests = SdoRequests(bus, board)  # type: ignore[arg-type]
@@ -51,4 +52,5 @@ def test_the_kind_of_an_error_reaches_the_client(
     while answer is None:
         requests.take_steps()
         answer = observer.service_answer()
+    observer.close()
     assert answer["kind"] == kind

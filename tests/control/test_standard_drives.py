@@ -1,4 +1,4 @@
-"""Drives as CiA 402 has them, through the whole loop in simulated time: of one mode, in the standard's units."""
+"""Drives of CiA 402 in the whole loop, in simulated time: of one mode, in the standard's units."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from rtcp.config import default_config, load, load_device, load_segment, segment
 from rtcp.config.model import ArmConfig, Pdo, SlaveConfig, StartupSdo
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus.errors import BusError
-from rtcp.ipc.commands import Enable, Home, MoveJoints, Reset, SetControlMode, SetDriveMode
-from rtcp.ipc.events import DriveFault, Homed, HomingFailed, ProcessDataLost, SlaveLost
+from rtcp.ipc.commands import Home, MoveJoints, Reset, SetControlMode, SetDriveMode
+from rtcp.ipc.events import DriveErrorCode, DriveFault, Homed, HomingFailed, ProcessDataLost, SlaveLost
 from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import DriveModeUnsupported, HomingUnsupported
 from rtcp.ipc.states import ControlMode, DriveMode, State
-from rtcp.launch.simulation import Simulation
+from rtcp.testing.simulation import Simulation
 from rtcp.virtual.models.servo import ServoAxis
 from tests.drive_esi import ARMS, Objects, write_esi
 
@@ -29,12 +29,12 @@ def of_one_mode() -> ArmConfig:
     """The shipped arm with drives whose PDOs have no mode, which a start-up SDO sets to CSP."""
     device = SHIPPED.slaves[1].device
     images = [
-        (Pdo(pdo.index, tuple(one for one in pdo.channels if "modes" not in one.name)),)
+        (Pdo(pdo.index, tuple(entry for entry in pdo.channels if "modes" not in entry.name)),)
         for (pdo,) in (device.rpdo, device.tpdo)
     ]
     csp = StartupSdo(0x6060, 0, "int8", 8)
     device = replace(device, rpdo=images[0], tpdo=images[1], sdo=(*device.sdo, csp))
-    slaves = tuple(one if i == 0 else SlaveConfig(one.name, device) for i, one in enumerate(SHIPPED.slaves))
+    slaves = tuple(slave if i == 0 else SlaveConfig(slave.name, device) for i, slave in enumerate(SHIPPED.slaves))
     return replace(SHIPPED, slaves=slaves, cycle=replace(SHIPPED.cycle, period_us=1000.0))
 
 
@@ -42,18 +42,14 @@ def of_one_mode() -> ArmConfig:
 def arm() -> Iterator[Simulation]:
     """Enabled at `BENT`."""
     with Simulation(of_one_mode(), follow_clock=False, positions=BENT) as made:
-        assert made.until(lambda: made.state is State.READY, 5.0)
-        made.run(0.1)  # the emergency stop has to settle
-        made.acquire()
-        assert made.send(Enable()).refusal is None
-        assert made.until(lambda: made.state is State.HOLDING, 5.0)
+        made.hold()
         yield made
 
 
 def test_an_arm_whose_drives_have_no_mode_in_their_pdos_moves_in_csp(arm: Simulation) -> None:
     goal = (0.1, *BENT[1:])
-    assert arm.send(MoveJoints(goal, 0.5, True)).refusal is None
-    assert arm.until(lambda: arm.state is State.HOLDING, 5.0)
+    arm.do(MoveJoints(goal, 0.5, True))
+    arm.bring_to(State.HOLDING)
     arm.run(0.2)
     assert arm.models[0].mechanics.position == pytest.approx(0.1, abs=2e-3)
 
@@ -76,10 +72,10 @@ def test_every_other_mode_is_refused_with_the_reason(arm: Simulation) -> None:
 
 
 def arm_of(directory: Path, name: str, differing: Objects | None = None) -> tuple[ArmConfig, SegmentConfig]:
-    """The shipped arm with the drives of another one, as many as its joints need."""
-    key, held, options = ARMS[name]
+    """The shipped arm with drives of `ARMS`, as many as its joints need."""
+    key, objects, options = ARMS[name]
     device = load_device(default_config().parent / "devices" / f"{key}.yaml")
-    write_esi(directory / "drive.xml", device, {**held, **(differing or {})})
+    write_esi(directory / "drive.xml", device, {**objects, **(differing or {})})
     axes = len(device.axes)
     slaves = tuple(SlaveConfig(f"drive{i + 1}", device, f"{key}.yaml") for i in range(6 // axes))
     joints = tuple(
@@ -104,11 +100,7 @@ def standard(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Simulat
 
 
 def start(arm: Simulation) -> None:
-    assert arm.until(lambda: arm.state is State.READY, 5.0)
-    arm.run(0.1)
-    arm.acquire()
-    assert arm.send(Enable()).refusal is None
-    assert arm.until(lambda: arm.state is State.HOLDING, 5.0), arm.events
+    arm.hold()
 
 
 def servos(arm: Simulation) -> list[ServoAxis]:
@@ -117,42 +109,42 @@ def servos(arm: Simulation) -> list[ServoAxis]:
 
 def test_an_arm_of_standard_drives_moves_where_it_is_sent(standard: Simulation) -> None:
     goal = (0.2, 0.35, 2.2, -0.2, 0.4, 0.3)
-    assert standard.send(MoveJoints(goal, 0.5, True)).refusal is None
+    standard.do(MoveJoints(goal, 0.5, True))
     standard.run(0.6)
     assert min(abs(servo.mechanics.velocity) for servo in servos(standard)) > 0.02
     speeds = [pytest.approx(servo.mechanics.velocity, abs=5e-3) for servo in servos(standard)]
     assert standard.loop.arm.state.actual_velocity == speeds
-    assert standard.until(lambda: standard.state is State.HOLDING, 8.0)
+    standard.bring_to(State.HOLDING, 8.0)
     standard.run(0.3)
     assert [servo.mechanics.position for servo in servos(standard)] == [pytest.approx(q, abs=5e-3) for q in goal]
     assert standard.loop.arm.state.actual == [pytest.approx(q, abs=5e-3) for q in goal]
-    held = [servo.axis.torque for servo in servos(standard)]
-    assert standard.loop.arm.state.actual_torque == [pytest.approx(torque, abs=0.5) for torque in held]
-    assert max(map(abs, held)) > 3.0
+    torques = [servo.axis.torque for servo in servos(standard)]
+    assert standard.loop.arm.state.actual_torque == [pytest.approx(torque, abs=0.5) for torque in torques]
+    assert max(map(abs, torques)) > 3.0
 
 
 def test_a_fault_of_one_axis_stops_all_and_names_its_joint(standard: Simulation) -> None:
-    assert standard.send(MoveJoints((0.3, *BENT[1:]), 0.3, True)).refusal is None
+    standard.do(MoveJoints((0.3, *BENT[1:]), 0.3, True))
     standard.run(0.2)
     servos(standard)[1].inject_fault(0x2310)
-    assert standard.until(lambda: standard.state is State.FAULT, 2.0)
+    standard.bring_to(State.FAULT, 2.0)
     standard.run(0.5)
     (fault,) = [record.event for record in standard.events if isinstance(record.event, DriveFault)]
     assert fault.axis == 1
-    texts = [text.sentence for text in standard.observer.texts_since(0)]
+    codes = [record.event for record in standard.events if isinstance(record.event, DriveErrorCode)]
     has_code = (0x603F, 0) in standard.bus.slaves[1].device.objects
-    assert any(text.startswith("joint2: the drive's error code is 0x2310") for text in texts) is has_code, texts
+    assert [(event.axis, event.error_code) for event in codes] == [(1, 0x2310)] * has_code
     assert not servos(standard)[1].powered
-    assert standard.send(Reset()).refusal is None
-    assert standard.until(lambda: standard.state is State.READY, 5.0)
+    standard.do(Reset())
+    standard.bring_to(State.READY)
 
 
 def test_a_drive_homes_where_it_can_and_otherwise_the_arm_holds(standard: Simulation) -> None:
     homes = (0x6098, 0) in standard.bus.slaves[1].device.objects
     before = standard.loop.arm.state.actual[2]
-    assert standard.send(Home(2)).refusal is None
+    standard.do(Home(2))
     standard.run(0.05)
-    assert standard.until(lambda: standard.state is State.HOLDING, 5.0)
+    standard.bring_to(State.HOLDING)
     (end,) = [record.event for record in standard.events if isinstance(record.event, Homed | HomingFailed)]
     assert (isinstance(end, Homed), end.axis) == (homes, 2)
     if isinstance(end, HomingFailed):
@@ -164,14 +156,12 @@ def test_the_loss_of_a_slave_concerns_all_its_axes(tmp_path: Path) -> None:
     with Simulation(config, follow_clock=False, positions=BENT, segment=segment) as arm:
         start(arm)
         arm.bus.drop(3, 2, 0x001B)
-        assert arm.until(lambda: arm.state is State.FAULT, 2.0)
+        arm.bring_to(State.FAULT, 2.0)
         arm.run(0.5)
         assert {type(record.event) for record in arm.events} & {SlaveLost, ProcessDataLost}
         assert not any(servo.powered for servo in servos(arm)[2:4])
-        assert arm.send(Reset()).refusal is None
-        assert arm.until(lambda: arm.state is State.READY, 5.0)
-        assert arm.send(Enable()).refusal is None
-        assert arm.until(lambda: arm.state is State.HOLDING, 5.0)
+        arm.do(Reset())
+        arm.hold()
 
 
 def test_a_drive_whose_second_axis_has_another_gear_does_not_start(tmp_path: Path) -> None:

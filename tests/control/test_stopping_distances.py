@@ -1,4 +1,4 @@
-"""Time and way to standstill by each stop reaction, by the joints' own truth, within what the configuration allows.
+"""True time and distance to standstill of every joint by each stop reaction, within the configured bounds.
 
 The shipped arm on the in-process bus; `pytest -s` prints what was measured.
 """
@@ -14,10 +14,10 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.commands import Command, Enable, Jog, MoveJoints, SetDriveMode
+from rtcp.ipc.commands import Jog, MoveJoints, SetDriveMode
 from rtcp.ipc.states import DriveMode, JogFrame, State
 from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, watchdog_bounds
-from rtcp.launch.simulation import NAME, Frame, Simulation
+from rtcp.testing.simulation import NAME, Frame, Simulation
 
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, bus=replace(CONFIG.bus, interface=NAME))
@@ -25,12 +25,12 @@ CONFIG = replace(CONFIG, bus=replace(CONFIG.bus, interface=NAME))
 PERIOD_S = CONFIG.cycle.period_us * 1e-6
 COUNTS = 10000
 UPRIGHT_LESS = [-0.3] * 6
-"""rad; from here all joints run at full speed past the upright pose, around which no box is."""
+"""Start of the moves, rad: all joints reach full speed near the upright pose, away from all boxes."""
 BENT = [0.0, -0.3, 1.2, 0.0, 0.9, 0.0]
 JOG_SPEED = 0.2
 """m/s"""
 STANDS_RAD_S = 0.01
-"""A joint that is slower stands."""
+"""A joint below this speed counts as standing."""
 SAFE_OP, AL_WATCHDOG = 4, 0x001B
 OUTPUTS = struct.Struct("<Hiiib")
 ENABLE_OPERATION, QUICK_STOP = 0x0F, 0x02
@@ -38,7 +38,7 @@ SITUATIONS = ("holding", "moving", "jogging")
 
 
 class Measured:
-    """A stop from the cycle in which its cause happens on: what every joint truly does, and what is sent."""
+    """A stop, from the cycle of its cause on: the true motion of every joint, and the outputs sent."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -49,7 +49,7 @@ class Measured:
         self.begun_ns = simulation.now_ns
         self._began = [model.mechanics.position for model in simulation.models]
         self.time_s = 0.0
-        self.ways = [0.0] * len(self._began)
+        self.distances = [0.0] * len(self._began)
         self.sent: list[list[tuple[int, ...]]] = []
         self.before = self._outputs(simulation.data.outputs)
         simulation.on_frame = self._see
@@ -62,12 +62,12 @@ class Measured:
         if any(abs(model.mechanics.velocity) > STANDS_RAD_S for model in models):
             self.time_s = (frame.now_ns - self.begun_ns) * 1e-9
         now = [abs(model.mechanics.position - began) for model, began in zip(models, self._began, strict=True)]
-        self.ways = [max(most, way) for most, way in zip(self.ways, now, strict=True)]
+        self.distances = [max(pair) for pair in zip(self.distances, now, strict=True)]
         self.sent.append(self._outputs(frame.sent))
 
     @property
     def longest_step(self) -> list[int]:
-        """For each joint the longest step, in counts, between two targets in a row that its drive obeys."""
+        """For each joint the largest difference, in counts, of two consecutive targets that its drive obeys."""
         rows = [self.before, *self.sent]
         return [
             max(
@@ -82,17 +82,19 @@ class Measured:
         ]
 
     def within(self, what: str, limits: Sequence[Bound]) -> None:
-        """Compare with the bounds of all joints, and print it."""
+        """Assert the bounds of all joints, and print time and distance."""
         longest_s = max(bound.time_s for bound in limits)
         print(f"\n{what}: stands after {1000 * self.time_s:.1f} ms (at most {1000 * longest_s:.1f})", end="")
         assert self.time_s <= longest_s
         self.not_beyond(what, limits)
 
     def not_beyond(self, what: str, limits: Sequence[Bound]) -> None:
-        """Compare the ways alone, where the joints need not stand at the end; and every step of a target."""
+        """Assert the bounds of distances and of steps of targets; the joints may still move."""
         most = max(bound.way_rad for bound in limits)
-        print(f"\n{what}: longest way {max(self.ways):.4f} rad (at most {most:.4f})", end="")
-        assert [way <= bound.way_rad for way, bound in zip(self.ways, limits, strict=True)] == [True] * len(limits)
+        print(f"\n{what}: longest distance {max(self.distances):.4f} rad (at most {most:.4f})", end="")
+        assert [distance <= bound.way_rad for distance, bound in zip(self.distances, limits, strict=True)] == [
+            True
+        ] * len(limits)
         steps = [joint.velocity * PERIOD_S * COUNTS + 1 for joint in CONFIG.joints]
         assert [step <= most for step, most in zip(self.longest_step, steps, strict=True)] == [True] * len(steps)
 
@@ -103,25 +105,21 @@ def arm() -> Iterator[Callable[..., Simulation]]:
     made: list[Simulation] = []
 
     def bring(situation: str, mode: int = 8, **stops: str) -> Simulation:
-        config: ArmConfig = replace(CONFIG, stops=replace(CONFIG.stops, **stops))
+        config: ArmConfig = replace(CONFIG, stops=replace(CONFIG.stops, **stops))  # type: ignore[arg-type]
         positions = BENT if situation == "jogging" else UPRIGHT_LESS
         simulation = Simulation(config, seed=5, positions=positions, follow_clock=False)
         made.append(simulation)
-        simulation.acquire()
-        assert simulation.until(lambda: simulation.state is State.READY, 3.0)
-        if mode != 8:
-            do(simulation, SetDriveMode(DriveMode(mode)))
-        do(simulation, Enable())
-        assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+        simulation.hold()
+        simulation.do(SetDriveMode(DriveMode(mode)))
         assert simulation.until(lambda: not simulation.loop.machine.changing_mode, 1.0)
         simulation.run(0.1)
         if situation == "moving":
-            do(simulation, MoveJoints((0.3,) * 6, 0.5, synchronized=False))
+            simulation.do(MoveJoints((0.3,) * 6, 0.5, synchronized=False))
             simulation.run(0.55)
             assert min(simulation.loop.arm.state.commanded_velocity) == pytest.approx(0.5, abs=1e-6)
         elif situation == "jogging":
             for _ in range(2):
-                do(simulation, Jog((0.0, 0.0, -JOG_SPEED, 0.0, 0.0, 0.0), JogFrame.BASE, 0.5))
+                simulation.do(Jog((0.0, 0.0, -JOG_SPEED, 0.0, 0.0, 0.0), JogFrame.BASE, 0.5))
                 simulation.run(0.4)
             assert max(map(abs, simulation.loop.arm.state.commanded_velocity)) > 0.15
         return simulation
@@ -131,20 +129,16 @@ def arm() -> Iterator[Callable[..., Simulation]]:
         simulation.close()
 
 
-def do(simulation: Simulation, command: Command) -> None:
-    assert simulation.send(command).refusal is None
-
-
 def lose_the_box(simulation: Simulation) -> None:
     simulation.bus.drop(1, SAFE_OP, AL_WATCHDOG)
-    # The service thread sees it some time later; the bound counts from the cycle that is told.
+    # The service thread detects it later; the bound counts from the cycle that learns of it.
     simulation.service.lost_slave = 1
 
 
 def brakes(simulation: Simulation) -> list[float]:
-    """What each joint's closed brake slows it down by at least, rad/s2, with the load pulling the other way."""
+    """Least deceleration of each joint by its closed brake, against its load, rad/s2."""
     joints = [model.mechanics for model in simulation.models]
-    return [(one.holding_torque + one.coulomb - abs(one.external_torque)) / one.inertia for one in joints]
+    return [(joint.holding_torque + joint.coulomb - abs(joint.external_torque)) / joint.inertia for joint in joints]
 
 
 # -- hold -----------------------------------------------------------------------------------------------------------
@@ -169,7 +163,7 @@ def test_held_cycles_send_no_new_target_and_carry_no_joint_farther_than_its_spee
     assert simulation.state is (State.HOLDING if situation == "holding" else State.MOVING)
     limits = bounds(CONFIG, StopReaction.HOLD)
     if mode == 10:
-        # A torque that is held is no speed: what it makes of it is the inertia's affair, and a tenth is granted here.
+        # A held torque goes on accelerating: a tenth more is allowed.
         limits = tuple(bound._replace(way_rad=1.1 * bound.way_rad) for bound in limits)
     measured.not_beyond(f"hold in mode {mode}, {situation}", limits)
 
@@ -186,8 +180,8 @@ def test_frames_that_stay_away_end_in_a_quick_stop_or_by_the_drives_watchdog(
     assert simulation.state is State.FAULT
     limits: Sequence[Bound] = watchdog_bounds(CONFIG)
     if heard:
-        held, stop = bounds(CONFIG, StopReaction.HOLD), bounds(CONFIG, StopReaction.QUICK_STOP)
-        limits = [Bound(a.time_s + b.time_s, a.way_rad + b.way_rad) for a, b in zip(held, stop, strict=True)]
+        hold, stop = bounds(CONFIG, StopReaction.HOLD), bounds(CONFIG, StopReaction.QUICK_STOP)
+        limits = [Bound(a.time_s + b.time_s, a.way_rad + b.way_rad) for a, b in zip(hold, stop, strict=True)]
     else:
         assert not any(model.powered for model in simulation.models)
     measured.within(f"frames lost, {situation}", limits)
@@ -213,7 +207,7 @@ def test_a_motion_whose_commander_is_lost_stands_within_the_bound_of_the_reactio
     assert [model.powered for model in simulation.models] == [reaction is not StopReaction.TORQUE_OFF] * 6
     limits = bounds(CONFIG, reaction, brakes(simulation))
     if situation == "jogging" and reaction is StopReaction.CONTROLLED_STOP:
-        # The tool's own ramp may be longer; no joint passes its speed meanwhile.
+        # The tool's ramp may be longer; no joint exceeds its speed meanwhile.
         slow = tool_bounds(CONFIG, JOG_SPEED, CONFIG.jog.angular_speed)[0].time_s
         limits = tuple(
             Bound(max(bound.time_s, slow), max(bound.way_rad, joint.velocity * slow))
@@ -235,7 +229,7 @@ def test_an_arm_that_holds_stays_where_it_is_by_every_reaction(
     assert simulation.state is State.FAULT
     assert [model.powered for model in simulation.models] == [reaction is StopReaction.QUICK_STOP] * 6
     measured.within(f"{reaction.words}, holding", bounds(CONFIG, reaction, brakes(simulation)))
-    assert max(measured.ways) < 0.001
+    assert max(measured.distances) < 0.001
 
 
 # -- the bounds themselves ------------------------------------------------------------------------------------------

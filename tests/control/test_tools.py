@@ -1,4 +1,4 @@
-"""Two tools on the in-process bus: guards, plans and gravity are those of the tool that is in use."""
+"""Two tools on the in-process bus: guards, plans and gravity are those of the tool in use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from rtcp.config.model import Point, Stop
 from rtcp.ipc.commands import (
     ApplyTorque,
     Command,
-    Enable,
     Jog,
     RunLines,
     RunTrajectory,
@@ -29,12 +28,12 @@ from rtcp.ipc.commands import (
 from rtcp.ipc.events import BoxReached, PayloadChanged, ToolChanged
 from rtcp.ipc.names import Names
 from rtcp.ipc.states import ControlMode, JogFrame, State
-from rtcp.launch.simulation import Simulation
 from rtcp.motion.controllers.jog_bounds import STANDOFF_M
 from rtcp.motion.guards.neighbours import body_of
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.trajectories import plan_trajectory
+from rtcp.testing.simulation import Simulation
 from tests.two_tools import two_tools
 
 FLANGE, PROBE = 0, 1
@@ -50,20 +49,14 @@ class Tooled(Simulation):
         config = load(file)
         config = replace(config, cycle=replace(config.cycle, period_us=2000.0))
         super().__init__(config, positions=positions, follow_clock=False)
-        assert self.until(lambda: self.state is State.READY, 10.0)
-        self.acquire()
-        self.do(Enable())
-        assert self.until(lambda: self.state is State.HOLDING, 5.0)
-
-    def do(self, command: Command) -> None:
-        assert self.refusal(command) == ""
+        self.hold()
 
     def refusal(self, command: Command) -> str:
         refusal = self.send(command).refusal
         return "" if refusal is None else Names(self.config).message(refusal)
 
     def run_to(self, q: tuple[float, ...], tool: int) -> None:
-        """Run a trajectory that nobody has compared with the boxes."""
+        """Run a trajectory that is not checked against the boxes."""
         points = [Point(0.0, tuple(self.q)), Point(14.0, q)]
         plan = plan_trajectory(points, self.loop.arm.limits, self.q)
         self.do(RunTrajectory(self.observer.write_plan(plan.rows), len(plan.rows), tool=tool))
@@ -74,7 +67,7 @@ class Tooled(Simulation):
         return list(self.loop.arm.state.commanded)
 
     def clearance(self, number: int) -> float:
-        """How far the arm is from boxes and itself beyond what it keeps, with a tool, m."""
+        """Distance of the arm with a tool from boxes and itself, less the configured clearance, m."""
         model = self.config.models[number]
         zones = Zones(model, self.loop.arm.limits, self.config.cartesian.clearance)
         return zones.distance(frames(model, self.q))[0]
@@ -89,8 +82,8 @@ def arm(tmp_path: Path) -> Iterator[Callable[[tuple[float, ...]], Tooled]]:
         return made[-1]
 
     yield begin
-    for one in made:
-        one.close()
+    for simulation in made:
+        simulation.close()
 
 
 def test_with_a_long_tool_the_arm_stops_before_a_box_that_the_short_one_passes(
@@ -134,7 +127,7 @@ def test_a_plan_for_another_tool_is_refused_and_one_for_this_tool_runs(
     assert bent.refusal(kind(slot, 1, tool=FLANGE)) == text
     bent.do(RunLines(slot, 1, PROBE))
     assert "not accepted in state moving" in bent.refusal(SetTool(FLANGE))
-    assert bent.until(lambda: bent.state is State.HOLDING, 20.0)
+    bent.bring_to(State.HOLDING, 20.0)
     assert forward(model, bent.q).position == pytest.approx(goal[:3], abs=1e-6)
 
 
@@ -164,7 +157,7 @@ def test_a_jog_slides_along_the_boxes_of_the_tool_in_use(arm: Callable[[tuple[fl
 
 def test_partners_in_a_cell_keep_away_from_the_bodies_of_all_tools(tmp_path: Path) -> None:
     config = load(two_tools(tmp_path))
-    body, bare = (body_of(Member("left", one, Base())) for one in (config, replace(config, other_tools=())))
+    body, bare = (body_of(Member("left", platform, Base())) for platform in (config, replace(config, other_tools=())))
     assert body is not None
     assert bare is not None
     assert body.placed.bodies == (*bare.placed.bodies, *(config.models[PROBE].tool_bodies or ()))
@@ -177,16 +170,16 @@ def test_the_weight_of_the_tool_and_of_the_payload_is_carried(arm: Callable[[tup
     bent.do(SetTool(PROBE))
     assert gravity.torques(BENT) == gravity_torques(models[PROBE], BENT)
     bent.do(SetPayload(0.5, 0.0, 0.1, 0.2))
-    held = gravity_torques(models[PROBE], BENT, payload=LinkMass(0.5, (0.0, 0.1, 0.2)))
-    assert gravity.torques(BENT) == held
-    assert abs(held[2] - gravity_torques(models[PROBE], BENT)[2]) > 3.0
+    expected = gravity_torques(models[PROBE], BENT, payload=LinkMass(0.5, (0.0, 0.1, 0.2)))
+    assert gravity.torques(BENT) == expected
+    assert abs(expected[2] - gravity_torques(models[PROBE], BENT)[2]) > 3.0
     record = bent.observer.latest()[0]
     shown = [record[name] for name in ("tool", "payload_mass", "payload_x", "payload_y", "payload_z")]
     assert shown == [PROBE, 0.5, 0.0, 0.1, 0.2]
     assert [record.event for record in bent.events][-2:] == [ToolChanged(PROBE), PayloadChanged(0.5)]
-    # The tool in use stays so, and what it holds too; another one holds nothing.
+    # The tool in use keeps its payload when it is chosen again; another tool has none.
     bent.do(SetTool(PROBE))
-    assert gravity.torques(BENT) == held
+    assert gravity.torques(BENT) == expected
     bent.do(SetTool(FLANGE))
     assert gravity.torques(BENT) == gravity_torques(models[FLANGE], BENT)
     assert bent.observer.latest()[0]["payload_mass"] == 0.0
@@ -195,23 +188,23 @@ def test_the_weight_of_the_tool_and_of_the_payload_is_carried(arm: Callable[[tup
 def test_in_control_mode_torque_the_payload_changes_the_torques_that_are_sent(
     arm: Callable[[tuple[float, ...]], Tooled],
 ) -> None:
-    begun, found = [], []
+    begun, sent = [], []
     for mass in (0.0, 1.0):
         bent = arm(BENT)
         bent.do(SetPayload(mass))
         bent.do(SetControlMode(ControlMode.TORQUE))
         bent.run(0.5)
-        # It begins with the torques that hold the arm; what is carried differs as soon as the arm is elsewhere.
+        # At first the torques hold the arm as it was; the payload changes them once the arm has moved.
         for _ in range(10):
             bent.do(ApplyTorque((0.0, 15.0, 0.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.5))
             bent.run(0.1)
         record, model = bent.observer.latest()[0], bent.config.models[FLANGE]
-        held = LinkMass(mass, (0.0, 0.0, 0.0))
-        now, before = (gravity_torques(model, q, payload=held) for q in (record["actual_position"].tolist(), BENT))
+        payload = LinkMass(mass, (0.0, 0.0, 0.0))
+        now, before = (gravity_torques(model, q, payload=payload) for q in (record["actual_position"].tolist(), BENT))
         begun.append(record["sent_torque"][2] - now[2] + before[2])
-        found.append(record["sent_torque"][2])
+        sent.append(record["sent_torque"][2])
     assert begun[0] == pytest.approx(begun[1], abs=0.02)
-    assert abs(found[0] - found[1]) > 0.3
+    assert abs(sent[0] - sent[1]) > 0.3
 
 
 @pytest.mark.parametrize(

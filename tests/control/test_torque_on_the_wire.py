@@ -16,7 +16,7 @@ def in_torque_mode(rig: LoopRig) -> LoopRig:
     rig.hold()
     rig.do(IN_TORQUE_MODE)
     rig.wait(lambda: not rig.machine.changing_mode)
-    assert all(said.mode_display == CST for said in rig.log[-1].drives)
+    assert all(drive.mode_display == CST for drive in rig.log[-1].drives)
     return rig
 
 
@@ -36,18 +36,17 @@ def test_the_torque_on_the_wire_is_bounded_and_so_is_the_speed_that_it_makes(rig
     push(rig, 49.0, -49.0, 1.0)
     push(rig, -49.0, 49.0, 1.0)
     push(rig, 4.0, 2.0, 0.3)
-    # Torques count in real time, in which the rig is faster.
-    rig.until(State.HOLDING, 60.0)
+    rig.bring_to(State.HOLDING)
     rig.run(1.0)
     for axis, (drive, joint) in enumerate(zip(rig.arm.drives, CONFIG.joints, strict=True)):
-        said = [cycle.drives[axis] for cycle in rig.log[begun:]]
-        efforts = [drive_said.effort for drive_said in said]
+        frames = [cycle.drives[axis] for cycle in rig.log[begun:]]
+        efforts = [frame.effort for frame in frames]
         one_nm = drive_scale(rig, axis)
         assert max(map(abs, efforts)) <= joint.torque * one_nm + 1
-        # It did push, and turned round.
+        # It pushed both ways.
         assert max(efforts) > 2.0 * one_nm
         assert min(efforts) < -2.0 * one_nm
-        fastest = max(abs(drive_said.velocity) for drive_said in said) / 10000
+        fastest = max(abs(frame.velocity) for frame in frames) / 10000
         assert 0.5 * joint.velocity < fastest <= 1.05 * joint.velocity
         assert abs(drive.velocity) < 0.01
     assert CommandExpired in rig.kinds
@@ -55,7 +54,7 @@ def test_the_torque_on_the_wire_is_bounded_and_so_is_the_speed_that_it_makes(rig
 
 
 def drive_scale(rig: LoopRig, axis: int) -> float:
-    """What the wire says for 1 Nm: as the driver encodes it."""
+    """Counts that the driver encodes for 1 Nm."""
     drive = rig.arm.drives[axis]
     kept, drive.target_torque = drive.target_torque, 1.0
     unit = abs(effort_of(drive.encode()))

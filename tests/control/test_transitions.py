@@ -10,63 +10,7 @@ import pytest
 from docs.machine_page import diagram
 from rtcp.control.machine import STATES
 from rtcp.control.states import ReadyState, Signal, StoppedByLimitState
-from rtcp.ipc.commands import (
-    ApplyTorque,
-    Command,
-    Disable,
-    Enable,
-    ExtendTrajectory,
-    Guide,
-    Halt,
-    Home,
-    Jog,
-    MoveAtVelocity,
-    MoveGripper,
-    OpenStream,
-    Pause,
-    Reset,
-    Resume,
-    RunInStep,
-    RunLines,
-    RunTrajectory,
-    SetChannel,
-    SetControlMode,
-    SetDriveMode,
-    SetLimits,
-    SetOutput,
-    SetPayload,
-    SetSpeedOverride,
-    SetTool,
-    SetZero,
-    Shutdown,
-    StreamPosition,
-)
-from rtcp.ipc.events import (
-    ClockLost,
-    DriveFault,
-    EmergencyStopActivated,
-    Event,
-    LeaseExpired,
-    OverSpeed,
-    PermissionWithdrawn,
-    ProcessDataLost,
-    SlaveLost,
-)
-from rtcp.ipc.refusals import (
-    ChannelNotSettable,
-    DamagedRow,
-    EmergencyStopPressed,
-    MassesUnknown,
-    NoGeometry,
-    NotOpen,
-    NotPaused,
-    PlanStartsElsewhere,
-    Refusal,
-    StartOutOfReach,
-    WrongControlMode,
-    WrongRowCount,
-    WrongState,
-)
+from rtcp.ipc import commands, events, refusals
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 from .rig import (
@@ -79,8 +23,8 @@ from .rig import (
     move_to,
 )
 
-# What follows on each command and event in each state, written down a second time: the state that it leads to, `=`
-# where it changes none. `.`: a command is refused, an event is not tried.
+# The next state for each command and event in each state, written independently of the product; `=`: no change.
+# `.`: a command is refused, an event is not tried.
 TABLE = """
                  start ready enab  hold  move  stop  limit home  disab fault emerg reset close
 enable           .     enab  .     .     .     .     .     .     .     .     .     .     .
@@ -128,46 +72,52 @@ _STATES = {
     "fault": State.FAULT, "emerg": State.EMERGENCY_STOP, "reset": State.RESETTING, "close": State.CLOSING,
 }  # fmt: skip
 CELLS = {(row[0], _STATES[state]): cell for row in _ROWS for state, cell in zip(_HEAD, row[1:], strict=True)}
-COMMANDS: dict[str, Command] = {
+COMMANDS: dict[str, commands.Command] = {
     command.name: command
     for command in (
-        Enable(), Disable(), Reset(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1),
-        RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
-        Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
-        MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Guide(), Halt(),
-        SetOutput(5, True), SetChannel(1, 0, 1.0),
-        MoveGripper(False), SetLimits(0, 1), SetSpeedOverride(0.5), Pause(), Resume(), SetTool(0), SetPayload(0.1),
-        SetZero(0, 0.0), Home(0), Shutdown(),
+        commands.Enable(), commands.Disable(), commands.Reset(), commands.SetDriveMode(DriveMode.CSP),
+        commands.SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1),
+        commands.RunTrajectory(0, 1), commands.ExtendTrajectory(1, False), commands.RunLines(0, 1),
+        commands.StreamPosition((0.0, 0.0), 0.0), commands.OpenStream(1),
+        commands.Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), commands.RunInStep(0, 1, 1, 0, 0, 1, 0.1),
+        commands.MoveAtVelocity((0.0, 0.0), 0.2), commands.ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), commands.Guide(),
+        commands.Halt(),
+        commands.SetOutput(5, True), commands.SetChannel(1, 0, 1.0),
+        commands.MoveGripper(False), commands.SetLimits(0, 1), commands.SetSpeedOverride(0.5), commands.Pause(),
+        commands.Resume(), commands.SetTool(0), commands.SetPayload(0.1),
+        commands.SetZero(0, 0.0), commands.Home(0), commands.Shutdown(),
     )
 }  # fmt: skip
-"""One of each kind, with fields that nobody could refuse."""
-FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
-    RunTrajectory: (DamagedRow, PlanStartsElsewhere),
-    RunInStep: (StartOutOfReach, WrongState),
-    ExtendTrajectory: (NotOpen,),
-    SetChannel: (ChannelNotSettable,),
-    RunLines: (NoGeometry,),
-    MoveAtVelocity: (WrongControlMode,),
-    ApplyTorque: (WrongControlMode,),
-    Resume: (NotPaused,),
-    Guide: (NoGeometry,),
-    SetLimits: (WrongRowCount,),
-    SetPayload: (MassesUnknown,),
-    Reset: (EmergencyStopPressed,),
+"""One command of each kind, with valid fields."""
+FOR_OTHER_REASONS: dict[type[commands.Command], tuple[type[refusals.Refusal], ...]] = {
+    commands.RunTrajectory: (refusals.DamagedRow, refusals.PlanStartsElsewhere),
+    commands.RunInStep: (refusals.StartOutOfReach, refusals.WrongState),
+    commands.ExtendTrajectory: (refusals.NotOpen,),
+    commands.SetChannel: (refusals.ChannelNotSettable,),
+    commands.RunLines: (refusals.NoGeometry,),
+    commands.MoveAtVelocity: (refusals.WrongControlMode,),
+    commands.ApplyTorque: (refusals.WrongControlMode,),
+    commands.Resume: (refusals.NotPaused,),
+    commands.Guide: (refusals.NoGeometry,),
+    commands.SetLimits: (refusals.WrongRowCount,),
+    commands.SetPayload: (refusals.MassesUnknown,),
+    commands.Reset: (refusals.EmergencyStopPressed,),
 }
-"""Commands that cannot be carried out as they are above, wherever they are accepted; tested elsewhere."""
+"""Other refusals of `COMMANDS` in states that accept them; tested elsewhere."""
 
 
-EVENTS: dict[str, type[Event]] = {
-    "lost_frames": ProcessDataLost, "slave_lost": SlaveLost, "drive_fault": DriveFault, "clock_lost": ClockLost,
-    "emergency_stop": EmergencyStopActivated, "supervision": OverSpeed, "lease_ended": LeaseExpired,
-    "enabling_switch": PermissionWithdrawn,
+EVENTS: dict[str, type[events.Event]] = {
+    "lost_frames": events.ProcessDataLost, "slave_lost": events.SlaveLost, "drive_fault": events.DriveFault,
+    "clock_lost": events.ClockLost,
+    "emergency_stop": events.EmergencyStopActivated, "supervision": events.OverSpeed,
+    "lease_ended": events.LeaseExpired,
+    "enabling_switch": events.PermissionWithdrawn,
 }  # fmt: skip
 """Event of each key of `stops`."""
 ACCEPTED = [(COMMANDS[name], state) for (name, state), cell in CELLS.items() if name in COMMANDS and cell != "."]
 HAPPENS = [(name, state) for (name, state), cell in CELLS.items() if name in EVENTS and cell != "."]
 RUNNING = sorted(set(State) - {State.OFF})
-"""Off is what a loop is that does not run."""
+"""The states of a loop that runs."""
 
 
 @pytest.fixture
@@ -176,9 +126,9 @@ def rig(switch_rig: Callable[..., LoopRig]) -> LoopRig:
 
 
 def bring_to(rig: LoopRig, state: State) -> None:
-    # A drive that is kept from enabling keeps the machine in that state.
-    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON} if state is State.ENABLING else {}
-    rig.bring_to(state)
+    # A drive that does not enable keeps the machine in that state.
+    rig.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON} if state is State.ENABLING else {}
+    rig.lead_to(state)
     rig.slaves_come_back = False
 
 
@@ -192,20 +142,20 @@ def name_of(value: object) -> str:
 
 
 def test_the_table_has_every_command_and_every_state() -> None:
-    own = {kind.name for kind in Command.kinds if kind.__module__ == "rtcp.ipc.commands"}
+    own = {kind.name for kind in commands.Command.kinds if kind.__module__ == "rtcp.ipc.commands"}
     assert set(CELLS) == {(name, state) for name in {*own, *EVENTS} for state in RUNNING}
     for command in COMMANDS.values():
         assert command.states == {state for other, state in ACCEPTED if other is command}
 
 
 @pytest.mark.parametrize(("command", "state"), ACCEPTED, ids=name_of)
-def test_a_command_that_is_accepted_leads_to_its_state(rig: LoopRig, command: Command, state: State) -> None:
+def test_a_command_that_is_accepted_leads_to_its_state(rig: LoopRig, command: commands.Command, state: State) -> None:
     bring_to(rig, state)
     refusal = rig.send(command).refusal
-    # A state may accept a command that is refused for what it asks.
+    # A state may accept a command that is refused for its fields.
     assert refusal is None or isinstance(refusal, FOR_OTHER_REASONS.get(type(command), ()))
     assert rig.state is (leads_to(command.name, state) if refusal is None else state)
-    if isinstance(command, Shutdown):
+    if isinstance(command, commands.Shutdown):
         rig.finish()
         assert rig.powered == [False, False]
 
@@ -217,12 +167,12 @@ def test_every_other_command_is_refused_with_the_states_that_accept_it_and_chang
     bring_to(rig, state)
     for command in (command for command in COMMANDS.values() if CELLS[command.name, state] == "."):
         refusal = rig.send(command).refusal
-        assert refusal == WrongState(command.number, state)
+        assert refusal == refusals.WrongState(command.number, state)
         message, _, accepting = rig.names.message(refusal).partition(", only in: ")
         assert message == f"{command.name} is not accepted in state {state.words}"
         accepting, _, hint = accepting.partition("; ")
-        assert accepting.split(", ") == sorted(one.words for one in command.states)
-        if state in Reset.states:
+        assert accepting.split(", ") == sorted(accepted.words for accepted in command.states)
+        if state in commands.Reset.states:
             assert hint == "`rtcp reset` first"
         elif state is State.READY and State.HOLDING in command.states:
             assert hint == "`rtcp enable` first"
@@ -241,12 +191,12 @@ def test_an_event_leads_to_its_state(rig: LoopRig, event: str, state: State) -> 
         rig.run(0.05)
         assert rig.state is state or (state is State.CLOSING and rig.machine.closed)
         return
-    rig.until(goal, 1.1)
+    rig.bring_to(goal, 1.1)
     assert rig.kinds.count(kind) == before + 1
-    words = {said.controlword for said in rig.log[-1].drives if said.has_torque}
+    words = {drive.controlword for drive in rig.log[-1].drives if drive.has_torque}
     if goal is State.STOPPING:
         assert words == {ENABLE_OPERATION}
-        rig.until(State.HOLDING)
+        rig.bring_to(State.HOLDING)
     else:
         assert words <= {QUICK_STOP}
         assert rig.machine.fault == kind.number
@@ -260,7 +210,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def targets(state: State) -> set[State]:
-    return {target for one in STATES if one.state is state for target in one.leads_to.values()}
+    return {target for entry in STATES if entry.state is state for target in entry.leads_to.values()}
 
 
 def reached_from(start: State) -> set[State]:
@@ -273,7 +223,7 @@ def reached_from(start: State) -> set[State]:
 
 
 def test_every_state_is_reached_from_the_start_and_leads_to_the_end() -> None:
-    assert {one.state for one in STATES} == set(RUNNING)
+    assert {entry.state for entry in STATES} == set(RUNNING)
     assert reached_from(State.STARTING) == set(State)
     assert all(State.OFF in reached_from(state) for state in State)
 
@@ -282,13 +232,15 @@ def test_nothing_leads_from_a_fault_or_an_emergency_stop_to_motion_but_through_r
     stopped = {State.FAULT, State.EMERGENCY_STOP, State.RESETTING}
     for state in stopped:
         assert targets(state) <= {*stopped, State.CLOSING, State.READY}
-    assert [cause for cause, target in ReadyState.leads_to.items() if target is State.ENABLING] == [Enable]
-    assert [cause for cause, target in StoppedByLimitState.leads_to.items() if target is State.HOLDING] == [Reset]
+    assert [cause for cause, target in ReadyState.leads_to.items() if target is State.ENABLING] == [commands.Enable]
+    assert [cause for cause, target in StoppedByLimitState.leads_to.items() if target is State.HOLDING] == [
+        commands.Reset
+    ]
 
 
 def test_where_a_lost_clock_may_end_in_a_controlled_stop_set_points_move_the_arm() -> None:
-    found = {one.state for one in STATES if Signal.STOP_FOR_CLOCK in one.leads_to}
-    assert found == {State.HOLDING, State.MOVING, State.STOPPING}
+    states = {entry.state for entry in STATES if Signal.STOP_FOR_CLOCK in entry.leads_to}
+    assert states == {State.HOLDING, State.MOVING, State.STOPPING}
 
 
 def test_the_diagram_shows_every_state() -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import load
-from rtcp.ipc.commands import Command, Enable, MoveGripper, MoveJoints, SetControlMode, SetOutput
+from rtcp.ipc.commands import MoveGripper, MoveJoints, SetControlMode, SetOutput
 from rtcp.ipc.events import EmergencyStopActivated, PermissionWithdrawn
 from rtcp.ipc.refusals import ReservedOutput, UnknownBox
 from rtcp.ipc.states import ControlMode, State
-from rtcp.launch.simulation import Simulation
+from rtcp.testing.simulation import Simulation
 from rtcp.virtual.models import DiewuIoBox
 from tests.two_boxes import SWITCH, two_boxes
 
@@ -28,16 +28,8 @@ def arm(tmp_path: Path) -> Iterator[Simulation]:
     """Enabled, the enabling switch pressed."""
     with Simulation(load(two_boxes(tmp_path)), follow_clock=False) as made:
         desk(made).set_input(SWITCH - 1, True)
-        assert made.until(lambda: made.state is State.READY, 5.0)
-        made.run(0.05)
-        made.acquire()
-        accept(made, Enable())
-        assert made.until(lambda: made.state is State.HOLDING, 5.0)
+        made.hold()
         yield made
-
-
-def accept(arm: Simulation, command: Command) -> None:
-    assert arm.send(command).refusal is None
 
 
 def io(arm: Simulation) -> DiewuIoBox:
@@ -53,7 +45,7 @@ def desk(arm: Simulation) -> DiewuIoBox:
 
 
 def move(arm: Simulation) -> None:
-    accept(arm, MoveJoints((0.5, *SOMEWHERE[1:]), speed=0.3, synchronized=True))
+    arm.do(MoveJoints((0.5, *SOMEWHERE[1:]), speed=0.3, synchronized=True))
     arm.run(0.3)
     assert arm.state is State.MOVING
 
@@ -69,19 +61,19 @@ def test_lamps_and_gripper_are_switched_at_the_box_that_they_name(arm: Simulatio
     assert desk(arm).outputs & ~HEARTBEAT == STATE_LAMP
     move(arm)
     assert desk(arm).outputs & ~HEARTBEAT == STATE_LAMP | MOTION_LAMP
-    accept(arm, MoveGripper(open=False))
+    arm.do(MoveGripper(open=False))
     arm.run(0.01)
     assert desk(arm).outputs & GRIPPER
     assert io(arm).outputs == 0
 
 
 def test_an_output_of_either_box_is_switched_and_both_are_in_the_record(arm: Simulation) -> None:
-    accept(arm, SetOutput(1, True, 0))
-    accept(arm, SetOutput(16, True, 1))
+    arm.do(SetOutput(1, True, 0))
+    arm.do(SetOutput(16, True, 1))
     arm.run(0.01)
     assert io(arm).outputs == 1
     assert desk(arm).outputs & ~HEARTBEAT == 1 << 15 | STATE_LAMP
-    (record,) = arm.observer.latest() or ()
+    (record,) = arm.observer.latest()
     assert record["io_outputs"] == 1
     assert int(record["desk_outputs"]) & ~HEARTBEAT == 1 << 15 | STATE_LAMP
     assert record["io_inputs"] == 0x033F
@@ -90,7 +82,7 @@ def test_an_output_of_either_box_is_switched_and_both_are_in_the_record(arm: Sim
 
 def test_a_number_has_a_function_at_its_own_box_alone(arm: Simulation) -> None:
     assert arm.send(SetOutput(4, True, 1)).refusal == ReservedOutput(4)
-    accept(arm, SetOutput(4, True, 0))
+    arm.do(SetOutput(4, True, 0))
     assert arm.send(SetOutput(4, True, 2)).refusal == UnknownBox(3, 2)
 
 
@@ -102,17 +94,17 @@ def test_the_enabling_switch_at_the_second_box_stops_the_arm_and_the_same_input_
     arm.run(0.05)
     assert arm.state is State.MOVING
     desk(arm).set_input(SWITCH - 1, False)
-    assert arm.until(lambda: arm.state is State.HOLDING, 1.0)
-    assert PermissionWithdrawn() in [one.event for one in arm.events]
+    arm.bring_to(State.HOLDING, 1.0)
+    assert PermissionWithdrawn() in [record.event for record in arm.events]
 
 
 def test_the_joystick_at_the_first_box_jogs_the_arm(arm: Simulation) -> None:
-    accept(arm, SetControlMode(ControlMode.JOYSTICK))
+    arm.do(SetControlMode(ControlMode.JOYSTICK))
     arm.run(0.1)
     io(arm).set_input(FORWARD, False)
-    assert arm.until(lambda: arm.state is State.MOVING, 0.5)
+    arm.bring_to(State.MOVING, 0.5)
     io(arm).set_input(FORWARD, True)
-    assert arm.until(lambda: arm.state is State.HOLDING, 2.0)
+    arm.bring_to(State.HOLDING, 2.0)
 
 
 def test_an_emergency_stop_pressed_while_the_other_box_is_lost_still_stops_the_arm(arm: Simulation) -> None:
@@ -121,14 +113,14 @@ def test_an_emergency_stop_pressed_while_the_other_box_is_lost_still_stops_the_a
     io(arm).set_input(STOP, False)
     arm.run(0.012)
     assert arm.state is State.EMERGENCY_STOP, "before the missing frames become a fault of their own"
-    assert any(isinstance(one.event, EmergencyStopActivated) for one in arm.events)
+    assert any(isinstance(record.event, EmergencyStopActivated) for record in arm.events)
 
 
 def test_the_outputs_of_the_box_that_is_lost_are_cleared_and_the_others_stay(arm: Simulation) -> None:
-    accept(arm, MoveGripper(open=False))
-    accept(arm, SetOutput(5, True, 0))
+    arm.do(MoveGripper(open=False))
+    arm.do(SetOutput(5, True, 0))
     lose_desk(arm)
-    assert arm.until(lambda: arm.state is State.FAULT, 2.0)
+    arm.bring_to(State.FAULT, 2.0)
     arm.run(0.2)
     assert io(arm).outputs == 1 << 4
     assert not int.from_bytes(arm.data.outputs[-1], "little") & GRIPPER

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
+from rtcp.config.model import ArmConfig, DeviceDescription, Pdo, PdoEntry, SlaveConfig
 from rtcp.control.cycle import make_drives
 from rtcp.control.process import stop_blindly
 from rtcp.devices import TargetState as T
-from rtcp.devices.drive import share_slaves
+from rtcp.devices.drive import Drive, share_slaves
 
 SECOND = 0x800
 OUT, IN = struct.Struct("<HihHih"), struct.Struct("<HihHih")
@@ -32,14 +32,13 @@ def entries(image: str, shift: int = 0) -> tuple[PdoEntry, ...]:
 
 
 def two_axes(*, one_pdo: bool) -> DeviceDescription:
-    images: dict[str, tuple[Pdo, ...]] = {}
-    for image, index in (("rpdo", 0x1600), ("tpdo", 0x1A00)):
-        first, second = entries(image), entries(image, SECOND)
+    def image(name: str, index: int) -> tuple[Pdo, ...]:
+        first, second = entries(name), entries(name, SECOND)
         if one_pdo:
-            images[image] = (Pdo(index, (*first, *(replace(entry, axis=2) for entry in second))),)
-        else:
-            images[image] = (Pdo(index, first), Pdo(index + 0x10, second, axis=2))
-    return DeviceDescription(name="two axes", kind="cia402", vendor_id=1, product_id=2, **images)
+            return (Pdo(index, (*first, *(replace(entry, axis=2) for entry in second))),)
+        return Pdo(index, first), Pdo(index + 0x10, second, axis=2)
+
+    return DeviceDescription("two axes", "cia402", 1, 2, image("rpdo", 0x1600), image("tpdo", 0x1A00))
 
 
 SHIPPED = load(default_config())
@@ -48,8 +47,11 @@ SHIPPED = load(default_config())
 class Data:
     """The process data of one slave."""
 
+    expected_wkc = dc_time = missed = stale = 0
+
     def __init__(self, inputs: bytes) -> None:
         self.inputs, self.outputs = inputs, b""
+        self.sent: list[tuple[int, ...]] = []
 
     def input(self, index: int) -> bytes:
         return self.inputs
@@ -58,12 +60,13 @@ class Data:
         self.outputs = data
 
     def send(self) -> None:
-        pass
+        self.sent.append(OUT.unpack(self.outputs))
 
-    receive = send
+    def receive(self) -> int:
+        return -1
 
 
-def drives(device: DeviceDescription):
+def drives(device: DeviceDescription) -> tuple[ArmConfig, list[tuple[int, Drive]]]:
     joints = tuple(
         replace(joint, slave="both", axis=axis) for axis, joint in zip((2, 1), SHIPPED.joints[:2], strict=True)
     )
@@ -74,7 +77,7 @@ def drives(device: DeviceDescription):
 
 
 @pytest.mark.parametrize("one_pdo", [False, True])
-def test_each_axis_reads_and_writes_its_own_part_of_one_image(one_pdo) -> None:
+def test_each_axis_reads_and_writes_its_own_part_of_one_image(one_pdo: bool) -> None:
     _, pairs = drives(two_axes(one_pdo=one_pdo))
     (_, second), (_, first) = pairs  # the first joint hangs on axis 2
     image = IN.pack(SWITCHED_ON, 10000, 100, SWITCHED_ON, -2000, -300)
@@ -100,16 +103,14 @@ def test_an_axis_that_moves_no_joint_stays_disabled() -> None:
 
 
 @pytest.mark.interpreted
-def test_a_blind_stop_tells_both_axes_also_where_the_driver_of_one_raises(monkeypatch) -> None:
+def test_a_blind_stop_tells_both_axes_also_where_the_driver_of_one_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     config, pairs = drives(two_axes(one_pdo=False))
     data = Data(IN.pack(ENABLED, 10000, 0, ENABLED, -2000, 0))
-    told = []
-    data.send = lambda: told.append(OUT.unpack(data.outputs))
 
     def broken(image: bytes) -> None:
         raise RuntimeError("a defect")
 
     monkeypatch.setattr(pairs[0][1], "decode", broken)
     stop_blindly(data, replace(config, cycle=replace(config.cycle, period_us=100_000)), pairs)
-    words = {(one[0], one[3]) for one in told}
+    words = {(first, second) for first, _, _, second, _, _ in data.sent}
     assert words == {(0x02, 0x02), (0x07, 0x00)}  # quick stop, then torque off: the axis whose driver raises at once

@@ -8,7 +8,7 @@ import pytest
 from rtcp.devices import Cia402Drive, DeviceError, DriveState
 from rtcp.devices import TargetState as T
 
-from .conftest import FACTOR, RPDO, TPDO, slave
+from .conftest import FACTOR, RPDO, TPDO, Channel, Wire, slave
 
 S = DriveState
 DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x0250, 0x0231, 0x0233, 0x0237, 0x0217
@@ -25,15 +25,15 @@ FAULT_REACTION, FAULT = 0x021F, 0x0218
         (FAULT, S.FAULT), (0x0238, S.FAULT), (0x0001, S.UNKNOWN), (0x0061, S.UNKNOWN),
     ],
 )  # fmt: skip
-def test_the_statusword_tells_the_state(drive, wire, word, state):
-    wire.says(word)
+def test_the_statusword_tells_the_state(drive: Cia402Drive, wire: Wire, word: int, state: DriveState) -> None:
+    wire.receive(word)
     assert drive.state is state
 
 
-def test_every_state_has_a_controlword_for_every_goal(drive, wire):
+def test_every_state_has_a_controlword_for_every_goal(drive: Cia402Drive, wire: Wire) -> None:
     for word in range(0x80):
         for goal in T:
-            wire.says(word)
+            wire.receive(word)
             drive.advance(goal)
 
 
@@ -47,18 +47,20 @@ def test_every_state_has_a_controlword_for_every_goal(drive, wire):
         (T.ENABLED, [(QUICK_STOP, 0x0F), (ENABLED, 0x0F)]),
     ],
 )
-def test_each_step_is_decided_by_the_state_found(drive, wire, goal, steps):
+def test_each_step_is_decided_by_the_state_found(
+    drive: Cia402Drive, wire: Wire, goal: T, steps: list[tuple[int, int]]
+) -> None:
     for status, control in steps:
-        wire.says(status)
+        wire.receive(status)
         drive.advance(goal)
-        assert wire.hears()[0] == control
+        assert wire.sent()[0] == control
 
 
-def test_a_drive_that_stays_where_it_is_gets_the_same_step_again(drive, wire):
+def test_a_drive_that_stays_where_it_is_gets_the_same_step_again(drive: Cia402Drive, wire: Wire) -> None:
     for _ in range(20):
-        wire.says(READY)
+        wire.receive(READY)
         assert not drive.advance(T.ENABLED)
-        assert wire.hears()[0] == 0x07
+        assert wire.sent()[0] == 0x07
 
 
 @pytest.mark.parametrize(
@@ -69,62 +71,66 @@ def test_a_drive_that_stays_where_it_is_gets_the_same_step_again(drive, wire):
         (T.DISABLED, QUICK_STOP, False), (T.RESET, FAULT, False), (T.RESET, DISABLED, True),
     ],
 )  # fmt: skip
-def test_advance_tells_whether_the_goal_is_reached(drive, wire, goal, status, reached):
-    wire.says(status)
+def test_advance_tells_whether_the_goal_is_reached(
+    drive: Cia402Drive, wire: Wire, goal: T, status: int, reached: bool
+) -> None:
+    wire.receive(status)
     assert drive.advance(goal) is reached
 
 
-def test_the_fault_reset_is_repeated_as_an_edge(drive, wire):
+def test_the_fault_reset_is_repeated_as_an_edge(drive: Cia402Drive, wire: Wire) -> None:
     words = []
     for _ in range(24):
-        wire.says(FAULT)
+        wire.receive(FAULT)
         drive.advance(T.RESET)
-        words.append(wire.hears()[0])
+        words.append(wire.sent()[0])
     edges = sum(1 for before, now in zip([0, *words], words, strict=False) if now & 0x80 and not before & 0x80)
     assert set(words) == {0x00, 0x80}
     assert edges == 4
 
 
-def test_the_target_follows_the_position_until_the_drive_is_enabled(drive, wire):
+def test_the_target_follows_the_position_until_the_drive_is_enabled(drive: Cia402Drive, wire: Wire) -> None:
     for status, position in ((DISABLED, 100), (READY, 200), (SWITCHED_ON, 300)):
-        wire.says(status, position)
-        assert wire.hears()[1] == position
+        wire.receive(status, position)
+        assert wire.sent()[1] == position
         drive.advance(T.ENABLED)
 
 
-def test_the_target_is_latched_once_on_the_step_to_operation_enabled(drive, wire):
-    wire.says(SWITCHED_ON, 12345)
+def test_the_target_is_latched_once_on_the_step_to_operation_enabled(drive: Cia402Drive, wire: Wire) -> None:
+    wire.receive(SWITCHED_ON, 12345)
     drive.advance(T.ENABLED)
-    sent = [wire.hears()[1]]
-    # The arm sags by a count a cycle: a target that were copied would sag with it.
+    sent = [wire.sent()[1]]
+    # The arm sags by a count a cycle: a copied target would sag with it.
     for position in range(12344, 12300, -1):
-        wire.says(SWITCHED_ON if position > 12340 else ENABLED, position)
+        wire.receive(SWITCHED_ON if position > 12340 else ENABLED, position)
         drive.advance(T.ENABLED)
-        sent.append(wire.hears()[1])
+        sent.append(wire.sent()[1])
     assert set(sent) == {12345}
 
 
-def test_the_target_is_latched_anew_after_a_fault_reset(drive, wire):
+def test_the_target_is_latched_anew_after_a_fault_reset(drive: Cia402Drive, wire: Wire) -> None:
     for status, position, goal in (
         (SWITCHED_ON, 1000, T.ENABLED), (ENABLED, 1000, T.ENABLED), (FAULT, 4000, T.ENABLED),
         (FAULT, 5000, T.RESET), (DISABLED, 6000, T.ENABLED), (READY, 7000, T.ENABLED),
         (SWITCHED_ON, 8000, T.ENABLED), (ENABLED, 8001, T.ENABLED),
     ):  # fmt: skip
-        wire.says(status, position)
+        wire.receive(status, position)
         drive.advance(goal)
-    assert wire.hears()[:2] == (0x0F, 8000)
+    assert wire.sent()[:2] == (0x0F, 8000)
 
 
-def test_the_target_is_latched_anew_when_the_drive_left_the_enabled_state_on_its_own(drive, wire):
+def test_the_target_is_latched_anew_when_the_drive_left_the_enabled_state_on_its_own(
+    drive: Cia402Drive, wire: Wire
+) -> None:
     for status, position in ((SWITCHED_ON, 1000), (ENABLED, 1000), (SWITCHED_ON, 9000), (ENABLED, 9001)):
-        wire.says(status, position)
+        wire.receive(status, position)
         drive.advance(T.ENABLED)
-    assert wire.hears()[1] == 9000
+    assert wire.sent()[1] == 9000
 
 
-def test_latching_forgets_a_velocity_and_a_torque_of_before(drive, wire):
+def test_latching_forgets_a_velocity_and_a_torque_of_before(drive: Cia402Drive, wire: Wire) -> None:
     drive.target_velocity, drive.target_torque = 1.0, 5.0
-    wire.says(SWITCHED_ON)
+    wire.receive(SWITCHED_ON)
     drive.advance(T.ENABLED)
     assert (drive.target_velocity, drive.target_torque) == (0.0, 0.0)
 
@@ -132,87 +138,100 @@ def test_latching_forgets_a_velocity_and_a_torque_of_before(drive, wire):
 @pytest.mark.parametrize(
     ("mode", "velocity", "torque"), [(8, 5000, 0), (9, 2500, 0), (10, 0, 12_0000), (1, 0, 0), (0, 0, 0)]
 )
-def test_each_mode_sends_its_own_fields(drive, wire, mode, velocity, torque):
+def test_each_mode_sends_its_own_fields(drive: Cia402Drive, wire: Wire, mode: int, velocity: int, torque: int) -> None:
     drive.mode, drive.target_velocity, drive.target_torque = mode, 0.25, 12.0
-    wire.says(ENABLED, mode=mode)
+    wire.receive(ENABLED, mode=mode)
     drive.controlword = 0x0F
-    assert wire.hears()[2:] == (velocity, torque, mode)
+    assert wire.sent()[2:] == (velocity, torque, mode)
 
 
 @pytest.mark.parametrize("commanded", [8, 9, 10])
 @pytest.mark.parametrize("displayed", [0, 1, 3, 6, 8, 9, 10])
 def test_no_speed_is_sent_to_a_drive_in_another_mode_and_torque_only_on_the_way_to_cst(
-    drive, wire, commanded, displayed
-):
+    drive: Cia402Drive, wire: Wire, commanded: int, displayed: int
+) -> None:
     drive.mode, drive.target_velocity, drive.target_torque = commanded, 0.25, 12.0
-    wire.says(ENABLED, mode=displayed)
+    wire.receive(ENABLED, mode=displayed)
     drive.controlword = 0x0F
-    _, _, velocity, torque, mode = wire.hears()
+    _, _, velocity, torque, mode = wire.sent()
     assert mode == commanded
     assert velocity == 0 or commanded == displayed
     assert torque == (12_0000 if commanded == 10 else 0)
 
 
-def test_a_quick_stop_is_held_and_sends_neither_speed_nor_torque(drive, wire):
+def test_a_quick_stop_is_held_and_sends_neither_speed_nor_torque(drive: Cia402Drive, wire: Wire) -> None:
     for mode in (8, 9, 10):
         drive.mode, drive.target_velocity, drive.target_torque = mode, 0.25, 12.0
         for status in (ENABLED, QUICK_STOP, QUICK_STOP):
-            wire.says(status, mode=mode)
+            wire.receive(status, mode=mode)
             drive.advance(T.QUICK_STOPPED)
-            assert wire.hears()[0] == 0x02
-            assert wire.hears()[2:4] == (0, 0)
+            assert wire.sent()[0] == 0x02
+            assert wire.sent()[2:4] == (0, 0)
 
 
 @pytest.mark.parametrize("status", [DISABLED, FAULT])
-def test_a_drive_without_torque_has_reached_its_quick_stop(drive, wire, status):
-    wire.says(status)
+def test_a_drive_without_torque_has_reached_its_quick_stop(drive: Cia402Drive, wire: Wire, status: int) -> None:
+    wire.receive(status)
     assert drive.advance(T.QUICK_STOPPED)
 
 
-def test_a_quick_stop_is_sent_whatever_the_statusword_says(drive, wire):
-    # The word may be false, and the drive enabled: anything else would take its torque.
+def test_a_quick_stop_is_sent_whatever_the_statusword_says(drive: Cia402Drive, wire: Wire) -> None:
+    # The statusword may be wrong and the drive enabled: any other controlword would take its torque.
     for word in range(0x80):
-        wire.says(word)
+        wire.receive(word)
         drive.advance(T.QUICK_STOPPED)
-        assert wire.hears()[0] == 0x02
+        assert wire.sent()[0] == 0x02
 
 
 @pytest.mark.parametrize("status", [DISABLED, READY, SWITCHED_ON, QUICK_STOP, FAULT])
-def test_no_speed_and_no_torque_is_sent_to_a_drive_that_is_not_enabled(drive, wire, status):
+def test_no_speed_and_no_torque_is_sent_to_a_drive_that_is_not_enabled(
+    drive: Cia402Drive, wire: Wire, status: int
+) -> None:
     for mode in (8, 9, 10):
         drive.mode, drive.target_velocity, drive.target_torque = mode, 0.25, 12.0
-        wire.says(status, mode=mode)
-        assert wire.hears()[2:4] == (0, 0)
+        wire.receive(status, mode=mode)
+        assert wire.sent()[2:4] == (0, 0)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_target_that_is_no_number_leaves_what_was_sent(drive, wire, bad):
-    wire.says(SWITCHED_ON, 700)
+def test_a_target_that_is_no_number_leaves_what_was_sent(drive: Cia402Drive, wire: Wire, bad: float) -> None:
+    wire.receive(SWITCHED_ON, 700)
     drive.advance(T.ENABLED)
     drive.mode = 9
-    wire.says(ENABLED, mode=9)
+    wire.receive(ENABLED, mode=9)
     drive.advance(T.ENABLED)
     drive.target_velocity = 0.1
-    assert wire.hears()[1:3] == (700, 1000)
+    assert wire.sent()[1:3] == (700, 1000)
     drive.target_position = drive.target_velocity = bad
-    assert wire.hears()[1:3] == (700, 1000)
+    assert wire.sent()[1:3] == (700, 1000)
 
 
 @pytest.mark.parametrize(("target", "counts"), [(1e9, 2**31 - 1), (-1e9, -(2**31)), (214748.3647, 2**31 - 1)])
-def test_a_target_out_of_the_field_is_cut_to_it(drive, wire, target, counts):
-    wire.says(ENABLED)
+def test_a_target_out_of_the_field_is_cut_to_it(drive: Cia402Drive, wire: Wire, target: float, counts: int) -> None:
+    wire.receive(ENABLED)
     drive.target_position = target
-    assert wire.hears()[1] == counts
+    assert wire.sent()[1] == counts
 
 
-def test_values_are_in_si_units(drive, wire):
-    wire.says(ENABLED, 12345, -678, 90)
+def test_values_are_in_si_units(drive: Cia402Drive, wire: Wire) -> None:
+    wire.receive(ENABLED, 12345, -678, 90)
     assert (drive.position, drive.velocity, drive.torque) == pytest.approx((1.2345, -0.0678, 0.009))
 
 
-def test_widths_and_order_are_those_of_the_description():
-    tpdo = (("torque", 0x6077, "int16", 0.1), TPDO[0], ("temperature", 0x2000, "int16", 0.1), *TPDO[1:3], TPDO[4])
-    rpdo = (RPDO[4], ("target_torque", 0x6071, "int16", 0.1), *RPDO[:3], ("offset", 0x60B1, "int32", 1.0))
+def test_widths_and_order_are_those_of_the_description() -> None:
+    tpdo: tuple[Channel, ...] = (
+        ("torque", 0x6077, "int16", 0.1),
+        TPDO[0],
+        ("temperature", 0x2000, "int16", 0.1),
+        *TPDO[1:3],
+        TPDO[4],
+    )
+    rpdo: tuple[Channel, ...] = (
+        RPDO[4],
+        ("target_torque", 0x6071, "int16", 0.1),
+        *RPDO[:3],
+        ("offset", 0x60B1, "int32", 1.0),
+    )
     drive = Cia402Drive(slave(rpdo, tpdo), 0.001)
     drive.decode(struct.pack("<hHhiib", -5, ENABLED, -125, 20000, 1, 10))
     assert (drive.torque, drive.temperature, drive.position) == pytest.approx((-0.5, -12.5, 2.0))
@@ -220,7 +239,7 @@ def test_widths_and_order_are_those_of_the_description():
     assert drive.encode() == struct.pack("<bhHiii", 10, 30, 0x0F, 20000, 0, 0)
 
 
-def test_missing_channels_are_all_named_at_the_start():
+def test_missing_channels_are_all_named_at_the_start() -> None:
     with pytest.raises(DeviceError, match=r"`rpdo` maps no target_position; kind cia402"):
         Cia402Drive(slave(rpdo=RPDO[:1]), 0.001)
     with pytest.raises(DeviceError, match=r"`tpdo` no modes_of_operation_display"):
@@ -230,7 +249,7 @@ def test_missing_channels_are_all_named_at_the_start():
 CSP_ONLY = slave((*RPDO[:2], RPDO[4]), (*TPDO[:2], TPDO[4]))
 
 
-def test_a_drive_with_the_entries_of_csp_alone_is_driven_in_csp():
+def test_a_drive_with_the_entries_of_csp_alone_is_driven_in_csp() -> None:
     drive = Cia402Drive(CSP_ONLY, 0.001, speed_limit=0.5)
     for status in (SWITCHED_ON, ENABLED, ENABLED):
         drive.decode(struct.pack("<Hib", status, 10000, 8))
@@ -240,7 +259,7 @@ def test_a_drive_with_the_entries_of_csp_alone_is_driven_in_csp():
     assert [drive.supports(mode) for mode in (8, 9, 10)] == [True, False, False]
 
 
-def test_a_drive_without_a_mode_in_its_pdos_stays_in_csp():
+def test_a_drive_without_a_mode_in_its_pdos_stays_in_csp() -> None:
     drive = Cia402Drive(slave(RPDO[:4], TPDO[:4]), 0.001, speed_limit=0.5)
     assert [drive.supports(mode) for mode in (8, 9, 10)] == [True, False, False]
     for status in (SWITCHED_ON, ENABLED, ENABLED):
@@ -250,7 +269,7 @@ def test_a_drive_without_a_mode_in_its_pdos_stays_in_csp():
     assert drive.encode() == struct.pack("<Hiii", 0x0F, 10000, 5000, 0)
 
 
-def test_the_speed_limit_is_positive_where_the_joint_turns_against_the_drive():
+def test_the_speed_limit_is_positive_where_the_joint_turns_against_the_drive() -> None:
     reversed_ = [(name, index, kind, -factor if factor == FACTOR else factor) for name, index, kind, factor in RPDO]
     drive = Cia402Drive(slave(reversed_), 0.001, speed_limit=0.5)
     drive.controlword = 0x0F
@@ -262,7 +281,7 @@ def test_the_speed_limit_is_positive_where_the_joint_turns_against_the_drive():
     assert struct.unpack("<Hiiib", drive.encode())[2] == -2500
 
 
-def test_a_velocity_that_is_not_mapped_is_the_mean_over_20_ms():
+def test_a_velocity_that_is_not_mapped_is_the_mean_over_20_ms() -> None:
     drive = Cia402Drive(CSP_ONLY, 0.0005)
     for cycle in range(200):
         drive.decode(struct.pack("<Hib", ENABLED, 70000 + 3 * cycle, 8))
@@ -278,7 +297,7 @@ def test_a_velocity_that_is_not_mapped_is_the_mean_over_20_ms():
     ("without", "modes"),
     [("target_velocity", [8, 10]), ("velocity", [8]), ("target_torque", [8, 9]), ("torque", [8, 9])],
 )
-def test_a_drive_serves_the_modes_whose_entries_it_maps(without, modes):
+def test_a_drive_serves_the_modes_whose_entries_it_maps(without: str, modes: list[int]) -> None:
     rpdo, tpdo = ([row for row in rows if row[0] != without] for rows in (RPDO, TPDO))
     drive = Cia402Drive(slave(tuple(rpdo), tuple(tpdo)), 0.001)
     assert [mode for mode in (8, 9, 10) if drive.supports(mode)] == modes

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
+from rtcp.config.model import DataTypeName, DeviceDescription, Pdo, PdoEntry, SlaveConfig
 from rtcp.devices.driver import Driver, make_codec
 from rtcp.fieldbus.pdo import layout
 
@@ -13,13 +13,13 @@ PADDING = Pdo(0x1A01, tuple(PdoEntry(0, 0, "bool", f"pad{i}") for i in range(3))
 REST = Pdo(0x1A02, (PdoEntry(0x6010, 1, "int16", "value"), PdoEntry(0x6010, 2, "float32", "ratio")))
 
 
-def test_an_image_of_whole_bytes_is_little_endian_without_gaps():
+def test_an_image_of_whole_bytes_is_little_endian_without_gaps() -> None:
     codec = make_codec(layout((REST,)))
     assert codec.pack(-2, 1.5) == b"\xfe\xff\x00\x00\xc0\x3f"
     assert codec.unpack(b"\xfe\xff\x00\x00\xc0\x3f") == (-2, 1.5)
 
 
-def test_single_bits_stand_from_bit_0_upwards():
+def test_single_bits_stand_from_bit_0_upwards() -> None:
     codec = make_codec(layout((BITS, PADDING, REST)))
     image = codec.pack(1, 0, 1, 0, 0, 0, -2, 1.5)
     assert int.from_bytes(image, "little") == 0b101 | 0xFFFE << 6 | 0x3FC00000 << 22
@@ -27,11 +27,11 @@ def test_single_bits_stand_from_bit_0_upwards():
 
 
 @pytest.mark.parametrize(("pdos", "bits", "length"), [((BITS,), 3, 1), ((BITS, PADDING, REST), 54, 7), ((), 0, 0)])
-def test_a_layout_knows_its_length(pdos, bits, length):
+def test_a_layout_knows_its_length(pdos: tuple[Pdo, ...], bits: int, length: int) -> None:
     assert (layout(pdos).bits, layout(pdos).bytes) == (bits, length)
 
 
-def entry(kind: str, bits: int | None = None, index: int = 0x6000) -> PdoEntry:
+def entry(kind: DataTypeName, bits: int | None = None, index: int = 0x6000) -> PdoEntry:
     return PdoEntry(index, 1, kind, kind, bits=bits)
 
 
@@ -41,7 +41,9 @@ def entry(kind: str, bits: int | None = None, index: int = 0x6000) -> PdoEntry:
      ("bits", 3, 5, "05"), ("bits", 12, 0xABC, "bc 0a"), ("bits", 64, 1 << 63, "00 " * 7 + "80"),
      ("bytes", 24, 0x030201, "01 02 03"), ("float32", None, 1.5, "00 00 c0 3f")],
 )  # fmt: skip
-def test_every_type_stands_in_the_image_as_long_as_it_is_also_behind_a_single_bit(kind, bits, value, image):
+def test_every_type_stands_in_the_image_as_long_as_it_is_also_behind_a_single_bit(
+    kind: DataTypeName, bits: int | None, value: float, image: str
+) -> None:
     codec = make_codec(layout((Pdo(0x1A00, (entry(kind, bits),)),)))
     assert codec.pack(value) == bytes.fromhex(image)
     assert codec.unpack(bytes.fromhex(image)) == (value,)
@@ -52,13 +54,13 @@ def test_every_type_stands_in_the_image_as_long_as_it_is_also_behind_a_single_bi
     assert shifted.unpack(shifted.pack(0, 1, value)) == (0, 1, value)
 
 
-def test_a_value_that_does_not_fit_is_never_sent_as_another_one():
+def test_a_value_that_does_not_fit_is_never_sent_as_another_one() -> None:
     codec = make_codec(layout((Pdo(0x1A00, (entry("int24"),)),)))
     with pytest.raises(struct.error, match=r"int24: 8388608 does not fit int24: -8388608 to 8388607"):
         codec.pack(1 << 23)
 
 
-def test_a_driver_offers_arrays_of_bytes_beside_its_numbers():
+def test_a_driver_offers_arrays_of_bytes_beside_its_numbers() -> None:
     outputs = Pdo(0x1600, (entry("bytes", 16), entry("bits", 8, index=0), entry("uint8")))
     inputs = Pdo(0x1A00, (entry("bytes", 24), entry("int24")))
     driver = Driver(SlaveConfig("a", DeviceDescription("d", "any", 1, 2, (outputs,), (inputs,))), 0.001)

@@ -24,13 +24,15 @@ class ForceSensor(Driver):
     REQUIRED_INPUTS = ("x", "y")
 
 
-def test_our_own_drivers_are_found_by_the_kind_of_their_device():
+def test_our_own_drivers_are_found_by_the_kind_of_their_device() -> None:
     box = SlaveConfig("io", DeviceDescription("a box", "io", 1, 2, (Pdo(0x1600, OUTPUTS),), (Pdo(0x1A00, INPUTS),)))
     assert type(make_driver(slave(), 0.001)) is Cia402Drive
     assert type(make_driver(box, 0.001)) is IoBox
 
 
-def test_a_driver_of_another_package_is_found_and_offers_its_channels_in_si_units(monkeypatch):
+def test_a_driver_of_another_package_is_found_and_offers_its_channels_in_si_units(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     points = EntryPoints([EntryPoint("force", "tests.devices.test_driver:ForceSensor", "rtcp.devices")])
     monkeypatch.setattr(find, "installed", lambda group: points.select(group=group))
     sensor = make_driver(SENSOR, 0.001)
@@ -40,7 +42,7 @@ def test_a_driver_of_another_package_is_found_and_offers_its_channels_in_si_unit
     assert sensor.encode() == b"\x07\x00"
 
 
-def test_what_is_set_is_bounded_by_the_channel_and_what_is_no_number_is_safe():
+def test_what_is_set_is_bounded_by_the_channel_and_what_is_no_number_is_safe() -> None:
     outputs = (
         PdoEntry(0x7000, 1, "int16", "current", 0.5, max=10.0, safe=1.0),
         PdoEntry(0x7000, 2, "float32", "flow", 1e-3, min=-2.0),
@@ -56,7 +58,7 @@ def test_what_is_set_is_bounded_by_the_channel_and_what_is_no_number_is_safe():
         assert sent.unpack(driver.encode()) == pytest.approx(counts)
 
 
-def test_a_kind_without_a_driver_is_refused_with_the_kinds_that_are_installed():
+def test_a_kind_without_a_driver_is_refused_with_the_kinds_that_are_installed() -> None:
     wanted = (
         r"a force sensor: no driver is installed for kind force .* analog, cia402, coupler, encoder, generic, io, joint"
     )
@@ -64,7 +66,7 @@ def test_a_kind_without_a_driver_is_refused_with_the_kinds_that_are_installed():
         make_driver(SENSOR, 0.001)
 
 
-def test_a_driver_refuses_a_device_that_lacks_a_channel_it_needs():
+def test_a_driver_refuses_a_device_that_lacks_a_channel_it_needs() -> None:
     device = replace(SENSOR.device, tpdo=())
     with pytest.raises(DeviceError, match="`tpdo` maps no x, y; kind force needs x, y, found are none"):
         ForceSensor(replace(SENSOR, device=device), 0.001)

@@ -219,8 +219,8 @@ def test_no_speed_is_above_the_limit_whatever_is_asked(
         drive.advance(goal)
         drive.mode = mode
         drive.target_position, drive.target_velocity = position, speed
-        target, found, _ = sent(drive)
-        assert abs(found) <= LIMIT
+        target, velocity, _ = sent(drive)
+        assert abs(velocity) <= LIMIT
         assert math.isfinite(target)
 
 

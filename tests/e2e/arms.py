@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -24,8 +25,9 @@ def replace_drives(folder: Path, name: str) -> None:
     axes = len(described.axes)
     arm, segment = (yaml.safe_load((folder / file).read_text()) for file in ("assistive_arm.yaml", "segment.yaml"))
     # A described drive has no 0x10F1: its limit of missed SYNC0 is an option.
-    drives = [{"esi": "drive.xml", "behaviour": "cia402", "options": {**own, "sync_error_limit": 0}}
-              for _ in range(6 // axes)]  # fmt: skip
+    drives: list[dict[str, Any]] = [
+        {"esi": "drive.xml", "behaviour": "cia402", "options": {**own, "sync_error_limit": 0}} for _ in range(6 // axes)
+    ]
     # Its inertia at the last joint is not that of the smallest Cubemars: the gains of the joint before it suit.
     arm["joints"][5] |= {key: value for key, value in arm["joints"][4].items() if key.startswith("cst_")}
     for i, joint in enumerate(arm["joints"]):

@@ -30,22 +30,22 @@ from tests.e2e.arms import replace_drives, slaves_of
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
 PERIOD_US = 2000
-"""Cycle of a platform under test: a shared host does not hold a shorter one beside what is tested."""
+"""Cycle of a platform under test, us: the shortest that a shared host keeps beside the tests."""
 
 
 OTHER_ARM = os.environ.get("RTCP_TEST_ARM", "")
 """Arm of `tests.drive_esi.ARMS` that the tests run with in place of the shipped one."""
 SLAVES = slaves_of(OTHER_ARM) if OTHER_ARM else 7
 CUBEMARS = pytest.mark.other_arms()
-"""Of a test that reads process data or objects as the shipped arm's drives have them."""
+"""Mark of a test of process data or objects of the shipped arm's drives."""
 FULL_CIA402 = pytest.mark.other_arms("two-axis", "synapticon")
-"""Of a test for which MyActuator's drives lack modes or objects: they have CSP alone, and do not home."""
+"""Mark of a test for which MyActuator's drives lack modes or objects: they have CSP alone, and no homing."""
 SEVEN_SLAVES = pytest.mark.other_arms("myactuator", "synapticon")
-"""Of a test that names slaves which an arm of three drives has not got."""
+"""Mark of a test that names slaves which an arm of three drives lacks."""
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests that another arm is no subject of."""
+    """Deselect the tests that do not apply to another arm."""
     markers = [(item, item.get_closest_marker("other_arms")) for item in items]
     left_out = [item for item, marker in markers if OTHER_ARM and marker is not None and OTHER_ARM not in marker.args]
     config.hook.pytest_deselected(items=left_out)
@@ -53,7 +53,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 class Platform:
-    """One runtime directory and the commands that a user would type in it."""
+    """A platform in a runtime directory of its own, used by the commands of a user."""
 
     def __init__(self) -> None:
         # Short, and in memory: a control socket's path has 107 bytes at most.
@@ -127,10 +127,10 @@ class Platform:
                 begun.communicate()
 
     def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
-        """Ask over the control socket, as `rtcp` does, without the half second that its start takes."""
+        """Call a method over the control socket; faster than a start of `rtcp` by half a second."""
         with ControlClient("the tests", control_socket(self.directory)) as client:
-            found: dict[str, Any] = client.call(verb, arguments, timeout_s=60.0)
-            return found
+            answer: dict[str, Any] = client.call(verb, arguments, timeout_s=60.0)
+            return answer
 
     def status(self) -> dict[str, Any]:
         """Return what `rtcp status --json` prints."""
@@ -145,7 +145,7 @@ class Platform:
         return max((int(event["number"]) for event in self.call("events")["events"]), default=0)
 
     def restore(self) -> None:
-        """Start what a test has ended, undo its faults, and bring the arm to 0 in mode joint, csp, disabled."""
+        """Start the ended processes, clear the faults, and move the arm to 0; mode joint, csp, disabled."""
         self.end_commands()
         if not all(lives(pid) for pid in self.pids().values()):
             self.rtcp("stop", check=None)
@@ -156,9 +156,9 @@ class Platform:
             # After an emergency stop the slaves return to OP only after a reset.
             self.call("reset")
         found = self.until(
-            lambda found: (
-                all(slave["state"] == "OP" for slave in found["slaves"])
-                and found["state"] not in ("moving", "stopping")
+            lambda status: (
+                all(slave["state"] == "OP" for slave in status["slaves"])
+                and status["state"] not in ("moving", "stopping")
             ),
             "OP and rest",
         )
@@ -175,23 +175,24 @@ class Platform:
         """Ask for the status until `met`; the patience only keeps a broken platform from hanging the tests."""
         end = time.monotonic() + patience_s
         while True:
-            found = self.status()
-            if met(found):
-                return found
-            assert time.monotonic() < end, f"{what} did not come: {found}\n{self.logs()}"
+            status = self.status()
+            if met(status):
+                return status
+            assert time.monotonic() < end, f"{what} did not come: {status}\n{self.logs()}"
             time.sleep(0.05)
 
     def until_moving(self, far_rad: float = 0.05) -> dict[str, Any]:
-        """Wait until the first joint is on its way and that far from 0.
+        """Wait until the first joint moves and is more than `far_rad` from 0.
 
         The distance and not the speed: where a host takes cycles away the motion takes longer, and its speed is less.
         """
         return self.until(
-            lambda found: found["state"] == "moving" and abs(found["joints"]["actual_position"][0]) > far_rad, "motion"
+            lambda status: status["state"] == "moving" and abs(status["joints"]["actual_position"][0]) > far_rad,
+            "motion",
         )
 
     def wire(self, *arguments: str) -> str:
-        """Run the independent look at the wire, in the segment's namespace."""
+        """Run `tests.e2e.wire` in the segment's namespace."""
         segment = self.pids()["segment"]
         done = subprocess.run(
             [sys.executable, str(WIRE), str(segment), *arguments], text=True, capture_output=True, check=False
@@ -277,7 +278,7 @@ def running(shared: Platform) -> Platform:
 
 @pytest.fixture(scope="module")
 def shared(request: pytest.FixtureRequest) -> Iterator[Platform]:
-    """A started platform for the tests of a module that leave it as they found it; its cycle is `PERIOD_US` there."""
+    """A started platform for tests of a module that restore it; its cycle is `PERIOD_US`."""
     made = Platform()
     made.be_patient(2000, getattr(request.module, "PERIOD_US", PERIOD_US))
     made.rtcp("start", "--detach")

@@ -23,10 +23,10 @@ MAGIC = (
 )
 PACKAGES = "python3,python3-venv,python3-dev,g++,make,git,ca-certificates,iproute2"
 TESTS = ("tests/config", "tests/devices", "tests/ipc", "tests/kinematics", "tests/realtime", "tests/virtual")
-"""Those that decode bytes, compute, or depend on the machine."""
+"""Tests that decode bytes, compute, or depend on the machine."""
 NOT_EMULATED = (
     "tests/realtime/test_doctor.py::test_the_kernel_of_this_machine_answers_for_its_interfaces",
-    "tests/virtual/faults/test_ground_truth.py::test_a_real_segment_tells_of_a_load_that_falls_without_any_master",
+    "tests/virtual/faults/test_ground_truth.py::test_a_real_segment_reports_a_falling_load_without_any_master",
 )
 """qemu passes neither the request of ethtool on nor those that create interfaces."""
 
@@ -59,7 +59,7 @@ def debian(tmp_path: Path) -> Iterator[Path]:
             ["debootstrap", "--arch=arm64", "--variant=minbase", f"--include={PACKAGES}", "bookworm", str(root)],
             check=True,
         )
-    # How this machine reaches the package index is as good for the guest.
+    # The guest reaches the package index as this machine does.
     for file in (Path("/etc/resolv.conf"), Path("/etc/hosts"), Path("/etc/ssl/certs/ca-certificates.crt")):
         if file.exists():
             shutil.copy(file, root / file.relative_to("/"))

@@ -1,4 +1,4 @@
-"""The virtual IRB 120 behind its virtual controller: started by one command, moved from each way in."""
+"""The virtual IRB 120 behind its virtual controller: started by one command, moved by each interface."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def platform() -> Iterator[Platform]:
 
 
 def operate(platform: Platform, verb: str, **keys: object) -> object:
-    """Do something at the controller."""
+    """Send a command to the controller."""
     with RequestClient(irc5_control(platform.directory), server="virtual IRC5") as operator:
         return operator.ask({"do": verb, **keys})
 
 
 def flange_joints(platform: Platform) -> list[float]:
-    """Return where the controller has its joints, degrees."""
+    """Return the controller's joint positions, degrees."""
     status = operate(platform, "status")
     assert isinstance(status, dict)
     joints: list[float] = status["units"]["ROB_1"]["position_deg"]
@@ -50,7 +50,7 @@ def flange_joints(platform: Platform) -> list[float]:
 
 
 def rest(platform: Platform) -> list[float]:
-    """Wait until the joints stand; return where, degrees."""
+    """Wait until the joints rest; return their positions, degrees."""
     here = flange_joints(platform)
     while True:
         time.sleep(0.2)
@@ -103,9 +103,9 @@ def test_it_is_moved_from_ros(platform: Platform, wire: str) -> None:
 def test_an_emergency_stop_at_the_controller_is_a_fault_and_the_way_back_is_the_operators(platform: Platform) -> None:
     platform.call("enable")
     move = platform.background("move", "1.5", "0.2", "0.1", "0.2", "0.6", "0.3")
-    platform.until(lambda shown: shown["state"] == "moving", "the motion")
+    platform.until(lambda status: status["state"] == "moving", "the motion")
     operate(platform, "stop", circuit="emergency")
-    platform.until(lambda shown: shown["state"] == "fault", "the fault")
+    platform.until(lambda status: status["state"] == "fault", "the fault")
     _, says = move.communicate()
     assert "the drive left Operation Enabled by itself (switch on disabled)" in says
     here = rest(platform)
@@ -115,7 +115,7 @@ def test_an_emergency_stop_at_the_controller_is_a_fault_and_the_way_back_is_the_
     assert (refused.value.reason, refused.value.fields["missing"]) == ("drive_not_ready", "motors")
     operate(platform, "release", circuit="emergency")
     operate(platform, "motors_on")
-    platform.until(lambda shown: set(shown["drive_states"]) == {"switched on"}, "EGM again")
+    platform.until(lambda status: set(status["drive_states"]) == {"switched on"}, "EGM again")
     assert rest(platform) == pytest.approx(here, abs=0.01)
     platform.call("enable")
     platform.call("move_joints", q=HOME)
@@ -124,15 +124,15 @@ def test_an_emergency_stop_at_the_controller_is_a_fault_and_the_way_back_is_the_
 def test_a_controller_that_falls_silent_is_a_fault_and_nothing_moves_when_it_is_back(platform: Platform) -> None:
     platform.call("enable")
     platform.background("move", "1.5", "0.2", "0.1", "0.2", "0.6", "0.3")
-    platform.until(lambda shown: shown["state"] == "moving", "the motion")
+    platform.until(lambda status: status["state"] == "moving", "the motion")
     operate(platform, "fault", fault="silent")
-    shown = platform.until(lambda shown: shown["state"] == "fault", "the fault")
+    shown = platform.until(lambda status: status["state"] == "fault", "the fault")
     # Which one is found first depends on the host.
     assert "process data lost" in shown["message"] or "left Operation Enabled" in shown["message"]
     platform.until(lambda _: "41822" in str(operate(platform, "status")), "the controller's own stop")
     here = rest(platform)
     operate(platform, "clear")
-    platform.until(lambda shown: shown["wkc"]["actual"] == 1, "messages")
+    platform.until(lambda status: status["wkc"]["actual"] == 1, "messages")
     assert rest(platform) == pytest.approx(here, abs=0.01)
     platform.call("reset")
     platform.call("enable")
@@ -142,7 +142,7 @@ def test_a_controller_that_falls_silent_is_a_fault_and_nothing_moves_when_it_is_
 def test_a_loop_that_is_killed_in_motion_leaves_the_arm_to_the_controllers_time_out(platform: Platform) -> None:
     platform.call("enable")
     platform.background("move", "1.5", "0.2", "0.1", "0.2", "0.6", "0.3")
-    platform.until(lambda shown: shown["joints"]["actual_velocity"][0] > 0.2, "the motion")
+    platform.until(lambda status: status["joints"]["actual_velocity"][0] > 0.2, "the motion")
     os.kill(platform.pids()["loop"], signal.SIGKILL)
     stood = rest(platform)
     # 0.2 s at 1 rad/s, then the controller's ramp of 0.5 s: it comes to rest before the end of the motion.

@@ -34,7 +34,7 @@ def platform() -> Iterator[Platform]:
 
 @pytest.fixture
 def moving(platform: Platform) -> Iterator[Platform]:
-    """The platform with the arm on its way, slowly; afterwards everything is as before."""
+    """The platform with the arm in slow motion; restored afterwards."""
     platform.call("enable")
     platform.call("move_joints", q=HOME)
     platform.background("move", "--speed", f"{SLOW_RAD_S}", "1.5", "0", "0", "0", "0.5", "0")
@@ -60,7 +60,7 @@ def can_be_commanded(shown: dict[str, Any]) -> bool:
 
 
 def operate(platform: Platform, verb: str, **keys: object) -> object:
-    """Do something at the controller."""
+    """Send a command to the controller."""
     with RequestClient(irc5_control(platform.directory), server="virtual IRC5") as operator:
         return operator.ask({"do": verb, **keys})
 
@@ -74,7 +74,7 @@ def units(platform: Platform) -> dict[str, list[float]]:
 
 
 def rest(platform: Platform) -> float:
-    """Wait until the first joint stands; return where, degrees."""
+    """Wait until the first joint rests; return its position, degrees."""
     while any(units(platform)["velocity_deg_s"]):
         time.sleep(0.1)
     return units(platform)["position_deg"][0]
@@ -108,10 +108,10 @@ def test_what_the_operator_stops_is_said_and_starts_by_the_operator_alone(
     moving: Platform, verb: str, keys: dict[str, str], state: str, missing: str
 ) -> None:
     operate(moving, verb, **keys)
-    found = moving.until(lambda shown: shown["state"] == "fault", "the fault")
-    assert "joint_1: the drive left Operation Enabled by itself" in found["message"]
+    status = moving.until(lambda status: status["state"] == "fault", "the fault")
+    assert "joint_1: the drive left Operation Enabled by itself" in status["message"]
     here = rest(moving)
-    found = moving.until(lambda shown: set(shown["drive_states"]) == {state}, state)
+    status = moving.until(lambda status: set(status["drive_states"]) == {state}, state)
     moving.call("reset")
     with pytest.raises(RtcpError) as refused:
         moving.call("enable")
@@ -128,8 +128,8 @@ def test_what_the_operator_stops_is_said_and_starts_by_the_operator_alone(
 @pytest.mark.parametrize("fault", ["socket_cut", "silent_motion", "silent_state"])
 def test_a_lost_connection_is_a_fault_and_nothing_moves_when_it_is_back(moving: Platform, fault: str) -> None:
     operate(moving, "fault", fault=fault)
-    found = moving.until(lambda shown: shown["state"] == "fault", "the fault")
-    assert ("process data lost" if fault == "silent_state" else "not ready to switch on") in found["message"]
+    status = moving.until(lambda status: status["state"] == "fault", "the fault")
+    assert ("process data lost" if fault == "silent_state" else "not ready to switch on") in status["message"]
     here = rest(moving)
     operate(moving, "clear")
     moving.until(can_be_commanded, "a controller that can be commanded")

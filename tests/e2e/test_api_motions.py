@@ -1,11 +1,11 @@
-"""What a ROS node, or any program that streams, asks of the API: on a real socket between real processes."""
+"""The API as a ROS node or any streaming program uses it: on a real socket between real processes."""
 
 from __future__ import annotations
 
 import asyncio
 import math
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
@@ -63,7 +63,7 @@ def test_a_motion_replaces_another_without_a_stop_and_each_ends_with_its_own_out
     robot.close()
     feed = rtcp.Feed(shared.directory)
 
-    async def moves(arm: AsyncRobot) -> list[Any]:
+    async def moves(arm: AsyncRobot) -> Sequence[Any]:
         first = asyncio.create_task(arm.move_joints(at(0.6)))
         await asyncio.sleep(0.7)
         second = asyncio.create_task(arm.move_joints(at(-0.2), replace=True))
@@ -104,7 +104,7 @@ def test_a_program_knows_the_tool_and_waits_for_an_input_and_sets_an_output(shar
     feed.close()
     assert robot.pose == pytest.approx(raised, abs=2e-3)
     assert robot.ik(robot.fk(arrival.positions)) == pytest.approx(arrival.positions, abs=1e-6)
-    # The way that the record's velocity of the tool adds up to is that of its pose.
+    # The integral of the record's tool velocity is the motion of its pose.
     speeds, steps = records["tool_vz"][1:], np.diff(records["time_ns"]) * 1e-9
     assert float(speeds @ steps) == pytest.approx(records["tool_z"][-1] - records["tool_z"][0], abs=3e-3)
     assert records["tool_z"][-1] - records["tool_z"][0] == pytest.approx(0.03, abs=2e-3)
@@ -132,15 +132,15 @@ def test_a_program_knows_the_tool_and_waits_for_an_input_and_sets_an_output(shar
 
 @pytest.mark.parametrize("rate_hz", [100, 1000, 2000])
 def test_a_stream_of_setpoints_loses_none_and_is_followed(shared: Platform, robot: Robot, rate_hz: int) -> None:
-    feed, turn = rtcp.Feed(shared.directory), 2 * math.pi * 0.4
+    feed, circumference = rtcp.Feed(shared.directory), 2 * math.pi * 0.4
     with robot.open_stream() as stream:
         began = time.monotonic()
         for number in range(2 * rate_hz):
             t = number / rate_hz
             while time.monotonic() < began + t:
                 time.sleep(0)
-            velocity = [0.1 * turn * math.sin(turn * t), *[0.0] * 5]
-            stream.send(at(0.1 * (1 - math.cos(turn * t))), velocity, t=t)
+            velocity = [0.1 * circumference * math.sin(circumference * t), *[0.0] * 5]
+            stream.send(at(0.1 * (1 - math.cos(circumference * t))), velocity, t=t)
         feed.ended(0.1)
         assert stream.taken == stream.sent == 2 * rate_hz
     assert largest_step(feed) <= 1.01
@@ -303,7 +303,7 @@ def test_an_open_trajectory_whose_finish_is_cancelled_stops_and_gives_its_lease_
         await asyncio.gather(finish, return_exceptions=True)
         while (await arm.status()).state is not State.HOLDING:
             await asyncio.sleep(0.02)
-        robot.move_joints(HOME)  # of another connection, while this one stands
+        robot.move_joints(HOME)  # of another connection, while this one is open
 
     run(shared, begin_and_cancel)
 
@@ -324,7 +324,8 @@ def test_a_trajectory_outside_its_tolerances_brakes_and_says_by_how_much(robot: 
 
 def test_every_record_wakes_whoever_waits_for_it(shared: Platform, robot: Robot) -> None:
     robot.close()
-    feed, numbers = rtcp.Feed(shared.directory), []
+    feed = rtcp.Feed(shared.directory)
+    numbers: list[int] = []
     while len(numbers) < 200:
         assert feed.wait(5.0)
         records, missing = feed.records()
@@ -337,7 +338,7 @@ def test_every_record_wakes_whoever_waits_for_it(shared: Platform, robot: Robot)
 
 def test_limits_and_robot_status_are_typed(robot: Robot) -> None:
     status, limits = robot.status(), robot.joint_limits()
-    assert [one.name for one in limits] == list(status.joint_names)
+    assert [limit.name for limit in limits] == list(status.joint_names)
     assert limits[0].min < limits[0].max
     assert (status.robot.mode, status.robot.motion_possible, status.robot.in_error) == ("auto", True, False)
     robot.close()

@@ -51,7 +51,7 @@ def test_the_cycle_locks_onto_drifting_clocks_within_two_seconds_of_cycles(share
     assert int(records["cycle"][0]) < 100
     assert locked.any()
     assert int(records["cycle"][np.argmax(locked)]) * PERIOD_US * 1e-6 < 2.0
-    # The slaves were asked to go to OP only then.
+    # OP was requested only then.
     assert not ((records["flags"] & FLAG_ALL_OP) != 0)[: np.argmax(locked)].any()
 
 
@@ -70,6 +70,7 @@ def test_a_stop_leaves_slaves_in_init_and_nothing_behind(running: Platform) -> N
     assert "no platform is running" in running.rtcp("status", check=4).stderr
 
 
+@CUBEMARS  # Other drives saturate while they catch up, and the supervision of torque ends the motion.
 def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_grid(running: Platform) -> None:
     running.call("enable")
     moving = running.background("move", "1.0", "0", "0", "0", "0", "0", "--speed", "0.3")
@@ -82,14 +83,14 @@ def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_g
     assert lost == 0
     without = records[records["wkc"] < 0]
     assert len(without) >= 20
-    # The grid: every wake-up was planned a whole number of periods after the one before.
+    # Every wake-up was planned a whole number of periods after the previous one.
     planned = (records["time_ns"] - records["wakeup_ns"]).astype(np.int64)
     periods = np.diff(planned) / observer.period_ns
     assert np.abs(periods - np.round(periods)).max() < 0.02
     # A lost frame costs its cycle only: frameless cycles follow each other at the cycle's pace.
     waits = np.diff(without["time_ns"].astype(np.int64)) / observer.period_ns
     assert np.median(waits) < 1.5
-    # Less than is allowed: the motion goes on, and no target jumped.
+    # Shorter than allowed: the motion continues, and no target jumped.
     assert moving.wait() == 0
     steps = np.abs(np.diff(records["sent_position"], axis=0))
     assert steps.max() <= 0.5 * observer.period_ns * 1e-9 * 1.001
@@ -108,14 +109,14 @@ def test_a_segment_that_stands_still_for_longer_than_allowed_is_a_fault_and_can_
     assert moving.returncode == 5
     assert LOST & set(running.events(since))
     records, _ = observer.since(first)
-    # No target of an enabled drive moved on while nobody listened, none jumped afterwards.
+    # No target of an enabled drive moved while no slave answered, and none jumped afterwards.
     _, steps = target_steps(records)
     assert steps.max() <= 0.5 * observer.period_ns * 1e-9 * 1.001
     observer.close()
     status = running.status()
     assert status["state"] == "fault"
     assert f"; the fault: {status['message']}" in running.rtcp("enable", check=3).stderr
-    running.until(lambda found: all(slave["state"] == "OP" for slave in found["slaves"]), "OP")
+    running.until(lambda status: all(slave["state"] == "OP" for slave in status["slaves"]), "OP")
     running.call("reset")
     assert running.al_states() == [OP] * SLAVES
     assert running.status()["state"] == "ready"
@@ -136,8 +137,8 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform
         segment.fault({"fault": "al_refuse", "slave": 1, "state": "PRE-OP"})
         running.wire("init", "0")
         assert moving.wait() == 5
-        # Not the first look alone: the cycle that it shows may be one whose frame a shared host held up.
-        status = running.until(lambda found: 0 < found["wkc"]["actual"] < 3 * SLAVES, "an answer without the IO box")
+        # Not the first status: the frame of its cycle may have been delayed by a shared host.
+        status = running.until(lambda status: 0 < status["wkc"]["actual"] < 3 * SLAVES, "an answer without the IO box")
         assert status["state"] == "fault"
 
         def drives() -> list[dict[str, Any]]:
@@ -147,10 +148,10 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform
         before = drives()
         time.sleep(0.5)
         after = drives()
-        for one, other in zip(before, after, strict=True):
-            assert one["position_rad"] == pytest.approx(other["position_rad"], abs=1e-3)
+        for drive_before, same_drive in zip(before, after, strict=True):
+            assert drive_before["position_rad"] == pytest.approx(same_drive["position_rad"], abs=1e-3)
         assert before[0]["position_rad"] < 1.5
-        # With the box the button has gone: after a second it counts as pressed.
+        # Without the box the button counts as pressed after a second.
         end = time.monotonic() + 20
         while "estop_unobservable" not in running.events(since):
             assert time.monotonic() < end
@@ -173,8 +174,11 @@ def test_an_object_is_not_written_while_drives_have_torque(running: Platform) ->
     done = running.rtcp("sdo", "write", "2", "0x6065:0", "9999", "--type", "uint32", check=3)
     assert "ready" in done.stderr
     running.call("disable")
-    running.rtcp("sdo", "write", "2", "0x6065:0", "2001", "--type", "uint32")
-    assert running.rtcp("sdo", "read", "2", "0x6065:0", "--type", "uint32").stdout.startswith("2001")
+    before = running.rtcp("sdo", "read", "2", "0x6065:0", "--type", "uint32").stdout.split()[0]
+    # A little longer, so that the next tests have a window of this size.
+    written = str(int(before) + 1)
+    running.rtcp("sdo", "write", "2", "0x6065:0", written, "--type", "uint32")
+    assert running.rtcp("sdo", "read", "2", "0x6065:0", "--type", "uint32").stdout.split()[0] == written
 
 
 def test_a_gateway_that_stands_still_ends_the_motion_by_its_lease(running: Platform) -> None:
@@ -206,7 +210,7 @@ def test_a_mover_that_is_suspended_loses_its_lease_and_the_arm_stops(running: Pl
     os.kill(moving.pid, signal.SIGSTOP)
     try:
         # Before it would have arrived, 30 s later.
-        running.until(lambda found: found["state"] == "holding", "rest", 15.0)
+        running.until(lambda status: status["state"] == "holding", "rest", 15.0)
         assert running.status()["lease"]["holder"] in ("", None)
         assert "lease_expired" in running.events(since)
         running.call("move_joints", q=[0.0] * 6)
@@ -278,7 +282,7 @@ def test_a_killed_segment_is_a_fault_that_a_new_start_mends(running: Platform) -
     running.call("enable")
     pids = running.pids()
     kill(pids["segment"])
-    running.until(lambda found: found["state"] == "fault", "the fault")
+    running.until(lambda status: status["state"] == "fault", "the fault")
     assert LOST & set(running.events())
     assert "no frame comes back" in running.rtcp("stop", check=5).stderr
     assert not any(lives(pid) for pid in pids.values())

@@ -60,7 +60,7 @@ def near(cell: Cell) -> dict[str, list[float]]:
 
 
 def moving(cell: Cell, targets: dict[str, list[float]], speed: float) -> tuple[threading.Thread, list[RtcpError]]:
-    """Begin a motion in step; return its thread when both arms move, and where its error will be."""
+    """Begin a motion in step; return its thread when both arms move, and the list for its error."""
     errors: list[RtcpError] = []
 
     def run() -> None:
@@ -80,8 +80,8 @@ def moving(cell: Cell, targets: dict[str, list[float]], speed: float) -> tuple[t
 def test_one_command_for_all_arms(irbs: RunningCell, cell: Cell) -> None:
     cell.disable()
     run = irbs.platform.rtcp
-    found = json.loads(run("cell", "status", "--json").stdout)
-    assert {name: one["state"] for name, one in found.items()} == {"left": "ready", "right": "ready"}
+    states = json.loads(run("cell", "status", "--json").stdout)
+    assert {name: arm["state"] for name, arm in states.items()} == {"left": "ready", "right": "ready"}
     run("cell", "enable")
     moved = run("cell", "move", "left=0.2,0.1,0,0,0.5,0", "right=-0.2,0.1,0,0,0.5,0", "--speed", "0.5")
     assert "left: arrived" in moved.stdout
@@ -188,7 +188,7 @@ def test_a_loop_that_hangs_stops_the_other(irbs: RunningCell, cell: Cell) -> Non
     finally:
         os.kill(loop, signal.SIGCONT)
     thread.join()
-    # What the loop finds when it runs again is a fault, or that it is behind.
+    # The loop reports a fault when it runs again, or that it is behind.
     assert len(errors) == 1
     restore(cell)
 
@@ -202,9 +202,9 @@ def test_a_sine_of_twelve_joints_by_a_stream(irbs: RunningCell, cell: Cell) -> N
             stream.send({name: [q + angle for q in ABB_HOME] for name in cell.arms})
             time.sleep(1.0 / 30.0)
         assert stream.is_open
-    found = records.read()
-    ways = {name: rows["commanded_position"][:, 0] for name, rows in found.items()}
-    times = {name: rows["time_ns"] for name, rows in found.items()}
+    recorded = records.read()
+    ways = {name: rows["commanded_position"][:, 0] for name, rows in recorded.items()}
+    times = {name: rows["time_ns"] for name, rows in recorded.items()}
     other = np.interp(times["left"], times["right"], ways["right"])
     assert np.ptp(ways["left"]) > 0.15
     assert np.abs(ways["left"] - other).max() < 0.01

@@ -49,7 +49,7 @@ def test_twelve_joints_are_one_group(irbs: RunningCell) -> None:
         assert call(session, "robot_enable", "std_srvs/srv/Trigger").success
         until(lambda: received and sorted(joints()) == sorted(NAMES), "the joints of both arms")
         begin = [joints()[name] for name in NAMES]
-        # The cell is there from the first test to the last: who comes again stands where the test ends.
+        # The cell runs from the first test to the last; the arms start where the test before ended.
         there = HOME if begin == pytest.approx(THERE, abs=0.1) else THERE
         records = Records(irbs)
         points = [point(0.0, begin), point(3.0, there)]
@@ -68,9 +68,9 @@ def test_twelve_joints_are_one_group(irbs: RunningCell) -> None:
             moved = make(POINT, positions=[q + 0.08 * sin(3.0 * t) * min(t, 1.0) for q in there])
             publisher.put(encode(POINT, moved))
             time.sleep(1.0 / 30.0)
-        found = records.read()
-        ways = {name: rows["commanded_position"][:, 0] for name, rows in found.items()}
-        assert min(float(np.ptp(way)) for way in ways.values()) > 0.1
+        recorded = records.read()
+        ways = {name: rows["commanded_position"][:, 0] for name, rows in recorded.items()}
+        assert min(float(np.ptp(path)) for path in ways.values()) > 0.1
         assert call(session, "stop_motion", "industrial_msgs/srv/StopMotion").code.val == 1
         assert call(session, "robot_disable", "std_srvs/srv/Trigger").success
         subscriber.undeclare()
@@ -102,7 +102,7 @@ def test_the_urdf_has_all_arms_on_one_world() -> None:
     robot = ET.fromstring(group_urdf(cell))
     moved = [joint.get("name") for joint in robot.iter("joint") if joint.get("type") == "revolute"]
     assert moved == NAMES
-    parents = {joint.find("child").get("link"): joint.find("parent").get("link") for joint in robot.iter("joint")}  # type: ignore[union-attr]
+    parents = {joint.find("child").get("link"): joint.find("parent").get("link") for joint in robot.iter("joint")}
     links = {link.get("name") for link in robot.iter("link")}
     assert set(parents) == links - {"world"}
     assert parents["left_base_link"] == "world"

@@ -18,7 +18,7 @@ def test_a_reference_clock_that_lost_its_station_address_stops_the_arm_and_is_fo
     moving = running.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.1")
     running.until_moving()
     since = running.last_event()
-    # What the FRMW of the cycle addresses is there no more; the process data is addressed by FMMUs and goes on.
+    # The FRMW of the cycle reaches no slave any more; the process data is addressed by FMMUs and continues.
     running.wire("station", "0", "0")
     moving.communicate()
     assert moving.returncode == 5
@@ -30,6 +30,6 @@ def test_a_reference_clock_that_lost_its_station_address_stops_the_arm_and_is_fo
         running.call("reset")
     assert failed.value.reason == "reset_without_frames"
     running.wire("station", "0", str(station_of(1)))
-    running.until(lambda found: found["dc"]["locked"], "the clock")
+    running.until(lambda status: status["dc"]["locked"], "the clock")
     running.call("reset")
     running.call("enable")

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -26,21 +25,21 @@ INIT, SAFE_OP_ERROR, SYNC_MANAGER_WATCHDOG = 0x01, 0x14, 0x1B
 QUICK_STOP = 0x0002
 """Controlword."""
 STATE_BITS, OPERATION_ENABLED, QUICK_STOP_ACTIVE, SWITCH_ON_DISABLED = 0x6F, 0x27, 0x07, 0x40
-"""Of the statusword."""
+"""Masked statuswords."""
 STILL_RAD_S = 0.002
 MOVE = ("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
 
 
 @pytest.fixture
-def platform(platform: Platform) -> Iterator[Platform]:
-    """One whose recordings are its own."""
+def platform(platform: Platform) -> Platform:
+    """A platform with recordings of its own."""
     platform.environment["RTCP_STATE_DIR"] = str(platform.directory / "state")
     return platform
 
 
 def recorded(platform: Platform) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(platform.rtcp("faults", "--json").stdout)["faults"]
-    return found
+    recordings: list[dict[str, Any]] = json.loads(platform.rtcp("faults", "--json").stdout)["faults"]
+    return recordings
 
 
 def until_recorded(platform: Platform, what: str) -> dict[str, Any]:
@@ -117,14 +116,14 @@ def test_a_loop_that_hangs_is_stopped_by_the_watchdog_and_moves_again_after_rese
         assert time.monotonic() < end
     assert json.loads(platform.wire("codes"))[1:] == [SYNC_MANAGER_WATCHDOG] * (SLAVES - 1)
     said = f"the loop (process {loop}) has published nothing for"
-    status = platform.until(lambda found: said in found["message"], "the silence")
+    status = platform.until(lambda status: said in status["message"], "the silence")
     assert status["state"] == "fault"
     fault = until_recorded(platform, said)
     assert fault["before"] == "moving"
     where = [drive["position_rad"] for drive in drives(platform)]
     os.kill(loop, signal.SIGCONT)
     assert moving.wait() != 0
-    platform.until(lambda found: found["state"] == "fault" and said not in found["message"], "the loop's own fault")
+    platform.until(lambda status: status["state"] == "fault" and said not in status["message"], "the loop's own fault")
     time.sleep(0.3)
     assert [drive["position_rad"] for drive in drives(platform)] == pytest.approx(where, abs=2e-3)
     assert max(drive["moved_ns"] for drive in drives(platform)) == last_ns
@@ -149,7 +148,7 @@ def test_a_command_gives_a_detached_loop_its_gateway_back_which_records_what_hap
     os.kill(before["segment"], signal.SIGSTOP)
     time.sleep(0.5)
     os.kill(before["segment"], signal.SIGCONT)
-    # Whatever that shell has for a state directory: the recording goes where the others are.
+    # The state directory of that shell does not matter: the recording is stored beside the others.
     platform.environment["RTCP_STATE_DIR"] = str(platform.directory / "of another shell")
     done = platform.rtcp("status", "--json")
     platform.environment["RTCP_STATE_DIR"] = str(state)
@@ -252,8 +251,8 @@ def test_a_defect_in_the_cycle_ramps_the_joints_down_and_leaves_slaves_in_init(p
         assert platform.rtcp("move", "1.5", "0", "0", "0", "0", "0", check=5).stderr
         gone(loop)
     assert "a defect for the test" in platform.logs()
-    told = [when for when, drives in outputs(path) if {drive.controlword for drive in drives} == {QUICK_STOP}]
-    assert told[-1] - told[0] > 75e6
+    quick_stops = [when for when, drives in outputs(path) if {drive.controlword for drive in drives} == {QUICK_STOP}]
+    assert quick_stops[-1] - quick_stops[0] > 75e6
     shown = list(inputs(path))
     turning = [drive.statusword & STATE_BITS for _, drives in shown for drive in drives if abs(drive.velocity) > 100]
     assert set(turning) == {OPERATION_ENABLED, QUICK_STOP_ACTIVE}

@@ -1,4 +1,4 @@
-"""Hand guiding on a whole platform: a hand pushes the virtual arm, and what it taught is replayed, smoothed."""
+"""Hand guiding on a whole platform: a hand pushes the virtual arm, and the motion is replayed, smoothed."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def pushed(platform: Platform, y: float) -> None:
     before = position(platform)
     platform.rtcp("segment", "push", "0", str(y), "0", "--seconds", "1")
     platform.until(
-        lambda found: (
-            abs(found["joints"]["actual_position"][0] - before) > 0.05
-            and max(map(abs, found["joints"]["actual_velocity"])) < 1e-2
+        lambda status: (
+            abs(status["joints"]["actual_position"][0] - before) > 0.05
+            and max(map(abs, status["joints"]["actual_velocity"])) < 1e-2
         ),
         "a motion and rest",
     )
@@ -48,7 +48,7 @@ def test_a_motion_guided_by_hand_is_recorded_and_replayed_smoothed(bent: Platfor
     out.unlink(missing_ok=True)
     bent.rtcp("record", "start", "--out", str(out))
     guiding = bent.background("guide")
-    bent.until(lambda found: found["state"] == "moving", "guiding")
+    bent.until(lambda status: status["state"] == "moving", "guiding")
     assert bent.status()["control_mode"] == "torque"
     pushed(bent, -20.0)
     pushed(bent, 20.0)
@@ -75,15 +75,15 @@ def test_a_motion_guided_by_hand_is_recorded_and_replayed_smoothed(bent: Platfor
 
 def test_a_guiding_command_that_is_interrupted_leaves_the_arm_holding(bent: Platform) -> None:
     guiding = bent.background("guide")
-    bent.until(lambda found: found["state"] == "moving", "guiding")
+    bent.until(lambda status: status["state"] == "moving", "guiding")
     pushed(bent, 20.0)
     bent.rtcp("segment", "push", "0", "20", "0", "--seconds", "60")
     guiding.send_signal(signal.SIGINT)
     _, said = guiding.communicate()
     assert (guiding.returncode, "controlled stop" in said) == (130, True)
-    bent.until(lambda found: found["state"] == "holding", "rest")
+    bent.until(lambda status: status["state"] == "holding", "rest")
     before = position(bent)
     time.sleep(1.0)
-    # The position loop of CST gives way by its stiffness, and its integral takes that back.
+    # The position loop of CST yields by its stiffness; its integral part corrects that.
     assert position(bent) == pytest.approx(before, abs=0.05)
     assert bent.status()["state"] == "holding"

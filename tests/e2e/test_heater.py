@@ -42,7 +42,7 @@ class Heater:
 
     def set_contacts(self, closed: int) -> None:
         with SegmentClient(segment_control(self.platform.directory)) as segment:
-            # Over the one before: to clear that first would put the key at Auto for an instant.
+            # Without a clear between them, which would put the key at Auto for an instant.
             segment.fault({"fault": "contacts", "slave": 1, "closed": closed})
         time.sleep(0.1)
 
@@ -85,7 +85,7 @@ def heater(started: Heater) -> Heater:
 
 
 def prepare(heater: Heater, robot: Robot) -> None:
-    """Arm and measure, and bring the profile to the loop."""
+    """Arm, measure, and send the profile to the loop."""
     robot.command("arm_heater")
     heater.until(lambda truth: truth["relay_closed"], "relay closed")
     time.sleep(0.1)
@@ -94,7 +94,7 @@ def prepare(heater: Heater, robot: Robot) -> None:
 
 
 def heating(heater: Heater, robot: Robot) -> tuple[threading.Thread, list[RtcpError]]:
-    """Begin to heat; return the command's thread when the rod gets hot, and where its error will be."""
+    """Begin to heat; return the command's thread when the rod gets hot, and the list for its error."""
     prepare(heater, robot)
     errors: list[RtcpError] = []
 

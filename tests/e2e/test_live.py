@@ -65,8 +65,8 @@ def test_the_view_ends_with_the_loop(running: Platform) -> None:
 
 
 def test_what_cannot_be_served_ends_in_one_message(running: Platform) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = str(server.getsockname()[1])
         said = running.rtcp("live", "--port", port, check=3).stderr
     assert said.startswith(f"rtcp: 127.0.0.1 port {port} cannot be listened at: Address already in use")
     assert "nowhere.invalid port 8765 cannot be" in running.rtcp("live", "--host", "nowhere.invalid", check=3).stderr

@@ -30,11 +30,11 @@ NUMBERS = [f"{q:g}" for q in BENT]
 
 @pytest.fixture
 def bent(enabled: Platform) -> Iterator[Platform]:
-    """The shared platform, enabled, the arm bent away from all limits, taking moves; as it was afterwards."""
+    """The shared platform, enabled, with the arm bent away from all limits; restored afterwards."""
     enabled.call("mode", name="joint")
     enabled.call("move_joints", q=BENT)
     yield enabled
-    enabled.until(lambda found: found["state"] in ("holding", "stopped_by_limit"), "rest")
+    enabled.until(lambda status: status["state"] in ("holding", "stopped_by_limit"), "rest")
     enabled.call("reset")
     enabled.call("mode", name="joint")
 
@@ -46,14 +46,14 @@ def client(bent: Platform) -> Iterator[ControlClient]:
 
 
 def tool(status: dict[str, Any]) -> list[float]:
-    """Where the commanded joints have the tool, m."""
+    """Commanded position of the tool, m."""
     model = load(default_config()).arm
     assert model is not None
     return list(forward(model, status["joints"]["commanded_position"]).position)
 
 
-def far(one: list[float], other: list[float]) -> float:
-    return max(abs(a - b) for a, b in zip(one, other, strict=True))
+def far(first: list[float], second: list[float]) -> float:
+    return max(abs(a - b) for a, b in zip(first, second, strict=True))
 
 
 def test_a_pose_is_reached_on_a_line_and_by_the_joints(bent: Platform) -> None:
@@ -63,8 +63,8 @@ def test_a_pose_is_reached_on_a_line_and_by_the_joints(bent: Platform) -> None:
         pose = [f"{number:.5f}" for number in (x, y, z)]
         model = load(default_config()).arm
         assert model is not None
-        turn = [f"{number:.6f}" for number in forward(model, BENT).rpy]
-        done = bent.rtcp("move", "--pose", *pose, *turn, *options)
+        rpy = [f"{number:.6f}" for number in forward(model, BENT).rpy]
+        done = bent.rtcp("move", "--pose", *pose, *rpy, *options)
         assert "arrived, largest error" in done.stdout
         assert far(tool(bent.status()), [x, y, z]) < 1e-4
 
@@ -90,17 +90,17 @@ def test_ctrl_c_stops_a_line_on_its_way(bent: Platform) -> None:
     x, y, z = tool(bent.status())
     model = load(default_config()).arm
     assert model is not None
-    turn = [f"{number:.6f}" for number in forward(model, BENT).rpy]
+    rpy = [f"{number:.6f}" for number in forward(model, BENT).rpy]
     moving = bent.background(
-        "move", "--pose", f"{x:.5f}", f"{y + 0.3:.5f}", f"{z:.5f}", *turn, "--line", "--speed", "0.03"
+        "move", "--pose", f"{x:.5f}", f"{y + 0.3:.5f}", f"{z:.5f}", *rpy, "--line", "--speed", "0.03"
     )
-    bent.until(lambda found: tool(found)[1] > y + 0.03, "motion")
+    bent.until(lambda status: tool(status)[1] > y + 0.03, "motion")
     moving.send_signal(signal.SIGINT)
     _, trouble = moving.communicate(timeout=20)
     assert moving.returncode == 130
     assert "controlled stop" in trouble
-    found = bent.until(lambda found: found["state"] == "holding", "rest")
-    at = tool(found)
+    status = bent.until(lambda status: status["state"] == "holding", "rest")
+    at = tool(status)
     assert y + 0.03 < at[1] < y + 0.25
     # Braked along the line, not off it.
     assert far([at[0], at[2]], [x, z]) < 1e-4
@@ -111,7 +111,7 @@ def test_a_jog_moves_along_its_axis_and_comes_to_rest(bent: Platform) -> None:
     bent.rtcp("jog", "y", "0.05", "--seconds", "1")
     after = tool(bent.status())
     assert bent.status()["state"] == "holding"
-    # 0.05 m at most; how much less, the cycles decide that a shared host takes away from the second.
+    # At most 0.05 m; less by the cycles that a shared host lost in that second.
     assert 0.005 < after[1] - before[1] < 0.08
     assert far([after[0], after[2]], [before[0], before[2]]) < 1e-3
 
@@ -121,17 +121,17 @@ def test_a_jogger_that_is_killed_leaves_an_arm_at_rest(bent: Platform) -> None:
     bent.until_moving()
     jogging.kill()
     jogging.communicate()
-    found = bent.until(lambda found: found["state"] == "holding", "rest")
-    assert found["lease"]["holder"] in ("", None)
+    status = bent.until(lambda status: status["state"] == "holding", "rest")
+    assert status["lease"]["holder"] in ("", None)
     again = bent.status()["joints"]["commanded_position"]
-    assert again == found["joints"]["commanded_position"]
+    assert again == status["joints"]["commanded_position"]
 
 
 def test_a_jogger_that_was_suspended_does_not_move_the_arm_again(bent: Platform) -> None:
     jogging = bent.background("jog", "joint1", "0.2", "--seconds", "30")
     bent.until_moving()
     jogging.send_signal(signal.SIGSTOP)
-    rest = bent.until(lambda found: found["state"] == "holding", "rest")["joints"]["commanded_position"]
+    rest = bent.until(lambda status: status["state"] == "holding", "rest")["joints"]["commanded_position"]
     jogging.send_signal(signal.SIGCONT)
     _, trouble = jogging.communicate(timeout=20)
     assert jogging.returncode == 5
@@ -146,8 +146,8 @@ def test_ctrl_z_stops_a_move_on_its_way(bent: Platform) -> None:
     _, trouble = moving.communicate(timeout=20)
     assert moving.returncode == 148
     assert "ended, not suspended" in trouble
-    found = bent.until(lambda found: found["state"] == "holding", "rest")
-    assert found["joints"]["commanded_position"][0] < 0.6
+    status = bent.until(lambda status: status["state"] == "holding", "rest")
+    assert status["joints"]["commanded_position"][0] < 0.6
 
 
 def test_an_object_that_does_not_come_is_a_timeout_and_one_that_is_refused_a_refusal(bent: Platform) -> None:
@@ -175,8 +175,8 @@ def test_a_stream_is_followed_and_its_end_stops_the_arm(bent: Platform, client: 
         q[0] += 0.004
         client.call("stream_position", {"q": q, "stamp_s": time.monotonic()})
         time.sleep(0.02)
-    found = bent.until(lambda found: found["state"] == "holding", "rest")
-    assert abs(found["joints"]["commanded_position"][0] - q[0]) < 0.03
+    status = bent.until(lambda status: status["state"] == "holding", "rest")
+    assert abs(status["joints"]["commanded_position"][0] - q[0]) < 0.03
 
 
 @FULL_CIA402
@@ -189,9 +189,9 @@ def test_joint_speeds_move_in_mode_velocity_only(bent: Platform, client: Control
     for _ in range(20):
         client.call("move_at_velocity", {"velocity": [0.1, 0, 0, 0, 0, 0]})
         time.sleep(0.05)
-    found = bent.until(lambda found: found["state"] == "holding", "rest")
-    assert found["drive_mode"] == "csv"
-    assert 0.05 < found["joints"]["commanded_position"][0] - start < 0.25
+    status = bent.until(lambda status: status["state"] == "holding", "rest")
+    assert status["drive_mode"] == "csv"
+    assert 0.05 < status["joints"]["commanded_position"][0] - start < 0.25
 
 
 @FULL_CIA402
@@ -215,8 +215,14 @@ def test_the_joystick_moves_the_arm_and_silence_releases_it(bent: Platform, clie
     moved = client.call("status")
     assert moved["state"] == "moving"
     assert tool(moved)[0] < start[0] - 0.03
-    found = bent.until(lambda found: found["state"] == "holding", "rest after the last word")
-    assert found["devices"]["io"]["inputs"]["value"] & 0xFF == 63
+    status = bent.until(lambda status: status["state"] == "holding", "rest after the last word")
+    assert status["devices"]["io"]["inputs"]["value"] & 0xFF == 63
+
+
+def test_the_command_joystick_returns_when_the_arm_rests(bent: Platform) -> None:
+    bent.rtcp("mode", "joystick")
+    bent.rtcp("joystick", "forward", "--seconds", "0.5")
+    assert bent.call("mode", name="joint") == {"mode": "joint"}
 
 
 def test_an_emergency_stop_by_the_virtual_button_ends_a_move(bent: Platform) -> None:
@@ -226,8 +232,8 @@ def test_an_emergency_stop_by_the_virtual_button_ends_a_move(bent: Platform) -> 
     _, trouble = moving.communicate(timeout=20)
     assert moving.returncode == 5
     assert "emergency stop" in trouble
-    found = bent.until(lambda found: not found["robot"]["drives_powered"], "torque off")
-    assert found["state"] == "emergency_stop"
+    status = bent.until(lambda status: not status["robot"]["drives_powered"], "torque off")
+    assert status["state"] == "emergency_stop"
     bent.call("reset")
     bent.call("enable")
 
@@ -248,11 +254,13 @@ def test_limits_are_narrowed_shown_and_kept_to(bent: Platform) -> None:
 
 
 def test_the_gripper_switches_its_output(bent: Platform) -> None:
-    for word, on in (("close", True), ("open", False)):
-        bent.call("move_gripper", open=word == "open")
-        bent.until(
-            lambda found, on=on: bool(found["devices"]["io"]["outputs"]["value"] >> 3 & 1) is on, f"gripper to {word}"
-        )
+    def closed(status: dict[str, Any]) -> bool:
+        return bool(status["devices"]["io"]["outputs"]["value"] >> 3 & 1)
+
+    bent.call("move_gripper", open=False)
+    bent.until(closed, "gripper to close")
+    bent.call("move_gripper", open=True)
+    bent.until(lambda status: not closed(status), "gripper to open")
 
 
 @FULL_CIA402

@@ -1,4 +1,4 @@
-"""Arcs and blends on a real socket between real processes: what left on the wire, by the arm's own geometry."""
+"""Arcs and blends on a real socket between real processes: the targets on the wire, by the arm's geometry."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def robot(enabled: Platform) -> Iterator[Robot]:
 
 
 def places(feed: rtcp.Feed) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return where the tool was sent and when, s, in cycles that were answered."""
+    """Return the tool's targets and their times, s, in answered cycles."""
     records, missing = feed.records()
     assert not missing
     answered = records[records["wkc"] == records["wkc_expected"]]
@@ -60,8 +60,8 @@ def test_a_circle_is_one_motion_on_its_circle_and_at_its_speed(shared: Platform,
     from_circle = np.hypot(np.linalg.norm(sent - (x, y, z - 0.1), axis=1) - 0.1, sent[:, 0] - x)
     assert from_circle.max() < 2e-4
     steps, lengths = np.diff(times), np.linalg.norm(np.diff(sent, axis=0), axis=1)
-    way = np.cumsum(lengths)
-    inside = (way > 0.03) & (way < way[-1] - 0.03) & (steps < 1.5 * np.median(steps))
+    travelled = np.cumsum(lengths)
+    inside = (travelled > 0.03) & (travelled < travelled[-1] - 0.03) & (steps < 1.5 * np.median(steps))
     assert inside.sum() > 500
     speeds = lengths[inside] / steps[inside]
     assert np.quantile(speeds, [0.01, 0.99]) == pytest.approx(0.1, rel=0.02)
@@ -74,8 +74,9 @@ def test_a_halt_on_a_circle_stops_on_the_circle(shared: Platform, robot: Robot) 
     x, y, z = start.position
     with ThreadPoolExecutor(1) as pool:
         arc = pool.submit(robot.move_arc, [x, y + 0.1, z - 0.1], [x, y, z - 0.2, *start.rpy], 2 * pi, 0.1)
-        time.sleep(2.0)
         with rtcp.connect("who halts", control_socket(shared.directory)) as other:
+            while not arc.done() and np.linalg.norm(np.subtract(other.pose[:3], start.position)) < 0.03:
+                time.sleep(0.02)
             other.halt()
         with pytest.raises(RtcpError):
             arc.result()
@@ -159,10 +160,10 @@ def test_a_step_moves_along_or_about_one_axis(
         joint = 1 if axis == "joint2" else 2
         assert after[joint] - before[joint] == pytest.approx(pi / 180 if joint == 1 else -0.05, abs=1e-6)
         return
-    way = np.array(forward(arm, after).position) - forward(arm, before).position
-    assert np.linalg.norm(way) == pytest.approx(moved, abs=1e-5)
+    shift = np.array(forward(arm, after).position) - forward(arm, before).position
+    assert np.linalg.norm(shift) == pytest.approx(moved, abs=1e-5)
     if index is not None:
-        assert way[index] == pytest.approx(moved, abs=1e-5)
+        assert shift[index] == pytest.approx(moved, abs=1e-5)
 
 
 def test_the_command_line_runs_a_circle_and_refuses_what_is_none(enabled: Platform, robot: Robot) -> None:

@@ -41,8 +41,8 @@ def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> Non
     assert [slave["state"] for slave in status["slaves"]] == ["OP"] * SLAVES
     assert shared.al_states() == [8] * SLAVES
     assert status["wkc"]["expected"] == 3 * SLAVES
-    # A single late frame, where the host was busy, is no matter.
-    shared.until(lambda found: found["wkc"]["actual"] == 3 * SLAVES, "a frame with the full working counter")
+    # A single late frame of a busy host does not matter.
+    shared.until(lambda status: status["wkc"]["actual"] == 3 * SLAVES, "a frame with the full working counter")
     assert status["dc"]["locked"]
     assert status["cycle_ns"] == PERIOD_US * 1000
 
@@ -99,11 +99,11 @@ def test_an_sdo_that_the_slave_refuses_is_a_sentence(shared: Platform) -> None:
 def test_a_move_ends_within_a_milliradian(enabled: Platform, mode: str) -> None:
     enabled.call("mode", name=mode)
     enabled.rtcp("move", *map(str, Q))
-    status = enabled.until(lambda found: distance(found, Q) < 1e-3, f"arrival in {mode}")
+    status = enabled.until(lambda status: distance(status, Q) < 1e-3, f"arrival in {mode}")
     assert status["drive_mode"] == mode
     assert status["state"] == "holding"
     enabled.call("move_joints", q=[-0.05] * 6)
-    enabled.until(lambda found: distance(found, [-0.05] * 6) < 1e-3, f"arrival in {mode}")
+    enabled.until(lambda status: distance(status, [-0.05] * 6) < 1e-3, f"arrival in {mode}")
 
 
 @FULL_CIA402
@@ -210,7 +210,7 @@ def test_a_move_without_enabling_is_refused(shared: Platform) -> None:
 
 def test_a_second_commander_is_refused_with_the_holders_name(enabled: Platform) -> None:
     moving = enabled.background("move", "0.4", "0", "0", "0", "0", "0", "--speed", "0.2")
-    enabled.until(lambda found: found["state"] == "moving", "motion")
+    enabled.until(lambda status: status["state"] == "moving", "motion")
     with pytest.raises(Refused) as refused:
         enabled.call("move_joints", q=Q)
     assert f"pid {moving.pid}" in refused.value.fields["holder"]
@@ -224,7 +224,7 @@ def test_a_commander_that_is_killed_ends_in_a_controlled_stop(enabled: Platform)
     since = enabled.last_event()
     moving.kill()
     moving.wait()
-    status = enabled.until(lambda found: found["state"] == "holding", "standstill")
+    status = enabled.until(lambda status: status["state"] == "holding", "standstill")
     assert 0.0 < status["joints"]["actual_position"][0] < 1.4
     assert "lease_expired" in enabled.events(since)
     enabled.call("move_joints", q=ZERO)
@@ -288,7 +288,7 @@ def test_drives_that_are_swapped_on_the_cable_are_found_by_their_aliases_and_eac
         slave["alias"] = alias
     for slave, alias in zip(segment["slaves"][1:3], (9, 7), strict=True):
         slave["alias"] = alias
-    # The arm on the segment is that of the order on the cable.
+    # The segment takes the arm's drives in the order of the cable.
     del segment["arm"]
     for file, data in (("assistive_arm.yaml", arm), ("segment.yaml", segment)):
         (folder / file).write_text(yaml.safe_dump(data, sort_keys=False))

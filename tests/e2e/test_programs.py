@@ -46,10 +46,10 @@ def test_a_program_steps_back_the_way_it_came(enabled: Platform, tmp_path: Path)
     taught = rtcp.ProgramFile(tmp_path / "taught.yaml")
     with rtcp.connect("who steps", control_socket(enabled.directory)) as robot:
         robot.move_joints(HERE)
-        x, y, z, *turn = robot.fk(HERE)
+        x, y, z, *rpy = robot.fk(HERE)
         taught.keep("here", q=HERE)
-        taught.keep("top", pose=[x, y + 0.05, z + 0.05, *turn])
-        taught.keep("right", pose=[x, y + 0.1, z, *turn])
+        taught.keep("top", pose=[x, y + 0.05, z + 0.05, *rpy])
+        taught.keep("right", pose=[x, y + 0.1, z, *rpy])
         taught.insert(0, {"arc": "right", "via": "top"})
         taught.insert(0, {"move": "here"})
         program = rtcp.Program(taught.path)
@@ -62,7 +62,7 @@ def test_a_program_steps_back_the_way_it_came(enabled: Platform, tmp_path: Path)
     # The centre of the arc is 0.05 m beside the start; the tool keeps this distance from it all the way.
     with rtcp.connect("who looks", control_socket(enabled.directory)) as robot:
         places = [robot.fk([float(q) for q in sent]) for sent in records["sent_position"][::50]]
-    assert [math.hypot(one[1] - y - 0.05, one[2] - z) for one in places] == pytest.approx(
+    assert [math.hypot(place[1] - y - 0.05, place[2] - z) for place in places] == pytest.approx(
         [0.05] * len(places), abs=2e-4
     )
 
@@ -78,7 +78,7 @@ def test_cancelled_from_asyncio_a_program_stops_the_arm(enabled: Platform, tmp_p
     async def run() -> None:
         async with rtcp.connect_async("who runs", control_socket(enabled.directory)) as robot:
             program = rtcp.Program(taught.path)
-            running = asyncio.create_task(robot.in_thread(lambda one: program.run(one, begun.append)))
+            running = asyncio.create_task(robot.in_thread(lambda synchronous: program.run(synchronous, begun.append)))
             end = time.monotonic() + 30.0
             while len(begun) < 2 or await robot.state() is not State.MOVING:
                 assert time.monotonic() < end
@@ -93,4 +93,4 @@ def test_cancelled_from_asyncio_a_program_stops_the_arm(enabled: Platform, tmp_p
             assert (await robot.positions())[0] < 0.8
 
     asyncio.run(run())
-    assert [one.number for one in begun] == [0, 1]
+    assert [step.number for step in begun] == [0, 1]

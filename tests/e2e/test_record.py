@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.session import read_processes
 from rtcp.telemetry.reading import read
+from tests.telemetry.test_recorder import messages
 
 from .conftest import CUBEMARS, Platform
 from .wire import COUNTS_PER_RAD, inputs, outputs
@@ -24,19 +23,9 @@ from .wire import COUNTS_PER_RAD, inputs, outputs
 pytestmark = pytest.mark.alone
 
 
-def cycles(path: Path) -> list[Any]:
-    with open(path, "rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        return [one.decoded_message for one in reader.iter_decoded_messages(topics=["/cycle"])]
-
-
-def numbers(path: Path) -> list[int]:
-    return [one.number for one in cycles(path)]
-
-
 def recordings(platform: Platform) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(platform.rtcp("record", "status", "--json").stdout)["recordings"]
-    return found
+    recordings: list[dict[str, Any]] = json.loads(platform.rtcp("record", "status", "--json").stdout)["recordings"]
+    return recordings
 
 
 def test_a_move_is_recorded_cycle_by_cycle_while_the_gateway_is_killed(enabled: Platform) -> None:
@@ -48,12 +37,12 @@ def test_a_move_is_recorded_cycle_by_cycle_while_the_gateway_is_killed(enabled: 
     enabled.rtcp("start", "--detach")  # gives the loop a gateway
     enabled.call("move_joints", q=[0.0] * 6)
     stopped = json.loads(enabled.rtcp("record", "stop", "--json").stdout)["recordings"]
-    assert [(one["missing"], one["problem"], one["running"]) for one in stopped] == [(0, "", False)] * 2
-    (first,) = (one for one in stopped if len(one["files"]) == 2)
-    found = numbers(Path(first["files"][0]))
-    assert len(found) == first["records"]
-    assert found == list(range(found[0], found[-1] + 1))
-    assert len(Path(first["files"][1]).read_text().splitlines()) == 1 + len(found)
+    assert [(file["missing"], file["problem"], file["running"]) for file in stopped] == [(0, "", False)] * 2
+    (first,) = (recording for recording in stopped if len(recording["files"]) == 2)
+    numbers = [record.number for record in messages(Path(first["files"][0]), "/cycle")]
+    assert len(numbers) == first["records"]
+    assert numbers == list(range(numbers[0], numbers[-1] + 1))
+    assert len(Path(first["files"][1]).read_text().splitlines()) == 1 + len(numbers)
 
 
 @CUBEMARS
@@ -71,24 +60,24 @@ def test_the_columns_of_a_csv_are_those_of_the_frames_captured_at_the_segment(
         "Time", *(f"J{axis}_{name}" for name in ("pos", "vel", "tor", "tpos") for axis in range(1, 7))
     ]  # fmt: skip
     counts = np.rint(np.loadtxt(out, delimiter=",", skiprows=1)[:, 1:] * COUNTS_PER_RAD).astype(int)
-    shown = np.array([[getattr(one, name) for name in ("position", "velocity", "torque") for one in drives]
+    shown = np.array([[getattr(drive, name) for name in ("position", "velocity", "torque") for drive in drives]
                       for _, drives in inputs(captured)])  # fmt: skip
-    asked = np.array([[one.position for one in drives] for _, drives in outputs(captured, answered=True)])
-    # A stall's cycles have the values of the one before it, and the segment does not answer a frame that waited for
-    # long: the cycles between two such are found one after the other. Without a stall that is all of them at once.
-    came = np.array([one.wkc == one.wkc_expected for one in cycles(beside)])
+    asked = np.array([[drive.position for drive in drives] for _, drives in outputs(captured, answered=True)])
+    # The cycles of a stall repeat the values before it, and the segment does not answer a frame that waited for
+    # long: the cycles between two stalls are compared separately. Without a stall all are compared at once.
+    came = np.array([record.wkc == record.wkc_expected for record in messages(beside, "/cycle")])
     at = 0
-    for run in np.ma.clump_masked(np.ma.masked_array(came, came)):
+    for run in np.ma.clump_masked(np.ma.masked_array(came, came)):  # type: ignore[no-untyped-call]
         rows = counts[run]
         n = len(rows)
         # A record has the answer to the frame of its cycle, and the targets that left with the next one.
-        found = (
+        frame = (
             start
             for start in range(at, len(shown) - n + 1)
             if (shown[start : start + n] == rows[:, :18]).all()
             and (asked[start + 1 : start + n] == rows[:-1, 18:]).all()
         )
-        start = next(found, None)
+        start = next(frame, None)
         assert start is not None, f"cycles {run.start} to {run.stop - 1}"
         at = start + n
     assert np.ptp(counts[came], axis=0).min() > 0
@@ -96,10 +85,10 @@ def test_the_columns_of_a_csv_are_those_of_the_frames_captured_at_the_segment(
 
 def test_a_killed_recorder_is_reported_and_the_arm_moves_on(enabled: Platform) -> None:
     enabled.rtcp("record", "start", "--out", str(enabled.directory / "killed.mcap"))
-    (running,) = (one for one in recordings(enabled) if one["running"])
+    (running,) = (recording for recording in recordings(enabled) if recording["running"])
     os.kill(running["pid"], signal.SIGKILL)
     enabled.call("move_joints", q=[0.1, 0, 0, 0, 0, 0])
-    (killed,) = (one for one in recordings(enabled) if one["pid"] == running["pid"])
+    (killed,) = (recording for recording in recordings(enabled) if recording["pid"] == running["pid"])
     assert "ended from outside" in killed["problem"]
     assert enabled.rtcp("record", "stop").stdout == "nothing is being recorded\n"
 
@@ -113,7 +102,8 @@ def test_a_full_disk_ends_the_recording_and_not_the_move(enabled: Platform, tmp_
         enabled.call("record_start", out=str(tmp_path), formats=["mcap", "csv"], reserve_mb=0)
 
         def ended() -> dict[str, Any]:
-            return next(one for one in enabled.call("record_status")["recordings"] if str(tmp_path) in one["files"][0])
+            running = enabled.call("record_status")["recordings"]
+            return next(recording for recording in running if str(tmp_path) in recording["files"][0])
 
         enabled.until(lambda _: not ended()["running"], "the end of the recording")
         assert ended()["problem"].endswith("cannot be written: No space left on device")
@@ -155,7 +145,7 @@ def test_the_recording_of_the_arms_file_runs_once_whatever_becomes_of_the_gatewa
     platform = Platform()
     try:
         out = start_with(platform, "{out: OUT, formats: [mcap, csv], max_file_seconds: 3600, keep: 2}")
-        platform.until(lambda _: any(one["running"] for one in recordings(platform)), "a recording")
+        platform.until(lambda _: any(recording["running"] for recording in recordings(platform)), "a recording")
         (before,) = recordings(platform)
         assert before["files"] == sorted(map(str, out.iterdir()), reverse=True)
         os.kill(read_processes(platform.directory).gateway, signal.SIGKILL)
@@ -164,8 +154,8 @@ def test_the_recording_of_the_arms_file_runs_once_whatever_becomes_of_the_gatewa
         assert (ended["pid"], ended["missing"], ended["problem"]) == (before["pid"], 0, "")
         os.kill(read_processes(platform.directory).gateway, signal.SIGKILL)
         platform.rtcp("start", "--detach")
-        platform.call("enable")  # what the gateway starts at its own start has been begun by then
-        assert [one["running"] for one in recordings(platform)] == [False]
+        platform.call("enable")  # by then the gateway has begun what it begins at its start
+        assert [recording["running"] for recording in recordings(platform)] == [False]
     finally:
         platform.end()
 
@@ -175,7 +165,7 @@ def test_a_recording_that_cannot_start_with_the_platform_is_reported_and_the_end
     try:
         start_with(platform, "{out: /proc/nowhere}")
         wanted = "the recording of the arm's file (recording) does not run: /proc/nowhere cannot be written"
-        platform.until(lambda found: any(one.startswith(wanted) for one in found["messages"]), "the message")
+        platform.until(lambda status: any(message.startswith(wanted) for message in status["messages"]), "the message")
         platform.call("enable")
         out = platform.directory / "whole.mcap"
         platform.rtcp("record", "start", "--out", str(out))

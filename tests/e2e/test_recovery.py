@@ -28,7 +28,7 @@ LARGEST_STEP = 0.5 * PERIOD_US * 1e-6 * 1.001
 
 @pytest.fixture
 def segment(shared: Platform) -> Iterator[SegmentClient]:
-    """The segment of the shared platform; its faults are mended afterwards, and the arm is ready."""
+    """The segment of the shared platform; its faults are cleared afterwards, and the arm is ready."""
     with SegmentClient(segment_control(shared.directory)) as client:
         yield client
         client.clear()
@@ -40,16 +40,16 @@ def segment(shared: Platform) -> Iterator[SegmentClient]:
 
 def well(platform: Platform) -> dict[str, Any]:
     """Wait until every slave is in OP."""
-    return platform.until(lambda found: all(slave["state"] == "OP" for slave in found["slaves"]), "OP")
+    return platform.until(lambda status: all(slave["state"] == "OP" for slave in status["slaves"]), "OP")
 
 
 def lose(platform: Platform, segment: SegmentClient, faults: list[dict[str, Any]]) -> dict[str, Any]:
-    """Break something; return the status when it was noticed and every slave is in OP again."""
+    """Inject faults; return the status when they were reported and every slave is in OP again."""
     before = [slave["recovered"] for slave in platform.status()["slaves"]]
     for fault in faults:
         segment.fault(fault)
-    platform.until(lambda found: found["state"] == "fault", "the fault")
-    platform.until(lambda found: [slave["recovered"] for slave in found["slaves"]] != before, "the return")
+    platform.until(lambda status: status["state"] == "fault", "the fault")
+    platform.until(lambda status: [slave["recovered"] for slave in status["slaves"]] != before, "the return")
     return well(platform)
 
 
@@ -77,7 +77,7 @@ def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
     with enabled.capture(path):
         lose(enabled, segment, [{"fault": "power", "slave": 4, "lasts": 0.2}])
         assert moving.wait() == 5
-        enabled.until(lambda found: max(map(abs, found["joints"]["actual_velocity"])) < 0.002, "standstill")
+        enabled.until(lambda status: max(map(abs, status["joints"]["actual_velocity"])) < 0.002, "standstill")
         stood = enabled.status()["joints"]
         time.sleep(0.3)
         assert enabled.status()["state"] == "fault"
@@ -86,7 +86,7 @@ def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
             enabled.call("enable")
     records, _ = observer.since(first)
     observer.close()
-    # The drive that came back: no step of its target but to where it is, no command that gives it torque.
+    # The recovered drive: its target steps only to its position, and no controlword gives it torque.
     noticed = int(np.argmax(records["fault"] != 0))
     came_back = records["statusword"][noticed:, 2] & 0x6F
     assert ENABLED not in came_back[int(np.argmax(came_back != ENABLED)) :]
@@ -99,8 +99,8 @@ def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
     assert ENABLE_OPERATION not in {drive.controlword for drives in after for drive in drives}
     assert abs(stood["commanded_position"][2] - stood["actual_position"][2]) < 1e-3
     reset_and_enable(enabled)
-    held = enabled.status()["joints"]
-    assert max(abs(a - b) for a, b in zip(held["actual_position"], stood["actual_position"], strict=True)) < 0.01
+    joints = enabled.status()["joints"]
+    assert max(abs(a - b) for a, b in zip(joints["actual_position"], stood["actual_position"], strict=True)) < 0.01
 
 
 def test_an_io_box_that_was_without_supply_takes_the_segments_time_up_again(
@@ -108,39 +108,43 @@ def test_an_io_box_that_was_without_supply_takes_the_segments_time_up_again(
 ) -> None:
     observer = Observer(blackboard_file(enabled.directory))
     first = observer.head
-    found = lose(enabled, segment, [{"fault": "power", "slave": 1, "lasts": 0.4}])
-    assert found["state"] == "fault"
+    status = lose(enabled, segment, [{"fault": "power", "slave": 1, "lasts": 0.4}])
+    assert status["state"] == "fault"
     reset_and_enable(enabled)
     records, _ = observer.since(first)
     observer.close()
-    # The reference clock goes on where the drives' clocks are: its time passes as the host's does, also in the gap.
+    # The reference clock continues with the drives' clocks; in the gap its time passes as the host's does.
     good = records[records["wkc"] == records["wkc_expected"]]
     offsets = good["dc_time_ns"].astype(np.int64) - good["time_ns"].astype(np.int64)
     gap = int(np.argmax(np.diff(good["time_ns"].astype(np.int64)))) + 1
     assert abs(np.median(offsets[:gap]) - np.median(offsets[gap:])) < 5_000_000
     assert np.abs(np.diff(records["sent_position"], axis=0)).max() <= LARGEST_STEP
-    told = enabled.status()["messages"]
-    assert any("slave 1 (io) is back in OP" in sentence for sentence in told), told
+    messages = enabled.status()["messages"]
+    assert any("slave 1 (io) is back in OP" in sentence for sentence in messages), messages
 
 
 def test_a_fall_that_is_over_at_once_still_needs_a_reset(enabled: Platform, segment: SegmentClient) -> None:
     before = enabled.status()["slaves"][2]
-    found = lose(enabled, segment, [{"fault": "al_fall", "slave": 3, "code": 0x1A}])
-    slave = found["slaves"][2]
-    assert (found["state"], slave["lost"], slave["recovered"]) == ("fault", before["lost"] + 1, before["recovered"] + 1)
+    status = lose(enabled, segment, [{"fault": "al_fall", "slave": 3, "code": 0x1A}])
+    slave = status["slaves"][2]
+    assert (status["state"], slave["lost"] - 1, slave["recovered"] - 1) == (
+        "fault",
+        before["lost"],
+        before["recovered"],
+    )
     with pytest.raises(RtcpError, match="fault"):
         enabled.call("enable")
     assert enabled.status()["state"] == "fault"
-    told = found["messages"]
-    (fell,) = [one for one in told if "left OP: it is in" in one]
+    messages = status["messages"]
+    (fell,) = [message for message in messages if "left OP: it is in" in message]
     for part in ("slave 3 (drive2)", "SAFE-OP + ERROR", "0x001A: synchronization error", "check the cycle's jitter"):
         assert part in fell
     reset_and_enable(enabled)
 
 
 def test_slaves_behind_a_mended_cable_are_back_when_the_arm_is_reset(enabled: Platform, segment: SegmentClient) -> None:
-    found = lose(enabled, segment, [{"fault": "cable", "after": 3, "lasts": 0.3}])
-    assert found["state"] == "fault"
+    status = lose(enabled, segment, [{"fault": "cable", "after": 3, "lasts": 0.3}])
+    assert status["state"] == "fault"
     assert ENABLED not in {word & 0x6F for word in enabled.status()["statuswords"][2:]}
     reset_and_enable(enabled)
 
@@ -149,7 +153,7 @@ def test_a_reset_while_a_slave_is_still_away_fails_and_a_later_one_does_not(
     enabled: Platform, segment: SegmentClient
 ) -> None:
     away = segment.fault({"fault": "power", "slave": SLAVES})
-    enabled.until(lambda found: found["state"] == "fault", "the fault")
+    enabled.until(lambda status: status["state"] == "fault", "the fault")
     with pytest.raises(RtcpError):
         enabled.call("reset")
     assert enabled.status()["state"] == "fault"
@@ -164,15 +168,16 @@ def test_a_cable_that_damages_frames_is_named_with_the_errors_counted(shared: Pl
     before = shared.status()["slaves"]
     segment.fault({"fault": "corrupt", "after": 4, "burst": 40})
 
-    def counted(found: dict[str, Any]) -> bool:
-        return found["slaves"][4]["errors"]["rx"] == [before[4]["errors"]["rx"][0] + 40, *before[4]["errors"]["rx"][1:]]
+    def counted(status: dict[str, Any]) -> bool:
+        first, *others = before[4]["errors"]["rx"]
+        return status["slaves"][4]["errors"]["rx"] == [first + 40, *others]
 
-    found = shared.until(counted, "the errors")
-    assert found["slaves"][3]["errors"]["rx"] == before[3]["errors"]["rx"]
+    status = shared.until(counted, "the errors")
+    assert status["slaves"][3]["errors"]["rx"] == before[3]["errors"]["rx"]
     forwarded = sum(before[5]["errors"]["forwarded"]) + 40
-    shared.until(lambda found: sum(found["slaves"][5]["errors"]["forwarded"]) == forwarded, "forwarded")
-    told = shared.status()["messages"]
-    assert any("errors enter between slave 4 (drive3) and slave 5 (drive4): " in one for one in told), told
+    shared.until(lambda status: sum(status["slaves"][5]["errors"]["forwarded"]) == forwarded, "forwarded")
+    messages = shared.status()["messages"]
+    assert any("errors enter between slave 4 (drive3) and slave 5 (drive4): " in text for text in messages), messages
     shown = shared.rtcp("status").stdout
     assert "lost/err/links" in shown
     assert "/40/" in shown

@@ -28,7 +28,7 @@ def record(platform: Platform, name: str, *command: str, check: int = 0) -> Reco
 def moving(recorded: Recorded) -> Any:
     """Sent positions, cycle by cycle, from 1 mrad after the beginning to 1 mrad before the end."""
     q = recorded.column("sent_position")
-    q = q[np.append(True, np.diff(q, axis=0).any(axis=1))]  # less what a loaded host had sent again
+    q = q[np.append(True, np.diff(q, axis=0).any(axis=1))]  # without cycles that a loaded host sent again
     left, there = (np.flatnonzero(np.abs(q - end).max(axis=1) > 1e-3) for end in (q[0], q[-1]))
     return q[left[0] : there[-1] + 1]
 
@@ -36,11 +36,11 @@ def moving(recorded: Recorded) -> Any:
 def test_the_sent_positions_of_a_replay_are_the_recorded_ones_at_the_scaled_speed(enabled: Platform) -> None:
     first = record(enabled, "first.mcap", "move", "0.3", "-0.2", "0.25", "0.1", "0", "0.4")
     again = record(enabled, "again.mcap", "replay", str(first.path), "--speed", "0.8")
-    wanted, found = moving(first), moving(again)
+    wanted, replayed = moving(first), moving(again)
     for joint in range(6):
-        then = np.interp(np.arange(len(wanted)) / 0.8, np.arange(len(found)), found[:, joint])
-        assert np.abs(then - wanted[:, joint]).max() < 2e-3  # of which 1 mrad is the way of one cycle
-    assert len(found) == pytest.approx(len(wanted) / 0.8, rel=0.02)
+        then = np.interp(np.arange(len(wanted)) / 0.8, np.arange(len(replayed)), replayed[:, joint])
+        assert np.abs(then - wanted[:, joint]).max() < 2e-3  # of which 1 mrad is the motion of one cycle
+    assert len(replayed) == pytest.approx(len(wanted) / 0.8, rel=0.02)
 
 
 def test_a_motion_that_the_planner_refuses_moves_nothing_and_says_what_to_do(enabled: Platform) -> None:

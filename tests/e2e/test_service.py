@@ -1,4 +1,4 @@
-"""A platform in the foreground tells the service manager how it is; a datagram socket stands for systemd's."""
+"""A platform in the foreground reports its state to the service manager, here a datagram socket."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.alone
 
 
 class Manager:
-    """What systemd has: a socket that takes messages, and patience."""
+    """The socket of systemd that receives the messages."""
 
     def __init__(self, address: str, watchdog_s: float) -> None:
         self.address = address
@@ -70,7 +70,7 @@ def test_it_is_ready_after_op_and_pings_only_while_the_cycle_goes_on(platform: P
     assert "STATUS=ready" in manager.heard
     loop = platform.pids()["loop"]
     os.kill(loop, signal.SIGSTOP)
-    manager.listen(1.0)  # one more may be on its way
+    manager.listen(1.0)  # one more may be in transit
     assert "WATCHDOG=1" not in manager.listen(1.5)
     os.kill(loop, signal.SIGCONT)
     manager.until("WATCHDOG=1", 5.0)
@@ -86,8 +86,8 @@ def test_a_loop_that_was_killed_ends_the_service_with_a_fault_and_the_journal_ha
 ) -> None:
     platform.be_patient(2000)
     reading, journal = os.pipe()
-    found = os.fstat(journal)
-    environment = {**platform.environment, "JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
+    status = os.fstat(journal)
+    environment = {**platform.environment, "JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
     started = subprocess.Popen([sys.executable, "-m", "rtcp.cli", "start"], env=environment, stderr=journal)
     os.close(journal)
     manager.until("READY=1")

@@ -18,12 +18,12 @@ SEED = 5
 OUTPUTS_AT = 26
 ENABLE_OPERATION = 0x0F
 FURTHER = 1000
-"""Counts; a joint may go 10 in a cycle."""
+"""0.1 rad in counts; a joint may move 10 in a cycle."""
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, Path]:
-    """What came of a session, and its capture."""
+    """The result of a session and its capture."""
     path = tmp_path_factory.mktemp("wire") / "capture"
     return run_on_the_wire(SEED, SECONDS, PERIOD_US, path), path
 
@@ -51,4 +51,4 @@ def test_one_target_that_is_changed_in_its_capture_is_found(session: tuple[Outco
             file.write(HEAD.pack(when, len(frame) | (LEAVES if leaves else 0)) + frame)
     assert enabled > 100
     _, failures = check(spoilt, PERIOD_US * 1e-6)
-    assert any(f"joint 1: step of {FURTHER}" in sentence for sentence, *_ in failures)
+    assert any("joint 1: step 0.1," in sentence for sentence, *_ in failures)

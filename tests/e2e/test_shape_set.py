@@ -1,4 +1,4 @@
-"""`rtcp shape-set` on the virtual cell: a rod gets its shape; what ends it early ends the heat before the motion."""
+"""`rtcp shape-set` on the virtual cell: a rod is bent; every early end ends the heat before the motion."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ BEGINS = {
     "heating": "heating to",
     "holding": "heating to",
 }
-"""What the command says when a phase begins."""
+"""Message of the command at the beginning of each phase."""
 
 
 class HeaterCell:
@@ -72,7 +72,7 @@ class HeaterCell:
         file.write_text(text)
 
     def start(self) -> None:
-        """Start what does not run."""
+        """Start the processes that do not run."""
         self.platform.rtcp("cell", "start", "--detach", "--config", str(self.config / "cell_shape_setting.yaml"))
 
     def connect(self) -> Cell:
@@ -90,7 +90,7 @@ class HeaterCell:
         return self.run
 
     def truth(self) -> dict[str, Any]:
-        """Return what the virtual control box does, past the bus."""
+        """Return the state of the virtual control box, read without the bus."""
         with SegmentClient(segment_control(self.directory / "heater")) as segment:
             box: dict[str, Any] = segment.truth()["slaves"][0]
         return box
@@ -115,7 +115,7 @@ class HeaterCell:
             time.sleep(0.02)
 
     def restore(self) -> None:
-        """Bring back what a test has ended; reset and enable all."""
+        """Restart what a test has ended; reset and enable all."""
         ended = False
         for name in ("left", "right", "heater"):
             processes = read_processes(self.directory / name)
@@ -147,7 +147,7 @@ class HeaterCell:
 
 
 class Run:
-    """A command that runs, in a process that begins as a copy of this one: it need not load scipy and matplotlib."""
+    """A running command, forked from this process so that it need not load scipy and matplotlib."""
 
     def __init__(self, arguments: Sequence[str], environment: Mapping[str, str], folder: Path) -> None:
         self.folder = folder
@@ -161,7 +161,7 @@ class Run:
         self._lines = os.fdopen(reading)
 
     def await_line(self, text: str) -> None:
-        """Read until it says so."""
+        """Read its output until a line has the text."""
         said = []
         for line in self._lines:
             said.append(line)
@@ -170,7 +170,7 @@ class Run:
         raise AssertionError(f"{text!r} was not said: {''.join(said)}{self._errors.read_text()}")
 
     def finish(self) -> str:
-        """Wait for its end; return what it said on standard error."""
+        """Wait for its end; return its standard error."""
         self._lines.read()
         self.end()
         errors = self._errors.read_text()
@@ -216,7 +216,7 @@ def shared() -> Iterator[HeaterCell]:
 
 @pytest.fixture
 def cell(shared: HeaterCell) -> Iterator[HeaterCell]:
-    """All run, nothing has tripped, and the arms are enabled."""
+    """The running cell, without trips, arms enabled."""
     shared.restore()
     yield shared
     if shared.run is not None:
@@ -277,7 +277,7 @@ def test_a_rod_gets_its_shape_and_the_report_says_what_was_measured(cell: Heater
     assert grid.max() == pytest.approx(510.0, abs=10.0)
     assert grid[len(grid) // 2].max() == grid.max()
     assert grid[0].max() < 50.0
-    # The fast ramp has not reached the steady state of the fin, which the estimate is by.
+    # After the fast ramp the fin is not in the steady state that the estimate assumes.
     assert hottest == pytest.approx(510.0, abs=30.0)
     assert float(facts["hottest place of the rod"].split()[0]) == pytest.approx(hottest, abs=10.0)
     assert set(report["interlocks"].values()) == {"good"}
@@ -315,7 +315,7 @@ def halt_left(cell: HeaterCell) -> None:
 
 
 def halt_all(cell: HeaterCell) -> None:
-    # Not by the command line, whose start takes longer than the heat on a busy host.
+    # Not by the command line: on a busy host it starts too slowly for the heat.
     with cell.connect() as arms:
         arms.halt()
 
@@ -343,7 +343,7 @@ CAUSES: dict[str, tuple[Callable[[HeaterCell], None], str]] = {
 
 
 @pytest.mark.parametrize(
-    "cause", [pytest.param(one, marks=[] if one == "cell halt" else [pytest.mark.slow]) for one in CAUSES]
+    "cause", [pytest.param(cause, marks=[] if cause == "cell halt" else [pytest.mark.slow]) for cause in CAUSES]
 )
 def test_heat_ends_by_itself_and_the_message_says_why(cell: HeaterCell, cause: str) -> None:
     act, words = CAUSES[cause]
@@ -379,7 +379,7 @@ def test_a_run_after_all_that_is_complete(cell: HeaterCell) -> None:
 
 
 def put_in_order_once_it_stands(panel: RequestClient, first: dict[str, str]) -> None:
-    """Do what an operator does once the robot stands, which a controller refuses before."""
+    """Perform the operator's steps at the controller, which refuses them until the robot rests."""
     end = time.monotonic() + 10.0
     while True:
         try:

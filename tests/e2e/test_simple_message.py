@@ -1,4 +1,4 @@
-"""`rtcp ros --simple-message` on the virtual arm: its motions, and what a lost client leaves."""
+"""`rtcp ros --simple-message` on the virtual arm: its motions, and the end of a lost client."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def port(enabled: Platform) -> Iterator[int]:
     served = enabled.background("ros", "--simple-message", "--motion-port", "0", "--state-port", "0")
     assert served.stdout is not None
     first = served.stdout.readline()
-    found = re.search(r"motion at 127\.0\.0\.1:(\d+)", first)
-    assert found, first
-    yield int(found[1])
+    match = re.search(r"motion at 127\.0\.0\.1:(\d+)", first)
+    assert match, first
+    yield int(match[1])
     served.terminate()
     served.communicate()
 
@@ -135,7 +135,7 @@ time.sleep(3600)
 
 @contextlib.contextmanager
 def namespace() -> Iterator[str]:
-    """A network namespace, by the process id that holds it."""
+    """Process id of a process in a network namespace of its own."""
     with subprocess.Popen(["unshare", "--net", "sh", "-c", "echo; exec cat"], stdin=-1, stdout=-1) as holder:
         assert holder.stdout is not None
         holder.stdout.readline()
@@ -188,7 +188,7 @@ def test_the_arms_file_starts_the_server_once_and_it_ends_with_the_platform(plat
     file = platform.directory / "config" / "assistive_arm.yaml"
     file.write_text(file.read_text() + "\nros: {simple_message: {motion_port: 0, state_port: 0}}\n")
     platform.rtcp("start", "--detach")
-    while not (found := re.search(r"motion at 127\.0\.0\.1:(\d+)", platform.logs())):
+    while not (match := re.search(r"motion at 127\.0\.0\.1:(\d+)", platform.logs())):
         time.sleep(0.05)
     gateway = platform.pids()["gateway"]
     kill(gateway)
@@ -196,7 +196,7 @@ def test_the_arms_file_starts_the_server_once_and_it_ends_with_the_platform(plat
     platform.rtcp("status")  # starts the gateway anew
 
     async def answers() -> ReplyCode:
-        client, running = await connect(int(found[1]))
+        client, running = await connect(int(match[1]))
         reply = await client.request(Ping())
         running.cancel()
         return reply.reply_code

@@ -1,4 +1,4 @@
-"""The speed override on a real socket between real processes: what is sent slows down and speeds up under way."""
+"""The speed override on a real socket between real processes: motions slow down and speed up."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def robot(enabled: Platform) -> Iterator[Robot]:
 
 def circle(robot: Robot) -> Any:
     assert robot.pose is not None
-    x, y, z, *turn = robot.pose
-    return robot.move_arc([x, y + 0.1, z - 0.1], [x, y, z - 0.2, *turn], 6.283, 0.2)
+    x, y, z, *rpy = robot.pose
+    return robot.move_arc([x, y + 0.1, z - 0.1], [x, y, z - 0.2, *rpy], 6.283, 0.2)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_who_paused_a_motion_that_has_ended_does_not_resume_the_next_one(shared:
             going = pool.submit(circle, robot)
             shared.until_moving(0.0)
             pauser.pause()
-            shared.until(lambda found: found["speed_override"] == 0.0, "the pause")
+            shared.until(lambda status: status["speed_override"] == 0.0, "the pause")
             if pauser is before:
                 before.halt()
                 with pytest.raises(rtcp.RtcpError):

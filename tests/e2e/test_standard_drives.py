@@ -1,4 +1,4 @@
-"""Arms of other drives, and a slave of which only its channels are known, by their files alone."""
+"""Arms of other drives, and a slave with known channels alone, by their files."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def build(folder: Path) -> None:
     add_valves(folder)
 
 
-def add_valves(folder: Path) -> None:
+def add_valves(folder: Path, behaviour: str = "") -> None:
     """Add an analog terminal behind the slaves of the configuration in `folder`, and to its segment."""
     (folder / "devices" / "valves.yaml").write_text(VALVES)
     write_esi(folder / "valves.xml", load_device(folder / "devices" / "valves.yaml"), {})
     for file, slave in (
         ("assistive_arm.yaml", {"name": "valves", "device": "valves"}),
-        ("segment.yaml", {"esi": "valves.xml"}),
+        ("segment.yaml", {"esi": "valves.xml"} | ({"behaviour": behaviour} if behaviour else {})),
     ):
         data = yaml.safe_load((folder / file).read_text())
         data["slaves"].append(slave)
@@ -75,7 +75,7 @@ def move_and_stop(platform: Platform) -> None:
         assert robot.status().pose[2] - before == pytest.approx(-0.03, abs=5e-3)
     platform.rtcp("joystick", "estop", "--seconds", "0.3")
     platform.until(
-        lambda found: found["state"] == "emergency_stop" and not found["robot"]["drives_powered"], "emergency stop"
+        lambda status: status["state"] == "emergency_stop" and not status["robot"]["drives_powered"], "emergency stop"
     )
     platform.rtcp("stop")
 
@@ -92,7 +92,7 @@ def test_an_arm_of_two_axis_drives_moves_is_recovered_and_its_channels_are_read_
     with rtcp.connect("a test", control_socket(started.directory)) as robot:
         robot.enable()
         started.rtcp("segment", "set", "5", "0x6000:1", "350")
-        started.until(lambda found: robot.io["valves.pressure"] == pytest.approx(2.5), 10.0)
+        started.until(lambda status: robot.io["valves.pressure"] == pytest.approx(2.5), "the pressure")
         assert robot.io["valves.current"] == 4.0
         robot.io["valves.current"] = 12.5
         with pytest.raises(rtcp.Refused) as refused:
@@ -106,11 +106,46 @@ def test_an_arm_of_two_axis_drives_moves_is_recovered_and_its_channels_are_read_
     assert "7500" in started.rtcp("segment", "get", "5", "0x7000:1").stdout
     # A slave that loses its supply is set up again, both axes with it.
     started.rtcp("segment", "fault", "power", "slave=3")
-    started.until(lambda found: found["state"] == "fault", 20.0)
+    started.until(lambda status: status["state"] == "fault", "the fault")
     started.rtcp("segment", "clear")
     started.call("reset")
     assert "4000" in started.rtcp("segment", "get", "5", "0x7000:1").stdout
     move_and_stop(started)
+
+
+STUCK = """
+from rtcp.virtual.behaviour import Behaviour
+
+class Stuck(Behaviour):
+    def on_sdo_read(self, index, subindex):
+        while index == 0x6000:
+            pass
+
+    def on_sdo_write(self, index, subindex, value):
+        if index == 0x7000:
+            self.device.objects = None
+"""
+
+
+def test_segment_and_arm_go_on_beside_a_slave_whose_behaviour_hangs(platform: Platform) -> None:
+    platform.be_patient(2000)
+    folder = platform.directory / "config"
+    (folder / "stuck.py").write_text(STUCK)
+    add_valves(folder, "stuck:Stuck")
+    platform.rtcp("start", "--detach")
+    platform.call("enable")
+    moving = platform.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.5")
+    platform.until_moving()
+    refused = platform.rtcp("sdo", "read", "valves", "0x6000:1", check=3)
+    assert "refused the read of 0x6000:1: abort code 0x08000000" in refused.stderr
+    assert moving.wait() == 0
+    sentences = (platform.directory / "segment.log").read_text().splitlines()
+    assert [line for line in sentences if "on_sdo_read failed at " in line and "stuck.py:6: it has not" in line]
+    # A device that cannot work leaves OP; the other slaves and the segment's socket continue.
+    platform.call("disable")
+    platform.rtcp("sdo", "write", "valves", "0x7000:1", "5000", "--type", "int16", check=None)
+    assert "has set its `objects`" in platform.rtcp("segment", "get", "8", check=3).stderr
+    assert "Statusword" in platform.rtcp("segment", "get", "2").stdout
 
 
 def test_an_arm_is_built_from_the_makers_file_and_moves(platform: Platform) -> None:

@@ -59,7 +59,7 @@ for node in null zero full random urandom tty net/tun cpu_dma_latency; do
     if [ -e /dev/$node ]; then : > dev/$node; mount --bind /dev/$node dev/$node; fi
 done
 ln -s pts/ptmx dev/ptmx
-# Nothing that this machine starts at boot: the overlay is to have the service alone.
+# The overlay starts the service alone, nothing else of this machine.
 rm -rf etc/systemd/system/*.wants etc/machine-id
 : > etc/machine-id
 cat > usr/bin/rtcp << END
@@ -94,7 +94,7 @@ class Machine:
             "SITE": str(Path(psutil.__file__).parents[1]), "SYSTEMD": str(SYSTEMD),
         }  # fmt: skip
         join = f'echo $$ > "{self._cgroup}/cgroup.procs"; exec "$@"'
-        # Also a test run that is killed leaves nothing running.
+        # A test run that is killed leaves nothing running either.
         supervised = ["setpriv", "--pdeathsig", "KILL", "unshare", "--fork", "--kill-child"]
         apart = ["--pid", "--mount", "--uts", "--ipc", "--cgroup", "--net"]
         self._console = base.with_suffix(".log")

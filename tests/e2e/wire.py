@@ -1,4 +1,4 @@
-"""A look at the wire that shares nothing with the platform: its own frames, its own decoder.
+"""Independent access to the wire: its own frames, its own decoder, no code of the platform.
 
 Usage: python wire.py SEGMENT_PID al | init POSITION | safeop POSITION | station POSITION ADDRESS | capture FILE
 The layout of the process image is that of the facts: an IO box (2 bytes out), then six drives (15 bytes out each); then
@@ -32,7 +32,7 @@ COUNTS_PER_RAD = 10_000
 AL_STATES = {"init": 1, "safeop": 4}
 STATION, AL_CONTROL = 0x0010, 0x0120
 ETH_P_ALL = 3
-"""What a socket must be bound to for packet(7) to show it what leaves, too."""
+"""Protocol of a socket that also receives outgoing frames, packet(7)."""
 LEAVES = 0x8000
 """Flag in a capture, beside the length, of a frame that leaves the segment."""
 SO_TIMESTAMPNS = 35
@@ -41,7 +41,7 @@ SOL_PACKET, PACKET_STATISTICS = 263, 6
 BUFFER = 16 << 20
 TIMESPEC = struct.Struct("@qq")
 HEAD = struct.Struct("<QH")
-"""Of a frame in a capture: its time, ns, and its length."""
+"""Header of a frame in a capture: time, ns, and length."""
 
 
 def enter(pid: int) -> None:
@@ -77,7 +77,7 @@ def ask(port: socket.socket, command: int, address: int, offset: int, length: in
                 answer, where = port.recvfrom(1600)
             except TimeoutError:
                 break
-            # Own frames on their way out are seen too; an answer comes in.
+            # Own outgoing frames are received too; only an incoming one is an answer.
             if where[2] != socket.PACKET_OUTGOING and answer[17] == index and answer[16] == command:
                 return answer[26 : 26 + length], struct.unpack_from("<H", answer, 26 + length)[0]
     raise TimeoutError("the segment does not answer")
@@ -92,7 +92,7 @@ def al_words(interface: str, register: int) -> list[int]:
 
 
 def write(interface: str, position: int, register: int, word: int) -> None:
-    """Write a register of the slave at `position` (from 0): a lower AL state as if it had lost its way, its station."""
+    """Write a register of the slave at `position` (from 0), for example a lower AL state or another station."""
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE)) as port:
         port.bind((interface, ETHERTYPE))
         port.send(frame(APWR, 0xDD, -position, register, struct.pack("<H", word)))
@@ -122,7 +122,7 @@ def capture(interface: str, path: str) -> None:
             except TimeoutError:
                 continue
             except OSError:
-                break  # the segment has taken its interface along
+                break  # the interface ended with the segment
             if got[12:14] != ETHERTYPE.to_bytes(2, "big"):
                 continue
             s, ns = TIMESPEC.unpack_from(extra[0][2])
@@ -136,7 +136,7 @@ def capture(interface: str, path: str) -> None:
 
 @dataclass(frozen=True)
 class Targets:
-    """What one frame asks of a drive, in counts."""
+    """Outputs of a drive in a frame, in counts."""
 
     controlword: int
     position: int
@@ -184,7 +184,7 @@ def outputs(path: Path, answered: bool = False) -> Iterator[tuple[int, list[Targ
 
 @dataclass(frozen=True)
 class Actual:
-    """What one frame brings back of a drive, in counts."""
+    """Inputs of a drive in a frame, in counts."""
 
     statusword: int
     position: int
@@ -194,14 +194,14 @@ class Actual:
 
 
 def inputs(path: Path) -> Iterator[tuple[int, list[Actual]]]:
-    """Yield time (ns) and what the drives show in every process data frame that leaves the segment."""
+    """Yield time (ns) and the inputs of all drives of every process data frame that leaves the segment."""
     first = BOX_OUT + DRIVES * DRIVE.size + BOX_IN
     for when, image in images(path, leave=True):
         yield when, [Actual(*DRIVE.unpack_from(image, first + i * DRIVE.size)) for i in range(DRIVES)]
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Run the command of the command line."""
     enter(int(sys.argv[1]))
     if sys.argv[2] == "al":
         print(json.dumps(al_words("ecat0", 0x0130)))

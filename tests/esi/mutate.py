@@ -87,7 +87,7 @@ def mutated_elements(data: bytes, random: Random) -> bytes:
 
 
 def read_file(path: Path) -> None:
-    """Do with a file all that the platform does with it; what is refused is refused with EsiError."""
+    """Use a file as the platform does; refusals are EsiError."""
     file = read_esi(path)
     try:
         find_device(file, product=0x402)
@@ -110,7 +110,7 @@ def read_file(path: Path) -> None:
 
 
 def read_image(image: bytes) -> None:
-    """Do with an image all that the platform does with it."""
+    """Use an image as the platform does."""
     check_sii(image)
     device = read_sii(image)
     complete(device)
@@ -118,8 +118,8 @@ def read_image(image: bytes) -> None:
 
 
 def failing(first: int, count: int, directory: Path) -> list[str]:
-    """Return what mutated files and images raise besides EsiError, with their seeds."""
-    found = []
+    """Return the exceptions other than EsiError of mutated files and images, with their seeds."""
+    places = []
     path = directory / "mutated.xml"
     for seed in range(first, first + count):
         random = Random(seed)
@@ -132,10 +132,10 @@ def failing(first: int, count: int, directory: Path) -> list[str]:
                 read_file(path)
         except EsiError as error:
             if len(str(error)) > 100_000:
-                found.append(f"seed {seed}: a message of {len(str(error))} characters")
+                places.append(f"seed {seed}: a message of {len(str(error))} characters")
         except Exception as error:
-            found.append(f"seed {seed}: {type(error).__name__}: {error}")
-    return found
+            places.append(f"seed {seed}: {type(error).__name__}: {error}")
+    return places
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Modules put into the slots of a device: a drive of two axes, one of them with a brake in its place."""
+"""Modules in the slots of a device: a drive of two axes, and one with a brake in the place of an axis."""
 
 from __future__ import annotations
 

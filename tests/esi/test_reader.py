@@ -1,4 +1,4 @@
-"""ESI files of several vendors' habits: what is read of them, and what is said of what is wrong."""
+"""ESI files as several vendors write them: what is read, and the messages for mistakes."""
 
 from __future__ import annotations
 
@@ -9,18 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.esi import object_reader, xml_tree
-from rtcp.esi.model import (
-    DcMode,
-    Device,
-    DeviceFile,
-    EsiError,
-    FmmuUse,
-    LookupFailure,
-    ObjectCode,
-    PdoEntry,
-    SyncManagerType,
-)
+from rtcp.esi import model, object_reader, xml_tree
 from rtcp.esi.reader import find_device, find_devices, read_esi
 
 FILES = Path(__file__).parent / "files"
@@ -29,17 +18,17 @@ END = "</Devices></Descriptions></EtherCATInfo>"
 
 
 @pytest.fixture(scope="module")
-def drive() -> Device:
+def drive() -> model.Device:
     return find_device(read_esi(FILES / "drive.xml"), product=0x402)
 
 
-def read(tmp_path: Path, content: str | bytes) -> DeviceFile:
+def read(tmp_path: Path, content: str | bytes) -> model.DeviceFile:
     path = tmp_path / "device.xml"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return read_esi(path)
 
 
-def device(tmp_path: Path, content: str, kind: str = 'ProductCode="1" RevisionNo="1"') -> DeviceFile:
+def device(tmp_path: Path, content: str, kind: str = 'ProductCode="1" RevisionNo="1"') -> model.DeviceFile:
     return read(tmp_path, f"{START}\n<Device><Type {kind}>T</Type>{content}</Device>{END}")
 
 
@@ -47,7 +36,7 @@ def plain(name: str, product: int = 1) -> str:
     return f"<Device><Type ProductCode='{product}'>T</Type><Name>{name}</Name></Device>"
 
 
-def test_names_are_in_english_and_the_identity_is_whole(drive: Device) -> None:
+def test_names_are_in_english_and_the_identity_is_whole(drive: model.Device) -> None:
     assert (drive.name, drive.vendor_name, drive.group_name) == (
         "Servo drive <one axis>",
         "Sample Drives",
@@ -60,16 +49,16 @@ def test_names_are_in_english_and_the_identity_is_whole(drive: Device) -> None:
     assert drive.origin == f"{FILES}/drive.xml:7"
 
 
-def test_sync_managers_fmmus_and_mailbox_are_read(drive: Device) -> None:
+def test_sync_managers_fmmus_and_mailbox_are_read(drive: model.Device) -> None:
     assert [(sync.start, sync.length, sync.control, sync.type) for sync in drive.sync_managers] == [
-        (0x1000, 256, 0x26, SyncManagerType.MAILBOX_RECEIVE),
-        (0x1200, 256, 0x22, SyncManagerType.MAILBOX_SEND),
-        (0x1400, 7, 0x64, SyncManagerType.OUTPUTS),
-        (0x1800, 8, 0x20, SyncManagerType.INPUTS),
+        (0x1000, 256, 0x26, model.SyncManagerType.MAILBOX_RECEIVE),
+        (0x1200, 256, 0x22, model.SyncManagerType.MAILBOX_SEND),
+        (0x1400, 7, 0x64, model.SyncManagerType.OUTPUTS),
+        (0x1800, 8, 0x20, model.SyncManagerType.INPUTS),
     ]
     assert (drive.sync_managers[0].minimum, drive.sync_managers[0].maximum) == (34, 256)
     assert [sync.op_only for sync in drive.sync_managers] == [False, False, True, False]
-    assert drive.fmmus == (FmmuUse.OUTPUTS, FmmuUse.INPUTS, FmmuUse.MAILBOX_STATE)
+    assert drive.fmmus == (model.FmmuUse.OUTPUTS, model.FmmuUse.INPUTS, model.FmmuUse.MAILBOX_STATE)
     assert drive.mailbox is not None
     assert drive.mailbox.foe
     assert drive.mailbox.data_link_layer
@@ -79,7 +68,7 @@ def test_sync_managers_fmmus_and_mailbox_are_read(drive: Device) -> None:
     assert (coe.complete_access, coe.segmented) == (True, True)
 
 
-def test_pdos_have_their_entries_of_any_length_padding_exclusions_and_assignment(drive: Device) -> None:
+def test_pdos_have_their_entries_of_any_length_padding_exclusions_and_assignment(drive: model.Device) -> None:
     first, second = drive.rx_pdos
     assert (first.index, first.sync_manager, first.mandatory, first.fixed) == (0x1600, 2, True, False)
     assert (first.excludes, second.sync_manager, second.fixed) == (frozenset({0x1601}), None, True)
@@ -94,28 +83,28 @@ def test_pdos_have_their_entries_of_any_length_padding_exclusions_and_assignment
     assert inputs.bits == 80
 
 
-def test_dc_modes_keep_the_whole_word_the_factors_and_the_shifts(drive: Device) -> None:
+def test_dc_modes_keep_the_whole_word_the_factors_and_the_shifts(drive: model.Device) -> None:
     assert drive.dc_modes == (
-        DcMode("DC", 0x0730, "SYNC0", sync0_factor=-2, sync0_shift=-20_000, sync1_factor=1),
-        DcMode("Off", 0, sync0_factor=0),
+        model.DcMode("DC", 0x0730, "SYNC0", sync0_factor=-2, sync0_shift=-20_000, sync1_factor=1),
+        model.DcMode("Off", 0, sync0_factor=0),
     )
 
 
 def test_a_cycle_without_a_factor_is_that_of_the_master(tmp_path: Path) -> None:
     file = device(tmp_path, "<Dc><OpMode><Name>A</Name><CycleTimeSync0>0</CycleTimeSync0></OpMode></Dc>")
-    assert file.devices[0].dc_modes == (DcMode("A", 0, sync0_factor=1),)
+    assert file.devices[0].dc_modes == (model.DcMode("A", 0, sync0_factor=1),)
 
 
-def test_commands_for_a_transition_are_read(drive: Device) -> None:
+def test_commands_for_a_transition_are_read(drive: model.Device) -> None:
     (command,) = drive.init_commands
     assert (command.transitions, command.index, command.data, command.fixed) == (("PS",), 0x6060, b"\x08", True)
 
 
 def test_an_array_without_subindexes_has_its_elements_with_types_rights_units_and_values_by_position(
-    drive: Device,
+    drive: model.Device,
 ) -> None:
     limits = next(item for item in drive.objects if item.index == 0x607D)
-    assert limits.code is ObjectCode.ARRAY
+    assert limits.code is model.ObjectCode.ARRAY
     assert [(entry.sub_index, entry.name, entry.type, entry.bits) for entry in limits.entries] == [
         (0, "SubIndex 000", "USINT", 8),
         (1, "Min", "DINT", 32),
@@ -130,9 +119,9 @@ def test_an_array_without_subindexes_has_its_elements_with_types_rights_units_an
     ]
 
 
-def test_a_record_keeps_its_names_though_those_of_the_values_differ_and_its_gaps(drive: Device) -> None:
+def test_a_record_keeps_its_names_though_those_of_the_values_differ_and_its_gaps(drive: model.Device) -> None:
     record = next(item for item in drive.objects if item.index == 0x2000)
-    assert record.code is ObjectCode.RECORD
+    assert record.code is model.ObjectCode.RECORD
     assert [(entry.sub_index, entry.name, entry.type, entry.readable) for entry in record.entries] == [
         (0, "SubIndex 000", "USINT", True),
         (1, "Gain", "REAL", True),
@@ -165,7 +154,7 @@ def test_values_of_some_subindexes_are_found_by_name_and_an_array_shares_its_len
     ]
 
 
-def test_values_that_are_shorter_than_the_type_are_filled_and_texts_are_not(drive: Device) -> None:
+def test_values_that_are_shorter_than_the_type_are_filled_and_texts_are_not(drive: model.Device) -> None:
     objects = {item.index: item.entries[0] for item in drive.objects}
     assert objects[0x6081].default == b"\x64\0\0\0"
     assert (objects[0x6081].rx_mappable, objects[0x6081].tx_mappable) == (True, True)
@@ -189,14 +178,14 @@ def test_a_terminal_without_a_mailbox_has_registers_bits_and_virtual_sync_manage
 
 def test_a_real_file_with_two_prefixes_of_numbers_and_sync_managers_of_its_own_names_is_read() -> None:
     (joint,) = read_esi(FILES / "Orbita2d.xml").devices
-    assert joint.rx_pdos[0].entries[0] == PdoEntry(0x6041, 0, 16, "controlword", "UINT16")
+    assert joint.rx_pdos[0].entries[0] == model.PdoEntry(0x6041, 0, 16, "controlword", "UINT16")
     assert [sync.type for sync in joint.sync_managers] == [
-        SyncManagerType.MAILBOX_RECEIVE,
-        SyncManagerType.MAILBOX_SEND,
-        SyncManagerType.OUTPUTS,
-        SyncManagerType.INPUTS,
+        model.SyncManagerType.MAILBOX_RECEIVE,
+        model.SyncManagerType.MAILBOX_SEND,
+        model.SyncManagerType.OUTPUTS,
+        model.SyncManagerType.INPUTS,
     ]
-    assert joint.fmmus == (FmmuUse.OUTPUTS, FmmuUse.INPUTS, FmmuUse.UNUSED)
+    assert joint.fmmus == (model.FmmuUse.OUTPUTS, model.FmmuUse.INPUTS, model.FmmuUse.UNUSED)
 
 
 # Looking up
@@ -213,11 +202,11 @@ def test_of_several_revisions_the_one_that_none_hides_is_found() -> None:
 def test_a_device_that_is_ambiguous_or_absent_is_refused_with_what_there_is() -> None:
     file = read_esi(FILES / "terminals.xml")
     with pytest.raises(
-        LookupFailure, match=r"3 devices fit without a choice; there are: 2 digital outputs \(DO-2\)"
-    ) as one:
+        model.LookupFailure, match=r"3 devices fit without a choice; there are: 2 digital outputs \(DO-2\)"
+    ) as target:
         find_device(file)
-    assert len(one.value.candidates) == 3
-    with pytest.raises(LookupFailure, match="no devices fit product 0x00000009; there are: 2 digital outputs"):
+    assert len(target.value.candidates) == 3
+    with pytest.raises(model.LookupFailure, match="no devices fit product 0x00000009; there are: 2 digital outputs"):
         find_device(file, product=9)
 
 
@@ -268,9 +257,9 @@ def test_what_real_files_get_wrong_is_accepted_with_a_warning_at_its_line(
 ) -> None:
     file = device(tmp_path, content)
     assert file.failures == ()
-    (found,) = file.warnings
-    assert warning in found
-    assert found.startswith(f"{tmp_path}/device.xml:2: ")
+    (message,) = file.warnings
+    assert warning in message
+    assert message.startswith(f"{tmp_path}/device.xml:2: ")
 
 
 def test_what_follows_the_root_is_left_out_with_a_warning(tmp_path: Path) -> None:
@@ -284,7 +273,7 @@ def test_a_device_that_cannot_be_understood_is_named_and_the_others_are_read(tmp
     file = read(tmp_path, f"{START}\n{broken}<Device><Type ProductCode='2'>U</Type></Device>{END}")
     assert [device.type for device in file.devices] == ["U"]
     assert file.failures == (f"{tmp_path}/device.xml:2: RxPdo: Index is 'sixteen', not a number",)
-    with pytest.raises(LookupFailure, match=r"not readable: .*sixteen"):
+    with pytest.raises(model.LookupFailure, match=r"not readable: .*sixteen"):
         find_device(file, product=1)
 
 
@@ -320,22 +309,22 @@ def test_a_file_of_modules_alone_is_a_file(tmp_path: Path) -> None:
 def test_what_is_no_description_or_too_large_is_refused_with_its_place(
     tmp_path: Path, content: str, problem: str
 ) -> None:
-    with pytest.raises(EsiError, match=problem) as error:
+    with pytest.raises(model.EsiError, match=problem) as error:
         read(tmp_path, content)
     assert error.value.origin.startswith(f"{tmp_path}/device.xml")
 
 
 def test_a_file_that_is_not_there_no_file_or_too_long_is_refused(tmp_path: Path) -> None:
-    # Opening it would wait for somebody who writes.
+    # Opening a pipe would wait for a writer.
     os.mkfifo(tmp_path / "pipe.xml")
     for none in (tmp_path / "pipe.xml", tmp_path):
-        with pytest.raises(EsiError, match="this is no regular file"):
+        with pytest.raises(model.EsiError, match="this is no regular file"):
             read_esi(none)
-    with pytest.raises(EsiError, match="cannot be read: No such file"):
+    with pytest.raises(model.EsiError, match="cannot be read: No such file"):
         read_esi(tmp_path / "none.xml")
     with (tmp_path / "long.xml").open("wb") as file:
         file.truncate(xml_tree.FILE_LIMIT + 1)
-    with pytest.raises(EsiError, match="more than 65536 KiB"):
+    with pytest.raises(model.EsiError, match="more than 65536 KiB"):
         read_esi(tmp_path / "long.xml")
 
 
@@ -352,7 +341,7 @@ def test_types_that_grow_when_they_are_unfolded_are_refused(tmp_path: Path, monk
 
     assert len(device(tmp_path, dictionary(40, 1)).devices[0].objects[0].entries) == 255  # subindexes end there
     monkeypatch.setattr(object_reader, "ENTRY_LIMIT", 2000)
-    with pytest.raises(EsiError, match="dictionaries of more than 2000 subindexes"):
+    with pytest.raises(model.EsiError, match="dictionaries of more than 2000 subindexes"):
         device(tmp_path, dictionary(1, 8))
 
 

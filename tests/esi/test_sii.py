@@ -1,4 +1,4 @@
-"""SII images: written for SOEM and IgH, read from real slaves, and what is wrong in one."""
+"""SII images: written for SOEM and IgH, read from real slaves, and their mistakes."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def outputs() -> Device:
 
 def categories(image: bytes) -> list[tuple[int, bytes]]:
     """Number and data of each category, by their definition."""
-    found = []
+    parts = []
     position = 128
     while (number := int.from_bytes(image[position : position + 2], "little")) != 0xFFFF:
         length = 2 * int.from_bytes(image[position + 2 : position + 4], "little")
-        found.append((number, image[position + 4 : position + 4 + length]))
+        parts.append((number, image[position + 4 : position + 4 + length]))
         position += 4 + length
-    return found
+    return parts
 
 
 def end_mark(image: bytes) -> int:
@@ -43,7 +43,7 @@ def end_mark(image: bytes) -> int:
 
 
 def without_lost(device: Device) -> Device:
-    """What an SII image cannot hold, left out."""
+    """The device without what an SII image cannot express."""
     mailbox = device.mailbox
     if mailbox is not None and mailbox.coe is not None:
         mailbox = replace(mailbox, coe=replace(mailbox.coe, segmented=False))
@@ -113,16 +113,16 @@ def test_pdos_and_modes_of_any_device_are_read_as_they_were_written(
     rx_pdos: tuple[Pdo, ...], tx_pdos: tuple[Pdo, ...], modes: tuple[DcMode, ...]
 ) -> None:
     device = find_device(read_esi(FILES / "terminals.xml"), name="DO-2")
-    found = read_sii(write_sii(replace(device, eeprom_bytes=0, rx_pdos=rx_pdos, tx_pdos=tx_pdos, dc_modes=modes)))
-    assert (found.rx_pdos, found.tx_pdos, found.dc_modes) == (rx_pdos, tx_pdos, modes)
+    information = read_sii(write_sii(replace(device, eeprom_bytes=0, rx_pdos=rx_pdos, tx_pdos=tx_pdos, dc_modes=modes)))
+    assert (information.rx_pdos, information.tx_pdos, information.dc_modes) == (rx_pdos, tx_pdos, modes)
 
 
 def test_the_categories_stand_in_the_order_that_masters_need_each_once(drive: Device) -> None:
-    found = categories(write_sii(drive))
-    assert [number for number, _ in found] == [10, 30, 40, 41, 50, 51, 60]
-    sizes = {number: len(data) for number, data in found}
+    numbers = categories(write_sii(drive))
+    assert [number for number, _ in numbers] == [10, 30, 40, 41, 50, 51, 60]
+    sizes = {number: len(data) for number, data in numbers}
     assert (sizes[30], sizes[40], sizes[41], sizes[60]) == (32, 4, 32, 48)
-    assert found[0][1][:8] == b"\x10\x06SD-402"  # 16 texts, the first is the type: SOEM's name
+    assert numbers[0][1][:8] == b"\x10\x06SD-402"  # 16 texts, the first is the type: SOEM's name
 
 
 def test_the_fixed_part_has_config_data_crc_identity_mailboxes_and_size(drive: Device) -> None:
@@ -161,7 +161,7 @@ def test_the_eeprom_of_a_real_terminal_is_written_byte_for_byte_but_for_its_own_
     assert written[:128] == image[:128]
     real, ours = dict(categories(image)), dict(categories(written))
     assert {number: ours[number] for number in (40, 41)} == {number: real[number] for number in (40, 41)}
-    # Physical ports stand twice in a real one, the older way too; texts and their numbers are the same.
+    # Real images have the physical ports twice, also in the older format; texts and their numbers are equal.
     assert ours[10] == real[10].replace(b"\xff", b"\0")
     assert (ours[30][:4], ours[30][5:]) == (real[30][:4], real[30][5:])
     assert ours[51] == real[51]
@@ -248,15 +248,15 @@ def test_several_categories_of_a_number_are_read_as_one(drive: Device) -> None:
 
 def test_what_is_wrong_in_an_image_is_said_in_sentences(drive: Device) -> None:
     image = bytearray(write_sii(drive))
-    assert check_sii(image[:100]) == ("100 bytes; the fixed part of an SII image alone has 128.",)
+    assert check_sii(bytes(image[:100])) == ("100 bytes; the fixed part of an SII image alone has 128.",)
     with pytest.raises(EsiError, match="100 bytes"):
         read_sii(bytes(image[:100]))
     image[0] ^= 1
     assert check_sii(bytes(image)) == (
-        f"The CRC of the first seven words is 0x{image[14]:02X}, not 0x{crc(image[:14]):02X}.",
+        f"The CRC of the first seven words is 0x{image[14]:02X}, not 0x{crc(bytes(image[:14])):02X}.",
     )
     image[0] ^= 1
-    end = end_mark(image)
+    end = end_mark(bytes(image))
     cut = bytes(image[:end])
     assert check_sii(cut) == ("The end mark 0xFFFF is missing: IgH drops all categories.",)
     assert "Category 60 is longer than the image." in check_sii(cut[:-2])

@@ -26,9 +26,9 @@ from rtcp.esi.units import unit
     ],
 )  # fmt: skip
 def test_a_name_tells_number_length_and_kind(name: str, number: int, bits: int, kind: Kind) -> None:
-    found = named(name)
-    assert found is not None
-    assert (found.number, found.bits, found.kind) == (number, bits, kind)
+    base_type = named(name)
+    assert base_type is not None
+    assert (base_type.number, base_type.bits, base_type.kind) == (number, bits, kind)
 
 
 def test_what_is_no_base_type_is_the_plainest_of_its_length() -> None:
@@ -42,9 +42,9 @@ def test_what_is_no_base_type_is_the_plainest_of_its_length() -> None:
 
 @given(st.sampled_from(sorted(types._BY_NUMBER)))
 def test_a_number_tells_its_type_again(number: int) -> None:
-    found = of_number(number, 0)
-    assert found.number == number
-    assert of_number(number, found.bits) == found
+    base_type = of_number(number, 0)
+    assert base_type.number == number
+    assert of_number(number, base_type.bits) == base_type
 
 
 @given(st.integers(1, 64), st.integers(0, (1 << 64) - 1))
@@ -68,9 +68,9 @@ def test_numbers_of_every_length_come_back(bits: int, value: int) -> None:
     ],
 )
 def test_values_are_little_endian_bytes(name: str, value: types.Value, data: bytes) -> None:
-    found = resolve(name, 0)
-    assert encode(found, value) == data
-    assert decode(found, data) == value
+    base_type = resolve(name, 0)
+    assert encode(base_type, value) == data
+    assert decode(base_type, data) == value
 
 
 @pytest.mark.parametrize(
@@ -102,10 +102,10 @@ def test_a_value_that_does_not_fit_is_refused(name: str, value: types.Value) -> 
     ],
 )
 def test_a_notation_tells_the_unit_and_its_factor_to_the_si(notation: int, text: str, factor: float, si: str) -> None:
-    found = unit(notation)
-    assert found is not None
-    assert (found.text, found.si) == (text, si)
-    assert found.factor == pytest.approx(factor, rel=1e-12)
+    parsed = unit(notation)
+    assert parsed is not None
+    assert (parsed.text, parsed.si) == (text, si)
+    assert parsed.factor == pytest.approx(factor, rel=1e-12)
 
 
 def test_a_files_own_units_are_understood_by_their_symbol_or_kept_as_they_are() -> None:

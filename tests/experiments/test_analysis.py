@@ -1,4 +1,4 @@
-"""What the experiments compute, on signals whose truth is known."""
+"""The computations of the experiments, on signals with known results."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def test_the_sine_fit_finds_the_latency_at_30_hz_within_0_2_ms(latency_s: float,
     command = fit_sine(t, 0.3 + pi / 16 * np.sin(tau * t / PERIOD_S + 0.4), PERIOD_S, 1239.5)
     actual = 0.3 + pi / 16 * np.sin(tau * (finer - latency_s) / PERIOD_S + 0.4)
     feedback = fit_sine(finer, actual + noise * random.standard_normal(len(finer)), PERIOD_S, 1239.5)
-    found, error = behind(feedback, command)
-    assert found == pytest.approx(latency_s, abs=0.2e-3)
-    assert abs(found - latency_s) <= 5 * error + 1e-9
+    delay, error = behind(feedback, command)
+    assert delay == pytest.approx(latency_s, abs=0.2e-3)
+    assert abs(delay - latency_s) <= 5 * error + 1e-9
     assert feedback.amplitude == pytest.approx(pi / 16, rel=1e-3)
     assert feedback.period_s == pytest.approx(PERIOD_S, rel=1e-4)
 
@@ -51,8 +51,8 @@ def test_noise_of_30_hz_samples_themselves_still_gives_the_latency_within_its_st
         command = fit_sine(t, np.sin(tau * t / PERIOD_S), PERIOD_S, 5.0)
         noisy = np.sin(tau * (t - 0.1) / PERIOD_S) + 0.01 * random.standard_normal(len(t))
         feedback = fit_sine(t, noisy, PERIOD_S, 5.0)
-        found, error = behind(feedback, command)
-        misses.append((found - 0.1) / error)
+        delay, error = behind(feedback, command)
+        misses.append((delay - 0.1) / error)
     assert np.std(misses) == pytest.approx(1.0, abs=0.3)
 
 
@@ -76,14 +76,14 @@ def test_inertia_and_friction_come_back_from_the_torque_that_they_take() -> None
     torque = 3.0 * acceleration + 2.0 * np.sign(v) + 1.5 * v - 19.6 * np.sin(q)
     torque[(t > 2.4) & (t < 2.5)] += 5.0  # what a stall leaves behind
     kept = np.arange(len(t)) % 50 != 3  # some cycles are missing
-    found = identify(*(np.round(values[kept], 4) for values in (t, torque, v, q)))
-    assert (found.inertia, found.coulomb, found.viscous) == pytest.approx((3.0, 2.0, 1.5), rel=0.01)
-    assert found.gravity == pytest.approx((19.6, 0.0), abs=0.1)
+    identified = identify(*(np.round(values[kept], 4) for values in (t, torque, v, q)))
+    assert (identified.inertia, identified.coulomb, identified.viscous) == pytest.approx((3.0, 2.0, 1.5), rel=0.01)
+    assert identified.gravity == pytest.approx((19.6, 0.0), abs=0.1)
 
 
 def test_a_joint_that_stands_is_not_identified() -> None:
     with pytest.raises(ExperimentFailed, match="hardly moved"):
-        identify(np.arange(1000) * 0.0005, *np.zeros((3, 1000)))
+        identify(np.arange(1000, dtype=np.float64) * 0.0005, *np.zeros((3, 1000)))
 
 
 @pytest.mark.parametrize(
@@ -119,12 +119,12 @@ def test_a_result_is_read_back_as_it_was_written(tmp_path: Path) -> None:
 def test_a_report_is_one_file_with_figures_verdicts_and_pictures_of_one_or_two_folders(tmp_path: Path) -> None:
     result(tmp_path / "a" / "step", 6.1)
     result(tmp_path / "b" / "step", 8.0)
-    one, both = page([tmp_path / "a"]), page([tmp_path / "a", tmp_path / "b"])
-    assert "A &lt;step&gt;" in one
-    assert "about 6" in one
-    assert '<td class="met">met</td>' in one
-    assert "data:image/png;base64," in one
-    assert "http" not in one
+    single, both = page([tmp_path / "a"]), page([tmp_path / "a", tmp_path / "b"])
+    assert "A &lt;step&gt;" in single
+    assert "about 6" in single
+    assert '<td class="met">met</td>' in single
+    assert "data:image/png;base64," in single
+    assert "http" not in single
     assert '<td class="missed">missed</td>' in both
     assert both.count("<img") == 2
 
@@ -138,8 +138,8 @@ def test_what_failed_or_could_not_be_measured_is_in_result_and_report_as_a_miss(
 
     with pytest.raises(ExperimentFailed, match="no geometry"):
         carry_out(Failing(), Setup(tmp_path, nullcontext, print), "rtcp experiment failing")
-    found = read_result(tmp_path)
-    assert (found.met, found.notes) == (False, ("the arm has no geometry",))
+    result = read_result(tmp_path)
+    assert (result.met, result.notes) == (False, ("the arm has no geometry",))
     assert "not measured" in page([tmp_path])
     assert "the arm has no geometry" in page([tmp_path])
 

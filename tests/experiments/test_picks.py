@@ -11,10 +11,10 @@ import pytest
 
 from kinematics import forward
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import Enable, MoveJoints, SetControlMode
+from rtcp.ipc.commands import MoveJoints, SetControlMode
 from rtcp.ipc.states import ControlMode, State
-from rtcp.launch.simulation import Simulation
 from rtcp.telemetry.experiments.motions import BASE_ABOVE_GROUND_M, ITEMS, Person, begin_pose
+from rtcp.testing.simulation import Simulation
 
 GRIPPER_OUTPUT = 0x08
 CONFIG = load(default_config())
@@ -49,16 +49,12 @@ class Joystick:
 def joystick() -> Iterator[Joystick]:
     config = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=2000.0))
     with Simulation(config, seed=1) as simulation:
-        assert simulation.until(lambda: simulation.state is State.READY, 5.0)
-        simulation.run(0.1)
-        simulation.acquire()
-        assert simulation.send(Enable()).refusal is None
-        assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
+        simulation.hold()
         assert CONFIG.arm is not None
         start = begin_pose(CONFIG.arm)
-        assert simulation.send(MoveJoints(start, 0.5, True)).refusal is None
-        assert simulation.until(lambda: simulation.state is State.HOLDING, 20.0)
-        assert simulation.send(SetControlMode(ControlMode.JOYSTICK)).refusal is None
+        simulation.do(MoveJoints(start, 0.5, True))
+        simulation.bring_to(State.HOLDING, 20.0)
+        simulation.do(SetControlMode(ControlMode.JOYSTICK))
         simulation.run(0.1)
         yield Joystick(simulation)
 

@@ -15,19 +15,16 @@ from typing import Any
 
 from rtcp.config import load
 from rtcp.control.part import Device
-from rtcp.ipc.commands import Enable, Halt
+from rtcp.ipc.commands import Halt
 from rtcp.ipc.names import Names
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Frame, Simulation
+from rtcp.testing.simulation import Frame, Simulation
 
 
 def started(path: Path) -> Simulation:
     """An enabled arm."""
     simulation = Simulation(load(path), follow_clock=False)
-    assert simulation.until(lambda: simulation.state is State.READY, 5.0)
-    simulation.acquire()
-    assert simulation.send(Enable()).refusal is None
-    assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
+    simulation.hold()
     return simulation
 
 
@@ -62,7 +59,7 @@ def sway(path: Path) -> Any:
 
 
 def fan(path: Path) -> Any:
-    """What the process publishes: before its command, after it, and after a halt."""
+    """Output of the process before its command, after it, and after a halt."""
     from rtcp_example.fan import RunFan
 
     own = path.with_name("fan.yaml")
@@ -76,20 +73,22 @@ def fan(path: Path) -> Any:
             return [float(record["fan_kelvin"][0]), int(record["fan_on"][0])]
 
         before = published()
-        assert simulation.send(RunFan(before[0] - 1.0)).refusal is None
+        simulation.do(RunFan(before[0] - 1.0))
         after = published()
         simulation.send(Halt())
-        kelvin = next(one for one in simulation.loop.devices if one.name == "thermometer").driver.values["second"]
+        kelvin = next(device for device in simulation.loop.devices if device.name == "thermometer").driver.values[
+            "second"
+        ]
         return {"before": before, "after": after, "halted": published(), "kelvin": kelvin}
 
 
 def thermometer(path: Path) -> Any:
-    """What the driver decodes and the record shows, beside the bytes on the bus and the model's own temperatures."""
+    """Decoded and recorded temperatures, beside the bytes on the bus and those of the model."""
     with started(path) as simulation:
         frames: list[Frame] = []
         simulation.on_frame = frames.append
         simulation.run(0.5)
-        part = next(one for one in simulation.loop.parts if one.name == "thermometer")
+        part = next(part for part in simulation.loop.parts if part.name == "thermometer")
         assert isinstance(part, Device)
         slot, driver = part.slot, part.driver
         counts = struct.unpack("<hh", frames[-1].received[slot])
@@ -116,13 +115,13 @@ def alarm(path: Path) -> Any:
         accepted = simulation.send(SetAlarm(302.0)).refusal is None
         simulation.until(lambda: simulation.events[-1].event.name == "warm", 5.0)
         states = [simulation.state.name]
-        simulation.until(lambda: simulation.state is State.FAULT, 5.0)
+        simulation.bring_to(State.FAULT)
         states.append(simulation.state.name)
         return {
             "refused": refused and names.message(refused),
             "accepted": accepted,
             "states": states,
-            "events": [names.message(one.event) for one in simulation.events if one.event.number > 1000],
+            "events": [names.message(record.event) for record in simulation.events if record.event.number > 1000],
             "fault": int(simulation.loop.machine.fault),
         }
 
@@ -131,8 +130,8 @@ def wire_break(path: Path) -> Any:
     """The fault on a real segment object: named as a script names it, begun and cleared by the registry."""
     from rtcp.config.segment import load_segment
     from rtcp.virtual.faults.fault import FaultRefused
-    from rtcp.virtual.faults.registry import FaultRegistry, parse, sentence_of
-    from rtcp.virtual.server import make_segment
+    from rtcp.virtual.faults.registry import FaultRegistry, parse
+    from rtcp.virtual.segment import make_segment
 
     config = load(path)
     segment = make_segment(load_segment(config.source.parent / config.bus.segment), time.monotonic_ns())
@@ -159,7 +158,7 @@ def wire_break(path: Path) -> Any:
     except FaultRefused as error:
         refused = str(error)
     _, wrong = parse({"fault": "wire_break", "slave": 0})
-    return {"shown": shown, "refused": refused, "wrong": [sentence_of(one) for one in wrong]}
+    return {"shown": shown, "refused": refused, "wrong": [str(finding) for finding in wrong]}
 
 
 def methods(path: Path) -> Any:
@@ -175,18 +174,18 @@ def methods(path: Path) -> Any:
         session = Session(simulation.config, "virtual", "ecat0", 0, time.monotonic_ns())
         snapshot = StatusSnapshot(simulation.observer, session, {})
         table = Methods(simulation.observer, snapshot, session, Path(directory), end_platform).table
-        found = table["sway"]
-        _, findings = found.parameters.check({"axis": 5, "amplitude": 0.02, "frequency": "fast"})
+        entry = table["sway"]
+        _, findings = entry.parameters.check({"axis": 5, "amplitude": 0.02, "frequency": "fast"})
         return {
-            "documentation": found.documentation,
-            "streams": found.streams,
-            "findings": [[list(where), text] for where, text in findings],
+            "documentation": entry.documentation,
+            "streams": entry.streams,
+            "findings": [str(finding) for finding in findings],
         }
 
 
 if __name__ == "__main__":
     _, scene, config = sys.argv
     json.dump(
-        {one.__name__: one for one in (sway, thermometer, alarm, wire_break, methods, fan)}[scene](Path(config)),
+        {play.__name__: play for play in (sway, thermometer, alarm, wire_break, methods, fan)}[scene](Path(config)),
         sys.stdout,
     )

@@ -26,8 +26,8 @@ pytestmark = pytest.mark.alone
 
 @pytest.fixture(scope="module")
 def seen(installed: Path) -> Iterator[SimpleNamespace]:
-    """What was seen of a thermometer until it became too warm and stopped the arm."""
-    platform, found = Platform(), SimpleNamespace()
+    """Outputs of a platform with a thermometer, until the thermometer was too warm and stopped the arm."""
+    platform, seen = Platform(), SimpleNamespace()
     try:
         platform.be_patient(lost_ms=2000)
         add_thermometer(platform.directory / "config")
@@ -37,25 +37,25 @@ def seen(installed: Path) -> Iterator[SimpleNamespace]:
         kept = platform.directory / "kept"
         signals = ("--signals", "thermometer_*")
         platform.rtcp("record", "start", "--format", "mcap,csv", *signals, "--out", str(kept))
-        found.status = json.loads(platform.rtcp("status", "--json").stdout)
+        seen.status = json.loads(platform.rtcp("status", "--json").stdout)
         feed = Feed(platform.directory)
-        found.scope = signals_of(feed.config, feed.schema)
+        seen.scope = signals_of(feed.config, feed.schema)
         feed.close()
         with begun(platform) as (_, url):
             platform.until(lambda _: b"rtcp_up 1" in urlopen(f"{url}/metrics").read(), "the state at the panel")
-            found.metrics = urlopen(f"{url}/metrics").read().decode()
+            seen.metrics = urlopen(f"{url}/metrics").read().decode()
         with Robot("a test", control_socket(platform.directory)) as robot:
             with pytest.raises(RtcpError) as refused:
                 robot.command("set_alarm", kelvin=200.0)
-            found.refused = refused.value
-            found.alarm = robot.status().raw["devices"]["thermometer"]["second"]["value"] + 3.0
-            robot.command("set_alarm", kelvin=found.alarm)
+            seen.refused = refused.value
+            seen.alarm = robot.status().raw["devices"]["thermometer"]["second"]["value"] + 3.0
+            robot.command("set_alarm", kelvin=seen.alarm)
         platform.until(lambda shown: shown["state"] == "fault", "the fault")
         platform.until(lambda _: any(platform.directory.glob("state/faults/*.mcap")), "the recording of the fault")
         platform.rtcp("record", "stop")
-        (found.mcap,), (found.csv,) = kept.glob("*.mcap"), kept.glob("*.csv")
-        (found.black_box,) = platform.directory.glob("state/faults/*.mcap")
-        yield found
+        (seen.mcap,), (seen.csv,) = kept.glob("*.mcap"), kept.glob("*.csv")
+        (seen.black_box,) = platform.directory.glob("state/faults/*.mcap")
+        yield seen
     finally:
         platform.end()
 
@@ -67,14 +67,14 @@ def test_its_values_are_in_the_status_with_their_unit(seen: SimpleNamespace) -> 
 
 
 def test_its_values_are_recorded_with_unit_and_meaning(seen: SimpleNamespace) -> None:
-    found, reader = read(seen.mcap), Reader(seen.mcap)
+    recording, reader = read(seen.mcap), Reader(seen.mcap)
     list(reader)
-    assert found.records.dtype.names == ("number", "time_ns", "thermometer_first", "thermometer_second")
+    assert recording.records.dtype.names == ("number", "time_ns", "thermometer_first", "thermometer_second")
     assert reader.schema["thermometer_first"].unit == "K"
     assert b"float64 thermometer_first  # thermometer, K: Input 0x6000:01" in reader.schema.definition()
-    assert found.records["thermometer_first"] == pytest.approx(300.0)
+    assert recording.records["thermometer_first"] == pytest.approx(300.0)
     # 10 K a second.
-    assert found.records["thermometer_second"][-1] > seen.alarm + 10.0
+    assert recording.records["thermometer_second"][-1] > seen.alarm + 10.0
 
 
 def test_chosen_they_are_columns_of_a_csv(seen: SimpleNamespace) -> None:
@@ -97,16 +97,16 @@ def test_its_command_is_refused_over_the_control_socket_in_its_own_words(seen: S
 
 
 def test_its_command_leads_to_its_event_and_its_fault_in_the_recordings_log(seen: SimpleNamespace) -> None:
-    log = [one.message for one in read(seen.mcap).log]
+    log = [line.message for line in read(seen.mcap).log]
     assert any(message.startswith("the second channel has") and message.endswith(" K") for message in log)
     assert any(message.endswith("more than 10 K above the alarm") for message in log)
 
 
 def test_its_values_are_in_the_black_box_around_its_fault(seen: SimpleNamespace) -> None:
-    found = recording.read(seen.black_box)
-    assert found.about.what.endswith("more than 10 K above the alarm")
-    assert found.records["thermometer_second"][found.about.at] > seen.alarm + 9.9
-    assert found.schema["thermometer_second"].unit == "K"
+    fault = recording.read(seen.black_box)
+    assert fault.about.what.endswith("more than 10 K above the alarm")
+    assert fault.records["thermometer_second"][fault.about.at] > seen.alarm + 9.9
+    assert fault.schema["thermometer_second"].unit == "K"
 
 
 def test_an_arm_on_a_bus_of_another_package_is_moved_and_what_the_bus_lacks_is_said(installed: Path) -> None:

@@ -69,43 +69,43 @@ def test_its_refusal_reads_as_those_of_the_platform(swayed: Any) -> None:
 
 
 def test_a_driver_of_another_package_decodes_what_the_model_of_that_package_sends(play: Any) -> None:
-    found = play("thermometer")
-    assert found["driver"] == "Thermometer"
-    first, second = found["counts"]
-    assert found["values"] == {"first": pytest.approx(first * 0.1), "second": pytest.approx(second * 0.1)}
-    assert found["values"]["first"] == pytest.approx(300.0)
-    assert found["values"]["second"] == pytest.approx(found["model"][1], abs=0.1)
-    assert found["values"]["second"] > 304.0
-    assert found["record"] == [found["values"]["first"], found["values"]["second"]]
-    assert found["unit"] == "K"
+    played = play("thermometer")
+    assert played["driver"] == "Thermometer"
+    first, second = played["counts"]
+    assert played["values"] == {"first": pytest.approx(first * 0.1), "second": pytest.approx(second * 0.1)}
+    assert played["values"]["first"] == pytest.approx(300.0)
+    assert played["values"]["second"] == pytest.approx(played["model"][1], abs=0.1)
+    assert played["values"]["second"] > 304.0
+    assert played["record"] == [played["values"]["first"], played["values"]["second"]]
+    assert played["unit"] == "K"
 
 
 def test_its_command_that_is_no_motion_is_refused_and_accepted_and_its_events_are_reported(play: Any) -> None:
-    found = play("alarm")
-    assert found["refused"].startswith("an alarm at 200 K would be active at once")
-    assert found["accepted"]
-    assert found["states"] == ["HOLDING", "FAULT"]
-    warm, hot = found["events"]
+    played = play("alarm")
+    assert played["refused"].startswith("an alarm at 200 K would be active at once")
+    assert played["accepted"]
+    assert played["states"] == ["HOLDING", "FAULT"]
+    warm, hot = played["events"]
     assert warm.startswith("the second channel has 302.")
     assert hot.endswith("more than 10 K above the alarm")
-    assert found["fault"] == 1002
+    assert played["fault"] == 1002
 
 
 def test_a_fault_of_another_package_begins_ends_and_is_refused_where_it_does_not_fit(play: Any) -> None:
-    found = play("wire_break")
-    assert found["shown"] == [3000, 0x7FFF, 3000]
-    assert found["refused"] == "slave 1 is no thermometer"
-    assert len(found["wrong"]) == 1
-    assert found["wrong"][0].startswith("slave: found 0")
+    played = play("wire_break")
+    assert played["shown"] == [3000, 0x7FFF, 3000]
+    assert played["refused"] == "slave 1 is no thermometer"
+    assert len(played["wrong"]) == 1
+    assert played["wrong"][0].startswith("slave: found 0")
 
 
 def test_the_gateway_lists_the_command_as_a_method_that_checks_its_parameters(play: Any) -> None:
-    found = play("methods")
-    assert found["documentation"].startswith("Swing a joint")
-    assert found["streams"] is False
-    missing, wrong = sorted(found["findings"])
-    assert "duration_s is missing" in missing[1]
-    assert wrong[0] == ["frequency"]
+    played = play("methods")
+    assert played["documentation"].startswith("Swing a joint")
+    assert played["streams"] is False
+    wrong, missing = sorted(played["findings"])
+    assert "duration_s is missing" in missing
+    assert wrong.startswith("frequency: ")
 
 
 def test_no_other_test_sees_what_the_package_registers(installed: Path) -> None:
@@ -139,10 +139,10 @@ def test_the_page_of_processes_shows_the_process_of_the_example_whole() -> None:
 
 
 def test_a_process_of_another_package_reads_its_channel_and_takes_its_command(play: Any) -> None:
-    found = play("fan")
-    assert found["before"] == [pytest.approx(found["kelvin"], abs=5.0), 0]
-    assert found["after"][1] == 1
-    assert found["halted"][1] == 0
+    played = play("fan")
+    assert played["before"] == [pytest.approx(played["kelvin"], abs=5.0), 0]
+    assert played["after"][1] == 1
+    assert played["halted"][1] == 0
 
 
 def test_the_page_of_buses_shows_the_bus_of_the_example_whole() -> None:

@@ -1,4 +1,4 @@
-"""The fault matrix of a cell: two virtual IRB 120, and what happens to the right one at rest, in motion and in step."""
+"""The fault matrix of a cell of two virtual IRB 120: faults of the right one at rest, in motion and in step."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ MOVED_RAD: Final = 0.003
 
 @dataclass(frozen=True)
 class Case:
-    """What happens to the right arm, and what has to become of both."""
+    """A fault of the right arm, and the required reaction of both."""
 
     name: str
     requests: Sequence[Mapping[str, Any]] = ()
-    """What is asked of its virtual controller."""
+    """Requests to its virtual controller."""
     process: str = ""
     """Its process that gets `signal`: segment (the virtual controller), loop or gateway."""
     signal: signal.Signals = signal.SIGKILL
     command: str = ""
-    """What somebody else commands it."""
+    """Command of another client to it."""
     right: str = FAULT
 
 
@@ -80,7 +80,7 @@ class Result:
 
 
 class Trials:
-    """The running cell; started anew after a process was killed."""
+    """The running cell; restarted after a process was killed."""
 
     def __init__(self) -> None:
         self.cell = RunningCell(CONFIG / "cell.yaml")
@@ -94,7 +94,7 @@ class Trials:
         return RequestClient(irc5_control(self.cell.of(RIGHT)), server="virtual IRC5")
 
     def state(self, name: str) -> str:
-        """Return what an arm does by its newest record, in words."""
+        """Return the state of an arm by its newest record, in words."""
         directory = self.cell.of(name)
         if not is_running(read_processes(directory).loop):
             return ENDED
@@ -114,7 +114,7 @@ class Trials:
         return now
 
     def recover(self, killed: bool) -> None:
-        """Put all in order, reset, enable, and go home; what was killed is started anew."""
+        """Recover, reset, enable and go home; restart killed processes."""
         if killed:
             for name in (LEFT, RIGHT):
                 self.cell.platform.rtcp("--name", name, "stop", check=None)
@@ -133,7 +133,7 @@ class Trials:
                     cell.move_joints(dict.fromkeys(cell.arms, ABB_HOME), SPEED * 2)
                     return
             except (RtcpError, RequestRefused):
-                # The controller needs a moment until it takes references again.
+                # The controller accepts references again after a moment.
                 if time.monotonic() > end:
                     raise
                 time.sleep(0.2)
@@ -194,7 +194,7 @@ def run_case(trials: Trials, case: Case, kind: str) -> Result:
 
 
 def _strike(trials: Trials, case: Case) -> int:
-    """Let it happen; return when."""
+    """Cause the fault; return its instant."""
     if case.requests:
         with trials.operator() as operator:
             began_ns = time.monotonic_ns()
@@ -213,7 +213,7 @@ def _strike(trials: Trials, case: Case) -> int:
 
 
 def _observe(trials: Trials, case: Case, kind: str, result: Result, records: Records, began_ns: int) -> None:
-    """See what becomes of both arms."""
+    """Observe the reactions of both arms."""
     result.right = trials.until(RIGHT, case.right, seconds=3.0 if case.right != HELD or kind == AT_REST else PATIENCE_S)
     if case.signal is signal.SIGSTOP:
         time.sleep(2.0)
@@ -226,7 +226,7 @@ def _observe(trials: Trials, case: Case, kind: str, result: Result, records: Rec
         result.problems.append(f"the left arm: {result.left}")
     with Robot("a trial", control_socket(trials.cell.of(LEFT))) as robot:
         events = robot.events()
-    result.message = next((one.message for one in reversed(events) if one.name.startswith("partner")), "-")
+    result.message = next((event.message for event in reversed(events) if event.name.startswith("partner")), "-")
     if kind != IN_STEP:
         result.message = "-"
     rows = records.read()[LEFT]
@@ -235,8 +235,8 @@ def _observe(trials: Trials, case: Case, kind: str, result: Result, records: Rec
     full = speed[0] if len(speed) else 0.0
     if kind == IN_STEP:
         paths = records.paths()
-        phases = {name: int(one["step_phase"][0]) for name, one in records.newest().items()}
-        ends = [one.name for one in events][-6:]
+        phases = {name: int(record["step_phase"][0]) for name, record in records.newest().items()}
+        ends = [event.name for event in events][-6:]
         if not {"partner_stopped", "partner_left", "partner_silent"} & set(ends):
             result.problems.append(f"the left arm did not stop with its partner: {ends}")
         braking = np.flatnonzero(rows["step_phase"] >= 3)
@@ -244,7 +244,7 @@ def _observe(trials: Trials, case: Case, kind: str, result: Result, records: Rec
             result.reaction_ms = 1e-6 * float(rows["time_ns"][braking[0]] - began_ns)
         if case.command or case.process == "gateway":
             result.apart_ms = 1e3 * abs(paths[LEFT] - paths[RIGHT])
-            if result.apart_ms > 2.0:  # a loop that the host held up comes to rest a little further on
+            if result.apart_ms > 2.0:  # a loop that the host delayed comes to rest a little further on
                 result.problems.append(f"the paths are {result.apart_ms:.2f} ms apart at rest: {phases}")
     elif kind == AT_REST and full > 0.0:
         result.problems.append("the left arm moved")
@@ -265,7 +265,7 @@ def columns(case: Case, kind: str, result: Result) -> list[str]:
     def shown(value: float | None, digits: int) -> str:
         return "-" if value is None else f"{value:.{digits}f}"
 
-    says = "; ".join([result.message, *(f"WRONG: {one}" for one in result.problems)])
+    says = "; ".join([result.message, *(f"WRONG: {problem}" for problem in result.problems)])
     return [
         case.name, kind, result.right, result.left, shown(result.reaction_ms, 1), shown(result.standstill_s, 2),
         shown(result.apart_ms, 3), says, shown(result.recovery_s, 1),

@@ -54,12 +54,12 @@ class Case:
 
     name: str
     requests: Sequence[Request] = ()
-    """What is asked of the virtual controller."""
+    """Requests to the virtual controller."""
     ends_in: tuple[str, ...] = (FAULT,)
     words: str = ""
-    """In a message of the platform before things are put in order."""
+    """Text in a message of the platform before recovery."""
     refused: str = ""
-    """In the refusal of an enable before things are put in order; empty: none is tried."""
+    """Text in the refusal of an enable before recovery; empty: not tried."""
     process: str = ""
     """Process that gets `signal`: segment (the virtual controller), loop or gateway."""
     signal: signal.Signals = signal.SIGKILL
@@ -129,7 +129,7 @@ class Trials:
         self.operator = RequestClient(Path(control), "virtual controller")
 
     def restart(self) -> None:
-        """Start everything anew, after one process was killed."""
+        """Restart all processes after one was killed."""
         self._leave()
         self.platform.rtcp("stop", check=None)
         self._start()
@@ -149,11 +149,11 @@ class Trials:
     # -- the controller ------------------------------------------------------------------------------------------------
 
     def ask(self, **request: Any) -> Any:
-        """Be the operator."""
+        """Send an operator's command to the controller."""
         return self.operator.ask(request)
 
     def joints(self) -> list[float]:
-        """Return where the joints truly are, rad."""
+        """Return the true joint positions, rad."""
         return [math.radians(q) for q in next(iter(self.ask(do="status")["units"].values()))["position_deg"]]
 
     def put_in_order(self, hand: bool = False) -> None:
@@ -179,7 +179,7 @@ class Trials:
         self.harness.wait_for(lambda: not self.missing(), PATIENCE_S)
 
     def missing(self) -> bool:
-        """Whether a drive is not yet where it can be enabled, as the platform shows it."""
+        """Whether a drive cannot be enabled yet, by the platform's status."""
         self.harness.read_cycles()
         latest = self.harness.observer.latest()
         return latest is None or int(latest[0]["drive_state"].min()) < 3
@@ -242,7 +242,7 @@ class Result:
 
     reaction: str = "-"
     standstill_s: float | None = None
-    """Time from the fault until the last joint truly stood; None where the arm goes on, or nobody can tell."""
+    """Time from the fault until the last joint rests; None if the arm continues or the time is unknown."""
     travel_rad: float = 0.0
     largest_speed: float = 0.0
     """Largest speed reference on the wire, as a fraction of its limit."""
@@ -252,19 +252,19 @@ class Result:
 
 
 def run_case(trials: Trials, case: Case, workload: str) -> tuple[Result, list[str]]:
-    """Run a case; return what was measured and a message for each violation."""
-    found, result = [], Result()
+    """Run a case; return its measurements and a message for each violation."""
+    violations, result = [], Result()
     tap = trials.platform.directory / "egm.tap"
     with trials.capture(tap):
         try:
-            found += _run(trials, case, workload, result)
+            violations += _run(trials, case, workload, result)
         except (AssertionError, RtcpError, RequestRefused, ServerAway) as error:
-            found.append(f"the trial ended: {type(error).__name__}: {error}")
+            violations.append(f"the trial ended: {type(error).__name__}: {error}")
             trials.restart()
     wire = egm_wire.check(tap, LIMITS, CONFIG.cycle.period_us * 1e-6)
     result.largest_speed = wire.largest_speed
-    found += wire.violations[:3]
-    return result, found
+    violations += wire.violations[:3]
+    return result, violations
 
 
 def _run(trials: Trials, case: Case, workload: str, result: Result) -> list[str]:
@@ -279,7 +279,7 @@ def _run(trials: Trials, case: Case, workload: str, result: Result) -> list[str]
         trials.ask(**request)
     if pid:
         (kill if case.signal is signal.SIGKILL else os.kill)(pid, case.signal)
-    found = []
+    violations = []
     if case.process != "loop":
         if workload == MOVING and STOPS in case.ends_in:
             harness.wait_for(lambda: harness.state().name == "HOLDING", WATCH_S)
@@ -295,20 +295,20 @@ def _run(trials: Trials, case: Case, workload: str, result: Result) -> list[str]
         result.standstill_s = trials.standstill() - began
         now = trials.joints()
         result.travel_rad = max(abs(a - b) for a, b in zip(now, before, strict=True))
-        found += [
+        violations += [
             f"{joint.name} stands at {q:.4f} rad"
             for joint, q in zip(CONFIG.joints, now, strict=True)
             if not joint.position.min <= q <= joint.position.max
         ]
     if result.reaction != CONTINUES:
-        harness.wait(STILL_S)  # what the controller lacks is said a little later
+        harness.wait(STILL_S)  # the controller reports its missing conditions a little later
     result.messages = harness.messages_since(moment)
     if result.reaction not in case.ends_in:
-        found.append(f"it ended in {result.reaction}, not in {' or '.join(case.ends_in)}")
+        violations.append(f"it ended in {result.reaction}, not in {' or '.join(case.ends_in)}")
     if case.words not in " | ".join(result.messages):
-        found.append(f"no message has {case.words!r}")
+        violations.append(f"no message has {case.words!r}")
     if case.refused:
-        found += _refusal(harness, case)
+        violations += _refusal(harness, case)
     if swinging is not None:
         swinging.end()
     began = time.monotonic()
@@ -317,19 +317,19 @@ def _run(trials: Trials, case: Case, workload: str, result: Result) -> list[str]
         harness = trials.harness
         trials.put_in_order()
     else:
-        found += _put_in_order(trials, watched=result.reaction not in (CONTINUES, STOPS))
+        violations += _put_in_order(trials, watched=result.reaction not in (CONTINUES, STOPS))
         if harness.largest_step > 1.0 + 1e-6:
-            found.append(f"a target stepped {harness.largest_step:.3f} of what its speed limit allows")
+            violations.append(f"a target stepped {harness.largest_step:.3f} of what its speed limit allows")
     result.resets, refusal = harness.enable()
     result.recovery_s = time.monotonic() - began
     refusal = refusal or harness.move([q + CHECK_RAD for q in START])
     if refusal:
-        found.append(f"the arm did not recover: {refusal}")
-    return found
+        violations.append(f"the arm did not recover: {refusal}")
+    return violations
 
 
 def _refusal(harness: Harness, case: Case) -> list[str]:
-    """Try to enable while things are not in order."""
+    """Try to enable before recovery."""
     try:
         harness.robot.reset()
         harness.robot.enable()
@@ -339,21 +339,21 @@ def _refusal(harness: Harness, case: Case) -> list[str]:
 
 
 def _put_in_order(trials: Trials, *, watched: bool) -> list[str]:
-    """Put things in order; return what moved by that."""
+    """Recover; return a message for each joint that moved by that."""
     if not watched:
         trials.put_in_order()
         return []
     before, state = trials.joints(), trials.harness.state()
     trials.put_in_order()
     trials.harness.wait(0.4)
-    found = [
+    violations = [
         f"{joint.name} moved by {abs(a - b):.4f} rad without a command"
         for joint, a, b in zip(CONFIG.joints, trials.joints(), before, strict=True)
         if abs(a - b) > MOVED_RAD
     ]
     if trials.harness.state() is not state:
-        found.append(f"the machine went from {state.name} to {trials.harness.state().name} by itself")
-    return found
+        violations.append(f"the machine went from {state.name} to {trials.harness.state().name} by itself")
+    return violations
 
 
 HEADS = ("fault", "while", "reaction", "standstill, s", "travel, rad", "largest speed", "first message", "recovery")

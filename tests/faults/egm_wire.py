@@ -1,4 +1,4 @@
-"""The datagrams of EGM on their way, decoded apart from the platform's codec.
+"""The datagrams of EGM on the network, decoded independently of the platform's codec.
 
 As a program, `python egm_wire.py PID PORT FILE`: write what reaches and leaves this UDP port in the network namespace
 of a process to a file, until SIGTERM.
@@ -22,7 +22,7 @@ from tests.e2e.wire import BUFFER, SO_RCVBUFFORCE, enter
 
 ETH_P_IP = 0x0800
 HEAD = struct.Struct("<QBH")
-"""Of a datagram in a capture: its time, ns, whether the PC sent it, and its length."""
+"""Header of a datagram in a capture: time, ns, whether the PC sent it, and length."""
 IP_HEAD, UDP_HEAD, UDP = 20, 8, 17
 _ROUND_OFF = 1e-6
 """Degrees, degrees/s."""
@@ -33,7 +33,7 @@ def capture(port: int, path: Path) -> None:
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, at: ended.append(number))
     with socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(ETH_P_IP)) as tap, path.open("wb") as file:
-        with contextlib.suppress(PermissionError):  # in a user namespace the usual size has to do
+        with contextlib.suppress(PermissionError):  # a user namespace allows only the default size
             tap.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER)
         tap.bind(("lo", ETH_P_IP))
         tap.settimeout(0.05)
@@ -72,7 +72,7 @@ class Limits:
 
 @dataclass
 class Checked:
-    """What a capture showed."""
+    """Results of a capture."""
 
     messages: int
     replies: int
@@ -91,16 +91,16 @@ def check(path: Path, limits: Limits, period_s: float) -> Checked:
     from tests.virtual.irc5.wire import Robot
 
     codec = EgmCodec(7)
-    found = Checked(0, 0, 0.0, [])
+    checked = Checked(0, 0, 0.0, [])
     last: tuple[float, ...] | None = None
     last_ns = 0
     known: list[list[float]] = []
     for time_ns, from_pc, payload in datagrams(path):
         if not from_pc:
-            found.messages += 1
+            checked.messages += 1
             known = [*known[-8:], Robot(payload).actual]
             continue
-        found.replies += 1
+        checked.replies += 1
         reference = codec.decode(payload, len(limits.low))
         position, speed = reference.position, reference.speed
         assert position is not None
@@ -109,17 +109,17 @@ def check(path: Path, limits: Limits, period_s: float) -> Checked:
         for i, (q, v) in enumerate(zip(position, speed, strict=True)):
             where = f"reply {reference.seqno}, joint {i + 1}"
             if not limits.low[i] - _ROUND_OFF <= q <= limits.high[i] + _ROUND_OFF:
-                found.violations.append(f"{where}: position {q:.4f} degrees")
-            found.largest_speed = max(found.largest_speed, abs(v) / limits.speed[i])
+                checked.violations.append(f"{where}: position {q:.4f} degrees")
+            checked.largest_speed = max(checked.largest_speed, abs(v) / limits.speed[i])
             if abs(v) > limits.speed[i] + _ROUND_OFF:
-                found.violations.append(f"{where}: speed {v:.4f} degrees/s")
+                checked.violations.append(f"{where}: speed {v:.4f} degrees/s")
             begins = v == 0.0 and any(abs(q - actual[i]) < _ROUND_OFF for actual in known)
             if last is not None and not begins and abs(q - last[i]) > limits.speed[i] * period_s * cycles:
-                found.violations.append(f"{where}: step of {q - last[i]:.4f} degrees in {cycles - 1:.1f} cycles")
+                checked.violations.append(f"{where}: step of {q - last[i]:.4f} degrees in {cycles - 1:.1f} cycles")
         last, last_ns = position, time_ns
-    if found.replies > found.messages + 1:  # the capture may begin between a message and its reply
-        found.violations.append(f"{found.replies} replies to {found.messages} messages")
-    return found
+    if checked.replies > checked.messages + 1:  # the capture may begin between a message and its reply
+        checked.violations.append(f"{checked.replies} replies to {checked.messages} messages")
+    return checked
 
 
 if __name__ == "__main__":

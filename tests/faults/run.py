@@ -12,7 +12,7 @@ from tests.e2e.conftest import Platform
 from tests.faults.cases import CONTINUES, MOVING, STOPS, Case
 
 HOLD_MS = 500
-"""Time without frames that is tolerated in the trials."""
+"""Tolerated time without frames in the trials."""
 
 
 @contextlib.contextmanager
@@ -40,18 +40,18 @@ def reaction(result: TrialResult) -> str:
 
 
 def violations(case: Case, result: TrialResult) -> list[str]:
-    """Return a message for everything that is not as the case requires."""
-    found = []
+    """Return a message for each violation of the case."""
+    problems = []
     end = reaction(result)
     if end not in case.ends_in:
-        found.append(f"it ended in {end}, not in {' or '.join(case.ends_in)}")
+        problems.append(f"it ended in {end}, not in {' or '.join(case.ends_in)}")
     if end not in (CONTINUES, STOPS) and not result.messages:
-        found.append("there was no message")
+        problems.append("there was no message")
     messages = " | ".join(result.messages).lower()
-    found += [f"no message has {words!r}" for words in case.words if words.lower() not in messages]
+    problems += [f"no message has {words!r}" for words in case.words if words.lower() not in messages]
     if case.reset_is_refused and not result.early_reset_refusal:
-        found.append("a reset was not refused while the fault was active")
-    return found + result.violations
+        problems.append("a reset was not refused while the fault was active")
+    return problems + result.violations
 
 
 def columns(case: Case, workload: str, result: TrialResult | None, wrong: list[str]) -> list[str]:

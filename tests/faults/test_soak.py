@@ -38,8 +38,8 @@ def test_every_random_fault_is_one_that_the_segment_accepts() -> None:
 
 
 def test_the_same_seed_gives_the_same_faults() -> None:
-    one, other = Random(7), Random(7)
-    assert [random_fault(one, 7, DRIVES) for _ in range(50)] == [random_fault(other, 7, DRIVES) for _ in range(50)]
+    first, second = Random(7), Random(7)
+    assert [random_fault(first, 7, DRIVES) for _ in range(50)] == [random_fault(second, 7, DRIVES) for _ in range(50)]
 
 
 @pytest.mark.parametrize(
@@ -52,9 +52,9 @@ def test_the_same_seed_gives_the_same_faults() -> None:
     ],
 )
 def test_a_resource_that_has_grown_is_a_failure(last: Resources | None, words: str) -> None:
-    found = grown({"loop": HELD}, {} if last is None else {"loop": last}, settled=True)
-    assert len(found) == 1
-    assert words in found[0]
+    messages = grown({"loop": HELD}, {} if last is None else {"loop": last}, settled=True)
+    assert len(messages) == 1
+    assert words in messages[0]
 
 
 def test_equal_resources_unsettled_memory_and_the_gateways_threads_are_no_failure() -> None:
@@ -94,18 +94,18 @@ def test_memory_is_compared_after_the_first_recordings_and_between_them(
 
 
 def test_resources_are_those_of_the_process() -> None:
-    held = resources(os.getpid())
-    assert held is not None
-    assert held.rss > 10 << 20
+    usage = resources(os.getpid())
+    assert usage is not None
+    assert usage.rss > 10 << 20
     with open(os.devnull):
         more = resources(os.getpid())
     assert more is not None
-    assert more.files == held.files + 1
+    assert more.files == usage.files + 1
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
-    [(("--minutes", "0"), "above 0"), (("--minutes", "nan"), "above 0"), (("--seed", "-1"), "0 or")],
+    [(("--minutes", "0"), "above 0"), (("--minutes", "nan"), "above 0"), (("--seed", "-1"), "0 to")],
 )
 def test_an_impossible_duration_or_seed_is_a_usage_error(arguments: tuple[str, str], words: str) -> None:
     platform = Platform()
@@ -121,15 +121,15 @@ def test_a_soak_reports_the_result_of_each_kind_of_fault_and_no_failure() -> Non
     try:
         platform.be_patient(HOLD_MS)
         done = platform.rtcp("soak", "--minutes", "0.12", "--seed", "5", "--json")
-        found = json.loads(done.stdout)
-        assert found["failures"] == []
-        assert found["records"] > 0
-        assert found["torn"] == 0
-        assert 0.0 < found["largest_step"] <= 1.0 + 1e-6
-        counts = found["counts"].values()
+        report = json.loads(done.stdout)
+        assert report["failures"] == []
+        assert report["records"] > 0
+        assert report["torn"] == 0
+        assert 0.0 < report["largest_step"] <= 1.0 + 1e-6
+        counts = report["counts"].values()
         assert sum(count["injected"] for count in counts) >= 1
         assert all(count["injected"] == count["recovered"] for count in counts)
-        assert set(found["last"]) == {"loop", "gateway", "segment"}
+        assert set(report["last"]) == {"loop", "gateway", "segment"}
         assert not (platform.directory / "processes.json").exists()
     finally:
         platform.end()

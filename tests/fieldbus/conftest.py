@@ -5,8 +5,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,7 +24,7 @@ class Segment:
     def __init__(
         self, file: Path, slaves: int | Sequence[str], program: Sequence[str] = ("-m", "rtcp.virtual")
     ) -> None:  # fmt: skip
-        """Start it with so many of the arm's slaves, or with these of `terminals`."""
+        """Start it with the first `slaves` of the arm, or with these of `terminals`."""
         if isinstance(slaves, int):
             file.write_text("slaves:\n" + "".join(f"  - model: {model}\n" for model in MODELS[:slaves]))
             self.count = slaves
@@ -43,10 +44,16 @@ class Segment:
         self.pid = json.loads(line)["pid"]
 
     def master(
-        self, scenario: str, *, receive_fraction: float = 0.3, promiscuous: bool = False, child: Path = CHILD, **more
-    ) -> dict:  # fmt: skip
+        self,
+        scenario: str,
+        *,
+        receive_fraction: float = 0.3,
+        promiscuous: bool = False,
+        child: Path = CHILD,
+        **arguments: object,
+    ) -> dict[str, Any]:
         """Run a scenario of `child`; return its answer, empty where it was killed."""
-        question = {"scenario": scenario, "pid": self.pid, "count": self.count, "arguments": more,
+        question = {"scenario": scenario, "pid": self.pid, "count": self.count, "arguments": arguments,
                     "receive_fraction": receive_fraction, "promiscuous": promiscuous}  # fmt: skip
         done = subprocess.run(
             [sys.executable, str(child), json.dumps(question)],
@@ -65,8 +72,12 @@ class Segment:
         shutil.rmtree(self.directory, ignore_errors=True)
 
 
+StartSegment = Callable[..., Segment]
+"""Starts a `Segment` of these slaves."""
+
+
 @pytest.fixture
-def start_segment(tmp_path):
+def start_segment(tmp_path: Path) -> Iterator[StartSegment]:
     running: list[Segment] = []
 
     def start(slaves: int | Sequence[str], **program: Sequence[str]) -> Segment:
@@ -79,6 +90,6 @@ def start_segment(tmp_path):
 
 
 @pytest.fixture
-def segment(start_segment) -> Segment:
+def segment(start_segment: StartSegment) -> Segment:
     """An IO box and two drives."""
     return start_segment(3)

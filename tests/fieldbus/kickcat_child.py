@@ -1,4 +1,4 @@
-"""KickCAT, another master, brings a segment to OP: `kickcat_child.py INTERFACE`; tells in JSON what it found."""
+"""KickCAT, another master, brings a segment to OP: `kickcat_child.py INTERFACE`; writes its results as JSON."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def main() -> None:
         answer: bytes = bus.read_sdo(slave, index, subindex, access, LONGEST, PATIENCE_S)
         return answer
 
-    found = [
+    results = [
         {
             "state": state.name,
             "bytes": [slave.output_size, slave.input_size],
@@ -47,7 +47,7 @@ def main() -> None:
         for slave, state in zip(slaves, states, strict=True)
     ]
     # Its link writes to standard output too.
-    print("\n" + json.dumps(found))
+    print("\n" + json.dumps(results))
 
 
 if __name__ == "__main__":

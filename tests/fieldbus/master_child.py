@@ -1,6 +1,6 @@
 """The master's side of a test, a process of its own: only a process of one thread may join a user namespace.
 
-Takes a scenario and its arguments as JSON in its first argument, writes what came of it as JSON to standard output.
+Reads a scenario and its arguments as JSON from its first argument; writes the result as JSON to standard output.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -80,8 +81,11 @@ class Cycle:
 
 
 def to_op(bus: SoemBus, cycle: Cycle) -> None:
-    refused = cycle.run(lambda: bus.request_state(AlState.OP) or bus.wait_for_state(AlState.OP, 5.0))
-    if refused:
+    def request() -> Sequence[str]:
+        bus.request_state(AlState.OP)
+        return bus.wait_for_state(AlState.OP, 5.0)
+
+    if refused := cycle.run(request):
         raise BusError(*refused)
 
 
@@ -110,17 +114,17 @@ class AlStatusListener:
 
     def errors(self) -> list[str]:
         """Return the AL status of each answer that shows an error, in hexadecimal."""
-        found = []
+        errors: list[str] = []
         while True:
             try:
                 frame = self.socket.recv(1518)
             except BlockingIOError:
                 self.socket.close()
-                return found
+                return errors
             length = int.from_bytes(frame[22:24], "little") & 0x07FF
             wkc = int.from_bytes(frame[26 + length : 28 + length], "little")
             if wkc and frame[26] & 0x10:
-                found.append(frame[26 : 26 + length].hex())
+                errors.append(frame[26 : 26 + length].hex())
 
 
 def registers_after() -> dict[str, Any]:
@@ -153,13 +157,13 @@ def op(bus: SoemBus, count: int, period_ns: int) -> Any:
     to_op(bus, cycle)
     cycle.wkcs.clear()
     first = fresh(cycle)
-    found = cycle.run(
+    result = cycle.run(
         lambda: {
             "mapping": [
-                bus.sdo_read(2, 0x1600, i).hex() for i in range(bus.sdo_read(2, 0x1600, 0)[0] + 1)
+                bus.sdo(2).read(0x1600, i).hex() for i in range(bus.sdo(2).read(0x1600, 0)[0] + 1)
             ],
-            "assigned": [bus.sdo_read(2, 0x1C12, 0).hex(), bus.sdo_read(2, 0x1C12, 1).hex()],
-            "following_window": int.from_bytes(bus.sdo_read(2, 0x6065, 0), "little"),
+            "assigned": [bus.sdo(2).read(0x1C12, 0).hex(), bus.sdo(2).read(0x1C12, 1).hex()],
+            "following_window": int.from_bytes(bus.sdo(2).read(0x6065, 0), "little"),
             "watchdog": int.from_bytes(bus.port.read(station_of(2), 0x0420, 2) or b"", "little"),
             "sync0_cycle_ns": int.from_bytes(bus.port.read(station_of(2), 0x09A0, 4) or b"", "little"),
             "states": [state.words() for state in bus.read_states()],
@@ -167,7 +171,7 @@ def op(bus: SoemBus, count: int, period_ns: int) -> Any:
     )  # fmt: skip
     last = fresh(cycle)
     return {
-        **found, "safe_op": safe_op, "notes": bus.notes, "expected_wkc": data.expected_wkc, "wkcs": cycle.wkcs,
+        **result, "safe_op": safe_op, "notes": bus.notes, "expected_wkc": data.expected_wkc, "wkcs": cycle.wkcs,
         "dc_passed_ns": last[0] - first[0], "host_passed_ns": last[1] - first[1],
     }  # fmt: skip
 
@@ -196,16 +200,21 @@ def refused(bus: SoemBus, count: int, how: str) -> Any:
 
 
 def up(bus: SoemBus, count: int, complete_access: bool = True) -> Any:
-    """All the way to SAFE-OP, as the loop's process goes it."""
+    """Configure the slaves up to SAFE-OP, as the loop's process does."""
     bus.scan()
     make, attempts = bus._map, []
-    bus._map = lambda slaves: attempts.append(1) or make(slaves)  # type: ignore[method-assign,func-returns-value]
-    data = bus.configure([with_device(one, complete_access=complete_access) for one in arm(count)], 1_000_000)
+
+    def count_attempt(slaves: Sequence[SlaveConfig]) -> dict[int, list[str]]:
+        attempts.append(len(slaves))
+        return make(slaves)
+
+    bus._map = count_attempt  # type: ignore[method-assign]
+    data = bus.configure([with_device(config, complete_access=complete_access) for config in arm(count)], 1_000_000)
     return {"expected_wkc": data.expected_wkc, "tries": bus.port.tries, "attempts": len(attempts)}
 
 
 def misread(bus: SoemBus, count: int, times: int) -> Any:
-    """SOEM's map ends as after a lost frame, so many times, once it is made; then all the way to OP."""
+    """Let SOEM's map fail `times` times, as after a lost frame; then bring the slaves to OP."""
     make, left, tries = bus._map, iter(range(times)), []
 
     def fails(slaves: Any) -> dict[int, list[str]]:
@@ -237,15 +246,15 @@ def sdo(bus: SoemBus, count: int) -> Any:
     bus.scan()
     aborted, absent = "", ""
     try:
-        bus.sdo_read(2, 0x5FFF, 0)
+        bus.sdo(2).read(0x5FFF, 0)
     except SdoAborted as error:
         aborted = f"{error} / {error.code:08X}"
     try:
-        bus.sdo_read(9, 0x1000, 0)
+        bus.sdo(9).read(0x1000, 0)
     except BusError as error:
         absent = str(error)
-    bus.sdo_write(2, 0x6065, 0, (1234).to_bytes(4, "little"))
-    return {"name": bus.sdo_read(2, 0x1008, 0).decode(), "kept": bus.sdo_read(2, 0x6065, 0).hex(),
+    bus.sdo(2).write(0x6065, 0, (1234).to_bytes(4, "little"))
+    return {"name": bus.sdo(2).read(0x1008, 0).decode(), "kept": bus.sdo(2).read(0x6065, 0).hex(),
             "aborted": aborted, "absent": absent}  # fmt: skip
 
 
@@ -262,7 +271,7 @@ def abandoned(bus: SoemBus, count: int) -> Any:
 
 
 def stopped(bus: SoemBus, count: int, pid: int, period_ns: int) -> Any:
-    """Stop the segment for 50 ms and let the cycle go on; tell how old each answer was, by the reference clock."""
+    """Stop the segment for 50 ms and let the cycle go on; return the age of each answer, by the reference clock."""
     data = bus.configure(arm(count), period_ns)
     cycle = Cycle(data, period_ns)
     to_op(bus, cycle)
@@ -282,7 +291,7 @@ def stopped(bus: SoemBus, count: int, pid: int, period_ns: int) -> Any:
 
 
 def beside(bus: SoemBus, count: int) -> Any:
-    """Registers and SDOs read from a second thread while the cycle runs."""
+    """Read registers and SDOs from a second thread while the cycle runs."""
     data = bus.configure(arm(count), 2_000_000)
     cycle = Cycle(data, 2_000_000)
     to_op(bus, cycle)
@@ -290,14 +299,14 @@ def beside(bus: SoemBus, count: int) -> Any:
 
     def reads() -> Any:
         aliases = [bus.port.read(station_of(p), 0x0010, 2) for _ in range(100) for p in range(1, count + 1)]
-        names = [bus.sdo_read(2, 0x1008, 0).decode() for _ in range(20)]
+        names = [bus.sdo(2).read(0x1008, 0).decode() for _ in range(20)]
         return {"stations": sorted({int.from_bytes(a or b"", "little") for a in aliases}), "names": sorted(set(names))}
 
     return {**cycle.run(reads), "wkcs": sorted(set(cycle.wkcs)), "expected_wkc": data.expected_wkc}
 
 
 def outputs(bus: SoemBus, count: int) -> Any:
-    """Outputs of a wrong length are not taken; nothing spills into the next slave's."""
+    """Set outputs of a wrong length, which must not reach this slave or the next."""
     data = bus.configure(arm(count), 1_000_000)
     cycle = Cycle(data, 1_000_000)
     to_op(bus, cycle)
@@ -307,11 +316,11 @@ def outputs(bus: SoemBus, count: int) -> Any:
     # A drive's mode of operation is the last byte of its outputs, shown among its inputs.
     data.set_output(1, bytes(14) + b"\x09")
     cycle.for_cycles(20)
-    return {"box": bus.sdo_read(1, 0x7000, 1).hex(), "display": data.input(1)[14]}
+    return {"box": bus.sdo(1).read(0x7000, 1).hex(), "display": data.input(1)[14]}
 
 
 def terminals(bus: SoemBus, count: int, kinds: list[str]) -> Any:
-    """Bring slaves of `terminals` to OP; send patterns, and tell what comes back of each."""
+    """Bring slaves of `terminals` to OP; send patterns, and return the answers to each."""
     slaves = [slave(f"t{n}", kind) for n, kind in enumerate(kinds)]
     data = bus.configure(slaves, 1_000_000)
     cycle = Cycle(data, 1_000_000)
@@ -319,23 +328,23 @@ def terminals(bus: SoemBus, count: int, kinds: list[str]) -> Any:
     patterns = []
     for pattern in (0xFF, 0x00, 0x55, 0xAA, 0x13):
         sent = []
-        for index, one in enumerate(slaves):
-            image = layout(one.device.rpdo)
+        for index, config in enumerate(slaves):
+            image = layout(config.device.rpdo)
             value = int.from_bytes(bytes((pattern + 7 * index & 0xFF,)) * image.bytes, "little") & (1 << image.bits) - 1
             sent.append(value.to_bytes(image.bytes, "little"))
             data.set_output(index, sent[-1])
         cycle.for_cycles(40)
-        patterns.append(([one.hex() for one in sent], [data.input(index).hex() for index in range(count)]))
+        patterns.append(([output.hex() for output in sent], [data.input(index).hex() for index in range(count)]))
     return {
         "states": [state.words() for state in bus.read_states()], "expected_wkc": data.expected_wkc,
         "soem_expected": bus._master.expected_wkc, "wkcs": cycle.wkcs, "patterns": patterns,
-        "objects": [bus.sdo_read(1, 0x7000, n).hex() for n in (1, 2, 3)] if kinds[0] == "areas" else [],
+        "objects": [bus.sdo(1).read(0x7000, n).hex() for n in (1, 2, 3)] if kinds[0] == "areas" else [],
         "sync": (bus.port.read(station_of(2), 0x0980, 2) or b"").hex(),
     }  # fmt: skip
 
 
 def repeated(bus: SoemBus, count: int) -> Any:
-    """An answer gets lost on its way back: what comes in the end, and how many requests it took."""
+    """Lose one answer on its way back; return the value, and the number of requests and answers."""
     bus.scan()
     info = bus._infos[0]
     assert info is not None
@@ -353,19 +362,19 @@ def repeated(bus: SoemBus, count: int) -> Any:
         requests.append(address == info.receive_start)
         return exchange(command, station, address, *more, **others)
 
-    port.read, port.exchange = losing, counting  # type: ignore[method-assign]
-    value = bus.sdo_read(1, 0x1008, 0).decode()
+    port.read, port.exchange = losing, counting  # type: ignore[assignment,method-assign]
+    value = bus.sdo(1).read(0x1008, 0).decode()
     return {"value": value, "requests": sum(requests), "answers": len(answers), "same": len(set(answers)) == 1}
 
 
 def described(bus: SoemBus, count: int, file: str) -> Any:
     """Set a slave up by its device's file; return what its start-up SDOs have written."""
     bus.configure([SlaveConfig("aio", load_device(Path(file)), file)], 1_000_000)
-    return [bus.sdo_read(1, 0x8001, 0).hex(), *(bus.sdo_read(1, 0x8000, n).hex() for n in (1, 2, 3))]
+    return [bus.sdo(1).read(0x8001, 0).hex(), *(bus.sdo(1).read(0x8000, n).hex() for n in (1, 2, 3))]
 
 
 def contradicted(bus: SoemBus, count: int) -> None:
-    """A terminal's file maps as many bits as its EEPROM, of another object."""
+    """Configure a terminal whose file maps other objects than its EEPROM, of as many bits."""
     slaves = [slave("t1", "input"), slave("t2", "bits4")]
     (pdo,) = slaves[1].device.rpdo
     other = replace(pdo, channels=(replace(pdo.channels[0], sub_index=9),))
@@ -378,8 +387,8 @@ def dies(bus: SoemBus, count: int, kinds: list[str]) -> Any:
     data = bus.configure(slaves, 1_000_000)
     cycle = Cycle(data, 1_000_000)
     to_op(bus, cycle)
-    for index, one in enumerate(slaves):
-        image = layout(one.device.rpdo)
+    for index, config in enumerate(slaves):
+        image = layout(config.device.rpdo)
         data.set_output(index, ((1 << image.bits) - 1).to_bytes(image.bytes, "little"))
     cycle.for_cycles(40)
     print(json.dumps([state.words() for state in cycle.run(bus.read_states)]), flush=True)
@@ -387,18 +396,22 @@ def dies(bus: SoemBus, count: int, kinds: list[str]) -> Any:
 
 
 def files(bus: SoemBus, count: int) -> Any:
-    """Files written and read, also in BOOT, and what the slave refuses."""
+    """Write and read files, also in BOOT; return the refusals."""
     bus.scan()
-    refused, done = [], []
+    refused: list[str] = []
+    done: list[int] = []
     foe = bus.foe(1)
     for size in (0, 5, 116, 1000):
         data = os.urandom(size)
         foe.write("settings", data, 0, done.append)
         if foe.read("settings", 0, lambda count: None) != data:
             refused.append(f"{size} bytes came back differently")
-    for attempt in (lambda: foe.read("nothing", 0, done.append), lambda: foe.write("firmware", b"x", 0, done.append),
-                    lambda: bus.foe(2).read("settings", 0, done.append), lambda: bus.boot(2),
-                    lambda: foe.read("n" * 300, 0, done.append)):  # fmt: skip
+    attempts: tuple[Callable[[], object], ...] = (
+        lambda: foe.read("nothing", 0, done.append), lambda: foe.write("firmware", b"x", 0, done.append),
+        lambda: bus.foe(2).read("settings", 0, done.append), lambda: bus.boot(2),
+        lambda: foe.read("n" * 300, 0, done.append),
+    )  # fmt: skip
+    for attempt in attempts:
         try:
             attempt()
         except BusError as error:
@@ -412,7 +425,7 @@ def files(bus: SoemBus, count: int) -> Any:
 
 
 def eeprom(bus: SoemBus, count: int) -> Any:
-    """Read an EEPROM, write it with one word changed, and break writes off after each word."""
+    """Read an EEPROM, write it with one word changed, and interrupt writes after each word."""
     bus.discover()
     parts: list[float] = []
     before = bus.read_eeprom(1, parts.append)
@@ -425,13 +438,13 @@ def eeprom(bus: SoemBus, count: int) -> Any:
     sound = []
     for last in (0.6, 0.7, 0.8, 1.0):
 
-        def breaks_off(part: float, last: float = last) -> None:
+        def interrupts(part: float, last: float = last) -> None:
             if part > last:
                 raise TimeoutError
 
         bus.write_eeprom(1, before, parts.append)
         with contextlib.suppress(TimeoutError):
-            bus.write_eeprom(1, bytes(other), breaks_off)
+            bus.write_eeprom(1, bytes(other), interrupts)
         sound.append(is_sound(bus.read_eeprom(1, parts.append, 16)))
     whole = bus.read_eeprom(1, parts.append) == other
     bus.release()
@@ -440,12 +453,12 @@ def eeprom(bus: SoemBus, count: int) -> Any:
 
 
 def emergency(bus: SoemBus, count: int) -> Any:
-    """A drive that is enabled loses its outputs: it faults and says so."""
+    """An enabled drive loses its outputs: it faults and sends an emergency message."""
     slaves = arm(count)
     data = bus.configure(slaves, 1_000_000)
     cycle = Cycle(data, 1_000_000)
     drive = Cia402Drive(slaves[1], 0.001)
-    steps = []
+    steps: list[str] = []
 
     def control() -> None:
         drive.decode(data.input(1))
@@ -457,14 +470,19 @@ def emergency(bus: SoemBus, count: int) -> Any:
     to_op(bus, cycle)
     cycle.before = control
     cycle.run(lambda: wait(lambda: steps[-1:] == ["operation enabled"]))
-    found: list[Any] = []
-    wait(lambda: found.extend(bus.emergencies()) or found)
-    return {"steps": steps, "sentences": [message.sentence() for message in found],
+    senders: list[int] = []
+
+    def receives() -> bool:
+        senders.extend(message.slave for message in bus.emergencies())
+        return bool(senders)
+
+    wait(receives)
+    return {"steps": steps, "slaves": senders,
             "states": [state.words() for state in bus.read_states()]}  # fmt: skip
 
 
 def killed(bus: SoemBus, count: int, pid: int) -> Any:
-    """The segment dies for good while the cycle runs."""
+    """Kill the segment while the cycle runs."""
     cycle = Cycle(bus.configure(arm(count), 1_000_000), 1_000_000)
     to_op(bus, cycle)
     os.kill(pid, signal.SIGKILL)
@@ -473,7 +491,7 @@ def killed(bus: SoemBus, count: int, pid: int) -> Any:
 
 
 def interrupted(bus: SoemBus, count: int, pid: int, child: subprocess.Popen[bytes]) -> Any:
-    """A scan in a process of its own is ended by a signal, as `rtcp scan` does on Ctrl-C; the bus is its alone."""
+    """End a scan in a process of its own by a signal, as `rtcp scan` does on Ctrl-C; only it opens the bus."""
     bus.close()
     assert child.stdin is not None
     child.stdin.write(json.dumps({"do": "scan", "interface": INTERFACE, "namespace_pid": pid}).encode())
@@ -489,7 +507,7 @@ def wait(condition: Any, timeout_s: float = 10.0) -> None:
         time.sleep(0.005)
 
 
-SCENARIOS = {
+SCENARIOS: dict[str, Callable[..., Any]] = {
     f.__name__: f
     for f in (
         scan,

@@ -1,4 +1,4 @@
-"""Slaves of all sorts: their SII images for the segment, their device descriptions for the master, and what they do."""
+"""Slaves of many kinds: SII images for the segment, device descriptions for the master, and behaviours."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Echo(Behaviour):
 
 
 class Bootable(Echo):
-    """Takes its firmware in BOOT only, and is busy with it for a while."""
+    """Accepts its firmware in BOOT only, and is busy three times first."""
 
     def on_start(self) -> None:
         self.state, self.busy = AlState.INIT, 3
@@ -88,7 +88,7 @@ def device(
 
 
 def bits(product: int, count: int, place: int = 0) -> model.Device:
-    """Return a terminal without mailbox that has so many bits of outputs and of inputs."""
+    """Return a terminal without mailbox with `count` bits of outputs and of inputs."""
     return device(product, [(0, 0x0F00, count)], [(1, 0x1000, count)])
 
 
@@ -118,23 +118,24 @@ DEVICES = {
 
 def slave(name: str, kind: str, alias: int = 0) -> SlaveConfig:
     """Return the master's description of a device."""
-    made = DEVICES[kind]
+    source = DEVICES[kind]
 
-    def pdos(found: Sequence[model.Pdo], several: bool) -> Iterator[Pdo]:
-        for pdo in found:
+    def pdos(mapped: Sequence[model.Pdo], several: bool) -> Iterator[Pdo]:
+        for pdo in mapped:
             (entry,) = pdo.entries
             kind, length = ("bits", entry.bits) if entry.bits < 8 else (f"uint{entry.bits}", None)
             channel = PdoEntry(entry.index, entry.sub_index, kind, entry.name, bits=length)  # type: ignore[arg-type]
-            start = made.sync_managers[pdo.sync_manager or 0].start if pdo.virtual else 0
+            start = source.sync_managers[pdo.sync_manager or 0].start if pdo.virtual else 0
             yield Pdo(pdo.index, (channel,), pdo.sync_manager if several else None, start_address=start)
 
-    several = max(len(made.rx_pdos), len(made.tx_pdos)) > 1
+    several = max(len(source.rx_pdos), len(source.tx_pdos)) > 1
     return SlaveConfig(
         name,
         DeviceDescription(
-            made.name, "generic", VENDOR, made.identity.product_code,
-            tuple(pdos(made.rx_pdos, several)), tuple(pdos(made.tx_pdos, several)), configurable_pdos=False,
-            coe=made.mailbox is not None, assign_activate=made.dc_modes[0].assign_activate if made.dc_modes else 0,
+            source.name, "generic", VENDOR, source.identity.product_code,
+            tuple(pdos(source.rx_pdos, several)), tuple(pdos(source.tx_pdos, several)), configurable_pdos=False,
+            coe=source.mailbox is not None,
+            assign_activate=source.dc_modes[0].assign_activate if source.dc_modes else 0,
         ),
         alias=alias,
     )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -11,7 +12,7 @@ from rtcp.config.device_file import file_text
 from rtcp.esi.reader import find_device, read_esi
 from rtcp.esi.sii import write_sii
 from rtcp.virtual.faults.control import SegmentClient
-from tests.fieldbus.conftest import WATCHER
+from tests.fieldbus.conftest import WATCHER, StartSegment
 from tests.fieldbus.terminals import DEVICES, ESI_FILES, OUT
 
 pytestmark = pytest.mark.alone
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.alone
 DIRECT = ("coupler", "bits2", "emulated", "output", "bits4", "bits7", "bits6", "input", "bits1", "bits6")
 
 
-def test_neighbours_that_share_bytes_each_have_their_own_bits(start_segment):
+def test_neighbours_that_share_bytes_each_have_their_own_bits(start_segment: StartSegment) -> None:
     answer = start_segment(DIRECT).master("terminals", kinds=DIRECT)
     result = answer["result"]
     assert answer["left"] == []
@@ -34,7 +35,7 @@ def test_neighbours_that_share_bytes_each_have_their_own_bits(start_segment):
         ]
 
 
-def test_several_sync_managers_of_a_direction_each_get_their_fmmu(start_segment):
+def test_several_sync_managers_of_a_direction_each_get_their_fmmu(start_segment: StartSegment) -> None:
     kinds = ("areas", "pairs", "bits3")
     entries = ("areas", "pairs, options: {sync_error_limit: 0}", "bits3")
     result = start_segment(entries).master("terminals", kinds=kinds)["result"]
@@ -48,7 +49,7 @@ def test_several_sync_managers_of_a_direction_each_get_their_fmmu(start_segment)
     assert result["sync"] == "3007"
 
 
-def test_registers_that_a_virtual_sync_manager_stands_for_are_process_data(start_segment):
+def test_registers_that_a_virtual_sync_manager_stands_for_are_process_data(start_segment: StartSegment) -> None:
     result = start_segment(("clock", "bits3")).master("terminals", kinds=("clock", "bits3"))["result"]
     assert result["states"] == ["OP"] * 2
     times = [int.from_bytes(bytes.fromhex(received[0])[1:], "little") for _, received in result["patterns"]]
@@ -56,7 +57,7 @@ def test_registers_that_a_virtual_sync_manager_stands_for_are_process_data(start
     assert [received[1] for _, received in result["patterns"]] == [sent[1] for sent, _ in result["patterns"]]
 
 
-def test_a_slave_on_one_branch_is_set_up_again_while_another_branch_is_lost(start_segment):
+def test_a_slave_on_one_branch_is_set_up_again_while_another_branch_is_lost(start_segment: StartSegment) -> None:
     kinds = ("coupler", "bits4", "bits2", "areas", "output")
     segment = start_segment((kinds[0], "bits4, after: 1, port: 3", "bits2", "areas, after: 1, port: 1", "output"))
     result = segment.master("branches", child=WATCHER, control=str(segment.control), kinds=kinds)["result"]
@@ -67,28 +68,30 @@ def test_a_slave_on_one_branch_is_set_up_again_while_another_branch_is_lost(star
     managers = bytes.fromhex(result["after"][3]["managers"])
     assert [managers[8 * n + 4] for n in (2, 3, 4)] == [0x64] * 3
     assert result["whole"]
-    told = "\n".join(result["said"])
-    assert "slave 2 (t2) to slave 3 (t3) left OP: none of them answers" in told
-    assert "between slave 1 (t1) and slave 2 (t2)" in told
-    assert "slave 4 (t4) to slave 5 (t5) left OP" in told
-    assert "between slave 1 (t1) and slave 4 (t4)" in told
+    messages = "\n".join(result["reported"])
+    assert "slave 2 (t2) to slave 3 (t3) left OP: none of them answers" in messages
+    assert "between slave 1 (t1) and slave 2 (t2)" in messages
+    assert "slave 4 (t4) to slave 5 (t5) left OP" in messages
+    assert "between slave 1 (t1) and slave 4 (t4)" in messages
 
 
-def test_outputs_become_safe_when_the_master_dies_also_where_the_eeprom_leaves_the_watchdog_off(start_segment):
+def test_outputs_become_safe_when_the_master_dies_also_where_the_eeprom_leaves_the_watchdog_off(
+    start_segment: StartSegment,
+) -> None:
     kinds = ("areas", "bits4", "output")
     segment = start_segment(kinds)
     assert segment.master("dies", kinds=kinds) == ["OP"] * 3
     with SegmentClient(segment.control) as client:
         end = time.monotonic() + 5.0
-        while (states := [one["al"] for one in client.truth()["slaves"]]) != ["SAFE-OP"] * 3:
+        while (states := [slave["al"] for slave in client.truth()["slaves"]]) != ["SAFE-OP"] * 3:
             assert time.monotonic() < end, states
-        held = [
-            one["value"] for slave in (1, 2, 3) for one in client.get(slave) if one["index"] == OUT
+        outputs = [
+            entry["value"] for slave in (1, 2, 3) for entry in client.get(slave) if entry["index"] == OUT
         ]  # fmt: skip
-    assert held == [0] * 5
+    assert outputs == [0] * 5
 
 
-def test_files_are_written_and_read_over_foe_and_firmware_in_boot(start_segment):
+def test_files_are_written_and_read_over_foe_and_firmware_in_boot(start_segment: StartSegment) -> None:
     result = start_segment(("files", "bits4")).master("files")["result"]
     assert result["refused"] == [
         "slave 1 (Terminal 40) refused the read of file 'nothing': error 0x8001, there is no such file (file not "
@@ -101,11 +104,11 @@ def test_files_are_written_and_read_over_foe_and_firmware_in_boot(start_segment)
         "116: give a shorter name",
     ]
     assert (result["in_boot"], result["kept"]) == ("BOOT", True)
-    # It is busy three times before it takes the last packet, and is heard of each time.
+    # It answers busy three times before it accepts the last packet; each answer is reported.
     assert result["done"][-5:] == [1952] * 4 + [2000]
 
 
-def test_an_eeprom_is_read_and_written_word_by_word_and_only_where_it_differs(start_segment):
+def test_an_eeprom_is_read_and_written_word_by_word_and_only_where_it_differs(start_segment: StartSegment) -> None:
     result = start_segment(("files",)).master("eeprom")["result"]
     assert bytes.fromhex(result["before"]) == write_sii(DEVICES["files"])
     assert result["written"] == [1, 0]
@@ -113,7 +116,9 @@ def test_an_eeprom_is_read_and_written_word_by_word_and_only_where_it_differs(st
     assert result["parts"] == [8 / 2048, 1.0]
 
 
-def test_texts_and_complete_objects_of_the_makers_start_up_commands_are_written_at_the_start(start_segment, tmp_path):
+def test_texts_and_complete_objects_of_the_makers_start_up_commands_are_written_at_the_start(
+    start_segment: StartSegment, tmp_path: Path
+) -> None:
     file = tmp_path / "analog.yaml"
     file.write_text(file_text(find_device(read_esi(ESI_FILES / "analog.xml"))))
     segment = start_segment(("analog.xml",))
@@ -126,7 +131,7 @@ def test_texts_and_complete_objects_of_the_makers_start_up_commands_are_written_
     ]
 
 
-def test_a_terminal_whose_eeprom_maps_other_objects_than_its_file_is_refused(start_segment):
+def test_a_terminal_whose_eeprom_maps_other_objects_than_its_file_is_refused(start_segment: StartSegment) -> None:
     assert start_segment(("input", "bits4")).master("contradicted")["error"] == [
         "slave 2 (t2): the PDOs in its EEPROM differ from the device's file (key `rpdo`): expected 4 bits (0x1601: "
         "0x7000:9/4), found 4 bits (0x1601: 0x7000:1/4); `rtcp device new --from-bus` describes it as it is"
@@ -134,11 +139,13 @@ def test_a_terminal_whose_eeprom_maps_other_objects_than_its_file_is_refused(sta
 
 
 @pytest.mark.interpreted
-def test_an_answer_that_got_lost_is_repeated_by_the_slave_and_not_asked_for_again(start_segment):
+def test_an_answer_that_got_lost_is_repeated_by_the_slave_and_not_asked_for_again(start_segment: StartSegment) -> None:
     result = start_segment(("analog.xml",)).master("repeated")["result"]
     assert result == {"value": "Analog terminal", "requests": 1, "answers": 2, "same": True}
 
 
-def test_an_eeprom_that_is_half_written_has_a_wrong_checksum_whenever_it_is_broken_off(start_segment):
+def test_an_eeprom_that_is_half_written_has_a_wrong_checksum_whenever_it_is_broken_off(
+    start_segment: StartSegment,
+) -> None:
     result = start_segment(("files",)).master("eeprom")["result"]
     assert (result["sound"], result["whole"]) == ([False, False, False, True], True)

@@ -1,4 +1,4 @@
-"""`rtcp capture`: the frames of a segment in a pcapng file, read here by the format's own description."""
+"""`rtcp capture`: the frames of a segment in a pcapng file, read here by the format's description."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import pytest
 
 from rtcp.ipc.errors import RtcpError
 from rtcp.launch.capturing import Capture
+from tests.fieldbus.conftest import Segment
 
 pytestmark = pytest.mark.alone
 
@@ -33,7 +34,7 @@ def blocks(file: Path) -> Iterator[tuple[int, bytes]]:
     assert at == len(data)
 
 
-def test_every_frame_of_a_scan_is_in_the_file_with_its_time_and_direction(segment, tmp_path):
+def test_every_frame_of_a_scan_is_in_the_file_with_its_time_and_direction(segment: Segment, tmp_path: Path) -> None:
     out = tmp_path / "scan.pcapng"
     began = time.time_ns()
     with out.open("xb") as file, Capture("ecat0", segment.pid, file) as capture:
@@ -57,7 +58,7 @@ def test_every_frame_of_a_scan_is_in_the_file_with_its_time_and_direction(segmen
     assert len(packets) > 500
 
 
-def test_an_interface_that_does_not_exist_is_told(tmp_path):
+def test_an_interface_that_does_not_exist_is_told(tmp_path: Path) -> None:
     with (
         (tmp_path / "x.pcapng").open("xb") as file,
         pytest.raises(RtcpError, match="there is no network interface rtcp-none0"),
@@ -65,14 +66,14 @@ def test_an_interface_that_does_not_exist_is_told(tmp_path):
         Capture("rtcp-none0", None, file)
 
 
-def test_a_disk_that_is_full_ends_the_capture_in_a_sentence(segment):
+def test_a_disk_that_is_full_ends_the_capture_in_a_sentence(segment: Segment) -> None:
     with Path("/dev/full").open("wb") as file, Capture("ecat0", segment.pid, file) as capture:
         segment.master("scan")
         with pytest.raises(RtcpError, match="capturing into /dev/full: No space left on device"):
             capture.wait(None)
 
 
-def test_a_capture_ends_with_the_command_that_is_killed(segment, tmp_path):
+def test_a_capture_ends_with_the_command_that_is_killed(segment: Segment, tmp_path: Path) -> None:
     program = (
         "import sys, time; from rtcp.launch.capturing import Capture\n"
         "capture = Capture('ecat0', int(sys.argv[1]), open(sys.argv[2], 'xb'))\n"

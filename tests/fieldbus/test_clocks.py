@@ -1,4 +1,4 @@
-"""The clock of a slave that is set up again: what is lost or not kept ends the attempt, it does not pass unseen."""
+"""The clock of a slave that is set up again: a write that is lost or not kept ends the attempt."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_sync0_is_not_started_with_half_of_its_settings(port: Direct, register: 
 
 
 def test_a_cycle_of_sync0_that_is_not_kept_is_told(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
-    # One that writes nothing: the slave answers and keeps what it had, a single SYNC0.
+    # The write changes nothing: the slave answers and keeps its old value, a single SYNC0.
     put = port.put
     monkeypatch.setattr(port, "put", lambda station, address, *rest: address == 0x09A0 or put(station, address, *rest))
     with pytest.raises(BusError, match=r"does not keep the cycle of SYNC0, 1000 us, .* \(registers 0x09A0 and"):

@@ -1,4 +1,4 @@
-"""The EGM bus at real sockets: bytes that are worked out by hand go in, and replies are decoded by hand."""
+"""The EGM bus on real sockets: messages are encoded and replies decoded without the product's code."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def message(
     motors: int = ON, rapid: int = 2, mci: int = RUNNING, collision: bool = False, mtype: int = 2,
     force: bytes = b"",
 ) -> bytes:  # fmt: skip
-    """An EgmRobot by hand. `clock_us`: the controller's clock, by default 4 ms a message; negative: no `time`."""
+    """Return an EgmRobot. `clock_us`: the controller's clock, by default 4 ms a message; negative: no `time`."""
     us = 4000 * seqno if clock_us is None else clock_us
     pose = entry(1, entry(1, 374.0) + entry(2, 0.0) + entry(3, 630.0))
     part = entry(1, doubles(1, joints)) + entry(2, pose)
@@ -61,7 +61,7 @@ def message(
 
 
 class Reply:
-    """An EgmSensor as read by hand: degrees and degrees/s, the external joint last."""
+    """A decoded EgmSensor: degrees and degrees/s, the external joint last."""
 
     def __init__(self, datagram: bytes) -> None:
         fields = parse(datagram)
@@ -95,7 +95,7 @@ class Wire:
         self.robot = self.other()
 
     def other(self) -> socket.socket:
-        """One more socket, of somebody else."""
+        """Return the socket of another sender."""
         made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         made.bind(("127.0.0.1", 0))
         made.setblocking(False)
@@ -106,12 +106,12 @@ class Wire:
         self.robot.close()
 
     def command(self, positions: Sequence[float], speeds: Sequence[float], command: int = FOLLOW) -> None:
-        """Set what goes out with the next reply: rad, rad/s."""
+        """Set the targets of the next reply: rad, rad/s."""
         for i, (position, speed) in enumerate(zip(positions, speeds, strict=True)):
             self.data.set_output(i, struct.pack("<ddB", position, speed, command))
 
     def cycle(self, *datagrams: bytes, sender: socket.socket | None = None) -> Reply | None:
-        """Send to the bus, let it do a cycle, and return its reply; more than one is an error."""
+        """Send to the bus, run a cycle, and return its reply; more than one is an error."""
         for datagram in datagrams:
             (sender or self.robot).sendto(datagram, self.address)
         self.data.receive()
@@ -121,13 +121,13 @@ class Wire:
         return Reply(replies[0]) if replies else None
 
     def replies(self) -> list[bytes]:
-        """Every datagram that waits at the controller."""
-        found = []
+        """Return all datagrams that wait at the controller."""
+        datagrams = []
         while True:
             try:
-                found.append(self.robot.recv(2048))
+                datagrams.append(self.robot.recv(2048))
             except BlockingIOError:
-                return found
+                return datagrams
 
     def states(self) -> list[DriveState]:
         return [DriveState(struct.unpack("<dBBd", self.data.input(i))[1]) for i in range(self.axes)]
@@ -174,8 +174,8 @@ def test_a_reply_is_these_bytes(wire: Wire) -> None:
 
 def test_positions_arrive_in_rad(wire: Wire) -> None:
     wire.cycle(message(0))
-    found = [struct.unpack("<dBBd", wire.data.input(i))[0] for i in range(6)]
-    assert found == pytest.approx([math.radians(value) for value in AT])
+    positions = [struct.unpack("<dBBd", wire.data.input(i))[0] for i in range(6)]
+    assert positions == pytest.approx([math.radians(value) for value in AT])
 
 
 def test_a_joint_without_a_command_is_answered_with_where_it_stands(wire: Wire) -> None:
@@ -210,8 +210,8 @@ def test_after_a_command_the_joint_stands_at_the_last_reference(wire: Wire) -> N
 def test_the_external_joint_is_the_third() -> None:
     for wire in new_wire(7):
         assert wire.cycle(message(0, external=(70.0,))) is not None
-        found = [math.degrees(struct.unpack("<dBBd", wire.data.input(i))[0]) for i in range(7)]
-        assert found == pytest.approx([10.0, -20.0, 70.0, 30.0, -40.0, 50.0, -60.0])
+        positions = [math.degrees(struct.unpack("<dBBd", wire.data.input(i))[0]) for i in range(7)]
+        assert positions == pytest.approx([10.0, -20.0, 70.0, 30.0, -40.0, 50.0, -60.0])
         wire.command([math.radians(value) for value in range(7)], [math.radians(-value) for value in range(7)])
         reply = wire.cycle(message(1, external=(70.0,)))
         assert reply is not None
@@ -335,7 +335,7 @@ def test_a_flood_of_messages_is_no_flood_of_cycles(wire: Wire) -> None:
     begun, cycles = time.monotonic_ns(), 50
     for seqno in range(cycles):
         assert wire.cycle(message(seqno)) is not None
-    # Each takes half a period at least, however fast messages come.
+    # A cycle takes at least half a period, however fast messages come.
     assert time.monotonic_ns() - begun >= (cycles - 1) * 2_016_000
 
 
@@ -516,7 +516,7 @@ def test_whatever_arrives_nothing_raises_and_no_reference_is_outside_the_limits(
                     sender.sendto(datagram, wire.address)
                 reply = wire.cycle()
                 assert sum(wire.counts().values()) >= before
-                if flipped:  # a joint's position may be another one, which UDP's checksum keeps away
+                if flipped:  # it may be another valid position; on a wire, UDP's checksum rejects it
                     break
                 if reply is None:
                     continue

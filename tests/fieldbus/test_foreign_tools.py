@@ -1,4 +1,4 @@
-"""What others wrote finds nothing to complain about: SOEM's slaveinfo, KickCAT and Wireshark's dissector.
+"""Other programs report no fault: SOEM's slaveinfo, KickCAT and Wireshark's dissector.
 
 `.ci/foreign_tools` installs them; where one is missing its tests are skipped.
 """
@@ -11,13 +11,15 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rtcp.config import default_config, load, segment_path
 from rtcp.launch.capturing import Capture
-from tests.fieldbus.conftest import MODELS
+from tests.fieldbus.conftest import MODELS, StartSegment
 from tests.virtual.conftest import ROOT, described, segment
 
 pytestmark = pytest.mark.alone
@@ -36,6 +38,11 @@ CHECKED = (
     "_ws.expert.message", "ecat_mailbox.invalid", "ecat_mailbox.coe.invalid", "ecat_mailbox.foe.invalid",
     "ecat_mailbox.foe_opmode", "ecat_mailbox.coe.type",
 )  # fmt: skip
+EXCHANGES: tuple[tuple[int | Sequence[str], dict[str, dict[str, Any]]], ...] = (
+    (3, {"op": {"period_ns": 1_000_000}, "sdo": {}, "scan": {}, "emergency": {}}),
+    (("files", "bits4"), {"files": {}}),
+)
+"""Segments, and for each the scenarios of `master_child` with their arguments."""
 SOEM_SOURCE = "Source MAC must not be a group address"
 """SOEM sends from 01:01:01:01:01:01."""
 
@@ -56,34 +63,34 @@ def test_slaveinfo_of_soem_brings_all_slaves_to_safe_op_and_reads_every_object(
     config = tmp_path / "segment.yaml"
     config.write_text("slaves:\n" + "".join(f"- {{{entry}}}\n" for entry in DESCRIBED))
     with segment(segment_path(load(default_config())) if slaves == "shipped" else config) as pid:
-        told = run("slaveinfo", pid, "ecat0", what)
-    assert f"{len(MODELS) if slaves == 'shipped' else len(DESCRIBED)} slaves found and configured." in told
-    assert re.findall(r".*(?:error:|[Uu]nknown|Not all|workaround).*", told) == []
-    assert set(re.findall(r"State: (.*)", told)) == {"4"}
+        output = run("slaveinfo", pid, "ecat0", what)
+    assert f"{len(MODELS) if slaves == 'shipped' else len(DESCRIBED)} slaves found and configured." in output
+    assert re.findall(r".*(?:error:|[Uu]nknown|Not all|workaround).*", output) == []
+    assert set(re.findall(r"State: (.*)", output)) == {"4"}
     if what == "-sdo":
-        objects = sum(map(int, re.findall(r"CoE Object Description found, (\d+) entries", told)))
-        assert objects == len(re.findall(r"^0x\w{4} ", told, re.MULTILINE)) > 40
+        objects = sum(map(int, re.findall(r"CoE Object Description found, (\d+) entries", output)))
+        assert objects == len(re.findall(r"^0x\w{4} ", output, re.MULTILINE)) > 40
 
 
 def test_kickcat_brings_the_shipped_segment_to_op_and_reads_objects() -> None:
     with segment(segment_path(load(default_config()))) as pid:
-        found = json.loads(run("python", pid, str(KICKCAT), "ecat0").splitlines()[-1])
-    assert [slave["name"] for slave in found] == ["DIEWU 16DI16DO", *(f"Cubemars {m[9:].upper()}" for m in MODELS[1:])]
-    assert [slave["bytes"] for slave in found] == [[2, 6]] + [[15, 15]] * 6
-    for number, slave in enumerate(found, 1):
+        slaves = json.loads(run("python", pid, str(KICKCAT), "ecat0").splitlines()[-1])
+    assert [slave["name"] for slave in slaves] == ["DIEWU 16DI16DO", *(f"Cubemars {m[9:].upper()}" for m in MODELS[1:])]
+    assert [slave["bytes"] for slave in slaves] == [[2, 6]] + [[15, 15]] * 6
+    for number, slave in enumerate(slaves, 1):
         assert (slave["state"], slave["object"], slave["entry"]) == ("OPERATIONAL", "Identity", "Vendor ID")
         assert slave["whole"] == slave["one by one"]
         assert slave["whole"].endswith(number.to_bytes(4, "little").hex())
 
 
 @pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
-def test_wiresharks_dissector_finds_no_fault_in_what_master_and_slaves_exchange(start_segment, tmp_path):
+def test_wiresharks_dissector_finds_no_fault_in_what_master_and_slaves_exchange(
+    start_segment: StartSegment, tmp_path: Path
+) -> None:
     services: tuple[set[str], set[str]] = (set(), set())
-    for slaves, scenarios in (
-        (3, {"op": {"period_ns": 1_000_000}, "sdo": {}, "scan": {}, "emergency": {}}),
-        (("files", "bits4"), {"files": {}}),
-    ):
-        segment, out = start_segment(slaves), tmp_path / "frames.pcapng"
+    out = tmp_path / "frames.pcapng"
+    for slaves, scenarios in EXCHANGES:
+        segment = start_segment(slaves)
         with out.open("wb") as file, Capture("ecat0", segment.pid, file) as capture:
             for scenario, arguments in scenarios.items():
                 assert "result" in segment.master(scenario, receive_fraction=0.5, **arguments)
@@ -96,5 +103,5 @@ def test_wiresharks_dissector_finds_no_fault_in_what_master_and_slaves_exchange(
             assert (not message or message.startswith(SOEM_SOURCE), "".join(invalid)) == (True, ""), line
             services[0].update(filter(None, file_service.split(",")))
             services[1].update(filter(None, coe_service.split(",")))
-    # It has seen every service: of FoE the six, of CoE emergency, SDO request and response, SDO information.
+    # Every service occurred: of FoE the six, of CoE emergency, SDO request and response, SDO information.
     assert [len(services[0]), services[1]] == [6, {"1", "2", "3", "8"}]

@@ -1,19 +1,19 @@
-"""Error counters of the ports, read from real slave controllers without a wire between."""
+"""Error counters of the ports, read from virtual slave controllers without a wire."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
-from rtcp.fieldbus import port_errors
 from rtcp.fieldbus.port_errors import ErrorCounters
 from rtcp.fieldbus.registers import DatagramCommand
+from rtcp.ipc.events import CableEvent, DamagedFrames, LinkLost
 from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 
-NAMES = ("io", "drive1", "drive2")
 MODELS = ("diewu-io", "cubemars-orh70", "cubemars-orh70")
 
 
@@ -24,10 +24,10 @@ class Bench:
         for position, slave in enumerate(self.segment.slaves, 1):
             slave.esc.write(0x0010, (0x1000 + position).to_bytes(2, "little"), 0)
         self.now = 100.0
-        monkeypatch.setattr(port_errors.time, "monotonic", lambda: self.now)
-        self.said: list[str] = []
+        monkeypatch.setattr(time, "monotonic", lambda: self.now)
+        self.reported: list[CableEvent] = []
         self.set(2, 0, 7)
-        self.counters = ErrorCounters(self.port, NAMES, self.said.append)
+        self.counters = ErrorCounters(self.port, len(MODELS), self.reported.append)
 
     def set(self, position: int, register: int, value: int) -> None:
         self.segment.slaves[position - 1].esc.memory[0x0300 + register] = value
@@ -35,13 +35,13 @@ class Bench:
     def get(self, position: int, register: int) -> int:
         return self.segment.slaves[position - 1].esc.memory[0x0300 + register]
 
-    def round(self) -> list[str]:
-        """Read every slave once; return what is said."""
-        self.said.clear()
-        for _ in NAMES:
+    def round(self) -> list[CableEvent]:
+        """Read every slave once; return what is reported."""
+        self.reported.clear()
+        for _ in MODELS:
             self.counters.read_next()
         self.counters.report_due()
-        return list(self.said)
+        return list(self.reported)
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 def test_what_was_counted_before_the_start_is_nobodys_fault(bench: Bench) -> None:
     assert bench.round() == []
-    assert [sum(one.rx) for one in bench.counters.of] == [0, 0, 0]
+    assert [sum(slave.rx) for slave in bench.counters.of] == [0, 0, 0]
 
 
 def test_counters_are_cleared_before_they_stop_and_the_sum_goes_on(bench: Bench) -> None:
@@ -70,21 +70,14 @@ def test_a_frame_that_counts_as_damaged_and_as_received_wrongly_is_one(bench: Be
 
 
 @pytest.mark.parametrize(
-    ("position", "register", "between"),
-    [
-        (1, 0x00, "between the master and slave 1 (io)"),
-        (2, 0x00, "between slave 1 (io) and slave 2 (drive1)"),
-        (1, 0x02, "between slave 1 (io) and slave 2 (drive1)"),
-        (3, 0x02, "behind slave 3 (drive2)"),
-    ],
+    ("position", "register", "near", "far"), [(1, 0x00, 0, 1), (2, 0x00, 1, 2), (1, 0x02, 1, 2), (3, 0x02, 3, 0)]
 )
 def test_errors_of_a_port_name_the_cable_that_is_plugged_in_there(
-    bench: Bench, position: int, register: int, between: str
+    bench: Bench, position: int, register: int, near: int, far: int
 ) -> None:
     bench.set(position, register, bench.get(position, register) + 3)
-    (sentence,) = bench.round()
-    assert sentence.startswith(f"errors enter {between}: 3 damaged frames since ")
-    assert sentence.endswith("; check that cable and its plugs")
+    (event,) = bench.round()
+    assert event == DamagedFrames(near, far, 3, event.began_ns)
 
 
 def test_forwarded_errors_name_no_cable(bench: Bench) -> None:
@@ -94,20 +87,20 @@ def test_forwarded_errors_name_no_cable(bench: Bench) -> None:
 
 
 def test_a_bad_cable_is_told_at_its_beginning_then_every_ten_seconds_with_the_number(bench: Bench) -> None:
-    told = []
+    reports = []
     for second in range(25):
         bench.now = 100.0 + second
         bench.set(2, 0, 7 + 2 * (second + 1))
-        told += [(second, sentence.partition(": ")[2].partition(" since")[0]) for sentence in bench.round()]
-    assert told == [(0, "2 damaged frames"), (10, "22 damaged frames"), (20, "42 damaged frames")]
+        reports += [(second, event.count) for event in bench.round()]
+    assert reports == [(0, 2), (10, 22), (20, 42)]
 
 
 def test_a_link_that_both_its_ends_lost_was_lost_once(bench: Bench) -> None:
     bench.set(2, 0x11, 1)
     bench.set(3, 0x10, 1)
-    (sentence,) = bench.round()
-    assert sentence.startswith("the link between slave 2 (drive1) and slave 3 (drive2) was lost once since ")
-    assert [sum(one.links) for one in bench.counters.of] == [0, 1, 1]
+    (event,) = bench.round()
+    assert event == LinkLost(2, 3, 1, event.began_ns)
+    assert [sum(slave.links) for slave in bench.counters.of] == [0, 1, 1]
 
 
 def test_a_slave_that_was_without_supply_counts_from_zero(bench: Bench) -> None:
@@ -142,10 +135,10 @@ def test_links_whose_clearing_got_lost_are_not_counted_twice(bench: Bench) -> No
 
 
 def test_a_cable_that_damages_frames_on_their_way_back_is_the_one_that_is_named(bench: Bench) -> None:
-    # Who is before the cable hears them first, at the port that looks away from the master; the others forward them.
+    # The slave before the cable counts them, at its port away from the master; the others forward them.
     bench.set(2, 0x02, 4)
     bench.set(2, 0x03, 4)
     bench.set(1, 0x09, 4)
-    (sentence,) = bench.round()
-    assert sentence.startswith("errors enter between slave 2 (drive1) and slave 3 (drive2): 4 damaged frames since ")
-    assert [(sum(one.rx), sum(one.forwarded)) for one in bench.counters.of] == [(0, 4), (4, 0), (0, 0)]
+    (event,) = bench.round()
+    assert event == DamagedFrames(2, 3, 4, event.began_ns)
+    assert [(sum(slave.rx), sum(slave.forwarded)) for slave in bench.counters.of] == [(0, 4), (4, 0), (0, 0)]

@@ -1,4 +1,4 @@
-"""The bus to a RAPID program, against servers of real sockets that the tests answer by hand; its clock is simulated."""
+"""The bus to a RAPID program, against servers on real sockets that the tests play; its clock is simulated."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ S = 1_000_000_000
 
 
 class Robot:
-    """A controller whose servers the test plays, and the bus that speaks to it."""
+    """A controller whose servers the test plays, and the bus that is connected to them."""
 
     def __init__(self, config: ArmConfig) -> None:
         self.listeners = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
@@ -53,11 +53,11 @@ class Robot:
 
     def close(self) -> None:
         self.data.close()
-        for each in (*self.listeners, self.motion, self.state):
-            each.close()
+        for server in (*self.listeners, self.motion, self.state):
+            server.close()
 
     def until(self, met: Callable[[], bool]) -> None:
-        """Read until something has arrived."""
+        """Receive until a condition is met."""
         while not met():
             self.data.receive()
 
@@ -65,14 +65,14 @@ class Robot:
         self.time_ns += round(seconds * S)
 
     def report(self, joints: list[float], status: tuple[int, ...] = READY) -> None:
-        """Send what the state server sends, and let the bus read it."""
+        """Send positions and status as the state server does, and let the bus read them."""
         body = struct.pack(f"<i{len(joints)}f", 0, *joints)
         self.state.sendall(struct.pack("<4i", 12 + len(body), 10, 1, 0) + body)
         self.state.sendall(struct.pack("<11i", 40, 13, 1, 0, *status))
         self.until(lambda: self.actual(0)[0] == pytest.approx(joints[0]))
 
     def command(self, target: float, command: int = FOLLOW) -> None:
-        """Command all joints, and let a cycle send and receive."""
+        """Command all joints, then send and receive once."""
         for i in range(self.axes):
             self.data.set_output(i, struct.pack("<ddB", target, 0.0, command))
         self.data.send()
@@ -118,7 +118,7 @@ def robot() -> Iterator[Robot]:
 
 @pytest.fixture
 def following(robot: Robot) -> Robot:
-    """A robot that follows, stands at 0.5 rad and has got nothing yet."""
+    """A robot that follows at 0.5 rad, before its first point."""
     robot.command(0.5)
     return robot
 
@@ -451,8 +451,8 @@ VELOCITY = 1.0
 class Session:
     """A controller that answers, refuses, falls silent and closes at random, and drives that are commanded at random.
 
-    What arrives at the motion server is checked: no point before a stop is answered, or while the controller takes
-    none, or faster than the joints may turn from where the arm is commanded or, first, stands.
+    Checks what the motion server receives: no point before a stop is answered, or while the controller is not ready,
+    or beyond the joints' speed from the commanded, at first the actual, positions.
     """
 
     def __init__(self, seed: int) -> None:
@@ -471,11 +471,11 @@ class Session:
         """Begin a connection."""
         self.bytes = b""
         self.unanswered: list[tuple[float, ...]] = []
-        """Positions of the requests; none: a stop."""
+        """Positions of the requests; empty: a stop."""
         self.commanded: tuple[float, ...] = ()
 
     def serve(self, state: DriveState, shown: list[float]) -> None:
-        """Check what the last cycle has sent, and answer the oldest request or not."""
+        """Check what the last cycle sent, and answer the oldest request at random."""
         with contextlib.suppress(OSError):
             self.bytes += self.robot.motion.recv(4096)
         while len(self.bytes) >= 68:
@@ -487,7 +487,7 @@ class Session:
                 distance = max(abs(a - b) for a, b in zip(point, self.commanded or shown, strict=True))
                 assert () not in self.unanswered
                 assert state is DriveState.OPERATION_ENABLED
-                # Positions that come late or not are older than some of the arm's last steps of 0.004 rad.
+                # Late or lost positions miss some of the arm's last steps of 0.004 rad.
                 assert distance <= VELOCITY * duration + (1e-4 if self.commanded else 0.031)
             self.unanswered.append(point)
         if self.unanswered and self.random.random() < 0.5:

@@ -1,4 +1,4 @@
-"""What the watcher does turn by turn with slaves that a test lets fall, stay away and change their states late."""
+"""The watcher, turn by turn: slaves that leave OP, stay away, or change their state late."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ from rtcp.fieldbus.bus import station_of
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Answer, DatagramCommand, Register, RegisterPort, Steps
 from rtcp.fieldbus.supervision import SlaveWatcher
+from rtcp.ipc.events import Event, SlavesBackInOp, SlavesLeftOp
 
-NAMES = ("io", "drive1", "drive2")
+COUNT = 3
 OP, SAFEOP, PREOP, INIT = AlState.OP, AlState.SAFEOP, AlState.PREOP, AlState.INIT
 FALLEN = SAFEOP | 0x10
 TURN_S = 0.01
 
 
 class Slaves(RegisterPort):
-    """AL states alone, each changed at once by a request unless a slave is slow."""
+    """AL states alone; a request changes them at once, or where `slow` is a list when `act` is called."""
 
     def __init__(self) -> None:
-        self.al = [int(OP)] * len(NAMES)
+        self.al = [int(OP)] * COUNT
         self.slow: list[tuple[int, int]] | None = None
-        """Requests that have not been acted on yet, where slaves are slow: index and word."""
+        """Delayed requests: index and state; None: slaves are not slow."""
         self.deaf: set[int] = set()
+        """Positions that receive no requests."""
         self.requests: list[tuple[int, int]] = []
         """Position and state."""
         self.lost: set[int] = set()
@@ -46,8 +48,8 @@ class Slaves(RegisterPort):
     ) -> Answer:
         if command is DatagramCommand.BRD:
             together = 0
-            for one in self.al:
-                together |= one
+            for status in self.al:
+                together |= status
             return Answer(bytes((together, 0)), len(self.al))
         index = station - station_of(1)
         if command is DatagramCommand.FPRD and address == Register.AL_STATUS:
@@ -65,14 +67,14 @@ class Slaves(RegisterPort):
         return Answer(bytes(len(data)), 1)
 
     def act(self) -> None:
-        """Let slow slaves do what was requested."""
+        """Carry out the delayed requests."""
         requested, self.slow = self.slow or [], None
         for index, state in requested:
             self.al[index] = state
 
 
 class Bench:
-    """A watcher of three slaves whose time a test lets pass."""
+    """A watcher of three slaves in simulated time."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 100.0
@@ -80,10 +82,10 @@ class Bench:
         for module in (supervision, recovery):
             monkeypatch.setattr(module, "time", clock)
         self.port = Slaves()
-        self.said: list[str] = []
+        self.reported: list[Event] = []
         self.restored: list[int] = []
         self.restoration: Callable[[int], Steps[None]] = self.endless
-        self.watcher = SlaveWatcher(self.port, NAMES, self, self.said.append)  # type: ignore[arg-type]
+        self.watcher = SlaveWatcher(self.port, COUNT, self, self.reported.append)  # type: ignore[arg-type]
 
     def wait(self, seconds: float) -> None:
         self.now += seconds
@@ -106,7 +108,7 @@ class Bench:
         raise BusError("its clock does not settle")
 
     def turn(self, count: int = 1) -> list[int]:
-        """Take turns; return who was said to have left OP."""
+        """Run turns; return the positions that left OP."""
         left = []
         for _ in range(count):
             left.append(self.watcher.turn())
@@ -118,7 +120,7 @@ class Bench:
             if self.watcher.all_op:
                 return
             self.turn()
-        raise AssertionError(f"never in OP again: {self.port.al}, {self.said}")
+        raise AssertionError(f"never in OP again: {self.port.al}, {self.reported}")
 
 
 @pytest.fixture
@@ -172,7 +174,7 @@ def test_a_slave_that_was_waiting_for_its_set_up_when_it_was_parked_gets_it(benc
     for state in (FALLEN, PREOP):
         bench.port.al[1] = state
         bench.turn(5)
-    # It fell out of OP again at once: nothing is done with it before a pause is over.
+    # It left OP again at once: it is left alone until a pause is over.
     assert (bench.watcher.all_op, bench.restored) == (False, [])
     bench.watcher.park()
     bench.turn(15)
@@ -205,7 +207,7 @@ def test_slaves_that_are_about_to_be_parked_are_not_taken_for_well_when_they_are
     bench.turn()
     assert not bench.watcher.all_op
     bench.until_op()
-    assert (bench.port.al, bench.restored, bench.said) == ([OP] * 3, [], [])
+    assert (bench.port.al, bench.restored, bench.reported) == ([OP] * 3, [], [])
     assert [slave.lost for slave in bench.watcher.slaves] == [0, 0, 0]
 
 
@@ -222,21 +224,20 @@ def test_a_slave_that_falls_again_and_again_is_told_every_ten_seconds_and_brough
 ) -> None:
     bench.restoration = bench.at_once
     falls = 0
-    told: list[float] = []
+    times_s: list[float] = []
     for _ in range(3000):
         if bench.watcher.all_op:
             bench.port.al[1] = FALLEN
             falls += 1
-        before = len(bench.said)
+        before = len(bench.reported)
         bench.turn()
-        told += [bench.now] * (len(bench.said) - before)
-    left = [sentence for sentence in bench.said if "left OP" in sentence]
+        times_s += [bench.now for event in bench.reported[before:] if isinstance(event, SlavesLeftOp)]
+    left = [event for event in bench.reported if isinstance(event, SlavesLeftOp)]
     # At 0 s, after 10 s and after 20 s, one pair each; pauses of 1, 2, 3, 4, 5, 5, ... s.
     assert 8 <= falls <= 10
-    assert len(left) == 3
-    assert len(bench.said) <= 7, bench.said
-    assert "it left OP" not in left[0].partition("left OP")[2]
-    assert left[1].endswith("; it left OP 4 times since the last report")
+    assert [at_s - times_s[0] for at_s in times_s] == pytest.approx([0.0, 10.0, 20.0], abs=2 * TURN_S)
+    assert [event.falls for event in left] == [1, 4, 2]
+    assert len(bench.reported) <= 7, bench.reported
     assert bench.watcher.slaves[1].lost == falls
     assert bench.watcher.slaves[1].recovered >= falls - 1
     assert 2 in bench.restored
@@ -256,14 +257,14 @@ def test_a_slave_that_was_well_for_a_while_is_brought_back_without_a_pause(bench
 def test_a_fall_that_was_not_told_at_once_is_told_later_where_the_slave_stays_away(bench: Bench) -> None:
     bench.port.al[1] = FALLEN
     bench.turn(5)
-    assert len(bench.said) == 2
+    assert len(bench.reported) == 2
     bench.port.al[1] = FALLEN
     bench.port.deaf = {2}
     bench.turn(600)
-    assert not any("left OP" in sentence for sentence in bench.said[2:])
+    assert not any(isinstance(event, SlavesLeftOp) for event in bench.reported[2:])
     bench.turn(500)
-    (told,) = [sentence for sentence in bench.said[2:] if "left OP" in sentence]
-    assert told.startswith("slave 2 (drive1) left OP")
+    (left,) = [event for event in bench.reported[2:] if isinstance(event, SlavesLeftOp)]
+    assert (left.slave, left.last) == (2, 2)
 
 
 def test_a_slave_waits_in_safe_op_until_outputs_come_in_time_with_its_clock(bench: Bench) -> None:
@@ -278,12 +279,12 @@ def test_a_slave_waits_in_safe_op_until_outputs_come_in_time_with_its_clock(benc
 
 def test_a_fall_after_a_reset_is_told_at_once(bench: Bench) -> None:
     for _ in range(3):
-        bench.said.clear()
+        bench.reported.clear()
         bench.port.al[1] = FALLEN
         bench.turn()
         bench.watcher.resume()
         bench.until_op()
-        assert ["left OP" in bench.said[0], "is back in OP" in bench.said[1]] == [True, True]
+        assert [type(event) for event in bench.reported[:2]] == [SlavesLeftOp, SlavesBackInOp]
 
 
 def test_a_look_that_was_cut_short_changes_nothing(bench: Bench) -> None:

@@ -1,4 +1,4 @@
-"""Answers to single datagrams: whose an answer is, shown by frames that wait at the port's socket."""
+"""Answers to single datagrams: an old or foreign frame at the port's socket is not the answer."""
 
 from __future__ import annotations
 

@@ -19,11 +19,11 @@ PERIOD = 1_000_000
 
 
 CONTROL_2, SYNC_MANAGER_2 = 0x0814, bytes.fromhex("0011100024000100")
-"""Its control byte leaves the trigger of the watchdog off."""
+"""Register and content of sync manager 2, whose control byte does not trigger the watchdog."""
 
 
 class Forgetful(Direct):
-    """No sync manager keeps the trigger of the watchdog."""
+    """Sync managers lose the bit that triggers the watchdog."""
 
     def exchange(self, command: DatagramCommand, station: int, address: int, data: bytes, **more: Any) -> Answer:
         if command is DatagramCommand.FPWR and address == CONTROL_2:

@@ -1,8 +1,10 @@
-"""What a drive says that it counts in, compared with its device's file: on the in-process bus, object by object."""
+"""The units in a drive's objects compared with its device's file, on the in-process bus."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import cast
 
 import pytest
 
@@ -10,9 +12,10 @@ from rtcp.config import default_config, load
 from rtcp.config.model import Pdo, SlaveConfig
 from rtcp.config.scaling import DriveScaling
 from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.registers import finish
 from rtcp.fieldbus.scaling import compare_scaling
-from rtcp.launch.inprocess import InProcessBus
+from rtcp.testing.bus import InProcessBus
 from rtcp.virtual.models import CubemarsDrive, create
 from rtcp.virtual.objects import DataType, Entry
 
@@ -21,12 +24,12 @@ DEVICE = replace(_WHOLE, sdo=tuple(sdo for sdo in _WHOLE.sdo if sdo.index == 0x6
 PERIOD_NS = 1_000_000
 MODEL = create("cubemars-orh70")
 assert isinstance(MODEL, CubemarsDrive)
-HELD = MODEL.objects[0x608F, 1].value, MODEL.objects[0x6091, 1].value
-AGREES = DriveScaling(encoder_increments=HELD[0], gear_ratio=HELD[1])
+INCREMENTS, GEAR_RATIO = int(MODEL.objects[0x608F, 1].value), int(MODEL.objects[0x6091, 1].value)
+AGREES = DriveScaling(encoder_increments=INCREMENTS, gear_ratio=GEAR_RATIO)
 
 
 def notes(scaling: tuple[DriveScaling, ...], *changes: tuple[int, tuple[int, ...]], pdos: int = 1) -> list[str]:
-    """What is noted at the start of a drive, or raised, whose objects (an index, its values) were changed or added."""
+    """Start a drive with changed or added objects (index, values); return the notes."""
     model = create("cubemars-orh70")
     for index, values in changes:
         if len(values) == 1:
@@ -36,7 +39,7 @@ def notes(scaling: tuple[DriveScaling, ...], *changes: tuple[int, tuple[int, ...
             model.objects.record(index, "ratio", entries)
     device = replace(DEVICE, scaling=scaling)
     if pdos == 2:
-        # The model has one axis: what is compared are the objects of a second, not what is mapped.
+        # The model has one axis: only the objects of a second axis are compared.
         more = Pdo(0x1A00, DEVICE.tpdo[0].channels, axis=2)
         device = replace(device, tpdo=(more,), rpdo=DEVICE.rpdo)
     bus = InProcessBus([model])
@@ -49,14 +52,16 @@ def test_a_drive_that_counts_as_its_file_says_starts_and_what_it_lacks_is_noted(
         "slave 1 (drive1) has no 0x60A9 (velocity_unit): whether its file is right about it is not checked"
     ]
     everything = replace(AGREES, feed_constant=36000.0, rated_torque=1.2346, rated_current=4.5, velocity_unit="mrpm")
-    held = (0x6092, (72000, 2)), (0x6076, (1235,)), (0x6075, (4500,)), (0x60A9, (0xFDB44700,))
-    assert notes((everything,), *held) == []
-    assert "0x6076 (rated_torque)" in notes((everything,), *held[:1], (0x6076, (0,)), *held[2:])[0]
-    assert notes((replace(everything, rated_torque_unit="uNm"),), *held[:1], (0x6076, (1234600,)), *held[2:]) == []
+    objects = (0x6092, (72000, 2)), (0x6076, (1235,)), (0x6075, (4500,)), (0x60A9, (0xFDB44700,))
+    assert notes((everything,), *objects) == []
+    assert "0x6076 (rated_torque)" in notes((everything,), *objects[:1], (0x6076, (0,)), *objects[2:])[0]
+    assert (
+        notes((replace(everything, rated_torque_unit="uNm"),), *objects[:1], (0x6076, (1234600,)), *objects[2:]) == []
+    )
 
 
 @pytest.mark.parametrize(
-    ("scaling", "held", "named"),
+    ("scaling", "objects", "named"),
     [
         (replace(AGREES, encoder_increments=1024.0), (0x608F, (131072, 1)),
          "0x608F holds 131072 increments a motor revolution, the file has 1024 (key `encoder_increments` of `scaling` "
@@ -69,9 +74,11 @@ def test_a_drive_that_counts_as_its_file_says_starts_and_what_it_lacks_is_noted(
         (replace(AGREES, velocity_unit="rpm"), (0x60A9, (0x00410300,)), "0x60A9 holds the unit 0x00410300, "),
     ],
 )  # fmt: skip
-def test_a_drive_that_counts_otherwise_is_refused_with_both_values(scaling, held, named) -> None:
+def test_a_drive_that_counts_otherwise_is_refused_with_both_values(
+    scaling: DriveScaling, objects: tuple[int, tuple[int, ...]], named: str
+) -> None:
     with pytest.raises(BusError) as refused:
-        notes((scaling,), held)
+        notes((scaling,), objects)
     (sentence,) = refused.value.sentences
     assert sentence.startswith("slave 1 (drive1): the drive counts otherwise than its file: ")
     assert named in sentence
@@ -96,7 +103,7 @@ def test_a_feed_constant_that_the_drive_does_not_count_in_is_not_compared() -> N
 
 def test_each_axis_is_compared_with_its_own_objects() -> None:
     second = replace(AGREES, gear_ratio=50.0)
-    objects = (0x688F, (HELD[0], 1)), (0x60A9, (0x00B50300,)), (0x68A9, (0x00B50300,))
+    objects = (0x688F, (INCREMENTS, 1)), (0x60A9, (0x00B50300,)), (0x68A9, (0x00B50300,))
     assert notes((AGREES, second), *objects, (0x6891, (50, 1)), pdos=2) == [
         "slave 1 (drive1) has no interpolation time (0x68C2)"
     ]
@@ -108,9 +115,9 @@ def test_a_drive_that_answers_with_another_error_is_no_drive_that_lacks_the_obje
     class Client:
         position, name = 1, "drive1"
 
-        def reading_int(self, index, subindex):
+        def reading_int(self, index: int, subindex: int) -> Iterator[None]:
             raise SdoAborted("hardware error", 0x06060000)
             yield
 
     with pytest.raises(SdoAborted):
-        finish(compare_scaling(Client(), SlaveConfig("drive1", replace(DEVICE, scaling=(AGREES,)))))
+        finish(compare_scaling(cast(SdoClient, Client()), SlaveConfig("drive1", replace(DEVICE, scaling=(AGREES,)))))

@@ -1,4 +1,4 @@
-"""The master's side of the watcher's tests, a process of its own as `master_child`, whose parts it uses."""
+"""The master's side of the watcher's tests: a process of its own, as `master_child`."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import master_child
-from master_child import Cycle, arm, to_op, with_device
-
+from rtcp.config import default_config, load
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus import AlState
 from rtcp.fieldbus.bus import station_of
 from rtcp.fieldbus.slave_setup import SlaveRestorer, read_set_up
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.fieldbus.supervision import SlaveWatcher
+from rtcp.ipc.codes import state_name
+from rtcp.ipc.events import Event
+from rtcp.ipc.names import Names
 from rtcp.virtual.faults.control import SegmentClient
-from tests.fieldbus import terminals
+from tests.fieldbus import master_child, terminals
+from tests.fieldbus.master_child import Cycle, arm, to_op, with_device
 
 PERIOD = 1_000_000
 PATIENCE_S = 20.0
-"""Only keeps a broken watcher from hanging the tests."""
+"""Limit that keeps a broken watcher from blocking the tests."""
 SM_STATUS = 5
 SYNC_LIMIT = 0x10F1
 BESIDE = 15
@@ -32,12 +34,12 @@ MISSED = 2
 
 
 def registers(bus: SoemBus, position: int) -> dict[str, str]:
-    """Return the registers that a restoration must bring back, as they were."""
+    """Return the registers that a restoration must bring back."""
     station = station_of(position)
     managers = bytearray(bus.port.read(station, 0x0800, 0x40) or b"")
     for at in range(SM_STATUS, len(managers), 8):
         managers[at] = 0
-    found = {"managers": bytes(managers)}
+    values = {"managers": bytes(managers)}
     for name, address, length in (
         ("station", 0x0010, 2),
         ("fmmus", 0x0600, 0x80),
@@ -46,24 +48,24 @@ def registers(bus: SoemBus, position: int) -> dict[str, str]:
         ("activation", 0x0981, 1),
         ("cycle", 0x09A0, 4),
     ):
-        found[name] = bus.port.read(station, address, length) or b""
-    return {name: data.hex() for name, data in found.items()}
+        values[name] = bus.port.read(station, address, length) or b""
+    return {name: data.hex() for name, data in values.items()}
 
 
 def clocks(bus: SoemBus, count: int) -> list[tuple[int, int]]:
-    """Return of each slave how far its clock is from the reference's and where in the cycle its SYNC0 lies, ns."""
-    found = []
+    """Return for each slave its clock's difference from the reference's and its SYNC0's phase in the cycle, ns."""
+    rows = []
     for position in range(1, count + 1):
         station = station_of(position)
         difference = int.from_bytes(bus.port.read(station, 0x092C, 4) or b"", "little")
         start = int.from_bytes(bus.port.read(station, 0x0990, 8) or b"", "little")
         sign = -1 if difference >> 31 else 1
-        found.append((sign * (difference & 0x7FFF_FFFF), start % PERIOD))
-    return found
+        rows.append((sign * (difference & 0x7FFF_FFFF), start % PERIOD))
+    return rows
 
 
 class Watching:
-    """What the thread beside the cycle does: turns of the watcher, ten milliseconds apart."""
+    """Runs the watcher every 10 ms, as the service thread does."""
 
     def __init__(self, watcher: SlaveWatcher) -> None:
         self.watcher = watcher
@@ -86,20 +88,20 @@ class Watching:
             self.left.append(position)
         self.longest_s = max(self.longest_s, time.monotonic() - began)
         for states, slave in zip(self.seen, self.watcher.slaves, strict=True):
-            words = slave.words().partition(" (")[0]
+            words = state_name(slave.al_status)
             if states[-1:] != [words]:
                 states.append(words)
         time.sleep(0.01)
 
 
 def patient(config: SlaveConfig) -> SlaveConfig:
-    """Let a slave bear a busy host: a longer watchdog, and no end of SYNC0 without outputs."""
-    sdo = tuple(replace(one, value=0) if one.index == SYNC_LIMIT else one for one in config.device.sdo)
+    """Adapt a slave to a busy host: a longer watchdog, and no sync error without outputs."""
+    sdo = tuple(replace(entry, value=0) if entry.index == SYNC_LIMIT else entry for entry in config.device.sdo)
     return with_device(config, watchdog_ms=200, sdo=sdo)
 
 
 class Watched:
-    """A segment in OP, its cycle and its watcher; an episode is a fault and what becomes of it."""
+    """A segment in OP with its cycle and its watcher; an episode is a fault and its recovery."""
 
     def __init__(
         self, bus: SoemBus, count: int, client: SegmentClient, slaves: Sequence[SlaveConfig] | None = None
@@ -108,6 +110,7 @@ class Watched:
         self.count = count
         self.client = client
         self.slaves = [patient(config) for config in slaves or arm(count)]
+        self.names = Names(replace(load(default_config()), slaves=tuple(self.slaves)))
         self.data = bus.configure(self.slaves, PERIOD)
         self.cycle = Cycle(self.data, PERIOD)
         to_op(bus, self.cycle)
@@ -116,25 +119,30 @@ class Watched:
     def registers(self) -> list[dict[str, str]]:
         return [registers(self.bus, position) for position in range(1, self.count + 1)]
 
-    def strange_watcher(self, position: int, say: Any, serial: int) -> SlaveWatcher:
-        """Return a watcher that expects another device at `position`, or where `serial` is not 0 one of its kind."""
+    def strange_watcher(self, position: int, report: Any, serial: int) -> SlaveWatcher:
+        """Return a watcher that expects another device at `position`; `serial`: of the same kind, with this number."""
         own = self.slaves[position - 1].device
         other = own if serial else replace(own, product_id=0x4711)
-        changed = [replace(one, device=other) if at == position else one for at, one in enumerate(self.slaves, 1)]
-        set_ups = [read_set_up(self.bus.port, at, one.name, serial) for at, one in enumerate(self.slaves, 1)]
+        changed = [
+            replace(config, device=other) if at == position else config for at, config in enumerate(self.slaves, 1)
+        ]
+        set_ups = [read_set_up(self.bus.port, at, config.name, serial) for at, config in enumerate(self.slaves, 1)]
         restorer = SlaveRestorer(self.bus.port, changed, set_ups, self.bus.sdo, PERIOD)
-        return SlaveWatcher(self.bus.port, [one.name for one in self.slaves], restorer, say)
+        return SlaveWatcher(self.bus.port, self.count, restorer, report)
 
     def episode(
         self, faults: list[dict[str, Any]], act: Any = None, foreign: int = 0, serial: int = 0
     ) -> dict[str, Any]:  # fmt: skip
-        """Let the faults begin, watch until every slave is in OP again and tell what came of it.
+        """Begin faults, watch until every slave is in OP again, and return the results.
 
-        `act` is done with the watching meanwhile and may return something to be told; `foreign` is the position at
-        which another device is expected, or one of the same kind with the number `serial`.
+        `act` runs meanwhile, and its result is among them; `foreign` and `serial`: see `strange_watcher`.
         """
-        said: list[str] = []
-        watcher = self.strange_watcher(foreign, said.append, serial) if foreign else self.bus.watcher(said.append)
+        reported: list[str] = []
+
+        def report(event: Event) -> None:
+            reported.append(self.names.message(event))
+
+        watcher = self.strange_watcher(foreign, report, serial) if foreign else self.bus.watcher(report)
         watching = Watching(watcher)
 
         def watch() -> dict[str, Any]:
@@ -143,16 +151,17 @@ class Watched:
                 self.client.fault(fault)
             acted = act(watching) if act is not None else None
             lost = faults and act is None
-            watching.until(lambda: watcher.all_op and (not lost or any(one.recovered for one in watcher.slaves)))
+            watching.until(lambda: watcher.all_op and (not lost or any(slave.recovered for slave in watcher.slaves)))
             took_s = time.monotonic() - began
-            # Drift compensation is at its end before the clocks are compared.
+            # Drift compensation ends before the clocks are compared.
             watching.during(0.3 if any(fault["fault"] in ("power", "clock_jump") for fault in faults) else 0.0)
             return {
-                "said": said, "left": watching.left, "took_s": took_s, "longest_s": watching.longest_s,
-                "states": [slave.words() for slave in watcher.slaves], "seen": watching.seen, "acted": acted,
+                "reported": reported, "left": watching.left, "took_s": took_s, "longest_s": watching.longest_s,
+                "states": [state_name(slave.al_status) for slave in watcher.slaves],
+                "seen": watching.seen, "acted": acted,
                 "lost": [slave.lost for slave in watcher.slaves],
                 "recovered": [slave.recovered for slave in watcher.slaves],
-                "errors": [[sum(one.rx), sum(one.forwarded), sum(one.links)] for one in watcher.errors.of],
+                "errors": [[sum(slave.rx), sum(slave.forwarded), sum(slave.links)] for slave in watcher.errors.of],
                 "before": self.before, "after": self.registers(), "clocks": clocks(self.bus, self.count),
             }  # fmt: skip
 
@@ -162,28 +171,28 @@ class Watched:
         result["whole"] = self.data.expected_wkc in self.cycle.wkcs
         return result
 
-    # -- what is done meanwhile -----------------------------------------------------------------------------------
+    # -- actions during an episode --------------------------------------------------------------------------------
 
     def al_states(self) -> list[str]:
-        return [one["al"] for one in self.client.truth()["slaves"]]
+        return [slave["al"] for slave in self.client.truth()["slaves"]]
 
     def leave_alone(self, watching: Watching) -> list[str]:
-        """Watch for a while; then put the right device there again, in other words: let the right watcher do it."""
+        """Watch for a while; then let the watcher that expects the right device recover it."""
         watching.during(0.5)
-        found = self.al_states()
-        right = Watching(self.bus.watcher(lambda sentence: None))
+        states = self.al_states()
+        right = Watching(self.bus.watcher(lambda event: None))
         right.turn()
         right.until(lambda: right.watcher.all_op)
         watching.turn()
-        return found
+        return states
 
     def park(self, watching: Watching) -> list[str]:
         watching.watcher.park()
         watching.until(lambda: all(slave.state is AlState.PREOP for slave in watching.watcher.slaves))
         watching.during(0.3)
-        found = self.al_states()
+        states = self.al_states()
         watching.watcher.resume()
-        return found
+        return states
 
     def read_beside(self, watching: Watching) -> dict[str, Any]:
         """Read an object of slave 3 again and again while slave 2 is being set up."""
@@ -197,7 +206,7 @@ class Watched:
         return {"names": sorted(names), "count": count, "took_s": time.monotonic() - began}
 
     def count_damage(self, watching: Watching) -> None:
-        """Damage more frames than a counter holds, no more at once than it holds until it is read."""
+        """Damage more frames than a counter holds, in bursts that it holds."""
         errors = watching.watcher.errors.of
         for number in range(1, BURSTS + 1):
             self.client.fault({"fault": "corrupt", "after": 1, "burst": BURST})
@@ -205,57 +214,57 @@ class Watched:
             watching.until(lambda least=least: sum(errors[1].rx) >= least and sum(errors[2].forwarded) >= least)
 
     def count_links(self, watching: Watching) -> None:
-        watching.until(lambda: all(any(one.links) for one in watching.watcher.errors.of[1:]))
+        watching.until(lambda: all(any(slave.links) for slave in watching.watcher.errors.of[1:]))
 
 
 def episodes(bus: SoemBus, count: int, control: str) -> Any:
-    """Break one thing after the other on one segment; return what came of each."""
+    """Cause one fault after the other on one segment; return the results."""
     with SegmentClient(Path(control)) as client:
-        one = Watched(bus, count, client)
+        watched = Watched(bus, count, client)
         return {
-            "supply": one.episode([{"fault": "power", "slave": 2, "lasts": 0.05}]),
-            "reference": one.episode([{"fault": "power", "slave": 1, "lasts": 0.05}]),
-            "cable": one.episode([{"fault": "cable", "after": 1, "lasts": 0.4}]),
-            "SAFE-OP": one.episode([{"fault": "al_fall", "slave": 3, "state": "SAFE-OP", "code": 0x1B}]),
-            "PRE-OP": one.episode([{"fault": "al_fall", "slave": 3, "state": "PRE-OP", "code": 0x1B}]),
-            "refusal": one.episode(
+            "supply": watched.episode([{"fault": "power", "slave": 2, "lasts": 0.05}]),
+            "reference": watched.episode([{"fault": "power", "slave": 1, "lasts": 0.05}]),
+            "cable": watched.episode([{"fault": "cable", "after": 1, "lasts": 0.4}]),
+            "SAFE-OP": watched.episode([{"fault": "al_fall", "slave": 3, "state": "SAFE-OP", "code": 0x1B}]),
+            "PRE-OP": watched.episode([{"fault": "al_fall", "slave": 3, "state": "PRE-OP", "code": 0x1B}]),
+            "refusal": watched.episode(
                 [
                     {"fault": "al_refuse", "slave": 2, "code": 0x52, "lasts": 1.2},
                     {"fault": "al_fall", "slave": 2},
                     {"fault": "al_fall", "slave": 3},
                 ]
             ),
-            "clock": one.episode([{"fault": "clock_jump", "slave": 3, "us": 20_000}]),
-            "late": one.episode(
+            "clock": watched.episode([{"fault": "clock_jump", "slave": 3, "us": 20_000}]),
+            "late": watched.episode(
                 [
                     {"fault": "sdo_late", "slave": 2, "ms": 300, "lasts": 0.8},
                     {"fault": "al_fall", "slave": 2, "state": "PRE-OP"},
                 ],
-                one.read_beside,
+                watched.read_beside,
             ),
-            "foreign": one.episode([{"fault": "power", "slave": 3, "lasts": 0.05}], one.leave_alone, foreign=3),
-            "swapped": one.episode(
-                [{"fault": "power", "slave": 3, "lasts": 0.05}], one.leave_alone, foreign=3, serial=0x4711
+            "foreign": watched.episode([{"fault": "power", "slave": 3, "lasts": 0.05}], watched.leave_alone, foreign=3),
+            "swapped": watched.episode(
+                [{"fault": "power", "slave": 3, "lasts": 0.05}], watched.leave_alone, foreign=3, serial=0x4711
             ),
-            "parked": one.episode([], one.park),
-            "damage": one.episode([], one.count_damage),
-            "link": one.episode([{"fault": "cable", "after": 2, "lasts": 0.05}], one.count_links),
+            "parked": watched.episode([], watched.park),
+            "damage": watched.episode([], watched.count_damage),
+            "link": watched.episode([{"fault": "cable", "after": 2, "lasts": 0.05}], watched.count_links),
         }
 
 
 def branches(bus: SoemBus, count: int, control: str, kinds: list[str]) -> Any:
     """Break the cable to the branch that frames pass first, and the supply of the other one's first slave."""
     with SegmentClient(Path(control)) as client:
-        one = Watched(bus, count, client, [terminals.slave(f"t{n}", kind) for n, kind in enumerate(kinds, 1)])
+        watched = Watched(bus, count, client, [terminals.slave(f"t{n}", kind) for n, kind in enumerate(kinds, 1)])
 
         def other_branch(watching: Watching) -> list[str]:
             watching.until(lambda: watching.watcher.slaves[3].recovered)
-            found = [slave.words() for slave in watching.watcher.slaves]
+            states = [state_name(slave.al_status) for slave in watching.watcher.slaves]
             client.clear(cable)
-            return found
+            return states
 
         cable = client.fault({"fault": "cable", "after": 1, "port": 3})
-        return one.episode([{"fault": "power", "slave": 4, "lasts": 0.05}], other_branch)
+        return watched.episode([{"fault": "power", "slave": 4, "lasts": 0.05}], other_branch)
 
 
 master_child.SCENARIOS["episodes"] = episodes

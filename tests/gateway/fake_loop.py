@@ -1,4 +1,4 @@
-"""The loop's side of a blackboard, faked: it accepts every command, and is at once where a motion leads."""
+"""A fake loop on a blackboard: it accepts every command, and every motion ends at once."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class FakeLoop:
         self.inputs = self.outputs = 0
 
     def clear(self) -> None:
-        """Forget what came and what was set."""
+        """Reset received commands and settings."""
         for came in (self.commands, self.plans, self.requests):
             came.clear()
         self._set_up((0.0,) * JOINTS, State.READY)
@@ -81,8 +81,9 @@ class FakeLoop:
 
     @property
     def written(self) -> list[tuple[int, int, str]]:
-        """The objects that were written: index, subindex, bytes in hexadecimal."""
-        return [(one["index"], one["subindex"], one["hex"]) for one in self.requests if one["do"] == "sdo_write"]
+        """The written objects: index, subindex, bytes in hexadecimal."""
+        writes = [request for request in self.requests if request["do"] == "sdo_write"]
+        return [(write["index"], write["subindex"], write["hex"]) for write in writes]
 
     def _run(self) -> None:
         while not self._ended.wait(0.001):
@@ -96,8 +97,8 @@ class FakeLoop:
         if not self._left:
             return
         self._left -= 1
-        held, renewed, duration = self.board.lease()
-        if held != self._lease or time.monotonic_ns() - renewed > duration:
+        lease, renewed, duration = self.board.lease()
+        if lease != self._lease or time.monotonic_ns() - renewed > duration:
             self._left = 0
             self.state = State.HOLDING
         elif self._left == 0:
@@ -106,11 +107,11 @@ class FakeLoop:
             self.state = self.ends_in
 
     def _publish(self) -> None:
-        told = {"time_ns": time.monotonic_ns(), "state": self.state, "control_mode": self.control_mode}
-        told["speed_override"] = self.speed_override
-        told |= dict.fromkeys(("actual_position", "commanded_position", "sent_position"), self.q)
-        told |= {"io_inputs": self.inputs, "io_outputs": self.outputs}
-        self.board.publish(numbers(self.board.schema, **told))
+        record: dict[str, Any] = {"time_ns": time.monotonic_ns(), "state": self.state}
+        record |= {"control_mode": self.control_mode, "speed_override": self.speed_override}
+        record |= dict.fromkeys(("actual_position", "commanded_position", "sent_position"), self.q)
+        record |= {"io_inputs": self.inputs, "io_outputs": self.outputs}
+        self.board.publish(numbers(self.board.schema, **record))
 
     def _handle(self) -> None:
         number, lease, command = self.board.take_command()

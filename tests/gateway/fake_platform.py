@@ -46,14 +46,14 @@ class FakePlatform:
         self.methods: Methods
 
     def reset(self, q: Sequence[float]) -> None:
-        """Hold at `q`, and forget what came before."""
+        """Hold at `q`, with nothing received."""
         self.loop.clear()
         self.loop.q = list(q)
         limits_file(self.directory).unlink(missing_ok=True)
         self.show(state=State.HOLDING)
 
     def show(self, *, control_mode: ControlMode | None = None, state: State | None = None) -> None:
-        """Let the loop be in another mode or state, and return when its records say so."""
+        """Set mode or state of the loop; return when its records have them."""
         self.loop.control_mode = self.loop.control_mode if control_mode is None else control_mode
         self.loop.state = self.loop.state if state is None else state
         seen = self.observer.head
@@ -61,15 +61,15 @@ class FakePlatform:
             time.sleep(0.001)
 
     async def call(self, method: str, params: dict[str, Any], client: str = "one", connection: int = 1) -> Any:
-        """Ask as a client's request does."""
+        """Call a method as a client's request does."""
         return await self.methods.call(method, Caller(client, connection), params)
 
     def ask(self, method: str, **params: Any) -> Any:
-        """Ask, in an event loop of its own."""
+        """Call a method in an event loop of its own."""
         return self.run(lambda: self.call(method, params))
 
     def error(self, method: str, **params: Any) -> RtcpError:
-        """Ask and return the error."""
+        """Call a method; return its error."""
         try:
             answer = self.ask(method, **params)
         except RtcpError as error:
@@ -77,7 +77,7 @@ class FakePlatform:
         raise AssertionError(f"{method} did not fail: {answer}")
 
     def run(self, work: Callable[[], Awaitable[T]]) -> T:
-        """Do something in an event loop, while the blackboard is followed as the gateway does."""
+        """Run a coroutine in an event loop while the gateway's tasks read the blackboard."""
 
         async def end_platform() -> list[str]:
             return []

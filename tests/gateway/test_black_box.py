@@ -1,4 +1,4 @@
-"""The black box: what of a blackboard it writes, and when; the loop's part is written, or it runs in simulated time."""
+"""The black box: what it writes of a blackboard, and when; the loop is fake, or runs in simulated time."""
 
 from __future__ import annotations
 
@@ -17,33 +17,23 @@ from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.gateway import black_box
 from rtcp.gateway.black_box import BlackBox
+from rtcp.ipc import events
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.commands import Enable, MoveJoints
-from rtcp.ipc.events import (
-    Arrived,
-    DriveFault,
-    EmergencyStopActivated,
-    Event,
-    ProcessDataLost,
-    ResetDone,
-    ResetTimeout,
-    ResetWhileMoving,
-    SlaveLost,
-)
+from rtcp.ipc.commands import MoveJoints
 from rtcp.ipc.layout import EVENTS
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.recording import FaultRecording, listed, read
+from rtcp.ipc.recording import FaultRecording, listed, read, write
 from rtcp.ipc.runtime_directory import stop_marker
 from rtcp.ipc.schema import arm_schema
 from rtcp.ipc.session import Pid, Processes, Session, identify
 from rtcp.ipc.states import DriveState, State
 from rtcp.launch import launcher
-from rtcp.launch.simulation import Simulation
+from rtcp.testing.simulation import Simulation
 from tests.records import numbers
 
 JOINTS = 6
 BEGAN_NS = 77
-LOST, DRIVE = ProcessDataLost(5, 3), DriveFault(2, DriveState.FAULT_REACTION_ACTIVE, 0x21F)
+LOST, DRIVE = events.ProcessDataLost(5, 3), events.DriveFault(2, DriveState.FAULT_REACTION_ACTIVE, 0x21F)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +45,7 @@ WriteBoard = Callable[..., "Written"]
 
 
 class Written:
-    """A blackboard whose last cycle is now, and a black box that watches it."""
+    """A blackboard whose last cycle is now, and a black box that reads it."""
 
     def __init__(self, path: Path, directory: Path, config: ArmConfig, period_ns: int = 500_000) -> None:
         self.period_ns = period_ns
@@ -65,8 +55,10 @@ class Written:
         self.observer = Observer(path)
         self.reports: list[str] = []
 
-    def fill(self, cycles: int, *, fault_at: int = 0, event: type[Event] = ProcessDataLost, ends_ns: int = 0) -> int:
-        """Publish so many cycles, the last of them now (CLOCK_MONOTONIC); from `fault_at` on they are in fault."""
+    def fill(
+        self, cycles: int, *, fault_at: int = 0, event: type[events.Event] = events.ProcessDataLost, ends_ns: int = 0
+    ) -> int:
+        """Publish `cycles` records, the last of them now (CLOCK_MONOTONIC); from `fault_at` on they are in fault."""
         ends_ns = ends_ns or time.monotonic_ns()
         for cycle in range(1, cycles + 1):
             broken = 0 < fault_at <= cycle
@@ -85,7 +77,7 @@ class Written:
         return BlackBox(self.observer, self.session, self.directory, self.reports.append)
 
     def lost(self, box: BlackBox) -> FaultRecording:
-        """Let frames be lost; return the one recording that there is once the box has finished."""
+        """Cause lost frames; return the only recording after the box has finished."""
         self.board.event(LOST)
         box.finish()
         (recording,) = self.recordings
@@ -93,7 +85,7 @@ class Written:
 
     @property
     def recordings(self) -> list[FaultRecording]:
-        return [read(one.path) for one in listed(self.directory)]
+        return [read(recording.path) for recording in listed(self.directory)]
 
     def close(self) -> None:
         self.observer.close()
@@ -122,8 +114,8 @@ def test_a_fault_is_written_with_the_ten_seconds_before_it(write_board: WriteBoa
     box = written.watched()
     written.fill(24_000, fault_at=23_990)
     written.board.event(LOST)
-    written.board.text("the drive's error code is 0x8611")
-    box.look()
+    written.board.event(events.ErrorReported("the drive's error code is 0x8611"))
+    box.poll()
     box.finish()
     (recording,) = written.recordings
     about, records = recording.about, recording.records
@@ -143,12 +135,12 @@ def test_further_fault_events_are_in_the_same_file_until_a_reset(write_board: Wr
     box = written.watched()
     written.fill(100, fault_at=50)
     written.board.event(LOST)
-    box.look()
+    box.poll()
     written.board.event(DRIVE)
-    box.look()
-    written.board.event(ResetDone())
-    written.board.event(EmergencyStopActivated())
-    box.look()
+    box.poll()
+    written.board.event(events.ResetDone())
+    written.board.event(events.EmergencyStopActivated())
+    box.poll()
     box.finish()
     first, second = written.recordings
     assert len(messages(first)) == 4
@@ -157,17 +149,17 @@ def test_further_fault_events_are_in_the_same_file_until_a_reset(write_board: Wr
 
 
 class Clock:
-    """The black box's clock, and the events' of a blackboard: an hour of faults in an instant."""
+    """Fake clock of the black box and of a blackboard's events: an hour of faults in an instant."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.s = 0.0
         self.set_s = 0.0
-        """By how much the wall clock was set meanwhile."""
+        """Change of the wall clock meanwhile, s."""
         self._began_ns, self._wall_ns = time.monotonic_ns(), time.time_ns()
         monkeypatch.setattr(time, "monotonic_ns", self.now_ns)
         monkeypatch.setattr(time, "time_ns", self.wall_ns)
         monkeypatch.setattr(black_box, "AFTER_S", 0.1)
-        monkeypatch.setattr(black_box, "SILENT_S", 1e9)  # on the host's clock, which a busy host lets run on
+        monkeypatch.setattr(black_box, "SILENT_S", 1e9)  # it is measured by the clock of the host, which may be busy
 
     def now_ns(self) -> int:
         return self._began_ns + round(self.s * 1e9)
@@ -184,16 +176,16 @@ def test_a_fault_event_after_the_end_of_the_file_begins_a_new_one_at_most_every_
     clock = Clock(monkeypatch)
     box = written.watched()
     happens = {
-        0.0: LOST, 0.05: DRIVE, 3.0: DRIVE, 5.0: EmergencyStopActivated(),
-        130.0: ResetTimeout(0, DriveState.UNKNOWN, 0),
-        131.5: ResetWhileMoving(0, 0.1), 131.6: ResetDone(), 131.7: EmergencyStopActivated(),
+        0.0: LOST, 0.05: DRIVE, 3.0: DRIVE, 5.0: events.EmergencyStopActivated(),
+        130.0: events.ResetTimeout(0, DriveState.UNKNOWN, 0),
+        131.5: events.ResetWhileMoving(0, 0.1), 131.6: events.ResetDone(), 131.7: events.EmergencyStopActivated(),
     }  # fmt: skip
     for at_s in sorted({*happens, 9.9, 10.0, 20.0, 140.0}):
         clock.s = at_s
         if at_s in happens:
             written.board.event(happens[at_s])
-        box.look()
-        # What was written when: the file of 5.0 s not before 10 s, that of 131.5 s at the reset.
+        box.poll()
+        # The file of 5.0 s is written not before 10 s, that of 131.5 s at the reset.
         seen = {9.9: [1], 10.0: [1, 4], 131.5: [1, 4, 5]}.get(at_s)
         if seen:
             box._writer.submit(int).result()
@@ -216,11 +208,11 @@ def test_a_wall_clock_that_is_set_neither_puts_a_recording_off_nor_brings_it_for
     clock = Clock(monkeypatch)
     box = written.watched()
 
-    def recorded_at(at_s: float, event: Event | None = None) -> list[int]:
+    def recorded_at(at_s: float, event: events.Event | None = None) -> list[int]:
         clock.s = at_s
         if event is not None:
             written.board.event(event)
-        box.look()
+        box.poll()
         box._writer.submit(int).result()
         return [recording.about.event for recording in written.recordings]
 
@@ -229,7 +221,7 @@ def test_a_wall_clock_that_is_set_neither_puts_a_recording_off_nor_brings_it_for
     assert recorded_at(9.0, DRIVE) == [1]
     assert recorded_at(10.0) == [1, 2]
     # The emergency stop half a minute into a fault, while its ten seconds are in the ring.
-    assert recorded_at(30.0, EmergencyStopActivated()) == [1, 2, 3]
+    assert recorded_at(30.0, events.EmergencyStopActivated()) == [1, 2, 3]
     box.finish()
     first, _, third = written.recordings
     assert third.about.time_ns == first.about.time_ns + round((30.0 + set_s) * 1e9), "people are shown the wall clock"
@@ -243,8 +235,8 @@ def test_a_fault_that_no_gateway_saw_is_made_up_for_although_the_wall_clock_was_
     written.fill(2000, fault_at=1000, ends_ns=clock.now_ns() + 500_000_000)
     written.board.event(LOST)
     clock.s, clock.set_s = 0.25, 3600.0
-    written.board.event(ResetDone())
-    written.board.event(EmergencyStopActivated())
+    written.board.event(events.ResetDone())
+    written.board.event(events.EmergencyStopActivated())
     clock.s = 2.0
     written.watched().finish()
     first, second = written.recordings
@@ -261,13 +253,13 @@ def test_what_is_reported_while_the_wall_clock_is_set_stands_where_it_was_said(
     written.fill(100, fault_at=50)
     clock = Clock(monkeypatch)
     box = written.watched()
-    written.board.event(Arrived())
+    written.board.event(events.Arrived())
     clock.s, clock.set_s = 5.0, -3600.0
     written.board.event(LOST)
     clock.s, clock.set_s = 5.05, 3600.0
     written.board.event(DRIVE)
     clock.s = 6.0
-    box.look()
+    box.poll()
     box.finish()
     (recording,) = written.recordings
     about = recording.about
@@ -283,10 +275,10 @@ def test_what_was_put_off_is_written_when_the_gateway_ends(
     clock = Clock(monkeypatch)
     box = written.watched()
     written.board.event(LOST)
-    box.look()
+    box.poll()
     clock.s = 4.0
-    written.board.event(EmergencyStopActivated())
-    box.look()
+    written.board.event(events.EmergencyStopActivated())
+    box.poll()
     box.finish()
     assert [recording.about.event for recording in written.recordings] == [1, 2]
 
@@ -297,7 +289,7 @@ def test_what_follows_a_fault_is_waited_for(write_board: WriteBoard, monkeypatch
     box = written.watched()
     began = written.fill(100, fault_at=100)
     written.board.event(LOST)
-    box.look()
+    box.poll()
     assert written.recordings == []
     written.fill(1000, fault_at=1, ends_ns=began + 500_000_000)
     while not written.reports:
@@ -310,27 +302,27 @@ def test_what_follows_a_fault_is_waited_for(write_board: WriteBoard, monkeypatch
 
 def test_the_shortest_cycle_has_its_ten_seconds_too(write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch) -> None:
     written = write_board(100_000)
-    taken, since = threading.Event(), written.observer.since
+    overwritten, since = threading.Event(), written.observer.since
 
     def reports(number: int) -> Any:
-        found = since(number)
-        taken.set()
-        return found
+        records = since(number)
+        overwritten.set()
+        return records
 
     box = written.watched()
     cycles = written.observer.records + 1000
     written.fill(cycles, fault_at=cycles)
     written.board.event(LOST)
     monkeypatch.setattr(written.observer, "since", reports)
-    box.look()
-    # Read at once: what the ring takes in the second that follows does not push out what was before.
-    assert taken.wait(20)
+    box.poll()
+    # Read at once: the records of the following second do not overwrite those before.
+    assert overwritten.wait(20)
     written.fill(40_000, fault_at=1)
     box.finish()
-    (one,) = listed(written.directory)
-    assert one.about is not None
-    assert one.seconds >= 10.0
-    assert not any("before the fault" in note for note in one.about.notes)
+    (recording,) = listed(written.directory)
+    assert recording.about is not None
+    assert recording.seconds >= 10.0
+    assert not any("before the fault" in note for note in recording.about.notes)
 
 
 def test_cycles_that_were_overwritten_before_they_were_read_are_reported(write_board: WriteBoard) -> None:
@@ -373,7 +365,7 @@ def test_events_that_the_ring_no_longer_holds_are_reported(write_board: WriteBoa
     box = written.watched()
     written.fill(100, fault_at=90)
     for _ in range(EVENTS):
-        written.board.event(Arrived())
+        written.board.event(events.Arrived())
     recording = written.lost(box)
     assert any(note.startswith(f"more than {EVENTS} events came") for note in recording.about.notes)
 
@@ -405,16 +397,16 @@ def test_a_loop_that_publishes_nothing_for_a_second_is_a_fault(write_board: Writ
     until = time.monotonic() + 0.5
     while time.monotonic() < until:
         written.fill(1)
-        box.look()
+        box.poll()
         time.sleep(0.02)
     assert written.reports == []
     last = time.monotonic()
     while not written.reports:
-        box.look()
+        box.poll()
         time.sleep(0.01)
     assert time.monotonic() - last >= 0.9
     written.fill(1)
-    box.look()
+    box.poll()
     assert any("publishes again" in message for message in written.reports)
     box.finish()
     (recording,) = written.recordings
@@ -434,18 +426,18 @@ def test_a_loop_that_hangs_and_goes_on_into_a_fault_makes_one_recording_until_th
 
     def recorded_at(at_s: float) -> int:
         clock.s = at_s
-        box.look()
+        box.poll()
         box._writer.submit(int).result()
         return len(written.recordings)
 
     assert [recorded_at(at_s) for at_s in (0.5, 1.5, 2.5, 3.0)] == [0, 1, 1, 1]
     written.fill(1, fault_at=1)
     assert recorded_at(3.1) == 1
-    written.board.event(SlaveLost(3))
+    written.board.event(events.SlaveLost(3))
     assert recorded_at(3.2) == 1
     assert "has published nothing" in written.recordings[0].about.what
-    # What the file does not hold is written at the reset, and a silence after that is a new fault.
-    written.board.event(ResetDone())
+    # The rest is written at the reset, and a silence after that is a new fault.
+    written.board.event(events.ResetDone())
     assert recorded_at(3.3) == 2
     assert recorded_at(5.0) == 3
     box.finish()
@@ -471,7 +463,7 @@ def test_a_loop_that_died_with_its_gateway_is_recorded_at_the_next_start_and_onl
     monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path))
     monkeypatch.setattr(launcher, "blackboard_file", lambda directory: written.board.path)
     reports: list[str] = []
-    # The processes: this one made the blackboard, so it was the loop; another one of its number lives now.
+    # This process made the blackboard, so it was the loop; another process has its number now.
     for processes in (Processes(), Processes(loop=identify(os.getpid())), Processes(loop=Pid(os.getpid(), 1))):
         assert written.recordings == []
         processes.write(tmp_path)
@@ -495,7 +487,7 @@ def test_a_new_gateway_reads_the_list_once_and_the_ring_not_at_all_for_faults_th
     written.fill(100, fault_at=50)
     for _ in range(5):
         written.board.event(LOST)
-        written.board.event(ResetDone())
+        written.board.event(events.ResetDone())
     written.watched().finish()
     assert len(written.recordings) == 5
     asked: list[str] = []
@@ -526,9 +518,9 @@ def test_a_list_that_cannot_be_made_is_reported_and_the_next_fault_is_recorded(
 
     monkeypatch.setattr(black_box, "listed", broken)
     box = written.watched()
-    written.board.event(ResetDone())
-    written.board.event(EmergencyStopActivated())
-    box.look()
+    written.board.event(events.ResetDone())
+    written.board.event(events.EmergencyStopActivated())
+    box.poll()
     box.finish()
     assert any("by a defect: TypeError odd" in message for message in written.reports)
     assert [recording.about.event for recording in written.recordings] == [3]
@@ -542,9 +534,9 @@ def test_a_fault_before_the_first_cycle_is_recorded_with_the_cycles_that_follow(
     read_once, since = threading.Event(), written.observer.since
 
     def followed(number: int) -> object:
-        found = since(number)
+        records = since(number)
         read_once.set()
-        return found
+        return records
 
     monkeypatch.setattr(written.observer, "since", followed)
     box._process_fault(time.monotonic_ns(), "has published nothing")
@@ -584,14 +576,14 @@ def test_a_disk_that_refuses_is_a_sentence_and_the_next_fault_is_tried_again(
     written.board.event(LOST)
     while not written.reports:
         written.fill(1)
-        box.look()
+        box.poll()
         time.sleep(0.01)
     assert str(written.directory) in written.reports[0]
     assert "no recording can be written" in written.reports[0]
     written.directory.unlink()
-    written.board.event(ResetDone())
-    written.board.event(EmergencyStopActivated())
-    box.look()
+    written.board.event(events.ResetDone())
+    written.board.event(events.EmergencyStopActivated())
+    box.poll()
     box.finish()
     assert len(written.recordings) == 1
 
@@ -600,19 +592,19 @@ def test_a_look_does_not_wait_for_the_disk(write_board: WriteBoard, monkeypatch:
     written = write_board()
     box = written.watched()
     written.fill(20_000, fault_at=19_000)
-    real_write, asked, gate = black_box.write, threading.Event(), threading.Event()
+    asked, gate = threading.Event(), threading.Event()
 
-    def slow(*given: object) -> object:
+    def slow(*arguments: Any) -> object:
         asked.set()
         assert gate.wait(60)
-        return real_write(*given)  # type: ignore[arg-type]
+        return write(*arguments)
 
     monkeypatch.setattr(black_box, "write", slow)
     monkeypatch.setattr(black_box, "AFTER_S", 0.0)
     written.board.event(LOST)
-    box.look()
+    box.poll()
     assert asked.wait(20)
-    box.look()
+    box.poll()
     assert written.reports == []
     gate.set()
     box.finish()
@@ -626,10 +618,7 @@ def test_the_loops_own_fault_is_recorded_cycle_by_cycle(config: ArmConfig, tmp_p
         reports: list[str] = []
         session = Session(quick, "inprocess", "", 0, BEGAN_NS)
         box = BlackBox(simulation.observer, session, tmp_path, reports.append)
-        assert simulation.until(lambda: simulation.state is State.READY, 3.0)
-        simulation.acquire()
-        simulation.send(Enable())
-        assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+        simulation.hold()
         simulation.send(MoveJoints((0.5,) * 6, 0.3, True))
         simulation.run(0.8)
         first = simulation.observer.head
@@ -637,18 +626,18 @@ def test_the_loops_own_fault_is_recorded_cycle_by_cycle(config: ArmConfig, tmp_p
             simulation.models[2].inject_fault(0x8611)
         else:
             simulation.data.lose(200)
-        assert simulation.until(lambda: simulation.state is State.FAULT, 2.0)
-        box.look()
+        simulation.bring_to(State.FAULT, 2.0)
+        box.poll()
         simulation.run(0.3)
         box.finish()
-        (one,) = listed(tmp_path)
-        recording = read(one.path)
+        (kept,) = listed(tmp_path)
+        recording = read(kept.path)
         about, records = recording.about, recording.records
         assert about.before == "moving"
         ring, _ = simulation.observer.since(0)
         whole = ring[np.isin(ring["number"], records["number"])]
-        for name, array in records.items():
-            assert name.startswith("tool_") or np.array_equal(array, whole[name]), name
+        for name in recording.schema.names:
+            assert name.startswith("tool_") or np.array_equal(records[name], whole[name]), name
         assert recording.records["tool_z"][about.at] > 0.0
         assert int(records["number"][about.at]) > first
         assert int(records["state"][about.at]) == State.FAULT

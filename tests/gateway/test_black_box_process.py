@@ -1,4 +1,4 @@
-"""The gateway's process and the black box: a fault is not lost by a gateway that ends, and nobody waits for it."""
+"""The gateway's process and the black box: a gateway that ends loses no fault, and nothing waits for the disk."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.gateway import server
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.events import ProcessDataLost
+from rtcp.ipc.events import ErrorReported, ProcessDataLost
 from rtcp.ipc.recording import About, listed
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
@@ -52,7 +52,9 @@ class Gateways:
 
     @property
     def recorded(self) -> list[About]:
-        return [one.about for one in listed(self.directory / "state" / "faults") if one.about is not None]
+        return [
+            recording.about for recording in listed(self.directory / "state" / "faults") if recording.about is not None
+        ]
 
     def end(self) -> None:
         for process in self._started:
@@ -119,7 +121,7 @@ def test_a_defect_in_following_the_loop_is_logged_now_and_then_and_ends_nothing(
         raise ValueError(what)
 
     monkeypatch.setattr(made._snapshot, "follow", lambda: broken("the status snapshot"))
-    monkeypatch.setattr(made._box, "look", lambda: broken("the black box"))
+    monkeypatch.setattr(made._box, "poll", lambda: broken("the black box"))
 
     async def followed() -> None:
         following = asyncio.create_task(made._follow())
@@ -139,14 +141,14 @@ def test_a_defect_in_following_the_loop_is_logged_now_and_then_and_ends_nothing(
 def test_a_new_gateway_knows_what_was_said_before_it_and_logs_only_what_comes(
     gateways: Gateways, caplog: pytest.LogCaptureFixture
 ) -> None:
-    gateways.loop.board.text("said before")
+    gateways.loop.board.event(ErrorReported("said before"))
     gateways.loop.board.event(LOST)
     caplog.set_level("INFO", "rtcp.gateway")
     made = server.Gateway(gateways.directory)
-    gateways.loop.board.text("said now")
+    gateways.loop.board.event(ErrorReported("said now"))
     made._log_messages()
     made._box.finish()
-    assert [one.getMessage() for one in caplog.records if one.name == "rtcp.gateway"] == ["said now"]
+    assert [record.getMessage() for record in caplog.records if record.name == "rtcp.gateway"] == ["said now"]
     messages = [message for _, message in made._snapshot.messages]
     assert "said before" in messages
     assert made._snapshot.fault.startswith("process data lost")

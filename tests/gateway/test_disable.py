@@ -11,36 +11,36 @@ import pytest
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range
 from rtcp.fieldbus.al_state import AlState
 from rtcp.gateway import command_channel
-from rtcp.gateway.command_channel import CommandChannel
+from rtcp.gateway.command_channel import Caller, CommandChannel
 from rtcp.gateway.machine_actions import MachineActions
 from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.ipc.errors import Faulted
 from rtcp.ipc.events import SlavesParked
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import State
-from tests.control.conftest import new_rig, rig, rig_board
+from tests.control.conftest import new_rig, rig
 from tests.control.rig import CONFIG, CONTROLWORD, LOST_CYCLES, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
 
-__all__ = ["new_rig", "rig", "rig_board"]
+__all__ = ["new_rig", "rig"]
 
 FINGER = Joint("finger", "drive2", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
 
 
 @pytest.fixture(autouse=True)
 def simulated_time(rig: LoopRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gateway waits so many cycles, whatever else the host has to do."""
+    """Cycles that the gateway waits on any host."""
     monkeypatch.setattr(command_channel, "monotonic", lambda: rig.observer.head * PERIOD_S)
     monkeypatch.setattr(command_channel, "_POLL_S", 0.0)
 
 
 def disable(rig: LoopRig, config: ArmConfig = CONFIG) -> dict[str, Any]:
-    """Ask for it while the loop's cycles continue."""
+    """Request it while the loop's cycles continue."""
 
     async def both() -> dict[str, Any]:
         session = Session(config, "eth0", "eth0", 0, rig.now_ns)
         channel = CommandChannel(rig.observer, StatusSnapshot(rig.observer, session, {}), config)
         following = asyncio.create_task(channel.follow())
-        asked = asyncio.ensure_future(MachineActions(channel).disable())
+        asked = asyncio.ensure_future(MachineActions(channel).disable(Caller("a test", 1)))
         while not asked.done():
             rig.cycle()
             await asyncio.sleep(0)
@@ -51,7 +51,7 @@ def disable(rig: LoopRig, config: ArmConfig = CONFIG) -> dict[str, Any]:
 
 
 def failure(rig: LoopRig) -> str:
-    """Ask for what cannot be confirmed; return why."""
+    """Request what cannot be confirmed; return the reason of the error."""
     with pytest.raises(Faulted) as raised:
         disable(rig)
     return str(raised.value)
@@ -77,7 +77,7 @@ def fault_in_motion(rig: LoopRig) -> None:
 
 
 def reset_that_waits(rig: LoopRig) -> None:
-    rig.bring_to(State.RESETTING)
+    rig.lead_to(State.RESETTING)
 
 
 @pytest.mark.parametrize("brought", [press_in_motion, fault_in_motion, reset_that_waits, LoopRig.set_in_motion])
@@ -89,8 +89,8 @@ def test_disabling_is_done_when_no_drive_has_torque_and_not_before(rig: LoopRig,
 
 
 def test_a_drive_that_keeps_its_torque_in_a_fault_is_named_with_its_statusword(rig: LoopRig) -> None:
-    rig.data.misunderstood[1, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
-    rig.bring_to(State.FAULT)
+    rig.misunderstood[1, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
+    rig.lead_to(State.FAULT)
     rig.run(0.5)
     message = failure(rig)
     assert powered(rig) == [False, True]
@@ -100,7 +100,7 @@ def test_a_drive_that_keeps_its_torque_in_a_fault_is_named_with_its_statusword(r
 
 
 def test_a_drive_that_keeps_its_torque_in_an_emergency_stop_is_named(rig: LoopRig) -> None:
-    rig.data.misunderstood[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
+    rig.misunderstood[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
     press_in_motion(rig)
     message = failure(rig)
     assert "not confirmed: joint1 (drive1) shows 0x" in message
@@ -108,7 +108,7 @@ def test_a_drive_that_keeps_its_torque_in_an_emergency_stop_is_named(rig: LoopRi
 
 
 def test_a_statusword_that_the_standard_does_not_know_confirms_nothing(rig: LoopRig) -> None:
-    rig.bring_to(State.FAULT)
+    rig.lead_to(State.FAULT)
     seen = rig.data.input
     rig.data.input = lambda index: b"\x01\x00" + seen(index)[2:] if index == 2 else seen(index)  # type: ignore[method-assign]
     assert "joint2 (drive2) shows 0x0001, a state that the standard does not know" in failure(rig)
@@ -116,7 +116,7 @@ def test_a_statusword_that_the_standard_does_not_know_confirms_nothing(rig: Loop
 
 def test_without_frames_nothing_is_known_of_any_joint(rig: LoopRig) -> None:
     rig.hold()
-    rig.data.carries = False
+    rig.lose_frames()
     rig.run(LOST_CYCLES * PERIOD_S)
     assert "no frame returns, and nothing is known of joint1 (drive1), joint2 (drive2)" in failure(rig)
 
@@ -132,7 +132,7 @@ def test_with_a_slave_missing_nothing_is_known_of_any_joint(rig: LoopRig) -> Non
 
 def test_what_was_shown_before_frames_were_lost_confirms_nothing(rig: LoopRig) -> None:
     rig.start()
-    rig.data.carries = False
+    rig.lose_frames()
     rig.run(LOST_CYCLES * PERIOD_S)
     assert rig.state is State.FAULT
     assert "no frame returns" in failure(rig)
@@ -154,7 +154,7 @@ def test_drives_that_were_parked_without_torque_are_confirmed(rig: LoopRig) -> N
 
 
 def test_drives_that_were_parked_and_showed_torque_last_are_not_confirmed(rig: LoopRig) -> None:
-    rig.data.misunderstood[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
+    rig.misunderstood[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
     press_in_motion(rig)
     park(rig)
     message = failure(rig)

@@ -1,4 +1,4 @@
-"""The joystick of the virtual IO box: which inputs of the virtual IO box are forced, when, and until when."""
+"""The joystick of the virtual IO box: the inputs that it forces, and for how long."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MASK, LEVELS = (0x2000, 1), (0x2000, 2)
 
 
 def written(arm: FakePlatform) -> list[tuple[int, int]]:
-    """What was written, subindex and number, but for how long the box holds it (subindex 3)."""
+    """Subindex and number of each write, without the hold time (subindex 3)."""
     for index, _, _ in arm.loop.written:
         assert index == 0x2000
     return [(sub, int.from_bytes(bytes.fromhex(value), "little")) for _, sub, value in arm.loop.written if sub != 3]
@@ -58,12 +58,16 @@ def test_each_of_two_boxes_is_forced_and_released(tmp_path: Path) -> None:
             await arm.call("joystick", {"byte": None})
 
         arm.run(force)
-        requests = [(one["slave"], one["subindex"], int(one["hex"][:2], 16)) for one in arm.loop.requests]
+        requests = [
+            (request["slave"], request["subindex"], int(request["hex"][:2], 16)) for request in arm.loop.requests
+        ]
         io, desk = 1, 8
-        assert [one for one in requests if one[1] != 3] == [
+        assert [request for request in requests if request[1] != 3] == [
             (desk, 1, 0), (io, 2, 62), (io, 1, 0xFF), (desk, 2, 1), (desk, 1, 1), (io, 1, 0), (desk, 1, 0),
         ]  # fmt: skip
-        assert [one[0] for one in requests if one[1] == 3] == [io, desk], "each is told when to release by itself"
+        assert [request[0] for request in requests if request[1] == 3] == [io, desk], (
+            "each is told when to release by itself"
+        )
 
 
 @pytest.mark.parametrize(
@@ -89,7 +93,7 @@ def test_levels_are_written_before_the_mask_and_only_what_changes_is_written(arm
 
     arm.run(force)
     assert written(arm) == [(2, 61), (1, 0xFF), (2, 62)]
-    # Before anything is forced the box is told when to release it by itself.
+    # The hold time is written before any input is forced.
     assert arm.loop.written[0] == (0x2000, 3, (1500).to_bytes(2, "little").hex())
 
 

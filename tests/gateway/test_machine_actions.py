@@ -1,4 +1,4 @@
-"""Torque, reset, modes, gripper, zero and homing as clients ask for them; the loop is fake."""
+"""Torque, reset, modes, gripper, zero and homing as clients call them; the loop is fake."""
 
 from __future__ import annotations
 
@@ -14,19 +14,7 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import LARGEST, GripperConfig, Joint, Range
 from rtcp.config.zero import read_zeros, state_directory, zero_file
-from rtcp.ipc.commands import (
-    Disable,
-    Enable,
-    Halt,
-    Home,
-    MoveGripper,
-    Reset,
-    SetChannel,
-    SetControlMode,
-    SetDriveMode,
-    SetOutput,
-    SetZero,
-)
+from rtcp.ipc import commands
 from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, Homed, HomingFailed, OverSpeed, ZeroSet
 from rtcp.ipc.layout import EVENTS
 from rtcp.ipc.refusals import GripperDisabled, Refusal, TorquePresent, WrongState
@@ -62,11 +50,11 @@ def driven(driven_platform: FakePlatform, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("method", "params", "command"),
     [
-        ("set_output", {"output": 3, "value": False}, SetOutput(3, False)),
-        ("mode", {"name": "cartesian"}, SetControlMode(ControlMode.CARTESIAN)),
-        ("mode", {"name": "csv"}, SetDriveMode(DriveMode.CSV)),
-        ("set_drive_mode", {"mode": "cst"}, SetDriveMode(DriveMode.CST)),
-        ("move_gripper", {"open": True}, MoveGripper(True)),
+        ("set_output", {"output": 3, "value": False}, commands.SetOutput(3, False)),
+        ("mode", {"name": "cartesian"}, commands.SetControlMode(ControlMode.CARTESIAN)),
+        ("mode", {"name": "csv"}, commands.SetDriveMode(DriveMode.CSV)),
+        ("set_drive_mode", {"mode": "cst"}, commands.SetDriveMode(DriveMode.CST)),
+        ("move_gripper", {"open": True}, commands.MoveGripper(True)),
     ],
 )
 def test_a_command_reaches_the_loop_as_it_was_sent(
@@ -105,10 +93,10 @@ def test_a_wrong_parameter_is_named_and_nothing_is_commanded(
 def test_an_output_of_two_boxes_is_switched_at_the_named_one(tmp_path: Path) -> None:
     with fake_platform(tmp_path, Q, config=load(two_boxes(tmp_path / "config"))) as arm:
         arm.ask("set_output", output=3, value=True, box="desk")
-        for box, found in ({}, "the key is missing"), ({"box": "shelf"}, 'found the text "shelf"'):
+        for box, problem in ({}, "the key is missing"), ({"box": "shelf"}, 'found the text "shelf"'):
             error = arm.error("set_output", output=3, value=True, **box)
-            assert (error.kind, str(error)) == ("invalid", f"box: {found}, allowed is one of io, desk")
-        assert arm.loop.commands == [SetOutput(3, True, 1)]
+            assert (error.kind, str(error)) == ("invalid", f"box: {problem}, allowed is one of io, desk")
+        assert arm.loop.commands == [commands.SetOutput(3, True, 1)]
 
 
 def test_a_wait_ends_with_the_level_and_needs_no_lease(arm: FakePlatform) -> None:
@@ -134,8 +122,10 @@ def test_a_level_that_does_not_come_is_a_timeout_with_its_fields(arm: FakePlatfo
 def test_terminals_are_read_by_the_names_of_their_functions_or_by_box_and_number(arm: FakePlatform) -> None:
     arm.loop.inputs, arm.loop.outputs = 1 << 9 | 1 << 15, 1 << 3
     arm.show()
-    found = arm.ask("read_io")
-    levels = {which: {one["name"]: one["value"] for one in found[which]} for which in ("inputs", "outputs")}
+    answer = arm.ask("read_io")
+    levels = {
+        which: {channel["name"]: channel["value"] for channel in answer[which]} for which in ("inputs", "outputs")
+    }
     assert (len(levels["inputs"]), len(levels["outputs"])) == (16, 16)
     assert [name for name, value in levels["inputs"].items() if value] == ["emergency_stop", "io.16"]
     assert [name for name, value in levels["outputs"].items() if value] == ["gripper"]
@@ -148,7 +138,7 @@ def test_an_output_that_the_file_names_is_set_at_its_own_box(tmp_path: Path) -> 
     with fake_platform(tmp_path, Q, config=load(file)) as arm:
         arm.ask("write_io", name="blower", value=True)
         arm.ask("write_io", name="io.5", value=False)
-        assert arm.loop.commands == [SetOutput(5, True, 0), SetOutput(5, False, 0)]
+        assert arm.loop.commands == [commands.SetOutput(5, True, 0), commands.SetOutput(5, False, 0)]
 
 
 VALVES = """
@@ -182,21 +172,21 @@ def test_channels_of_a_slave_are_read_and_set_by_name_and_those_of_one_bit_are_t
     drive6 = "  - {name: drive6, device: cubemars-orh}\n"
     file.write_text(file.read_text().replace(drive6, f"{drive6}  - {{name: valves, device: valves}}\n"))
     with fake_platform(tmp_path, Q, config=load(file)) as arm:
-        found = arm.ask("read_io")
-        assert [one["name"] for one in found["inputs"]][-1] == "valves.closed"
-        assert [(one["name"], one["number"]) for one in found["outputs"]][-1] == ("valves.open", 1)
+        answer = arm.ask("read_io")
+        assert [channel["name"] for channel in answer["inputs"]][-1] == "valves.closed"
+        assert [(output["name"], output["number"]) for output in answer["outputs"]][-1] == ("valves.open", 1)
         still = {"value": 0.0, "unit": "m"}
-        assert found["channels"] == [
+        assert answer["channels"] == [
             {"name": "valves.depth", **still, "is_output": False, "settable": False, "range": None},
             {"name": "valves.level", **still, "is_output": True, "settable": True, "range": [0.5, LARGEST["float32"]]},
         ]
         arm.ask("write_io", name="valves.open", value=True)
         arm.ask("set_channel", name="valves.level", value=1.25)
-        assert arm.loop.commands == [SetChannel(8, 0, 1.0), SetChannel(8, 1, 1.25)]
+        assert arm.loop.commands == [commands.SetChannel(8, 0, 1.0), commands.SetChannel(8, 1, 1.25)]
         arm.ask("wait_io", name="valves.closed", value=False, timeout_s=1.0)
         arm.ask("set_channel", name="valves.open", value=1)
         arm.ask("set_channel", name="io.gripper", value=0)
-        assert arm.loop.commands[2:] == [SetChannel(8, 0, 1.0), SetOutput(4, False, 0)]
+        assert arm.loop.commands[2:] == [commands.SetChannel(8, 0, 1.0), commands.SetOutput(4, False, 0)]
         assert arm.error("set_channel", name="valves.open", value=0.5).reason == "wrong_level"
         assert arm.error("write_io", name="valves.level", value=True).reason == "wrong_level"
         error = arm.error("set_channel", name="valves.closed", value=1.0)
@@ -230,13 +220,13 @@ def test_what_holds_already_is_not_enabled_again_and_what_is_well_not_reset(arm:
 def test_a_reset_of_a_stop_by_a_limit_waits_for_no_other_state(arm: FakePlatform) -> None:
     arm.show(state=State.STOPPED_BY_LIMIT)
     assert arm.ask("reset") == {"from": "stopped_by_limit"}
-    assert arm.loop.commands == [Reset()]
+    assert arm.loop.commands == [commands.Reset()]
 
 
 def test_a_refusal_in_a_fault_ends_with_the_fault(arm: FakePlatform) -> None:
     arm.loop.board.event(OverSpeed(0, 1.7, 1.5))
     arm.show(state=State.FAULT)
-    arm.loop.refusals[Enable] = WrongState(Enable.number, State.FAULT)
+    arm.loop.refusals[commands.Enable] = WrongState(commands.Enable.number, State.FAULT)
     error = arm.error("enable")
     assert error.reason == "wrong_state"
     assert "`rtcp reset` first; the fault: joint1: measured speed 1.7 rad/s" in str(error)
@@ -245,12 +235,12 @@ def test_a_refusal_in_a_fault_ends_with_the_fault(arm: FakePlatform) -> None:
 def test_a_halt_in_state_ready_reaches_the_loop_and_is_no_failure(arm: FakePlatform) -> None:
     arm.show(state=State.READY)
     arm.ask("halt")
-    assert arm.loop.kinds == [Halt]
+    assert arm.loop.kinds == [commands.Halt]
 
 
 def test_disabling_that_another_command_ends_is_no_success(arm: FakePlatform) -> None:
     arm.show(state=State.RESETTING)
-    arm.loop.refusals[Disable] = WrongState(Disable.number, State.RESETTING)
+    arm.loop.refusals[commands.Disable] = WrongState(commands.Disable.number, State.RESETTING)
     assert arm.error("disable").kind == "refused"
 
 
@@ -269,9 +259,9 @@ HELD, CLOSED = GripperAtRest(AXIS, 0.5, True), GripperAtRest(AXIS, 0.0, False)
     ids=["closed", "holds something", "after the end of an earlier motion"],
 )
 def test_a_driven_gripper_returns_where_it_rests(driven: FakePlatform, events: Any, answer: dict[str, Any]) -> None:
-    driven.loop.reports[MoveGripper] = events
+    driven.loop.reports[commands.MoveGripper] = events
     assert driven.ask("move_gripper", open=False) == answer
-    assert driven.loop.commands == [MoveGripper(False)]
+    assert driven.loop.commands == [commands.MoveGripper(False)]
 
 
 @pytest.mark.parametrize(
@@ -285,14 +275,14 @@ def test_a_driven_gripper_returns_where_it_rests(driven: FakePlatform, events: A
 def test_a_driven_gripper_that_does_not_arrive_fails(
     driven: FakePlatform, events: Any, kind: str, message: str
 ) -> None:
-    driven.loop.reports[MoveGripper] = events
+    driven.loop.reports[commands.MoveGripper] = events
     error = driven.error("move_gripper", open=False)
     assert error.kind == kind
     assert str(error).startswith(message)
 
 
 def test_a_gripper_without_torque_is_refused(driven: FakePlatform) -> None:
-    driven.loop.refusals[MoveGripper] = GripperDisabled()
+    driven.loop.refusals[commands.MoveGripper] = GripperDisabled()
     assert driven.error("move_gripper", open=False).reason == "gripper_disabled"
 
 
@@ -303,15 +293,15 @@ def test_the_present_position_becomes_the_zero_or_what_it_is_reported_to_be(arm:
     answer = arm.ask("zero", joint="joint1")
     assert (answer["joint"], answer["offset"], answer["before"]) == ("joint1", 0.25, 0.0)
     assert arm.ask("zero", joint="2", at=0.05)["joint"] == "joint2"
-    # The fake loop still shows 0.2: now beyond the offset that is in force.
+    # The fake loop still shows 0.2, now with the new offset.
     arm.ask("zero", joint="joint2", at=0.1)
-    offsets = [(command.axis, pytest.approx(command.offset)) for command in arm.loop.received(SetZero)]
+    offsets = [(command.axis, pytest.approx(command.offset)) for command in arm.loop.received(commands.SetZero)]
     assert offsets == [(0, 0), (0, 0.25), (1, 0), (1, 0.15), (1, 0.15), (1, 0.25)]
     assert read_zeros(arm.config) == (0.25, pytest.approx(0.25), 0, 0, 0, 0)
 
 
 def test_a_zero_that_the_loop_refuses_is_in_no_file(arm: FakePlatform) -> None:
-    arm.loop.refusals[SetZero] = TorquePresent()
+    arm.loop.refusals[commands.SetZero] = TorquePresent()
     assert arm.error("zero", joint="joint1").reason == "torque_present"
     assert not zero_file(arm.config.name).exists()
 
@@ -321,7 +311,7 @@ def test_a_zero_that_cannot_be_kept_in_the_file_is_taken_back_from_the_loop(arm:
     error = arm.error("zero", joint="joint1")
     assert error.kind == "refused"
     assert str(tmp_path / "state") in str(error)
-    assert [command.offset for command in arm.loop.received(SetZero)] in ([], [0.0, 0.25, 0.0])
+    assert [command.offset for command in arm.loop.received(commands.SetZero)] in ([], [0.0, 0.25, 0.0])
 
 
 @pytest.mark.interpreted
@@ -332,19 +322,19 @@ def test_a_zero_whose_answer_does_not_come_is_taken_back_from_the_loop(
     loop, answer = arm.loop, arm.loop.board.answer
 
     def withheld(number: int, refusal: Refusal | None = None) -> None:
-        if loop.commands[-1] != SetZero(0, 0.25):
+        if loop.commands[-1] != commands.SetZero(0, 0.25):
             answer(number, refusal)
 
     monkeypatch.setattr(loop.board, "answer", withheld)
     assert arm.error("zero", joint="joint1").kind == "timeout"
-    assert loop.commands == [SetZero(0, 0.0), SetZero(0, 0.25), SetZero(0, 0.0)]
+    assert loop.commands == [commands.SetZero(0, 0.0), commands.SetZero(0, 0.25), commands.SetZero(0, 0.0)]
     assert not zero_file(arm.config.name).exists()
 
 
 def test_a_zero_is_taken_from_the_event_of_its_own_joint_and_of_no_other(arm: FakePlatform) -> None:
-    arm.loop.reports[SetZero] = [ZeroSet(3, 0.0, 9.0)]
+    arm.loop.reports[commands.SetZero] = [ZeroSet(3, 0.0, 9.0)]
     assert arm.ask("zero", joint="joint1")["offset"] == 0.25
-    arm.loop.reports[SetZero] = [Disabled()] * EVENTS
+    arm.loop.reports[commands.SetZero] = [Disabled()] * EVENTS
     error = arm.error("zero", joint="joint1")
     assert (error.kind, "was overwritten" in str(error)) == ("fault", True)
 
@@ -356,12 +346,12 @@ def test_the_gripper_with_a_drive_has_a_zero_too(driven: FakePlatform) -> None:
 
 
 def test_homing_returns_the_position_or_fails_with_the_drives_answer(arm: FakePlatform) -> None:
-    arm.loop.reports[Home] = [Homed(1, 0.2)]
+    arm.loop.reports[commands.Home] = [Homed(1, 0.2)]
     assert arm.ask("home", joint="joint2") == {"joint": "joint2", "position": 0.2}
-    arm.loop.reports[Home] = [HomingFailed(1, 0x2637, 6)]
+    arm.loop.reports[commands.Home] = [HomingFailed(1, 0x2637, 6)]
     error = arm.error("home", joint="joint2")
     assert (error.kind, error.reason, error.fields["statusword"]) == ("fault", "homing_failed", 0x2637)
-    arm.loop.reports[Home] = []
+    arm.loop.reports[commands.Home] = []
     assert "homing was interrupted" in str(arm.error("home", joint="joint2"))
 
 

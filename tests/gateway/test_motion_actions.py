@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,12 +36,12 @@ def tool(arm: FakePlatform, q: list[float]) -> list[float]:
 
 
 def beside(arm: FakePlatform, dy: float) -> list[float]:
-    x, y, z, *turn = tool(arm, BENT)
-    return [x, y + dy, z, *turn]
+    x, y, z, *rpy = tool(arm, BENT)
+    return [x, y + dy, z, *rpy]
 
 
 def end_of_line(arm: FakePlatform, pose: list[float]) -> tuple[float, ...]:
-    """Where the joints are at the end of a line: what the fake loop is to come to."""
+    """Joint positions at the end of a line, which the fake loop takes as its end."""
     return Planner(arm.config, Limits(arm.config)).path([Stop(tuple(pose))], BENT, None).end
 
 
@@ -77,11 +78,12 @@ def test_a_motion_reports_once_that_it_was_accepted_and_one_that_is_refused_does
 @pytest.mark.parametrize("motion", ["move_joints", "run_trajectory", "move_line"])
 def test_the_status_has_the_goal_while_the_arm_moves_there(arm: FakePlatform, motion: str) -> None:
     pose = beside(arm, 0.1)
-    goal, params = {
+    goals: dict[str, tuple[Sequence[float], dict[str, Any]]] = {
         "move_joints": (THERE, {"q": THERE}),
         "run_trajectory": (THERE, {"points": [{"t": 0.0, "q": BENT}, {"t": 2.0, "q": THERE}]}),
         "move_line": (end_of_line(arm, pose), {"poses": [pose]}),
-    }[motion]
+    }
+    goal, params = goals[motion]
     arm.loop.ends[RunLines], arm.loop.moves_for = goal, LONG
 
     async def work() -> None:
@@ -116,7 +118,7 @@ def test_a_jog_and_a_refused_motion_have_no_goal(arm: FakePlatform, method: str)
 
 
 async def status_in(arm: FakePlatform, state: State, moving: asyncio.Task[Any] | None = None) -> Any:
-    """Return the first status in a state with whatever goal is known by then."""
+    """Return the first status in a state, with its goal if already known."""
     while (status := await arm.call("status", {}))["state"] != state.name.lower():
         assert moving is None or not moving.done()
         await asyncio.sleep(0.002)
@@ -299,20 +301,20 @@ def test_a_motion_that_another_command_ends_is_refused(arm: FakePlatform) -> Non
 
 
 def test_a_preview_of_a_joint_move_leads_from_here_to_there_and_sends_nothing(arm: FakePlatform) -> None:
-    found = arm.ask("preview", q=THERE, speed=0.1)
-    assert found["path"][0] == pytest.approx(BENT)
-    assert found["path"][-1] == pytest.approx(THERE)
-    assert found["duration_s"] > 2.0
+    preview = arm.ask("preview", q=THERE, speed=0.1)
+    assert preview["path"][0] == pytest.approx(BENT)
+    assert preview["path"][-1] == pytest.approx(THERE)
+    assert preview["duration_s"] > 2.0
     assert arm.loop.commands == []
 
 
 def test_a_preview_of_a_line_keeps_the_tool_on_it(arm: FakePlatform) -> None:
-    found = arm.ask("preview", pose=beside(arm, 0.1), line=True)
+    preview = arm.ask("preview", pose=beside(arm, 0.1), line=True)
     x, _, z, *_ = tool(arm, BENT)
-    for q in found["path"]:
+    for q in preview["path"]:
         assert tool(arm, q)[0] == pytest.approx(x, abs=1e-6)
         assert tool(arm, q)[2] == pytest.approx(z, abs=1e-6)
-    assert tool(arm, found["path"][-1]) == pytest.approx(beside(arm, 0.1), abs=1e-6)
+    assert tool(arm, preview["path"][-1]) == pytest.approx(beside(arm, 0.1), abs=1e-6)
 
 
 def test_a_preview_of_a_file_passes_its_points(arm: FakePlatform, tmp_path: Path) -> None:
@@ -321,9 +323,9 @@ def test_a_preview_of_a_file_passes_its_points(arm: FakePlatform, tmp_path: Path
     points = "".join(f"  - {{t: {t}, q: {q}}}\n" for t, q in enumerate((BENT, middle, THERE)))
     file.write_text(f"trajectory:\n{points}")
     for approach in (False, True):
-        found = arm.ask("preview", file=str(file), approach=approach)
-        assert min(max(map(abs, (a - b for a, b in zip(q, middle, strict=True)))) for q in found["path"]) < 1e-2
-        assert found["path"][-1] == pytest.approx(THERE)
+        preview = arm.ask("preview", file=str(file), approach=approach)
+        assert min(max(map(abs, (a - b for a, b in zip(q, middle, strict=True)))) for q in preview["path"]) < 1e-2
+        assert preview["path"][-1] == pytest.approx(THERE)
 
 
 def test_a_preview_is_refused_with_what_would_refuse_the_move(arm: FakePlatform) -> None:

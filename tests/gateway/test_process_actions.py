@@ -1,4 +1,4 @@
-"""Commands of processes as clients ask for them; the loop is fake, and its platform has no process."""
+"""Clients' commands to processes; the loop is fake, and its platform has no process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings on disk: numbers, the oldest that go, disks that refuse, files that are none."""
+"""Recordings on disk: numbers, removal of the oldest, full disks, files that are no recordings."""
 
 from __future__ import annotations
 
@@ -28,41 +28,37 @@ def recording(cycles: int = CYCLES, joints: int = 2) -> FaultRecording:
     whole = np.zeros(cycles, dtype=record_type(schema))
     whole["number"] = whole["time_ns"] = np.arange(cycles) + 1
     whole["actual_position"] = np.arange(cycles * joints).reshape(cycles, joints) * 0.1
-    records = {name: whole[name] for name in schema.names}
     about = About(
         number=0, time_ns=1_790_000_000_123_456_789, what="process data lost: ü", before="moving", arm="arm",
         bus="virtual", period_ns=500_000, joints=tuple(f"joint{i}" for i in range(joints)), versions={"rtcp": "1"},
         began_ns=5, event=7, at=cycles // 2 if cycles else -1, notes=("a note",), timeline=(Moment(9, "a sentence"),),
     )  # fmt: skip
-    return FaultRecording(about, records, schema)
+    return FaultRecording(about, whole, schema)
 
 
 def test_a_recording_is_read_as_it_was_written(tmp_path: Path) -> None:
     number, path = write(tmp_path / "deep" / "faults", recording())
     assert path.name.startswith("fault-000001-20")
-    found = read(path)
-    assert found.about == replace(recording().about, number=number)
-    for name, array in recording().records.items():
-        assert np.array_equal(found.records[name], array)
-    assert [one.about for one in listed(path.parent)] == [found.about]
+    restored = read(path)
+    assert restored.about == replace(recording().about, number=number)
+    for name in restored.schema.names:
+        assert np.array_equal(restored.records[name], recording().records[name])
+    assert [file.about for file in listed(path.parent)] == [restored.about]
 
 
 def test_any_reader_of_mcap_opens_a_recording(tmp_path: Path) -> None:
     made = recording()
     _, path = write(tmp_path, made)
     with open(path, "rb") as file:
-        found = [(schema, channel, message) for schema, channel, message in make_reader(file).iter_messages()]
-    cycles = [(schema, message) for schema, channel, message in found if channel.topic == "/cycle"]
-    schema, first = cycles[0]
+        messages = [(schema, channel, message) for schema, channel, message in make_reader(file).iter_messages()]
+    cycles = [(schema, message) for schema, channel, message in messages if channel.topic == "/cycle"]
+    schema, _ = cycles[0]
     assert (schema.name, schema.encoding, len(cycles)) == ("rtcp_msgs/msg/Cycle", "ros2msg", CYCLES)
     assert b"uint64 number  # cycle, : Number" in schema.data
     assert b"float64[2] actual_position  # arm, rad: Measured position.\n" in schema.data
     # By the clock of the fault's instant, its cycle is at that instant.
     assert cycles[made.about.at][1].log_time == made.about.time_ns
-    # CDR: four bytes of header, then each number at a multiple of its size.
-    assert first.data[:4] == b"\x00\x01\x00\x00"
-    assert int.from_bytes(first.data[4:12], "little") == 1
-    logs = [json.loads(message.data)["message"] for _, channel, message in found if channel.topic == "/log"]
+    logs = [json.loads(message.data)["message"] for _, channel, message in messages if channel.topic == "/log"]
     assert logs == ["a sentence"]
 
 
@@ -140,9 +136,9 @@ def test_a_file_cut_off_anywhere_is_listed_as_damaged(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for length in [0, 1, 100, *range(200, len(whole), 997), len(whole) - 1]:
         path.write_bytes(whole[:length])
-        (one,) = listed(tmp_path)
-        assert one.about is None
-        assert str(path) in one.trouble
+        (file,) = listed(tmp_path)
+        assert file.about is None
+        assert str(path) in file.trouble
         with pytest.raises(RecordingError):
             read(path)
 
@@ -166,20 +162,23 @@ def test_changed_bytes_are_never_a_traceback(tmp_path: Path) -> None:
 
 
 def _written(path: Path, about: Any = None, **options: Any) -> None:
-    """Write a file of the same form with other contents."""
+    """Write a file of the same form with other contents, as former versions did."""
     made = recording()
-    told = {"format": module.FORMAT, "seconds": 0.0, **asdict(made.about), **(about or {})}
+    timeline = [{"time_ns": 9, "message": "a sentence"}]
+    about_json = {"format": module.FORMAT, "seconds": 0.0, **asdict(made.about), "timeline": timeline, **(about or {})}
     with open(path, "wb") as file:
         writer = Writer(file, compression=options.get("compression", CompressionType.ZSTD))
         writer.start()
         if about is not False:
-            writer.add_metadata(options.get("metadata", "rtcp/about"), {"json": options.get("json", json.dumps(told))})
+            writer.add_metadata(
+                options.get("metadata", "rtcp/about"), {"json": options.get("json", json.dumps(about_json))}
+            )
         definition = options.get("definition", arm_schema(2).definition())
         channel = writer.register_channel("/cycle", "cdr", writer.register_schema("a", "ros2msg", definition))
         size = options.get("size", 4 + module.cycle_type(arm_schema(2)).itemsize)
         for number in range(options.get("cycles", CYCLES)):
             writer.add_message(channel, number, bytes(size), number)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 FOREIGN: dict[str, dict[str, Any]] = {
@@ -191,13 +190,11 @@ FOREIGN: dict[str, dict[str, Any]] = {
     "a cycle too short": {"size": 20},
     "another compression": {"compression": CompressionType.LZ4},
     "another format": {"about": {"format": 1}},
-    "a text for a number": {"about": {"time_ns": "now"}},
     "a truth for a number": {"about": {"at": True}},
     "a fault's cycle beyond the end": {"about": {"at": CYCLES}},
     "fewer cycles": {"cycles": 3},
     "an instant that no calendar has": {"about": {"time_ns": 10**40}},
     "a cycle of nothing": {"about": {"period_ns": 0}},
-    "joints that are a number": {"about": {"joints": 3}},
     "moments that are none": {"about": {"timeline": [3]}},
 }
 
@@ -211,10 +208,12 @@ def test_a_foreign_file_is_refused_with_its_name(tmp_path: Path, options: dict[s
         read(path)
 
 
-def test_the_form_that_the_foreign_files_vary_is_read(tmp_path: Path) -> None:
-    _, path = write(tmp_path, recording())
+def test_a_recording_of_a_former_version_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "fault.mcap"
     _written(path)
-    assert len(read(path).records["cycle"]) == CYCLES
+    restored = read(path)
+    assert restored.about == recording().about
+    assert len(restored.records["cycle"]) == CYCLES
 
 
 def test_a_chunk_that_unpacks_to_more_than_allowed_is_not_unpacked(
@@ -222,6 +221,6 @@ def test_a_chunk_that_unpacks_to_more_than_allowed_is_not_unpacked(
 ) -> None:
     _, path = write(tmp_path, recording())
     monkeypatch.setattr(module, "_LARGEST", 1000)
-    monkeypatch.setattr(module.zstandard, "ZstdDecompressor", None)
+    monkeypatch.setattr("zstandard.ZstdDecompressor", None)
     with pytest.raises(RecordingError, match="a chunk of"):
         read(path)

@@ -18,7 +18,7 @@ import pytest
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.commands import Halt, MoveJoints
 from rtcp.ipc.errors import Invalid, Refused
-from rtcp.ipc.events import SlaveLost
+from rtcp.ipc.events import ErrorReported, SlaveLost
 from rtcp.ipc.jsonrpc import LINE_LIMIT
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.ipc.states import State
@@ -46,9 +46,9 @@ class Raw:
     def receive(self) -> dict[str, Any]:
         """Return the next answer; progress is skipped."""
         while True:
-            found: dict[str, Any] = json.loads(self.file.readline())
-            if "method" not in found:
-                return found
+            answer: dict[str, Any] = json.loads(self.file.readline())
+            if "method" not in answer:
+                return answer
 
     def ask(self, message: dict[str, Any] | bytes) -> dict[str, Any]:
         self.send(message)
@@ -220,7 +220,7 @@ def test_a_client_stopped_by_sigstop_during_a_move_loses_its_lease(
 
 def test_the_status_has_each_message_with_its_instant(client: ControlClient, loop: FakeLoop) -> None:
     before = datetime.now().astimezone()
-    loop.board.text("a message with a time")
+    loop.board.event(ErrorReported("a message with a time"))
     status = client.call("status")
     at = status["messages"].index("a message with a time")
     when = datetime.fromisoformat(status["message_times"][at])

@@ -1,4 +1,4 @@
-"""The status: its message, what it says of a silent loop; the loop is fake."""
+"""The status: its message, and its fields when the loop is silent; the loop is fake."""
 
 from __future__ import annotations
 
@@ -13,11 +13,17 @@ import pytest
 from kinematics.forward import forward
 from kinematics.jacobian import jacobian
 from rtcp.config import default_config, load
-from rtcp.fieldbus.emergency import Emergency
 from rtcp.gateway import status_snapshot
 from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.events import Arrived, DriveFault, EmergencyStopActivated
+from rtcp.ipc.events import (
+    Arrived,
+    DriveFault,
+    EmergencyMessage,
+    EmergencyStopActivated,
+    ErrorReported,
+    ErrorReset,
+)
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.schema import (
     FLAG_DC_LOCKED,
@@ -41,9 +47,9 @@ class Written:
         self.snapshot = StatusSnapshot(self.observer, Session(load(default_config()), "virtual", "ecat0", 0, 0), {})
 
     def publish(self, state: State, moves: int = 0, wkc: int = 21, held: int = 0, **joints: Any) -> None:
-        told = {"state": state, "moves": moves, "wkc": wkc, "wkc_expected": 21, "flags": FLAG_DC_LOCKED, "held": held}
+        record = {"state": state, "moves": moves, "wkc": wkc, "wkc_expected": 21, "flags": FLAG_DC_LOCKED, "held": held}
         joints.setdefault("speed_override", 1.0)
-        self.board.publish(numbers(self.board.schema, **told, time_ns=time.monotonic_ns(), **joints))
+        self.board.publish(numbers(self.board.schema, **record, time_ns=time.monotonic_ns(), **joints))
 
     @property
     def status(self) -> dict[str, Any]:
@@ -57,7 +63,7 @@ class Written:
 
 @pytest.fixture
 def written(board: Blackboard, path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Written]:
-    monkeypatch.setattr(status_snapshot, "_SILENT_S", 1e9)  # a busy host must not make the loop a silent one
+    monkeypatch.setattr(status_snapshot, "_SILENT_S", 1e9)  # so that a busy host does not count as a silent loop
     made = Written(board, path)
     yield made
     made.observer.close()
@@ -74,13 +80,12 @@ def test_an_emergency_stop_out_of_a_fault_replaces_the_message_of_the_fault(writ
 
 def test_an_emergency_with_error_code_0_is_listed_and_never_the_message(written: Written) -> None:
     written.publish(State.READY)
-    written.board.text("something to know")
-    none, over = (Emergency(2, "drive1", code, 0, bytes(5)).sentence() for code in (0x0000, 0x8611))
-    written.board.text(none, is_problem=False)
+    written.board.event(ErrorReported("something to know"))
+    written.board.event(ErrorReset(2, 0, 0, 0))
     assert written.headline == "something to know"
-    assert written.status["messages"] == ["something to know", none]
-    written.board.text(over)
-    assert written.headline == over
+    assert written.status["messages"][1].startswith("slave 2 (drive1) sent emergency 0x0000: error reset")
+    written.board.event(EmergencyMessage(2, 0x8611, 0, 0))
+    assert written.headline.startswith("slave 2 (drive1) sent emergency 0x8611: following error")
 
 
 def test_while_the_arm_moves_the_message_is_not_the_end_of_the_last_motion(written: Written) -> None:
@@ -93,7 +98,7 @@ def test_while_the_arm_moves_the_message_is_not_the_end_of_the_last_motion(writt
     written.publish(State.MOVING, moves=2)
     assert written.headline == "moving"
     time.sleep(0.002)
-    written.board.text("said meanwhile")
+    written.board.event(ErrorReported("said meanwhile"))
     written.publish(State.MOVING, moves=2)
     assert written.headline == "said meanwhile"
     time.sleep(0.002)
@@ -115,7 +120,7 @@ def test_while_a_motion_is_limited_the_message_says_by_what_and_a_later_message_
     assert list(status["limited_by"]) == ["joint3 range", "elbow"]
     assert status["message"] == "moving, limited: " + "; ".join(status["limited_by"].values())
     time.sleep(0.002)
-    written.board.text("said meanwhile")
+    written.board.event(ErrorReported("said meanwhile"))
     written.publish(State.MOVING, moves=1, held=HELD_SHOULDER)
     assert written.headline == "said meanwhile"
     written.publish(State.HOLDING, moves=1, held=HELD_SHOULDER)

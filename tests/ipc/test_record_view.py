@@ -21,11 +21,11 @@ def board(tmp_path: Path) -> Blackboard:
 
 def values(board: Blackboard, **given: Any) -> list[Any]:
     """Return the numbers of a record, 0 but for those given."""
-    found: list[Any] = []
+    numbers: list[Any] = []
     for field in board.schema.fields[1:]:
-        one = given.get(field.name, [0] * field.count if field.shape else 0)
-        found += one if field.shape else [one]
-    return found
+        value = given.get(field.name, [0] * field.count if field.shape else 0)
+        numbers += value if field.shape else [value]
+    return numbers
 
 
 def test_fields_of_the_newest_record_by_name(board: Blackboard) -> None:

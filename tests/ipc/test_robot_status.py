@@ -21,13 +21,13 @@ def shown(
 
 @pytest.mark.parametrize("state", State)
 def test_it_follows_the_state(state: State) -> None:
-    found = shown(state)
-    assert found.motion_possible is (state in (State.HOLDING, State.MOVING))
-    assert found.in_motion is (state in (State.MOVING, State.STOPPING, State.HOMING))
+    status = shown(state)
+    assert status.motion_possible is (state in (State.HOLDING, State.MOVING))
+    assert status.in_motion is (state in (State.MOVING, State.STOPPING, State.HOMING))
     in_error = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING)
-    assert found.in_error is (state in in_error)
-    assert found.e_stopped is (state is State.EMERGENCY_STOP)
-    assert found.drives_powered
+    assert status.in_error is (state in in_error)
+    assert status.e_stopped is (state is State.EMERGENCY_STOP)
+    assert status.drives_powered
 
 
 @pytest.mark.parametrize("flags", [ALLOWED | FLAG_EMERGENCY_STOP, ALLOWED | FLAG_SWITCHING, FLAG_ENABLED])
@@ -47,11 +47,11 @@ def test_an_error_code_is_the_number_of_the_event() -> None:
 
 
 def test_a_pressed_emergency_stop_is_an_error_in_every_state() -> None:
-    found = shown(State.READY, FLAG_EMERGENCY_STOP)
-    assert (found.e_stopped, found.in_error, found.error_code) == (True, True, EmergencyStopActivated.number)
+    status = shown(State.READY, FLAG_EMERGENCY_STOP)
+    assert (status.e_stopped, status.in_error, status.error_code) == (True, True, EmergencyStopActivated.number)
 
 
 def test_an_arm_whose_loop_has_ended_is_in_error_and_takes_no_motion() -> None:
-    found = RobotStatus.lost(ControlMode.JOINT)
-    assert (found.in_error, found.motion_possible, found.drives_powered) == (True, False, False)
-    assert found.error_code != 0
+    status = RobotStatus.lost(ControlMode.JOINT)
+    assert (status.in_error, status.motion_possible, status.drives_powered) == (True, False, False)
+    assert status.error_code != 0

@@ -5,14 +5,18 @@ Nothing here uses the code under test except the model and the pose. `RTCP_SLOW=
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import inf, pi, radians
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kinematics.model import ArmModel, DhRow, JointLimit
 from kinematics.pose import Pose
 from tests.samples import SLOW
+
+Change = Callable[[ArmModel], ArmModel]
 
 TOOL = Pose.from_xyzrpy(0.03, -0.02, 0.11, 0.4, -1.2, 2.1)
 
@@ -101,7 +105,7 @@ def wrist_centres(model: ArmModel, arm: np.ndarray) -> np.ndarray:
 
 
 def stretched(model: ArmModel) -> float:
-    """Joint 3 with the elbow stretched, for an arm with right angles at the forearm."""
+    """Angle of joint 3, rad, with the elbow stretched; the forearm of the arm has right angles."""
     return -model.rows[2].offset - float(np.arctan2(-np.sin(model.rows[3].alpha) * model.rows[3].d, model.rows[3].a))
 
 
@@ -119,8 +123,8 @@ def pose_errors(wanted: np.ndarray, actual: np.ndarray) -> tuple[np.ndarray, np.
     return position, np.linalg.norm(difference, axis=(1, 2)) / np.sqrt(2.0)
 
 
-def worst_error(model: ArmModel, wanted: np.ndarray, q) -> float:
-    """Largest error, m or rad, of configurations (N, 6) that are to reach poses (N, 4, 4) or one pose (4, 4)."""
+def worst_error(model: ArmModel, wanted: np.ndarray, q: ArrayLike) -> float:
+    """Largest error, m or rad, between configurations (N, 6) and their poses (N, 4, 4) or one pose (4, 4)."""
     reached = chain(model, np.array(q))
     return float(np.max(pose_errors(np.broadcast_to(wanted, reached.shape), reached)))
 
@@ -135,9 +139,9 @@ def matrix(pose: Pose) -> np.ndarray:
     return result
 
 
-def wrapped_difference(one, other) -> np.ndarray:
+def wrapped_difference(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     """The largest difference of a joint, rad, regardless of multiples of 2 pi."""
-    return np.abs(np.remainder(np.subtract(one, other) + pi, 2 * pi) - pi).max(axis=-1)
+    return np.abs(np.remainder(np.subtract(a, b) + pi, 2 * pi) - pi).max(axis=-1)
 
 
 class Draw:
@@ -160,7 +164,7 @@ class Draw:
 
 
 # alpha1, a1, alpha2 of the arm
-GEOMETRIES = {
+GEOMETRIES: dict[str, Callable[[Draw], tuple[float, float, float]]] = {
     "parallel axes 2 and 3, offsets": lambda draw: (
         pi / 2 * draw.sign(),
         draw.length(0.0, 0.2),
@@ -181,7 +185,7 @@ def foldable(draw: Draw) -> tuple[float, float]:
 
 
 # alpha4, alpha5
-WRISTS = {
+WRISTS: dict[str, Callable[[Draw], tuple[float, float]]] = {
     "right-angled": lambda draw: (pi / 2 * draw.sign(), pi / 2 * draw.sign()),
     "oblique": lambda draw: (draw.oblique(), draw.oblique()),
     "foldable": foldable,

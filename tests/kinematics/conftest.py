@@ -24,12 +24,12 @@ def ur5() -> ArmModel:
 
 
 @pytest.fixture(scope="session", params=[arms.assistive, arms.irb120], ids=["assistive", "irb120"])
-def either(request) -> ArmModel:
+def either(request: pytest.FixtureRequest) -> ArmModel:
     """Both arms, one after the other."""
     return request.param()
 
 
 @pytest.fixture(scope="session", params=arms.GEOMETRIES)
-def geometry(request) -> str:
+def geometry(request: pytest.FixtureRequest) -> str:
     """The name of a geometry of joints 1 to 3."""
     return request.param

@@ -7,6 +7,7 @@ import random
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,40 +16,43 @@ from hypothesis import strategies as st
 
 from kinematics.capsules import Placed, between_axes, capsules, distance, from_box, self_pairs
 from kinematics.forward import frames
-from kinematics.model import Capsule
-from kinematics.pose import IDENTITY, Pose
+from kinematics.model import ArmModel, Capsule
+from kinematics.pose import IDENTITY, Pose, Vector
 from kinematics.urdf import to_urdf
-from tests.kinematics.arms import irb120, random_configurations, with_general_rows, with_tool
+from tests.kinematics.arms import Change, irb120, random_configurations, with_general_rows, with_tool
 from tests.kinematics.test_urdf import read, transform
 from tests.samples import examples
 
 BOX = (-0.3, -0.2, 0.1, 0.4, 0.5, 0.6)
 NUMBER = st.one_of(st.sampled_from([-1.0, 0.0, 0.5, 1.0]), st.floats(-1.0, 1.0))
+Segment = tuple[Vector, Vector]
 POINT = st.tuples(NUMBER, NUMBER, NUMBER)
 POSES = (IDENTITY,) * 7
 
 
 def placed(*bodies: Capsule) -> Placed:
-    made = Placed(bodies)
-    made.place(POSES)
-    return made
+    arm = Placed(bodies)
+    arm.place(POSES)
+    return arm
 
 
-def sampled(start, end, count=401) -> np.ndarray:
+def sampled(start: Vector, end: Vector, count: int = 401) -> np.ndarray:
     return np.linspace(0.0, 1.0, count)[:, None] * np.subtract(end, start) + start
 
 
 def surface(body: ET.Element) -> np.ndarray:
     """Points on the edges of a cylinder or around a ball, in the frame of its link."""
-    turn = np.linspace(0.0, 2.0 * math.pi, 60)
+    angles = np.linspace(0.0, 2.0 * math.pi, 60)
     sphere, cylinder = body.find("geometry/sphere"), body.find("geometry/cylinder")
     if sphere is not None:
-        lift = np.linspace(-math.pi / 2, math.pi / 2, 30)[:, None]
-        unit = np.stack(np.broadcast_arrays(np.cos(lift) * np.cos(turn), np.cos(lift) * np.sin(turn), np.sin(lift)))
+        heights = np.linspace(-math.pi / 2, math.pi / 2, 30)[:, None]
+        unit = np.stack(
+            np.broadcast_arrays(np.cos(heights) * np.cos(angles), np.cos(heights) * np.sin(angles), np.sin(heights))
+        )
         local = float(sphere.get("radius")) * unit.reshape(3, -1).T
     else:
         radius, length = float(cylinder.get("radius")), float(cylinder.get("length"))
-        ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full_like(turn, 0.5 * length)], axis=1)
+        ring = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full_like(angles, 0.5 * length)], axis=1)
         local = np.concatenate([ring, ring * (1.0, 1.0, -1.0)])
     pose = transform(body.find("origin"))
     return local @ pose[:3, :3].T + pose[:3, 3]
@@ -62,7 +66,7 @@ BODIES = (
 
 
 @pytest.mark.parametrize("change", [replace, with_tool, with_general_rows, lambda arm: replace(arm, bodies=BODIES)])
-def test_all_bodies_of_the_urdf_lie_inside_the_capsules(change, either):
+def test_all_bodies_of_the_urdf_lie_inside_the_capsules(change: Change, either: ArmModel) -> None:
     model = change(either)
     bodies = capsules(model)
     links = ET.fromstring(to_urdf(model)).findall("link")
@@ -81,14 +85,16 @@ def test_all_bodies_of_the_urdf_lie_inside_the_capsules(change, either):
                 assert depth.min() > -1e-4  # the file has four digits
 
 
-def test_an_irb_120_has_a_capsule_for_each_rod():
+def test_an_irb_120_has_a_capsule_for_each_rod() -> None:
     assert [body.link for body in capsules(irb120())] == [0, 2, 3, 3, 5]
 
 
-def test_named_bodies_take_the_place_of_derived_ones(either):
+def test_named_bodies_take_the_place_of_derived_ones(either: ArmModel) -> None:
     assert capsules(replace(either, bodies=BODIES)) == BODIES
     robot = ET.fromstring(to_urdf(replace(either, bodies=BODIES)))
-    drawn = {link.get("name"): [one.tag for one in link.findall("collision/geometry/*")] for link in robot.iter("link")}
+    drawn = {
+        link.get("name"): [shape.tag for shape in link.findall("collision/geometry/*")] for link in robot.iter("link")
+    }
     assert {name: shapes for name, shapes in drawn.items() if shapes} == {
         "base_link": ["cylinder", "sphere", "sphere"],
         "link3": ["cylinder", "sphere", "sphere"],
@@ -107,7 +113,7 @@ def test_named_bodies_take_the_place_of_derived_ones(either):
         ({"radius": 0.0}, "radius is 0.0; a positive number is required"),
     ],
 )
-def test_an_impossible_body_is_refused(change, message):
+def test_an_impossible_body_is_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(BODIES[0], **change)
 
@@ -115,7 +121,7 @@ def test_an_impossible_body_is_refused(change, message):
 # -- pairs ------------------------------------------------------------------------------------------------------------
 
 
-def test_neighbours_and_bodies_that_meet_at_a_joint_do_not_collide(assistive, irb120):
+def test_neighbours_and_bodies_that_meet_at_a_joint_do_not_collide(assistive: ArmModel, irb120: ArmModel) -> None:
     named = [
         [(capsules(arm)[i].link, capsules(arm)[j].link) for i, j in self_pairs(arm)] for arm in (assistive, irb120)
     ]
@@ -125,7 +131,7 @@ def test_neighbours_and_bodies_that_meet_at_a_joint_do_not_collide(assistive, ir
     assert named[1] == [(0, 3), (0, 3), (0, 5), (2, 5), (3, 5)]
 
 
-def test_pairs_that_are_left_out_of_the_delivered_arms_overlap_in_every_configuration(either):
+def test_pairs_that_are_left_out_of_the_delivered_arms_overlap_in_every_configuration(either: ArmModel) -> None:
     bodies, around = capsules(either), Placed(capsules(either))
     left_out = [
         (i, j)
@@ -138,7 +144,7 @@ def test_pairs_that_are_left_out_of_the_delivered_arms_overlap_in_every_configur
         assert all(distance(around, around, (pair,))[0] < 0.0 for pair in left_out)
 
 
-def test_named_bodies_that_overlap_at_home_are_looked_at(irb120):
+def test_named_bodies_that_overlap_at_home_are_checked(irb120: ArmModel) -> None:
     thick = tuple(replace(body, radius=0.2) for body in capsules(irb120))
     assert self_pairs(replace(irb120, bodies=thick))
 
@@ -148,7 +154,7 @@ def test_named_bodies_that_overlap_at_home_are_looked_at(irb120):
 
 @given(a=POINT, b=POINT, c=POINT, d=POINT)
 @settings(max_examples=examples(300))
-def test_no_points_of_two_segments_are_nearer_than_their_distance(a, b, c, d):
+def test_no_points_of_two_segments_are_nearer_than_their_distance(a: Vector, b: Vector, c: Vector, d: Vector) -> None:
     axes = [*a, *np.subtract(b, a), *c, *np.subtract(d, c)]
     square, s, t = between_axes(axes, 0, axes, 6)
     apart = np.linalg.norm(sampled(a, b)[:, None] - sampled(c, d)[None], axis=2).min()
@@ -175,12 +181,12 @@ def test_no_points_of_two_segments_are_nearer_than_their_distance(a, b, c, d):
         (((0, 0, 0), (1, 0, 0)), ((2, 2, 0), (2, 1, 0)), math.sqrt(2.0)),  # both at an end
     ],
 )
-def test_the_distance_of_special_segments(one, other, expected):
-    first, second = (Capsule(0, *((tuple(map(float, p))) for p in ends), 0.125) for ends in (one, other))
+def test_the_distance_of_special_segments(one: Segment, other: Segment, expected: float) -> None:
+    first, second = (Capsule(0, start, end, 0.125) for start, end in (one, other))
     assert distance(placed(first), placed(second))[0] == pytest.approx(expected - 0.25, abs=1e-12)
 
 
-def test_nearly_parallel_segments_are_as_far_apart_as_parallel_ones():
+def test_nearly_parallel_segments_are_as_far_apart_as_parallel_ones() -> None:
     numbers = random.Random(3)
     for _ in range(2000):
         turn = 10.0 ** numbers.uniform(-16, -4)
@@ -191,7 +197,7 @@ def test_nearly_parallel_segments_are_as_far_apart_as_parallel_ones():
         )
 
 
-def test_the_least_of_all_pairs_is_found_and_named(irb120):
+def test_the_least_of_all_pairs_is_found_and_named(irb120: ArmModel) -> None:
     one, other = Placed(capsules(irb120)), Placed(capsules(irb120))
     base = Pose.from_xyzrpy(0.7, 0.1, 0.0, 0.0, 0.0, math.pi)
     for q in random_configurations(irb120, 200).tolist():
@@ -203,11 +209,11 @@ def test_the_least_of_all_pairs_is_found_and_named(irb120):
         assert distance(one, other, [pair for pair in every if pair != (i, j)])[0] >= least
 
 
-def test_without_bodies_nothing_is_near():
+def test_without_bodies_nothing_is_near() -> None:
     assert distance(placed(), placed(BODIES[0])) == (math.inf, -1, -1)
 
 
-def test_bodies_stand_where_the_base_of_their_arm_stands(irb120):
+def test_bodies_stand_where_the_base_of_their_arm_stands(irb120: ArmModel) -> None:
     base, q = Pose.from_xyzrpy(0.5, -0.2, 0.3, 0.3, 0.4, 2.0), [0.1, 0.2, -0.3, 0.4, 0.5, -0.6]
     moved, around = Placed(capsules(irb120)), Placed(capsules(irb120))
     moved.place(frames(irb120, q), base)
@@ -226,7 +232,7 @@ def box_distance(points: np.ndarray) -> np.ndarray:
 
 @given(a=POINT, b=POINT)
 @settings(max_examples=examples(500))
-def test_no_point_of_a_capsules_axis_is_nearer_to_a_box_than_their_distance(a, b):
+def test_no_point_of_a_capsules_axis_is_nearer_to_a_box_than_their_distance(a: Vector, b: Vector) -> None:
     body = placed(Capsule(0, a, b, 0.05))
     apart, part = from_box(body, 0, BOX)
     every = box_distance(sampled(a, b, 4001))

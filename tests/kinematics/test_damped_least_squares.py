@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,35 +15,36 @@ from kinematics.forward import forward
 from kinematics.jacobian import characteristic_length
 from kinematics.model import ArmModel, JointLimit
 from kinematics.pose import IDENTITY, Pose, Rotation
+from kinematics.solution import six
 from tests.kinematics.arms import count, random_configurations, with_general_rows
 
 
 @pytest.fixture(scope="module")
-def ur5(ur5) -> ArmModel:
-    """With the maker's limits, a turn each way."""
+def ur5(ur5: ArmModel) -> ArmModel:
+    """With the manufacturer's limits, one revolution each way."""
     return replace(ur5, limits=(JointLimit(-2 * math.pi, 2 * math.pi, math.pi),) * 6)
 
 
 @pytest.fixture(scope="module")
-def general(ur5) -> ArmModel:
+def general(ur5: ArmModel) -> ArmModel:
     """No parallel axes, no axes that meet."""
     return with_general_rows(ur5)
 
 
-def inside(model: ArmModel, q) -> bool:
+def inside(model: ArmModel, q: Sequence[float]) -> bool:
     return all(limit.lower <= angle <= limit.upper for angle, limit in zip(q, model.limits, strict=True))
 
 
 def errors(model: ArmModel, pose: Pose, result: NumericResult) -> tuple[float, float]:
     """Position error, m, and rotation error, rad, computed differently from the solver."""
-    found = forward(model, result.q)
-    turn = np.reshape(pose.rotation, (3, 3)).T @ np.reshape(found.rotation, (3, 3))
-    chord = np.linalg.norm(turn - np.eye(3)) / math.sqrt(8.0)
-    return math.dist(found.position, pose.position), 2.0 * math.asin(min(1.0, chord))
+    reached = forward(model, result.q)
+    deviation = np.reshape(pose.rotation, (3, 3)).T @ np.reshape(reached.rotation, (3, 3))
+    chord = np.linalg.norm(deviation - np.eye(3)) / math.sqrt(8.0)
+    return math.dist(reached.position, pose.position), 2.0 * math.asin(min(1.0, chord))
 
 
 @pytest.mark.parametrize("arm", ["ur5", "general", "assistive", "irb120"])
-def test_every_pose_within_reach_is_found_from_anywhere(arm, request):
+def test_every_pose_within_reach_is_found_from_anywhere(arm: str, request: pytest.FixtureRequest) -> None:
     model = request.getfixturevalue(arm)
     for q, near in random_configurations(model, 2 * count(12, 100)).reshape(-1, 2, 6).tolist():
         pose = forward(model, q)
@@ -52,7 +54,7 @@ def test_every_pose_within_reach_is_found_from_anywhere(arm, request):
         assert inside(model, result.q)
 
 
-def test_from_nearby_the_nearby_solution_is_found(ur5):
+def test_from_nearby_the_nearby_solution_is_found(ur5: ArmModel) -> None:
     generator = np.random.default_rng(13)
     for q in generator.uniform(-2.0, 2.0, (20, 6)).tolist():
         q[2], q[4] = math.copysign(max(0.4, abs(q[2])), q[2]), math.copysign(max(0.4, abs(q[4])), q[4])
@@ -62,16 +64,16 @@ def test_from_nearby_the_nearby_solution_is_found(ur5):
         assert damped_least_squares(ur5, pose, near) == pytest.approx(q, abs=1e-6)
 
 
-def test_damped_least_squares_give_up_on_a_pose_that_no_small_step_reaches(ur5):
+def test_damped_least_squares_give_up_on_a_pose_that_no_small_step_reaches(ur5: ArmModel) -> None:
     assert damped_least_squares(ur5, Pose((3.0, 0.0, 0.0), IDENTITY.rotation), [0.1] * 6) is None
 
 
-def test_a_pose_that_is_already_reached_changes_no_joint(ur5):
+def test_a_pose_that_is_already_reached_changes_no_joint(ur5: ArmModel) -> None:
     q = (0.3, -0.4, 1.1, 5.9, 0.8, -4.0)
     assert solve_numeric(ur5, forward(ur5, q), q) == (q, True, 0.0, pytest.approx(0.0, abs=1e-15), 0)
 
 
-def test_each_joint_is_wrapped_to_the_value_nearest_to_q_near(ur5):
+def test_each_joint_is_wrapped_to_the_value_nearest_to_q_near(ur5: ArmModel) -> None:
     q = [0.3, -0.4, 1.1, 0.4, 0.8, 0.2]
     near = [0.3 + 2 * math.pi, -0.4, 1.1 - 2 * math.pi, 0.4, 0.8 + 2 * math.pi, 0.2]
     # 0.8 + 2 pi is beyond the limit of 2 pi, and so is 0.3 + 2 pi; 1.1 - 2 pi is inside.
@@ -80,13 +82,13 @@ def test_each_joint_is_wrapped_to_the_value_nearest_to_q_near(ur5):
     assert free.q == pytest.approx(near, abs=1e-6)
 
 
-def test_without_limits_each_joint_is_within_half_a_turn_of_q_near(ur5):
+def test_without_limits_each_joint_is_within_half_a_turn_of_q_near(ur5: ArmModel) -> None:
     for q, near in random_configurations(ur5, 40).reshape(-1, 2, 6).tolist():
         result = solve_numeric(ur5, forward(ur5, q), near, respect_limits=False)
         assert max(abs(angle - before) for angle, before in zip(result.q, near, strict=True)) <= math.pi + 1e-12
 
 
-def test_a_pose_that_only_angles_beyond_the_limits_reach_is_reached_without_limits_only(assistive):
+def test_a_pose_that_only_angles_beyond_the_limits_reach_is_reached_without_limits_only(assistive: ArmModel) -> None:
     narrow = replace(assistive, limits=(JointLimit(-0.5, 0.5),) * 6)
     pose = forward(assistive, [0.4, 1.2, 1.0, 0.3, -1.1, 0.2])
     result = solve_numeric(narrow, pose, [0.0] * 6)
@@ -96,7 +98,7 @@ def test_a_pose_that_only_angles_beyond_the_limits_reach_is_reached_without_limi
     assert solve_numeric(narrow, pose, [0.0] * 6, respect_limits=False).converged
 
 
-def test_the_same_arguments_give_the_same_result(ur5):
+def test_the_same_arguments_give_the_same_result(ur5: ArmModel) -> None:
     q, near = random_configurations(ur5, 2).tolist()
     pose = forward(ur5, q)
     far = Pose((3.0, 0.0, 0.0), pose.rotation)
@@ -105,7 +107,7 @@ def test_the_same_arguments_give_the_same_result(ur5):
 
 
 @pytest.mark.parametrize("beyond", [1e-6, 1e-3, 0.1, 1.0])
-def test_beyond_the_reach_the_arm_stretches_towards_the_pose(beyond, assistive):
+def test_beyond_the_reach_the_arm_stretches_towards_the_pose(beyond: float, assistive: ArmModel) -> None:
     pose = Pose((0.0, 0.0, 1.300 + beyond), IDENTITY.rotation)
     result = solve_numeric(assistive, pose, [0.1, 0.2, 0.3, 0.1, 0.1, 0.1])
     assert not result.converged
@@ -115,20 +117,21 @@ def test_beyond_the_reach_the_arm_stretches_towards_the_pose(beyond, assistive):
 
 
 @pytest.mark.parametrize("arm", ["ur5", "irb120"])
-def test_no_configuration_beside_the_result_is_nearer_to_a_pose_out_of_reach(arm, request):
+def test_no_configuration_beside_the_result_is_nearer_to_a_pose_out_of_reach(
+    arm: str, request: pytest.FixtureRequest
+) -> None:
     model = request.getfixturevalue(arm)
     numbers = random.Random(15)
     length = characteristic_length(model)
 
-    def cost(q) -> float:
-        found = errors(model, pose, NumericResult(tuple(q), False, 0.0, 0.0, 0))
-        return (found[0] / length) ** 2 + found[1] ** 2
+    def cost(q: Sequence[float]) -> float:
+        position, rotation = errors(model, pose, NumericResult(six(q), False, 0.0, 0.0, 0))
+        return (position / length) ** 2 + rotation**2
 
     for _ in range(3):
         there = forward(model, [numbers.uniform(limit.lower, limit.upper) for limit in model.limits])
-        pose = Pose(
-            tuple(value * 1.8 / math.dist(there.position, (0.0,) * 3) for value in there.position), there.rotation
-        )
+        x, y, z = (value * 1.8 / math.hypot(*there.position) for value in there.position)
+        pose = Pose((x, y, z), there.rotation)
         result = solve_numeric(model, pose, [0.1] * 6)
         assert not result.converged
         least = cost(result.q)
@@ -139,13 +142,13 @@ def test_no_configuration_beside_the_result_is_nearer_to_a_pose_out_of_reach(arm
                     assert cost(other) > least - 1e-5
 
 
-def test_a_singular_pose_is_reached(assistive):
+def test_a_singular_pose_is_reached(assistive: ArmModel) -> None:
     result = solve_numeric(assistive, forward(assistive, [0.0] * 6), [0.5, -0.7, 1.3, 0.4, 0.9, 0.2])
     assert result.converged
 
 
 @pytest.mark.parametrize("half_turn", [(1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
-def test_a_tool_rotated_by_half_a_turn_has_an_error_of_pi(half_turn, assistive):
+def test_a_tool_rotated_by_half_a_turn_has_an_error_of_pi(half_turn: tuple[int, int, int], assistive: ArmModel) -> None:
     fixed = replace(assistive, limits=(JointLimit(-1e-9, 1e-9),) * 6)
     x, y, z = half_turn
     rotation: Rotation = (x, 0.0, 0.0, 0.0, y, 0.0, 0.0, 0.0, z)
@@ -154,7 +157,7 @@ def test_a_tool_rotated_by_half_a_turn_has_an_error_of_pi(half_turn, assistive):
 
 
 @pytest.mark.parametrize("half_turn", [(1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
-def test_a_pose_half_a_turn_away_is_reached(half_turn, ur5):
+def test_a_pose_half_a_turn_away_is_reached(half_turn: tuple[int, int, int], ur5: ArmModel) -> None:
     q = [0.3, -1.4, 1.1, 0.4, 0.8, 0.2]
     here = forward(ur5, q)
     turned = np.reshape(here.rotation, (3, 3)) @ np.diag(half_turn)
@@ -164,13 +167,13 @@ def test_a_pose_half_a_turn_away_is_reached(half_turn, ur5):
     assert max(errors(ur5, pose, result)) < 1e-9
 
 
-def test_a_value_that_is_not_finite_is_refused_by_name(ur5):
+def test_a_value_that_is_not_finite_is_refused_by_name(ur5: ArmModel) -> None:
     with pytest.raises(ValueError, match="joint2"):
         solve_numeric(ur5, IDENTITY, [0.0, math.nan, 0.0, 0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="y is inf"):
         solve_numeric(ur5, Pose((0.0, math.inf, 0.0), IDENTITY.rotation), [0.0] * 6)
 
 
-def test_an_invalid_rotation_is_refused(ur5):
+def test_an_invalid_rotation_is_refused(ur5: ArmModel) -> None:
     with pytest.raises(ValueError, match="rotation"):
         solve_numeric(ur5, Pose((0.3, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0)), [0.0] * 6)

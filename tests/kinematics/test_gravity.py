@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from kinematics.forward import forward, frames
 from kinematics.gravity import gravity_torques
 from kinematics.model import ArmModel, LinkMass
-from kinematics.pose import IDENTITY, Pose
+from kinematics.pose import IDENTITY, Pose, Vector
 
 G = 9.80665
 # The masses of the actuators, each on the link before its joint; the tubes are massless.
@@ -28,11 +29,11 @@ ALONG_X = [0.0, math.pi / 2, 0.0, 0.0, 0.0, 0.0]
 
 
 @pytest.fixture
-def loaded(assistive) -> ArmModel:
+def loaded(assistive: ArmModel) -> ArmModel:
     return replace(assistive, links=LINKS)
 
 
-def potential_energy(model: ArmModel, q, gravity, payload: LinkMass | None = None) -> float:
+def potential_energy(model: ArmModel, q: Sequence[float], gravity: Vector, payload: LinkMass | None = None) -> float:
     poses = frames(model, q)
     bodies = list(zip(poses[:6], model.links, strict=True))
     if payload is not None:
@@ -45,7 +46,9 @@ def potential_energy(model: ArmModel, q, gravity, payload: LinkMass | None = Non
 
 @pytest.mark.parametrize("gravity", [(0.0, 0.0, -G), (3.0, -7.0, 2.0)])
 @pytest.mark.parametrize("payload", [None, LinkMass(0.5, (0.02, 0.03, 0.08))])
-def test_the_torques_are_the_gradient_of_the_potential_energy(gravity, payload, loaded):
+def test_the_torques_are_the_gradient_of_the_potential_energy(
+    gravity: Vector, payload: LinkMass | None, loaded: ArmModel
+) -> None:
     model = replace(loaded, tool=Pose.from_xyzrpy(0.01, 0.02, 0.1, 0.5, -0.3, 1.0))
     numbers = random.Random(2)
     step = 1e-5
@@ -61,17 +64,17 @@ def test_the_torques_are_the_gradient_of_the_potential_energy(gravity, payload, 
         assert gravity_torques(model, q, gravity, payload) == pytest.approx(slopes, abs=1e-7)
 
 
-def test_a_balanced_arm_pointing_straight_up_needs_no_torque(assistive):
+def test_a_balanced_arm_pointing_straight_up_needs_no_torque(assistive: ArmModel) -> None:
     centred = tuple(LinkMass(link.mass, frame_centre) for link, frame_centre in zip(LINKS, _on_axis(), strict=True))
     assert gravity_torques(replace(assistive, links=centred), [0.0] * 6) == pytest.approx([0.0] * 6, abs=1e-14)
 
 
-def _on_axis():
+def _on_axis() -> list[Vector]:
     """Points on the vertical through the straight arm, in each link's frame."""
     return [(0, 0, 0.1), (0.2, 0, 0), (0, 0.3, 0), (0, 0, -0.1), (0, 0, 0), (0, 0, 0.02)]
 
 
-def test_joint_2_of_the_stretched_arm_carries_every_mass_times_its_distance(loaded):
+def test_joint_2_of_the_stretched_arm_carries_every_mass_times_its_distance(loaded: ArmModel) -> None:
     expected = G * (0.720 * 0.440 + 0.650 * 0.890 + 0.500 * 0.990 + 0.335 * 1.050 + 0.100 * 1.090)
     assert forward(loaded, ALONG_X).position == pytest.approx((1.130, 0.0, 0.170))
     torques = gravity_torques(loaded, ALONG_X)
@@ -80,25 +83,25 @@ def test_joint_2_of_the_stretched_arm_carries_every_mass_times_its_distance(load
     assert torques[0] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_payload_is_a_mass_at_the_tool(loaded):
-    without = gravity_torques(loaded, ALONG_X)
-    held = gravity_torques(loaded, ALONG_X, payload=LinkMass(1.0, (0.0, 0.0, 0.050)))
-    assert held[1] - without[1] == pytest.approx(-G * (1.130 + 0.050))
+def test_a_payload_is_a_mass_at_the_tool(loaded: ArmModel) -> None:
+    empty = gravity_torques(loaded, ALONG_X)
+    carrying = gravity_torques(loaded, ALONG_X, payload=LinkMass(1.0, (0.0, 0.0, 0.050)))
+    assert carrying[1] - empty[1] == pytest.approx(-G * (1.130 + 0.050))
 
 
-def test_the_centre_of_the_payload_is_in_the_tool_frame(loaded):
+def test_the_centre_of_the_payload_is_in_the_tool_frame(loaded: ArmModel) -> None:
     longer = replace(loaded, tool=Pose((0.0, 0.0, 0.2), IDENTITY.rotation))
     at_the_tool = gravity_torques(longer, ALONG_X, payload=LinkMass(1.0, (0.0, 0.0, 0.0)))
     from_the_flange = gravity_torques(loaded, ALONG_X, payload=LinkMass(1.0, (0.0, 0.0, 0.2)))
     assert at_the_tool == pytest.approx(from_the_flange)
 
 
-def test_an_arm_without_masses_is_refused_by_name(assistive):
+def test_an_arm_without_masses_is_refused_by_name(assistive: ArmModel) -> None:
     with pytest.raises(ValueError, match=f"arm '{assistive.name}' has no link masses"):
         gravity_torques(assistive, [0.0] * 6)
 
 
-def test_a_value_that_is_not_finite_is_refused_by_name(loaded):
+def test_a_value_that_is_not_finite_is_refused_by_name(loaded: ArmModel) -> None:
     with pytest.raises(ValueError, match="gravity y"):
         gravity_torques(loaded, [0.0] * 6, gravity=(0.0, math.nan, -G))
     with pytest.raises(ValueError, match="joint6"):

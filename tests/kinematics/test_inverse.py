@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import hypot, inf, nan, pi, sin
 
@@ -15,19 +16,10 @@ from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel, JointLimit
 from kinematics.pose import IDENTITY, Pose
 from kinematics.solution import BRANCHES, Branch, Singularity
-from tests.kinematics.arms import (
-    as_pose,
-    chain,
-    count,
-    matrix,
-    pose_errors,
-    random_configurations,
-    worst_error,
-    wrapped_difference,
-)
+from tests.kinematics import arms
 
 ACCURACY = 1e-9  # m and rad
-COUNT, BLOCK = count(2_000, 100_000), 1_000
+COUNT, BLOCK = arms.count(2_000, 100_000), 1_000
 
 angles = st.floats(-pi, pi)
 lengths = st.floats(-1.5, 1.5)
@@ -54,34 +46,34 @@ def distance_from_singularities(model: ArmModel, q: np.ndarray, poses: np.ndarra
     return np.abs(np.sin(q[:, 4])) * elbow * np.hypot(centre[:, 0], centre[:, 1])
 
 
-def test_each_random_configuration_is_among_eight_confirmed_solutions(either):
+def test_each_random_configuration_is_among_eight_confirmed_solutions(either: ArmModel) -> None:
     solver = InverseKinematics(either)
     lower = np.array([limit.lower for limit in either.limits])
     upper = np.array([limit.upper for limit in either.limits])
     for block in range(COUNT // BLOCK):
-        true = random_configurations(either, BLOCK, seed=block)
-        poses = chain(either, true)
-        answers = [solver.solve(as_pose(pose)).solutions for pose in poses]
+        true = arms.random_configurations(either, BLOCK, seed=block)
+        poses = arms.chain(either, true)
+        answers = [solver.solve(arms.as_pose(pose)).solutions for pose in poses]
         assert {len(solutions) for solutions in answers} == {8}
-        found = np.array([[solution.q for solution in solutions] for solutions in answers])
-        errors = pose_errors(np.repeat(poses, 8, axis=0), chain(either, found.reshape(-1, 6)))
+        solved = np.array([[solution.q for solution in solutions] for solutions in answers])
+        errors = arms.pose_errors(np.repeat(poses, 8, axis=0), arms.chain(either, solved.reshape(-1, 6)))
         assert np.max(errors) < ACCURACY
         # The round-off of the pose is amplified beside a singularity, and only there
         tolerance = 1e-12 + 5e-15 / distance_from_singularities(either, true, poses)
-        assert (wrapped_difference(found, true[:, None, :]).min(axis=1) < tolerance).all()
+        assert (arms.wrapped_difference(solved, true[:, None, :]).min(axis=1) < tolerance).all()
         flags = [[solution.within_limits for solution in solutions] for solutions in answers]
-        assert (np.array(flags) == ((lower <= found) & (found <= upper)).all(axis=2)).all()
+        assert (np.array(flags) == ((lower <= solved) & (solved <= upper)).all(axis=2)).all()
         assert np.any(flags, axis=1).all()
 
 
-@settings(max_examples=count(60, 300))
+@settings(max_examples=arms.count(60, 300))
 @given(pose=poses)
-def test_a_pose_has_distinct_confirmed_solutions_or_a_reason_with_the_amount(pose, either):
+def test_a_pose_has_distinct_confirmed_solutions_or_a_reason_with_the_amount(pose: Pose, either: ArmModel) -> None:
     answer = InverseKinematics(either).solve(pose)
-    found = np.array([solution.q for solution in answer.solutions]).reshape(-1, 6)
-    for index, q in enumerate(found):
-        assert worst_error(either, matrix(pose), [q]) < ACCURACY
-        assert (wrapped_difference(found[:index], q) > 1e-9).all()
+    solved = np.array([solution.q for solution in answer.solutions]).reshape(-1, 6)
+    for index, q in enumerate(solved):
+        assert arms.worst_error(either, arms.matrix(pose), [q]) < ACCURACY
+        assert (arms.wrapped_difference(solved[:index], q) > 1e-9).all()
     distance, shortest, longest = reach(either, pose)
     beyond = max(distance - longest, shortest - distance)
     if beyond < 0.0:
@@ -95,35 +87,37 @@ def test_a_pose_has_distinct_confirmed_solutions_or_a_reason_with_the_amount(pos
 
 @pytest.mark.parametrize("beyond", [1e-9, 1e-6, 1e-3, 0.1])
 @pytest.mark.parametrize("side", ["longest", "shortest"])
-def test_a_pose_just_out_of_reach_is_refused_with_the_amount(beyond, side, either):
+def test_a_pose_just_out_of_reach_is_refused_with_the_amount(beyond: float, side: str, either: ArmModel) -> None:
     solver = InverseKinematics(either)
     random = np.random.default_rng(5)
     for _ in range(20):
         direction = random.normal(size=3)
         _, shortest, longest = reach(either, IDENTITY)
         distance = longest + beyond if side == "longest" else max(0.0, shortest - beyond)
-        turn = Pose.from_xyzrpy(0.0, 0.0, 0.0, *random.uniform(-pi, pi, 3))
+        orientation = Pose.from_xyzrpy(0.0, 0.0, 0.0, *random.uniform(-pi, pi, 3))
         centre = direction / np.linalg.norm(direction) * distance + [0.0, 0.0, either.rows[0].d]
-        position = centre + np.multiply(either.rows[5].d, turn.rotation[2::3])
-        near = solver.solve_near(Pose(tuple(position.tolist()), turn.rotation), [0.0] * 6)
+        position = centre + np.multiply(either.rows[5].d, orientation.rotation[2::3])
+        near = solver.solve_near(Pose(tuple(position.tolist()), orientation.rotation), [0.0] * 6)
         expected = beyond if side == "longest" else min(beyond, shortest)
         assert near.q is None
         assert near.out_of_reach == pytest.approx(expected, rel=1e-6, abs=1e-15)
         assert near.reason.startswith(f"out of reach by {near.out_of_reach:.6g} m")
 
 
-def test_a_pose_beyond_the_edge_by_round_off_is_reached(either):
+def test_a_pose_beyond_the_edge_by_round_off_is_reached(either: ArmModel) -> None:
     centre = np.array([reach(either, IN_REACH)[2] + 5e-11, 0.0, either.rows[0].d])
     pose = Pose(tuple((centre + np.multiply(either.rows[5].d, IN_REACH.rotation[2::3])).tolist()), IN_REACH.rotation)
-    assert {one.singularity for one in InverseKinematics(either).solve(pose).solutions} == {Singularity.ELBOW}
+    assert {solution.singularity for solution in InverseKinematics(either).solve(pose).solutions} == {Singularity.ELBOW}
 
 
 @pytest.mark.parametrize("value", [nan, inf, -inf])
 @pytest.mark.parametrize("place", range(12))
-def test_a_pose_with_a_value_that_is_not_finite_is_refused_with_its_name(value, place, assistive):
-    numbers = [*IN_REACH.position, *IN_REACH.rotation]
+def test_a_pose_with_a_value_that_is_not_finite_is_refused_with_its_name(
+    value: float, place: int, assistive: ArmModel
+) -> None:
+    numbers = np.array([*IN_REACH.position, *IN_REACH.rotation])
     numbers[place] = value
-    pose = Pose(tuple(numbers[:3]), tuple(numbers[3:]))
+    pose = Pose(tuple(numbers[:3].tolist()), tuple(numbers[3:].tolist()))
     name = "xyz"[place] if place < 3 else rf"rotation\[{(place - 3) // 3}\]\[{place % 3}\]"
     solver = InverseKinematics(assistive)
     for call in (solver.solve, lambda pose: solver.solve_near(pose, [0.0] * 6)):
@@ -133,7 +127,9 @@ def test_a_pose_with_a_value_that_is_not_finite_is_refused_with_its_name(value, 
 
 @pytest.mark.parametrize("value", [nan, inf, -inf])
 @pytest.mark.parametrize("joint", range(6))
-def test_a_value_of_q_near_that_is_not_finite_is_refused_with_its_joint(value, joint, assistive):
+def test_a_value_of_q_near_that_is_not_finite_is_refused_with_its_joint(
+    value: float, joint: int, assistive: ArmModel
+) -> None:
     near = [0.0] * 6
     near[joint] = value
     solver = InverseKinematics(assistive)
@@ -143,13 +139,13 @@ def test_a_value_of_q_near_that_is_not_finite_is_refused_with_its_joint(value, j
 
 
 @pytest.mark.parametrize("number", [0, 5, 7])
-def test_q_near_with_a_wrong_count_of_angles_is_refused(number, assistive):
+def test_q_near_with_a_wrong_count_of_angles_is_refused(number: int, assistive: ArmModel) -> None:
     with pytest.raises(ValueError, match=f"q_near has {number} joint angles; 6 are required"):
         InverseKinematics(assistive).solve_near(IN_REACH, [0.0] * number)
 
 
 @pytest.mark.parametrize("size", [1e160, 1e300])
-def test_a_pose_whose_squares_overflow_is_out_of_reach_like_any_other(size, either):
+def test_a_pose_whose_squares_overflow_is_out_of_reach_like_any_other(size: float, either: ArmModel) -> None:
     near = InverseKinematics(either).solve_near(Pose((size, -size, size), IN_REACH.rotation), [0.0] * 6)
     assert near.q is None
     assert near.out_of_reach > size
@@ -157,7 +153,7 @@ def test_a_pose_whose_squares_overflow_is_out_of_reach_like_any_other(size, eith
 
 @pytest.mark.parametrize("arm", ["assistive", "ur5"])
 @pytest.mark.parametrize("distance", [0.0, 5.0])
-def test_a_pose_with_an_invalid_rotation_is_refused(distance, arm, request):
+def test_a_pose_with_an_invalid_rotation_is_refused(distance: float, arm: str, request: pytest.FixtureRequest) -> None:
     solver = InverseKinematics(request.getfixturevalue(arm))
     pose = Pose((0.3 + distance, 0.1, 0.5), (1.001, *IDENTITY.rotation[1:]))
     for call in (solver.solve, lambda pose: solver.solve_near(pose, [0.0] * 6)):
@@ -166,7 +162,7 @@ def test_a_pose_with_an_invalid_rotation_is_refused(distance, arm, request):
 
 
 @pytest.mark.parametrize(("lower", "upper"), [(6.5, 12.0), (-12.0, -6.5)])
-def test_a_joint_is_wrapped_into_its_limits(lower, upper, irb120):
+def test_a_joint_is_wrapped_into_its_limits(lower: float, upper: float, irb120: ArmModel) -> None:
     limits = (*irb120.limits[:5], JointLimit(lower, upper))
     solutions = InverseKinematics(replace(irb120, limits=limits)).solve(IN_REACH).solutions
     inside = [solution for solution in solutions if 5 not in solution.outside]
@@ -176,14 +172,14 @@ def test_a_joint_is_wrapped_into_its_limits(lower, upper, irb120):
     assert all(-pi < solution.q[5] <= pi for solution in solutions if solution not in inside)
 
 
-def test_a_joint_beyond_its_limit_by_round_off_is_set_to_the_limit(assistive):
+def test_a_joint_beyond_its_limit_by_round_off_is_set_to_the_limit(assistive: ArmModel) -> None:
     q = [limit.upper for limit in assistive.limits]
-    found = InverseKinematics(assistive).solve(as_pose(chain(assistive, np.array([q]))[0])).solutions
-    assert [solution.q for solution in found if solution.within_limits and max(solution.q) == 3.1] != []
-    assert min(wrapped_difference(solution.q, q) for solution in found if solution.within_limits) < 1e-12
+    solutions = InverseKinematics(assistive).solve(arms.as_pose(arms.chain(assistive, np.array([q]))[0])).solutions
+    assert [solution.q for solution in solutions if solution.within_limits and max(solution.q) == 3.1] != []
+    assert min(arms.wrapped_difference(solution.q, q) for solution in solutions if solution.within_limits) < 1e-12
 
 
-def name_by_sight(model: ArmModel, q) -> str:
+def name_by_sight(model: ArmModel, q: Sequence[float]) -> str:
     """The branch seen from the side, for arms without lateral and shoulder offset."""
     poses = frames(model, q)
     second, third, wrist = (np.array(poses[index].position) for index in (1, 2, 4))
@@ -197,8 +193,8 @@ def name_by_sight(model: ArmModel, q) -> str:
     return f"{shoulder}/{'up' if elbow[1] > height_of_line else 'down'}/{flip}"
 
 
-def test_each_of_eight_solutions_has_its_own_branch_as_seen_from_the_side(either):
-    for q in random_configurations(either, count(50, 300)).tolist():
+def test_each_of_eight_solutions_has_its_own_branch_as_seen_from_the_side(either: ArmModel) -> None:
+    for q in arms.random_configurations(either, arms.count(50, 300)).tolist():
         solutions = InverseKinematics(either).solve(forward(either, q)).solutions
         assert {solution.branch for solution in solutions} == set(BRANCHES)
         for solution in solutions:
@@ -214,14 +210,16 @@ def test_each_of_eight_solutions_has_its_own_branch_as_seen_from_the_side(either
         ([0.0, -1.5, -0.9, 0.0, 0.5, 0.0], "back/down/no-flip"),
     ],
 )
-def test_known_configurations_of_the_assistive_arm_keep_their_branch(q, name, assistive):
+def test_known_configurations_of_the_assistive_arm_keep_their_branch(
+    q: list[float], name: str, assistive: ArmModel
+) -> None:
     # This fails when the solver and `name_by_sight` change together.
     assert name == name_by_sight(assistive, q)
-    own = [one for one in InverseKinematics(assistive).solve(forward(assistive, q)).solutions if np.allclose(one.q, q)]
-    assert [str(one.branch) for one in own] == [name]
+    solutions = InverseKinematics(assistive).solve(forward(assistive, q)).solutions
+    assert [str(solution.branch) for solution in solutions if np.allclose(solution.q, q)] == [name]
 
 
-def test_the_branch_is_constant_along_a_motion_that_crosses_no_singularity(either):
+def test_the_branch_is_constant_along_a_motion_that_crosses_no_singularity(either: ArmModel) -> None:
     start, end = np.array([-1.0, 0.9, -0.6, -0.5, 0.4, -1.0]), np.array([1.0, 0.7, -0.3, 0.8, 1.2, 1.0])
     names: set[Branch] = set()
     for share in np.linspace(0.0, 1.0, 50):

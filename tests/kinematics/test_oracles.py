@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,18 +18,10 @@ from kinematics.gravity import gravity_torques
 from kinematics.inverse import InverseKinematics
 from kinematics.jacobian import jacobian
 from kinematics.model import ArmModel, LinkMass
+from kinematics.pose import Vector
 from kinematics.urdf import to_urdf
-from tests.kinematics.arms import (
-    as_pose,
-    chain,
-    count,
-    matrix,
-    random_configurations,
-    with_general_rows,
-    with_row,
-    with_tool,
-    wrapped_difference,
-)
+from tests.kinematics import arms
+from tests.kinematics.arms import Change
 
 COUNT = 2000
 LINKS = (
@@ -38,27 +32,28 @@ LINKS = (
     LinkMass(0.6, (-0.01, 0.03, 0.02)),
     LinkMass(0.4, (0.0, 0.01, -0.03)),
 )
+Oracle = tuple[Any, Any, int]
 CONFIGURATIONS = np.random.default_rng(10).uniform(-np.pi, np.pi, (COUNT, 6))
 
 
 @pytest.fixture
-def pin():
+def pin() -> ModuleType:
     return pytest.importorskip("pinocchio")
 
 
 @pytest.fixture(params=["as it is", "general"])
-def model(request, either) -> ArmModel:
-    return replace(with_general_rows(either) if request.param == "general" else either, links=LINKS)
+def model(request: pytest.FixtureRequest, either: ArmModel) -> ArmModel:
+    return replace(arms.with_general_rows(either) if request.param == "general" else either, links=LINKS)
 
 
 @pytest.fixture
-def oracle(model, pin):
+def oracle(model: ArmModel, pin: ModuleType) -> Oracle:
     """Pinocchio's model of the document, its data, and the number of its frame tool0."""
     built = pin.buildModelFromXML(to_urdf(model))
     return built, built.createData(), built.getFrameId("tool0")
 
 
-def test_the_tool_pose_matches_pinocchio(model, oracle, pin):
+def test_the_tool_pose_matches_pinocchio(model: ArmModel, oracle: Oracle, pin: ModuleType) -> None:
     built, data, tool = oracle
     positions, rotations = forward_batch(model, CONFIGURATIONS)
     for row, position, rotation in zip(CONFIGURATIONS, positions, rotations, strict=True):
@@ -67,7 +62,7 @@ def test_the_tool_pose_matches_pinocchio(model, oracle, pin):
         assert np.abs(data.oMf[tool].rotation - rotation).max() < 1e-9
 
 
-def test_the_jacobian_matches_pinocchio(model, oracle, pin):
+def test_the_jacobian_matches_pinocchio(model: ArmModel, oracle: Oracle, pin: ModuleType) -> None:
     built, data, tool = oracle
     for row in CONFIGURATIONS:
         expected = pin.computeFrameJacobian(built, data, row, tool, pin.LOCAL_WORLD_ALIGNED)
@@ -76,7 +71,9 @@ def test_the_jacobian_matches_pinocchio(model, oracle, pin):
 
 @pytest.mark.parametrize("payload", [None, LinkMass(1.5, (0.02, -0.04, 0.07))])
 @pytest.mark.parametrize("gravity", [(0.0, 0.0, -9.80665), (4.0, -2.0, 8.0)])
-def test_the_gravity_torques_match_pinocchio(gravity, payload, model, oracle, pin):
+def test_the_gravity_torques_match_pinocchio(
+    gravity: Vector, payload: LinkMass | None, model: ArmModel, oracle: Oracle, pin: ModuleType
+) -> None:
     built, _, tool = oracle
     if payload is not None:
         frame = built.frames[tool]
@@ -89,7 +86,7 @@ def test_the_gravity_torques_match_pinocchio(gravity, payload, model, oracle, pi
         assert np.abs(expected - gravity_torques(model, row.tolist(), gravity, payload)).max() < 1e-9
 
 
-def test_pinocchio_reads_the_limits_of_the_model(model, pin):
+def test_pinocchio_reads_the_limits_of_the_model(model: ArmModel, pin: ModuleType) -> None:
     built = pin.buildModelFromXML(to_urdf(model, effort=[6.0, 5.0, 4.0, 3.0, 2.0, 1.0]))
     assert list(built.names[1:]) == list(model.joint_names)
     assert built.lowerPositionLimit.tolist() == [limit.lower for limit in model.limits]
@@ -100,31 +97,31 @@ def test_pinocchio_reads_the_limits_of_the_model(model, pin):
 
 def with_offsets(model: ArmModel) -> ArmModel:
     """A shoulder offset and a lateral offset, as in a PUMA, and a tool."""
-    return with_tool(with_row(with_row(model, 1, a=0.08), 2, d=0.12))
+    return arms.with_tool(arms.with_row(arms.with_row(model, 1, a=0.08), 2, d=0.12))
 
 
 @pytest.mark.parametrize("change", [replace, with_offsets], ids=["as it is", "with offsets and tool"])
-def test_eaik_finds_the_same_solutions(change, either):
+def test_eaik_finds_the_same_solutions(change: Change, either: ArmModel) -> None:
     eaik = pytest.importorskip("eaik.IK_Homogeneous")
     model = change(either)
     solver = InverseKinematics(model)
-    other = eaik.HomogeneousRobot(np.array([matrix(pose) for pose in frames(model, [0.0] * 6)]))
+    other = eaik.HomogeneousRobot(np.array([arms.matrix(pose) for pose in frames(model, [0.0] * 6)]))
     compared = 0
-    for pose in chain(model, random_configurations(model, COUNT, seed=7)):
-        ours = np.array([solution.q for solution in solver.solve(as_pose(pose)).solutions])
+    for pose in arms.chain(model, arms.random_configurations(model, COUNT, seed=7)):
+        ours = np.array([solution.q for solution in solver.solve(arms.as_pose(pose)).solutions])
         answer = other.IK(pose)
         theirs = np.array([q for q, is_approximate in zip(answer.Q, answer.is_LS, strict=True) if not is_approximate])
-        distance = wrapped_difference(ours[:, None], theirs[None])
+        distance = arms.wrapped_difference(ours[:, None], theirs[None])
         assert len(ours) == len(theirs)
         assert max(distance.min(axis=0).max(), distance.min(axis=1).max()) < 1e-9
         compared += len(theirs)
     assert compared > 4 * COUNT
 
 
-def test_coal_finds_the_same_distances_of_two_arms_and_of_boxes():
+def test_coal_finds_the_same_distances_of_two_arms_and_of_boxes() -> None:
     pytest.importorskip("coal")
-    found = compare(count(2000, 100_000))
-    assert found.overlapping > 30
-    assert found.in_boxes > 30
-    assert found.arms < 1e-6
-    assert found.boxes < 1e-6
+    differences = compare(arms.count(2000, 100_000))
+    assert differences.overlapping > 30
+    assert differences.in_boxes > 30
+    assert differences.arms < 1e-6
+    assert differences.boxes < 1e-6

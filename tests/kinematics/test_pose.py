@@ -19,83 +19,84 @@ poses = st.builds(Pose.from_xyzrpy, lengths, lengths, lengths, angles, angles, a
 
 def about(axis: int, angle: float) -> np.ndarray:
     s, c = np.sin(angle), np.cos(angle)
-    turn = np.eye(3)
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    turn[one, one] = turn[two, two] = c
-    turn[two, one], turn[one, two] = s, -s
-    return turn
+    rotation = np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    rotation[i, i] = rotation[j, j] = c
+    rotation[j, i], rotation[i, j] = s, -s
+    return rotation
 
 
 @given(angles, angles, angles)
-def test_the_rotation_is_rx_ry_rz_in_this_order(rx, ry, rz):
+def test_the_rotation_is_rx_ry_rz_in_this_order(rx: float, ry: float, rz: float) -> None:
     assert np.reshape(rotation_from_rpy(rx, ry, rz), (3, 3)) == pytest.approx(
         about(0, rx) @ about(1, ry) @ about(2, rz), abs=1e-15
     )
 
 
 @given(angles, angles, angles)
-def test_the_angles_of_a_rotation_reproduce_it(rx, ry, rz):
+def test_the_angles_of_a_rotation_reproduce_it(rx: float, ry: float, rz: float) -> None:
     rotation = rotation_from_rpy(rx, ry, rz)
     assert rotation_from_rpy(*rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-14)
 
 
 @given(angles, st.floats(-1.5, 1.5), angles)
-def test_angles_away_from_the_singular_orientations_are_recovered(rx, ry, rz):
-    found = rpy_from_rotation(rotation_from_rpy(rx, ry, rz))
-    error = [abs(np.remainder(a - b + pi, 2 * pi) - pi) for a, b in zip(found, (rx, ry, rz), strict=True)]
+def test_angles_away_from_the_singular_orientations_are_recovered(rx: float, ry: float, rz: float) -> None:
+    recovered = rpy_from_rotation(rotation_from_rpy(rx, ry, rz))
+    error = [abs(np.remainder(a - b + pi, 2 * pi) - pi) for a, b in zip(recovered, (rx, ry, rz), strict=True)]
     assert max(error) < 1e-13
 
 
 @given(angles, st.sampled_from([-1, 1]), st.floats(-12, -5), angles)
-def test_the_angles_of_a_rotation_beside_a_singular_one_reproduce_it(rx, side, exponent, rz):
+def test_the_angles_of_a_rotation_beside_a_singular_one_reproduce_it(
+    rx: float, side: float, exponent: float, rz: float
+) -> None:
     rotation = rotation_from_rpy(rx, side * (pi / 2 - 10**exponent), rz)
     assert rotation_from_rpy(*rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-14)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_in_a_singular_orientation_rz_is_zero_and_rx_is_the_whole_angle(side):
+def test_in_a_singular_orientation_rz_is_zero_and_rx_is_the_whole_angle(side: float) -> None:
     rx, ry, rz = rpy_from_rotation(rotation_from_rpy(0.4, side * pi / 2, 0.9))
     assert (rx, ry, rz) == (pytest.approx(0.4 + side * 0.9, abs=1e-15), pytest.approx(side * pi / 2), 0.0)
 
 
 @given(poses, poses)
-def test_poses_compose_as_their_matrices_do(one, other):
+def test_poses_compose_as_their_matrices_do(one: Pose, other: Pose) -> None:
     assert matrix(one @ other) == pytest.approx(matrix(one) @ matrix(other), abs=1e-14)
 
 
 @given(poses)
-def test_a_pose_times_its_inverse_is_the_identity(pose):
+def test_a_pose_times_its_inverse_is_the_identity(pose: Pose) -> None:
     assert matrix(pose @ pose.inverse()) == pytest.approx(np.eye(4), abs=1e-14)
     assert matrix(pose.inverse() @ pose) == pytest.approx(np.eye(4), abs=1e-14)
 
 
 @pytest.mark.parametrize("index", range(6))
 @pytest.mark.parametrize("value", [nan, inf, -inf])
-def test_a_value_that_is_not_finite_is_refused_by_name(index, value):
+def test_a_value_that_is_not_finite_is_refused_by_name(index: int, value: float) -> None:
     numbers = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     numbers[index] = value
     with pytest.raises(ValueError, match=f"^{('x', 'y', 'z', 'rx', 'ry', 'rz')[index]} is {value}"):
         Pose.from_xyzrpy(*numbers)
 
 
-def test_a_rotation_with_an_entry_that_is_not_finite_is_refused_by_its_place():
-    rotation = list(IDENTITY.rotation)
-    rotation[5] = nan
+def test_a_rotation_with_an_entry_that_is_not_finite_is_refused_by_its_place() -> None:
+    rotation = (*IDENTITY.rotation[:5], nan, *IDENTITY.rotation[6:])
     with pytest.raises(ValueError, match=r"rotation\[1\]\[2\] is nan"):
-        Pose((0.0, 0.0, 0.0), tuple(rotation)).require_finite()
+        Pose((0.0, 0.0, 0.0), rotation).require_finite()
 
 
 @given(poses)
-def test_rotations_have_no_orthonormality_error(pose):
+def test_rotations_have_no_orthonormality_error(pose: Pose) -> None:
     assert orthonormality_error(pose.rotation) < 1e-14
 
 
 @pytest.mark.parametrize("index", range(9))
-def test_a_change_of_any_entry_is_an_orthonormality_error(index):
-    rotation = list(rotation_from_rpy(0.3, 0.5, 0.7))
+def test_a_change_of_any_entry_is_an_orthonormality_error(index: int) -> None:
+    rotation = np.array(rotation_from_rpy(0.3, 0.5, 0.7))
     rotation[index] += 1e-3
-    assert orthonormality_error(tuple(rotation)) > 1e-4
+    assert orthonormality_error(tuple(rotation.tolist())) > 1e-4
 
 
-def test_a_reflection_is_no_rotation():
+def test_a_reflection_is_no_rotation() -> None:
     assert orthonormality_error((1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0)) == 2.0

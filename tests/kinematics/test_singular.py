@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import acos, atan2, hypot, pi, sin
 
 import numpy as np
@@ -32,7 +33,7 @@ def wrist_height_and_distance(model: ArmModel, q: list[float]) -> tuple[float, f
     return x, z - model.rows[0].d
 
 
-def beside(model: ArmModel, shape, kinds, distance: float, side: float) -> list[float]:
+def beside(model: ArmModel, shape: Sequence[float], kinds: set[str], distance: float, side: float) -> list[float]:
     """A configuration inside the limits at a distance (rad, or m from axis 1) from all named singularities."""
     q = [share * min(-limit.lower, limit.upper) for share, limit in zip(shape, model.limits, strict=True)]
     if "wrist" in kinds:
@@ -54,7 +55,7 @@ def beside(model: ArmModel, shape, kinds, distance: float, side: float) -> list[
     return q
 
 
-def tolerance(kinds, distance: float) -> float:
+def tolerance(kinds: set[str], distance: float) -> float:
     """How far (rad) the round-off of the pose, 1e-16, may move a solution at a distance from the named singularities.
 
     Distance from axis 1 divides it. At the edge of the workspace only the square of the bend is known: nearer than
@@ -72,33 +73,39 @@ def tolerance(kinds, distance: float) -> float:
 
 @settings(max_examples=count(60, 400))
 @given(shape=configurations, kinds=kinds, distance=distances, side=sides)
-def test_no_solution_is_missing_beside_singularities(shape, kinds, distance, side, either):
+def test_no_solution_is_missing_beside_singularities(
+    shape: Sequence[float], kinds: set[str], distance: float, side: float, either: ArmModel
+) -> None:
     q = beside(either, shape, kinds, distance, side)
     matrix = chain(either, np.array([q]))[0]
-    found = [solution.q for solution in InverseKinematics(either).solve(as_pose(matrix), q).solutions]
-    assert wrapped_difference(found, q).min() < tolerance(kinds, distance)
-    assert worst_error(either, matrix, found) < 1e-9
+    solved = [solution.q for solution in InverseKinematics(either).solve(as_pose(matrix), q).solutions]
+    assert wrapped_difference(solved, q).min() < tolerance(kinds, distance)
+    assert worst_error(either, matrix, solved) < 1e-9
 
 
 @settings(max_examples=count(30, 100))
-@given(shape=configurations, kinds=kinds, side=sides, held=st.floats(-1.0, 1.0))
-def test_on_a_singularity_the_free_joints_stay_and_it_is_named(shape, kinds, side, held, either):
+@given(shape=configurations, kinds=kinds, side=sides, free=st.floats(-1.0, 1.0))
+def test_on_a_singularity_the_free_joints_stay_and_it_is_named(
+    shape: Sequence[float], kinds: set[str], side: float, free: float, either: ArmModel
+) -> None:
     q = beside(either, shape, kinds, 0.0, side)
-    near = [held, q[1], q[2], -held, q[4], q[5]]
+    near = [free, q[1], q[2], -free, q[4], q[5]]
     solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0]), near).solutions
     named = [solution for solution in solutions if FLAGS["wrist"] in solution.singularity]
     if kinds <= {"wrist", "elbow"} and "wrist" in kinds:
         assert named
-        assert all(solution.q[3] == pytest.approx(-held, abs=1e-15) for solution in named)
+        assert all(solution.q[3] == pytest.approx(-free, abs=1e-15) for solution in named)
     if "shoulder" in kinds:
-        assert all(solution.q[0] == pytest.approx(held, abs=1e-15) for solution in solutions)
+        assert all(solution.q[0] == pytest.approx(free, abs=1e-15) for solution in solutions)
     for kind in {"shoulder", "elbow"} & kinds:
         assert all(FLAGS[kind] in solution.singularity for solution in solutions)
 
 
 @settings(max_examples=count(30, 100))
 @given(shape=configurations, kinds=kinds, side=sides)
-def test_a_thousandth_away_no_singularity_is_named_and_all_eight_solutions_are_found(shape, kinds, side, either):
+def test_a_thousandth_away_no_singularity_is_named_and_all_eight_solutions_are_found(
+    shape: Sequence[float], kinds: set[str], side: float, either: ArmModel
+) -> None:
     q = beside(either, shape, kinds, 1e-3, side)
     solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0])).solutions
     assert len(solutions) == 8
@@ -111,14 +118,16 @@ def test_a_thousandth_away_no_singularity_is_named_and_all_eight_solutions_are_f
     [({"elbow"}, 4), ({"shoulder"}, 4), ({"shoulder", "elbow"}, 2)],
     ids=["elbow", "shoulder", "both"],
 )
-def test_solutions_that_coincide_are_returned_once(kinds, count, either):
+def test_solutions_that_coincide_are_returned_once(kinds: set[str], count: int, either: ArmModel) -> None:
     q = beside(either, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), kinds, 0.0, 1.0)
     solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0]), q).solutions
     assert len(solutions) == count
 
 
 @pytest.mark.parametrize(("arm", "count"), [("assistive", 2), ("irb120", 1)])
-def test_both_wrist_solutions_coincide_where_the_forearm_points_along_axis_6(arm, count, request):
+def test_both_wrist_solutions_coincide_where_the_forearm_points_along_axis_6(
+    arm: str, count: int, request: pytest.FixtureRequest
+) -> None:
     # Without an elbow offset, half a turn of joint 1 and leaning back gives the same forearm.
     model = request.getfixturevalue(arm)
     q = beside(model, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), {"wrist"}, 0.0, 1.0)
@@ -127,7 +136,7 @@ def test_both_wrist_solutions_coincide_where_the_forearm_points_along_axis_6(arm
     assert len(solutions) == 8 - count
 
 
-def test_straight_up_has_one_solution_which_holds_joints_1_and_4(assistive):
+def test_straight_up_has_one_solution_which_holds_joints_1_and_4(assistive: ArmModel) -> None:
     near = [0.3, 0.1, -0.1, -0.8, 0.2, 0.9]
     (solution,) = InverseKinematics(assistive).solve(forward(assistive, [0.0] * 6), near).solutions
     assert solution.q == pytest.approx((0.3, 0.0, 0.0, -0.8, 0.0, 0.5), abs=1e-15)
@@ -141,7 +150,7 @@ def equal_lengths(model: ArmModel) -> ArmModel:
 
 
 @pytest.mark.parametrize("opened", [0.0, 5e-11, 1e-3])
-def test_with_the_wrist_centre_on_axis_2_joint_2_is_held(opened, assistive):
+def test_with_the_wrist_centre_on_axis_2_joint_2_is_held(opened: float, assistive: ArmModel) -> None:
     model = equal_lengths(assistive)
     folded = pi + stretched(model)
     q = [0.4, 0.7, folded - 2 * pi * round(folded / (2 * pi)) - opened, 0.3, 0.6, 0.1]
@@ -152,11 +161,11 @@ def test_with_the_wrist_centre_on_axis_2_joint_2_is_held(opened, assistive):
     assert solutions
     assert all((solution.q[1] == pytest.approx(0.9, abs=1e-15)) == is_held for solution in solutions)
     assert all((Singularity.ELBOW in solution.singularity) == is_held for solution in solutions)
-    assert all(forward(model, one.q).position == pytest.approx(pose.position, abs=1e-9) for one in solutions)
+    assert all(forward(model, own.q).position == pytest.approx(pose.position, abs=1e-9) for own in solutions)
 
 
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-7, 1e-5, 1e-3])
-def test_beside_the_tube_of_a_lateral_offset_no_solution_is_missing(distance, assistive):
+def test_beside_the_tube_of_a_lateral_offset_no_solution_is_missing(distance: float, assistive: ArmModel) -> None:
     model = with_row(assistive, 2, d=0.12)
     q = beside(assistive, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), {"shoulder"}, distance, 1.0)
     solutions = InverseKinematics(model).solve(as_pose(chain(model, np.array([q]))[0])).solutions

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from kinematics.forward import forward
-from kinematics.model import LinkMass
+from kinematics.model import ArmModel, LinkMass
 from kinematics.pose import IDENTITY
 from kinematics.urdf import UNKNOWN, fixed_axes_rpy, to_urdf
-from tests.kinematics.arms import with_general_rows, with_tool
+from tests.kinematics.arms import Change, with_general_rows, with_tool
 
 LINKS = tuple(LinkMass(0.1 * i, (0.01 * i, -0.02, 0.03)) for i in range(1, 7))
 
@@ -26,14 +26,13 @@ def read(element: ET.Element, name: str) -> list[float]:
 def transform(origin: ET.Element | None) -> np.ndarray:
     """By the format's definition: roll, pitch, yaw about fixed x, y, z, one after the other."""
     result = np.eye(4)
-    assert origin is not None
     roll, pitch, yaw = read(origin, "rpy")
     for axes, angle in (((1, 2), roll), ((2, 0), pitch), ((0, 1), yaw)):
-        turn = np.eye(3)
+        rotation = np.eye(3)
         i, j = axes
-        turn[i, i] = turn[j, j] = math.cos(angle)
-        turn[j, i], turn[i, j] = math.sin(angle), -math.sin(angle)
-        result[:3, :3] = turn @ result[:3, :3]
+        rotation[i, i] = rotation[j, j] = math.cos(angle)
+        rotation[j, i], rotation[i, j] = math.sin(angle), -math.sin(angle)
+        result[:3, :3] = rotation @ result[:3, :3]
     result[:3, 3] = read(origin, "xyz")
     return result
 
@@ -49,27 +48,27 @@ def tool_of_the_document(robot: ET.Element, q: list[float]) -> np.ndarray:
         if joint.get("type") == "revolute":
             assert read(joint.find("axis"), "xyz") == [0, 0, 1]
             angle = next(angles)
-            turn = np.eye(4)
-            turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-            result = result @ turn
+            rotation = np.eye(4)
+            rotation[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+            result = result @ rotation
         link = joint.find("child").get("link")
     assert link == "tool0"
     return result
 
 
 @pytest.mark.parametrize("change", [replace, with_tool, with_general_rows])
-def test_the_tool_pose_of_the_document_matches_the_model(change, either):
+def test_the_tool_pose_of_the_document_matches_the_model(change: Change, either: ArmModel) -> None:
     model = change(either)
     robot = ET.fromstring(to_urdf(model))
     numbers = random.Random(7)
     for _ in range(50):
         q = [numbers.uniform(-3.0, 3.0) for _ in range(6)]
-        found, expected = tool_of_the_document(robot, q), forward(model, q)
-        assert found[:3, 3] == pytest.approx(expected.position, abs=1e-13)
-        assert found[:3, :3].ravel() == pytest.approx(expected.rotation, abs=1e-13)
+        exported, expected = tool_of_the_document(robot, q), forward(model, q)
+        assert exported[:3, 3] == pytest.approx(expected.position, abs=1e-13)
+        assert exported[:3, :3].ravel() == pytest.approx(expected.rotation, abs=1e-13)
 
 
-def test_every_body_that_is_drawn_is_a_collision_body_too(irb120):
+def test_every_body_that_is_drawn_is_a_collision_body_too(irb120: ArmModel) -> None:
     for link in ET.fromstring(to_urdf(irb120)).findall("link"):
         drawn, solid = (
             [(body.find("origin").attrib, body.find("geometry/cylinder").attrib) for body in link.findall(use)]
@@ -79,7 +78,7 @@ def test_every_body_that_is_drawn_is_a_collision_body_too(irb120):
         assert drawn or link.get("name") == "tool0"
 
 
-def test_limits_are_exact(irb120):
+def test_limits_are_exact(irb120: ArmModel) -> None:
     joints = ET.fromstring(to_urdf(irb120, effort=[6.1, 5.0, 4.0, 3.0, 2.0, 1.0])).findall("joint[@type='revolute']")
     assert [joint.get("name") for joint in joints] == list(irb120.joint_names)
     for joint, limit, effort in zip(joints, irb120.limits, [6.1, 5.0, 4.0, 3.0, 2.0, 1.0], strict=True):
@@ -87,13 +86,13 @@ def test_limits_are_exact(irb120):
         assert written == {"lower": limit.lower, "upper": limit.upper, "velocity": limit.velocity, "effort": effort}
 
 
-def test_unknown_limits_are_large_finite_numbers(irb120):
+def test_unknown_limits_are_large_finite_numbers(irb120: ArmModel) -> None:
     limits = tuple(replace(limit, velocity=math.inf) for limit in irb120.limits)
     for limit in ET.fromstring(to_urdf(replace(irb120, limits=limits))).iter("limit"):
         assert (float(limit.get("velocity")), float(limit.get("effort"))) == (UNKNOWN, UNKNOWN)
 
 
-def test_masses_and_centres_match_the_model(assistive):
+def test_masses_and_centres_match_the_model(assistive: ArmModel) -> None:
     robot = ET.fromstring(to_urdf(replace(assistive, links=LINKS)))
     for number, body in enumerate(LINKS, start=1):
         inertial = robot.find(f"link[@name='link{number}']/inertial")
@@ -104,7 +103,7 @@ def test_masses_and_centres_match_the_model(assistive):
         assert inertia["ixy"] == inertia["ixz"] == inertia["iyz"] == 0.0
 
 
-def test_a_link_without_mass_has_no_inertial(assistive):
+def test_a_link_without_mass_has_no_inertial(assistive: ArmModel) -> None:
     assert ET.fromstring(to_urdf(replace(assistive, links=()))).find(".//inertial") is None
     links = (*LINKS[:3], LinkMass(0.0, (0.0, 0.0, 0.0)), *LINKS[4:])
     robot = ET.fromstring(to_urdf(replace(assistive, links=links)))
@@ -113,7 +112,7 @@ def test_a_link_without_mass_has_no_inertial(assistive):
 
 
 @pytest.mark.parametrize("change", [with_tool, with_general_rows])
-def test_the_drawn_links_connect_each_joint_to_the_next(change, irb120):
+def test_the_drawn_links_connect_each_joint_to_the_next(change: Change, irb120: ArmModel) -> None:
     robot = ET.fromstring(to_urdf(change(irb120)))
     for joint in robot.findall("joint"):
         corner = np.zeros(3)
@@ -128,7 +127,7 @@ def test_the_drawn_links_connect_each_joint_to_the_next(change, irb120):
         assert corner == pytest.approx(read(joint.find("origin"), "xyz"), abs=1e-3)
 
 
-def test_every_link_is_visible_without_meshes(assistive):
+def test_every_link_is_visible_without_meshes(assistive: ArmModel) -> None:
     robot = ET.fromstring(to_urdf(assistive))
     colours = {material.get("name") for material in robot.findall("material")}
     for link in robot.findall("link"):
@@ -138,13 +137,13 @@ def test_every_link_is_visible_without_meshes(assistive):
     assert robot.find(".//mesh") is None
 
 
-def test_a_name_with_markup_characters_is_escaped(assistive):
+def test_a_name_with_markup_characters_is_escaped(assistive: ArmModel) -> None:
     name = 'arm <1> & "2"'
     assert ET.fromstring(to_urdf(replace(assistive, name=name))).get("name") == name
 
 
 @pytest.mark.parametrize("pitch", [0.3, -1.2, math.pi / 2, -math.pi / 2, math.pi / 2 - 1e-9, -math.pi / 2 + 1e-12])
-def test_the_angles_reproduce_the_rotation_also_where_yaw_is_undefined(pitch):
+def test_the_angles_reproduce_the_rotation_also_where_yaw_is_undefined(pitch: float) -> None:
     numbers = random.Random(8)
     for _ in range(20):
         roll, yaw = numbers.uniform(-3.0, 3.0), numbers.uniform(-3.0, 3.0)
@@ -156,7 +155,7 @@ def test_the_angles_reproduce_the_rotation_also_where_yaw_is_undefined(pitch):
         assert transform(origin)[:3, :3] == pytest.approx(rotation, abs=1e-14)
 
 
-def test_the_identity_has_angles_of_zero():
+def test_the_identity_has_angles_of_zero() -> None:
     assert fixed_axes_rpy(IDENTITY.rotation) == (0.0, 0.0, 0.0)
 
 
@@ -164,6 +163,6 @@ def test_the_identity_has_angles_of_zero():
     ("effort", "reason"),
     [([1.0] * 5, "5 values"), ([1.0] * 5 + [math.nan], "joint6"), ([-1.0] + [1.0] * 5, "negative")],
 )
-def test_invalid_efforts_are_refused(effort, reason, assistive):
+def test_invalid_efforts_are_refused(effort: list[float], reason: str, assistive: ArmModel) -> None:
     with pytest.raises(ValueError, match=reason):
         to_urdf(assistive, effort=effort)

@@ -1,4 +1,4 @@
-"""The launcher beside other launchers: what an unclean end left, who waits for whom, what a new gateway gets."""
+"""The launcher beside other launchers: remains of an unclean end, waiting, and the start of a new gateway."""
 
 from __future__ import annotations
 
@@ -16,19 +16,11 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
+from rtcp.ipc import session
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import LockHeld, blackboard_file, control_socket, exclusive, stop_marker
 from rtcp.ipc.schema import arm_schema
-from rtcp.ipc.session import (
-    Pid,
-    Processes,
-    Session,
-    identify,
-    is_running,
-    read_processes,
-    session_file,
-)
 from rtcp.launch import launcher, platform
 from rtcp.launch.platform import Platform
 from tests.records import numbers
@@ -49,24 +41,24 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def other() -> Iterator[subprocess.Popen[bytes]]:
-    """A process of a platform that only has to live."""
+def sleeper() -> Iterator[subprocess.Popen[bytes]]:
+    """A process in place of one of a platform."""
     process = subprocess.Popen(["sleep", "600"])
     yield process
     process.kill()
     process.wait()
 
 
-def session_of(config: ArmConfig) -> Session:
-    return Session(config, "virtual", "ecat0", 0, 77)
+def session_of(config: ArmConfig) -> session.Session:
+    return session.Session(config, "virtual", "ecat0", 0, 77)
 
 
 @pytest.fixture
-def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]:
+def dead_loop(directory: Path, sleeper: subprocess.Popen[bytes]) -> Iterator[None]:
     """A platform whose loop (this process has its number) has ended uncleanly, and whose segment lives."""
     board = Blackboard(blackboard_file(directory), arm_schema(JOINTS), 500_000)
     board.publish(numbers(board.schema))
-    Processes(loop=Pid(os.getpid(), 1), segment=identify(other.pid)).write(directory)
+    session.Processes(loop=session.Pid(os.getpid(), 1), segment=session.identify(sleeper.pid)).write(directory)
     yield
     board.close()
     blackboard_file(directory).unlink(missing_ok=True)
@@ -74,84 +66,84 @@ def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]
 
 @pytest.mark.parametrize("wrong", ["session", "black box"])
 def test_the_files_of_an_unclean_end_are_removed_even_if_they_are_damaged(
-    directory: Path, dead_loop: None, other: subprocess.Popen[bytes], config: ArmConfig,
+    directory: Path, dead_loop: None, sleeper: subprocess.Popen[bytes], config: ArmConfig,
     monkeypatch: pytest.MonkeyPatch, wrong: str,
 ) -> None:  # fmt: skip
     if wrong == "session":
-        session_file(directory).write_text('{"version": "0.0.1"}')
+        session.session_file(directory).write_text('{"version": "0.0.1"}')
     else:
         session_of(config).write(directory)
-        monkeypatch.setattr(launcher, "BlackBox", lambda *given: given.nothing)
+        monkeypatch.setattr(launcher, "BlackBox", lambda *arguments: arguments.nothing)
     sockets = [directory / "segment.sock", directory / "segment-7.sock"]
     for path in sockets:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
-            left.bind(str(path))
-    told: list[str] = []
-    left_over = launcher.stop(told.append)
-    said = "had ended before, and not in order: its drives were left to their watchdog"
-    assert left_over == (f"the loop (process {os.getpid()}) {said}",)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stale_socket:
+            stale_socket.bind(str(path))
+    reports: list[str] = []
+    left_over = launcher.stop(reports.append)
+    sentence = "had ended before, and not in order: its drives were left to their watchdog"
+    assert left_over == (f"the loop (process {os.getpid()}) {sentence}",)
     assert not any(path.exists() for path in sockets)
-    assert len(told) == 1
-    assert f"the end of the loop (process {os.getpid()}) was not recorded" in told[0]
-    assert ("another version" if wrong == "session" else "AttributeError") in told[0]
-    assert other.wait(timeout=60) == -signal.SIGTERM
+    assert len(reports) == 1
+    assert f"the end of the loop (process {os.getpid()}) was not recorded" in reports[0]
+    assert ("another version" if wrong == "session" else "AttributeError") in reports[0]
+    assert sleeper.wait(timeout=60) == -signal.SIGTERM
     assert not blackboard_file(directory).exists()
-    assert read_processes(directory) == Processes()
+    assert session.read_processes(directory) == session.Processes()
 
 
-def test_a_stop_waits_for_the_lock(directory: Path, other: subprocess.Popen[bytes]) -> None:
-    Processes(segment=identify(other.pid)).write(directory)
-    told: list[str] = []
-    stopper = threading.Thread(target=launcher.stop, args=(told.append,))
+def test_a_stop_waits_for_the_lock(directory: Path, sleeper: subprocess.Popen[bytes]) -> None:
+    session.Processes(segment=session.identify(sleeper.pid)).write(directory)
+    reports: list[str] = []
+    stopper = threading.Thread(target=launcher.stop, args=(reports.append,))
     with exclusive(directory):
         stopper.start()
         time.sleep(0.3)
-        assert other.poll() is None
-        assert told == ["another process starts or stops the platform: waiting for it, at most 30 s"]
+        assert sleeper.poll() is None
+        assert reports == ["another process starts or stops the platform: waiting for it, at most 30 s"]
     stopper.join()
-    assert other.wait(timeout=60) == -signal.SIGTERM
+    assert sleeper.wait(timeout=60) == -signal.SIGTERM
 
 
 def test_a_stop_does_not_wait_long_for_a_gateway_that_hangs(
-    directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
+    directory: Path, sleeper: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "_ANSWER_TIMEOUT_S", 0.2)
     gateway = subprocess.Popen(["sleep", "600"])
-    Processes(loop=identify(other.pid), gateway=identify(gateway.pid)).write(directory)
-    told: list[tuple[str, int | None]] = []
+    session.Processes(loop=session.identify(sleeper.pid), gateway=session.identify(gateway.pid)).write(directory)
+    reports: list[tuple[str, int | None]] = []
     began_s = time.monotonic()
-    # As one that is stopped: the kernel takes the connection, nobody the request.
+    # As of a stopped process: the kernel accepts the connection, and the request is not read.
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(str(control_socket(directory)))
         listener.listen()
-        launcher.stop(lambda said: told.append((said, other.poll())))
-    ended_by = other.wait(), gateway.wait()
-    # Well under the 20 s that one is given that answers.
+        launcher.stop(lambda text: reports.append((text, sleeper.poll())))
+    ended_by = sleeper.wait(), gateway.wait()
+    # Far below the 20 s for one that answers.
     assert time.monotonic() - began_s < 10
-    said = "the gateway did not stop the platform: it has not answered for 0.2 s; its processes are ended one by one"
-    assert told == [(said, None)]
+    why = "the gateway did not stop the platform: it has not answered for 0.2 s; its processes are ended one by one"
+    assert reports == [(why, None)]
     assert ended_by == (-signal.SIGTERM, -signal.SIGTERM)
 
 
 def test_a_stop_that_does_not_get_the_lock_is_refused_and_has_done_nothing(
-    directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
+    directory: Path, sleeper: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(launcher, "STOP_TIMEOUT_S", 0.1)
-    Processes(segment=identify(other.pid)).write(directory)
+    session.Processes(segment=session.identify(sleeper.pid)).write(directory)
     with exclusive(directory), pytest.raises(RtcpError, match=r"another process starts or stops .* has done nothing"):
         launcher.stop(print)
-    assert other.poll() is None
+    assert sleeper.poll() is None
 
 
 class Replacement:
-    """A gateway that is being started for a loop (this process) and is held up before it is ready."""
+    """A gateway that is starting for a loop (this process) and blocked before it is ready."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self.ended: list[object] = []
         self._thread = threading.Thread(target=self._replace)
         self._thread.start()
-        while not (gateway := read_processes(directory).gateway):
+        while not (gateway := session.read_processes(directory).gateway):
             time.sleep(0.002)
         self.gateway = gateway
         os.kill(gateway, signal.SIGSTOP)
@@ -170,12 +162,12 @@ class Replacement:
 @pytest.fixture
 def replacement(directory: Path, config: ArmConfig) -> Iterator[Replacement]:
     session_of(config).write(directory)
-    Processes(loop=identify(os.getpid())).write(directory)
-    made = Replacement(directory)
-    yield made
-    if is_running(made.gateway):
-        os.kill(made.gateway, signal.SIGKILL)
-    made.until_ended()
+    session.Processes(loop=session.identify(os.getpid())).write(directory)
+    started = Replacement(directory)
+    yield started
+    if session.is_running(started.gateway):
+        os.kill(started.gateway, signal.SIGKILL)
+    started.until_ended()
 
 
 def test_the_lock_is_free_while_a_new_gateway_is_waited_for(directory: Path, replacement: Replacement) -> None:
@@ -188,7 +180,7 @@ def test_the_lock_is_free_while_a_new_gateway_is_waited_for(directory: Path, rep
             assert time.monotonic() < until, "the lock is held until the gateway is ready"
             time.sleep(0.01)
     assert replacement.ended == []
-    # A gateway that is already on its way is nobody else's to start.
+    # While a gateway is starting no other launcher starts one.
     assert launcher.replace_gateway(directory) == 0
     os.kill(replacement.gateway, signal.SIGKILL)
     assert f"the gateway (process {replacement.gateway}) ended with code -9" in str(replacement.until_ended())
@@ -201,7 +193,7 @@ def test_a_gateway_that_a_stop_ends_while_it_starts_is_no_error(directory: Path,
 
 
 def test_a_new_gateway_gets_the_state_directory_of_the_start(directory: Path, config: ArmConfig) -> None:
-    running = Platform(directory, config, Processes(), directory / "of the start")
+    running = Platform(directory, config, session.Processes(), directory / "of the start")
     os.close(running.begin_gateway())
     (child,) = running._children
     try:
@@ -216,7 +208,7 @@ def test_a_new_gateway_gets_the_state_directory_of_the_start(directory: Path, co
 def test_a_gateway_whose_pipe_closes_before_it_exits_is_reported_with_its_exit_code(
     directory: Path, config: ArmConfig
 ) -> None:
-    running = Platform(directory, config, Processes())
+    running = Platform(directory, config, session.Processes())
     running._children.append(subprocess.Popen(["sh", "-c", "sleep 0.2; exit 7"]))
     reading, writing = os.pipe()
     os.close(writing)
@@ -230,6 +222,6 @@ def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmCo
     (directory / "gateway.log.1").write_text("long ago")
     broken = replace(config, bus=replace(config.bus, interface="nosuch0"))
     with pytest.raises(RtcpError):
-        launcher._start_all(directory, broken, launcher.StartOptions(), 0, lambda said: None)
+        launcher._start_all(directory, broken, launcher.StartOptions(), 0, lambda text: None)
     assert (directory / "loop.log.1").read_text() == "what went wrong"
     assert (directory / "gateway.log.1").read_text() == "who asked"

@@ -1,4 +1,4 @@
-"""What systemd receives of a platform (sd_notify(3)), over a real datagram socket."""
+"""Notifications of a platform to systemd (sd_notify(3)), over a real datagram socket."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tests.records import numbers
 
 JOINTS = 6
 AT_ONCE = 1e-6
-"""A watchdog interval, s, for which a ping is due at every look."""
+"""A watchdog interval, s, for which a ping is due at every poll."""
 
 
 class Cycle:
-    """A blackboard and what a loop would publish on it."""
+    """A blackboard, on which a test publishes as a loop."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -33,19 +33,19 @@ class Cycle:
 
 @pytest.fixture
 def cycle() -> Iterator[Cycle]:
-    made = Cycle(Path(f"/dev/shm/rtcp-test-notifier-{os.getpid()}"))
-    yield made
-    made.board.close()
-    made.path.unlink()
+    published = Cycle(Path(f"/dev/shm/rtcp-test-notifier-{os.getpid()}"))
+    yield published
+    published.board.close()
+    published.path.unlink()
 
 
 @pytest.fixture
 def manager(tmp_path: Path) -> Iterator[socket.socket]:
     """The service manager's end."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as made:
-        made.bind(str(tmp_path / "notify"))
-        made.setblocking(False)
-        yield made
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(tmp_path / "notify"))
+        receiver.setblocking(False)
+        yield receiver
 
 
 def received(manager: socket.socket) -> list[str]:
@@ -59,14 +59,14 @@ def received(manager: socket.socket) -> list[str]:
 
 def test_a_ping_is_sent_only_after_the_cycle_has_published_a_record(cycle: Cycle, manager: socket.socket) -> None:
     notifier = Notifier(cycle.path, manager.getsockname(), AT_ONCE)
-    notifier.look()
+    notifier.poll()
     assert received(manager) == []
     cycle.publish()
-    notifier.look()
-    notifier.look()
+    notifier.poll()
+    notifier.poll()
     assert received(manager) == ["STATUS=ready", "WATCHDOG=1"]
     cycle.publish(State.STOPPED_BY_LIMIT)
-    notifier.look()
+    notifier.poll()
     assert received(manager) == ["STATUS=stopped by limit", "WATCHDOG=1"]
     notifier.close()
 
@@ -75,7 +75,7 @@ def test_a_ping_is_sent_three_times_a_watchdog_interval_at_most(cycle: Cycle, ma
     notifier = Notifier(cycle.path, manager.getsockname(), 3000.0)
     notifier.ready()
     cycle.publish()
-    notifier.look()
+    notifier.poll()
     assert received(manager) == ["READY=1", "STATUS=ready"]
     notifier.close()
 
@@ -93,7 +93,7 @@ def test_an_abstract_address_begins_with_an_at_sign(cycle: Cycle) -> None:
 
 def test_without_a_blackboard_no_ping_is_sent(tmp_path: Path, manager: socket.socket) -> None:
     notifier = Notifier(tmp_path / "none", manager.getsockname(), AT_ONCE)
-    notifier.look()
+    notifier.poll()
     notifier.stopping("the loop has ended")
     assert received(manager) == ["STOPPING=1\nSTATUS=the loop has ended"]
     notifier.close()
@@ -107,7 +107,7 @@ def test_a_manager_that_is_gone_or_was_never_there_is_no_error(
     notifier = Notifier(cycle.path, str(tmp_path / "nobody"), AT_ONCE) if gone else Notifier.of_environment(cycle.path)
     cycle.publish()
     notifier.ready()
-    notifier.look()
+    notifier.poll()
     notifier.stopping("stopping")
     notifier.close()
 
@@ -131,6 +131,6 @@ def test_the_environment_selects_the_process_that_sends_pings(
         monkeypatch.setenv(name, value)
     cycle.publish()
     notifier = Notifier.of_environment(cycle.path)
-    notifier.look()
+    notifier.poll()
     assert received(manager).count("WATCHDOG=1") == pings
     notifier.close()

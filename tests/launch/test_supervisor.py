@@ -1,4 +1,4 @@
-"""The gateway of a platform is restarted when it has ended; here each one ends at once, since it finds no session."""
+"""The supervisor restarts a gateway that has ended; here each ends at once, as it finds no session."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rtcp.launch.supervisor import GatewaySupervisor
 
 
 class Supervised:
-    """A platform of which this process plays the loop, and what its supervisor reports."""
+    """A platform with this process as its loop, and the reports of its supervisor."""
 
     def __init__(self, directory: Path) -> None:
         self.reports: list[str] = []
@@ -30,11 +30,11 @@ class Supervised:
         self.platform.processes.write(directory)
         self.supervisor = GatewaySupervisor(self.platform, self.reports.append)
 
-    def look_until(self, met: Callable[[], bool]) -> None:
+    def poll_until(self, met: Callable[[], bool]) -> None:
         end = time.monotonic() + 60
         while not met():
             assert time.monotonic() < end, self.reports
-            self.supervisor.look()
+            self.supervisor.poll()
             time.sleep(0.01)
 
     @property
@@ -45,10 +45,10 @@ class Supervised:
 @pytest.fixture
 def supervised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Supervised]:
     monkeypatch.setattr(supervisor, "STARTS", 2)
-    made = Supervised(tmp_path)
-    yield made
-    made.supervisor.close()
-    for child in made.platform._children:
+    supervised_platform = Supervised(tmp_path)
+    yield supervised_platform
+    supervised_platform.supervisor.close()
+    for child in supervised_platform.platform._children:
         child.kill()
         child.wait()
 
@@ -56,9 +56,9 @@ def supervised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Supe
 def test_a_gateway_that_ends_again_and_again_is_restarted_up_to_the_limit_and_its_log_keeps_every_end(
     supervised: Supervised, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    supervised.look_until(lambda: "tried again" in (supervised.reports or [""])[-1])
+    supervised.poll_until(lambda: "tried again" in (supervised.reports or [""])[-1])
     for _ in range(3):
-        supervised.supervisor.look()
+        supervised.supervisor.poll()
     assert supervised.starts == 2
     assert len(supervised.reports) == 3
     assert supervised.reports[0] == f"the gateway (process {1 << 22}) has ended: it is restarted"
@@ -67,11 +67,11 @@ def test_a_gateway_that_ends_again_and_again_is_restarted_up_to_the_limit_and_it
     assert (tmp_path / "gateway.log").read_text().count("No such file") == 2
     # The minute has passed.
     monkeypatch.setattr(supervisor, "WINDOW_S", 0.0)
-    supervised.look_until(lambda: supervised.starts == 3)
+    supervised.poll_until(lambda: supervised.starts == 3)
 
 
 def test_the_new_gateway_is_written_to_the_file_of_processes(supervised: Supervised, tmp_path: Path) -> None:
-    supervised.supervisor.look()
+    supervised.supervisor.poll()
     written = read_processes(tmp_path)
     assert written.loop == os.getpid()
     assert written.gateway == supervised.platform.processes.gateway
@@ -80,23 +80,23 @@ def test_the_new_gateway_is_written_to_the_file_of_processes(supervised: Supervi
 
 def test_no_gateway_is_started_while_another_process_holds_the_lock(supervised: Supervised, tmp_path: Path) -> None:
     with exclusive(tmp_path):
-        supervised.supervisor.look()
+        supervised.supervisor.poll()
         with pytest.raises(LockHeld), exclusive(tmp_path):
             pass
     assert supervised.reports == []
-    supervised.supervisor.look()
+    supervised.supervisor.poll()
     assert supervised.starts == 1
 
 
 def test_no_gateway_is_started_while_the_platform_is_being_stopped(supervised: Supervised, tmp_path: Path) -> None:
     stop_marker(tmp_path).touch()
-    supervised.supervisor.look()
+    supervised.supervisor.poll()
     assert supervised.reports == []
 
 
 def test_a_gateway_that_a_command_has_started_meanwhile_is_supervised(supervised: Supervised, tmp_path: Path) -> None:
     Processes(loop=supervised.platform.processes.loop, gateway=identify(os.getpid())).write(tmp_path)
-    supervised.supervisor.look()
+    supervised.supervisor.poll()
     assert supervised.reports == []
     assert supervised.platform.processes.gateway == os.getpid()
 
@@ -105,15 +105,15 @@ def open_files() -> set[str]:
     return set(os.listdir("/proc/self/fd"))
 
 
-@pytest.mark.parametrize("what", ["gateway.log", "processes.new"])
+@pytest.mark.parametrize("file", ["gateway.log", "processes.new"])
 def test_a_gateway_that_cannot_be_started_is_reported_once_and_counts_as_a_start(
-    supervised: Supervised, tmp_path: Path, what: str
+    supervised: Supervised, tmp_path: Path, file: str
 ) -> None:
-    # A directory in the place of a file stands for a disk that refuses to write.
-    (tmp_path / what).mkdir()
+    # A directory in the place of the file makes every write fail, as a full disk does.
+    (tmp_path / file).mkdir()
     before = open_files()
     for _ in range(5):
-        supervised.supervisor.look()
+        supervised.supervisor.poll()
     assert [sentence.partition(":")[0] for sentence in supervised.reports] == [
         "the gateway cannot be restarted",
         f"the gateway (process {1 << 22}) has ended, 2 times within 60 s",
@@ -125,9 +125,9 @@ def test_a_gateway_that_cannot_be_started_is_reported_once_and_counts_as_a_start
         supervised.platform._children
     )
     # It is tried again when the minute has passed.
-    (tmp_path / what).rmdir()
+    (tmp_path / file).rmdir()
     supervised.supervisor._starts.clear()
-    supervised.supervisor.look()
+    supervised.supervisor.poll()
     assert supervised.starts == 1
 
 
@@ -135,7 +135,7 @@ def test_a_launcher_without_free_file_descriptors_goes_on(supervised: Supervised
     allowed = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, allowed[1]))
     try:
-        supervised.supervisor.look()
+        supervised.supervisor.poll()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, allowed)
     assert "Too many open files" in supervised.reports[0]
@@ -146,5 +146,5 @@ def test_a_signal_without_a_name_is_reported_by_its_number(supervised: Supervise
     supervised.platform._children.append(child)
     supervised.platform.processes.gateway = identify(child.pid)
     child.send_signal(40)
-    supervised.look_until(lambda: supervised.reports != [])
+    supervised.poll_until(lambda: supervised.reports != [])
     assert f"the gateway (process {child.pid}) has ended by signal 40: it is restarted" in supervised.reports[0]

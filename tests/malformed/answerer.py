@@ -27,14 +27,14 @@ from rtcp.virtual.segment import make_segment
 from tests.malformed.mutate import garbled, shape
 
 ORDER = b"\xff" * 6 + b"\x02" * 6 + ETHERTYPE.to_bytes(2, "big") + b"\x00\xf0"
-"""What an order begins with: an EtherCAT header of type 15. Behind it a JSON object, padded with spaces."""
+"""Beginning of an order: an EtherCAT header of type 15; a JSON object padded with spaces follows."""
 FRAME_NS = 100_000
 QUIET_NS = 100_000
 QUIET_S = 0.001
 
 
 def ask(interface: str, **order: object) -> dict[str, object]:
-    """Give the answerer on the other end an order; return its answer.
+    """Send an order to the answerer on the other end; return its answer.
 
     `garble` and `hide` give the shares of answers that are mutated and that never come; `keep` is a file into which
     the frames that came are written, one of each kind.
@@ -63,7 +63,7 @@ class Answerer:
         self._buffer = bytearray(2048)
 
     def take(self) -> None:
-        """Take the frame that waits."""
+        """Receive the waiting frame."""
         self._now += FRAME_NS
         buffer, segment = self._buffer, self._segment
         size = self._port.recv_into(buffer)
@@ -92,7 +92,7 @@ class Answerer:
         self._port.send(b"\xfe" * 6 + ORDER[6:] + counts.ljust(60))
 
     def work(self, quiet: bool) -> None:
-        """Let happen what time brings."""
+        """Run the events that are due."""
         segment = self._segment
         self._now += QUIET_NS if quiet else 0
         while segment.next_event <= self._now:
@@ -109,8 +109,9 @@ def main() -> None:
         port.bind((own, ETHERTYPE))
         answerer = Answerer(Path(sys.argv[1]), int(sys.argv[2]), port)
         print(json.dumps({"pid": os.getpid()}), flush=True)
+        sources: list[socket.socket | int] = [port, 0]
         while True:
-            ready, _, _ = select.select([port, 0], [], [], QUIET_S)
+            ready, _, _ = select.select(sources, [], [], QUIET_S)
             if 0 in ready:
                 return
             if port in ready:

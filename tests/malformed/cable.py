@@ -34,13 +34,13 @@ def answerer(seed: int) -> Iterator[int]:
 
 
 def master(pid: int, scenario: str, amount: int, *further: str) -> subprocess.CompletedProcess[str]:
-    """Let a master play a scenario of master_child.py against the answerer `pid`."""
+    """Run a scenario of master_child.py against the answerer `pid`."""
     command = [sys.executable, str(HERE / "master_child.py"), str(pid), scenario, str(amount), *further]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def report_of(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
-    """Return what a master said; assert that it came to its end."""
+    """Return the report of a master; assert that it ended normally."""
     assert done.returncode == 0, f"ended with {done.returncode}: {done.stderr[-3000:]}"
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report

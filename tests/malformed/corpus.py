@@ -21,7 +21,7 @@ def frames() -> list[bytes]:
 
 
 def record() -> list[str]:
-    """Let a master live its life and return the frames that it sent."""
+    """Run a master from the scan to the end; return the frames that it sent."""
     with tempfile.TemporaryDirectory() as folder, answerer(1) as pid:
         kept = Path(folder) / "frames"
         report_of(master(pid, "record", 200, str(kept)))

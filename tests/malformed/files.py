@@ -1,4 +1,4 @@
-"""Files that are nearly right: cut, damaged, and with values in them that nobody meant."""
+"""Damaged files: cut, with changed bytes, and with other values."""
 
 from __future__ import annotations
 
@@ -14,61 +14,61 @@ WORDS = (
 
 def damaged(content: bytes, random: Random) -> bytes:
     """Return a file's content with one to three mutations."""
-    found = bytearray(content)
+    mutant = bytearray(content)
     for _ in range(random.choice((1, 1, 2, 3))):
-        _MUTATIONS[random.randrange(len(_MUTATIONS))](found, random)
-    return bytes(found)
+        _MUTATIONS[random.randrange(len(_MUTATIONS))](mutant, random)
+    return bytes(mutant)
 
 
-def _cut(found: bytearray, random: Random) -> None:
-    del found[random.randrange(len(found) + 1) :]
+def _cut(content: bytearray, random: Random) -> None:
+    del content[random.randrange(len(content) + 1) :]
 
 
-def _flip(found: bytearray, random: Random) -> None:
+def _flip(content: bytearray, random: Random) -> None:
     for _ in range(random.randrange(1, 5)):
-        if found:
-            found[random.randrange(len(found))] ^= 1 << random.randrange(8)
+        if content:
+            content[random.randrange(len(content))] ^= 1 << random.randrange(8)
 
 
-def _noise(found: bytearray, random: Random) -> None:
-    at = random.randrange(len(found) + 1)
-    found[at : at + random.randrange(30)] = random.randbytes(random.randrange(30))
+def _noise(content: bytearray, random: Random) -> None:
+    at = random.randrange(len(content) + 1)
+    content[at : at + random.randrange(30)] = random.randbytes(random.randrange(30))
 
 
-def _line(found: bytearray, random: Random) -> None:
-    """Take a line out, or put it in again elsewhere, once or often."""
-    lines = found.splitlines(keepends=True)
+def _line(content: bytearray, random: Random) -> None:
+    """Remove a line, or insert it elsewhere, once or often."""
+    lines = content.splitlines(keepends=True)
     if lines:
         line = lines.pop(random.randrange(len(lines)))
         for _ in range(random.choice((0, 0, 1, 2, 50))):
             lines.insert(random.randrange(len(lines) + 1), line)
-    found[:] = b"".join(lines)
+    content[:] = b"".join(lines)
 
 
-def _indent(found: bytearray, random: Random) -> None:
-    lines = found.splitlines(keepends=True)
+def _indent(content: bytearray, random: Random) -> None:
+    lines = content.splitlines(keepends=True)
     if lines:
         at = random.randrange(len(lines))
-        lines[at] = random.choice((b"  ", b"\t", b" ", b"- ")) + lines[at]
-    found[:] = b"".join(lines)
+        lines[at][:0] = random.choice((b"  ", b"\t", b" ", b"- "))
+    content[:] = b"".join(lines)
 
 
-def _value(found: bytearray, random: Random) -> None:
+def _value(content: bytearray, random: Random) -> None:
     """Another value behind a colon or a comma, or in place of a number."""
-    places = [at for at, byte in enumerate(found) if byte in b":,[{="]
+    places = [at for at, byte in enumerate(content) if byte in b":,[{="]
     if places:
         at = random.choice(places) + 1
         end = at
-        while end < len(found) and found[end] not in b",]}\n#":
+        while end < len(content) and content[end] not in b",]}\n#":
             end += 1
-        found[at:end] = b" " + random.choice(WORDS)
+        content[at:end] = b" " + random.choice(WORDS)
 
 
-def _key(found: bytearray, random: Random) -> None:
-    places = [at for at, byte in enumerate(found) if byte in b":"]
+def _key(content: bytearray, random: Random) -> None:
+    places = [at for at, byte in enumerate(content) if byte in b":"]
     if places:
         at = random.choice(places)
-        found[at:at] = random.choice((b"x", b"_", b" ", b"0", b"\xff"))
+        content[at:at] = random.choice((b"x", b"_", b" ", b"0", b"\xff"))
 
 
 _MUTATIONS = (_cut, _flip, _noise, _line, _indent, _value, _value, _value, _value, _key)

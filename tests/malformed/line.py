@@ -16,7 +16,7 @@ INIT, PRE_OP, SAFE_OP, OP, ACK = 1, 2, 4, 8, 0x10
 FRAME_NS = 100_000
 PERIOD_NS = 1_000_000
 MOST_TICKS = 500
-"""Looks of the segment at itself between two frames; more would keep it from answering the next."""
+"""Most steps of the segment between two frames; more would delay the next answer."""
 SIZES = ((2, 6), *((15, 15),) * 6)
 """Bytes of outputs and inputs of each slave."""
 RX = (0x60400010, 0x607A0020, 0x60FF0020, 0x60710020, 0x60600008)
@@ -31,7 +31,7 @@ _IMAGE_IN = sum(in_ for _, in_ in SIZES)
 
 
 class Line:
-    """A segment, the time, and what a sane master does to it."""
+    """A segment in simulated time, and the steps of a sane master."""
 
     def __init__(self) -> None:
         self.now = 1_000_000_000
@@ -41,15 +41,15 @@ class Line:
 
     @property
     def states(self) -> list[int]:
-        """What AL status of each slave says, error bit included."""
+        """AL status of each slave, error bit included."""
         return [slave.esc.memory[0x0130] for slave in self.segment.slaves]
 
     def targets(self) -> list[bytes]:
-        """The outputs that each slave holds."""
+        """Present outputs of each slave."""
         return [bytes(slave.esc.sync_managers[2].buffer) for slave in self.segment.slaves]
 
     def give(self, frame: bytes | bytearray, after: int = FRAME_NS) -> bytes | None:
-        """Give the segment a frame as its server does; return what goes back, None if nothing."""
+        """Send the segment a frame as its server does; return the answer, None without one."""
         self.pass_time(after)
         size = len(frame)
         self.buffer[:size] = frame
@@ -59,7 +59,7 @@ class Line:
         return answer
 
     def pass_time(self, ns: int) -> None:
-        """Let time pass, with every event at its instant, and every device that waits for it stepped."""
+        """Let time pass: run every event at its instant, and step every device that is due."""
         segment, until = self.segment, self.now + ns
         turns = 0
         while segment.next_event <= until:
@@ -90,7 +90,7 @@ class Line:
         return answer.data
 
     def request(self, state: int) -> None:
-        """Ask all slaves for a state; assert that they take it."""
+        """Request a state of all slaves; assert that they reach it."""
         self.write_all(0x0120, bytes((state, 0)))
         for _ in range(100):
             if self.states == [state & ~ACK] * len(SIZES):
@@ -100,7 +100,7 @@ class Line:
         raise AssertionError(f"the slaves do not go to {state}: {codes}")
 
     def download(self, slave: int, index: int, subindex: int, value: int, size: int) -> None:
-        """Write an object, expedited; assert that it is taken."""
+        """Write an object, expedited; assert that it is accepted."""
         self._counter = self._counter % 7 + 1
         command = 0x23 | (4 - size) << 2
         message = _SDO.pack(10, 0, 0, self._counter << 4 | 3, 2 << 12, command, index, subindex, value)
@@ -114,7 +114,7 @@ class Line:
         raise AssertionError(f"slave {slave} does not answer the download of 0x{index:04X}:{subindex}")
 
     def reset(self) -> None:
-        """What SOEM does first: INIT, and nothing left of what the last master set."""
+        """The first steps of SOEM: INIT, and all settings of the last master cleared."""
         topology = self.segment.topology
         if len(topology.reached) < len(SIZES) or not topology.returns:
             # A mutated frame closed or opened a port: no frame of a master opens port 0 again, the supply does.
@@ -129,15 +129,13 @@ class Line:
             (0x0500, b"\x00\x00"), (0x0981, bytes(1)), (0x0920, bytes(12)), (0x0930, b"\x00\x10"),
         ):  # fmt: skip
             self.write_all(offset, data)
-        for slave in range(len(SIZES)):
-            assert (
-                self.ask(DatagramCommand.APWR, -slave & 0xFFFF, 0x0010, (STATION + slave).to_bytes(2, "little")).counter
-                == 1
-            )
+        for position in range(len(SIZES)):
+            station = (STATION + position).to_bytes(2, "little")
+            assert self.ask(DatagramCommand.APWR, -position & 0xFFFF, 0x0010, station).counter == 1
         self.request(INIT | ACK)
 
     def start(self, state: int) -> None:
-        """Lead all slaves from wherever they are to `state`."""
+        """Bring all slaves from any state to `state`."""
         self.reset()
         if state == INIT:
             return

@@ -54,7 +54,7 @@ def to_op(bus: SoemBus) -> SoemProcessData:
 
 
 def recovered(data: SoemProcessData) -> bool:
-    """Whether ten answers come as they should, and none otherwise between them; a busy machine may lose some."""
+    """Whether ten right answers come without a wrong one between them; a busy machine may lose some."""
     good = 0
     until = time.monotonic() + PATIENCE_S
     while good < 10 and time.monotonic() < until:
@@ -67,7 +67,7 @@ def recovered(data: SoemProcessData) -> bool:
 
 
 def record(bus: SoemBus, amount: int) -> dict[str, Any]:
-    """All that a master does in a short life."""
+    """Run a master from the scan to the end."""
     bus.scan()
     data = to_op(bus)
     for _ in range(amount):
@@ -75,27 +75,27 @@ def record(bus: SoemBus, amount: int) -> dict[str, Any]:
         data.receive()
     bus.read_states()
     bus.emergencies()
-    bus.sdo_read(2, 0x1008, 0)
-    bus.sdo_write(2, 0x6065, 0, (2000).to_bytes(4, "little"))
+    bus.sdo(2).read(0x1008, 0)
+    bus.sdo(2).write(0x6065, 0, (2000).to_bytes(4, "little"))
     bus.port.read(station_of(2), 0x0300, 20)
     bus.port.write_all(0x0300, bytes(20))
     return {}
 
 
 def exchange(bus: SoemBus, amount: int) -> dict[str, Any]:
-    """Exchange process data as fast as it goes, every second answer mutated and a few lost."""
+    """Exchange process data at full speed, every second answer mutated and a few lost."""
     data = to_op(bus)
     before = ask(INTERFACE, garble=0.5, hide=0.01)
     counters: Counter[str] = Counter()
     lengths = [len(data.input(at)) for at in range(len(SLAVES))]
-    began, held = time.monotonic(), resident_kb()
-    for turn in range(amount):
-        data.set_output(turn % len(SLAVES), bytes(len(data.input(0))))
+    began, memory_kb = time.monotonic(), resident_kb()
+    for number in range(amount):
+        data.set_output(number % len(SLAVES), bytes(len(data.input(0))))
         data.send()
         wkc = data.receive()
         counters["none" if wkc < 0 else "good" if wkc == data.expected_wkc else "other"] += 1
         assert [len(data.input(at)) for at in range(len(SLAVES))] == lengths
-    seconds, kilobytes = time.monotonic() - began, resident_kb() - held
+    seconds, kilobytes = time.monotonic() - began, resident_kb() - memory_kb
     after = ask(INTERFACE, garble=0, hide=0)
     mutated = int(str(after["mutated"])) - int(str(before["mutated"]))
     return {
@@ -114,35 +114,35 @@ def services(bus: SoemBus, amount: int) -> dict[str, Any]:
     actions: tuple[Callable[[], Any], ...] = (
         bus.read_states,
         bus.emergencies,
-        lambda: bus.sdo_read(2, 0x1008, 0),
-        lambda: bus.sdo_read(3, 0x6064, 0),
-        lambda: bus.sdo_write(2, 0x6065, 0, (2000).to_bytes(4, "little")),
+        lambda: bus.sdo(2).read(0x1008, 0),
+        lambda: bus.sdo(3).read(0x6064, 0),
+        lambda: bus.sdo(2).write(0x6065, 0, (2000).to_bytes(4, "little")),
         lambda: bus.port.read(station_of(2), 0x0130, 6),
         lambda: bus.wait_for_state(AlState.PREOP, 0.01),
     )
     sentences: Counter[str] = Counter()
-    for turn in range(amount):
+    for number in range(amount):
         try:
-            actions[turn % len(actions)]()
+            actions[number % len(actions)]()
         except BusError as error:
             sentences[str(error).partition(":")[0]] += 1
     after = ask(INTERFACE, garble=0)
     mutated = int(str(after["mutated"])) - int(str(before["mutated"]))
-    return {"refused": sum(sentences.values()), "mutated": mutated, "name": bus.sdo_read(2, 0x1008, 0).hex()}
+    return {"refused": sum(sentences.values()), "mutated": mutated, "name": bus.sdo(2).read(0x1008, 0).hex()}
 
 
 def scans(bus: SoemBus, amount: int) -> dict[str, Any]:
     """Scan and configure while answers are mutated, from one in a thousand to one in three."""
     sentences: Counter[str] = Counter()
     before = ask(INTERFACE)
-    for turn in range(amount):
-        ask(INTERFACE, garble=(0.001, 0.01, 0.1, 0.3)[turn % 4])
+    for number in range(amount):
+        ask(INTERFACE, garble=(0.001, 0.01, 0.1, 0.3)[number % 4])
         try:
-            bus.scan() if turn % 2 else bus.configure(SLAVES, PERIOD_NS)
+            bus.scan() if number % 2 else bus.configure(SLAVES, PERIOD_NS)
             sentences["done"] += 1
         except BusError as error:
             sentences["refused"] += 1
-            sys.stderr.write(f"{turn}: {error}\n")
+            sys.stderr.write(f"{number}: {error}\n")
     after = ask(INTERFACE, garble=0)
     mutated = int(str(after["mutated"])) - int(str(before["mutated"]))
     return {"ends": sentences, "mutated": mutated, "slaves": len(bus.scan())}

@@ -1,20 +1,11 @@
-"""Frames that are nearly right: what a broken cable, a broken master or an attacker would put on the wire."""
+"""Mutated frames, as of a broken cable, a broken master or an attacker."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from random import Random
 
-from rtcp.virtual.protocol import (
-    COUNTER,
-    DATAGRAM_HEADER,
-    FIRST_DATAGRAM,
-    HEADER,
-    LENGTH_MASK,
-    MAX_FRAME,
-    MORE_FOLLOWS,
-    TYPE_DATAGRAMS,
-)
+from rtcp.virtual import protocol
 
 EDGES = (0, 1, 2, 3, 4, 7, 8, 13, 15, 16, 0x7F, 0x80, 0xFF, 0x100, 0x400, 0x7FE, 0x7FF, 0x800, 0xFFF, 0x1000, 0x3FFF,
          0x7FFF, 0x8000, 0xFFFE, 0xFFFF)  # fmt: skip
@@ -59,47 +50,47 @@ REGISTERS = (
     0x1FFF,
     0x2FFF,
 )
-"""Where something listens."""
+"""Addresses of registers with a function."""
 LARGEST = 2048
 """Bytes of the segment's buffer."""
-_INDEX_AT = FIRST_DATAGRAM + 1
+_INDEX_AT = protocol.FIRST_DATAGRAM + 1
 Mutation = Callable[[bytearray, Random], None]
 
 
 def places(frame: bytes | bytearray) -> list[tuple[int, int]]:
-    """Return where each datagram begins and how long its data are, as far as they fit in the frame."""
-    found, at = [], FIRST_DATAGRAM
-    while at + DATAGRAM_HEADER + COUNTER <= len(frame):
+    """Return the offset and the data length of each datagram that fits in the frame."""
+    datagrams, at = [], protocol.FIRST_DATAGRAM
+    while at + protocol.DATAGRAM_HEADER + protocol.COUNTER <= len(frame):
         flags = frame[at + 6] | frame[at + 7] << 8
-        length = flags & LENGTH_MASK
-        if at + DATAGRAM_HEADER + length + COUNTER > len(frame):
+        length = flags & protocol.LENGTH_MASK
+        if at + protocol.DATAGRAM_HEADER + length + protocol.COUNTER > len(frame):
             break
-        found.append((at, length))
-        if not flags & MORE_FOLLOWS:
+        datagrams.append((at, length))
+        if not flags & protocol.MORE_FOLLOWS:
             break
-        at += DATAGRAM_HEADER + length + COUNTER
-    return found
+        at += protocol.DATAGRAM_HEADER + length + protocol.COUNTER
+    return datagrams
 
 
 def shape(frame: bytes | bytearray) -> tuple[int, ...]:
     """Return what makes a frame a kind of its own: commands, addresses within a slave, lengths; of mailboxes also what
     is asked."""
-    found: list[int] = []
+    key: list[int] = []
     for at, length in places(frame):
-        command, _, _, offset, _, _ = HEADER.unpack_from(frame, at)
-        data = at + DATAGRAM_HEADER
-        found += [command, offset, length]
+        command, _, _, offset, _, _ = protocol.HEADER.unpack_from(frame, at)
+        data = at + protocol.DATAGRAM_HEADER
+        key += [command, offset, length]
         if offset == 0x1000 and length >= 16:
             # The SDO command with index and subindex.
-            found += frame[data + 8 : data + 12]
+            key += frame[data + 8 : data + 12]
         elif offset == 0x0120:
-            found += frame[data : data + 1]
-    return tuple(found)
+            key += frame[data : data + 1]
+    return tuple(key)
 
 
 def _datagram(frame: bytearray, random: Random) -> tuple[int, int]:
-    found = places(frame)
-    return random.choice(found) if found else (FIRST_DATAGRAM, 0)
+    datagrams = places(frame)
+    return random.choice(datagrams) if datagrams else (protocol.FIRST_DATAGRAM, 0)
 
 
 def _put(frame: bytearray, at: int, value: int) -> None:
@@ -145,7 +136,7 @@ def other_address(frame: bytearray, random: Random) -> None:
 
 
 def other_logical(frame: bytearray, random: Random) -> None:
-    """A logical command at another address of the process image, or where there is none."""
+    """A logical command at another address, in the process image or outside."""
     at, _ = _datagram(frame, random)
     if at + 6 <= len(frame):
         frame[at] = random.choice((10, 11, 12))
@@ -156,19 +147,19 @@ def other_logical(frame: bytearray, random: Random) -> None:
 def other_length(frame: bytearray, random: Random) -> None:
     at, length = _datagram(frame, random)
     near = max(0, length + random.randrange(-3, 4))
-    _put(frame, at + 6, random.choice((near, near | MORE_FOLLOWS, _word(random))))
+    _put(frame, at + 6, random.choice((near, near | protocol.MORE_FOLLOWS, _word(random))))
 
 
 def other_frame_length(frame: bytearray, random: Random) -> None:
-    kind = TYPE_DATAGRAMS if random.random() < 0.9 else random.randrange(16)
-    whole = len(frame) - FIRST_DATAGRAM
+    kind = protocol.TYPE_DATAGRAMS if random.random() < 0.9 else random.randrange(16)
+    whole = len(frame) - protocol.FIRST_DATAGRAM
     size = random.choice((whole, whole - random.randrange(12), whole + random.randrange(12), _word(random)))
-    _put(frame, 14, (size & LENGTH_MASK) | kind << 12)
+    _put(frame, 14, (size & protocol.LENGTH_MASK) | kind << 12)
 
 
 def other_counter(frame: bytearray, random: Random) -> None:
     at, length = _datagram(frame, random)
-    _put(frame, at + DATAGRAM_HEADER + length, _word(random))
+    _put(frame, at + protocol.DATAGRAM_HEADER + length, _word(random))
 
 
 def other_event(frame: bytearray, random: Random) -> None:
@@ -178,7 +169,7 @@ def other_event(frame: bytearray, random: Random) -> None:
 
 def other_data(frame: bytearray, random: Random) -> None:
     at, length = _datagram(frame, random)
-    data = at + DATAGRAM_HEADER
+    data = at + protocol.DATAGRAM_HEADER
     if not length:
         return
     if random.random() < 0.3:
@@ -192,7 +183,7 @@ def other_data(frame: bytearray, random: Random) -> None:
 def mailbox_message(frame: bytearray, random: Random) -> None:
     """Other mailbox and CoE headers, other SDO commands."""
     at, length = _datagram(frame, random)
-    data = at + DATAGRAM_HEADER
+    data = at + protocol.DATAGRAM_HEADER
     if length < 16:
         return
     for place, choice in (
@@ -213,25 +204,27 @@ def cut(frame: bytearray, random: Random) -> None:
 
 
 def grow(frame: bytearray, random: Random) -> None:
-    frame += random.randbytes(random.choice((1, 2, 40, max(0, MAX_FRAME - len(frame)), random.randrange(200))))
+    frame += random.randbytes(random.choice((1, 2, 40, max(0, protocol.MAX_FRAME - len(frame)), random.randrange(200))))
 
 
 def repeat(frame: bytearray, random: Random) -> None:
     """Several datagrams: each says that more follow, also the last."""
-    found = places(frame)
-    if not found:
+    datagrams = places(frame)
+    if not datagrams:
         return
-    body = b"".join(bytes(frame[at : at + DATAGRAM_HEADER + length + COUNTER]) for at, length in found)
+    body = b"".join(
+        bytes(frame[at : at + protocol.DATAGRAM_HEADER + length + protocol.COUNTER]) for at, length in datagrams
+    )
     copies = random.choice((2, 3, 8, 60))
-    whole = bytearray(body * copies)[: MAX_FRAME - FIRST_DATAGRAM]
-    frame[FIRST_DATAGRAM:] = whole
+    whole = bytearray(body * copies)[: protocol.MAX_FRAME - protocol.FIRST_DATAGRAM]
+    frame[protocol.FIRST_DATAGRAM :] = whole
     for at, length in places(frame):
-        _put(frame, at + 6, length | MORE_FOLLOWS)
-    _put(frame, 14, len(whole) | TYPE_DATAGRAMS << 12)
+        _put(frame, at + 6, length | protocol.MORE_FOLLOWS)
+    _put(frame, 14, len(whole) | protocol.TYPE_DATAGRAMS << 12)
 
 
 def all_of_chance(frame: bytearray, random: Random) -> None:
-    head = bytes(frame[:FIRST_DATAGRAM]) if random.random() < 0.8 else b""
+    head = bytes(frame[: protocol.FIRST_DATAGRAM]) if random.random() < 0.8 else b""
     frame[:] = head + random.randbytes(random.randrange(LARGEST - 16))
 
 
@@ -244,13 +237,13 @@ MUTATIONS: tuple[Mutation, ...] = (
 
 def mutated(frame: bytes, random: Random, mutations: Sequence[Mutation] = MUTATIONS) -> bytearray:
     """Return `frame` with one to four mutations, at most as long as the segment's buffer."""
-    found = bytearray(frame)
+    mutated = bytearray(frame)
     for _ in range(random.choice((1, 1, 1, 2, 2, 3, 4))):
-        if len(found) < FIRST_DATAGRAM:
+        if len(mutated) < protocol.FIRST_DATAGRAM:
             break
-        random.choice(mutations)(found, random)
-    del found[LARGEST:]
-    return found
+        random.choice(mutations)(mutated, random)
+    del mutated[LARGEST:]
+    return mutated
 
 
 ANSWERS: tuple[Mutation, ...] = (
@@ -262,4 +255,4 @@ ANSWERS: tuple[Mutation, ...] = (
 
 def garbled(frame: bytes, random: Random) -> bytes:
     """Return an answer with one to four mutations, no longer than what a network card takes."""
-    return bytes(mutated(frame, random, ANSWERS)[:MAX_FRAME]).ljust(FIRST_DATAGRAM, b"\0")
+    return bytes(mutated(frame, random, ANSWERS)[: protocol.MAX_FRAME]).ljust(protocol.FIRST_DATAGRAM, b"\0")

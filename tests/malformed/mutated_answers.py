@@ -19,24 +19,25 @@ from typing import Any
 from rtcp.config import default_config, load
 from rtcp.fieldbus import AlState, BusError, al_state, registers, scan
 from rtcp.fieldbus.bus import MailboxInfo, SlaveState
-from rtcp.fieldbus.emergency import Emergency, parse
-from rtcp.fieldbus.mailbox import Mailbox, SdoClient
+from rtcp.fieldbus.mailbox import Mailbox, SdoClient, parse_emergency
+from rtcp.fieldbus.pdo import reading_assignment
 from rtcp.fieldbus.registers import RegisterPort, finish
 from rtcp.fieldbus.slave_setup import configure_slave
-from rtcp.virtual.device import Emergency as Sent
+from rtcp.ipc.events import EmergencyMessage
+from rtcp.virtual.device import Emergency
 from tests.malformed.line import OP, PRE_OP, SIZES, STATION, Line
 from tests.malformed.mutate import garbled
-from tests.malformed.mutated_frames import Found, Memory
+from tests.malformed.mutated_frames import Memory, Outcome
 
 CONFIGS = load(default_config()).slaves
 LONGEST_S = 60.0
-"""Simulated seconds that one service may take, whatever is answered."""
+"""Simulated time limit of one service, s."""
 _BOX = MailboxInfo(0x1000, 128, 0x1080, 128, ("CoE",))
 _TURN = 200
 
 
 class Loopback:
-    """What RegisterPort takes for its socket; an answer in `share` is mutated, late, doubled or lost."""
+    """The socket of RegisterPort; a `share` of the answers is mutated, late, doubled or lost."""
 
     def __init__(self, line: Line, random: Random) -> None:
         self.line = line
@@ -91,7 +92,7 @@ class Clock:
 
 @contextlib.contextmanager
 def looped(line: Line, random: Random, kind: type[Loopback] = Loopback) -> Iterator[tuple[RegisterPort, Loopback]]:
-    """Lead the master's registers and its time into a segment meanwhile."""
+    """Connect the master's registers and its clock to a segment meanwhile."""
     loopback, clock = kind(line, random), Clock(line)
     modules = [module for name, module in sys.modules.items() if name.startswith("rtcp.fieldbus.")]
     timed: list[Any] = [module for module in modules if getattr(module, "time", None) is time]
@@ -109,12 +110,12 @@ def looped(line: Line, random: Random, kind: type[Loopback] = Loopback) -> Itera
 
 
 class Master:
-    """What a master does beside its cycle, one action after the other."""
+    """The actions of a master beside its cycle."""
 
     def __init__(self, line: Line, port: RegisterPort, random: Random) -> None:
         self._line, self._port, self._random = line, port, random
         lock = threading.Lock()
-        self.emergencies: list[Emergency] = []
+        self.emergencies: list[EmergencyMessage] = []
         self._boxes = [Mailbox(port, STATION + at, _BOX) for at in range(len(SIZES))]
         self._sdos = [SdoClient(box, at + 1, CONFIGS[at].name, lock, self._keep) for at, box in enumerate(self._boxes)]
         self.actions: tuple[Callable[[int], object], ...] = (
@@ -123,12 +124,11 @@ class Master:
         )  # fmt: skip
 
     def _keep(self, message: bytes, position: int) -> None:
-        if (found := parse(message, position, CONFIGS[position - 1].name)) is not None:
-            found.sentence()
-            self.emergencies.append(found)
+        if (emergency := parse_emergency(message, position)) is not None:
+            self.emergencies.append(emergency)
 
     def do(self) -> None:
-        """Do something with a slave; raises BusError alone."""
+        """Run a random action with a slave; raises only BusError."""
         self._random.choice(self.actions)(self._random.randrange(len(SIZES)))
 
     def _states(self, at: int) -> None:
@@ -142,8 +142,8 @@ class Master:
         al_state.acknowledge(self._port, STATION + at)
 
     def _registers(self, at: int) -> None:
-        found = self._port.read(STATION + at, 0x0300, 20)
-        assert found is None or len(found) == 20
+        counters = self._port.read(STATION + at, 0x0300, 20)
+        assert counters is None or len(counters) == 20
         assert len(self._port.read_all(0x0130, 2).data) in (0, 2)
         scan._sync_managers(self._port, STATION + at)
 
@@ -158,10 +158,10 @@ class Master:
         self._sdos[at].write(0x6065, 0, self._random.randbytes(self._random.choice((2, 4, 4, 200))))
 
     def _assignment(self, at: int) -> None:
-        finish(scan.reading_assignment(self._sdos[at], self._random.choice((0x1C12, 0x1C13))))
+        finish(reading_assignment(self._sdos[at], self._random.choice((0x1C12, 0x1C13))))
 
     def _mailbox(self, at: int) -> None:
-        self._line.segment.slaves[at].application.device.emergencies.append(Sent(0x8611, 1, b"12345"))
+        self._line.segment.slaves[at].application.device.emergencies.append(Emergency(0x8611, 1, b"12345"))
         self._line.pass_time(2_000_000)
         for _ in range(4):
             if (message := self._boxes[at].receive()) is not None:
@@ -175,14 +175,14 @@ class Master:
         self._sdos[at].read(0x1018, 4)
 
 
-def run(count: int, seed: int) -> Found:
-    """Do what a master does until `count` answers were mutated; a failure names the action's number."""
-    found = Found("master, own parsers")
+def run(count: int, seed: int) -> Outcome:
+    """Run a master's actions until `count` answers were mutated; a failure names the action's number."""
+    outcome = Outcome("master, own parsers")
     random, line = Random(seed), Line()
     began = time.monotonic()
     memory: Memory | None = None
     with looped(line, random) as (port, loopback):
-        while loopback.mutated < count and len(found.failures) < 10:
+        while loopback.mutated < count and len(outcome.failures) < 10:
             if memory is None and loopback.mutated >= 0.3 * count:
                 memory = Memory()
             loopback.share = 0.0
@@ -190,35 +190,35 @@ def run(count: int, seed: int) -> Found:
             try:
                 line.start(random.choice((PRE_OP, OP)))
                 sane = Master(line, port, random)
-                assert finish(scan.reading_assignment(sane._sdos[1], 0x1C12))[0].bits == 120
-                found.starts += 1
+                assert finish(reading_assignment(sane._sdos[1], 0x1C12))[0].bits == 120
+                outcome.starts += 1
             except Exception:
-                found.failures.append(f"sane again after {loopback.mutated}:\n{traceback.format_exc()}")
+                outcome.failures.append(f"sane again after {loopback.mutated}:\n{traceback.format_exc()}")
                 line.__init__()  # type: ignore[misc]
                 continue
             loopback.share = random.choice((0.02, 0.3, 0.9))
-            _turn(line, Master(line, port, random), loopback, found, count)
-    found.frames = loopback.mutated
-    found.seconds = time.monotonic() - began
+            _mutate(line, Master(line, port, random), loopback, outcome, count)
+    outcome.frames = loopback.mutated
+    outcome.seconds = time.monotonic() - began
     if memory is not None:
-        memory.report(found)
-    return found
+        memory.report(outcome)
+    return outcome
 
 
-def _turn(line: Line, master: Master, loopback: Loopback, found: Found, count: int) -> None:
+def _mutate(line: Line, master: Master, loopback: Loopback, outcome: Outcome, count: int) -> None:
     for _ in range(_TURN):
         if loopback.mutated >= count:
             return
         before = line.now
         try:
             master.do()
-            found.kinds["done"] += 1
+            outcome.kinds["done"] += 1
         except BusError as error:
-            found.kinds["refused"] += 1
+            outcome.kinds["refused"] += 1
             if not all(len(sentence) > 10 for sentence in error.sentences):
-                found.failures.append(f"no sentence: {error!r}")
+                outcome.failures.append(f"no sentence: {error!r}")
         except Exception:
-            found.failures.append(f"after {loopback.mutated}:\n{traceback.format_exc()}")
+            outcome.failures.append(f"after {loopback.mutated}:\n{traceback.format_exc()}")
         if line.now - before > LONGEST_S * 1e9:
-            found.failures.append(f"after {loopback.mutated}: took {(line.now - before) / 1e9:.0f} s")
-    found.kinds["emergencies"] += len(master.emergencies)
+            outcome.failures.append(f"after {loopback.mutated}: took {(line.now - before) / 1e9:.0f} s")
+    outcome.kinds["emergencies"] += len(master.emergencies)

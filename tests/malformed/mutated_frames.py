@@ -17,28 +17,28 @@ from tests.malformed.mutate import mutated, places
 
 STATES = (INIT, PRE_OP, SAFE_OP, OP, OP)
 TURN = 500
-"""Mutated frames until a sane master starts anew."""
+"""Mutated frames between two starts of a sane master."""
 _WRITES = frozenset((2, 3, 5, 6, 8, 9, 11, 12, 13, 14))
 _CONTROLWORDS = (6, 7, 15, 15, 15)
 _WARM = 0.3
-"""After this share of the frames everything that is kept is there."""
+"""Share of the frames after which memory no longer grows."""
 
 
 @dataclass
-class Found:
-    """What came of mutated frames."""
+class Outcome:
+    """Results of mutated frames."""
 
     name: str
     frames: int = 0
     seconds: float = 0.0
     starts: int = 0
-    """How often a sane start-up succeeded afterwards."""
+    """Successful sane start-ups afterwards."""
     kinds: Counter[str] = field(default_factory=Counter)
     failures: list[str] = field(default_factory=list)
     objects: int = 0
-    """Python objects more at the end than when all was warm."""
+    """Growth of Python objects after the warm-up."""
     kilobytes: int = 0
-    """Resident memory more at the end than when all was warm."""
+    """Growth of the resident memory after the warm-up, kB."""
 
 
 def resident_kb() -> int:
@@ -47,50 +47,50 @@ def resident_kb() -> int:
 
 
 class Memory:
-    """What is kept more than when all was warm."""
+    """Growth of the memory after the warm-up."""
 
     def __init__(self) -> None:
         gc.collect()
         self._objects, self._kb = len(gc.get_objects()), resident_kb()
 
-    def report(self, found: Found) -> None:
+    def report(self, outcome: Outcome) -> None:
         gc.collect()
-        found.objects = len(gc.get_objects()) - self._objects
-        found.kilobytes = resident_kb() - self._kb
+        outcome.objects = len(gc.get_objects()) - self._objects
+        outcome.kilobytes = resident_kb() - self._kb
 
 
-def run(count: int, seed: int) -> Found:
-    """Give a segment `count` mutated frames; a failure names the frame."""
-    found = Found("segment")
+def run(count: int, seed: int) -> Outcome:
+    """Send a segment `count` mutated frames; a failure names the frame."""
+    outcome = Outcome("segment")
     random, corpus, line = Random(seed), frames(), Line()
     began = time.monotonic()
     memory: Memory | None = None
-    while found.frames < count and len(found.failures) < 10:
-        if memory is None and found.frames >= _WARM * count:
+    while outcome.frames < count and len(outcome.failures) < 10:
+        if memory is None and outcome.frames >= _WARM * count:
             memory = Memory()
         try:
             line.start(random.choice(STATES))
-            found.starts += 1
+            outcome.starts += 1
         except Exception:
-            found.failures.append(f"the start-up after {found.frames} frames:\n{traceback.format_exc()}")
+            outcome.failures.append(f"the start-up after {outcome.frames} frames:\n{traceback.format_exc()}")
             line = Line()
             continue
-        _turn(line, random, corpus, found, min(TURN, count - found.frames))
+        _mutate(line, random, corpus, outcome, min(TURN, count - outcome.frames))
     try:
         line.start(OP)
-        found.starts += 1
+        outcome.starts += 1
     except Exception:
-        found.failures.append(f"the last start-up:\n{traceback.format_exc()}")
-    found.seconds = time.monotonic() - began
+        outcome.failures.append(f"the last start-up:\n{traceback.format_exc()}")
+    outcome.seconds = time.monotonic() - began
     if memory is not None:
-        memory.report(found)
-    return found
+        memory.report(outcome)
+    return outcome
 
 
-def _turn(line: Line, random: Random, corpus: list[bytes], found: Found, count: int) -> None:
+def _mutate(line: Line, random: Random, corpus: list[bytes], outcome: Outcome, count: int) -> None:
     for _ in range(count):
         frame = bytes(mutated(random.choice(corpus), random))
-        found.frames += 1
+        outcome.frames += 1
         before = line.targets()
         try:
             answer = line.give(frame, random.choice((1_000, 50_000, 100_000, 1_000_000)))
@@ -98,15 +98,15 @@ def _turn(line: Line, random: Random, corpus: list[bytes], found: Found, count: 
                 line.exchange(random.choice(_CONTROLWORDS), random.randrange(-20_000, 20_000))
                 before = []
         except Exception:
-            found.failures.append(f"{frame.hex()}:\n{traceback.format_exc()}")
+            outcome.failures.append(f"{frame.hex()}:\n{traceback.format_exc()}")
             return
-        found.kinds["answered" if answer is not None else "not answered"] += 1
+        outcome.kinds["answered" if answer is not None else "not answered"] += 1
         if answer is not None and len(answer) != len(frame):
-            found.failures.append(f"{frame.hex()}: came back with {len(answer)} bytes")
+            outcome.failures.append(f"{frame.hex()}: came back with {len(answer)} bytes")
         if before and line.targets() != before and not writes(frame):
-            found.failures.append(f"{frame.hex()}: writes nothing and changed outputs")
+            outcome.failures.append(f"{frame.hex()}: writes nothing and changed outputs")
 
 
 def writes(frame: bytes) -> bool:
-    """Whether a well-formed datagram in it may write."""
+    """Whether the frame has a well-formed datagram that may write."""
     return any(frame[at] in _WRITES for at, _ in places(frame))

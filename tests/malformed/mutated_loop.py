@@ -11,9 +11,9 @@ from random import Random
 from rtcp.config import default_config, load
 from rtcp.ipc.commands import Disable, Enable, Halt, MoveJoints, Reset
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Frame, Simulation
+from rtcp.testing.simulation import Frame, Simulation
 from tests.malformed.mutate import EDGES
-from tests.malformed.mutated_frames import Found, Memory
+from tests.malformed.mutated_frames import Memory, Outcome
 
 WIRE = struct.Struct("<HiiiB")
 COUNTS = 10_000.0
@@ -28,7 +28,7 @@ _STRETCH = 400
 
 
 class Garbler:
-    """Stands before the process data's `receive`: a share of the answers is not what the slaves said."""
+    """Wraps `receive` of the process data: mutates a share of the answers."""
 
     def __init__(self, simulation: Simulation, random: Random) -> None:
         self.share = 0.0
@@ -58,15 +58,15 @@ class Garbler:
     def _mutated(self, given: bytes) -> bytes:
         """Other bytes, of the same length: a frame's length is judged before."""
         random = self._random
-        found = bytearray(given)
+        mutated = bytearray(given)
         kind = random.random()
         if kind < 0.3:
-            found[random.randrange(len(found))] ^= 1 << random.randrange(8)
+            mutated[random.randrange(len(mutated))] ^= 1 << random.randrange(8)
         elif kind < 0.5:
-            at = random.randrange(len(found))
-            found[at : at + 4] = random.randbytes(len(found[at : at + 4]))
-        elif kind < 0.7 and len(found) == WIRE.size:
-            status, position, velocity, torque, mode = WIRE.unpack(found)
+            at = random.randrange(len(mutated))
+            mutated[at : at + 4] = random.randbytes(len(mutated[at : at + 4]))
+        elif kind < 0.7 and len(mutated) == WIRE.size:
+            status, position, velocity, torque, mode = WIRE.unpack(mutated)
             wild = random.choice(
                 (
                     -(1 << 31),
@@ -80,16 +80,16 @@ class Garbler:
                 (status, position, wild, torque, mode), (status, position, velocity, wild, mode),
                 (status, position, velocity, torque, random.randrange(256)),
             ))  # fmt: skip
-            found[:] = WIRE.pack(*fields)
+            mutated[:] = WIRE.pack(*fields)
         elif kind < 0.85:
-            found[:] = random.choice((b"\x00", b"\xff", b"\x80", b"\x7f")) * len(found)
+            mutated[:] = random.choice((b"\x00", b"\xff", b"\x80", b"\x7f")) * len(mutated)
         else:
-            found[:] = random.randbytes(len(found))
-        return bytes(found)
+            mutated[:] = random.randbytes(len(mutated))
+        return bytes(mutated)
 
 
 class Watch:
-    """Looks at every frame: what a drive that is enabled, and commanded to be, is commanded to do.
+    """Checks every frame: the targets of enabled drives.
 
     Enabled by its own word: what the loop has heard of it may be wrong.
     """
@@ -105,7 +105,7 @@ class Watch:
         self.failures: list[str] = []
         self.enabled = 0
         self.largest = 0.0
-        """Largest step, as a share of what the speed limit allows in a cycle."""
+        """Largest step, as a fraction of the speed limit's step in a cycle."""
 
     def see(self, frame: Frame) -> None:
         for axis, (slot, joint) in enumerate(zip(self._slots, self._joints, strict=True)):
@@ -131,23 +131,23 @@ class Watch:
             self._before[axis] = (position, mode)
 
 
-def run(count: int, seed: int) -> Found:
-    """Let the loop run until `count` answers were mutated, a third in each drive mode; a failure says what and when."""
-    found = Found("loop behind the master")
+def run(count: int, seed: int) -> Outcome:
+    """Run the loop until `count` answers were mutated, a third in each drive mode; a failure names kind and cycle."""
+    outcome = Outcome("loop behind the master")
     for at, mode in enumerate(("csp", "csv", "cst")):
-        one = _run(count // 3, seed + at, mode)
-        found.frames += one.frames
-        found.seconds += one.seconds
-        found.starts += one.starts
-        found.kinds += one.kinds
-        found.failures += [f"{mode}, {failure}" for failure in one.failures]
-        found.objects = max(found.objects, one.objects)
-        found.kilobytes = max(found.kilobytes, one.kilobytes)
-    return found
+        part = _run(count // 3, seed + at, mode)
+        outcome.frames += part.frames
+        outcome.seconds += part.seconds
+        outcome.starts += part.starts
+        outcome.kinds += part.kinds
+        outcome.failures += [f"{mode}, {failure}" for failure in part.failures]
+        outcome.objects = max(outcome.objects, part.objects)
+        outcome.kilobytes = max(outcome.kilobytes, part.kilobytes)
+    return outcome
 
 
-def _run(count: int, seed: int, mode: str) -> Found:
-    found = Found(mode)
+def _run(count: int, seed: int, mode: str) -> Outcome:
+    outcome = Outcome(mode)
     random = Random(seed)
     config = load(default_config())
     config = replace(config, drive_mode=mode, cycle=replace(config.cycle, period_us=1000.0))  # type: ignore[arg-type]
@@ -157,8 +157,8 @@ def _run(count: int, seed: int, mode: str) -> Found:
         garbler, watch = Garbler(simulation, random), Watch(simulation)
         simulation.on_frame = watch.see
         simulation.acquire()
-        simulation.until(lambda: simulation.state is State.READY, 5.0)
-        while garbler.mutated < count and len(found.failures) < 10:
+        simulation.bring_to(State.READY)
+        while garbler.mutated < count and len(outcome.failures) < 10:
             if memory is None and garbler.mutated >= 0.3 * count:
                 memory = Memory()
             garbler.share = random.choice(_SHARES)
@@ -168,26 +168,26 @@ def _run(count: int, seed: int, mode: str) -> Found:
                     before = simulation.now_ns
                     simulation.cycle()
                     if not 0 < simulation.now_ns - before < 3_000_000:
-                        found.failures.append(f"the next cycle came {simulation.now_ns - before} ns later")
+                        outcome.failures.append(f"the next cycle came {simulation.now_ns - before} ns later")
             except Exception:
-                found.failures.append(f"after {garbler.mutated}:\n{traceback.format_exc()}")
-            found.kinds[simulation.state.name] += 1
-            found.failures += watch.failures[: 10 - len(found.failures)]
+                outcome.failures.append(f"after {garbler.mutated}:\n{traceback.format_exc()}")
+            outcome.kinds[simulation.state.name] += 1
+            outcome.failures += watch.failures[: 10 - len(outcome.failures)]
             watch.failures.clear()
         garbler.share = 0.0
-        found.starts += _sane(simulation)
-        if not found.starts:
-            found.failures.append(f"cannot be enabled afterwards: {simulation.state.name}, {simulation.events[-3:]}")
-        found.frames = garbler.mutated
-        found.kinds["cycles with a drive enabled"] = watch.enabled // 6
-    found.seconds = time.monotonic() - began
+        outcome.starts += _sane(simulation)
+        if not outcome.starts:
+            outcome.failures.append(f"cannot be enabled afterwards: {simulation.state.name}, {simulation.events[-3:]}")
+        outcome.frames = garbler.mutated
+        outcome.kinds["cycles with a drive enabled"] = watch.enabled // 6
+    outcome.seconds = time.monotonic() - began
     if memory is not None:
-        memory.report(found)
-    return found
+        memory.report(outcome)
+    return outcome
 
 
 def _send_something(simulation: Simulation, random: Random) -> None:
-    """Enable, move, jog, halt, come back: whatever fits the state, and now and then what does not."""
+    """Enable, move, jog, halt, move back: a random command that fits the state, sometimes one that does not."""
     state = simulation.state
     if state in (State.FAULT, State.STOPPED_BY_LIMIT, State.EMERGENCY_STOP):
         simulation.send(Reset())
@@ -201,7 +201,7 @@ def _send_something(simulation: Simulation, random: Random) -> None:
 
 
 def _sane(simulation: Simulation) -> bool:
-    """Whether the arm comes back to holding once the answers are right."""
+    """Whether the arm holds again after the answers are right."""
     simulation.run(0.5)
     for _ in range(5):
         if simulation.state not in (State.READY, State.HOLDING, State.MOVING):

@@ -1,4 +1,4 @@
-"""The control socket of a real gateway on lines that are nearly right: answered or closed, and nothing happens."""
+"""The control socket of a real gateway on mutated lines: answered or closed, and without effect."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ RAW = (
 
 
 def nodes(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The ways to every value within a request."""
+    """The paths to all values in a request."""
     if path:
         yield path
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -74,7 +74,7 @@ def mutated_line(random: Random) -> bytes:
             del within[path[-1]]
         else:
             within[path[-1]] = copy.deepcopy(random.choice(NASTY))
-    # What would end the platform or let the arm have torque is not in the list; nothing makes it up by chance.
+    # Without the methods that end the platform or enable the arm; no mutation produces their names.
     line = bytearray(json.dumps(request).encode())
     if random.random() < 0.2:
         for _ in range(random.randrange(1, 4)):
@@ -142,8 +142,8 @@ def test_every_mutated_line_is_answered_or_ends_its_connection_and_nothing_moves
         else:
             assert "result" in answer or len(answer["error"]["message"]) > 10, answer
             ends["done" if "result" in answer else answer["error"]["data"]["kind"]] += 1
-    for one in (raw, *silent):
-        one.close()
+    for client in (raw, *silent):
+        client.close()
     assert ends["internal"] == 0, started.logs()
     assert ends["invalid"] > LINES // 3
     assert ends["done"] > 10
@@ -160,9 +160,9 @@ def test_a_request_that_nobody_waits_for_and_a_flood_of_them_do_not_keep_others_
     flood = Raw(started)
     flood.send(b'{"jsonrpc":"2.0","id":1,"method":"sdo_read","params":{"slave":2,"index":24641,"subindex":0}}\n' * 200)
     for _ in range(30):
-        one = Raw(started)
-        one.send(b'{"jsonrpc":"2.0","id":1,"method":"status"}\n' * 20)
-        one.close()
+        client = Raw(started)
+        client.send(b'{"jsonrpc":"2.0","id":1,"method":"status"}\n' * 20)
+        client.close()
     assert started.status()["state"] == "ready"
     assert all("result" in (flood.receive() or {}) for _ in range(200))
     flood.close()

@@ -1,4 +1,4 @@
-"""Every file that is read, damaged in many ways: it says what it says, or one sentence a mistake."""
+"""Every file that is read, damaged at random: it is read, or refused with one message a mistake."""
 
 from __future__ import annotations
 
@@ -20,30 +20,20 @@ from rtcp.config.motion_file import read_motion
 from rtcp.config.segment import load_segment
 from rtcp.config.zero import read_zeros, store_zero, zero_file
 from rtcp.gateway.limit_settings import _read as read_kept_limits
+from rtcp.ipc import session
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.events import SlaveLost
-from rtcp.ipc.layout import EVENTS_AT, EVENTS_HEAD_AT, RECORDS_AT, RECORDS_HEAD_AT, TEXTS_AT, TEXTS_HEAD_AT
+from rtcp.ipc.events import ErrorReported, SlaveLost
+from rtcp.ipc.layout import EVENTS_AT, EVENTS_HEAD_AT, RECORDS_AT, RECORDS_HEAD_AT
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import arm_schema
-from rtcp.ipc.session import (
-    Pid,
-    Processes,
-    Session,
-    SessionError,
-    identify,
-    processes_file,
-    read_processes,
-    read_session,
-    session_file,
-)
 from rtcp.virtual.faults.registry import load_script
 from rtcp.virtual.segment import make_segment
 from tests.malformed.files import damaged
 
 SHIPPED = default_config().parent
 HANGS_S = 120
-"""No file takes so long, on any machine; a reader that hangs is ended by a signal."""
+"""Time limit of a read, s, far above any machine's; a signal ends a reader that hangs."""
 SCRIPT = b"""# A script of faults.
 faults:
   - {fault: loss, at: 1.0, rate: 0.1, lasts: 2.0}
@@ -71,19 +61,19 @@ def _no_hang() -> Iterator[None]:
 
 
 def sentences_of(read: Callable[[], object]) -> list[str]:
-    """Return what a reader says is wrong, nothing where it takes the file."""
+    """Return the messages of a reader, none if it accepts the file."""
     signal.alarm(HANGS_S)
     try:
         read()
     except ConfigError as error:
-        found = error.problems
+        problems = error.problems
     else:
         return []
     finally:
         signal.alarm(0)
-    assert found
-    assert all(len(problem) > 10 and "Traceback" not in problem for problem in found)
-    return found
+    assert problems
+    assert all(len(problem) > 10 and "Traceback" not in problem for problem in problems)
+    return problems
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +92,7 @@ def test_a_damaged_configuration_is_reported_in_sentences(folder: Path, name: st
     random = Random(name)
     file = folder / name
     whole = file.read_bytes()
-    found = 0
+    refused = 0
 
     def read() -> object:
         if name == "segment.yaml":
@@ -118,9 +108,9 @@ def test_a_damaged_configuration_is_reported_in_sentences(folder: Path, name: st
     assert sentences_of(read) == []
     for _ in range(turns):
         file.write_bytes(damaged(whole, random))
-        found += bool(sentences_of(read))
+        refused += bool(sentences_of(read))
     file.write_bytes(whole)
-    assert found > turns // 3
+    assert refused > turns // 3
     assert sentences_of(read) == []
 
 
@@ -137,12 +127,12 @@ def test_a_damaged_motion_or_script_is_reported_in_sentences(
     file = tmp_path / name
     file.write_bytes(content)
     assert sentences_of(lambda: read(file)) == []
-    found = 0
+    refused = 0
     for _ in range(300):
         file.write_bytes(damaged(content, random))
-        found += bool(sentences_of(lambda: read(file)))
+        refused += bool(sentences_of(lambda: read(file)))
     # Some mutants are sound: a comment was hit, or a number changed.
-    assert 100 < found < 300
+    assert 100 < refused < 300
 
 
 def test_a_damaged_file_of_zero_offsets_is_reported_in_sentences(
@@ -157,25 +147,25 @@ def test_a_damaged_file_of_zero_offsets_is_reported_in_sentences(
     for _ in range(300):
         content = damaged(whole, random)
         file.write_bytes(content)
-        taken: list[object] = []
-        if not sentences_of(lambda: taken.append(read_zeros(config))):  # noqa: B023
-            # Taken: it says the same (a comment was hit, or white-space).
-            assert taken == [before], content
+        zeros: list[object] = []
+        if not sentences_of(lambda: zeros.append(read_zeros(config))):  # noqa: B023
+            # Accepted: the values are the same (a comment or white space was hit).
+            assert zeros == [before], content
 
 
 def test_damaged_files_of_process_ids_name_no_process_that_is_not_ours(tmp_path: Path) -> None:
     random = Random(1)
-    mine = identify(os.getpid())
-    Processes(mine, mine, Pid(0)).write(tmp_path)
-    content = processes_file(tmp_path).read_bytes()
+    mine = session.identify(os.getpid())
+    session.Processes(mine, mine, session.Pid(0)).write(tmp_path)
+    content = session.processes_file(tmp_path).read_bytes()
     for _ in range(500):
-        processes_file(tmp_path).write_bytes(damaged(content, random))
-        found = read_processes(tmp_path)
-        for pid in (found.loop, found.gateway, found.segment):
-            assert isinstance(pid, Pid)
+        session.processes_file(tmp_path).write_bytes(damaged(content, random))
+        processes = session.read_processes(tmp_path)
+        for pid in (processes.loop, processes.gateway, processes.segment):
+            assert isinstance(pid, session.Pid)
     for text in (b"[" * 100_000, b'{"loop":1e999}', b'{"loop":NaN}', b"\xff", b'{"loop":[],"gateway":0,"segment":0}'):
-        processes_file(tmp_path).write_bytes(text)
-        assert read_processes(tmp_path) == Processes()
+        session.processes_file(tmp_path).write_bytes(text)
+        assert session.read_processes(tmp_path) == session.Processes()
 
 
 def test_a_damaged_file_of_limits_kept_is_as_none(tmp_path: Path) -> None:
@@ -192,7 +182,7 @@ def test_a_damaged_blackboard_is_refused_in_a_sentence_or_read_without_an_except
     board = Blackboard(path, arm_schema(6), 500_000)
     for number in range(5):
         board.event(SlaveLost(number + 1))
-        board.text("a sentence")
+        board.event(ErrorReported("a sentence"))
     board.close()
     whole = path.read_bytes()[:RECORDS_AT]
     size = path.stat().st_size
@@ -203,7 +193,7 @@ def test_a_damaged_blackboard_is_refused_in_a_sentence_or_read_without_an_except
             first = 0 if turn % 2 else 64
             for _ in range(random.choice((1, 4, 60))):
                 at = first + random.randrange(len(content) - first - 8)
-                at = random.choice((at, RECORDS_HEAD_AT, EVENTS_HEAD_AT, TEXTS_HEAD_AT, EVENTS_AT, TEXTS_AT))
+                at = random.choice((at, RECORDS_HEAD_AT, EVENTS_HEAD_AT, EVENTS_AT))
                 content[at : at + 8] = random.choice(
                     (bytes(8), b"\xff" * 8, b"\xff" * 7 + b"\x7f", random.randbytes(8))
                 )
@@ -217,7 +207,6 @@ def test_a_damaged_blackboard_is_refused_in_a_sentence_or_read_without_an_except
             observer.latest()
             observer.since(0)
             observer.events_since(0)
-            observer.texts_since(0)
             observer.slaves(7)
             observer.holder()
             observer.close()
@@ -236,30 +225,30 @@ SESSIONS: dict[str, bytes] = {
 
 @pytest.mark.parametrize("how", SESSIONS)
 def test_a_damaged_session_is_a_sentence_of_the_process_that_reads_it(tmp_path: Path, how: str) -> None:
-    file = session_file(tmp_path)
-    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
+    file = session.session_file(tmp_path)
+    session.Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
     assert file.stat().st_mode & 0o077 == 0
-    assert read_session(tmp_path).bus == "virtual"
+    assert session.read_session(tmp_path).bus == "virtual"
     file.write_bytes(file.read_bytes()[:500] if how == "half" else SESSIONS[how])
-    with pytest.raises(SessionError, match=r"session\.json is damaged: "):
-        read_session(tmp_path)
+    with pytest.raises(session.SessionError, match=r"session\.json is damaged: "):
+        session.read_session(tmp_path)
 
 
 def test_a_session_that_others_may_write_is_not_read(tmp_path: Path) -> None:
-    file = session_file(tmp_path)
-    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
+    file = session.session_file(tmp_path)
+    session.Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
     file.chmod(0o666)
-    with pytest.raises(SessionError, match="others may write"):
-        read_session(tmp_path)
+    with pytest.raises(session.SessionError, match="others may write"):
+        session.read_session(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["session", "started.json", "blackboard"])
 def test_a_gateway_that_finds_a_damaged_file_says_so_without_a_traceback(tmp_path: Path, name: str) -> None:
-    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
+    session.Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
     (tmp_path / "started.json").write_text("{}")
     file = blackboard_file(tmp_path)
     Blackboard(file, arm_schema(6), 500_000).close()
-    damage = {"blackboard": file, "session": session_file(tmp_path)}.get(name, tmp_path / name)
+    damage = {"blackboard": file, "session": session.session_file(tmp_path)}.get(name, tmp_path / name)
     damage.write_bytes(b"{")
     done = subprocess.run(
         [sys.executable, "-m", "rtcp.gateway.server", "--directory", str(tmp_path), "--ready-fd", "1"],

@@ -20,40 +20,40 @@ pytestmark = pytest.mark.alone
 
 def test_process_data_are_exchanged_on_through_mutated_answers_and_are_right_again_after_them() -> None:
     with answerer(1) as pid:
-        found = report_of(master(pid, "exchange", 5000))
-    assert found["mutated"] > 2000
-    assert sum(found["counters"].values()) == 5000
+        report = report_of(master(pid, "exchange", 5000))
+    assert report["mutated"] > 2000
+    assert sum(report["counters"].values()) == 5000
     # Lost, judged by the working counter, or good: all three come.
-    assert min(found["counters"].values()) > 50
-    assert found["recovered"]
+    assert min(report["counters"].values()) > 50
+    assert report["recovered"]
 
 
 def test_services_beside_the_cycle_end_in_an_answer_or_a_sentence() -> None:
     with answerer(1) as pid:
-        found = report_of(master(pid, "services", 150))
-    assert found["mutated"] > 100
-    assert bytes.fromhex(found["name"]).startswith(b"Cubemars")
+        report = report_of(master(pid, "services", 150))
+    assert report["mutated"] > 100
+    assert bytes.fromhex(report["name"]).startswith(b"Cubemars")
 
 
 def test_scans_and_configurations_on_mutated_answers_end_in_a_sentence_and_a_sane_scan_follows() -> None:
     with answerer(3) as pid:
-        found = report_of(master(pid, "scans", 3))
-    assert sum(found["ends"].values()) == 3
-    assert found["slaves"] == 7
+        report = report_of(master(pid, "scans", 3))
+    assert sum(report["ends"].values()) == 3
+    assert report["slaves"] == 7
 
 
 def test_the_masters_own_parsers_end_in_an_answer_or_a_sentence_and_work_on() -> None:
-    found = mutated_answers.run(2000, 1)
-    assert found.failures == []
-    assert found.frames >= 2000
-    assert found.kinds["done"] > 100
-    assert found.kinds["refused"] > 100
-    assert found.kinds["emergencies"] > 5
-    assert found.objects < 20_000
+    outcome = mutated_answers.run(2000, 1)
+    assert outcome.failures == []
+    assert outcome.frames >= 2000
+    assert outcome.kinds["done"] > 100
+    assert outcome.kinds["refused"] > 100
+    assert outcome.kinds["emergencies"] > 5
+    assert outcome.objects < 20_000
 
 
 class Eeprom:
-    """What pysoem offers of a slave."""
+    """The methods of a slave in pysoem."""
 
     def __init__(self, words: dict[int, bytes], name: bytes = b"") -> None:
         self._words = words

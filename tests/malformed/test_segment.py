@@ -1,4 +1,4 @@
-"""The segment on mutated frames: nothing breaks, nothing grows, and a sane master finds it as it should be."""
+"""The segment on mutated frames: no exception, no growth, and a sane master still starts it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.malformed.mutated_frames import run
 from tests.virtual.frames import Datagram, build, parse
 
 SHARE = 20_000
-"""Of the million that `benchmarks/mutations.py` gives."""
+"""Frames, of the million of `benchmarks/mutations.py`."""
 MOST_OBJECTS = 20_000
 
 
@@ -46,13 +46,13 @@ def test_every_mutation_changes_frames(mutation: object) -> None:
 
 
 def test_a_segment_survives_mutated_frames_in_all_states_and_is_led_to_op_afterwards() -> None:
-    found = run(SHARE, 1)
-    assert found.failures == []
-    assert found.frames == SHARE
-    assert found.starts == SHARE // 500 + 1
-    assert found.kinds["answered"] > 0.5 * SHARE
-    assert found.kinds["not answered"] > 0.1 * SHARE
-    assert found.objects < MOST_OBJECTS
+    outcome = run(SHARE, 1)
+    assert outcome.failures == []
+    assert outcome.frames == SHARE
+    assert outcome.starts == SHARE // 500 + 1
+    assert outcome.kinds["answered"] > 0.5 * SHARE
+    assert outcome.kinds["not answered"] > 0.1 * SHARE
+    assert outcome.objects < MOST_OBJECTS
 
 
 def test_nothing_is_kept_for_every_address_that_a_master_makes_up() -> None:

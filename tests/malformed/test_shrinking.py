@@ -7,7 +7,7 @@ million take minutes, and a seed plays them again. What it finds it cannot make 
 from __future__ import annotations
 
 import random as chance
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from hypothesis import given, note, settings
@@ -23,15 +23,15 @@ from tests.samples import examples
 
 EXAMPLES = examples(200)
 WHOLE = 3 * len(SIZES)
-"""Working counter when all slaves take part."""
+"""Working counter of an exchange with all slaves."""
 FEW = 2
-"""Answers of a action that are mutated; hypothesis keeps what it draws short."""
+"""Mutated answers of an action; few, as hypothesis draws short sequences."""
 _lines: list[Line] = []
 
 
 @contextmanager
 def line_in_op() -> Iterator[Line]:
-    """The line of the example before if that left it sound; else another, so that what fails fails again alone."""
+    """The line of the previous example if it is still sound, else a new one, so that a failure is reproducible."""
     line = _lines.pop() if _lines else Line()
     if line.states != [OP] * len(SIZES) or line.exchange() != WHOLE:
         line.start(OP)
@@ -40,7 +40,7 @@ def line_in_op() -> Iterator[Line]:
 
 
 class FirstStruck(Loopback):
-    """Mutates the first answers only, and notes what comes of them."""
+    """Mutates only the first answers and records them."""
 
     def send(self, frame: bytes) -> None:
         self.share = 1.0 if self.mutated < FEW else 0.0
@@ -70,7 +70,8 @@ def test_no_mutated_answer_gets_more_than_a_sentence_out_of_the_masters_parsers(
     random: chance.Random, action: int, slave: int, seed: int
 ) -> None:
     with line_in_op() as line, looped(line, random, FirstStruck) as (port, loopback):
-        began, said = line.now, ["nothing to say"]
+        began = line.now
+        said: Sequence[str] = ()
         try:
             Master(line, port, chance.Random(seed)).actions[action](slave)
         except BusError as error:

@@ -14,7 +14,7 @@ import pytest
 from kinematics.forward import forward, frames
 from kinematics.jacobian import singularity_distances
 from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import ArmConfig, FrameName
 from rtcp.ipc.commands import Command
 from rtcp.ipc.refusals import Refusal
 from rtcp.motion.controllers import Controller, ControllerSetup, JogController
@@ -26,6 +26,8 @@ from tests.samples import SLOW
 PERIOD = 0.0005
 JOG_PERIOD = 0.0005 if SLOW else 0.002
 SAMPLED = round(0.01 / JOG_PERIOD)
+Rows = Callable[..., "tuple[memoryview[float], int]"]
+"""Plans points; returns the rows and their count."""
 C = TypeVar("C", bound=Controller)
 
 ARM = load(default_config())
@@ -49,7 +51,7 @@ class Drive:
     path: list[list[float]] = field(default_factory=list)
     means: list[float] = field(default_factory=lambda: [0.0] * 6)
     cuts: int = 0
-    plans: list[Any] = field(default_factory=lambda: [None, None])
+    plans: list[memoryview[float]] = field(default_factory=lambda: [None, None])
     active: Controller | None = None
 
     def __post_init__(self) -> None:
@@ -62,20 +64,21 @@ class Drive:
         return kind(ControllerSetup(config, self.limits, self.guard, self.period_s, self.plans.__getitem__))
 
     def command(self, controller: Controller, command: Command) -> Refusal | None:
-        """Send a command as the commander who has the arm already, if this controller moves it."""
+        """Send a command; the commander continues its own motion if this controller moves the arm."""
         continues = self.active is controller and controller.phase is Phase.MOVE
         refusal = controller.accept(command, self.state, continues)
         if refusal is None:
             self.active = controller
         return refusal
 
-    def execute(self, controller: Controller, rows: Any, count: int) -> Refusal | None:
+    def execute(self, controller: Controller, rows: memoryview[float], count: int) -> Refusal | None:
         """Put a plan into a slot and start it."""
         self.plans[0] = rows
-        return self.command(controller, controller.commands[0](0, count))
+        run: Callable[[int, int], Command] = controller.commands[0]
+        return self.command(controller, run(0, count))
 
     def at(self, q: Sequence[float]) -> Drive:
-        """Stand at `q`."""
+        """Put the arm to rest at `q`, rad."""
         self.state.commanded = [float(angle) for angle in q]
         self.state.actual = list(self.state.commanded)
         self.guard.latch(self.state)
@@ -110,7 +113,7 @@ class Drive:
         self._measured()
 
     def clamped(self, mode: Controller, target: Setpoint, before: Sequence[float]) -> None:
-        """A mode that the guards may cut: what they make of it keeps to the limits, and they never have to stop it."""
+        """One cycle of a controller that tolerates saturation: the guards may clamp its setpoint, never stop it."""
         state, dt, limits = self.state, self.period_s, self.limits
         speeds = list(self.means)
         verdict = self.guard.apply(state, target, mode.tolerates_saturation)
@@ -131,12 +134,11 @@ class Drive:
         self.path.append(list(state.commanded))
 
     def run(self, mode: Controller, cycles: int) -> None:
-        """So many cycles."""
         for _ in range(cycles):
             self.cycle(mode)
 
     def until_rest(self, mode: Controller, most_s: float = 60.0) -> float:
-        """Run until the mode holds and return how long it took, s; at rest then."""
+        """Run until the controller holds at rest; return the time, s."""
         began = self.state.now_ns
         while mode.phase is not Phase.HOLD:
             self.cycle(mode)
@@ -161,25 +163,26 @@ def new_drive(arm: ArmConfig) -> Callable[..., Drive]:
     return lambda **given: Drive(arm, **given)
 
 
-@pytest.fixture(scope="session")
-def memory() -> Callable[[Iterable[Sequence[float]]], Any]:
-    """Lay rows out as the plan area does."""
-    return lambda rows: memoryview(array.array("d", [number for row in rows for number in row]))
+def memory(rows: Iterable[Sequence[float]]) -> memoryview[float]:
+    """The rows as the plan area holds them."""
+    return memoryview(bytearray(array.array("d", [number for row in rows for number in row]))).cast("d")
 
 
-class Driven:
-    """The mode with its guards; every cycle is checked."""
+def near(value: float) -> Any:
+    """A number that equals every float near to it, as a field of an event or a refusal."""
+    return pytest.approx(value)
+
+
+class Driven(Drive):
+    """A jog from `q` with all guards; every cycle is checked."""
 
     def __init__(self, q: list[float]) -> None:
-        self.limits = Limits(ARM)
-        self.trajectory_guard = TrajectoryGuard(ARM, self.limits, JOG_PERIOD)
-        setup = ControllerSetup(ARM, self.limits, self.trajectory_guard, JOG_PERIOD, no_plan)
-        self.jog = JogController(setup)
-        self.state = ArmState(6)
-        self.state.commanded[:] = q
-        self.trajectory_guard.latch(self.state)
-        self.path: list[tuple[float, float, float]] = []
+        super().__init__(ARM, period_s=JOG_PERIOD)
+        self.guard = TrajectoryGuard(ARM, self.limits, JOG_PERIOD)
+        self.jog = self.controller(JogController)
+        self.tools: list[tuple[float, float, float]] = []
         self.least_distance = 1e9
+        self.at(q)
 
     @property
     def tool(self) -> tuple[float, float, float]:
@@ -193,53 +196,33 @@ class Driven:
     def singularities(self) -> tuple[float, float, float]:
         return singularity_distances(MODEL, self.state.commanded)[:3]
 
-    def cycle(self) -> None:
-        state, limits = self.state, self.limits
-        before, speed = list(state.commanded), list(state.commanded_velocity)
-        target = self.jog.update(state)
-        verdict = self.trajectory_guard.apply(state, target, self.jog.tolerates_saturation)
-        assert verdict is GuardResult.PASS, (
-            verdict,
-            self.trajectory_guard.held,
-            self.trajectory_guard.ended,
-            before,
-            speed,
-        )
-        for i, (old, new, v, w) in enumerate(
-            zip(before, state.commanded, speed, state.commanded_velocity, strict=True)
-        ):
-            assert abs(w) <= limits.velocity[i] * (1.0 + 1e-6)
-            assert abs(w - v) <= limits.acceleration[i] * JOG_PERIOD * (1.0 + 1e-6)
+    def jog_cycle(self) -> None:
+        state = self.state
+        before = list(state.commanded)
+        self.cycle(self.jog)
+        for old, new, w in zip(before, state.commanded, state.commanded_velocity, strict=True):
             assert abs(new - old - w * JOG_PERIOD) < 1e-12
-            assert limits.low[i] <= new <= limits.high[i] or abs(new - old) < 1e-9
-        if self.jog.phase is Phase.HOLD:
-            assert self.still
-        state.now_ns += round(JOG_PERIOD * 1e9)
+        assert self.still or self.jog.phase is not Phase.HOLD
 
-    def run(self, twist: list[float], seconds: float, frame: str = "base") -> Driven:
+    def deflect(self, twist: list[float], seconds: float, frame: FrameName = "base") -> Driven:
         for cycle in range(round(seconds / JOG_PERIOD)):
             if self.jog.phase is Phase.HOLD and any(twist):
                 self.jog.start()
             self.jog.command(twist, in_tool_frame=frame == "tool")
-            self.cycle()
+            self.jog_cycle()
             if cycle % SAMPLED == 0:
-                self.path.append(self.tool)
+                self.tools.append(self.tool)
                 self.least_distance = min(self.least_distance, self.distance())
         return self
 
     def distance(self) -> float:
-        return self.trajectory_guard.zones.distance(frames(MODEL, self.state.commanded))[0]
+        return self.guard.zones.distance(frames(MODEL, self.state.commanded))[0]
 
-    def until_rest(self, at_most_s: float = 1.0) -> float:
-        """Release the stick; return how long it takes to HOLD."""
+    def release(self, at_most_s: float = 1.0) -> float:
+        """Return the time from the release of the joystick to HOLD, s."""
         start = self.state.now_ns
         while self.jog.phase is not Phase.HOLD:
             self.jog.command(ZERO, in_tool_frame=False)
-            self.cycle()
+            self.jog_cycle()
             assert self.state.now_ns - start < at_most_s * 1e9, self.state.commanded_velocity
         return (self.state.now_ns - start) * 1e-9
-
-
-@pytest.fixture
-def jogged() -> type[Driven]:
-    return Driven

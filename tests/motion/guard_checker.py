@@ -1,4 +1,4 @@
-"""The guards beside a checker that knows the limits, and nothing of how the guards keep them."""
+"""The guards and an independent checker of the limits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROUNDING_M = 1e-8
 
 
 class GuardChecker:
-    """A guard and what it was given; every cycle is compared with the limits that were in force when it began."""
+    """A guard and its targets; every cycle is compared with the limits in force at its beginning."""
 
     def __init__(self, config: ArmConfig, start: Sequence[float], dt: float) -> None:
         self.config, self.dt = config, dt
@@ -36,8 +36,8 @@ class GuardChecker:
         if self.config.arm is None:
             return []
         q = self.state.commanded
-        found = [-1.0 if self.limits.box is None else -depth(points(q)[0], self.limits.box), -own_gap(q)]
-        return found + [-gap for box in self.limits.keep_out for gap in box_gaps(q, box)]
+        depths = [-1.0 if self.limits.box is None else -depth(points(q)[0], self.limits.box), -own_gap(q)]
+        return depths + [-gap for box in self.limits.keep_out for gap in box_gaps(q, box)]
 
     def request(
         self, position: Iterable[float], tolerates_saturation: bool, velocity: Iterable[float] | None = None
@@ -76,7 +76,7 @@ class GuardChecker:
         return verdict
 
     def stop(self) -> int:
-        """Let the guard's own stop come to rest, whatever is asked for; return how many cycles it took."""
+        """Run the guard's own stop to rest whatever the targets; return its cycles."""
         longest = max(v / a for v, a in zip(self.limits.velocity, self.limits.acceleration, strict=True))
         for cycle in range(int(longest / self.dt) + 3):
             if not self.guard.stopping:
@@ -102,7 +102,7 @@ MODEL = ARM.arm
 _RANGE = replace(ARM.joints[1].position, min=-0.3, max=0.2)
 _SHORT = replace(ARM.joints[1], acceleration=0.7, velocity=1.5, position=_RANGE)
 JOINTS_ONLY = replace(ARM, joints=(ARM.joints[0], _SHORT), arm=None)
-"""Two joints without a geometry: nothing but the joints' own limits, one of them too fast for its short range."""
+"""Two joints without a geometry; one is too fast for its short range."""
 
 
 def with_boxes(box: Sequence[float] | None, *keep_out: Sequence[float]) -> ArmConfig:
@@ -110,6 +110,8 @@ def with_boxes(box: Sequence[float] | None, *keep_out: Sequence[float]) -> ArmCo
     cartesian = replace(
         ARM.cartesian,
         box=None if box is None else Box(tuple(box[:3]), tuple(box[3:])),
-        keep_out=tuple(KeepOut(f"box{n}", tuple(one[:3]), tuple(one[3:])) for n, one in enumerate(keep_out)),
+        keep_out=tuple(
+            KeepOut(f"box{n}", tuple(corners[:3]), tuple(corners[3:])) for n, corners in enumerate(keep_out)
+        ),
     )
     return replace(ARM, cartesian=cartesian)

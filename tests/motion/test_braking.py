@@ -1,4 +1,4 @@
-"""What is said of the guard's stop before it is made: compared with the stop itself, cycle by cycle."""
+"""Predictions of the guard's stop, compared with the stop itself, cycle by cycle."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ SIZES = st.sampled_from([0.0004, 0.002, 0.01, 0.05, 0.3])
 
 def stopped(mean: Sequence[float], rates: Sequence[float], q: Sequence[float], dt: float) -> list[list[float]]:
     """Every configuration of the stop: `q` first, then cycle by cycle until it rests."""
-    w, way = list(mean), [list(q)]
+    w, path = list(mean), [list(q)]
     while any(w):
         w = [max(v - a * dt, 0.0) if v > 0.0 else min(v + a * dt, 0.0) for v, a in zip(w, rates, strict=True)]
-        way.append([here + v * dt for here, v in zip(way[-1], w, strict=True)])
-    return way
+        path.append([here + v * dt for here, v in zip(path[-1], w, strict=True)])
+    return path
 
 
 @given(room=st.floats(1e-9, 10.0), u=st.floats(1e-6, 0.1), dt=st.floats(1e-4, 0.1))
@@ -56,8 +56,8 @@ def test_no_point_travels_further_than_is_reported(
     step, whole = travel(speeds, rates, Zones(MODEL, Limits(ARM), CLEARANCE).reach, dt)
     before = [angle - v * dt for angle, v in zip(q, speeds, strict=True)]
     for bound, there in ((step, q), (whole, stopped(speeds, rates, q, dt)[-1])):
-        for one, other in zip(points(before), points(there), strict=True):
-            assert sum((a - b) ** 2 for a, b in zip(one, other, strict=True)) ** 0.5 <= bound + 1e-12
+        for start, end in zip(points(before), points(there), strict=True):
+            assert sum((a - b) ** 2 for a, b in zip(start, end, strict=True)) ** 0.5 <= bound + 1e-12
 
 
 @given(
@@ -83,21 +83,21 @@ def test_a_stop_that_is_reported_to_be_free_is_free_in_every_cycle_and_one_with_
 ) -> None:
     speeds = [part * joint.velocity for part, joint in zip(parts, ARM.joints, strict=True)]
     before = [angle - v * dt for angle, v in zip(q, speeds, strict=True)]
-    way = [before, *stopped(speeds, rates, q, dt)]
-    # A box of any shape beside, or across, the way of one of the bodies.
-    at = points(way[round(when * (len(way) - 1))])[which]
+    path = [before, *stopped(speeds, rates, q, dt)]
+    # A box of any shape beside or across the path of a body.
+    at = points(path[round(when * (len(path) - 1))])[which]
     middle = [x + part * (size + RADIUS + CLEARANCE) for x, part, size in zip(at, off, sizes, strict=True)]
     box = [x + sign * size for sign in (-1.0, 1.0) for x, size in zip(middle, sizes, strict=True)]
     assume(min(*box_gaps(before, box), own_gap(before)) >= 0.0)
     zones = Zones(MODEL, Limits(with_boxes(WIDE, box)), CLEARANCE)
-    found = touched(zones, frames(MODEL, before), frames(MODEL, q), q, speeds, rates, dt)
-    room = min(min(*box_gaps(angles, box), own_gap(angles)) for angles in way)
-    if found is None:
+    contact = touched(zones, frames(MODEL, before), frames(MODEL, q), q, speeds, rates, dt)
+    room = min(min(*box_gaps(angles, box), own_gap(angles)) for angles in path)
+    if contact is None:
         event("free")
         assert room >= -1e-8
     elif room < 0.0:
         event("touched")
     else:
         event("said to be touched with room")
-        # No farther from the box than a cycle's way of the farthest point, or a few millimetres.
+        # No farther from the box than the farthest point moves in a cycle, or a few millimetres.
         assert room < 0.003 + travel(speeds, rates, zones.reach, dt)[0]

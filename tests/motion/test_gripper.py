@@ -48,7 +48,7 @@ def finger() -> Finger:
 
 
 @given(st.lists(st.tuples(st.sampled_from(["open", "close", "stop"]), st.integers(1, 800)), min_size=1, max_size=12))
-def test_whatever_it_is_commanded_it_keeps_to_its_limits(orders):
+def test_whatever_it_is_commanded_it_keeps_to_its_limits(orders: list[tuple[str, int]]) -> None:
     finger = Finger()
     path = [0.5] * 3
     for order, cycles in orders:
@@ -58,13 +58,13 @@ def test_whatever_it_is_commanded_it_keeps_to_its_limits(orders):
     assert max(map(abs, speeds)) <= JOINT.velocity * (1 + 1e-6)
     assert max(abs(b - a) / DT for a, b in itertools.pairwise(speeds)) <= JOINT.acceleration * (1 + 1e-3)
     changes = [(b - a) / DT for a, b in itertools.pairwise(speeds)]
-    # The acceleration at the beginning of a way is known but for the jerk of a cycle.
+    # The acceleration at the start of a motion is known but for the jerk of a cycle.
     assert max(abs(b - a) / DT for a, b in itertools.pairwise(changes)) <= 3 * JOINT.jerk
     assert JOINT.position.min <= min(path) <= max(path) <= JOINT.position.max
 
 
 @pytest.mark.parametrize(("close", "push"), [(True, -2.0), (False, 2.0)])
-def test_what_it_holds_ends_the_motion_at_once(finger, close, push):
+def test_what_it_holds_ends_the_motion_at_once(finger: Finger, close: bool, push: float) -> None:
     finger.grip(close)
     finger.run(0.3)
     before = finger.position
@@ -78,12 +78,14 @@ def test_what_it_holds_ends_the_motion_at_once(finger, close, push):
 
 
 @pytest.mark.parametrize(("close", "side"), [(True, -1.0), (False, 1.0)])
-def test_what_it_holds_with_more_than_its_torque_it_yields_to_until_it_does_not(finger, close, side):
+def test_what_it_holds_with_more_than_its_torque_it_yields_to_until_it_does_not(
+    finger: Finger, close: bool, side: float
+) -> None:
     finger.grip(close)
     finger.run(0.3)
     finger.run(5 * DT, 3.0 * side)
-    held = finger.position
-    path = [held, *finger.run(0.1, 2.1 * side)]
+    rest = finger.position
+    path = [rest, *finger.run(0.1, 2.1 * side)]
     step = JOINT.acceleration * DT * DT
     assert [(a - b) * side for a, b in itertools.pairwise(path)] == pytest.approx([step] * (len(path) - 1))
     assert set(finger.run(0.1, 1.9 * side)) == {path[-1]}
@@ -92,7 +94,7 @@ def test_what_it_holds_with_more_than_its_torque_it_yields_to_until_it_does_not(
     assert finger.motion.gripped
 
 
-def test_a_command_that_is_repeated_changes_nothing(finger):
+def test_a_command_that_is_repeated_changes_nothing(finger: Finger) -> None:
     other = Finger()
     other.grip(True)
     for _ in range(1000):
@@ -101,7 +103,7 @@ def test_a_command_that_is_repeated_changes_nothing(finger):
     assert finger.motion.moving
 
 
-def test_a_torque_with_the_motion_is_no_grip(finger):
+def test_a_torque_with_the_motion_is_no_grip(finger: Finger) -> None:
     finger.grip(True)
     finger.run(0.3)
     finger.run(3.0, +5.0)
@@ -109,7 +111,7 @@ def test_a_torque_with_the_motion_is_no_grip(finger):
     assert not finger.motion.gripped
 
 
-def test_a_short_blow_is_no_grip(finger):
+def test_a_short_blow_is_no_grip(finger: Finger) -> None:
     finger.grip(True)
     finger.run(0.3)
     for _ in range(20):
@@ -119,14 +121,14 @@ def test_a_short_blow_is_no_grip(finger):
     assert not finger.motion.gripped
 
 
-def test_it_lets_go_of_what_it_holds(finger):
+def test_it_lets_go_of_what_it_holds(finger: Finger) -> None:
     finger.grip(True)
     finger.run(0.3)
     finger.run(0.1, -2.0)
-    held = finger.position
+    rest = finger.position
     finger.grip(False)
     assert not finger.motion.gripped
-    # The torque that held it is there for a while.
-    assert finger.run(0.05, -2.0)[-1] > held
+    # The gripping torque lasts for a while.
+    assert finger.run(0.05, -2.0)[-1] > rest
     finger.run(3.0)
     assert finger.position == pytest.approx(OPEN)

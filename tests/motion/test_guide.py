@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
@@ -12,26 +13,18 @@ import pytest
 
 from kinematics.forward import forward, frames
 from kinematics.jacobian import jacobian
-from rtcp.config.model import InputConfig
-from rtcp.ipc.commands import Enable, Guide, Halt, SetControlMode
+from rtcp.config.model import ArmConfig, InputConfig
+from rtcp.ipc import refusals
+from rtcp.ipc.commands import Guide, Halt, SetControlMode
 from rtcp.ipc.events import Event, GuidedTooFast, LeaseExpired, PermissionWithdrawn
-from rtcp.ipc.refusals import (
-    DurationOutOfRange,
-    MassesUnknown,
-    NoEnablingSwitch,
-    NotPermitted,
-    Refusal,
-    WeightDiffers,
-    WrongControlMode,
-)
 from rtcp.ipc.states import ControlMode, State
-from rtcp.launch.simulation import Frame, Simulation
 from rtcp.motion.controllers import ControllerSetup
 from rtcp.motion.controllers.guide import GuideController
 from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState
+from rtcp.testing.simulation import Frame, Simulation
 from tests.samples import examples
 
 from .conftest import ARM, MODEL, no_plan
@@ -42,67 +35,60 @@ SWITCH = 11
 ZONES = Zones(MODEL, Limits(ARM), ARM.cartesian.clearance)
 
 
-class Guided:
-    """An arm on the bus in control mode torque; every cycle is looked at."""
+class Guided(Simulation):
+    """An arm on the bus in control mode torque, tracked in every cycle."""
 
-    def __init__(self, q: Sequence[float], config: Any = ARM, mode: ControlMode = ControlMode.TORQUE) -> None:
-        self.simulation = simulation = Simulation(config, follow_clock=False, positions=q)
+    def __init__(self, q: Sequence[float], config: ArmConfig = ARM) -> None:
+        super().__init__(config, follow_clock=False, positions=q)
         self.largest_step = 0.0
         self.fastest_tool = self.fastest_joint = 0.0
         self.clear = self.range = 1e9
-        assert simulation.until(lambda: simulation.state is State.READY, 5.0)
-        simulation.acquire()
         if config.inputs.enabling_switch is not None:
             self.press(True)
-        assert simulation.send(Enable()).refusal is None
-        assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
-        assert simulation.send(SetControlMode(mode)).refusal is None
-        simulation.run(0.3)
-        self.cycles, self.commanded = 0, list(simulation.loop.arm.state.commanded)
-        simulation.on_frame = self.see
+        self.hold()
+        self.do(SetControlMode(ControlMode.TORQUE))
+        self.run(0.3)
+        self.cycles, self.commanded = 0, list(self.loop.arm.state.commanded)
+        self.on_frame = self.track
 
     def press(self, pressed: bool) -> None:
         """Press the enabling switch, or release it."""
-        assert self.simulation.box is not None
-        self.simulation.box.set_input(SWITCH - 1, pressed)
-        self.simulation.run(0.02)
+        assert self.box is not None
+        self.box.set_input(SWITCH - 1, pressed)
+        self.run(0.02)
 
     @property
     def q(self) -> list[float]:
-        """Where the joints truly are, rad."""
-        return [model.mechanics.position for model in self.simulation.models]
+        """Positions of the simulated joints, rad."""
+        return [model.mechanics.position for model in self.models]
 
     @property
     def speeds(self) -> list[float]:
-        return [model.mechanics.velocity for model in self.simulation.models]
+        return [model.mechanics.velocity for model in self.models]
 
     @property
     def tool(self) -> tuple[float, float, float]:
         return forward(MODEL, self.q).position
 
-    def begin(self, duration_s: float = 0.0) -> Refusal | None:
-        return self.simulation.send(Guide(duration_s)).refusal
+    def begin(self, duration_s: float = 0.0) -> refusals.Refusal | None:
+        return self.send(Guide(duration_s)).refusal
 
     def push(self, *wrench: float) -> Callable[[int], None]:
-        arm = self.simulation.bus.segment.arm
+        arm = self.bus.segment.arm
         assert arm is not None
         return arm.push((*wrench, *[0.0] * (6 - len(wrench))))
 
-    def run(self, seconds: float) -> Guided:
-        self.simulation.run(seconds)
-        return self
-
-    def see(self, frame: Frame) -> None:
-        """Look at a cycle."""
-        commanded = list(self.simulation.loop.arm.state.commanded)
+    def track(self, frame: Frame) -> None:
+        """Track a cycle."""
+        commanded = list(self.loop.arm.state.commanded)
         steps = (abs(after - before) for after, before in zip(commanded, self.commanded, strict=True))
         self.largest_step = max(self.largest_step, *steps)
         self.commanded = commanded
         self.cycles += 1
         if self.cycles % 10 == 0:
-            self.look()
+            self.measure()
 
-    def look(self) -> None:
+    def measure(self) -> None:
         q, speeds = self.q, self.speeds
         twist = [sum(a * b for a, b in zip(row, speeds, strict=True)) for row in jacobian(MODEL, q)[:3]]
         self.fastest_tool = max(self.fastest_tool, math.hypot(*twist))
@@ -115,27 +101,20 @@ class Guided:
         self.range = min(self.range, *ends)
 
     @property
-    def events(self) -> list[Event]:
-        return [record.event for record in self.simulation.events]
+    def happened(self) -> list[Event]:
+        return [record.event for record in self.events]
 
     def check(self) -> None:
         """Inside the range and clear of all boxes; the setpoint has made no step larger than a joint's speed."""
         assert self.clear > 0.0
         assert self.range > 0.0
-        assert self.largest_step <= max(joint.velocity for joint in ARM.joints) * self.simulation.period_ns * 1.001e-9
+        assert self.largest_step <= max(joint.velocity for joint in ARM.joints) * self.period_ns * 1.001e-9
 
 
 @pytest.fixture
 def guided() -> Iterator[Callable[..., Guided]]:
-    made: list[Guided] = []
-
-    def make(*given: Any, **more: Any) -> Guided:
-        made.append(Guided(*given, **more))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.simulation.close()
+    with ExitStack() as made:
+        yield lambda *given: made.enter_context(Guided(*given))
 
 
 @pytest.mark.parametrize("q", POSTURES)
@@ -144,7 +123,7 @@ def test_without_a_push_the_arm_stays_where_it_is(guided: Callable[..., Guided],
     before = arm.tool
     assert arm.begin() is None
     arm.run(2.0)
-    assert arm.simulation.state is State.MOVING
+    assert arm.state is State.MOVING
     assert math.dist(arm.tool, before) < 2e-3
 
 
@@ -172,7 +151,7 @@ def test_the_tool_follows_the_force_and_rests_where_it_is_let_go(
 def test_a_weight_that_is_200_grams_wrong_does_not_make_the_arm_drift(guided: Callable[..., Guided]) -> None:
     arm = guided((0.0, -1.2, 0.4, 0.0, 0.0, 0.0))
     arm.push(0.0, 0.0, -0.2 * 9.81)
-    arm.simulation.run(0.3)
+    arm.run(0.3)
     assert arm.begin() is None
     arm.run(1.0)
     before = arm.tool
@@ -193,7 +172,7 @@ def test_a_hand_that_leans_on_the_arm_stops_it_before_a_box_without_ending_the_g
     assert arm.begin() is None
     arm.push(*force)
     arm.run(4.0)
-    assert arm.simulation.state is State.MOVING
+    assert arm.state is State.MOVING
     assert max(map(abs, arm.speeds)) < 0.02
     assert ZONES.distance(frames(MODEL, arm.q))[0] < 0.02
     arm.check()
@@ -204,7 +183,7 @@ def test_a_hand_that_leans_on_a_joint_stops_it_before_the_end_of_its_range(guide
     assert arm.begin() is None
     arm.push(*[0.0] * 5, 12.0)
     arm.run(2.0)
-    assert arm.simulation.state is State.MOVING
+    assert arm.state is State.MOVING
     assert 0.02 < 3.1 - arm.q[0] < 0.06
     arm.check()
 
@@ -219,14 +198,14 @@ def test_no_pushes_whatever_carry_the_arm_out_of_its_bounds(guided: Callable[...
     arm = guided(q)
     assert arm.begin() is None
     for _ in range(6):
-        way = [chance.gauss(0.0, 1.0) for _ in range(3)]
-        size = chance.uniform(0.0, 20.0) / math.hypot(*way)
-        end = arm.push(*(size * part for part in way), *(chance.uniform(-1.0, 1.0) for _ in range(3)))
+        direction = [chance.gauss(0.0, 1.0) for _ in range(3)]
+        size = chance.uniform(0.0, 20.0) / math.hypot(*direction)
+        end = arm.push(*(size * part for part in direction), *(chance.uniform(-1.0, 1.0) for _ in range(3)))
         arm.run(chance.uniform(0.2, 1.2))
         end(0)
-        if arm.simulation.state is not State.MOVING:
+        if arm.state is not State.MOVING:
             arm.run(1.0)
-            assert isinstance(arm.events[-2], GuidedTooFast)
+            assert isinstance(arm.happened[-2], GuidedTooFast)
             assert arm.begin() is None
     arm.check()
     assert arm.fastest_joint < ARM.guiding.joint_speed
@@ -240,8 +219,8 @@ def test_a_hand_that_moves_the_tool_too_fast_ends_it(guided: Callable[..., Guide
     arm.run(0.3)
     end(0)
     arm.run(1.0)
-    assert arm.simulation.state is State.HOLDING
-    (event,) = (event for event in arm.events if isinstance(event, GuidedTooFast))
+    assert arm.state is State.HOLDING
+    (event,) = (event for event in arm.happened if isinstance(event, GuidedTooFast))
     assert event.speed > 1.5 * event.limit == pytest.approx(1.5 * 0.05)
     arm.check()
 
@@ -251,9 +230,9 @@ def with_switch() -> Any:
 
 
 ENDS: dict[str, tuple[Callable[[Guided], object], type[Event] | None]] = {
-    "halt": (lambda arm: arm.simulation.send(Halt()), None),
+    "halt": (lambda arm: arm.send(Halt()), None),
     "enabling switch": (lambda arm: arm.press(False), PermissionWithdrawn),
-    "silence": (lambda arm: arm.simulation.fall_silent(), LeaseExpired),
+    "silence": (lambda arm: arm.fall_silent(), LeaseExpired),
     "time": (lambda arm: None, None),
 }
 
@@ -270,12 +249,12 @@ def test_at_every_end_it_stops_and_holds_and_the_setpoint_makes_no_step(
     assert arm.fastest_tool > 0.1
     act(arm)
     arm.run(1.2)
-    assert arm.simulation.state is State.HOLDING
+    assert arm.state is State.HOLDING
     # The hand pushes on: the position loop holds against it.
     before = arm.tool
     arm.run(0.5)
     assert math.dist(arm.tool, before) < 1e-2
-    assert (event is None) or any(isinstance(one, event) for one in arm.events)
+    assert (event is None) or any(isinstance(each, event) for each in arm.happened)
     arm.check()
 
 
@@ -284,31 +263,31 @@ def test_it_is_refused_while_the_enabling_switch_is_released_in_another_mode_and
 ) -> None:
     arm = guided(BENT, with_switch())
     arm.press(False)
-    assert isinstance(arm.begin(), NotPermitted)
+    assert isinstance(arm.begin(), refusals.NotPermitted)
     arm.press(True)
-    assert arm.begin(1e6) == DurationOutOfRange(1e6, 3600.0)
+    assert arm.begin(1e6) == refusals.DurationOutOfRange(1e6, 3600.0)
     end = arm.push(0.0, 0.0, -15.0)
-    arm.simulation.run(0.3)
-    assert isinstance(arm.begin(), WeightDiffers)
-    end(0)
-    arm.simulation.run(0.3)
-    assert arm.simulation.send(SetControlMode(ControlMode.JOINT)).refusal is None
     arm.run(0.3)
-    assert isinstance(arm.begin(), WrongControlMode)
+    assert isinstance(arm.begin(), refusals.WeightDiffers)
+    end(0)
+    arm.run(0.3)
+    arm.do(SetControlMode(ControlMode.JOINT))
+    arm.run(0.3)
+    assert isinstance(arm.begin(), refusals.WrongControlMode)
 
 
 def test_on_a_real_bus_it_is_refused_without_an_enabling_switch_unless_a_key_allows_it() -> None:
     real = replace(ARM, bus=replace(ARM.bus, interface="eth0"))
-    assert refusal(real) == NoEnablingSwitch()
+    assert refusal(real) == refusals.NoEnablingSwitch()
     assert refusal(replace(real, guiding=replace(ARM.guiding, enabling_switch=False))) is None
     assert refusal(replace(real, inputs=with_switch().inputs)) is None
 
 
 def test_it_is_refused_where_the_masses_are_unknown() -> None:
-    assert refusal(replace(ARM, arm=replace(MODEL, links=()))) == MassesUnknown()
+    assert refusal(replace(ARM, arm=replace(MODEL, links=()))) == refusals.MassesUnknown()
 
 
-def refusal(config: Any) -> Refusal | None:
+def refusal(config: ArmConfig) -> refusals.Refusal | None:
     limits, state = Limits(config), ArmState(6)
     guard = TrajectoryGuard(config, limits, 0.0005)
     return GuideController(ControllerSetup(config, limits, guard, 0.0005, no_plan)).accept(Guide(0.0), state, False)

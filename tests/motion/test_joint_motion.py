@@ -1,10 +1,9 @@
-"""The generator of set-points keeps its bounds and its continuity whatever is asked."""
+"""The generator of setpoints keeps its bounds and its continuity for every target."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -16,20 +15,22 @@ from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.state import ArmState, Phase
 from tests.samples import examples
 
+from .conftest import Drive
+
 PERIOD = 0.0005
 SPEED, ACCELERATION, JERK = [0.5] * 6, [2.0] * 6, [20.0] * 6
 
 
 class Driven:
-    """The generator with the state that the loop keeps for it, where no guard cuts anything."""
+    """The generator with the state of the loop, without guards."""
 
     def __init__(self) -> None:
-        self.made = JointMotion(PERIOD, SPEED, ACCELERATION, JERK)
+        self.motion = JointMotion(PERIOD, SPEED, ACCELERATION, JERK)
         self.state = ArmState(6)
 
     @property
     def phase(self) -> Phase:
-        return self.made.phase
+        return self.motion.phase
 
     @property
     def position(self) -> list[float]:
@@ -40,27 +41,23 @@ class Driven:
         return self.state.commanded_velocity
 
     def move_to(self, target: list[float], speed: float, *, synchronized: bool = True) -> bool:
-        return self.made.move_to(self.state, target, speed, synchronized=synchronized)
+        return self.motion.move_to(self.state, target, speed, synchronized=synchronized)
 
     def stop(self) -> None:
-        self.made.stop(self.state)
+        self.motion.stop(self.state)
 
     def update(self) -> bool:
         state = self.state
-        target = self.made.update(state)
+        target = self.motion.update(state)
         state.commanded_acceleration = [
             (new - old) / PERIOD for new, old in zip(target.velocity, state.commanded_velocity, strict=True)
         ]
         state.commanded, state.commanded_velocity = list(target.position), list(target.velocity)
-        return not self.made.failed
-
-
-def generator() -> Driven:
-    return Driven()
+        return not self.motion.failed
 
 
 def test_a_move_arrives_exactly_and_all_joints_together() -> None:
-    made = generator()
+    made = Driven()
     target = [1.0, -0.5, 0.25, 0.0, 0.1, -1.0]
     made.move_to(target, 0.5)
     still_moving = []
@@ -72,7 +69,7 @@ def test_a_move_arrives_exactly_and_all_joints_together() -> None:
 
 
 def test_each_joint_at_its_best_arrives_earlier_the_shorter_its_way() -> None:
-    made = generator()
+    made = Driven()
     target = [1.0, -0.5, 0.25, 0.0, 0.1, -1.0]
     assert made.move_to(target, 0.5, synchronized=False)
     arrived = [0.0] * 6
@@ -88,7 +85,7 @@ def test_each_joint_at_its_best_arrives_earlier_the_shorter_its_way() -> None:
 
 
 def test_a_slower_speed_is_kept() -> None:
-    made = generator()
+    made = Driven()
     made.move_to([1.0] * 6, 0.2)
     fastest = 0.0
     while made.phase is Phase.MOVE:
@@ -98,7 +95,7 @@ def test_a_slower_speed_is_kept() -> None:
 
 
 def test_a_stop_comes_to_rest_and_stays() -> None:
-    made = generator()
+    made = Driven()
     made.move_to([2.0] * 6, 0.5)
     for _ in range(1000):
         made.update()
@@ -113,23 +110,23 @@ def test_a_stop_comes_to_rest_and_stays() -> None:
 
 
 def test_a_stop_at_rest_changes_nothing() -> None:
-    made = generator()
+    made = Driven()
     made.stop()
     assert made.phase is Phase.HOLD
 
 
 def test_latching_holds_there() -> None:
-    made = generator()
+    made = Driven()
     made.move_to([1.0] * 6, 0.5)
     for _ in range(500):
         made.update()
     made.state.commanded_velocity = [0.0] * 6
     made.state.commanded_acceleration = [0.0] * 6
-    made.made.hold()
-    held = list(made.position)
+    made.motion.hold()
+    position = list(made.position)
     assert made.phase is Phase.HOLD
     made.update()
-    assert made.position == held
+    assert made.position == position
 
 
 angle = st.floats(-2.0, 2.0)
@@ -141,8 +138,10 @@ event = st.one_of(
 
 @settings(max_examples=examples(60), deadline=None)
 @given(st.lists(st.tuples(event, st.integers(1, 400)), min_size=1, max_size=6))
-def test_position_speed_and_acceleration_stay_bounded_under_any_sequence(script: list) -> None:  # type: ignore[type-arg]
-    made = generator()
+def test_position_speed_and_acceleration_stay_bounded_under_any_sequence(
+    script: list[tuple[tuple[str, list[float], float], int]],
+) -> None:
+    made = Driven()
     position, velocity = list(made.position), list(made.velocity)
     for (kind, target, speed), cycles in script:
         if kind == "move":
@@ -162,7 +161,7 @@ def test_a_distance_on_the_border_of_two_profiles_is_planned_and_reached() -> No
     # 2 a^3 / j^2: there ruckig finds no solution with exactly these bounds.
     border = 2 * ACCELERATION[0] ** 3 / JERK[0] ** 2
     for start in range(0, 5000, 37):
-        made = generator()
+        made = Driven()
         made.state.commanded = [start * 1e-4] * 6
         target = [start * 1e-4 + border, *([start * 1e-4] * 5)]
         assert made.move_to(target, 0.5), start
@@ -172,7 +171,7 @@ def test_a_distance_on_the_border_of_two_profiles_is_planned_and_reached() -> No
 
 
 def test_a_move_that_would_take_too_long_is_refused_and_nothing_moves() -> None:
-    made = generator()
+    made = Driven()
     for speed in (1e-3, 1e-5, 1e-7, 1e-12):
         assert not made.move_to([1.0] * 6, speed)
         assert made.phase is Phase.HOLD
@@ -182,7 +181,7 @@ def test_a_move_that_would_take_too_long_is_refused_and_nothing_moves() -> None:
 @settings(max_examples=examples(200), deadline=None)
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.floats(1e-7, 0.5))
 def test_no_target_and_no_speed_raises(target: list[float], speed: float) -> None:
-    made = generator()
+    made = Driven()
     if made.move_to(target, speed):
         for _ in range(50):
             assert made.update()
@@ -191,7 +190,7 @@ def test_no_target_and_no_speed_raises(target: list[float], speed: float) -> Non
 @pytest.mark.parametrize("stopped", [False, True], ids=["replaced", "stopped"])
 @pytest.mark.parametrize("cycles", range(1990, 2070, 8))
 def test_a_move_that_ends_early_while_a_joint_brakes_for_the_end_of_its_range_is_cut_by_no_guard(
-    new_drive: Callable[..., Any], cycles: int, stopped: bool
+    new_drive: Callable[..., Drive], cycles: int, stopped: bool
 ) -> None:
     drive = new_drive(period_s=0.002).at([0.0] * 6)
     controller, end = drive.controller(JointMoveController), drive.limits.low[4]

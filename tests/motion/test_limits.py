@@ -1,35 +1,34 @@
-"""Limits change as one transaction: refused with a reason, or taken whole."""
+"""Limits change as one transaction: refused with a reason, or applied whole."""
 
 from __future__ import annotations
 
-import array
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf, nan
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.ipc.refusals import ImpossibleLimit, LimitsExcludeArm, LimitsExcludeJoint, LimitWidened, Refusal
-from rtcp.motion.limits import Limits, Values, read, rows
+from rtcp.motion.limits import Corners, Limits, Values, corners, read, rows
 from rtcp.motion.planning.plan import COLUMNS
 from tests.arm_geometry import points
 
+from .conftest import memory, near
 from .guard_checker import ARM, JOINTS_ONLY, GuardChecker, with_boxes
 
 WIDEST = Values.configured(ARM)
 STILL = [0.0] * 6
 
 
-def memory(plan: Sequence[Sequence[float]]) -> memoryview:
-    """The rows as the plan area holds them."""
-    return memoryview(array.array("d", [x for row in plan for x in (*row, *[0.0] * (COLUMNS - len(row)))]))
+def full(plan: Sequence[Sequence[float]]) -> memoryview[float]:
+    """The rows as the plan area holds them, filled up with zeros."""
+    return memory([*row, *[0.0] * (COLUMNS - len(row))] for row in plan)
 
 
 def of_first(values: Values, name: str, number: float) -> Values:
-    """The same with another number for the first joint."""
+    """These values with another number for the first joint."""
     return replace(values, **{name: (number, *getattr(values, name)[1:])})
 
 
@@ -46,14 +45,14 @@ def test_what_is_configured_is_taken() -> None:
     [
         ("low", -3.2, LimitWidened(0, -3.2, -3.1)),
         ("high", 3.2, LimitWidened(0, 3.2, 3.1)),
-        ("low", -inf, ImpossibleLimit(0, -inf, -inf)),
+        ("low", -inf, ImpossibleLimit(0, -inf, -3.1)),
         ("high", -3.1, ImpossibleLimit(0, -3.1, -3.1)),
         ("velocity", 0.6, LimitWidened(0, 0.6, 0.5)),
         ("velocity", 0.0, ImpossibleLimit(0, 0.0, 0.0005)),
         ("velocity", 1e-300, ImpossibleLimit(0, 1e-300, 0.0005)),
         ("acceleration", 2.1, LimitWidened(0, 2.1, 2.0)),
         ("acceleration", -1.0, ImpossibleLimit(0, -1.0, 0.002)),
-        ("jerk", inf, ImpossibleLimit(0, inf, 0.02)),
+        ("jerk", inf, ImpossibleLimit(0, inf, 20.0)),
         ("torque", 50.0, LimitWidened(0, 50.0, 49.0)),
         ("high", -0.1, LimitsExcludeJoint(0, 0.0, -0.1)),
         ("low", 0.1, LimitsExcludeJoint(0, 0.0, 0.1)),
@@ -84,9 +83,9 @@ def test_a_joint_that_would_come_to_rest_outside_refuses_the_range_and_one_that_
     moving = [0.4, *STILL[1:]]
     # From 0.4 rad/s with 2 rad/s^2 the stop takes 0.04 rad.
     assert check(of_first(WIDEST, "high", 0.041), velocity=moving) is None
-    assert check(of_first(WIDEST, "high", 0.039), velocity=moving) == LimitsExcludeJoint(0, pytest.approx(0.04), 0.039)
+    assert check(of_first(WIDEST, "high", 0.039), velocity=moving) == LimitsExcludeJoint(0, near(0.04), 0.039)
     slower = of_first(of_first(WIDEST, "high", 0.041), "acceleration", 1.0)
-    assert check(slower, velocity=moving) == LimitsExcludeJoint(0, pytest.approx(0.08), 0.041)
+    assert check(slower, velocity=moving) == LimitsExcludeJoint(0, near(0.08), 0.041)
     assert check(of_first(WIDEST, "velocity", 0.3), velocity=moving) == ImpossibleLimit(0, 0.3, 0.4)
 
 
@@ -96,10 +95,10 @@ def test_a_box_only_becomes_narrower_and_a_keep_out_box_only_wider(which: str, a
     outward = (-0.01 if at < 3 else 0.01) * (1.0 if which == "box" else -1.0)
 
     def moved(by: float) -> Values:
-        if which == "box":
-            return replace(WIDEST, box=tuple(x + (by if n == at else 0.0) for n, x in enumerate(WIDEST.box or ())))
         first, *others = WIDEST.keep_out
-        return replace(WIDEST, keep_out=(tuple(x + (by if n == at else 0.0) for n, x in enumerate(first)), *others))
+        walls = tuple(x + (by if n == at else 0.0) for n, x in enumerate(WIDEST.box if which == "box" else first))
+        box = corners(walls[:3], walls[3:])
+        return replace(WIDEST, box=box) if which == "box" else replace(WIDEST, keep_out=(box, *others))
 
     assert check(moved(-outward)) is None
     refused = check(moved(outward))
@@ -122,10 +121,10 @@ def test_other_joints_than_the_arms_are_refused() -> None:
 
 def test_whoever_holds_a_list_sees_the_change() -> None:
     limits = Limits(ARM)
-    held = limits.high
+    high = limits.high
     limits.apply(of_first(WIDEST, "high", 1.0))
-    assert held is limits.high
-    assert held[0] == 1.0
+    assert high is limits.high
+    assert high[0] == 1.0
     assert limits.widest.high[0] == 3.1
 
 
@@ -173,17 +172,20 @@ JOINT = st.tuples(*[NUMBER] * 6)
 
 
 @given(joints=st.lists(JOINT, min_size=1, max_size=6), box=st.none() | JOINT, keep_out=st.lists(JOINT, max_size=4))
-def test_limits_come_back_from_their_rows_as_they_were(joints: list[Any], box: Any, keep_out: list[Any]) -> None:
-    values = Values(*zip(*joints, strict=True), box=box, keep_out=tuple(keep_out))
+def test_limits_come_back_from_their_rows_as_they_were(
+    joints: list[Corners], box: Corners | None, keep_out: list[Corners]
+) -> None:
+    low, high, velocity, acceleration, jerk, torque = zip(*joints, strict=True)
+    values = Values(low, high, velocity, acceleration, jerk, torque, box, tuple(keep_out))
     plan = rows(values)
-    assert repr(read(memory(plan), len(plan))) == repr(values)
+    assert repr(read(full(plan), len(plan))) == repr(values)
 
 
 @pytest.mark.parametrize("count", [-1, 0, 1, 9, 11, 400])
 def test_another_count_of_rows_is_none(count: int) -> None:
     plan = rows(WIDEST)
     assert len(plan) == 10
-    assert read(memory(plan), count) is None
+    assert read(full(plan), count) is None
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -191,11 +193,11 @@ def test_another_count_of_rows_is_none(count: int) -> None:
 def test_a_head_that_does_not_fit_the_rows_is_none(column: int, number: float) -> None:
     plan = rows(WIDEST)
     plan[0][column] = number
-    assert read(memory(plan), len(plan)) is None
+    assert read(full(plan), len(plan)) is None
 
 
 @given(plan=st.lists(st.lists(NUMBER, min_size=COLUMNS, max_size=COLUMNS), min_size=1, max_size=9), count=st.integers())
 def test_whatever_is_in_memory_nothing_but_none_or_limits_comes_of_it(plan: list[list[float]], count: int) -> None:
-    found = read(memory(plan), count)
-    if found is not None:
-        check(found)
+    values = read(full(plan), count)
+    if values is not None:
+        check(values)

@@ -15,7 +15,7 @@ import pytest
 from kinematics import Pose, forward
 from kinematics.jacobian import singularity_distances
 from kinematics.solution import Near, Singularity
-from rtcp.config.model import SingularityLimits, Stop
+from rtcp.config.model import ArmConfig, SingularityLimits, Stop
 from rtcp.ipc.events import JointLimitReached, NoSolution, OutOfReach, PlanDamaged, SetpointJump, SingularityReached
 from rtcp.ipc.refusals import DamagedRow, PathNeedsRest, PathStartsElsewhere
 from rtcp.motion.controllers.line import LineController
@@ -24,19 +24,24 @@ from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.plan import COLUMNS, KIND
 from rtcp.motion.state import Phase
 
+from .conftest import Drive, Rows, memory
+
 PERIOD = 0.0005
 ANYWHERE = SingularityLimits(shoulder=0.0, elbow=0.0, wrist=0.0)
 Q = (0.0, 0.3, 1.2, 0.0, 0.8, 0.0)
 
 
+Moved = Callable[..., Stop]
+
+
 @pytest.fixture
-def mode(arm: Any, drive: Any) -> LineController:
+def mode(arm: ArmConfig, drive: Drive) -> LineController:
     made: LineController = drive.controller(LineController, cartesian=replace(arm.cartesian, singularity=ANYWHERE))
     return made
 
 
 @pytest.fixture
-def moved(arm: Any) -> Callable[..., Stop]:
+def moved(arm: ArmConfig) -> Moved:
     """The pose at Q, moved and turned."""
     at = forward(arm.arm, Q)
     x, y, z = at.position
@@ -47,8 +52,8 @@ def moved(arm: Any) -> Callable[..., Stop]:
 
 
 @pytest.fixture
-def rows(arm: Any, drive: Any, memory: Callable[..., Any]) -> Callable[..., tuple[Any, int]]:
-    def planned(stops: list[Stop], q: Sequence[float] = Q, speed: float | None = None) -> tuple[Any, int]:
+def rows(arm: ArmConfig, drive: Drive) -> Rows:
+    def planned(stops: list[Stop], q: Sequence[float] = Q, speed: float | None = None) -> tuple[memoryview[float], int]:
         plan = plan_lines(arm.arm, drive.limits, arm.cartesian, q, stops, speed=speed)
         return memory(plan.rows), len(plan.rows)
 
@@ -56,14 +61,14 @@ def rows(arm: Any, drive: Any, memory: Callable[..., Any]) -> Callable[..., tupl
 
 
 def off_line(start: Sequence[float], end: Sequence[float], point: Sequence[float]) -> float:
-    way = [b - a for a, b in zip(start, end, strict=True)]
-    length = math.hypot(*way)
-    along = sum((p - a) * w for p, a, w in zip(point, start, way, strict=True)) / length
-    return math.dist(point, [a + along * w / length for a, w in zip(start, way, strict=True)])
+    direction = [b - a for a, b in zip(start, end, strict=True)]
+    length = math.hypot(*direction)
+    along = sum((p - a) * w for p, a, w in zip(point, start, direction, strict=True)) / length
+    return math.dist(point, [a + along * w / length for a, w in zip(start, direction, strict=True)])
 
 
 def test_the_tool_stays_on_the_line_and_rests_at_each_pose(
-    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
+    arm: ArmConfig, drive: Drive, mode: LineController, rows: Rows, moved: Moved
 ) -> None:
     stops = [moved(dy=0.2), moved(dy=0.2, dz=0.1), moved()]
     drive.at(Q)
@@ -87,7 +92,7 @@ def test_the_tool_stays_on_the_line_and_rests_at_each_pose(
 
 
 def test_the_tool_keeps_to_speed_and_acceleration(
-    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
+    arm: ArmConfig, drive: Drive, mode: LineController, rows: Rows, moved: Moved
 ) -> None:
     drive.at(Q)
     drive.execute(mode, *rows([moved(dz=-0.2)], speed=0.05))
@@ -100,7 +105,7 @@ def test_the_tool_keeps_to_speed_and_acceleration(
 
 
 def test_a_turn_is_about_one_axis_and_ends_where_it_should(
-    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
+    arm: ArmConfig, drive: Drive, mode: LineController, rows: Rows, moved: Moved
 ) -> None:
     goal = moved(drx=0.4, dry=-0.3, drz=0.2)
     drive.at(Q)
@@ -122,7 +127,7 @@ def test_a_turn_is_about_one_axis_and_ends_where_it_should(
 
 @pytest.mark.parametrize("after_s", [0.0005, 0.1, 0.5, 1.0, 1.4])
 def test_a_stop_brakes_along_the_line(
-    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any, after_s: float
+    arm: ArmConfig, drive: Drive, mode: LineController, rows: Rows, moved: Moved, after_s: float
 ) -> None:
     goal = moved(dy=0.2, drz=0.2)
     drive.at(Q)
@@ -137,7 +142,7 @@ def test_a_stop_brakes_along_the_line(
 
 
 def test_a_small_rest_at_the_start_fades_out_without_a_jump(
-    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
+    arm: ArmConfig, drive: Drive, mode: LineController, rows: Rows, moved: Moved
 ) -> None:
     plan = rows([moved(dy=0.2)])
     drive.at([q + 3e-4 for q in Q])
@@ -146,7 +151,7 @@ def test_a_small_rest_at_the_start_fades_out_without_a_jump(
     assert math.dist(forward(arm.arm, drive.state.commanded).position, moved(dy=0.2).pose[:3]) < 1e-9
 
 
-def test_a_line_that_begins_elsewhere_is_refused(drive: Any, mode: LineController, rows: Any, moved: Any) -> None:
+def test_a_line_that_begins_elsewhere_is_refused(drive: Drive, mode: LineController, rows: Rows, moved: Moved) -> None:
     plan = rows([moved(dy=0.2)])
     drive.at([q + 3e-3 for q in Q])
     refused = drive.execute(mode, *plan)
@@ -155,7 +160,7 @@ def test_a_line_that_begins_elsewhere_is_refused(drive: Any, mode: LineControlle
 
 
 def test_a_line_in_motion_is_refused_and_what_runs_goes_on(
-    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
+    arm: ArmConfig, drive: Drive, mode: LineController, rows: Rows, moved: Moved
 ) -> None:
     first, second = rows([moved(dy=0.1)]), rows([moved(dz=-0.1)])
     drive.at(Q)
@@ -167,12 +172,12 @@ def test_a_line_in_motion_is_refused_and_what_runs_goes_on(
     assert abs(refused.velocity) > 0.01
     drive.until_rest(mode)
     assert math.dist(forward(arm.arm, drive.state.commanded).position, moved(dy=0.1).pose[:3]) < 1e-9
-    # At rest it is looked at for what it is: this one begins elsewhere.
+    # At rest the refusal names the start of the plan.
     refused = drive.execute(mode, *second)
     assert isinstance(refused, PathStartsElsewhere)
 
 
-def test_lines_stopped_and_begun_anew_never_jump(arm: Any, new_drive: Any, memory: Any) -> None:
+def test_lines_stopped_and_begun_anew_never_jump(arm: ArmConfig, new_drive: Callable[..., Drive]) -> None:
     for seed in range(4):
         chance, drive = random.Random(seed), new_drive().at(Q)
         mode = drive.controller(LineController)
@@ -190,17 +195,24 @@ def test_lines_stopped_and_begun_anew_never_jump(arm: Any, new_drive: Any, memor
 @pytest.mark.parametrize(
     ("place", "rates", "checked", "kind"),
     [
-        # So far and so fast that the first set-point is out of reach already.
+        # The first setpoint is out of reach.
         (200.0, (1e6, 1e8, 1e9), True, OutOfReach),
-        # Towards the edge of the reach the elbow's speed grows without bound. The drive checks every cycle.
+        # At the edge of the reach the speed of the elbow grows without bound.
         (1.5, (0.1, 0.2, 2.0), True, SetpointJump),
-        # As if nothing had been slowed down: the tool stays bounded, a joint does not, and no guard holds it.
+        # A plan that was not slowed down for the joints: the tool keeps its bounds, a joint does not.
         (None, (5.0, 0.9, 5.0), False, SetpointJump),
     ],
     ids=["out of reach", "stretches the arm", "too fast for a joint"],
 )
 def test_a_line_that_cannot_be_followed_ends_in_a_stop_that_says_why(
-    drive: Any, mode: LineController, rows: Any, moved: Any, place: float | None, rates: Any, checked: bool, kind: Any
+    drive: Drive,
+    mode: LineController,
+    rows: Rows,
+    moved: Moved,
+    place: float | None,
+    rates: Any,
+    checked: bool,
+    kind: Any,
 ) -> None:
     plan, count = rows([moved(dy=0.4 if place is None else 0.2)])
     plan[8] = plan[8] if place is None else place
@@ -219,7 +231,7 @@ def test_a_line_that_cannot_be_followed_ends_in_a_stop_that_says_why(
 
 @pytest.mark.interpreted
 def test_a_line_to_a_pose_in_reach_without_a_solution_does_not_name_a_distance_of_zero(
-    drive: Any, mode: LineController, rows: Any, moved: Any
+    drive: Drive, mode: LineController, rows: Rows, moved: Moved
 ) -> None:
     drive.at(Q)
     assert drive.execute(mode, *rows([moved(dy=0.2)])) is None
@@ -229,7 +241,7 @@ def test_a_line_to_a_pose_in_reach_without_a_solution_does_not_name_a_distance_o
 
 
 def test_a_line_that_comes_near_a_singularity_after_all_ends_in_a_stop_before_it(
-    arm: Any, drive: Any, rows: Any, moved: Any
+    arm: ArmConfig, drive: Drive, rows: Rows, moved: Moved
 ) -> None:
     plan, count = rows([moved(dy=0.2)])
     plan[8], plan[14], plan[15], plan[16] = 1.5, 0.03, 0.1, 1.0
@@ -243,12 +255,14 @@ def test_a_line_that_comes_near_a_singularity_after_all_ends_in_a_stop_before_it
     assert isinstance(ended, SingularityReached)
     assert (ended.which, ended.limit) == (1, 0.6)
     assert 0.93 * 0.6 < ended.value < 0.95 * 0.6
-    found = singularity_distances(arm.arm, drive.state.commanded).elbow
-    assert found is not None
-    assert 0.5 < found < ended.value
+    elbow = singularity_distances(arm.arm, drive.state.commanded).elbow
+    assert elbow is not None
+    assert 0.5 < elbow < ended.value
 
 
-def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(arm: Any, drive: Any, rows: Any, moved: Any) -> None:
+def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(
+    arm: ArmConfig, drive: Drive, rows: Rows, moved: Moved
+) -> None:
     plan, count = rows([moved(dy=0.2)])
     model = replace(
         arm.arm,
@@ -267,7 +281,7 @@ def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(arm: Any, dri
     [(0, math.nan), (3, 2.0), (9, math.inf), (14, 0.0), (14, -1.0), (15, math.nan), (18, -1.0), (KIND, 3.0)],
 )
 def test_a_damaged_piece_is_not_started_and_ends_what_runs(
-    drive: Any, mode: LineController, rows: Any, moved: Any, column: int, value: float
+    drive: Drive, mode: LineController, rows: Rows, moved: Moved, column: int, value: float
 ) -> None:
     plan, count = rows([moved(dy=0.1), moved()])
     drive.at(Q)
@@ -284,7 +298,7 @@ def test_a_damaged_piece_is_not_started_and_ends_what_runs(
 
 
 def test_a_piece_that_begins_elsewhere_than_the_last_ended_is_damaged(
-    drive: Any, mode: LineController, rows: Any, moved: Any
+    drive: Drive, mode: LineController, rows: Rows, moved: Moved
 ) -> None:
     plan, count = rows([moved(dy=0.1), moved()])
     plan[COLUMNS + 2] += 0.01

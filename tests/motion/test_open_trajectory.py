@@ -60,10 +60,10 @@ def test_between_points_the_joint_passes_neither_of_them(steps: list[float]) -> 
         points.append(at(2.0 * number, here))
     rows = [row for point in points for row in made.append([point])] + made.append((), rest=True)
     for (t0, q0, v0), (t1, q1, v1) in pairwise(of_first(rows)):
-        found = cubic(q0, v0, q1, v1, t1 - t0)
-        assert beyond(found, min(q0, q1) - 1e-9, max(q0, q1) + 1e-9) is None
+        piece = cubic(q0, v0, q1, v1, t1 - t0)
+        assert beyond(piece, min(q0, q1) - 1e-9, max(q0, q1) + 1e-9) is None
         most = LIMITS.velocity[0] * (t1 - t0)
-        assert beyond(derivative(found), -most, most) is None
+        assert beyond(derivative(piece), -most, most) is None
 
 
 @pytest.mark.parametrize(
@@ -81,8 +81,8 @@ def test_between_points_the_joint_passes_neither_of_them(steps: list[float]) -> 
 )
 def test_points_that_are_refused_change_nothing(points: list[Point], text: str) -> None:
     made, same = plan(), plan()
-    for one in (made, same):
-        one.append([at(1.0, 0.1), at(2.0, 0.2)])
+    for trajectory in (made, same):
+        trajectory.append([at(1.0, 0.1), at(2.0, 0.2)])
     with pytest.raises(PlanRefused, match=text):
         made.append(points)
     assert made.append([at(3.0, 0.25)]) == same.append([at(3.0, 0.25)])

@@ -24,17 +24,18 @@ STEP = 0.5 * PERIOD
 
 @dataclass
 class Drive:
-    """The fields of a drive that the guard sees."""
+    """The fields of a drive that a drive writer reads and writes."""
 
     position: float = 0.0
     velocity: float = 0.0
+    torque: float = 0.0
     target_position: float = 0.0
     target_velocity: float = 0.0
     target_torque: float = 0.0
 
 
 CHANGE = 2.0 * PERIOD
-"""What a target velocity may change by in a cycle, rad/s."""
+"""Largest change of a target velocity in a cycle, rad/s."""
 
 
 def guarded(last: float, drive: Drive) -> tuple[Drive, int]:
@@ -44,8 +45,8 @@ def guarded(last: float, drive: Drive) -> tuple[Drive, int]:
     return drive, guard.held
 
 
-def in_the_end(last: float, drive: Drive) -> tuple[Drive, int]:
-    """What becomes of a velocity that is wanted for so long that its change bounds it no more."""
+def settled(last: float, drive: Drive) -> tuple[Drive, int]:
+    """The targets after a velocity was requested until its change no longer bounds it."""
     guard = OutputLimiter(Limits(CONFIG), PERIOD)
     guard.latch(0, last)
     wanted = drive.target_velocity
@@ -68,14 +69,14 @@ def in_the_end(last: float, drive: Drive) -> tuple[Drive, int]:
     ],
 )
 def test_a_target_is_held_inside_range_and_step(last: float, wanted: float, passed: float) -> None:
-    drive, held = guarded(last, Drive(target_position=wanted))
+    drive, clamped = guarded(last, Drive(target_position=wanted))
     assert drive.target_position == pytest.approx(passed, abs=1e-9)
-    assert held == (0 if wanted == passed else 1)
+    assert clamped == (0 if wanted == passed else 1)
 
 
 @pytest.mark.parametrize(("wanted", "passed"), [(0.4, 0.4), (9.0, 0.5), (-9.0, -0.5), (math.nan, 0.0)])
 def test_a_speed_is_held_inside_its_bound(wanted: float, passed: float) -> None:
-    assert in_the_end(0.0, Drive(target_velocity=wanted))[0].target_velocity == passed
+    assert settled(0.0, Drive(target_velocity=wanted))[0].target_velocity == passed
 
 
 @pytest.mark.parametrize(("wanted", "passed"), [(4.0, 4.0), (99.0, 10.0), (-99.0, -10.0), (math.nan, 0.0)])
@@ -84,8 +85,8 @@ def test_a_torque_is_held_inside_its_bound(wanted: float, passed: float) -> None
 
 
 def test_beyond_the_range_speed_only_leads_back() -> None:
-    assert in_the_end(2.0, Drive(position=2.01, target_position=2.0, target_velocity=0.1))[0].target_velocity == 0.0
-    assert in_the_end(2.0, Drive(position=2.01, target_position=2.0, target_velocity=-0.1))[0].target_velocity == -0.1
+    assert settled(2.0, Drive(position=2.01, target_position=2.0, target_velocity=0.1))[0].target_velocity == 0.0
+    assert settled(2.0, Drive(position=2.01, target_position=2.0, target_velocity=-0.1))[0].target_velocity == -0.1
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50), st.floats(-1.0, 2.0))
@@ -114,7 +115,7 @@ def test_limits_that_change_are_those_that_count_from_then_on() -> None:
         drive.target_velocity = 99.0
         guard.check([drive])
     assert drive.target_velocity == 0.1
-    # Gently back into the range.
+    # Slowly back into the range.
     assert 1.0 - 200 * BACK_RAD_S * PERIOD <= drive.target_position <= 1.0 - 100 * BACK_RAD_S * PERIOD
 
 
@@ -140,7 +141,7 @@ def test_a_target_beyond_the_range_begins_where_it_is_and_is_led_back_to_the_edg
     targets = led_back(last, wanted)
     assert targets[1] == pytest.approx(last, abs=1e-12)
     assert targets[-1] == edge
-    # The way at full pace, and what it takes to gain it and to lose it.
+    # The distance at full return speed, and the time to reach and to leave that speed.
     assert (len(targets) - 2) * PERIOD <= abs(last - edge) / BACK_RAD_S + BACK_RAD_S / JOINT.acceleration + 2 * PERIOD
 
 

@@ -9,15 +9,18 @@ from typing import Any
 
 import pytest
 
-from rtcp.config.model import MOST_AXES, Point
+from rtcp.config.model import MOST_AXES, ArmConfig, Point
 from rtcp.motion.controllers.trajectory import TrajectoryController
 from rtcp.motion.planning.plan import ACCELERATIONS, CUBIC, KIND, QUINTIC, VELOCITIES, Plan, PlanRefused
 from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.motion.state import Phase
 
+from .conftest import Drive, memory
+
 PERIOD = 0.0005
 ZERO = (0.0,) * 6
 NAMES = [f"j{i}" for i in range(1, 7)]
+Planned = Callable[..., Plan]
 
 UNUSED = (0.0,) * (MOST_AXES - 6)
 
@@ -27,7 +30,7 @@ def at(*first: float) -> tuple[float, ...]:
 
 
 @pytest.fixture
-def plan(drive: Any) -> Callable[..., Plan]:
+def plan(drive: Drive) -> Planned:
     def planned(points: Sequence[Point], q: Sequence[float] = ZERO, **given: Any) -> Plan:
         return plan_trajectory(points, drive.limits, q, names=NAMES, **given)
 
@@ -92,13 +95,13 @@ REFUSALS = [
 
 
 @pytest.mark.parametrize(("points", "sentence"), REFUSALS, ids=range(len(REFUSALS)))
-def test_a_plan_that_cannot_be_is_refused_in_a_sentence(plan: Any, points: list[Point], sentence: str) -> None:
+def test_a_plan_that_cannot_be_is_refused_in_a_sentence(plan: Planned, points: list[Point], sentence: str) -> None:
     with pytest.raises(PlanRefused) as refused:
         plan(points)
     assert str(refused.value) == sentence
 
 
-def test_a_joint_that_swings_beyond_its_range_between_two_points_is_refused(plan: Any) -> None:
+def test_a_joint_that_swings_beyond_its_range_between_two_points_is_refused(plan: Planned) -> None:
     # Both points are inside; with these speeds the cubic is T v / 4 = 0.1 rad beyond both half way.
     points = [
         Point(9.0, at(3.05), ZERO),
@@ -108,8 +111,8 @@ def test_a_joint_that_swings_beyond_its_range_between_two_points_is_refused(plan
     ]
     with pytest.raises(PlanRefused) as refused:
         plan(points, at(3.05))
-    found = "between points 2 and 3: j1 would be at 3.15 rad at 11.500 s, allowed is -3.1 to 3.1 rad"
-    assert str(refused.value) == found
+    expected = "between points 2 and 3: j1 would be at 3.15 rad at 11.500 s, allowed is -3.1 to 3.1 rad"
+    assert str(refused.value) == expected
 
 
 @pytest.mark.parametrize(
@@ -119,12 +122,12 @@ def test_a_joint_that_swings_beyond_its_range_between_two_points_is_refused(plan
         ([Point(4.0, at(0.8)), Point(8.0, at(0.8))], "on the way to point 1"),
     ],
 )
-def test_a_plan_through_a_box_is_refused(plan: Any, points: list[Point], where: str) -> None:
+def test_a_plan_through_a_box_is_refused(plan: Planned, points: list[Point], where: str) -> None:
     with pytest.raises(PlanRefused, match=rf"^{where}: the arm would be in the keep-out box user at 2\.\d+ s$"):
         plan(points, zone_at=lambda q: "the keep-out box user" if 0.4 < q[0] < 0.45 else None)
 
 
-def test_rows_have_times_numbers_and_kind(plan: Any) -> None:
+def test_rows_have_times_numbers_and_kind(plan: Planned) -> None:
     made = plan([Point(0.0, ZERO, ZERO), Point(2.0, at(0.4), ZERO)])
     assert made.rows[1] == (2.0, *at(0.4), *UNUSED, *ZERO, *UNUSED, *ZERO, *UNUSED, CUBIC)
     assert (made.duration_s, made.slowed, made.length_m, made.end) == (2.0, 1.0, 0.0, at(0.4))
@@ -135,12 +138,12 @@ def test_rows_have_times_numbers_and_kind(plan: Any) -> None:
     assert made.rows[1][ACCELERATIONS] == pytest.approx(-6 * 0.4 / 4)
 
 
-def test_an_arm_of_fewer_joints_is_planned_for_too(arm: Any, drive: Any) -> None:
+def test_an_arm_of_fewer_joints_is_planned_for_too(arm: ArmConfig, drive: Drive) -> None:
     made = plan_trajectory([Point(0.0, (0.0, 0.0)), Point(2.0, (0.2, -0.1))], drive.limits, (0.0, 0.0))
     assert made.rows[1][:7] == (2.0, 0.2, -0.1, 0.0, 0.0, 0.0, 0.0)
 
 
-def test_what_was_planned_is_driven_to_its_end_inside_the_limits(new_drive: Any, memory: Any) -> None:
+def test_what_was_planned_is_driven_to_its_end_inside_the_limits(new_drive: Callable[..., Drive]) -> None:
     chance, driven = random.Random(7), 0
     for _ in range(40):
         drive = new_drive()

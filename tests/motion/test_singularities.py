@@ -1,4 +1,4 @@
-"""The distances that are looked at every cycle are those of the kinematics."""
+"""The distances that the cycle computes are those of the kinematics."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ ANGLES = st.lists(st.floats(-pi, pi), min_size=6, max_size=6)
 
 @given(q=ANGLES)
 def test_each_distance_is_that_of_the_kinematics(q: Sequence[float]) -> None:
-    found = Singularities(MODEL).distances(frames(MODEL, q))
-    assert tuple(found) == pytest.approx(singularity_distances(MODEL, q)[:3], abs=1e-9)
+    distances = Singularities(MODEL).distances(frames(MODEL, q))
+    assert tuple(distances) == pytest.approx(singularity_distances(MODEL, q)[:3], abs=1e-9)
 
 
 @given(bend=st.floats(-0.1, 0.1))
 def test_close_to_a_singularity_the_distance_is_the_angle_that_is_left(bend: float) -> None:
-    found = Singularities(MODEL).distances(frames(MODEL, [0.4, 0.9, bend, 0.3, bend, 0.1]))
-    assert found.elbow == pytest.approx(abs(bend), abs=1e-7)
-    assert found.wrist == pytest.approx(abs(bend), abs=1e-7)
+    distances = Singularities(MODEL).distances(frames(MODEL, [0.4, 0.9, bend, 0.3, bend, 0.1]))
+    assert distances.elbow == pytest.approx(abs(bend), abs=1e-7)
+    assert distances.wrist == pytest.approx(abs(bend), abs=1e-7)
 
 
 def test_an_arm_without_a_spherical_wrist_has_none_of_them() -> None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import hypot
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -28,12 +27,14 @@ from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.motion.speed_override import TimeScale
 from tests.samples import examples
 
+from .conftest import Drive, memory
+
 PERIOD = 0.0005
 ZERO = (0.0,) * 6
 HERE = (0.0, 0.3, 1.57, 0.0, 0.5, 0.0)
 A, B = (0.3, 0.2, 0.5, 0.1, 0.2, -0.3), (0.5, 0.4, 0.9, 0.1, 0.5, -0.3)
 SOME = st.tuples(st.integers(0, 10**6), st.sampled_from([0.001, 0.01]))
-"""Seed, and how often the override changes: by chance in each cycle."""
+"""Seed, and probability of a change of the override in a cycle."""
 
 
 def override(controller: Controller, fraction: float) -> None:
@@ -41,21 +42,21 @@ def override(controller: Controller, fraction: float) -> None:
 
 
 def change(controller: Controller, chance: random.Random, share: float) -> None:
-    """Change the override by chance: to a bound of it, to anything between, or to rest and back."""
+    """Change the override at random: to a bound, to a value between them, or to 0 and back."""
     if chance.random() < share:
         # 0: a pause.
         stops = [0.0] if controller.pausable and controller.speed_override.fraction > 0.0 else []
         override(controller, chance.choice([*stops, 0.01, 1.0, chance.uniform(0.01, 1.0)]))
 
 
-def trajectory(drive: Any, memory: Any, points: list[Point], q: Any = ZERO) -> TrajectoryController:
+def trajectory(drive: Drive, points: list[Point], q: Sequence[float] = ZERO) -> TrajectoryController:
     made: TrajectoryController = drive.controller(TrajectoryController)
     plan = plan_trajectory(points, drive.limits, q)
     assert drive.execute(made, memory(plan.rows), len(plan.rows)) is None
     return made
 
 
-def line(drive: Any, memory: Any, speed: float = 0.1) -> LineController:
+def line(drive: Drive, speed: float = 0.1) -> LineController:
     """A line of 0.15 m and a third of it back."""
     drive.at(HERE)
     model, config = drive.config.arm, drive.config
@@ -68,7 +69,7 @@ def line(drive: Any, memory: Any, speed: float = 0.1) -> LineController:
     return made
 
 
-def accelerations(drive: Any, cycle: Callable[[], None]) -> list[float]:
+def accelerations(drive: Drive, cycle: Callable[[], None]) -> list[float]:
     before = list(drive.state.commanded_velocity)
     cycle()
     return [(v - u) / PERIOD for u, v in zip(before, drive.state.commanded_velocity, strict=True)]
@@ -78,7 +79,7 @@ def accelerations(drive: Any, cycle: Callable[[], None]) -> list[float]:
 
 
 @pytest.mark.parametrize("fraction", [0.05, 0.5])
-def test_a_joint_move_takes_the_fraction_of_its_speed(drive: Any, fraction: float) -> None:
+def test_a_joint_move_takes_the_fraction_of_its_speed(drive: Drive, fraction: float) -> None:
     mode = drive.controller(JointMoveController)
     override(mode, fraction)
     assert drive.command(mode, MoveJoints((0.4, *ZERO[1:]), 0.4, True)) is None
@@ -88,7 +89,7 @@ def test_a_joint_move_takes_the_fraction_of_its_speed(drive: Any, fraction: floa
     assert mode.elapsed_s == mode.duration_s
 
 
-def test_a_joint_move_under_way_slows_down_and_speeds_up_again(new_drive: Any) -> None:
+def test_a_joint_move_under_way_slows_down_and_speeds_up_again(new_drive: Callable[..., Drive]) -> None:
     drive = new_drive(with_jerk=True)
     mode = drive.controller(JointMoveController)
     drive.command(mode, MoveJoints((1.0, *ZERO[1:]), 0.5, True))
@@ -104,7 +105,7 @@ def test_a_joint_move_under_way_slows_down_and_speeds_up_again(new_drive: Any) -
     assert drive.state.commanded[0] == pytest.approx(1.0, abs=1e-12)
 
 
-def test_what_follows_a_slowed_move_begins_as_it_is(drive: Any) -> None:
+def test_what_follows_a_slowed_move_begins_as_it_is(drive: Drive) -> None:
     mode = drive.controller(JointMoveController)
     override(mode, 0.5)
     drive.command(mode, MoveJoints((1.0, *ZERO[1:]), 0.5, True))
@@ -115,8 +116,8 @@ def test_what_follows_a_slowed_move_begins_as_it_is(drive: Any) -> None:
     assert drive.until_rest(mode) < 0.5
 
 
-def test_a_line_under_way_slows_down_and_speeds_up_again(drive: Any, memory: Any) -> None:
-    mode = line(drive, memory)
+def test_a_line_under_way_slows_down_and_speeds_up_again(drive: Drive) -> None:
+    mode = line(drive)
     fastest, places = 0.15 * mode._piece[14], []
     for fraction, cycles in ((1.0, 700), (0.1, 1400), (1.0, 1200)):
         override(mode, fraction)
@@ -130,17 +131,17 @@ def test_a_line_under_way_slows_down_and_speeds_up_again(drive: Any, memory: Any
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.3])
-def test_the_time_of_a_trajectory_passes_at_the_fraction(drive: Any, memory: Any, fraction: float) -> None:
-    mode = trajectory(drive, memory, [Point(0.0, ZERO), Point(1.0, (0.1,) * 6), Point(2.0, (0.0,) * 6)])
+def test_the_time_of_a_trajectory_passes_at_the_fraction(drive: Drive, fraction: float) -> None:
+    mode = trajectory(drive, [Point(0.0, ZERO), Point(1.0, (0.1,) * 6), Point(2.0, (0.0,) * 6)])
     override(mode, fraction)
     # The override falls from 1 while the arm leaves its start, which takes less than 0.4 s.
     assert drive.until_rest(mode, 200.0) == pytest.approx(2.0 / fraction, abs=0.4 / fraction)
     assert mode.ended is None
 
 
-def test_a_trajectory_under_way_slows_down_and_comes_back_to_exactly_1(new_drive: Any, memory: Any) -> None:
+def test_a_trajectory_under_way_slows_down_and_comes_back_to_exactly_1(new_drive: Callable[..., Drive]) -> None:
     drive = new_drive(with_jerk=True)
-    mode = trajectory(drive, memory, [Point(0.0, ZERO), Point(4.0, A), Point(8.0, B)])
+    mode = trajectory(drive, [Point(0.0, ZERO), Point(4.0, A), Point(8.0, B)])
     drive.run(mode, 2000)
     override(mode, 0.25)
     drive.run(mode, 2000)
@@ -156,7 +157,7 @@ def test_a_trajectory_under_way_slows_down_and_comes_back_to_exactly_1(new_drive
     assert drive.state.commanded == pytest.approx(B, abs=1e-9)
 
 
-def test_velocities_and_jogs_are_scaled_and_follow_a_change(drive: Any) -> None:
+def test_velocities_and_jogs_are_scaled_and_follow_a_change(drive: Drive) -> None:
     mode = drive.controller(VelocityController)
     for fraction in (1.0, 0.1, 0.5):
         override(mode, fraction)
@@ -168,7 +169,7 @@ def test_velocities_and_jogs_are_scaled_and_follow_a_change(drive: Any) -> None:
 
 
 @pytest.mark.parametrize("frame", [JogFrame.BASE, JogFrame.TOOL])
-def test_a_jog_of_the_tool_is_scaled(drive: Any, frame: JogFrame) -> None:
+def test_a_jog_of_the_tool_is_scaled(drive: Drive, frame: JogFrame) -> None:
     drive.at(HERE)
     mode = drive.controller(JogController)
     for fraction in (1.0, 0.1, 0.5):
@@ -185,7 +186,9 @@ def test_a_jog_of_the_tool_is_scaled(drive: Any, frame: JogFrame) -> None:
 
 @settings(max_examples=examples(5))
 @given(SOME)
-def test_joint_moves_keep_acceleration_and_jerk_and_arrive(new_drive: Any, given: tuple[int, float]) -> None:
+def test_joint_moves_keep_acceleration_and_jerk_and_arrive(
+    new_drive: Callable[..., Drive], given: tuple[int, float]
+) -> None:
     seed, share = given
     chance, drive = random.Random(seed), new_drive()
     mode = drive.controller(JointMoveController)
@@ -211,7 +214,7 @@ def test_joint_moves_keep_acceleration_and_jerk_and_arrive(new_drive: Any, given
 @settings(max_examples=examples(5))
 @given(SOME)
 def test_trajectories_keep_acceleration_and_jerk_and_their_path(
-    new_drive: Any, memory: Any, given: tuple[int, float]
+    new_drive: Callable[..., Drive], given: tuple[int, float]
 ) -> None:
     seed, share = given
     chance, drive, whole = random.Random(seed), new_drive(with_jerk=True), new_drive()
@@ -219,7 +222,7 @@ def test_trajectories_keep_acceleration_and_jerk_and_their_path(
     for _ in range(chance.randint(1, 3)):
         time += chance.uniform(4.0, 6.0)
         points.append(Point(time, tuple(chance.uniform(-0.6, 0.6) for _ in range(6))))
-    mode, undisturbed = trajectory(drive, memory, points), trajectory(whole, memory, points)
+    mode, undisturbed = trajectory(drive, points), trajectory(whole, points)
     for at in range(3000):
         change(mode, chance, share)
         drive.cycle(mode)
@@ -236,13 +239,13 @@ def test_trajectories_keep_acceleration_and_jerk_and_their_path(
 @settings(max_examples=examples(4))
 @given(SOME)
 def test_trajectories_at_their_limits_keep_acceleration_and_stop(
-    new_drive: Any, memory: Any, given: tuple[int, float]
+    new_drive: Callable[..., Drive], given: tuple[int, float]
 ) -> None:
     seed, share = given
     chance, drive, whole = random.Random(seed), new_drive(), new_drive()
     # 0.53 rad in 2 s: 98 % of the speed; the accelerations change by steps.
     points = [Point(0.0, ZERO, ZERO), Point(1.6, (0.52, -0.5, *ZERO[2:]), ZERO), Point(3.2, ZERO, ZERO)]
-    mode, undisturbed = trajectory(drive, memory, points), trajectory(whole, memory, points)
+    mode, undisturbed = trajectory(drive, points), trajectory(whole, points)
     for _ in range(chance.randint(1, 6000)):
         change(mode, chance, share)
         drive.cycle(mode)
@@ -254,10 +257,12 @@ def test_trajectories_at_their_limits_keep_acceleration_and_stop(
 
 @settings(max_examples=examples(4))
 @given(SOME)
-def test_lines_keep_accelerations_and_stay_on_the_line(new_drive: Any, memory: Any, given: tuple[int, float]) -> None:
+def test_lines_keep_accelerations_and_stay_on_the_line(
+    new_drive: Callable[..., Drive], given: tuple[int, float]
+) -> None:
     seed, share = given
     chance, drive = random.Random(seed), new_drive()
-    mode = line(drive, memory)
+    mode = line(drive)
     x, _, z = forward(drive.config.arm, HERE).position
     for at in range(2000):
         change(mode, chance, share)
@@ -274,7 +279,7 @@ def test_lines_keep_accelerations_and_stay_on_the_line(new_drive: Any, memory: A
 
 @settings(max_examples=examples(4))
 @given(SOME)
-def test_jogs_and_velocities_keep_accelerations(new_drive: Any, given: tuple[int, float]) -> None:
+def test_jogs_and_velocities_keep_accelerations(new_drive: Callable[..., Drive], given: tuple[int, float]) -> None:
     seed, share = given
     chance, drive = random.Random(seed), new_drive()
     drive.at(HERE)
@@ -293,11 +298,11 @@ def test_jogs_and_velocities_keep_accelerations(new_drive: Any, given: tuple[int
 # -- what is not slowed -----------------------------------------------------------------------------------------------
 
 
-def test_at_1_a_trajectory_is_the_same_to_the_bit(new_drive: Any, memory: Any) -> None:
+def test_at_1_a_trajectory_is_the_same_to_the_bit(new_drive: Callable[..., Drive]) -> None:
     paths = []
     for touched in (False, True):
         drive = new_drive()
-        mode = trajectory(drive, memory, [Point(0.0, ZERO), Point(2.0, A), Point(4.0, B)])
+        mode = trajectory(drive, [Point(0.0, ZERO), Point(2.0, A), Point(4.0, B)])
         if touched:
             override(mode, 1.0)
         drive.until_rest(mode)
@@ -305,7 +310,7 @@ def test_at_1_a_trajectory_is_the_same_to_the_bit(new_drive: Any, memory: Any) -
     assert paths[0] == paths[1]
 
 
-def test_a_motion_in_step_is_refused_below_1(drive: Any) -> None:
+def test_a_motion_in_step_is_refused_below_1(drive: Drive) -> None:
     mode = drive.controller(InStepController)
     command = RunInStep(0, 1, 1, 0, drive.state.now_ns + 10**9, 1, 0.1)
     override(mode, 0.5)
@@ -321,7 +326,7 @@ def test_joints_that_want_opposite_changes_keep_the_rate() -> None:
     assert scale.rate == 0.0
 
 
-def test_from_rest_a_trajectory_begins_at_the_override(new_drive: Any, memory: Any) -> None:
+def test_from_rest_a_trajectory_begins_at_the_override(new_drive: Callable[..., Drive]) -> None:
     drive = new_drive()
     made: TrajectoryController = drive.controller(TrajectoryController)
     override(made, 0.01)

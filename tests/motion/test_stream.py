@@ -6,7 +6,6 @@ import math
 import random
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -20,23 +19,25 @@ from rtcp.motion.controllers.stream import TIMEOUT_S, StreamController
 from rtcp.motion.state import Phase
 from tests.samples import examples
 
+from .conftest import Drive
+
 PERIOD = 0.0005
 ZERO = [0.0] * 6
 
 
 @pytest.fixture
-def mode(drive: Any) -> StreamController:
+def mode(drive: Drive) -> StreamController:
     made: StreamController = drive.controller(StreamController)
     return made
 
 
-def send(drive: Any, mode: StreamController, q: list[float], stamp: float) -> Refusal | None:
+def send(drive: Drive, mode: StreamController, q: list[float], stamp: float) -> Refusal | None:
     refusal: Refusal | None = drive.command(mode, StreamPosition(tuple(q), stamp))
     return refusal
 
 
 def stream(
-    drive: Any,
+    drive: Drive,
     mode: StreamController,
     wanted: Callable[[float], list[float]],
     seconds: float,
@@ -57,7 +58,7 @@ def stream(
         drive.cycle(mode)
 
 
-def test_a_stream_is_followed_and_its_end_is_a_stop(drive: Any, mode: StreamController) -> None:
+def test_a_stream_is_followed_and_its_end_is_a_stop(drive: Drive, mode: StreamController) -> None:
     stream(drive, mode, lambda t: [0.1 * (1.0 - math.cos(math.pi * t))] * 6, 2.0, 1 / 30)
     assert mode.phase is Phase.MOVE
     assert drive.until_rest(mode) < TIMEOUT_S + 0.5
@@ -65,7 +66,7 @@ def test_a_stream_is_followed_and_its_end_is_a_stop(drive: Any, mode: StreamCont
     assert drive.state.commanded == pytest.approx([0.0] * 6, abs=0.01)
 
 
-def test_the_last_target_is_reached_and_not_passed_by_much(drive: Any, mode: StreamController) -> None:
+def test_the_last_target_is_reached_and_not_passed_by_much(drive: Drive, mode: StreamController) -> None:
     stream(drive, mode, lambda t: [0.3 * t] * 6, 1.0, 0.02)
     drive.until_rest(mode)
     # The speed is kept for two and a half intervals; a stop from it takes v^2 / 2a + v a / 2j.
@@ -73,13 +74,13 @@ def test_the_last_target_is_reached_and_not_passed_by_much(drive: Any, mode: Str
     assert drive.state.commanded == pytest.approx([0.3 * 0.98] * 6, abs=0.054)
 
 
-def test_a_target_that_is_renewed_is_reached_and_held(drive: Any, mode: StreamController) -> None:
+def test_a_target_that_is_renewed_is_reached_and_held(drive: Drive, mode: StreamController) -> None:
     stream(drive, mode, lambda _: [0.2] * 6, 2.0, 0.1)
     assert drive.state.commanded == pytest.approx([0.2] * 6, abs=1e-9)
 
 
 @pytest.mark.parametrize("interval", [0.001, 0.0333, 0.15])
-def test_any_rate_is_followed_smoothly(new_drive: Any, interval: float) -> None:
+def test_any_rate_is_followed_smoothly(new_drive: Callable[..., Drive], interval: float) -> None:
     drive = new_drive(with_jerk=True)
     mode = drive.controller(StreamController)
     stream(drive, mode, lambda t: [0.1 * (1.0 - math.cos(0.5 * math.pi * t))] * 6, 4.0, interval)
@@ -95,7 +96,7 @@ def test_any_rate_is_followed_smoothly(new_drive: Any, interval: float) -> None:
 
 @pytest.mark.parametrize(("speed", "interval", "jitter"), [(0.2, 0.1, 0.0), (0.2, 0.05, 0.02), (0.02, 0.05, 0.02)])
 def test_rare_targets_and_jitter_of_the_network_hardly_change_the_speed(
-    drive: Any, mode: StreamController, speed: float, interval: float, jitter: float
+    drive: Drive, mode: StreamController, speed: float, interval: float, jitter: float
 ) -> None:
     stream(drive, mode, lambda t: [speed * t] * 6, 3.0, interval, jitter=jitter)
     speeds = [(b[0] - a[0]) / PERIOD for a, b in pairwise(drive.path[3000:])]
@@ -107,7 +108,7 @@ def test_rare_targets_and_jitter_of_the_network_hardly_change_the_speed(
         assert max(speeds) < 1.1 * speed
 
 
-def test_a_stream_has_ended_after_the_timeout_and_not_before(drive: Any, mode: StreamController) -> None:
+def test_a_stream_has_ended_after_the_timeout_and_not_before(drive: Drive, mode: StreamController) -> None:
     assert send(drive, mode, ZERO, 1.0) is None
     drive.run(mode, round(TIMEOUT_S / PERIOD) + 1)
     assert (mode.phase, mode.ended) == (Phase.MOVE, None)
@@ -115,7 +116,7 @@ def test_a_stream_has_ended_after_the_timeout_and_not_before(drive: Any, mode: S
     assert (mode.phase, mode.ended) == (Phase.HOLD, StreamEnded())
 
 
-def test_a_target_that_is_out_of_order_or_stamped_alike_is_dropped(drive: Any, mode: StreamController) -> None:
+def test_a_target_that_is_out_of_order_or_stamped_alike_is_dropped(drive: Drive, mode: StreamController) -> None:
     assert send(drive, mode, ZERO, 5.0) is None
     drive.run(mode, 2)
     assert send(drive, mode, [0.1] * 6, 5.0) == StreamPointDropped(0.0)
@@ -123,7 +124,7 @@ def test_a_target_that_is_out_of_order_or_stamped_alike_is_dropped(drive: Any, m
     assert send(drive, mode, ZERO, 5.001) is None
 
 
-def test_how_late_a_setpoint_came_is_a_finite_number_whatever_the_stamps(drive: Any, mode: StreamController) -> None:
+def test_how_late_a_setpoint_came_is_a_finite_number_whatever_the_stamps(drive: Drive, mode: StreamController) -> None:
     assert drive.command(mode, OpenStream(1)) is None
     mode.put(drive.state, 0, 1.7e308, [0.0] * 3 * MOST_AXES)
     mode.put(drive.state, 0, -1.7e308, [0.0] * 3 * MOST_AXES)
@@ -132,7 +133,7 @@ def test_how_late_a_setpoint_came_is_a_finite_number_whatever_the_stamps(drive: 
     assert mode.ended.late_s >= 1e9
 
 
-def test_a_target_that_is_late_by_more_than_the_timeout_is_dropped(drive: Any, mode: StreamController) -> None:
+def test_a_target_that_is_late_by_more_than_the_timeout_is_dropped(drive: Drive, mode: StreamController) -> None:
     assert send(drive, mode, ZERO, 100.0) is None
     drive.state.now_ns += 100_000_000
     assert send(drive, mode, ZERO, 100.1) is None
@@ -146,7 +147,7 @@ def test_a_target_that_is_late_by_more_than_the_timeout_is_dropped(drive: Any, m
 @pytest.mark.parametrize("axis", [0, 5])
 @pytest.mark.parametrize("value", [math.nan, math.inf, 3.2, -1e300])
 def test_a_target_that_is_not_finite_or_out_of_range_is_refused(
-    drive: Any, mode: StreamController, axis: int, value: float
+    drive: Drive, mode: StreamController, axis: int, value: float
 ) -> None:
     refusal = send(drive, mode, [value if i == axis else 0.0 for i in range(6)], 1.0)
     assert isinstance(refusal, PositionOutOfRange if math.isfinite(value) else NotFinite)
@@ -154,11 +155,11 @@ def test_a_target_that_is_not_finite_or_out_of_range_is_refused(
     assert mode.phase is Phase.HOLD
 
 
-def test_a_stamp_that_is_not_finite_is_refused(drive: Any, mode: StreamController) -> None:
+def test_a_stamp_that_is_not_finite_is_refused(drive: Drive, mode: StreamController) -> None:
     assert isinstance(send(drive, mode, ZERO, math.nan), StampNotFinite)
 
 
-def test_a_stream_that_begins_in_motion_continues_from_it(drive: Any, mode: StreamController) -> None:
+def test_a_stream_that_begins_in_motion_continues_from_it(drive: Drive, mode: StreamController) -> None:
     stream(drive, mode, lambda t: [0.3 * t] * 6, 1.0, 0.02)
     assert drive.state.commanded_velocity[0] > 0.2
     mode.stop(drive.state)
@@ -167,7 +168,7 @@ def test_a_stream_that_begins_in_motion_continues_from_it(drive: Any, mode: Stre
     drive.until_rest(mode)
 
 
-def test_targets_at_the_edge_of_a_range_do_not_carry_a_joint_beyond(drive: Any, mode: StreamController) -> None:
+def test_targets_at_the_edge_of_a_range_do_not_carry_a_joint_beyond(drive: Drive, mode: StreamController) -> None:
     drive.at([2.8, 1.7, 2.1, 2.8, 1.7, 2.8])
     start, high = list(drive.state.commanded), drive.limits.high
     stream(drive, mode, lambda t: [min(q + 0.45 * t, h) for q, h in zip(start, high, strict=True)], 2.0, 0.05)
@@ -184,7 +185,7 @@ def test_targets_at_the_edge_of_a_range_do_not_carry_a_joint_beyond(drive: Any, 
     ],
 )
 def test_a_fast_stream_towards_the_edge_can_always_stop_before_it(
-    drive: Any, mode: StreamController, before_rad: float, seconds: float, interval: float
+    drive: Drive, mode: StreamController, before_rad: float, seconds: float, interval: float
 ) -> None:
     high = drive.limits.high
     drive.at([h - before_rad for h in high])
@@ -193,7 +194,7 @@ def test_a_fast_stream_towards_the_edge_can_always_stop_before_it(
     assert mode.ended == StreamEnded()
 
 
-def test_a_run_up_that_would_leave_the_range_is_not_made(drive: Any, mode: StreamController) -> None:
+def test_a_run_up_that_would_leave_the_range_is_not_made(drive: Drive, mode: StreamController) -> None:
     low = drive.limits.low[0]
     drive.at([low + 0.02, *ZERO[1:]])
     # To pass low + 0.01 at 0.3 rad/s the joint would have to start from below its range.
@@ -206,7 +207,7 @@ def test_a_run_up_that_would_leave_the_range_is_not_made(drive: Any, mode: Strea
 
 @settings(max_examples=examples(30))
 @given(st.integers(0, 10**6))
-def test_no_stream_breaks_a_limit(new_drive: Any, seed: int) -> None:
+def test_no_stream_breaks_a_limit(new_drive: Callable[..., Drive], seed: int) -> None:
     chance, drive = random.Random(seed), new_drive()
     mode = drive.controller(StreamController)
     stamp = 0.0
@@ -237,7 +238,7 @@ def lag(path: list[list[float]], amplitude: float, omega: float) -> tuple[float,
     [(30, 0.0, 0.012, 0.08), (1000, 0.0, 0.003, 0.03), (1000, 0.003, 0.004, 0.03)],
 )
 def test_a_streamed_sine_is_followed_at_full_amplitude_and_hardly_late(
-    new_drive: Any, rate: int, jitter: float, most_s: float, more: float
+    new_drive: Callable[..., Drive], rate: int, jitter: float, most_s: float, more: float
 ) -> None:
     # pi/8 rad with a period of 2 s needs 1.23 rad/s, 3.9 rad/s^2 and 12.2 rad/s^3.
     drive = new_drive()
@@ -250,7 +251,7 @@ def test_a_streamed_sine_is_followed_at_full_amplitude_and_hardly_late(
 
 
 def test_a_stream_that_turns_back_before_the_edge_of_the_range_is_not_ended_by_a_guard(
-    drive: Any, mode: StreamController
+    drive: Drive, mode: StreamController
 ) -> None:
     targets = [2.9512, 2.9624, 2.9736, 2.9848, 2.9959, 3.0071, 3.0183, 3.0295, 3.0407, 3.0242, 3.0077]
     drive.at([targets[0], *ZERO[1:]])
@@ -263,7 +264,7 @@ def test_a_stream_that_turns_back_before_the_edge_of_the_range_is_not_ended_by_a
 
 @pytest.mark.parametrize("seed", range(12))
 def test_a_target_far_away_that_is_renewed_is_not_passed_by_any_joint(
-    drive: Any, mode: StreamController, seed: int
+    drive: Drive, mode: StreamController, seed: int
 ) -> None:
     chance = random.Random(seed)
     target = [chance.uniform(-1.5, 1.5) for _ in range(6)]
@@ -276,7 +277,7 @@ def test_a_target_far_away_that_is_renewed_is_not_passed_by_any_joint(
 
 @pytest.mark.parametrize("share", [0.99, 1.0, 1.2])
 def test_a_target_as_fast_as_the_joint_may_be_is_run_after_and_not_away_from(
-    drive: Any, mode: StreamController, share: float
+    drive: Drive, mode: StreamController, share: float
 ) -> None:
     speed = share * drive.limits.velocity[0]
     stream(drive, mode, lambda t: [speed * t, *ZERO[1:]], 1.5, 0.002)
@@ -284,7 +285,7 @@ def test_a_target_as_fast_as_the_joint_may_be_is_run_after_and_not_away_from(
     assert drive.state.commanded[0] > 0.85 * min(speed, drive.limits.velocity[0]) * 1.5
 
 
-def test_a_target_that_comes_from_an_encoder_is_no_faster_for_its_steps(drive: Any, mode: StreamController) -> None:
+def test_a_target_that_comes_from_an_encoder_is_no_faster_for_its_steps(drive: Drive, mode: StreamController) -> None:
     step = 2 * math.pi / 2**14
 
     def wanted(t: float) -> float:

@@ -6,13 +6,13 @@ import math
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinematics.model import LinkMass
+from rtcp.config.model import ArmConfig
 from rtcp.ipc.commands import ApplyTorque
 from rtcp.ipc.events import CommandExpired
 from rtcp.ipc.refusals import FractionOutOfRange, TorqueOutOfRange
@@ -24,20 +24,18 @@ from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase
 from tests.samples import examples, some
 
+from .conftest import no_plan
+
 PERIOD = 0.0005
 MASS, ARM_M, G = 3.0, 0.4, 9.80665
 INERTIA = (1.2, 1.5, 0.8, 0.4, 0.2, 0.08)
-"""kg m^2, of each joint with what it carries, and the rotor."""
+"""Inertia of each joint with its load and its rotor, kg m^2."""
 FREE = [0.0] * 6
-
-
-def no_plan(slot: int) -> memoryview[float]:
-    raise LookupError(slot)
 
 
 @dataclass
 class Joint:
-    """What the law sees of a drive."""
+    """The fields of a drive that the control law reads and writes."""
 
     position: float = 0.0
     velocity: float = 0.0
@@ -50,7 +48,7 @@ class Joint:
 class Plant:
     """Six joints without friction; one link hangs on joint 2: its weight's potential is m g r cos(q2)."""
 
-    def __init__(self, arm: Any, q: Sequence[float] = FREE, payload: float = 0.0) -> None:
+    def __init__(self, arm: ArmConfig, q: Sequence[float] = FREE, payload: float = 0.0) -> None:
         no_mass, link = LinkMass(0.0, (0.0, 0.0, 0.0)), LinkMass(MASS, (ARM_M, 0.0, 0.0))
         model = replace(arm.arm, links=(no_mass, link, no_mass, no_mass, no_mass, no_mass))
         self.weight = (MASS + payload) * G * ARM_M
@@ -66,7 +64,7 @@ class Plant:
         setup = ControllerSetup(replace(arm, arm=model), self.limits, self.guard, PERIOD, no_plan)
         self.mode = TorqueController(setup)
         self.outside = [0.0] * 6
-        """Torques from outside, as of a hand, Nm."""
+        """External torques, Nm."""
         self.seen: list[tuple[list[float], list[float], list[float]]] = []
         """Position, speed and torque of all joints after each cycle."""
 
@@ -82,10 +80,10 @@ class Plant:
             self.law.pass_on(state.commanded, target.torque, joints)
         else:
             self.law.update(state.commanded, state.commanded_velocity, joints)
-        held = self.holding([joint.position for joint in joints])
+        load = self.holding([joint.position for joint in joints])
         for i, joint in enumerate(joints):
             joint.torque = joint.target_torque
-            joint.velocity += (joint.torque + self.outside[i] - held[i]) / INERTIA[i] * PERIOD
+            joint.velocity += (joint.torque + self.outside[i] - load[i]) / INERTIA[i] * PERIOD
             joint.position += joint.velocity * PERIOD
         state.actual = [joint.position for joint in joints]
         state.actual_velocity = [joint.velocity for joint in joints]
@@ -120,7 +118,7 @@ class Plant:
         return [(b - a) / over_s for a, b in zip(speeds, speeds[n:], strict=False)]
 
     def largest_step(self, since: int = 1) -> float:
-        """Nm that the torque of any joint changed by in a cycle."""
+        """Largest change of a joint's torque in a cycle, Nm."""
         torques = [torque for _, _, torque in self.seen]
         return max(
             abs(b - a)
@@ -130,17 +128,17 @@ class Plant:
 
 
 @pytest.fixture
-def plant(arm: Any) -> Plant:
+def plant(arm: ArmConfig) -> Plant:
     return Plant(arm, [0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="session")
-def new_plant(arm: Any) -> Callable[..., Plant]:
+def new_plant(arm: ArmConfig) -> Callable[..., Plant]:
     return lambda *given, **more: Plant(arm, *given, **more)
 
 
 @pytest.mark.parametrize("angle", [-1.5, 0.5, 1.2])
-def test_without_a_torque_asked_for_the_arm_floats_where_it_is(new_plant: Any, angle: float) -> None:
+def test_without_a_torque_asked_for_the_arm_floats_where_it_is(new_plant: Callable[..., Plant], angle: float) -> None:
     plant = new_plant([0.0, angle, 0.0, 0.0, 0.0, 0.0])
     plant.run(1.0, FREE)
     assert plant.state.actual == pytest.approx([0.0, angle, 0.0, 0.0, 0.0, 0.0], abs=1e-6)
@@ -158,7 +156,7 @@ def test_gravity_is_carried_wherever_the_arm_is_pushed_to(plant: Plant) -> None:
     plant.check()
 
 
-def test_a_weight_that_the_model_does_not_know_is_held_at_the_start(new_plant: Any) -> None:
+def test_a_weight_that_the_model_does_not_know_is_held_at_the_start(new_plant: Callable[..., Plant]) -> None:
     plant = new_plant([0.0, 1.0, 0.0, 0.0, 0.0, 0.0], payload=1.0)
     plant.run(0.5, FREE)
     assert plant.state.actual[1] == pytest.approx(1.0, abs=1e-6)
@@ -195,7 +193,7 @@ def test_the_torque_asked_for_rises_no_faster_than_to_its_limit_in_a_tenth_of_a_
 
 @pytest.mark.parametrize("sign", some([1.0, -1.0], 2))
 def test_any_torque_leaves_the_speed_and_the_range_as_they_are(plant: Plant, sign: float) -> None:
-    # Against the edge of the range, and on against it.
+    # To the edge of the range, and on against it.
     plant.run(9.0, [sign * torque for torque in plant.limits.torque])
     plant.check()
     edges = plant.limits.high if sign > 0 else plant.limits.low
@@ -210,7 +208,7 @@ def test_any_torque_leaves_the_speed_and_the_range_as_they_are(plant: Plant, sig
 
 @settings(max_examples=examples(12))
 @given(st.integers(0, 10**6))
-def test_no_torques_whatever_break_a_bound(new_plant: Any, seed: int) -> None:
+def test_no_torques_whatever_break_a_bound(new_plant: Callable[..., Plant], seed: int) -> None:
     chance = random.Random(seed)
     limits = new_plant().limits
     ends = list(zip(limits.low, limits.high, strict=True))
@@ -238,13 +236,13 @@ def test_the_law_of_cst_takes_over_and_gives_back_without_a_step(plant: Plant) -
     plant.mode.stop(plant.state)
     plant.run(1.5)
     plant.run(0.2, FREE)
-    # The ramp of what is asked for is 0.25 Nm a cycle at most; the law follows its set-point's deceleration.
+    # The requested torque changes by at most 0.25 Nm a cycle; the law adds the deceleration of its setpoint.
     assert plant.largest_step(handed) < 0.4
     plant.check()
 
 
 def test_a_law_whose_set_point_is_elsewhere_takes_over_without_a_step(plant: Plant) -> None:
-    """As after a blow that the guards let the set-point follow only slowly."""
+    """For example after a blow, which the setpoint follows only slowly."""
     joint = plant.joints
     there = [drive.position + 0.05 for drive in joint]
     plant.law.pass_on(there, [3.0] * 6, joint)
@@ -260,10 +258,10 @@ def test_stiffness_holds_the_arm_about_where_it_was_asked_for(plant: Plant) -> N
     plant.check()
 
 
-def test_stiffness_asked_for_at_once_is_about_where_the_arm_begins(new_plant: Any) -> None:
+def test_stiffness_asked_for_at_once_is_about_where_the_arm_begins(new_plant: Callable[..., Plant]) -> None:
     bent = [0.4, 0.5, 1.2, -0.3, 0.8, 0.1]
     plant = new_plant(bent)
-    for _ in range(2):  # a second motion is not about the first one's end either
+    for _ in range(2):  # a second motion does not begin at the end of the first
         plant.mode.hold()
         plant.run(0.5, FREE, stiffness=1.0, damping=1.0)
         assert plant.state.actual == pytest.approx(bent, abs=1e-3)
@@ -274,7 +272,7 @@ def test_damping_slows_a_motion_down(plant: Plant) -> None:
     assert plant.state.actual_velocity[0] == pytest.approx(6.0 / 60.0, rel=0.05)
 
 
-def test_a_hand_that_leans_on_the_arm_does_not_push_it_out_of_its_range(new_plant: Any) -> None:
+def test_a_hand_that_leans_on_the_arm_does_not_push_it_out_of_its_range(new_plant: Callable[..., Plant]) -> None:
     plant = new_plant([3.0, 0.5, 0.0, 0.0, 0.0, 0.0])
     plant.outside[0] = 6.0
     plant.run(4.0, FREE)
@@ -283,7 +281,7 @@ def test_a_hand_that_leans_on_the_arm_does_not_push_it_out_of_its_range(new_plan
     plant.check()
 
 
-def test_beside_the_edge_it_begins_without_a_push(new_plant: Any) -> None:
+def test_beside_the_edge_it_begins_without_a_push(new_plant: Callable[..., Plant]) -> None:
     plant = new_plant([3.09, 0.5, -2.395, 0.0, 0.0, 0.0])
     before = list(plant.state.actual_torque)
     plant.push(FREE)

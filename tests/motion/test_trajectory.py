@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import pytest
 from hypothesis import given, settings
@@ -21,27 +20,29 @@ from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.motion.state import ArmState, Phase
 from tests.samples import examples
 
+from .conftest import Drive, Rows, memory, near
+
 PERIOD = 0.0005
 ZERO = (0.0,) * 6
 A, B, C = (0.3, 0.2, 0.5, 0.1, 0.2, -0.3), (0.5, 0.4, 0.9, 0.1, 0.5, -0.3), (0.2, -0.1, 0.4, 0.3, 0.1, 0.1)
 
 
 @pytest.fixture
-def mode(drive: Any) -> TrajectoryController:
+def mode(drive: Drive) -> TrajectoryController:
     made: TrajectoryController = drive.controller(TrajectoryController)
     return made
 
 
 @pytest.fixture
-def rows(drive: Any, memory: Callable[..., Any]) -> Callable[..., tuple[Any, int]]:
-    def planned(points: list[Point], q: Any = ZERO) -> tuple[Any, int]:
+def rows(drive: Drive) -> Rows:
+    def planned(points: list[Point], q: Sequence[float] = ZERO) -> tuple[memoryview[float], int]:
         plan = plan_trajectory(points, drive.limits, q)
         return memory(plan.rows), len(plan.rows)
 
     return planned
 
 
-def test_every_point_is_passed_at_its_time(drive: Any, mode: TrajectoryController, rows: Any) -> None:
+def test_every_point_is_passed_at_its_time(drive: Drive, mode: TrajectoryController, rows: Rows) -> None:
     assert drive.execute(mode, *rows([Point(0.0, ZERO), Point(2.0, A), Point(4.0, B), Point(6.0, C)])) is None
     assert (mode.duration_s, mode.tolerates_saturation, mode.phase) == (6.0, False, Phase.MOVE)
     assert drive.until_rest(mode) == pytest.approx(6.0, abs=2 * PERIOD)
@@ -51,7 +52,7 @@ def test_every_point_is_passed_at_its_time(drive: Any, mode: TrajectoryControlle
     assert mode.ended is None
 
 
-def test_points_with_velocities_are_joined_by_cubics(drive: Any, mode: TrajectoryController, rows: Any) -> None:
+def test_points_with_velocities_are_joined_by_cubics(drive: Drive, mode: TrajectoryController, rows: Rows) -> None:
     speed = (0.1,) * 6
     points = [Point(0.0, ZERO, ZERO), Point(2.0, (0.1,) * 6, speed), Point(4.0, (0.2,) * 6, ZERO)]
     drive.execute(mode, *rows(points))
@@ -63,7 +64,7 @@ def test_points_with_velocities_are_joined_by_cubics(drive: Any, mode: Trajector
     drive.until_rest(mode)
 
 
-def test_points_with_accelerations_are_joined_by_quintics(drive: Any, mode: TrajectoryController, rows: Any) -> None:
+def test_points_with_accelerations_are_joined_by_quintics(drive: Drive, mode: TrajectoryController, rows: Rows) -> None:
     points = [Point(0.0, ZERO, ZERO, ZERO), Point(2.0, (0.2,) * 6, ZERO, ZERO)]
     drive.execute(mode, *rows(points))
     drive.run(mode, 1000)
@@ -71,7 +72,9 @@ def test_points_with_accelerations_are_joined_by_quintics(drive: Any, mode: Traj
     assert drive.state.commanded[3] == pytest.approx(0.2 * x**3 * (10 - 15 * x + 6 * x * x))
 
 
-def test_a_first_piece_leads_to_a_first_point_that_is_later(drive: Any, mode: TrajectoryController, rows: Any) -> None:
+def test_a_first_piece_leads_to_a_first_point_that_is_later(
+    drive: Drive, mode: TrajectoryController, rows: Rows
+) -> None:
     assert drive.execute(mode, *rows([Point(2.0, A), Point(4.0, B)])) is None
     drive.run(mode, 4000)
     assert drive.state.commanded == pytest.approx(A, abs=1e-6)
@@ -79,7 +82,9 @@ def test_a_first_piece_leads_to_a_first_point_that_is_later(drive: Any, mode: Tr
     assert drive.state.commanded == pytest.approx(B, abs=1e-9)
 
 
-def test_a_small_rest_at_the_start_fades_out_without_a_jump(drive: Any, mode: TrajectoryController, rows: Any) -> None:
+def test_a_small_rest_at_the_start_fades_out_without_a_jump(
+    drive: Drive, mode: TrajectoryController, rows: Rows
+) -> None:
     plan = rows([Point(0.0, ZERO), Point(3.0, A)])
     drive.at([9e-4, -9e-4, 0.0, 5e-4, 0.0, 9e-4])
     assert drive.execute(mode, *plan) is None
@@ -89,7 +94,7 @@ def test_a_small_rest_at_the_start_fades_out_without_a_jump(drive: Any, mode: Tr
 
 @pytest.mark.parametrize(("axis", "off"), [(0, 1.1e-3), (5, -0.5)])
 def test_a_plan_that_begins_elsewhere_is_refused_and_what_runs_goes_on(
-    drive: Any, mode: TrajectoryController, rows: Any, axis: int, off: float
+    drive: Drive, mode: TrajectoryController, rows: Rows, axis: int, off: float
 ) -> None:
     plan = rows([Point(0.0, ZERO), Point(3.0, A)])
     drive.execute(mode, *plan)
@@ -101,7 +106,7 @@ def test_a_plan_that_begins_elsewhere_is_refused_and_what_runs_goes_on(
     assert drive.state.commanded == pytest.approx(A, abs=1e-9)
 
 
-def test_a_plan_at_time_0_is_refused_in_motion(drive: Any, mode: TrajectoryController, rows: Any) -> None:
+def test_a_plan_at_time_0_is_refused_in_motion(drive: Drive, mode: TrajectoryController, rows: Rows) -> None:
     plan = rows([Point(0.0, ZERO), Point(3.0, A)])
     drive.state.commanded_velocity[2] = 0.1
     refused = drive.execute(mode, *plan)
@@ -109,7 +114,7 @@ def test_a_plan_at_time_0_is_refused_in_motion(drive: Any, mode: TrajectoryContr
 
 
 @pytest.mark.parametrize("after_s", [0.0005, 0.2, 0.9, 1.5, 2.0, 2.7, 3.9, 3.9995])
-def test_a_stop_brakes_along_the_path(drive: Any, mode: TrajectoryController, rows: Any, after_s: float) -> None:
+def test_a_stop_brakes_along_the_path(drive: Drive, mode: TrajectoryController, rows: Rows, after_s: float) -> None:
     plan = rows([Point(0.0, ZERO), Point(2.0, A), Point(4.0, B)])
     drive.execute(mode, *plan)
     drive.run(mode, round(after_s / PERIOD))
@@ -126,7 +131,7 @@ def test_a_stop_brakes_along_the_path(drive: Any, mode: TrajectoryController, ro
     assert mode.phase is Phase.HOLD
 
 
-def test_a_stop_uses_what_the_joints_accelerations_allow(drive: Any, mode: TrajectoryController, rows: Any) -> None:
+def test_a_stop_uses_what_the_joints_accelerations_allow(drive: Drive, mode: TrajectoryController, rows: Rows) -> None:
     drive.execute(mode, *rows([Point(0.0, ZERO), Point(2.0, (0.4,) * 6)]))
     drive.run(mode, 2000)
     speed = drive.state.commanded_velocity[0]
@@ -137,7 +142,7 @@ def test_a_stop_uses_what_the_joints_accelerations_allow(drive: Any, mode: Traje
 
 @settings(max_examples=examples(25))
 @given(st.integers(0, 10**6))
-def test_plans_that_interrupt_each_other_never_jump(new_drive: Any, memory: Callable[..., Any], seed: int) -> None:
+def test_plans_that_interrupt_each_other_never_jump(new_drive: Callable[..., Drive], seed: int) -> None:
     chance, drive = random.Random(seed), new_drive()
     mode = drive.controller(TrajectoryController)
     for _ in range(4):
@@ -172,7 +177,7 @@ DAMAGES = [
 
 @pytest.mark.parametrize(("column", "value"), DAMAGES)
 def test_a_waypoint_that_is_damaged_ends_the_motion_in_a_stop(
-    drive: Any, mode: TrajectoryController, rows: Any, column: int, value: float
+    drive: Drive, mode: TrajectoryController, rows: Rows, column: int, value: float
 ) -> None:
     plan, count = rows([Point(0.0, ZERO), Point(2.0, A), Point(4.0, B), Point(6.0, C)])
     drive.execute(mode, plan, count)
@@ -187,7 +192,7 @@ def test_a_waypoint_that_is_damaged_ends_the_motion_in_a_stop(
 @pytest.mark.parametrize(("column", "value"), [(0, math.nan), (0, -1.0), (5, math.inf), (5, 9.0), (KIND, 0.0)])
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_plan_whose_ends_are_damaged_is_not_started(
-    drive: Any, mode: TrajectoryController, rows: Any, row: int, column: int, value: float
+    drive: Drive, mode: TrajectoryController, rows: Rows, row: int, column: int, value: float
 ) -> None:
     plan, count = rows([Point(0.0, ZERO), Point(2.0, A)])
     plan[row * COLUMNS + column] = value
@@ -197,9 +202,11 @@ def test_a_plan_whose_ends_are_damaged_is_not_started(
     assert mode.phase is Phase.HOLD
 
 
-def test_a_plan_that_does_not_end_at_rest_is_brought_to_rest(drive: Any, mode: TrajectoryController, rows: Any) -> None:
+def test_a_plan_that_does_not_end_at_rest_is_brought_to_rest(
+    drive: Drive, mode: TrajectoryController, rows: Rows
+) -> None:
     plan, count = rows([Point(0.0, ZERO, ZERO), Point(2.0, A, ZERO)])
     plan[COLUMNS + VELOCITIES] = 0.2
     drive.execute(mode, plan, count)
     drive.until_rest(mode)
-    assert mode.ended == PlanDamaged(1, pytest.approx(0.2))
+    assert mode.ended == PlanDamaged(1, near(0.2))

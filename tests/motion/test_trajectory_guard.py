@@ -1,11 +1,12 @@
-"""Whatever a mode wants, what is commanded keeps to range, speed and acceleration, and can stop; what fits passes."""
+"""The commanded position keeps range, speed and acceleration for every target; a target within them passes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf, nan
 from random import Random
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -22,12 +23,13 @@ from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import Phase, Setpoint
 from tests.samples import examples
 
+from .conftest import near
 from .guard_checker import JOINTS_ONLY, GuardChecker
 
 CYCLES_S = st.sampled_from([0.0005, 0.002, 0.01])
 
-# What may be wanted of a joint, from where it is: (checker, joint) -> rad.
-WISHES: dict[str, Callable[[GuardChecker, int], float]] = {
+# Targets for a joint, rad, from the checker and the number of the joint.
+TARGETS: dict[str, Callable[[GuardChecker, int], float]] = {
     "stay": lambda c, i: c.state.commanded[i],
     "nan": lambda c, i: nan,
     "infinite": lambda c, i: inf,
@@ -47,7 +49,7 @@ WISHES: dict[str, Callable[[GuardChecker, int], float]] = {
     "creep down": lambda c, i: _at(c, i, -4e-8),
     "brake a bit too little": lambda c, i: _at(c, i, c.mean[i] - c.limits.acceleration[i] * c.dt * 0.99996),
 }
-WISH = st.sampled_from(sorted(WISHES))
+TARGET = st.sampled_from(sorted(TARGETS))
 SHARES = st.floats(0.0, 1.0)
 
 
@@ -55,8 +57,8 @@ def _at(checker: GuardChecker, i: int, speed: float) -> float:
     return checker.state.commanded[i] + speed * checker.dt
 
 
-def narrower(checker: GuardChecker, shares: tuple[float, ...]) -> Values:
-    """Limits within the widest; shares of 1 leave them as they are."""
+def narrower(checker: GuardChecker, shares: Sequence[float]) -> Values:
+    """Limits within the widest; shares of 1 leave them unchanged."""
     widest = checker.limits.widest
     a, b, c, d = shares
     return replace(
@@ -69,7 +71,7 @@ def narrower(checker: GuardChecker, shares: tuple[float, ...]) -> Values:
 
 
 ACTION = st.one_of(
-    st.tuples(st.just("want"), WISH, WISH, st.booleans(), st.integers(1, 40)),
+    st.tuples(st.just("want"), TARGET, TARGET, st.booleans(), st.integers(1, 40)),
     st.tuples(st.just("limits"), SHARES, SHARES, SHARES, SHARES),
 )
 
@@ -81,32 +83,32 @@ ACTION = st.one_of(
 )
 @settings(max_examples=examples(150))
 def test_whatever_is_wanted_range_speed_and_acceleration_are_kept_and_the_guards_stop_rests_inside(
-    dt: float, start: tuple[float, float], actions: list[tuple[object, ...]]
+    dt: float, start: tuple[float, float], actions: list[tuple[Any, ...]]
 ) -> None:
     bounds = Limits(JOINTS_ONLY)
     at = [low + share * (high - low) for low, high, share in zip(bounds.low, bounds.high, start, strict=True)]
     checker = GuardChecker(JOINTS_ONLY, at, dt)
-    for kind, *given_ in actions:
+    for kind, *values in actions:
         if kind == "limits":
-            checker.change(narrower(checker, given_))  # type: ignore[arg-type]
+            checker.change(narrower(checker, values))
             continue
-        first, second, tolerates_saturation, times = given_
-        for _ in range(times):  # type: ignore[call-overload]
-            checker.request([WISHES[first](checker, 0), WISHES[second](checker, 1)], tolerates_saturation)  # type: ignore[index,arg-type]
+        first, second, tolerates_saturation, times = values
+        for _ in range(times):
+            checker.request([TARGETS[first](checker, 0), TARGETS[second](checker, 1)], tolerates_saturation)
     checker.request([nan, inf], tolerates_saturation=False)
     checker.stop()
 
 
-@given(dt=CYCLES_S, velocity=st.lists(st.floats(width=64), min_size=2, max_size=2), way=st.floats(-0.5, 0.5))
+@given(dt=CYCLES_S, velocity=st.lists(st.floats(width=64), min_size=2, max_size=2), position=st.floats(-0.5, 0.5))
 def test_a_speed_that_does_not_go_with_the_position_is_not_commanded(
-    dt: float, velocity: list[float], way: float
+    dt: float, velocity: list[float], position: float
 ) -> None:
     checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], dt)
     for _ in range(30):
-        checker.request([way, way], tolerates_saturation=True, velocity=velocity)
+        checker.request([position, position], tolerates_saturation=True, velocity=velocity)
 
 
-# -- what fits passes -----------------------------------------------------------------------------------------------
+# -- targets within the limits pass ----------------------------------------------------------------------------------
 
 
 @given(
@@ -235,7 +237,7 @@ def test_a_step_that_is_too_long_is_reported_as_a_speed() -> None:
     checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], 0.001)
     checker.request([0.0, 0.1], tolerates_saturation=False)
     guard = checker.guard
-    assert guard.ended == JointLimitReached(1, pytest.approx(100.0), pytest.approx(0.7e-3))
+    assert guard.ended == JointLimitReached(1, near(100.0), near(0.7e-3))
 
 
 @given(beyond=st.floats(0.0, 0.02), dt=CYCLES_S, outward=st.booleans())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import nan
 from typing import Any
@@ -20,21 +20,23 @@ from rtcp.motion.controllers.velocity import VelocityController
 from rtcp.motion.state import Phase
 from tests.samples import examples
 
+from .conftest import Drive
+
 PERIOD = 0.0005
 NONE = [0.0] * 6
 
 
 @pytest.fixture
-def mode(drive: Any) -> VelocityController:
+def mode(drive: Drive) -> VelocityController:
     made: VelocityController = drive.controller(VelocityController)
     return made
 
 
-def ramp(drive: Any, mode: VelocityController, velocity: Sequence[float], hold_s: float) -> None:
+def ramp(drive: Drive, mode: VelocityController, velocity: Sequence[float], hold_s: float) -> None:
     assert drive.command(mode, MoveAtVelocity(tuple(velocity), hold_s)) is None
 
 
-def test_a_speed_is_reached_by_a_ramp_of_acceleration_and_jerk(new_drive: Any) -> None:
+def test_a_speed_is_reached_by_a_ramp_of_acceleration_and_jerk(new_drive: Callable[..., Drive]) -> None:
     drive = new_drive(with_jerk=True)
     mode = drive.controller(VelocityController)
     ramp(drive, mode, [0.4, -0.2, 0.0, 0.1, 0.3, -0.4], 1.0)
@@ -59,14 +61,14 @@ def test_a_speed_is_reached_by_a_ramp_of_acceleration_and_jerk(new_drive: Any) -
     ],
 )
 def test_a_command_that_is_out_of_range_is_refused(
-    drive: Any, mode: VelocityController, velocity: tuple[float, ...], hold_s: float, refusal: Refusal
+    drive: Drive, mode: VelocityController, velocity: tuple[float, ...], hold_s: float, refusal: Refusal
 ) -> None:
     assert drive.command(mode, MoveAtVelocity(velocity, hold_s)) == refusal
     assert isinstance(drive.command(mode, MoveAtVelocity((nan,) * 6, 0.5)), NotFinite)
     assert mode.phase is Phase.HOLD
 
 
-def test_a_velocity_that_is_not_renewed_ends_in_a_stop(drive: Any, mode: VelocityController) -> None:
+def test_a_velocity_that_is_not_renewed_ends_in_a_stop(drive: Drive, mode: VelocityController) -> None:
     for k in range(4):
         ramp(drive, mode, [0.3] * 6, 0.5)
         drive.run(mode, 600 + 100 * k)
@@ -77,14 +79,14 @@ def test_a_velocity_that_is_not_renewed_ends_in_a_stop(drive: Any, mode: Velocit
     assert mode.ended == CommandExpired()
 
 
-def test_at_rest_it_ends_without_an_event(drive: Any, mode: VelocityController) -> None:
+def test_at_rest_it_ends_without_an_event(drive: Drive, mode: VelocityController) -> None:
     ramp(drive, mode, NONE, 0.1)
     drive.run(mode, 300)
     assert (mode.phase, mode.ended) == (Phase.HOLD, None)
     assert drive.state.commanded == NONE
 
 
-def test_a_stop_ramps_down_and_a_new_velocity_begins_anew(drive: Any, mode: VelocityController) -> None:
+def test_a_stop_ramps_down_and_a_new_velocity_begins_anew(drive: Drive, mode: VelocityController) -> None:
     ramp(drive, mode, [0.5] * 6, 1.0)
     drive.run(mode, 1000)
     mode.stop(drive.state)
@@ -98,7 +100,7 @@ def test_a_stop_ramps_down_and_a_new_velocity_begins_anew(drive: Any, mode: Velo
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("speed", [0.05, 0.5])
 def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
-    drive: Any, mode: VelocityController, sign: float, speed: float
+    drive: Drive, mode: VelocityController, sign: float, speed: float
 ) -> None:
     edges = drive.limits.high if sign > 0 else drive.limits.low
     start = [edge - sign * 0.1 for edge in edges]
@@ -110,7 +112,7 @@ def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
     assert max(map(abs, drive.state.commanded_velocity)) < 1e-6
     fastest = max(abs(b[0] - a[0]) / PERIOD for a, b in pairwise(drive.path))
     assert fastest <= speed * (1 + 1e-6)
-    # It does not go to and fro there, and it is the mode that stops it, not the guard.
+    # It does not oscillate there, and the controller stops it, not the guard.
     joint = [sign * q[0] for q in drive.path]
     assert joint == sorted(joint)
     assert drive.cuts == 0
@@ -120,17 +122,17 @@ def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
     assert drive.state.commanded_velocity == pytest.approx([-sign * speed] * 6)
 
 
-def test_the_ramp_continues_from_what_the_guards_have_cut(drive: Any, mode: VelocityController) -> None:
+def test_the_ramp_continues_from_what_the_guards_have_cut(drive: Drive, mode: VelocityController) -> None:
     ramp(drive, mode, [0.4] * 6, 1.0)
     drive.run(mode, 400)
-    # As after a stop before a box: at rest, a little behind.
+    # As after a stop before a box: at rest, a little behind the setpoint.
     drive.state.commanded_velocity, drive.state.commanded_acceleration = [0.0] * 6, [0.0] * 6
     drive.at([q - 0.01 for q in drive.state.commanded])
     before = list(drive.state.commanded)
     assert mode.update(drive.state).position == pytest.approx(before, abs=1e-6)
 
 
-def test_the_other_joints_move_on_while_one_stands_at_its_edge(drive: Any, mode: VelocityController) -> None:
+def test_the_other_joints_move_on_while_one_stands_at_its_edge(drive: Drive, mode: VelocityController) -> None:
     drive.at([3.05, 0.0, 0.0, 0.0, 0.0, 0.0])
     for _ in range(6):
         ramp(drive, mode, [0.4] * 6, 0.5)
@@ -138,7 +140,7 @@ def test_the_other_joints_move_on_while_one_stands_at_its_edge(drive: Any, mode:
     assert drive.state.commanded_velocity[1:] == pytest.approx([0.4] * 5)
 
 
-def test_narrower_limits_count_from_the_next_cycle_on(drive: Any, mode: VelocityController) -> None:
+def test_narrower_limits_count_from_the_next_cycle_on(drive: Drive, mode: VelocityController) -> None:
     drive.limits.high[0] = 0.1
     for _ in range(8):
         ramp(drive, mode, [0.5] * 6, 0.5)
@@ -147,19 +149,19 @@ def test_narrower_limits_count_from_the_next_cycle_on(drive: Any, mode: Velocity
 
 
 class Failing:
-    """A generator that knows no ways to a position."""
+    """A generator that finds no profile to a position."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
 
-    def update(self, way: Any, output: Any) -> Any:
-        if ControlInterface.Position in way.per_dof_control_interface:
+    def update(self, parameters: Any, output: Any) -> Any:
+        if ControlInterface.Position in parameters.per_dof_control_interface:
             raise RuckigError
-        return self.real.update(way, output)
+        return self.real.update(parameters, output)
 
 
-def test_where_no_way_to_an_edge_is_found_the_joints_ramp_down(drive: Any, mode: VelocityController) -> None:
-    mode._otg = Failing(mode._otg)  # type: ignore[assignment]
+def test_where_no_way_to_an_edge_is_found_the_joints_ramp_down(drive: Drive, mode: VelocityController) -> None:
+    mode._otg = Failing(mode._otg)
     drive.at([2.8, 0.0, 0.0, 0.0, 0.0, 0.0])
     for _ in range(12):
         ramp(drive, mode, [0.4] * 6, 0.5)
@@ -171,7 +173,7 @@ def test_where_no_way_to_an_edge_is_found_the_joints_ramp_down(drive: Any, mode:
 
 @settings(max_examples=examples(12))
 @given(st.integers(0, 10**6))
-def test_no_velocities_break_a_limit(new_drive: Any, seed: int) -> None:
+def test_no_velocities_break_a_limit(new_drive: Callable[..., Drive], seed: int) -> None:
     chance, drive = random.Random(seed), new_drive()
     drive.at([chance.uniform(low, high) for low, high in zip(drive.limits.low, drive.limits.high, strict=True)])
     mode = drive.controller(VelocityController)

@@ -1,4 +1,4 @@
-"""No body enters a keep-out box or another body, the tool never leaves its box; who begins inside may come out."""
+"""No body enters a keep-out box or another body, and the tool stays in its box; an arm that begins inside may leave."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import product
 from math import hypot, inf, nan
 from random import Random
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import assume, given, settings
@@ -20,7 +21,7 @@ from rtcp.ipc.events import BoxReached, CollisionAhead, NotLeavingBox
 from rtcp.motion.guards.braking import touched
 from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.guards.zones import ITSELF, TOOL, Zones, inside
-from rtcp.motion.limits import Limits
+from rtcp.motion.limits import Limits, corners
 from tests.arm_geometry import CLEARANCE, RADIUS, Point, box_gaps, depth, own_gap, points
 from tests.samples import SLOW, examples
 
@@ -45,13 +46,13 @@ def box_before(point: Point, axis: int, side: float, gap: float, shift: Sequence
 def driven(
     checker: GuardChecker, direction: Sequence[float], cycles: int, tolerates_saturation: bool = True
 ) -> list[GuardResult]:
-    """Ask for joint speeds in a direction, as parts of each joint's limit."""
+    """Request joint speeds in a direction, as parts of each joint's limit."""
     verdicts = []
     for _ in range(cycles):
         steps = [part * v * checker.dt for part, v in zip(direction, checker.limits.velocity, strict=True)]
         verdicts.append(
             checker.request(
-                [q + way for q, way in zip(checker.state.commanded, steps, strict=True)], tolerates_saturation
+                [q + step for q, step in zip(checker.state.commanded, steps, strict=True)], tolerates_saturation
             )
         )
     return verdicts
@@ -212,7 +213,7 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     checker = GuardChecker(with_boxes(WIDE, box), q, dt)
     while min(box_gaps(checker.state.commanded, box)) < 0.01:
         assert driven(checker, away, 1)[0] <= GuardResult.CLAMPED
-    # And the way back in ends before the box.
+    # The motion back ends before the box.
     while driven(checker, [-part for part in away], 1)[0] is not GuardResult.STOPPED:
         assert min(box_gaps(checker.state.commanded, box)) > 0.0
     assert isinstance(checker.guard.ended, BoxReached)
@@ -247,7 +248,7 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
             after, mean, limits.acceleration, dt,
         )  # fmt: skip
         most = max(most, len(looked))
-    # A cycle has no time for more; seldom it would take three times as many, and then the stop counts as touching.
+    # More would take too long in a cycle; a stop that would need more counts as touching.
     assert most == 16
 
 
@@ -292,19 +293,17 @@ def test_boxes_that_close_in_are_kept_or_refused(shares: list[float], direction:
     for share in shares:
         driven(checker, direction, 30)
         tool = points(checker.state.commanded)[0]
-        walls = [t + 0.2 * share for t in tool]
-        checker.change(replace(limits.widest, box=(*WIDE[:3], *walls)))
+        walls = tuple(t + 0.2 * share for t in tool)
+        checker.change(replace(limits.widest, box=corners(WIDE[:3], walls)))
 
 
 @pytest.mark.interpreted
 def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
-    counted = []
-    monkeypatch.setattr(
-        "rtcp.motion.guards.trajectory_guard.frames", lambda *given: counted.append(1) or frames(*given)
-    )
+    counted = Mock(side_effect=frames)
+    monkeypatch.setattr("rtcp.motion.guards.trajectory_guard.frames", counted)
     checker = GuardChecker(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), [0.0] * 6, 0.001)
     driven(checker, [0.5] * 6, 200)
-    assert len(counted) <= 3
+    assert counted.call_count <= 3
     assert checker.guard.poses == frames(MODEL, checker.state.commanded)
 
 
@@ -320,9 +319,9 @@ def test_with_a_point_exactly_on_a_face_any_single_joint_may_be_asked_for(axis: 
     checker = GuardChecker(with_boxes(box) if kept_in else with_boxes(WIDE, box), Q, 0.001)
     for sign in (1.0, -1.0):
         for _ in range(60):
-            way = [sign * 0.5 * checker.dt if i == axis else 0.0 for i in range(6)]
+            step = [sign * 0.5 * checker.dt if i == axis else 0.0 for i in range(6)]
             verdict = checker.request(
-                [q + w for q, w in zip(checker.state.commanded, way, strict=True)], tolerates_saturation=True
+                [q + w for q, w in zip(checker.state.commanded, step, strict=True)], tolerates_saturation=True
             )
             if axis == 5:
                 assert verdict <= GuardResult.CLAMPED
@@ -336,10 +335,10 @@ def test_with_a_point_exactly_on_a_face_any_single_joint_may_be_asked_for(axis: 
 def test_a_plate_that_the_first_cycle_would_cross_is_not_crossed(dt: float, gap: float, part: float) -> None:
     q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
     x, y, z = frames(MODEL, q)[6].position
-    # Joint 1 moves the tool along y; so far it comes in a cycle from rest.
-    way = abs(x) * ARM.joints[0].acceleration * dt * dt
+    # Joint 1 moves the tool along y, by this step in the first cycle from rest.
+    step = abs(x) * ARM.joints[0].acceleration * dt * dt
     low = y + BODY + gap
-    checker = GuardChecker(with_boxes(WIDE, (x - 0.3, low, z - 0.3, x + 0.3, low + part * way, z + 0.3)), q, dt)
+    checker = GuardChecker(with_boxes(WIDE, (x - 0.3, low, z - 0.3, x + 0.3, low + part * step, z + 0.3)), q, dt)
     speed = ARM.joints[0].velocity if x > 0 else -ARM.joints[0].velocity
     for _ in range(50):
         checker.request([checker.state.commanded[0] + speed * dt, *q[1:]], tolerates_saturation=True)
@@ -368,13 +367,13 @@ def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
     limits = Limits(ARM)
     zones = Zones(MODEL, limits, CLEARANCE)
     poses = frames(MODEL, q)
-    found = zones.clearances(poses, inf)
-    assert [one.distance for one in found] == sorted(one.distance for one in found)
-    assert found[0].distance == pytest.approx(zones.distance(poses)[0], abs=1e-12)
-    for one in found:
-        moved = tuple(p + 1e-6 * n for p, n in zip(one.place, one.normal, strict=True))
-        if 0 <= one.zone < ITSELF:
-            further = outside(*moved, limits.keep_out[one.zone]) - BODY - one.distance
+    clearances = zones.clearances(poses, inf)
+    assert [clearance.distance for clearance in clearances] == sorted(clearance.distance for clearance in clearances)
+    assert clearances[0].distance == pytest.approx(zones.distance(poses)[0], abs=1e-12)
+    for clearance in clearances:
+        x, y, z = (p + 1e-6 * n for p, n in zip(clearance.place, clearance.normal, strict=True))
+        if 0 <= clearance.zone < ITSELF:
+            further = outside(x, y, z, limits.keep_out[clearance.zone]) - BODY - clearance.distance
             assert further == pytest.approx(1e-6, rel=1e-3)
     assert zones.clearances(poses, min(zones.room(poses), 0.0)) == []
 
@@ -394,7 +393,7 @@ def test_no_point_moves_further_than_the_reach_of_each_joint_says(q: Sequence[fl
 
 
 def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
-    # A plate 2 mm thin beside the tool, at each of many distances: a stop from full speed passes it in a cycle.
+    # A plate of 2 mm beside the tool, at many distances: at full speed a cycle's step is longer.
     q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
     tool = points(q)[0]
     for gap, sign in product([0.004 * n for n in range(1, 20, 1 if SLOW else 3)], [1.0, -1.0]):

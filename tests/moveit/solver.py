@@ -83,14 +83,14 @@ class CSolver:
         return [name.decode() for name in (ctypes.c_char_p * 6).in_dll(self.library, f"{self.prefix}_joint_names")]
 
     def frames(self, q: Sequence[float]) -> list[Pose]:
-        found = (CPose * 7)()
-        self._function("frames")((ctypes.c_double * 6)(*q), found)
-        return [frame.pose() for frame in found]
+        poses = (CPose * 7)()
+        self._function("frames")((ctypes.c_double * 6)(*q), poses)
+        return [frame.pose() for frame in poses]
 
     def forward(self, q: Sequence[float]) -> Pose:
-        found = CPose()
-        self._function("forward")((ctypes.c_double * 6)(*q), ctypes.byref(found))
-        return found.pose()
+        result = CPose()
+        self._function("forward")((ctypes.c_double * 6)(*q), ctypes.byref(result))
+        return result.pose()
 
     def solve(self, pose: Pose, near: Sequence[float] | None = None) -> list[Solution] | None:
         """None for an argument that the solver calls invalid."""
@@ -99,21 +99,23 @@ class CSolver:
     def nearest(self, pose: Pose, seed: Sequence[float]) -> list[Solution] | None:
         return self._solutions("nearest", pose, seed)
 
-    def many(self, poses: Array, near: Array, *, nearest: bool = False) -> tuple[npt.NDArray[np.void], Array, Array]:
+    def many(
+        self, poses: Array, near: Array, *, nearest: bool = False
+    ) -> tuple[npt.NDArray[np.void], npt.NDArray[np.int32], Array]:
         """Solutions (N, 16), their counts (N,) and the times, us (N,), for poses (N, 12) and joint positions (N, 6)."""
         poses, near = np.ascontiguousarray(poses), np.ascontiguousarray(near)
-        found = np.zeros((len(poses), MOST), SOLUTION)
+        solutions = np.zeros((len(poses), MOST), SOLUTION)
         counts, us = np.zeros(len(poses), np.int32), np.zeros(len(poses))
-        arrays = (array.ctypes.data_as(ctypes.c_void_p) for array in (poses, near, found, counts, us))
+        arrays = (array.ctypes.data_as(ctypes.c_void_p) for array in (poses, near, solutions, counts, us))
         self.library.many(int(nearest), len(poses), *arrays)
-        return found, counts, us
+        return solutions, counts, us
 
     def _solutions(self, name: str, pose: Pose, near: Sequence[float] | None) -> list[Solution] | None:
-        found = np.zeros(MOST, SOLUTION)
+        solutions = np.zeros(MOST, SOLUTION)
         given = CPose((ctypes.c_double * 3)(*pose[0]), (ctypes.c_double * 9)(*pose[1]))
         seed = None if near is None else (ctypes.c_double * 6)(*near)
-        count = self._function(name)(ctypes.byref(given), seed, found.ctypes.data_as(ctypes.c_void_p))
-        return None if count == INVALID else [_solution(one) for one in found[:count]]
+        count = self._function(name)(ctypes.byref(given), seed, solutions.ctypes.data_as(ctypes.c_void_p))
+        return None if count == INVALID else [_solution(solution) for solution in solutions[:count]]
 
     def _function(self, name: str) -> ctypes._NamedFuncPointer:
         return getattr(self.library, f"{self.prefix}_{name}")
@@ -127,7 +129,7 @@ def _solution(row: np.void) -> Solution:
 
 @dataclass
 class Comparison:
-    """What was compared, and what differed."""
+    """Compared poses and their differences."""
 
     poses: int = 0
     solutions: int = 0
@@ -170,8 +172,8 @@ def compare(model: ArmModel, solver: CSolver, count: int, seed: int = 1) -> Comp
             centres = poses[:, :3] - levers
             poses[5::16, :2] -= (centres[:, :2] - [model.rows[0].a, 0.0])[5::16]
         nears = np.random.default_rng(seed + block).uniform(-3.0, 3.0, q.shape)
-        found, counts, _ = solver.many(poses, nears)
-        for row, number, given, near in zip(poses.tolist(), counts.tolist(), found, nears.tolist(), strict=True):
+        solutions, counts, _ = solver.many(poses, nears)
+        for row, number, given, near in zip(poses.tolist(), counts.tolist(), solutions, nears.tolist(), strict=True):
             pose = Pose(tuple(row[:3]), tuple(row[3:]))
             _count(result, model, pose, inverse.solve(pose, near).solutions, given[: max(number, 0)])
     return result
@@ -182,16 +184,19 @@ def _count(
 ) -> None:
     result.poses += 1
     result.solutions += len(wanted)
-    result.singular += any(one.singularity for one in wanted)
+    result.singular += any(solution.singularity for solution in wanted)
     result.unreachable += not wanted
     # The slow types only where the numbers are not plainly equal.
     is_same = len(wanted) == len(given)
     if is_same and wanted:
-        bits = [(BITS[one.branch], one.singularity.value, sum(1 << joint for joint in one.outside)) for one in wanted]
+        bits = [
+            (BITS[solution.branch], solution.singularity.value, sum(1 << joint for joint in solution.outside))
+            for solution in wanted
+        ]
         is_same = bits == given[["branch", "singularity", "outside"]].tolist()
         outside = given["outside"][:, None] >> np.arange(6) & 1
         is_same &= bool((given["q"] > np.where(outside, -pi, -inf)).all())
-        difference = np.abs((given["q"] - [one.q for one in wanted] + pi) % (2 * pi) - pi).max(axis=1)
+        difference = np.abs((given["q"] - [solution.q for solution in wanted] + pi) % (2 * pi) - pi).max(axis=1)
         result.worst = max(result.worst, float(difference.max()))
         for number in np.flatnonzero(difference > SAME):
             here = forward(model, given["q"][number].tolist())

@@ -1,4 +1,4 @@
-"""The exported C: it is plain C99 on its own, gives what `kinematics` gives, and refuses what it does not cover."""
+"""The exported C: plain C99 without dependencies, with the results of `kinematics`; refused for other models."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from math import inf, nan, pi
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from kinematics.c_source import c_name, numbers_digest, to_c
 from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel, JointLimit
-from kinematics.pose import Pose
+from kinematics.pose import Pose, Rotation
 from kinematics.solution import Singularity
 from rtcp.config import find_arm, load_kinematics
 from tests.kinematics.arms import TOOL, assistive, count, irb120, ur5, with_general_rows, with_row, with_tool
@@ -52,7 +53,7 @@ def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 @needs_c
 def test_all_solutions_are_those_of_kinematics(arm: tuple[ArmModel, CSolver]) -> None:
-    """With their order, branch, limits and singularities; a million poses with RTCP_SLOW=1."""
+    """Order, branch, limits and singularities are compared too; a million poses with RTCP_SLOW=1."""
     compared = compare(*arm, count(3_000, 1_000_000 // len(ARMS)))
     assert compared.different == 0, compared.first
     assert compared.worst < 1e-4  # at an edge of the workspace an angle has half the digits of the pose
@@ -63,10 +64,10 @@ def test_all_solutions_are_those_of_kinematics(arm: tuple[ArmModel, CSolver]) ->
 def test_frames_are_those_of_kinematics(arm: tuple[ArmModel, CSolver]) -> None:
     model, solver = arm
     for q in np.random.default_rng(2).uniform(-7, 7, (200, 6)).tolist():
-        for found, wanted in zip(
+        for actual, wanted in zip(
             [*solver.frames(q), solver.forward(q)], [*frames(model, q), forward(model, q)], strict=True
         ):
-            assert np.hstack(found) == pytest.approx(np.hstack(wanted), abs=1e-14)
+            assert np.hstack(actual) == pytest.approx(np.hstack(wanted), abs=1e-14)
 
 
 @needs_c
@@ -79,20 +80,22 @@ def test_the_first_solution_is_the_nearest_of_kinematics(arm: tuple[ArmModel, CS
         q = random.uniform(lower, upper) if number % 4 else random.uniform(-pi, pi, 6)
         seed = (q + random.uniform(-0.5, 0.5, 6) if number % 2 else random.uniform(-pi, pi, 6)).tolist()
         pose = forward(model, q.tolist())
-        wanted, found = inverse.solve_near(pose, seed), solver.nearest(pose, seed)
-        assert found is not None
+        wanted, solutions = inverse.solve_near(pose, seed), solver.nearest(pose, seed)
+        assert solutions is not None
         none += wanted.q is None
         if wanted.q is None:
-            assert found == []
+            assert solutions == []
             continue
         moves = [
-            max(abs(a - b) for a, b in zip(one, seed, strict=True)) for one in (wanted.q, *(one.q for one in found))
+            max(abs(a - b) for a, b in zip(solution, seed, strict=True))
+            for solution in (wanted.q, *(solution.q for solution in solutions))
         ]
         assert moves[0] == pytest.approx(moves[1], abs=1e-9)
         assert moves[1:] == sorted(moves[1:])
         # Several may be equally near, as where joint 4 of each has to turn by pi.
-        assert any(one.q == pytest.approx(wanted.q, abs=1e-9) for one in found)
-        assert all(low <= angle <= high for one in found for angle, low, high in zip(one.q, lower, upper, strict=True))
+        assert any(solution.q == pytest.approx(wanted.q, abs=1e-9) for solution in solutions)
+        for solution in solutions:
+            assert all(low <= angle <= high for angle, low, high in zip(solution.q, lower, upper, strict=True))
     assert none > 0 or model.limits[0].upper > 3.0
 
 
@@ -101,14 +104,14 @@ def test_joint_6_at_its_limit_is_compensated_by_joint_4_on_the_wrist_singularity
     model = load_kinematics(find_arm("assistive_arm"))
     solver, inverse = CSolver(model, tmp_path), InverseKinematics(model)
     q = (0.3, 0.5, -0.8, 0.4, 0.0, 2.9)
-    for turn in (0.5, 0.8):
-        pose = forward(model, (*q[:5], q[5] + turn))
-        wanted, found = inverse.solve_near(pose, q), solver.nearest(pose, q)
-        assert found
+    for excess in (0.5, 0.8):
+        pose = forward(model, (*q[:5], q[5] + excess))
+        wanted, solutions = inverse.solve_near(pose, q), solver.nearest(pose, q)
+        assert solutions
         assert wanted.q is not None
-        assert found[0].q == pytest.approx(wanted.q, abs=1e-9)
-        assert found[0].q[5] == model.limits[5].upper
-        assert Singularity.WRIST in found[0].singularity
+        assert solutions[0].q == pytest.approx(wanted.q, abs=1e-9)
+        assert solutions[0].q[5] == model.limits[5].upper
+        assert Singularity.WRIST in solutions[0].singularity
 
 
 @needs_c
@@ -118,10 +121,10 @@ def test_a_free_joint_stays_at_the_seed_or_at_the_limit_nearest_to_it(tmp_path: 
     pose = forward(model, (0.3, 0.5, -0.8, 0.4, 0.0, 0.2))
     for seed4 in (0.1, 2.0, 4.0, -5.0):
         seed = (0.3, 0.5, -0.8, seed4, 0.0, 0.6 - min(max(seed4, -3.1), 3.1))
-        wanted, found = inverse.solve_near(pose, seed), solver.nearest(pose, seed)
-        assert found
+        wanted, solutions = inverse.solve_near(pose, seed), solver.nearest(pose, seed)
+        assert solutions
         assert wanted.q is not None
-        assert found[0].q == pytest.approx(wanted.q, abs=1e-9)
+        assert solutions[0].q == pytest.approx(wanted.q, abs=1e-9)
 
 
 # -- arguments ------------------------------------------------------------------------------------------------------
@@ -149,9 +152,10 @@ def test_a_value_that_is_not_finite_is_invalid(tmp_path: Path, value: float) -> 
 @needs_c
 def test_a_matrix_that_is_no_rotation_is_invalid(tmp_path: Path) -> None:
     solver, pose = CSolver(irb120(), tmp_path), forward(irb120(), Q)
-    for wrong in (tuple(1.01 * value for value in pose.rotation), tuple(-value for value in pose.rotation), (0.0,) * 9):
-        assert solver.solve(Pose(pose.position, wrong)) is None
-        assert solver.nearest(Pose(pose.position, wrong), Q) is None
+    for factor in (1.01, -1.0, 0.0):
+        wrong = Pose(pose.position, cast(Rotation, tuple(factor * value for value in pose.rotation)))
+        assert solver.solve(wrong) is None
+        assert solver.nearest(wrong, Q) is None
 
 
 @needs_c
@@ -173,7 +177,7 @@ def test_threads_that_solve_at_once_get_their_own_solutions(tmp_path: Path) -> N
         thread.start()
     for thread in threads:
         thread.join()
-    assert [together[number] for number in range(4)] == [(one[0].tobytes(), one[1].tobytes()) for one in alone]
+    assert [together[number] for number in range(4)] == [(share[0].tobytes(), share[1].tobytes()) for share in alone]
 
 
 # -- the file -------------------------------------------------------------------------------------------------------
@@ -201,7 +205,7 @@ def test_the_digest_changes_with_every_number() -> None:
         replace(model, joint_names=("a", "b", "c", "d", "e", "f")),
         replace(model, limits=(*model.limits[:5], JointLimit(-1.0, 1.0))),
     ]
-    assert len({numbers_digest(one) for one in [model, *changed]}) == len(changed) + 1
+    assert len({numbers_digest(variant) for variant in [model, *changed]}) == len(changed) + 1
     assert numbers_digest(irb120()) == numbers_digest(model)
 
 

@@ -1,4 +1,4 @@
-"""`rtcp arm export-c` and `rtcp arm export-moveit`: what is written fits together and to the arm."""
+"""`rtcp arm export-c` and `rtcp arm export-moveit`: the files agree with each other and with the arm."""
 
 from __future__ import annotations
 
@@ -75,8 +75,7 @@ def test_the_srdf_names_what_is_in_the_urdf(package: Path) -> None:
     assert chain is not None
     assert chain.attrib == {"base_link": links[0], "tip_link": links[-1]}
     neighbours = {
-        (joint.find("parent").get("link"), joint.find("child").get("link"))  # type: ignore[union-attr]
-        for joint in urdf.findall("joint")
+        (joint.find("parent").get("link"), joint.find("child").get("link")) for joint in urdf.findall("joint")
     }
     unchecked = srdf.findall("disable_collisions")
     assert {
@@ -88,7 +87,7 @@ def test_the_srdf_names_what_is_in_the_urdf(package: Path) -> None:
 
 @pytest.mark.parametrize(
     ("arm", "wrist"), [("assistive_arm", "Default"), ("abb_irb120", "Always")]
-)  # whose tool leaves the wrist's cylinder, or does not
+)  # the tool is outside the wrist's cylinder, or inside
 def test_links_that_always_overlap_are_not_checked_for_collisions(arm: str, wrist: str) -> None:
     files = moveit_package(find_arm(arm)).files
     [srdf] = [ET.fromstring(text) for name, text in files.items() if name.endswith(".srdf")]

@@ -34,7 +34,7 @@ HEADERS = {
         "rclcpp/rclcpp.hpp",
     ),
 }  # fmt: skip
-"""What the class includes of MoveIt 1 and of MoveIt 2; each is a stand-in."""
+"""Headers of MoveIt 1 and of MoveIt 2 that the class includes; each is a stand-in."""
 
 pytestmark = needs_cpp
 
@@ -54,7 +54,7 @@ class Plugin:
         [solver] = folder.glob("src/*.c")
         subprocess.run(["cc", "-std=c99", "-O1", "-c", solver, "-o", folder / "solver.o"], check=True)
         options = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", f"-DSTAND_IN_MOVEIT={moveit}"]
-        command = ["c++", *options, f"-I{folder / 'include'}", f"-I{HERE}", folder / "src/kinematics_plugin.cpp"]
+        command = ["c++", *options, f"-I{folder / 'include'}", f"-I{HERE}", str(folder / "src/kinematics_plugin.cpp")]
         subprocess.run([*command, HERE / "driver.cpp", folder / "solver.o", "-o", folder / "driver"], check=True)
         self.folder = folder
         [self.urdf] = folder.glob("config/*.urdf")
@@ -66,7 +66,7 @@ class Plugin:
             text=True,
         )
 
-    def ask(self, *command: object) -> list[str]:
+    def ask(self, *command: str | float | Sequence[float]) -> list[str]:
         """Send one command; values of sequences are flattened."""
         assert self.process.stdin
         assert self.process.stdout
@@ -75,7 +75,7 @@ class Plugin:
         self.process.stdin.flush()
         return self.process.stdout.readline().split()
 
-    def numbers(self, *command: object) -> list[float]:
+    def numbers(self, *command: str | float | Sequence[float]) -> list[float]:
         return [float(word) for word in self.ask(*command)]
 
     def initialize(
@@ -124,21 +124,22 @@ def message(pose: Pose) -> list[float]:
 
 def within(model: ArmModel, pose: Pose, seed: Sequence[float]) -> list[list[float]]:
     """The solutions inside the limits, at the turns nearest to the seed, nearest first: from `kinematics`."""
-    found = []
-    for one in InverseKinematics(model).solve(pose, seed).solutions:
+    solutions = []
+    for solution in InverseKinematics(model).solve(pose, seed).solutions:
         choices = []
-        for angle, near, limit in zip(one.q, seed, model.limits, strict=True):
-            turns = (angle + turn * 2 * pi for turn in range(-3, 4))
-            allowed = [turn for turn in turns if limit.lower <= turn <= limit.upper]
-            choices.append(min(allowed, key=lambda turn: abs(turn - near), default=None))
+        for angle, near, limit in zip(solution.q, seed, model.limits, strict=True):
+            turned = (angle + number * 2 * pi for number in range(-3, 4))
+            allowed = [q for q in turned if limit.lower <= q <= limit.upper]
+            choices.append(min(allowed, key=lambda q: abs(q - near), default=None))
         if None not in choices:
-            found.append(choices)
-    return sorted(found, key=lambda q: max(abs(a - b) for a, b in zip(q, seed, strict=True)))
+            solutions.append(choices)
+    return sorted(solutions, key=lambda q: max(abs(a - b) for a, b in zip(q, seed, strict=True)))
 
 
 @pytest.fixture(scope="module", params=[("assistive_arm", 2), ("abb_irb120", 1)], ids=["moveit2", "moveit1"])
 def plugin(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plugin]:
-    made = Plugin(*request.param, tmp_path_factory.mktemp("plugin"))
+    arm, moveit = request.param
+    made = Plugin(arm, moveit, tmp_path_factory.mktemp("plugin"))
     yield made
     made.process.communicate()
 
@@ -232,10 +233,10 @@ def test_every_frame_is_computed_and_an_unknown_one_is_not(ready: Plugin) -> Non
     assert ready.ask("names") == [*ready.model.joint_names, *links]
     for q in np.random.default_rng(1).uniform(-3, 3, (20, 6)).tolist():
         for link, pose in zip(links, frames(ready.model, q), strict=True):
-            found, wanted = ready.numbers("fk", link, q), message(pose)
-            assert found[:3] == pytest.approx(wanted[:3], abs=1e-12)
-            assert abs(np.dot(found[3:], wanted[3:])) == pytest.approx(1.0, abs=1e-12)
-            assert sqrt(np.dot(found[3:], found[3:])) == pytest.approx(1.0, abs=1e-12)
+            actual, wanted = ready.numbers("fk", link, q), message(pose)
+            assert actual[:3] == pytest.approx(wanted[:3], abs=1e-12)
+            assert abs(np.dot(actual[3:], wanted[3:])) == pytest.approx(1.0, abs=1e-12)
+            assert sqrt(np.dot(actual[3:], actual[3:])) == pytest.approx(1.0, abs=1e-12)
     assert ready.ask("fk", "gripper", Q) == []
 
 

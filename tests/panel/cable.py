@@ -31,9 +31,9 @@ class Cable:
         self._namespace = namespace
         self._ended = threading.Event()
         self._run(f"ip netns add {namespace}")
-        for end, other in zip((_NEAR_END, _FAR_END), _ENDS, strict=True):
-            self._run(f"ip link add {end} type veth peer name {other}")
-            self._run(f"ip link set {other} up")
+        for end, interface in zip((_NEAR_END, _FAR_END), _ENDS, strict=True):
+            self._run(f"ip link add {end} type veth peer name {interface}")
+            self._run(f"ip link set {interface} up")
             _send_whole_checksums(end)
         self._run(f"ip addr add {NEAR}/24 dev {_NEAR_END}")
         self._run(f"ip link set {_NEAR_END} up")
@@ -42,9 +42,9 @@ class Cable:
         self._run(f"ip -n {namespace} link set {_FAR_END} up")
         self._run(f"ip -n {namespace} link set lo up")
         self._sockets = [socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3)) for _ in _ENDS]
-        for one, end in zip(self._sockets, _ENDS, strict=True):
-            one.bind((end, 0))
-            one.setblocking(False)
+        for port, end in zip(self._sockets, _ENDS, strict=True):
+            port.bind((end, 0))
+            port.setblocking(False)
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
 
@@ -56,15 +56,15 @@ class Cable:
         return script
 
     def cut(self) -> None:
-        """Let nothing through any more."""
+        """Cut the cable."""
         self.loss = 1.0
 
     def close(self) -> None:
         """Remove everything."""
         self._ended.set()
         self._thread.join()
-        for one in self._sockets:
-            one.close()
+        for port in self._sockets:
+            port.close()
         subprocess.run(["ip", "link", "del", _NEAR_END], check=False)
         subprocess.run(["ip", "link", "del", _ENDS[1]], check=False)
         subprocess.run(["ip", "netns", "del", self._namespace], check=False)
@@ -74,8 +74,8 @@ class Cable:
         waiting: list[tuple[float, int, int, bytes]] = []
         count = 0
         with selectors.DefaultSelector() as selector:
-            for at, one in enumerate(self._sockets):
-                selector.register(one, selectors.EVENT_READ, at)
+            for at, port in enumerate(self._sockets):
+                selector.register(port, selectors.EVENT_READ, at)
             while not self._ended.is_set():
                 wait_s = max(0.0, waiting[0][0] - time.monotonic()) if waiting else 0.05
                 for key, _ in selector.select(min(wait_s, 0.05)):
@@ -93,7 +93,7 @@ class Cable:
 
 
 def _send_whole_checksums(interface: str) -> None:
-    """Have the kernel compute what it leaves to the device otherwise: a frame that is read here is sent as it is."""
+    """Switch off offloading: the kernel completes each frame, which is forwarded unchanged."""
     value = array.array("I", [_ETHTOOL_STXCSUM, 0])
     address, _ = value.buffer_info()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:

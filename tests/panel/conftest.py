@@ -34,7 +34,7 @@ PASSWORD, VIEWERS_PASSWORD = "correct horse", "battery staple"
 @contextlib.contextmanager
 def begun(platform: Platform, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Run a panel on a free port; yield its process and address."""
-    # Not one of the platform's commands, which end with a test.
+    # Not started as a command of the platform, as those end with each test.
     command = [sys.executable, "-m", "rtcp.cli", "panel", "--port", "0", *arguments]
     panel = subprocess.Popen(
         command, env=platform.environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -59,22 +59,22 @@ def chromium() -> Iterator[BrowserType]:
 
 @pytest.fixture(scope="module")
 def browser(chromium: BrowserType) -> Iterator[Browser]:
-    found = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-    yield found
-    found.close()
+    chrome = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    yield chrome
+    chrome.close()
 
 
 @pytest.fixture(scope="module")
 def platform() -> Iterator[Platform]:
     """A platform that does not run yet."""
-    made = Platform()
-    made.be_patient(lost_ms=2000)
+    started = Platform()
+    started.be_patient(lost_ms=2000)
     try:
-        yield made
+        yield started
     finally:
-        made.end_commands()
-        made.rtcp("stop", check=None)
-        shutil.rmtree(made.directory, ignore_errors=True)
+        started.end_commands()
+        started.rtcp("stop", check=None)
+        shutil.rmtree(started.directory, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")
@@ -86,20 +86,20 @@ def panel(platform: Platform) -> Iterator[str]:
 
 @pytest.fixture
 def page(browser: Browser, panel: str) -> Iterator[Page]:
-    with visitor(browser, panel) as found:
-        yield found
+    with visitor(browser, panel) as opened:
+        yield opened
 
 
 @contextlib.contextmanager
 def visitor(browser: Browser, url: str, **options: Any) -> Iterator[Page]:
-    """A browser window of its own; what the panel's scripts complain of fails the test."""
+    """A browser window of its own; an error of the panel's scripts fails the test."""
     complaints: list[str] = []
     context = browser.new_context(base_url=url, viewport={"width": 1200, "height": 700}, **options)
-    found = context.new_page()
-    found.on("pageerror", lambda error: complaints.append(str(error)))
-    found.set_default_timeout(15_000)
+    page = context.new_page()
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.set_default_timeout(15_000)
     try:
-        yield found
+        yield page
     finally:
         with contextlib.suppress(Error):  # a browser that was killed
             context.close()
@@ -114,7 +114,7 @@ def show(page: Page, path: str) -> Page:
 
 
 def log_in(page: Page, password: str = PASSWORD) -> None:
-    """Get past the panel's door."""
+    """Log in."""
     page.goto("/")
     page.get_by_label("Your name").fill("Ada")
     page.get_by_label("Password").fill(password)
@@ -123,22 +123,22 @@ def log_in(page: Page, password: str = PASSWORD) -> None:
 
 
 def barriers(page: Page) -> dict[str, list[str]]:
-    """Return what axe-core calls serious or critical, by its rule."""
+    """Return the serious and critical findings of axe-core, by rule."""
     return {
-        one["id"]: [f"{node['html'][:150]}: {node['any'] and node['any'][0]['message']}" for node in one["nodes"][:3]]
-        for one in Axe().run(page).response["violations"]
-        if one["impact"] in ("serious", "critical")
+        rule["id"]: [f"{node['html'][:150]}: {node['any'] and node['any'][0]['message']}" for node in rule["nodes"][:3]]
+        for rule in Axe().run(page).response["violations"]
+        if rule["impact"] in ("serious", "critical")
     }
 
 
-def until(met: Callable[[], Any], what: str, patience_s: float = 20.0) -> Any:
-    """Wait until `met` returns something true; return that."""
+def until(met: Callable[[], Any], goal: str, patience_s: float = 20.0) -> Any:
+    """Wait until `met` returns a true value; return it."""
     end = time.monotonic() + patience_s
     while time.monotonic() < end:
-        if found := met():
-            return found
+        if result := met():
+            return result
         time.sleep(0.05)
-    raise AssertionError(f"not within {patience_s:g} s: {what}")
+    raise AssertionError(f"not within {patience_s:g} s: {goal}")
 
 
 BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
@@ -152,11 +152,11 @@ def holding(platform: Platform, panel: str) -> Platform:
 
 
 def ready(platform: Platform) -> None:
-    """Bring the arm to `BENT`, holding, in mode joint and csp; all the way only where it has to be."""
+    """Bring the arm to `BENT`, holding, in mode joint and csp; do only the missing steps."""
     with contextlib.suppress(RtcpError):
         platform.call("halt")
-        found = platform.status()
-        if found["state"] == "holding" and found["drive_mode"] == "csp":
+        status = platform.status()
+        if status["state"] == "holding" and status["drive_mode"] == "csp":
             platform.call("mode", name="joint")
             platform.call("move_joints", q=BENT)
             return

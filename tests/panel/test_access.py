@@ -1,4 +1,4 @@
-"""Who gets into the panel: over real HTTP and WebSockets, with requests that no browser would send."""
+"""Access to the panel: over real HTTP and WebSockets, with requests that no browser would send."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PASSWORDS = {"operator": "correct horse", "viewer": "battery staple"}
 
 @pytest.fixture(scope="module")
 def open_panel() -> Iterator[tuple[Platform, str]]:
-    """A panel that asks nobody, without a platform."""
+    """A panel without passwords, without a platform."""
     platform = Platform()
     try:
         with begun(platform) as (_, url):
@@ -47,7 +47,7 @@ def open_panel() -> Iterator[tuple[Platform, str]]:
 
 @pytest.fixture(scope="module")
 def closed_panel() -> Iterator[str]:
-    """One that asks for passwords."""
+    """A panel with passwords."""
     platform = Platform()
     try:
         for role, password in PASSWORDS.items():
@@ -93,8 +93,8 @@ def cookie_of(response: Any) -> str:
 
 def log_in(url: str, password: str, **headers: str) -> Any:
     body = urlencode({"name": "Ada", "password": password})
-    given = {"Origin": url, "Content-Type": "application/x-www-form-urlencoded", **headers}
-    return ask(url, "POST", "/login", given, body)
+    fields = {"Origin": url, "Content-Type": "application/x-www-form-urlencoded", **headers}
+    return ask(url, "POST", "/login", fields, body)
 
 
 def status_of_socket(url: str, path: str, **headers: str) -> int:
@@ -250,7 +250,7 @@ def test_tries_from_many_addresses_lock_nobody_out_who_was_there_before(
 def test_many_requests_are_refused_and_others_are_still_served(closed_panel: str) -> None:
     cookie = cookie_of(log_in(closed_panel, "battery staple"))
     place = urlsplit(closed_panel)
-    # All at once over one connection: the first that is one too many closes it.
+    # All at once over one connection: the first message beyond the limit closes it.
     with socket.create_connection((place.hostname, place.port), 20.0) as flood:
         flood.sendall(f"GET /metrics HTTP/1.1\r\nHost: {place.netloc}\r\n\r\n".encode() * 1000)
         answered = b""
@@ -298,19 +298,19 @@ def test_a_busy_port_of_the_panel_refuses_the_start_before_the_platform() -> Non
 
 
 def test_open_shows_the_panel_in_a_browser_and_does_not_wait_for_it(tmp_path: Path) -> None:
-    browser, shown = tmp_path / "browser", tmp_path / "shown"
-    browser.write_text(f'#!/bin/sh\necho "$1" $$ >{shown}\nexec sleep 60 >/dev/null 2>&1\n')
+    browser, opened = tmp_path / "browser", tmp_path / "shown"
+    browser.write_text(f'#!/bin/sh\necho "$1" $$ >{opened}\nexec sleep 60 >/dev/null 2>&1\n')
     browser.chmod(0o700)
     platform = Platform()
     platform.environment["BROWSER"] = f"{browser} %s"  # Python waits for one that is named so
     try:
         with begun(platform, "--open") as (_, url):
-            address = until(lambda: shown.exists() and shown.read_text(), "the browser").split()[0]
+            address = until(lambda: opened.exists() and opened.read_text(), "the browser").split()[0]
             assert address.rstrip("/") == url
             assert ask(url, "GET", "/", PAGE).status == 303
     finally:
         # After the panel, which would try the next browser.
-        os.kill(int(shown.read_text().split()[1]), signal.SIGKILL)
+        os.kill(int(opened.read_text().split()[1]), signal.SIGKILL)
         platform.end()
 
 
@@ -329,8 +329,8 @@ def test_the_file_is_readable_by_its_owner_alone_and_a_damaged_one_is_said(tmp_p
     access.set_password(file, "operator", "correct horse")
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert "horse" not in file.read_text()
-    kept = access.read_passwords(file)
-    assert [access.role_of(kept, one) for one in ("correct horse", "battery staple", "", "horse")] == [
+    hashes = access.read_passwords(file)
+    assert [access.role_of(hashes, password) for password in ("correct horse", "battery staple", "", "horse")] == [
         "operator", "viewer", None, None,
     ]  # fmt: skip
     with pytest.raises(Invalid, match="found 5 characters, allowed are 8"):

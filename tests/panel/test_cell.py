@@ -9,6 +9,7 @@ import re
 import signal
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,21 +28,21 @@ from tests.panel.conftest import barriers, begun, show, until, visitor
 
 pytestmark = [pytest.mark.alone, pytest.mark.browser]
 SLACK_S = 0.6
-"""Braking, which takes 0.22 s along a common path, and a shared host."""
+"""Allowance for braking, 0.22 s along a common path, and a shared host, s."""
 FAR = {"left": "0.9, 0.2, 0.1, 0, 0.5, 0.3", "right": "-0.9, 0.1, -0.1, 0.1, 0.6, 0"}
 """Seconds away at 0.15 rad/s."""
 
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[RunningCell]:
-    """Two virtual IRB 120; a loop may be late for longer than is shipped: a browser draws beside it."""
+    """Two virtual IRB 120; their loops may be later than shipped, as a browser draws beside them."""
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     file, count = re.subn(r"^silence_s: \S+", "silence_s: 0.2", (CONFIG / "cell.yaml").read_text(), flags=re.MULTILINE)
     assert count == 1
-    made = RunningCell(file)
-    made.platform.environment["RTCP_NAME"] = "left"
-    yield made
-    made.end()
+    cell = RunningCell(file)
+    cell.platform.environment["RTCP_NAME"] = "left"
+    yield cell
+    cell.end()
 
 
 @pytest.fixture(scope="module")
@@ -75,13 +76,13 @@ def states(cell: Cell) -> dict[str, State]:
 
 
 def drawn(page: Page) -> dict[str, list[float]]:
-    """Return where the tools of the partners are drawn, m, from this arm's base."""
-    found: dict[str, list[float]] = json.loads(page.locator(".arm-view").get_attribute("data-partners") or "{}")
-    return found
+    """Return the drawn tool positions of the partners, m, in this arm's base."""
+    positions: dict[str, list[float]] = json.loads(page.locator(".arm-view").get_attribute("data-partners") or "{}")
+    return positions
 
 
 def stood_after(feed: Feed, since_ns: int) -> float:
-    """Return how long after an instant the last cycle with a speed was, s; what follows is all at rest."""
+    """Return the time from an instant to the last cycle in motion, s."""
     time.sleep(PRESENCE_S + SLACK_S + 0.5)
     records, _ = feed.records()
     moving = records[np.abs(records["commanded_velocity"]).max(axis=1) > 0.0]
@@ -97,13 +98,17 @@ def begin(page: Page, running: RunningCell) -> dict[str, Feed]:
     page.get_by_role("button", name="Move in step").click()
     feeds = {name: Feed(running.of(name)) for name in FAR}
     for feed in feeds.values():
-        until(lambda feed=feed: speed(feed) > 0.05, "motion")
+        until(partial(moves, feed), "motion")
     return feeds
 
 
 def speed(feed: Feed) -> float:
     record = feed.latest()
     return 0.0 if record is None else float(np.abs(record["commanded_velocity"]).max())
+
+
+def moves(feed: Feed) -> bool:
+    return speed(feed) > 0.05
 
 
 # -- one space --------------------------------------------------------------------------------------------------------
@@ -113,10 +118,10 @@ def test_partners_are_drawn_where_they_stand_live_and_only_while_they_run(
     page: Page, running: RunningCell, cell: Cell
 ) -> None:
     def expected() -> tuple[float, ...]:
-        own, other = (Pose.from_xyzrpy(*one.base.position, *one.base.rpy) for one in cell.config.arms)
+        own, partner = (Pose.from_xyzrpy(*arm.base.position, *arm.base.rpy) for arm in cell.config.arms)
         arm = cell.config.arms[1].config.arm
         assert arm is not None
-        return (own.inverse() @ other @ forward(arm, cell.arms["right"].status().positions)).position
+        return (own.inverse() @ partner @ forward(arm, cell.arms["right"].status().positions)).position
 
     show(page, "/arm")
     expect(page.get_by_role("link", name="Cell")).to_be_visible()
@@ -142,7 +147,7 @@ def test_stop_ends_what_anybody_moves_at_any_arm(page: Page, running: RunningCel
     for name in cell.arms:
         running.platform.background("--name", name, "move", "1.2", "0", "0", "0", "0.5", "0", "--speed", "0.15")
     for feed in feeds.values():
-        until(lambda feed=feed: speed(feed) > 0.05, "motion")
+        until(partial(moves, feed), "motion")
     now = time.monotonic_ns()
     page.get_by_role("button", name="STOP not the emergency stop").click()
     assert max(stood_after(feed, now) for feed in feeds.values()) < JOG_S + SLACK_S
@@ -205,20 +210,20 @@ def test_all_arms_are_enabled_moved_in_step_and_disabled(page: Page, running: Ru
     cell.disable()
     show(page, "/cell")
 
-    def shown(name: str, key: str) -> str:
+    def cell_text(name: str, key: str) -> str:
         return page.locator(f"[data-arm={name}] [data-live$={key}]").text_content() or ""
 
     page.get_by_role("button", name="Enable all").click()
     until(lambda: states(cell) == dict.fromkeys(cell.arms, State.HOLDING), "all arms hold")
-    until(lambda: [shown(name, "state") for name in cell.arms] == ["holding"] * 2, "the table says so")
+    until(lambda: [cell_text(name, "state") for name in cell.arms] == ["holding"] * 2, "the table says so")
     page.get_by_role("button", name="Here").click()
     expect(page.get_by_label("Joints of right, rad")).to_have_value(re.compile(r"^-?[\d.e-]+(, -?[\d.e-]+){5}$"))
     page.get_by_label("Joints of left, rad").fill("0.2, 0, 0, 0, 0.5, 0")
     page.get_by_label("Joints of right, rad").fill("-pi/12, 0, 0, 0, 0.5, 0")
     page.get_by_label("Speed (empty: the limit), rad/s").fill("0.15")
     page.get_by_role("button", name="Move in step").click()
-    until(lambda: [shown(name, "step") for name in cell.arms] == ["moves"] * 2, "in step")
-    assert all(shown(name, "holder").startswith("panel: ") for name in cell.arms)
+    until(lambda: [cell_text(name, "step") for name in cell.arms] == ["moves"] * 2, "in step")
+    assert all(cell_text(name, "holder").startswith("panel: ") for name in cell.arms)
     expect(page.get_by_text(re.compile("^There; largest errors"))).to_be_visible()
     positions = {name: status.positions for name, status in cell.status().items()}
     assert positions["left"][0] == pytest.approx(0.2, abs=2e-3)
@@ -235,7 +240,7 @@ def test_all_arms_are_enabled_moved_in_step_and_disabled(page: Page, running: Ru
         operator.ask({"do": "stop", "circuit": "emergency"})
         until(lambda: states(cell)["right"] is State.FAULT, "fault")
         put_in_order(operator)
-    until(lambda: shown("right", "state") == "fault", "the table says so")
+    until(lambda: cell_text("right", "state") == "fault", "the table says so")
     page.get_by_role("button", name="Reset all").click()
     until(lambda: states(cell)["right"] is State.READY, "reset")
     page.get_by_role("button", name="Disable all").click()
@@ -267,9 +272,9 @@ def test_a_motion_in_step_ends_with_its_page(
 def test_another_page_commands_nothing_while_one_operates(
     browser: Browser, panel: str, running: RunningCell, cell: Cell
 ) -> None:
-    with visitor(browser, panel) as page, visitor(browser, panel) as other:
+    with visitor(browser, panel) as page, visitor(browser, panel) as second:
         show(page, "/cell").get_by_role("button", name="Disable all").click()
         until(lambda: states(cell) == dict.fromkeys(cell.arms, State.READY), "no arm has torque")
-        show(other, "/cell").get_by_role("button", name="Enable all").click()
-        expect(other.get_by_role("button", name="Ask to take over")).to_be_visible()
+        show(second, "/cell").get_by_role("button", name="Enable all").click()
+        expect(second.get_by_role("button", name="Ask to take over")).to_be_visible()
         assert states(cell) == dict.fromkeys(cell.arms, State.READY)

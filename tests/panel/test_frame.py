@@ -1,19 +1,19 @@
-"""The frame around the tabs, used as a person would: what stays, what leads, units, override, steps, alarms, trends."""
+"""The frame around the tabs, used as a person would: guidance, units, override, steps, alarms, trends."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import re
+import time
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, ViewportSize, expect
 
 from kinematics.forward import forward
 from rtcp.api import EventRecord, State
 from rtcp.config.loader import load
-from rtcp.panel import trends
 from rtcp.panel.live import NEXT, Live, sentence
 from rtcp.panel.server import PAGES
 from rtcp.panel.trends import KEPT_S, SAMPLE_S, Trends
@@ -21,7 +21,7 @@ from tests.e2e.conftest import Platform
 from tests.panel.conftest import BENT, begun, show, until, visitor
 
 pytestmark = [pytest.mark.alone, pytest.mark.browser]
-PHONE = {"width": 400, "height": 844}
+PHONE: ViewportSize = {"width": 400, "height": 844}
 
 
 def tool_of(platform: Platform) -> tuple[float, ...]:
@@ -47,7 +47,7 @@ def test_whoever_comes_first_is_led_from_start_to_motion_on_a_phone(browser: Bro
             page.get_by_label("Frame").select_option("joints")  # straight up the tool has no way to go
             page.get_by_role("button", name="joint1 +").hover()
             page.mouse.down()
-            platform.until(lambda found: found["state"] == "moving", "the jog")
+            platform.until(lambda status: status["state"] == "moving", "the jog")
             page.mouse.up()
             expect(page.locator("#lead")).to_be_hidden(timeout=20_000)
             show(page, "/jog")
@@ -92,7 +92,7 @@ def test_home_is_asked_for_and_then_reached(page: Page, holding: Platform) -> No
     expect(page.get_by_role("button", name="Leave it")).to_have_count(0)
     page.get_by_role("button", name="Home", exact=True).click()
     page.get_by_role("button", name="Move home").click()
-    holding.until(lambda found: found["state"] == "moving", "on the way")
+    holding.until(lambda status: status["state"] == "moving", "on the way")
     home = load(Path(holding.environment["RTCP_CONFIG"])).home
     assert home is not None
     expect(page.get_by_text("The arm is at home")).to_be_visible(timeout=20_000)
@@ -111,20 +111,20 @@ def test_the_override_slows_what_the_page_moves_and_others_may_only_lower_it(
     slider = page.get_by_role("slider", name="Override", exact=True)
     for _ in range(3):
         slider.press("PageDown")
-    holding.until(lambda found: found["speed_override"] < 0.9, "slower")
+    holding.until(lambda status: status["speed_override"] < 0.9, "slower")
     assert holding.status()["state"] == "moving"
-    with visitor(browser, panel) as other:
-        show(other, "/health")
-        other.get_by_role("slider", name="Override", exact=True).press("Home")
-        holding.until(lambda found: found["speed_override"] == pytest.approx(0.01), "as slow as can be")
+    with visitor(browser, panel) as second:
+        show(second, "/health")
+        second.get_by_role("slider", name="Override", exact=True).press("Home")
+        holding.until(lambda status: status["speed_override"] == pytest.approx(0.01), "as slow as can be")
         expect(page.locator("output")).to_have_text("1 %")
-        other.get_by_role("slider", name="Override", exact=True).press("End")
-        expect(other.get_by_role("button", name="Ask to take over")).to_be_visible()
+        second.get_by_role("slider", name="Override", exact=True).press("End")
+        expect(second.get_by_role("button", name="Ask to take over")).to_be_visible()
     assert holding.status()["speed_override"] == pytest.approx(0.01)
     slider.press("End")
-    holding.until(lambda found: found["speed_override"] == 1.0, "at full speed")
+    holding.until(lambda status: status["speed_override"] == 1.0, "at full speed")
     page.keyboard.press("Escape")
-    holding.until(lambda found: found["state"] == "holding", "standstill")
+    holding.until(lambda status: status["state"] == "holding", "standstill")
 
 
 def test_values_are_shown_and_typed_in_the_units_that_the_browser_keeps(page: Page, holding: Platform) -> None:
@@ -164,13 +164,13 @@ def test_a_click_or_a_key_moves_one_step_and_holding_does_not_go_on(page: Page, 
     assert tool_of(holding)[2] == pytest.approx(before, abs=1e-6)
     page.mouse.up()
     until(lambda: tool_of(holding)[2] == pytest.approx(before + 0.01, abs=1e-5), "one step")
-    holding.until(lambda found: found["state"] == "holding", "rest")
+    holding.until(lambda status: status["state"] == "holding", "rest")
     page.get_by_label("Movement").select_option("fine")
     expect(page.locator("[data-jog-step=fine]")).to_be_visible()
     page.locator(".jog-area").focus()
     page.keyboard.press("PageDown")
     until(lambda: tool_of(holding)[2] == pytest.approx(before + 0.009, abs=1e-5), "one step back")
-    holding.until(lambda found: found["state"] == "holding", "rest")
+    holding.until(lambda status: status["state"] == "holding", "rest")
     page.get_by_label("Frame").select_option("joints")
     page.get_by_role("button", name="joint1 +").click()
     until(
@@ -182,9 +182,13 @@ def test_terminals_have_their_names_and_outputs_are_set_by_hand(page: Page, hold
     show(page, "/io")
     expect(page.get_by_role("listitem").filter(has_text="emergency stop")).to_contain_text(re.compile(r"io\.10.*high"))
     output = page.get_by_role("switch", name="io.12")
+
+    def is_on() -> bool:
+        return bool(holding.status()["devices"]["io"]["outputs"]["value"] >> 11 & 1)
+
     for value in (True, False):
         output.click()
-        until(lambda value=value: bool(holding.status()["devices"]["io"]["outputs"]["value"] >> 11 & 1) is value, "set")
+        until(is_on if value else lambda: not is_on(), "set")
         expect(output).to_have_attribute("aria-checked", str(value).lower())
     holding.rtcp("segment", "fault", "input", "number=1", "how=low")
     expect(page.get_by_role("listitem").filter(has_text="forward")).to_contain_text("low")
@@ -199,10 +203,10 @@ def test_an_alarm_says_what_to_do_until_somebody_acknowledges_it(
         page.get_by_role("button", name=re.compile("^Acknowledge")).first.click()
     expect(page.locator("#alarmed")).to_be_hidden()
     holding.rtcp("segment", "fault", "drive", "slave=3", "error=encoder")
-    with visitor(browser, panel) as other:
-        show(other, "/jog")
-        other.get_by_role("link", name="1 alarm").click()
-        alarm = other.locator("tr.waits")
+    with visitor(browser, panel) as second:
+        show(second, "/jog")
+        second.get_by_role("link", name="1 alarm").click()
+        alarm = second.locator("tr.waits")
         expect(alarm).to_contain_text(
             re.compile("joint2: the drive is in fault.*Remove the cause, then Reset and Enable")
         )
@@ -211,7 +215,7 @@ def test_an_alarm_says_what_to_do_until_somebody_acknowledges_it(
     expect(page.get_by_role("row", name=re.compile("by local"))).not_to_have_count(0)
     expect(page.locator("#alarmed")).to_be_hidden()
     page.get_by_role("button", name="Reset").click()
-    holding.until(lambda found: found["state"] == "ready", "reset")
+    holding.until(lambda status: status["state"] == "ready", "reset")
 
 
 def test_alarms_that_nobody_has_acknowledged_are_kept_longest() -> None:
@@ -229,7 +233,7 @@ def test_alarms_that_nobody_has_acknowledged_are_kept_longest() -> None:
 
 
 @pytest.mark.parametrize(
-    ("message", "shown"),
+    ("message", "text"),
     [
         ("paused: `rtcp resume` continues the motion", "Paused."),
         (
@@ -243,8 +247,8 @@ def test_alarms_that_nobody_has_acknowledged_are_kept_longest() -> None:
         ("", ""),
     ],
 )
-def test_the_header_says_in_sentences_what_needs_no_terminal(message: str, shown: str) -> None:
-    assert sentence(message) == shown
+def test_the_header_says_in_sentences_what_needs_no_terminal(message: str, text: str) -> None:
+    assert sentence(message) == text
 
 
 def test_health_draws_the_last_hour(page: Page, holding: Platform) -> None:
@@ -256,7 +260,7 @@ def test_health_draws_the_last_hour(page: Page, holding: Platform) -> None:
 
 def test_a_trend_keeps_an_hour_and_the_largest_of_each_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     now = itertools.count()
-    monkeypatch.setattr(trends.time, "monotonic", lambda: float(next(now)))
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(now)))
     status = {
         "joint_names": ["joint1"],
         "joints": {"actual_torque": [0.0]},
@@ -266,15 +270,15 @@ def test_a_trend_keeps_an_hour_and_the_largest_of_each_interval(monkeypatch: pyt
         "dc": None,
         "missed": 7,
     }
-    found = Trends()
+    hour = Trends()
     for at in range(2 * int(KEPT_S)):
         status["joints"] = {"actual_torque": [-5.0 if at == KEPT_S + 2 else 1.0]}
-        found.read(status, [10.0], [None])
-    trend = found.all["joint1 torque"]
+        hour.read(status, [10.0], [None])
+    trend = hour.all["joint1 torque"]
     assert len(trend.samples) == KEPT_S / SAMPLE_S
     line = trend.line(2 * KEPT_S)
     assert len(line) <= 181
     assert max(line, key=lambda point: point[1]) == (pytest.approx(1.0, abs=0.01), 50.0)
     assert line[-1] == (pytest.approx(0.0, abs=0.01), 10.0)
-    assert "joint1 temperature" not in found.all
-    assert {value for _, value in found.all["skipped cycles"].samples} == {0.0}
+    assert "joint1 temperature" not in hour.all
+    assert {value for _, value in hour.all["skipped cycles"].samples} == {0.0}

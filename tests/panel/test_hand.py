@@ -1,4 +1,4 @@
-"""The operator's hand: what moves the arm, and that whatever becomes of the person, the browser or the network ends it.
+"""Jogging by hand: every failure of the operator, the browser or the network ends the motion.
 
 The network is a real one: Chromium in a namespace of its own, at the far end of a cable of `tests/panel/cable.py`.
 """
@@ -43,9 +43,9 @@ from tests.panel.conftest import (
 pytestmark = [pytest.mark.alone, pytest.mark.browser]
 NAMESPACE = f"rtcp-net-{os.getpid()}"
 GRIPPER = 1 << 3
-"""Its output, number 4."""
+"""Mask of the gripper's output, number 4."""
 SLACK_S = 0.35
-"""What braking, the screen's frame and a shared host may add: figures without it are those of benchmarks/panel.py."""
+"""Allowance for braking, the screen's frame and a shared host: figures without it are those of benchmarks/panel.py."""
 
 
 def jogging(page: Page, platform: Platform) -> None:
@@ -54,7 +54,7 @@ def jogging(page: Page, platform: Platform) -> None:
     page.get_by_label("Frame").select_option("joints")
     page.get_by_role("button", name="joint1 +").hover()
     page.mouse.down()
-    platform.until(lambda found: found["state"] == "moving", "the jog")
+    platform.until(lambda status: status["state"] == "moving", "the jog")
     time.sleep(0.5)
 
 
@@ -71,9 +71,9 @@ def moved_after(platform: Platform, feed: Feed, instant_ns: int) -> float:
 
 @pytest.fixture
 def feed(holding: Platform) -> Iterator[Feed]:
-    made = Feed(holding.directory)
-    yield made
-    made.close()
+    records = Feed(holding.directory)
+    yield records
+    records.close()
 
 
 def test_a_jog_lasts_as_long_as_it_is_held(page: Page, holding: Platform, feed: Feed) -> None:
@@ -92,7 +92,7 @@ def test_keys_jog_the_tool_while_they_are_held(page: Page, holding: Platform, fe
     before = [float(page.locator(f"[data-live='tool.{at}']").inner_text()) for at in range(3)]
     page.locator(".jog-area").focus()
     page.keyboard.down("PageUp")
-    holding.until(lambda found: found["state"] == "moving", "the jog")
+    holding.until(lambda status: status["state"] == "moving", "the jog")
     time.sleep(1.0)
     page.keyboard.up("PageUp")
     assert moved_after(holding, feed, time.monotonic_ns()) < JOG_S + SLACK_S
@@ -112,17 +112,17 @@ def test_what_holds_a_jog_back_is_shown_while_the_pad_is_held(page: Page, holdin
         "Moving, limited: the elbow is 0.000 rad from its singularity, limit 0.08 rad: jog away from it"
     )
     page.mouse.up()
-    holding.until(lambda found: found["state"] == "holding", "standstill")
+    holding.until(lambda status: status["state"] == "holding", "standstill")
 
 
 def test_the_gripper_is_opened_and_closed_by_its_buttons_and_keys(page: Page, holding: Platform) -> None:
     show(page, "/jog")
     page.get_by_role("button", name="Close gripper").click()
-    holding.until(lambda found: found["devices"]["io"]["outputs"]["value"] & GRIPPER, "closed")
+    holding.until(lambda status: status["devices"]["io"]["outputs"]["value"] & GRIPPER, "closed")
     expect(page.get_by_text("The gripper has closed")).to_be_visible()
     page.locator(".jog-area").focus()
     page.keyboard.press("o")
-    holding.until(lambda found: not found["devices"]["io"]["outputs"]["value"] & GRIPPER, "open")
+    holding.until(lambda status: not status["devices"]["io"]["outputs"]["value"] & GRIPPER, "open")
 
 
 def test_a_key_ends_its_jog_also_where_its_letter_has_changed(page: Page, holding: Platform, feed: Feed) -> None:
@@ -130,7 +130,7 @@ def test_a_key_ends_its_jog_also_where_its_letter_has_changed(page: Page, holdin
     show(page, "/jog")
     page.locator(".jog-area").focus()
     page.keyboard.down("w")
-    holding.until(lambda found: found["state"] == "moving", "the jog")
+    holding.until(lambda status: status["state"] == "moving", "the jog")
     page.keyboard.down("Shift")
     page.keyboard.up("W")
     assert moved_after(holding, feed, time.monotonic_ns()) < JOG_S + SLACK_S
@@ -165,21 +165,21 @@ def test_a_gamepad_jogs_while_its_shoulder_button_is_held(
         time.sleep(0.4)
         assert holding.status()["state"] == "holding"
         page.evaluate("pad.buttons[4].pressed = true")
-        holding.until(lambda found: found["state"] == "moving", "the jog")
+        holding.until(lambda status: status["state"] == "moving", "the jog")
         now = time.monotonic_ns()
         page.evaluate("pad.buttons[4].pressed = false")
         assert moved_after(holding, feed, now) < JOG_S + SLACK_S
         page.evaluate("pad.buttons[4].pressed = true")
-        holding.until(lambda found: found["state"] == "moving", "the jog")
+        holding.until(lambda status: status["state"] == "moving", "the jog")
         # The gripper ends the jog, which does not begin again by itself.
         now = time.monotonic_ns()
         page.evaluate("pad.buttons[0].pressed = true")
-        holding.until(lambda found: found["devices"]["io"]["outputs"]["value"] & GRIPPER, "closed")
+        holding.until(lambda status: status["devices"]["io"]["outputs"]["value"] & GRIPPER, "closed")
         assert moved_after(holding, feed, now) < JOG_S + SLACK_S
         page.evaluate("pad.buttons[0].pressed = pad.buttons[4].pressed = false")
         page.wait_for_timeout(200)
         page.evaluate("pad.buttons[4].pressed = true")
-        holding.until(lambda found: found["state"] == "moving", "the jog")
+        holding.until(lambda status: status["state"] == "moving", "the jog")
         now = time.monotonic_ns()
         page.keyboard.press("Escape")
         assert moved_after(holding, feed, now) < JOG_S + SLACK_S
@@ -225,7 +225,7 @@ def test_a_jog_ends_with_the_attention_of_its_page(
 def test_the_arm_stops_when_browser_or_panel_does(
     chromium: BrowserType, platform: Platform, motion: str, loss: str
 ) -> None:
-    """A machine whose lid is closed stands still, its connections open: as a browser after SIGSTOP."""
+    """A machine whose lid is closed hangs with open connections, as a browser after SIGSTOP does."""
     with begun(platform) as (panel, url):
         ready(platform)
         before = set(psutil.Process().children(recursive=True))
@@ -244,7 +244,7 @@ def test_the_arm_stops_when_browser_or_panel_does(
                     for process in browser:
                         with contextlib.suppress(psutil.Error):
                             process.resume()
-                time.sleep(1.0)  # what was pressed before moves nothing
+                time.sleep(1.0)  # keys pressed before move nothing
                 assert np.ptp(feed.records()[0]["commanded_position"][:, 0]) < 1e-9
         with contextlib.suppress(Error):
             own.close()
@@ -269,10 +269,10 @@ def begin(page: Page, platform: Platform, motion: str) -> None:
 def test_the_stop_button_ends_a_move_of_anybody(browser: Browser, panel: str, holding: Platform, feed: Feed) -> None:
     with visitor(browser, panel) as page:
         begin(page, holding, "move")
-        with visitor(browser, panel) as other:
-            show(other, "/health")
+        with visitor(browser, panel) as second:
+            show(second, "/health")
             now = time.monotonic_ns()
-            other.get_by_role("button", name="STOP not the emergency stop").click()
+            second.get_by_role("button", name="STOP not the emergency stop").click()
             assert moved_after(holding, feed, now) < JOG_S + SLACK_S
         assert abs(holding.status()["joints"]["actual_position"][0]) < 1.4
 
@@ -318,7 +318,7 @@ def test_a_pad_of_the_tool_frame_is_held_by(
         else:
             pad.focus()
             page.keyboard.down("Space")
-        holding.until(lambda found: found["state"] == "moving", "the jog")
+        holding.until(lambda status: status["state"] == "moving", "the jog")
         time.sleep(1.0)
         now = time.monotonic_ns()
         if how == "finger":
@@ -333,9 +333,9 @@ def test_a_pad_of_the_tool_frame_is_held_by(
 
 
 def test_a_viewer_looks_and_stops_and_commands_nothing(browser: Browser, holding: Platform, feed: Feed) -> None:
-    kept = Path(holding.environment["RTCP_STATE_DIR"], "panel.json")
-    access.set_password(kept, "operator", PASSWORD)
-    access.set_password(kept, "viewer", VIEWERS_PASSWORD)
+    passwords = Path(holding.environment["RTCP_STATE_DIR"], "panel.json")
+    access.set_password(passwords, "operator", PASSWORD)
+    access.set_password(passwords, "viewer", VIEWERS_PASSWORD)
     holding.call("move_gripper", open=True)
     since, limits = holding.last_event(), holding.call("limits")
     try:
@@ -370,12 +370,12 @@ def test_a_viewer_looks_and_stops_and_commands_nothing(browser: Browser, holding
             page.mouse.down()
             page.wait_for_timeout(700)
             page.mouse.up()
-            found = holding.status()
-            assert (found["state"], found["drive_mode"], found["lease"]["holder"]) == ("holding", "csp", "")
+            status = holding.status()
+            assert (status["state"], status["drive_mode"], status["lease"]["holder"]) == ("holding", "csp", "")
             assert holding.events(since) == []
             assert holding.call("limits") == limits
             assert holding.call("record_status")["recordings"] == []
-            assert not found["devices"]["io"]["outputs"]["value"] & GRIPPER
+            assert not status["devices"]["io"]["outputs"]["value"] & GRIPPER
             records, _ = feed.records()
             assert np.ptp(records["commanded_position"], axis=0).max() < 1e-9
             holding.background("move", "1.5", *map(str, BENT[1:]), "--speed", "0.1")
@@ -383,7 +383,7 @@ def test_a_viewer_looks_and_stops_and_commands_nothing(browser: Browser, holding
             page.get_by_role("button", name="STOP not the emergency stop").click()
             holding.until(lambda now: now["state"] == "holding", "standstill")
     finally:
-        kept.unlink()
+        passwords.unlink()
         holding.end_commands()
 
 
@@ -391,10 +391,10 @@ def test_nothing_moves_after_stop_that_was_clicked_before(browser: Browser, pane
     with visitor(browser, panel) as page:
         begin(page, holding, "move")
         since = holding.last_event()
-        # A click whose way to the panel takes longer than that of STOP: it has the token of before.
+        # A click that takes longer to the panel than STOP: it has an earlier token.
         page.evaluate("Object.defineProperty(rtcp, 'token', { value: rtcp.token })")
         page.keyboard.press("Escape")
-        holding.until(lambda found: found["state"] == "holding", "standstill")
+        holding.until(lambda status: status["state"] == "holding", "standstill")
         page.get_by_role("button", name="Plan").click()
         page.get_by_role("button", name="Send", exact=True).click()
         expect(page.get_by_text("STOP was pressed after this click")).to_be_visible()
@@ -426,18 +426,18 @@ def test_the_arm_is_handed_over_only_when_asked(browser: Browser, panel: str, ho
         first.get_by_role("button", name="Give it").click()
         expect(second.locator("#operator")).to_have_text("You operate the arm")
         expect(first.get_by_text("has taken over the arm")).to_be_visible()
-        holding.until(lambda found: found["state"] == "holding", "what moved has stopped")
-        # Without an answer it changes hands after 10 s.
+        holding.until(lambda status: status["state"] == "holding", "what moved has stopped")
+        # Without an answer the lease passes on after 10 s.
         show(first, "/")
         first.get_by_role("button", name="Disable").click()
         expect(first.get_by_role("button", name="Ask to take over")).to_be_visible()
         assert barriers(first) == {}
-        asked = time.monotonic()
+        began = time.monotonic()
         first.get_by_role("button", name="Ask to take over").click()
         expect(second.get_by_role("button", name="Keep it")).to_be_visible()
         assert barriers(second) == {}
         expect(first.locator("#operator")).to_have_text("You operate the arm", timeout=20_000)
-        assert time.monotonic() - asked > 9.0
+        assert time.monotonic() - began > 9.0
 
 
 # -- over a network -------------------------------------------------------------------------------------------------
@@ -448,11 +448,11 @@ def cable(platform: Platform) -> Iterator[Cable]:
     """From the panel to a namespace for the browser."""
     if os.geteuid() or not (shutil.which("ip") and CHROMIUM):
         pytest.skip("needs root, iproute2 and Chromium")
-    made = Cable(NAMESPACE)
+    far = Cable(NAMESPACE)
     try:
-        yield made
+        yield far
     finally:
-        made.close()
+        far.close()
         Path(platform.environment["RTCP_STATE_DIR"], "panel.json").unlink(missing_ok=True)
 
 
@@ -496,7 +496,7 @@ def test_stop_ends_a_move_over_a_bad_network(
     with contextlib.closing(Feed(platform.directory)) as feed:
         now = time.monotonic_ns()
         far_page.get_by_role("button", name="STOP not the emergency stop").click()
-        # Where STOP itself is lost, all that the page sends after it waits for it: the arm stops unheard.
+        # If STOP itself is lost, all later messages wait for it: the presence expires.
         assert moved_after(platform, feed, now) < PRESENCE_S + SLACK_S
 
 
@@ -518,7 +518,7 @@ def test_a_lossy_network_never_jogs_on(platform: Platform, cable: Cable, far_pag
     pad = far_page.get_by_role("button", name="joint1 +")
     cable.loss = 0.2
     presses = 0
-    # Some presses come too late to move: at least one has to, or nothing was tried.
+    # Some presses come too late to move the arm; at least one must move it.
     while presses < 5 or (presses < 30 and platform.status()["joints"]["actual_position"][0] < 1e-3):
         presses += 1
         with contextlib.closing(Feed(platform.directory)) as feed:

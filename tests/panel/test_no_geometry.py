@@ -1,4 +1,4 @@
-"""Arms without `kinematics`, of 4 and of 7 joints: the panel says so, and offers what such an arm can do."""
+"""Arms without `kinematics`, of 4 and of 7 joints: the panel says so, and offers what such an arm supports."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ pytestmark = [pytest.mark.alone, pytest.mark.browser]
 @pytest.fixture(scope="module", params=[4, 7])
 def platform(request: pytest.FixtureRequest) -> Iterator[Platform]:
     """An enabled platform with the given number of joints."""
-    made = Platform()
+    started = Platform()
     try:
-        made.be_patient(lost_ms=2000)
-        without_geometry(made, request.param)
-        made.rtcp("start", "--detach")
-        made.call("enable")
-        yield made
+        started.be_patient(lost_ms=2000)
+        without_geometry(started, request.param)
+        started.rtcp("start", "--detach")
+        started.call("enable")
+        yield started
     finally:
-        made.rtcp("stop", check=None)
-        shutil.rmtree(made.directory, ignore_errors=True)
+        started.rtcp("stop", check=None)
+        shutil.rmtree(started.directory, ignore_errors=True)
 
 
 def without_geometry(platform: Platform, joints: int) -> None:
@@ -49,8 +49,8 @@ def without_geometry(platform: Platform, joints: int) -> None:
 
 @pytest.fixture
 def page(browser: Browser, platform: Platform) -> Iterator[Page]:
-    with begun(platform) as (_, url), visitor(browser, url) as found:
-        yield found
+    with begun(platform) as (_, url), visitor(browser, url) as opened:
+        yield opened
 
 
 def test_pages_say_that_there_is_no_geometry_and_offer_joints_alone(page: Page, platform: Platform) -> None:
@@ -67,7 +67,7 @@ def test_pages_say_that_there_is_no_geometry_and_offer_joints_alone(page: Page, 
     page.mouse.down()
     until(lambda: abs(platform.status()["joints"]["actual_position"][-1]) > 0.01, "the jog")
     page.mouse.up()
-    platform.until(lambda found: found["state"] == "holding", "rest")
+    platform.until(lambda status: status["state"] == "holding", "rest")
 
 
 def test_targets_of_the_joints_are_planned_and_sent(page: Page, platform: Platform) -> None:

@@ -1,4 +1,4 @@
-"""A program taught, run, stepped and paused by clicks; what came of it is judged by the file and the API."""
+"""A program taught, run, stepped and paused by clicks; the file and the API show the result."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ pytestmark = [pytest.mark.alone, pytest.mark.browser]
 
 
 def file_of(platform: Platform, name: str) -> Path:
-    (found,) = platform.directory.rglob(f"programs/{name}.yaml")
-    return found
+    (path,) = platform.directory.rglob(f"programs/{name}.yaml")
+    return path
 
 
 def click(page: Page, name: str) -> None:
@@ -33,8 +33,8 @@ def opened(page: Page, platform: Platform, name: str) -> None:
     expect(page.get_by_text(re.compile("^New; saved as"))).to_be_visible()
 
 
-def said(page: Page, text: str) -> None:
-    """Wait until the page says so; a motion may lie before it."""
+def expect_notice(page: Page, text: str) -> None:
+    """Wait until the page has the text, possibly after a motion."""
     expect(page.get_by_text(text, exact=True)).to_be_visible(timeout=40_000)
 
 
@@ -44,9 +44,9 @@ def kind(page: Page, name: str, its_field: str) -> None:
     expect(page.get_by_label(its_field)).to_be_visible(timeout=20_000)
 
 
-def keep(page: Page, name: str, what: str = "q") -> None:
+def keep(page: Page, name: str, kind: str = "q") -> None:
     page.get_by_label("Name of the pose").fill(name)
-    page.get_by_label("Kept as").select_option(what)
+    page.get_by_label("Kept as").select_option(kind)
     click(page, "Keep where the arm is")
     expect(page.get_by_role("row", name=re.compile(f"^{name} "))).to_be_visible()
 
@@ -72,7 +72,7 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     page.get_by_label("Where").select_option("before step 2")
     click(page, "Add the step")
     expect(page.get_by_role("row", name=re.compile("^2 move to there at 0.2 rad"))).to_be_visible()
-    # The wait between both, and back, and once too much taken back.
+    # The wait moves between both and back; then one undo too many.
     click(page, "Move step 3 up")
     expect(page.get_by_role("row", name=re.compile("^2 wait 0.2 s"))).to_be_visible()
     click(page, "Delete step 2")
@@ -92,7 +92,7 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     expect(page.get_by_text(re.compile(r"^It can be run: 2 motions"))).to_be_visible(timeout=40_000)
     for number in (1, 2):
         click(page, "Step")
-        said(page, f"Step {number} is done")
+        expect_notice(page, f"Step {number} is done")
     assert holding.status()["joints"]["actual_position"] == pytest.approx(BENT, abs=2e-3)
     click(page, "Step")
     holding.until_moving()
@@ -107,12 +107,12 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     page.get_by_role("link", name="Program", exact=True).click()
     expect(page.get_by_label("Movement")).to_have_count(0, timeout=20_000)
     click(page, "Go on")
-    said(page, "Step 3 is done")
+    expect_notice(page, "Step 3 is done")
     assert holding.status()["joints"]["actual_position"] == pytest.approx(there, abs=2e-3)
     click(page, "Run from step 1")
-    said(page, "Done")
+    expect_notice(page, "Done")
     click(page, "Run from step 3")
-    said(page, "Done")
+    expect_notice(page, "Done")
     holding.call("move_joints", q=BENT)
     holding.rtcp("run", str(file_of(holding, "clicks")))
     assert holding.status()["joints"]["actual_position"] == pytest.approx(there, abs=2e-3)
@@ -130,14 +130,14 @@ def test_a_step_back_returns_and_a_stop_ends_the_program(page: Page, holding: Pl
     click(page, "Add the step")
     expect(page.get_by_role("row", name=re.compile("line to there"))).to_be_visible(timeout=20_000)
     click(page, "Step")
-    said(page, "Step 1 is done")
+    expect_notice(page, "Step 1 is done")
     click(page, "Step")
-    said(page, "Step 2 is done")
+    expect_notice(page, "Step 2 is done")
     click(page, "Step back")
-    said(page, "Step 2 is next")
+    expect_notice(page, "Step 2 is next")
     assert holding.status()["joints"]["actual_position"] == pytest.approx(BENT, abs=2e-3)
     click(page, "Step")
     holding.until_moving()
     page.get_by_role("button", name="STOP").click()
-    said(page, "It has ended early")
+    expect_notice(page, "It has ended early")
     until(lambda: holding.status()["state"] == "holding", "held")

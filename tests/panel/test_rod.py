@@ -1,4 +1,4 @@
-"""The rod that two arms are to bend, as a panel of one of them sees it."""
+"""The rod that two arms bend, in the panel of one of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the scope shows of the records: its triggers, its ends, and that no peak is lost where it decimates."""
+"""The scope on records: its triggers, its ends, and that no peak is lost by decimation."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ PERIOD_NS = 500_000
 
 def cycles(count: int, begin: int = 0) -> Any:
     schema = RecordSchema((*arm_schema(6).fields, Field("io_inputs", "uint32", part="io")))
-    found = np.zeros(count, dtype=cycle_type(schema))
-    found["time_ns"] = (np.arange(count) + begin) * PERIOD_NS
-    return found
+    records = np.zeros(count, dtype=cycle_type(schema))
+    records["time_ns"] = (np.arange(count) + begin) * PERIOD_NS
+    return records
 
 
 def scope(span_s: float, trigger: str = "", level: float = 0.0) -> Scope:
@@ -36,10 +36,10 @@ def test_a_peak_of_one_cycle_is_shown_at_every_time_base(span_s: float) -> None:
     records = cycles(2 * count)
     records["actual_position"][count + count // 3, 0] = 1.0
     records["actual_position"][count + count // 2, 0] = -1.0
-    shown = scope(span_s)
+    picture = scope(span_s)
     for part in np.array_split(records, 50):
-        shown.read(part)
-    block = shown.block()
+        picture.read(part)
+    block = picture.block()
     assert block is not None
     assert len(block["t"]) <= 2 * COLUMNS
     assert (min(block["y"][0]), max(block["y"][0])) == (-1.0, 1.0)
@@ -52,24 +52,24 @@ def test_a_peak_of_one_cycle_is_shown_at_every_time_base(span_s: float) -> None:
     ("trigger", "field", "value"), [("state", "state", 3), ("inputs", "io_inputs", 4), ("fault", "fault", 1)]
 )
 def test_an_event_holds_the_picture(trigger: str, field: str, value: int) -> None:
-    shown = scope(1.0, trigger)
-    shown.read(cycles(3000))
-    assert shown.block() is None
+    picture = scope(1.0, trigger)
+    picture.read(cycles(3000))
+    assert picture.block() is None
     records = cycles(3000, 3000)
     records[field][1000:] = value
     records["actual_position"][1000:, 0] = 1.0
-    shown.read(records)
-    block = shown.block()
+    picture.read(records)
+    block = picture.block()
     assert block is not None
     assert block["t"][0] == pytest.approx(-0.2, abs=2e-3)
     assert all(y == float(t >= 0.0) for t, y in zip(block["t"], block["y"][0], strict=True) if abs(t) > 4e-3)
-    assert shown.block() is None
+    assert picture.block() is None
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("arguments", "message"),
     [((0.019, "", 0.0), "0.02 to 60 s"), ((61.0, "", 0.0), "0.02 to 60 s"), ((1.0, "speed", 0.0), 'found "speed"')],
 )
-def test_what_cannot_be_shown_is_refused(given: tuple[float, str, float], said: str) -> None:
-    with pytest.raises(Invalid, match=said):
-        scope(*given)
+def test_what_cannot_be_shown_is_refused(arguments: tuple[float, str, float], message: str) -> None:
+    with pytest.raises(Invalid, match=message):
+        scope(*arguments)

@@ -1,4 +1,4 @@
-"""Hosts as folders of files: what the kernel of a Jetson, of a PC and of a laptop shows of itself."""
+"""Hosts as folders of files, as the kernels of a Jetson, a PC and a laptop have them."""
 
 from __future__ import annotations
 
@@ -139,33 +139,33 @@ HOSTS = {"good": GOOD_PC, "jetson": JETSON, "laptop": LAPTOP}
 
 @dataclass
 class Card:
-    """What the card's driver and the kernel answer to ioctl."""
+    """Answers of the card's driver and the kernel to ioctl."""
 
-    held: Coalescing | None = field(default_factory=lambda: Coalescing(0, 0, False))
+    coalescing: Coalescing | None = field(default_factory=lambda: Coalescing(0, 0, False))
     ipv4: str | None = None
 
 
 @dataclass(frozen=True)
 class FakeHost(Host):
-    """Files in a folder and a card that answers as the test says."""
+    """Files in a folder and a card with the test's answers."""
 
     card: Card = field(default_factory=Card)
 
     def coalescing(self, interface: str) -> Coalescing | None:
-        return self.card.held
+        return self.card.coalescing
 
     def ipv4_address(self, interface: str) -> str | None:
         return self.card.ipv4
 
 
 class Patient:
-    """A host in a folder, and what the doctor says of it."""
+    """A host in a folder, and the doctor's findings on it."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.card = Card()
         self.during: Callable[[], None] = lambda: None
-        """What happens while the doctor counts frames."""
+        """Called while the doctor counts frames."""
         self.case = Case(
             FakeHost(root, lambda seconds: self.during(), self.card),
             cpu=3,
@@ -176,7 +176,7 @@ class Patient:
         )
 
     def put(self, files: dict[str, str | None]) -> None:
-        """Write files; None takes one away."""
+        """Write files; None removes one."""
         for name, text in files.items():
             path = self.root / name
             if path.is_symlink() or path.exists():

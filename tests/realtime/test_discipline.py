@@ -113,7 +113,7 @@ def test_frames_that_a_loaded_host_delays_do_not_keep_the_cycle_from_locking() -
     discipline = Discipline(PERIOD, PHASE)
     planned = 10**12
     for _ in range(2000):
-        # A quarter of the frames are kept up to 3 ms on their way, as where sender or receiver is off the CPU.
+        # A quarter of the frames are delayed by up to 3 ms, as by a sender or receiver that is off the CPU.
         late = reference.random.randrange(3_000_000) if reference.random.random() < 0.25 else 0
         discipline.observe(planned, reference.seen_by_frame(planned + late))
         planned = discipline.next_wakeup(planned)
@@ -135,28 +135,28 @@ def test_a_reference_clock_that_jumps_for_good_is_not_taken_for_late_frames() ->
 
 
 class Line:
-    """A master that follows a clock frame by frame; each may be late, or bring the time of the one before it again."""
+    """A master that tracks a clock frame by frame; a frame may be late or repeat the time before it."""
 
     def __init__(self) -> None:
         self.discipline = Discipline(PERIOD, PHASE)
         self.reference = Reference(8.0, seed=11)
         self.planned = 10**12
-        self.shown = 0
+        self.reference_ns = 0
 
     def frames(self, delays_ns: Iterable[int]) -> list[bool]:
-        """Let frames come, each so late; return after which of them the clock was followed."""
+        """Send frames, each with its delay; return after which of them the clock was tracked."""
         locked = []
         for delay_ns in delays_ns:
-            self.shown = self.reference.seen_by_frame(self.planned + delay_ns)
+            self.reference_ns = self.reference.seen_by_frame(self.planned + delay_ns)
             locked.append(self._observe())
         return locked
 
     def standing(self, frames: int) -> list[bool]:
-        """Let frames come that bring the last reference time again."""
+        """Send frames that bring the last reference time again."""
         return [self._observe() for _ in range(frames)]
 
     def silent(self, cycles: int) -> list[bool]:
-        """Let no frame come back."""
+        """Return no frame."""
         locked = []
         for _ in range(cycles):
             self.discipline.holdover()
@@ -165,25 +165,25 @@ class Line:
         return locked
 
     def _observe(self) -> bool:
-        self.discipline.observe(self.planned, self.shown)
+        self.discipline.observe(self.planned, self.reference_ns)
         self.planned = self.discipline.next_wakeup(self.planned)
         return self.discipline.locked
 
 
 @pytest.fixture
 def line() -> Line:
-    made = Line()
-    assert made.frames([0] * 2000)[-1]
-    return made
+    steady = Line()
+    assert steady.frames([0] * 2000)[-1]
+    return steady
 
 
 def test_a_reference_time_that_stands_is_not_followed_and_is_again_when_it_moves(line: Line) -> None:
     assert line.standing(UNHEARD_CYCLES) == [True] * (UNHEARD_CYCLES - 1) + [False]
     assert not any(line.standing(5000))
-    again = line.frames([0] * 1000)
-    # By the usual way: so many good frames from the first one on, as after the start.
-    assert again.index(True) >= LOCK_CYCLES - 1
-    assert all(again[again.index(True) :])
+    tracked = line.frames([0] * 1000)
+    # As after the start: that many good frames from the first one on.
+    assert tracked.index(True) >= LOCK_CYCLES - 1
+    assert all(tracked[tracked.index(True) :])
     assert abs(line.discipline.filtered_ns) < 5_000
 
 
@@ -213,7 +213,7 @@ def test_a_reference_that_stands_from_the_start_is_neither_measured_nor_followed
 def test_a_clock_that_jumps_is_noticed_although_one_frame_in_a_few_is_in_time(line: Line, in_time: int) -> None:
     locked = line.frames(0 if n % in_time == 0 else 120_000 for n in range(6000))
     assert not all(locked)
-    # Most frames are the clock's: its new phase is followed.
+    # Most frames have the new phase of the clock, which is tracked.
     assert locked[-1]
     assert abs(line.discipline.filtered_ns) < 5_000
     early = (line.reference.at(line.planned + 130_000) - PHASE + PERIOD // 2) % PERIOD - PERIOD // 2
@@ -224,7 +224,8 @@ def test_a_clock_that_jumps_is_noticed_although_one_frame_in_a_few_is_in_time(li
 def test_bursts_of_late_frames_are_a_host_that_takes_the_cpu_away_while_fewer_than_half_are_late(
     line: Line, burst: int
 ) -> None:
-    draw, delays = line.reference.random, []
+    draw = line.reference.random
+    delays: list[int] = []
     while len(delays) < 20_000:
         delays += [60_000 + draw.randrange(3_000_000) for _ in range(burst)] + [0] * round(1.2 * burst + 0.5)
     assert 0.3 < sum(delay > 0 for delay in delays) / len(delays) < 0.5

@@ -1,8 +1,9 @@
-"""Three hosts as folders of files, and what each check of the doctor finds on them."""
+"""Three hosts as folders of files, and the findings of each check of the doctor."""
 
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import os
 import re
 import shutil
@@ -19,7 +20,6 @@ from hypothesis import strategies as st
 from kinematics.compiled import Build
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.schema import arm_schema
-from rtcp.realtime import host
 from rtcp.realtime.doctor import CHECKS, Case, Severity, examine
 from rtcp.realtime.host import Coalescing, Host, NotKnown, format_cpus, parse_cpus
 from tests.realtime.conftest import LIMITS, STATUS
@@ -42,7 +42,7 @@ VIRTUAL: dict[str, object] = {"interface": None}
 
 Files = dict[str, str | None]
 
-# check, host, files put there before (None: removed), severity, part of what was found, part of the remedy
+# check, host, files written before (None: removed), severity, part of the finding, part of the remedy
 ROWS: list[tuple[str, str, Files, Severity, str, str]] = [
     ("preempt-rt", "good", {"proc/version": None}, NOTE, "not known: /proc/version: No such file or directory", ""),
     ("preempt-rt", "good", {"sys/kernel/realtime": None, "proc/version": "Linux version 5 (gcc) #1 SMP PREEMPT RT Tue"},
@@ -160,15 +160,15 @@ ROWS: list[tuple[str, str, Files, Severity, str, str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("key", "kind", "files", "severity", "found", "remedy"), ROWS)
+@pytest.mark.parametrize(("key", "kind", "files", "severity", "text", "remedy"), ROWS)
 def test_a_check_finds_what_the_files_say(
-    patient: Callable[[str], Any], key: str, kind: str, files: Files, severity: Severity, found: str, remedy: str
+    patient: Callable[[str], Any], key: str, kind: str, files: Files, severity: Severity, text: str, remedy: str
 ) -> None:
     examined = patient(kind)
     examined.put(files)
     finding = examined.finding(key)
     assert finding.severity is severity
-    assert found in finding.found
+    assert text in finding.found
     assert remedy in "\n".join(finding.remedy)
 
 
@@ -270,7 +270,7 @@ def test_the_interrupt_of_a_longer_name_is_not_the_cards(good: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("held", "severity", "found"),
+    ("settings", "severity", "text"),
     [
         (None, OK, "has no coalescing to set"),
         (Coalescing(0, 0, False), OK, "every frame at once"),
@@ -283,16 +283,16 @@ def test_the_interrupt_of_a_longer_name_is_not_the_cards(good: Any) -> None:
     ],
 )
 def test_a_card_that_holds_frames_back_longer_than_the_loop_waits_is_bad(
-    good: Any, held: Coalescing | None, severity: Severity, found: str
+    good: Any, settings: Coalescing | None, severity: Severity, text: str
 ) -> None:
-    good.card.held = held
+    good.card.coalescing = settings
     finding = good.finding("coalescing")
     assert finding.severity is severity
-    assert found in finding.found
+    assert text in finding.found
 
 
 def test_coalescing_is_switched_off_on_this_interface_now_and_after_a_restart(good: Any) -> None:
-    good.card.held = Coalescing(3, 0, True)
+    good.card.coalescing = Coalescing(3, 0, True)
     now, kept = good.finding("coalescing").remedy
     assert now == "ethtool -C eth0 adaptive-rx off adaptive-tx off rx-usecs 0 tx-usecs 0"
     assert "OriginalName=eth0" in kept
@@ -312,7 +312,7 @@ def test_the_kernels_answer_is_read_at_the_places_of_its_structure(monkeypatch: 
         words = [0x0E, *range(101, 110), 1, *[0] * 12]
         ctypes.memmove(struct.unpack_from("P", request, 16)[0], struct.pack("23I", *words), 92)
 
-    monkeypatch.setattr(host.fcntl, "ioctl", answer)
+    monkeypatch.setattr(fcntl, "ioctl", answer)
     assert Host().coalescing("eth0") == Coalescing(receive_us=101, send_us=105, adaptive=True)
 
 
@@ -402,7 +402,7 @@ def test_a_malformed_file_raises_no_exception(
     for path in files_of(broken.root):
         kept = path.read_bytes()
         path.write_bytes(garbage(kept))
-        assert len(broken.findings()) >= asked - 3, path  # without its model a Jetson is asked two things less
+        assert len(broken.findings()) >= asked - 3, path  # a Jetson without its model has two checks less
         path.write_bytes(kept)
 
 

@@ -13,11 +13,11 @@ def test_the_percentiles_of_the_window_are_those_of_its_samples() -> None:
     figure = SlidingPercentiles()
     for part, second in zip(np.split(samples, 20), range(100, 120), strict=True):
         figure.add(second, part)
-    found, exact = figure.read(), percentiles(samples)
-    assert abs(found.p50 - exact.p50) <= 1.0
-    assert abs(found.p99 - exact.p99) <= 1.5
-    assert abs(found.p999 - exact.p999) <= 6.0
-    assert found.max == exact.max
+    window, exact = figure.read(), percentiles(samples)
+    assert abs(window.p50 - exact.p50) <= 1.0
+    assert abs(window.p99 - exact.p99) <= 1.5
+    assert abs(window.p999 - exact.p999) <= 6.0
+    assert window.max == exact.max
 
 
 def test_what_is_older_than_a_minute_is_forgotten() -> None:
@@ -49,22 +49,22 @@ SLOW_TAIL = Percentiles(p50=20.0, p99=60.0, p999=620.0, max=9000.0)
 def test_the_part_with_the_slowest_tail_is_the_cause_and_the_suggested_period_holds_it(
     part: Part, suggested_us: int
 ) -> None:
-    times = {one: SLOW_TAIL if one is part else QUICK for one in Part}
-    found = diagnose(500.0, 997, 3, times[Part.WAKEUP], times[Part.EXCHANGE], times[Part.COMPUTE])
-    assert found is not None
-    assert (found.part, found.part_us, found.suggested_period_us) == (part, 620.0, suggested_us)
-    assert found.share == 0.003
+    times = {part_of_cycle: SLOW_TAIL if part_of_cycle is part else QUICK for part_of_cycle in Part}
+    diagnosis = diagnose(500.0, 997, 3, times[Part.WAKEUP], times[Part.EXCHANGE], times[Part.COMPUTE])
+    assert diagnosis is not None
+    assert (diagnosis.part, diagnosis.part_us, diagnosis.suggested_period_us) == (part, 620.0, suggested_us)
+    assert diagnosis.share == 0.003
     assert (
-        found.message
+        diagnosis.message
         == f"0.3 % of the ticks are skipped (limit 0.1 %): in slow cycles {part.value} takes 620 of 500 us"
     )
-    assert f"set cycle.period_us to {suggested_us} or more" in found.remedy
+    assert f"set cycle.period_us to {suggested_us} or more" in diagnosis.remedy
 
 
 def test_where_more_than_a_hundredth_is_skipped_the_slow_cycles_are_the_last_hundredth() -> None:
-    found = diagnose(500.0, 900, 100, QUICK, Percentiles(20.0, 600.0, 700.0, 800.0), QUICK)
-    assert found is not None
-    assert (found.part, found.part_us) == (Part.EXCHANGE, 600.0)
+    diagnosis = diagnose(500.0, 900, 100, QUICK, Percentiles(20.0, 600.0, 700.0, 800.0), QUICK)
+    assert diagnosis is not None
+    assert (diagnosis.part, diagnosis.part_us) == (Part.EXCHANGE, 600.0)
 
 
 @pytest.mark.parametrize(("cycles", "missed"), [(0, 0), (10_000, 0), (10_000, 9)])
@@ -79,8 +79,8 @@ def test_records_are_diagnosed_by_the_ticks_skipped_among_them() -> None:
     records["missed"][500:] = 74
     records["exchange_ns"] = 60_000
     records["compute_ns"][::100] = 900_000
-    found = diagnose_records(records, 500_000)
-    assert found is not None
-    assert (found.missed, found.cycles, found.part, found.part_us) == (4, 1000, Part.COMPUTE, 900.0)
+    diagnosis = diagnose_records(records, 500_000)
+    assert diagnosis is not None
+    assert (diagnosis.missed, diagnosis.cycles, diagnosis.part, diagnosis.part_us) == (4, 1000, Part.COMPUTE, 900.0)
     assert diagnose_records(records[:500], 500_000) is None
     assert diagnose_records(records[:1], 500_000) is None

@@ -1,4 +1,4 @@
-"""An arm that moves nothing: it keeps what it was asked for, and a motion lasts until the test ends it."""
+"""A fake arm that records its calls; a motion lasts until the test ends it."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ class FakeTrajectory:
 
 
 class FakeArm:
-    """`calls` has the name and the arguments of each call; "cancelled" where a motion's task was."""
+    """`calls` has the name and the arguments of each call, and "cancelled" for a cancelled task."""
 
     def __init__(self, positions: Joints = HOME) -> None:
         self.state: ArmState | None = ArmState(1, positions, (0.0,) * len(positions), positions, READY)
         self.calls: list[tuple[Any, ...]] = []
         self.called = asyncio.Event()
         self.refuses: dict[str, RtcpError] = {}
-        """What a call of this name is refused with."""
+        """Errors by the name of the call that they refuse."""
         self.motion: asyncio.Future[None] | None = None
         self.stopped = asyncio.Event()
-        """Until it is set a stop lasts."""
+        """Set at the end of a stop."""
         self.stopped.set()
 
     def set_status(self, **fields: Any) -> None:

@@ -8,24 +8,14 @@ from collections.abc import Awaitable
 
 import pytest
 
+from rtcp.fieldbus.simple_message import messages
 from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder
-from rtcp.fieldbus.simple_message.messages import (
-    ByteOrder,
-    CommType,
-    GetVersion,
-    JointPosition,
-    JointTrajPt,
-    Message,
-    Ping,
-    ReplyCode,
-    Status,
-)
 from rtcp.ros.simple_message import client as client_module
 from rtcp.ros.simple_message.client import MotionClient, StateClient
 from rtcp.ros.simple_message.server import ServerOptions, SimpleMessageServer
 from tests.ros.fake_arm import HOME, FakeArm
 
-OK = ReplyCode.SUCCESS
+OK = messages.ReplyCode.SUCCESS
 
 
 @pytest.fixture(autouse=True)
@@ -50,22 +40,22 @@ def test_it_is_tried_again_once_a_second(monkeypatch: pytest.MonkeyPatch) -> Non
     assert client_module.RECONNECT_S == 1.0
 
 
-@pytest.mark.parametrize("order", ByteOrder)
-def test_motion_and_state_of_a_controller_in_either_byte_order(order: ByteOrder) -> None:
+@pytest.mark.parametrize("order", messages.ByteOrder)
+def test_motion_and_state_of_a_controller_in_either_byte_order(order: messages.ByteOrder) -> None:
     async def test() -> None:
-        arm, received = FakeArm(), list[Message]()
+        arm, received = FakeArm(), list[messages.Message]()
         async with SimpleMessageServer(arm, ServerOptions(motion_port=0, state_port=0, byte_order=order)) as server:
             motion = MotionClient("127.0.0.1", server.ports[0], order)
             state = StateClient("127.0.0.1", received.append, server.ports[1])
             tasks = [asyncio.create_task(each.run()) for each in (motion, state)]
             await connected(motion)
-            assert (await motion.request(GetVersion())).reply_code is OK
-            motion.send(JointTrajPt(-1, HOME, 0.1, 10.0))
-            motion.send(JointTrajPt(-3, (0.5, *HOME[1:]), 0.1, 0.5))
+            assert (await motion.request(messages.GetVersion())).reply_code is OK
+            motion.send(messages.JointTrajPt(-1, HOME, 0.1, 10.0))
+            motion.send(messages.JointTrajPt(-3, (0.5, *HOME[1:]), 0.1, 0.5))
             await arm.until("run_trajectory")
             assert await motion.stop()
             await arm.until("halt")
-            while {type(each) for each in received} < {JointPosition, Status}:
+            while {type(each) for each in received} < {messages.JointPosition, messages.Status}:
                 arm.set_status(error_code=0)  # a new sample
                 await asyncio.sleep(0.001)
             for task in tasks:
@@ -75,7 +65,7 @@ def test_motion_and_state_of_a_controller_in_either_byte_order(order: ByteOrder)
 
 
 class Controller:
-    """A socket of which a test says what it answers."""
+    """A socket with the test's answers."""
 
     def __init__(self) -> None:
         self.writers: list[asyncio.StreamWriter] = []
@@ -110,7 +100,7 @@ def test_a_lost_connection_is_made_again_and_logged_once_and_its_request_fails(
         for number in range(1, 5):
             await controller.until(connections=number)
             await connected(client)
-            request = asyncio.create_task(client.request(Ping()))
+            request = asyncio.create_task(client.request(messages.Ping()))
             await controller.until(frames=number)
             controller.writers[-1].close()
             with pytest.raises(ConnectionError, match="before the reply"):
@@ -125,9 +115,9 @@ def test_without_a_connection_nothing_is_sent() -> None:
     async def test() -> None:
         client = MotionClient("127.0.0.1", 1)
         with pytest.raises(ConnectionError, match="no connection"):
-            client.send(Ping())
+            client.send(messages.Ping())
         with pytest.raises(ConnectionError, match="no connection"):
-            await client.request(Ping())
+            await client.request(messages.Ping())
 
     run(test())
 
@@ -138,13 +128,13 @@ def test_replies_belong_to_requests_in_their_order_also_where_one_was_cancelled(
         client = MotionClient("127.0.0.1", await controller.listen())
         running = asyncio.create_task(client.run())
         await connected(client)
-        first, second, third = (asyncio.create_task(client.request(Ping())) for _ in range(3))
+        first, second, third = (asyncio.create_task(client.request(messages.Ping())) for _ in range(3))
         await controller.until(frames=3)
         second.cancel()
-        for code in (ReplyCode.SUCCESS, ReplyCode.SUCCESS, ReplyCode.FAILURE):
-            controller.writers[0].write(controller.frames[0].reply(code).pack(ByteOrder.LITTLE))
-        assert (await first).reply_code is ReplyCode.SUCCESS
-        assert (await third).reply_code is ReplyCode.FAILURE
+        for code in (messages.ReplyCode.SUCCESS, messages.ReplyCode.SUCCESS, messages.ReplyCode.FAILURE):
+            controller.writers[0].write(controller.frames[0].reply(code).pack(messages.ByteOrder.LITTLE))
+        assert (await first).reply_code is messages.ReplyCode.SUCCESS
+        assert (await third).reply_code is messages.ReplyCode.FAILURE
         running.cancel()
 
     run(test())
@@ -159,7 +149,7 @@ def test_a_request_without_a_reply_ends_the_connection(monkeypatch: pytest.Monke
         running = asyncio.create_task(client.run())
         await connected(client)
         with pytest.raises(TimeoutError, match="no reply to PING"):
-            await client.request(Ping())
+            await client.request(messages.Ping())
         await controller.until(connections=2)
         running.cancel()
 
@@ -168,14 +158,16 @@ def test_a_request_without_a_reply_ends_the_connection(monkeypatch: pytest.Monke
 
 def test_a_controller_that_requests_is_answered_and_garbage_ends_the_connection() -> None:
     async def test() -> None:
-        controller, received = Controller(), list[Message]()
+        controller, received = Controller(), list[messages.Message]()
         client = StateClient("127.0.0.1", received.append, await controller.listen())
         running = asyncio.create_task(client.run())
         await controller.until(connections=1)
-        controller.writers[0].write(Frame.request(Status(), ByteOrder.BIG).pack(ByteOrder.BIG))
+        controller.writers[0].write(
+            Frame.request(messages.Status(), messages.ByteOrder.BIG).pack(messages.ByteOrder.BIG)
+        )
         await controller.until(frames=1)
-        assert controller.frames[0] == Frame(Status.TYPE, CommType.SERVICE_REPLY, OK)
-        assert received == [Status()]
+        assert controller.frames[0] == Frame(messages.Status.TYPE, messages.CommType.SERVICE_REPLY, OK)
+        assert received == [messages.Status()]
         controller.writers[0].write(b"\0\0\0\0")
         await controller.until(connections=2)
         running.cancel()

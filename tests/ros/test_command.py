@@ -48,8 +48,8 @@ def test_wrong_options_are_refused(arguments: list[str], reason: str, capsys: py
 
 def test_a_port_that_is_taken_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     program = [sys.executable, "-m", "rtcp.cli", "ros", "--simple-message", "--state-port", "0", "--motion-port"]
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = str(server.getsockname()[1])
         done = subprocess.run([*program, port], capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert port in done.stderr

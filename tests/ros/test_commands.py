@@ -1,4 +1,4 @@
-"""What becomes of a ROS command, on an arm of the test's own: no ROS, no platform."""
+"""ROS commands on a fake arm: no ROS, no platform."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PATH = Trajectory(NAMES, [TrajectoryPoint(0.0, HERE), TrajectoryPoint(1.0, (0, 0
 
 
 class FakeStream:
-    """Keeps what is sent; `error`: what the next `send` raises."""
+    """Records what is sent; `error` is raised by the next `send`."""
 
     def __init__(self, arm: FakeArm) -> None:
         self._arm = arm
@@ -55,7 +55,7 @@ class FakeStream:
 
 
 class FakeArm:
-    """A robot that moves until the next motion, a halt or `end`; `refusal`: what it refuses everything with."""
+    """A robot that moves until the next motion, a halt or `end`; `refusal` is raised by every command."""
 
     def __init__(self) -> None:
         self.state = State.HOLDING
@@ -110,7 +110,7 @@ class FakeArm:
         self, points: Sequence[dict[str, Any]], progress: Callable[[Progress], None], replace: bool, **given: Any
     ) -> Arrival:
         assert replace
-        progress(Progress(0.5, 1.0))  # of what it replaces
+        progress(Progress(0.5, 1.0))  # of the replaced motion
         self._check()
         if self.refuse_runs is not None:
             await asyncio.sleep(0.01)
@@ -399,7 +399,7 @@ def test_a_new_target_is_never_followed_by_the_old_one(arm: FakeArm, monkeypatch
             nonlocal has_come
             if not has_come:
                 has_come = True
-                await commander.command_point(point(2.0))  # just while the node looks whether the arm is there
+                await commander.command_point(point(2.0))  # while the node checks whether the arm has arrived
             arm.commanded = HERE
             return await status()
 
@@ -640,8 +640,8 @@ def test_a_joint_command_that_no_arm_could_follow_opens_no_stream(
 def test_a_stream_that_was_ended_stays_ended_until_its_sender_pauses(
     arm: FakeArm, by: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = SimpleNamespace(monotonic=lambda: now, time=time.time)
     now = 100.0
+    clock = SimpleNamespace(monotonic=lambda: now, time=time.time)
 
     async def test(commander: Commander) -> None:
         nonlocal now
@@ -676,7 +676,7 @@ def test_what_waited_while_the_node_did_not_run_moves_nothing(arm: FakeArm, monk
 
     async def test(commander: Commander) -> None:
         await commander.command_point(point(1.0))
-        time.sleep(0.4)  # nothing of the process runs
+        time.sleep(0.4)  # the whole process is stopped
         await commander.command_point(point(2.0))
         for command in (commander.begin_trajectory(PATH), commander.enable(), commander.set_outputs([("io", "3", 1)])):
             with pytest.raises(RtcpError) as refused:
@@ -702,7 +702,7 @@ def test_a_stream_that_ran_out_while_its_node_was_held_up_is_opened_again(arm: F
         arm.commanded = HERE
         if by == "the next setpoint":
             await commander.command_point(point(2.0))
-        while len(arm.streams) < 2 or len(arm.streams[1].sent) < 3:  # and it is attended to
+        while len(arm.streams) < 2 or len(arm.streams[1].sent) < 3:  # and its points are sent
             arm.commanded = HERE
             await asyncio.sleep(0.01)
 
@@ -730,8 +730,8 @@ def test_buffered_joint_commands_are_points_of_an_open_trajectory_that_much_late
         await commander.command_point(point(9, 9.0))
 
     assert carry_out(arm, test, buffer_s=2.0) == []
-    assert [one["t"] for one in arm.appended] == pytest.approx([2.0, 3.0, 4.0, 2.0])
-    assert [one["q"][0] for one in arm.appended] == [1, 2, 3, 9]
+    assert [appended["t"] for appended in arm.appended] == pytest.approx([2.0, 3.0, 4.0, 2.0])
+    assert [appended["q"][0] for appended in arm.appended] == [1, 2, 3, 9]
     assert arm.calls == ["open", "open"]
 
 

@@ -1,4 +1,4 @@
-"""Frames from a stream of bytes, however it is cut, and what is no stream of frames."""
+"""Frames from a stream of bytes in any parts, and streams that are no frames."""
 
 from __future__ import annotations
 

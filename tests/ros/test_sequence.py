@@ -1,4 +1,4 @@
-"""What the sequence numbers and times of a client's points make of them."""
+"""Sequence numbers and times of a client's points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The server over real sockets, with an arm that is a fake: it keeps what it was asked for."""
+"""The server over real sockets, with a fake arm that records its calls."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import logging
 import socket
 import struct
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from math import nan
+from typing import Any
 
 import pytest
 
@@ -45,7 +46,7 @@ STOP_POINT = JointTrajPt(STOP, (), 0.0, 0.0)
 
 
 def exact(q1: float) -> float:
-    """The number that a float32 brings over."""
+    """The number rounded to float32."""
     return float(struct.unpack("f", struct.pack("f", q1))[0])
 
 
@@ -58,7 +59,7 @@ def at(time: float, q1: float = 0.5) -> Point:
 
 
 class Peer:
-    """A client that is written after the byte tables alone, but for the messages' own bytes."""
+    """A client written from the byte tables; only the messages' bodies use the product's code."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, order: ByteOrder) -> None:
         self._reader, self.writer, self.order = reader, writer, order
@@ -116,14 +117,14 @@ class Rig:
 
 
 @contextlib.asynccontextmanager
-async def serving(arm: FakeArm | None = None, **options: object) -> AsyncIterator[Rig]:
+async def serving(arm: FakeArm | None = None, **options: Any) -> AsyncIterator[Rig]:
     arm = arm or FakeArm()
-    given = ServerOptions(motion_port=0, state_port=0, **options)  # type: ignore[arg-type]
+    given = ServerOptions(motion_port=0, state_port=0, **options)
     async with SimpleMessageServer(arm, given) as server:
         yield Rig(arm, server)
 
 
-def run(test: Callable[[Rig], Awaitable[None]], **options: object) -> FakeArm:
+def run(test: Callable[[Rig], Awaitable[None]], **options: Any) -> FakeArm:
     """Run a test's client; return the arm when the server has ended."""
 
     async def whole() -> FakeArm:
@@ -218,19 +219,19 @@ def test_points_that_the_arm_ran_out_of_just_then_are_not_lost() -> None:
     class LateArm(FakeArm):
         """Its trajectory ends in the moment in which a point is appended."""
 
-        async def open_trajectory(self, points: object) -> FakeTrajectory:
-            trajectory = await super().open_trajectory(points)  # type: ignore[arg-type]
+        async def open_trajectory(self, points: Sequence[Point]) -> FakeTrajectory:
+            trajectory = await super().open_trajectory(points)
             append = trajectory.append
 
-            async def late(more: object) -> None:
+            async def late(points: Sequence[Point]) -> None:
                 if self.names.count("append") == 0:
                     self.arrive()
                     with contextlib.suppress(RtcpError):
-                        await append(more)  # type: ignore[arg-type]
+                        await append(points)
                     while not self.is_over:
                         await asyncio.sleep(0)
                     raise RtcpError("refused", "the trajectory has ended")
-                await append(more)  # type: ignore[arg-type]
+                await append(points)
 
             trajectory.append = late  # type: ignore[method-assign]
             wait = trajectory.wait
@@ -330,14 +331,14 @@ def test_a_new_trajectory_takes_the_place_of_the_one_under_way_without_a_stop() 
 def test_a_stop_is_answered_at_once_and_what_follows_is_ignored_until_a_new_sequence() -> None:
     async def client(rig: Rig) -> None:
         peer = await rig.motion()
-        rig.arm.stopped.clear()  # the arm takes its time
+        rig.arm.stopped.clear()  # the stop lasts
         await peer.codes(point(0), point(1))
         await rig.arm.until("open_trajectory")
         assert await peer.codes(STOP_POINT, point(2), point(3)) == [OK, NO, NO]
         await rig.arm.until("open_trajectory", "halt")
         assert await peer.codes(point(0), point(1)) == [OK, OK]
         await asyncio.sleep(0.3)
-        assert rig.arm.names[-1] == "halt"  # it brakes still
+        assert rig.arm.names[-1] == "halt"  # still braking
         rig.arm.stopped.set()
         await rig.arm.until("halt", "open_trajectory")
 
@@ -536,7 +537,7 @@ def test_points_that_waited_while_the_server_did_not_run_are_a_lost_link(
         await rig.arm.until("open_trajectory")
         peer.send(point(2), point(0, 0.7), JointPosition(0, THERE))
         await peer.writer.drain()
-        time.sleep(0.4)  # nothing of the process runs
+        time.sleep(0.4)  # the whole process is stopped
         with pytest.raises((EOFError, OSError)):
             await peer.frame()
         await rig.arm.until("halt", "disable")

@@ -1,4 +1,4 @@
-"""What the node publishes of the arm, from records that the test makes: no ROS, no platform."""
+"""The node's messages of the arm, from the test's records: no ROS, no platform."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from rtcp.config.find import default_config
 from rtcp.config.loader import load
 from rtcp.config.model import ArmConfig
 from rtcp.control.cycle import record_schema
+from rtcp.fieldbus.simple_message.messages import RobotMode, TriState
 from rtcp.ipc.observer import record_type
 from rtcp.ipc.schema import (
     FLAG_EMERGENCY_STOP,
@@ -33,10 +34,8 @@ from rtcp.ros.state import (
     ChannelSample,
     Diagnostics,
     JointSample,
-    RobotMode,
     RobotStatus,
     StatePublisher,
-    TriState,
     _diagnostics,
     robot_status,
     transforms_of,
@@ -78,15 +77,15 @@ class FakeFeed:
         return bool(self.waiting)
 
     def records(self) -> tuple[Any, int]:
-        found, self.waiting = self.waiting, []
-        return np.array(found, record_type(self.schema)), 0
+        samples, self.waiting = self.waiting, []
+        return np.array(samples, record_type(self.schema)), 0
 
     def close(self) -> None:
         self.is_closed = True
 
 
 class Heard:
-    """A sink that keeps what it was told."""
+    """A sink that records its messages."""
 
     def __init__(self) -> None:
         self.samples: list[JointSample] = []
@@ -337,18 +336,18 @@ def test_the_tool_has_a_frame_and_the_links_where_that_is_asked_for() -> None:
     assert list(alone) == [TOOL_FRAME]
     assert list(every) == [*(f"link{number}" for number in range(1, 7)), "tool0", TOOL_FRAME]
     assert every["tool0"] == every[TOOL_FRAME] == alone[TOOL_FRAME]
-    position, turn = alone[TOOL_FRAME]
+    position, orientation = alone[TOOL_FRAME]
     assert position == pytest.approx(pose.position)
-    assert rotation(turn) == pytest.approx(pose.rotation)
+    assert rotation(orientation) == pytest.approx(pose.rotation)
 
 
 def test_diagnostics_name_the_channels_of_slaves_with_their_units() -> None:
     config = with_valves()
     schema = record_schema(config)
     feed = SimpleNamespace(config=config, schema=schema, holder="")
-    (found,) = np.zeros(1, record_type(schema))
-    found["state"], found["valves_pressure"] = State.READY, 2.5
-    values = dict(_diagnostics(cast(Feed, feed), found, 0).values)
+    (record,) = np.zeros(1, record_type(schema))
+    record["state"], record["valves_pressure"] = State.READY, 2.5
+    values = dict(_diagnostics(cast(Feed, feed), record, 0).values)
     assert values["valves pressure"] == "2.5 bar"
     assert values["valves current"] == "0.0 mA"
 
@@ -360,10 +359,10 @@ def test_channels_and_named_terminals_are_published_ten_times_a_second_by_slave_
     made = np.zeros(151, record_type(feed.schema))
     made["time_ns"] = time.monotonic_ns() + np.arange(151) * 2 * MS
     made["valves_pressure"], made["io_inputs"], made["io_outputs"] = 2.5, 0b10, 0b1000
-    made["wkc"][50:55] = -1  # of a cycle without an answer only what came before is known
+    made["wkc"][50:55] = -1  # a cycle without an answer repeats the last known values
     feed.waiting = list(made)
     publisher.step(0)
-    assert [one.stamp_ns - heard.sampled[0].stamp_ns for one in heard.sampled] == [0, 110 * MS, 210 * MS]
+    assert [each.stamp_ns - heard.sampled[0].stamp_ns for each in heard.sampled] == [0, 110 * MS, 210 * MS]
     sample = heard.sampled[0]
     assert sample.values["valves"] == {"pressure": 2.5, "angle": 0.0, "current": 0.0}
     assert {name for name, level in sample.values["io"].items() if level} == {"backward", "gripper"}

@@ -1,4 +1,4 @@
-"""One command from a client on rospy: `client.py KIND JSON` prints what came of it as JSON.
+"""One command from a client on rospy: `client.py KIND JSON` prints the result as JSON.
 
 `path` and `point` publish once, `stream` publishes points of a sine at `rate_hz` on `topic`; `service`, `stop_motion`,
 `robot_enable`, `robot_disable` call; `follow` sends a goal of the action, and with `cancel_s` cancels it after so many
@@ -84,8 +84,8 @@ def follow(given: dict[str, Any]) -> dict[str, Any]:
     client = actionlib.SimpleActionClient("joint_trajectory_action", FollowJointTrajectoryAction)
     client.wait_for_server()
     goal = FollowJointTrajectoryGoal(trajectory=trajectory_of(given))
-    goal.path_tolerance = [JointTolerance(**one) for one in given.get("path_tolerance", ())]
-    goal.goal_tolerance = [JointTolerance(**one) for one in given.get("goal_tolerance", ())]
+    goal.path_tolerance = [JointTolerance(**tolerance) for tolerance in given.get("path_tolerance", ())]
+    goal.goal_tolerance = [JointTolerance(**tolerance) for tolerance in given.get("goal_tolerance", ())]
     client.send_goal(goal)
     if "cancel_s" in given:
         while client.get_state() == actionlib.GoalStatus.PENDING:

@@ -25,16 +25,16 @@ from tests.e2e.conftest import Platform
 
 CLIENT = Path(__file__).parent / "client.py"
 PATIENCE_S = 120.0
-"""For what must come: only keeps a broken node from hanging the tests."""
+"""Time limit, s, that only keeps a broken node from hanging the tests."""
 
 
 def until(met: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
-    """Return what `met` returns as soon as that is true."""
+    """Wait until `met` returns a true value; return it."""
     end = time.monotonic() + patience_s
-    while not (found := met()):
+    while not (answer := met()):
         assert time.monotonic() < end, f"{what} did not come within {patience_s:g} s"
         time.sleep(0.05)
-    return found
+    return answer
 
 
 class Ros:
@@ -132,7 +132,7 @@ class Ros:
         """End everything."""
         for begun in reversed(list(self._begun)):
             self.stop(begun)
-        self._holder.stdin.close()  # type: ignore[union-attr]
+        self._holder.stdin.close()
         self._holder.wait()
         shutil.rmtree(self.directory, ignore_errors=True)
 
@@ -144,7 +144,7 @@ def begin_node(ros: Ros, platform: Platform, *arguments: str) -> subprocess.Pope
 
 
 def command(ros: Ros, kind: str, **given: Any) -> dict[str, Any]:
-    """Carry out a command of a client on rospy; return what came of it."""
+    """Run a command of a client on rospy; return its result."""
     said = ros.run(sys.executable, CLIENT, kind, json.dumps(given)).stdout
     (line,) = (line for line in said.splitlines() if line.startswith("answer "))
     answer: dict[str, Any] = json.loads(line.removeprefix("answer "))
@@ -178,7 +178,7 @@ def ros(ros_on_the_path: None) -> Iterator[Ros]:
 
 @pytest.fixture(scope="module")
 def platform() -> Iterator[Platform]:
-    """A started platform on its virtual segment, which forgives what a shared host does."""
+    """A started platform on its virtual segment, with the tolerances of a shared host."""
     made = Platform()
     made.be_patient(2000)
     made.rtcp("start", "--detach")

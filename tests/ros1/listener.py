@@ -52,10 +52,10 @@ def main() -> None:
             write("diagnostics", message, level=entry.level, text=entry.message, values=values)
 
         def on_tf(message: Any) -> None:
-            for one in message.transforms:
-                at, turn = one.transform.translation, one.transform.rotation
-                write("/tf", one, parent=one.header.frame_id, child=one.child_frame_id, at=[at.x, at.y, at.z],
-                      turn=[turn.w, turn.x, turn.y, turn.z])  # fmt: skip
+            for stamped in message.transforms:
+                at, q = stamped.transform.translation, stamped.transform.rotation
+                write("/tf", stamped, parent=stamped.header.frame_id, child=stamped.child_frame_id,
+                      at=[at.x, at.y, at.z], turn=[q.w, q.x, q.y, q.z])  # fmt: skip
 
         for topic, kind, callback in (
             ("/tf", TFMessage, on_tf),

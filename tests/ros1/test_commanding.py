@@ -76,7 +76,7 @@ def test_a_new_trajectory_takes_the_place_of_the_one_under_way(ros: Ros, arm: Pl
     until(lambda: is_at(arm, THERE), "the end of the second trajectory")
     records, _ = feed.records()
     feed.close()
-    # Without a stop: it moves in every cycle of its way.
+    # Without a stop: it moves in every cycle.
     whole = records[records["wkc"] == records["wkc_expected"]]
     change = np.abs(np.diff(whole["commanded_position"], axis=0)).max(axis=1)
     moves = np.flatnonzero(change > 1e-6)
@@ -210,7 +210,7 @@ def test_a_goal_that_is_cancelled_ends_and_the_arm_holds_on_the_way(ros: Ros, ar
     assert ended["state"] == PREEMPTED
     rest = arm.until(lambda status: status["state"] == "holding", "rest")["joints"]["actual_position"]
     assert 0.0 < rest[0] < THERE[0] - 0.01
-    # On the path: all joints have come equally far.
+    # On the path: all joints are at the same fraction.
     assert [have / want for have, want in zip(rest, THERE, strict=True) if want] == pytest.approx(
         [rest[0] / THERE[0]] * 5, abs=0.02
     )

@@ -43,8 +43,8 @@ SERVICES = {
 def test_the_generated_classes_have_the_md5_sums_of_the_published_ones(
     ros_on_the_path: None, module: str, sums: dict[str, str]
 ) -> None:
-    found = importlib.import_module(module)
-    assert {name: getattr(found, name)._md5sum for name in sums} == sums
+    imported = importlib.import_module(module)
+    assert {name: getattr(imported, name)._md5sum for name in sums} == sums
 
 
 def test_they_are_generated_once_and_whole(

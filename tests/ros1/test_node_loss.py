@@ -1,4 +1,4 @@
-"""What the arm does where its node is lost: a module of its own, since a service belongs to the node that came last."""
+"""The loss of the node: a module of its own, since a service belongs to the newest node."""
 
 from __future__ import annotations
 

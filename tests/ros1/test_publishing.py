@@ -27,7 +27,7 @@ LISTENER = Path(__file__).parent / "listener.py"
 
 
 class Listener:
-    """A process of rospy that writes down what it hears (`listener.py`)."""
+    """A process of rospy that writes the messages it receives (`listener.py`)."""
 
     def __init__(self, ros: Ros) -> None:
         self._ros = ros
@@ -44,10 +44,10 @@ class Listener:
 
     def until(self, topic: str, met: Callable[[dict[str, Any]], bool], since: int = 0) -> dict[str, Any]:
         """Return the first message after the first `since` that is as wanted."""
-        found: Any = until(
+        link_message: Any = until(
             lambda: next((message for message in self.heard(topic)[since:] if met(message)), None), f"{topic} as wanted"
         )
-        return dict(found)
+        return dict(link_message)
 
 
 @pytest.fixture
@@ -215,7 +215,7 @@ def test_after_the_return_of_a_killed_roscore_everything_is_there_again(
 ) -> None:
     listener.until("joint_states", lambda message: True)
     ros.kill_core()
-    # What was connected goes on without a master.
+    # Connections continue without a master.
     before = len(listener.heard("joint_states"))
     until(lambda: len(listener.heard("joint_states")) > before + 10, "joint states without a master")
     ros.start_core()
@@ -223,7 +223,7 @@ def test_after_the_return_of_a_killed_roscore_everything_is_there_again(
     until(lambda: topics <= set(ros.run("/usr/bin/rostopic", "list").stdout.split()), "the topics")
     assert "/rtcp" in ros.run("/usr/bin/rosnode", "list").stdout.split()
     until(lambda: "<robot" in description(ros), "robot_description")
-    assert node.poll() is None  # the same process: whoever supervises it sees no end
+    assert node.poll() is None  # the same process: a supervisor sees no end
     late = Listener(ros)
     try:
         late.until("joint_states", lambda message: True)

@@ -44,14 +44,14 @@ class FastDds:
 
 def main(program: str) -> None:
     arm = FakeArm()
-    found: dict[str, Any] = {}
+    received: dict[str, Any] = {}
     with Commands(OPTIONS, cast(Any, arm.connect)) as commands:
         wire = DdsWire(OPTIONS, commands)
         publications = Publications(wire, "arm", lambda: None)
         publications.connected(CONFIG)
 
         late = FastDds(program, "read", "rt/robot_description", "std_msgs::msg::dds_::String_", "durable")
-        found["robot_description"] = until(late.samples, "the description")[0]
+        received["robot_description"] = until(late.samples, "the description")[0]
         late.end()
 
         reader = FastDds(program, "read", "rt/joint_states", "sensor_msgs::msg::dds_::JointState_", "volatile")
@@ -61,8 +61,8 @@ def main(program: str) -> None:
             return len(reader.samples()) > 4
 
         until(publish, "joint_states")
-        found["joint_states"] = reader.samples()
-        found["writers"] = [line.split()[1:] for line in reader.lines if line.startswith("writer ")]
+        received["joint_states"] = reader.samples()
+        received["writers"] = [line.split()[1:] for line in reader.lines if line.startswith("writer ")]
         reader.end()
 
         for topic, kind, message in (
@@ -78,14 +78,14 @@ def main(program: str) -> None:
                     writer.put(data)
                     return commanded(arm, topic)[before:]  # noqa: B023  called in this turn alone
 
-                found[f"{topic}, {quality}"] = until(command, topic)[0][:2]
+                received[f"{topic}, {quality}"] = until(command, topic)[0][:2]
                 writer.put(b"\x00\x01\x00\x00\xff\xff\xff\xff")  # no message: the next one is taken
                 before = len(commanded(arm, topic))
                 until(command, topic)
                 writer.end()
         commands.loop.call_soon_threadsafe(arm.end)
         wire.close()
-    print(json.dumps(found))
+    print(json.dumps(received))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A node of ROS 2 on an arm that moves nothing, and what it needs: no ROS, no platform."""
+"""A node of ROS 2 on a fake arm: no ROS, no platform."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ CONFIG = load(default_config())
 SAMPLE = JointSample(1_700_000_000_250_000_000, (0.1,) * 6, (0.2,) * 6, (0.3,) * 6, (0.15,) * 6)
 OPTIONS = Ros2Options("arm", commands=CommandOptions())
 PATIENCE_S = 120.0
-"""For what must come: only keeps a broken node from hanging the tests."""
+"""Time limit, s, that only keeps a broken node from hanging the tests."""
 
 
 def until(met: Callable[[], Any], what: str) -> Any:
-    """Return what `met` returns as soon as that is true."""
+    """Wait until `met` returns a true value; return it."""
     end = time.monotonic() + PATIENCE_S
-    while not (found := met()):
+    while not (answer := met()):
         assert time.monotonic() < end, f"{what} did not come within {PATIENCE_S:g} s"
         time.sleep(0.01)
-    return found
+    return answer
 
 
 def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return int(server.getsockname()[1])
 
 
 def point(t: float, q: Any, **fields: Any) -> Any:
@@ -55,7 +55,7 @@ def outputs(values: Mapping[str, Mapping[str, float]], make: Any = make) -> Any:
 
 
 def commanded(arm: FakeArm, topic: str) -> list[Any]:
-    """What has reached the arm from a topic: (`stream`, joint positions) of each setpoint, or its calls."""
+    """The arm's commands from a topic: (`stream`, joint positions) of each setpoint, or its calls."""
     if topic == "joint_command":
         return [("stream", sent[0]) for stream in arm.streams for sent in stream.sent]
     return list(arm.calls)

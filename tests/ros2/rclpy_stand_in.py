@@ -207,7 +207,7 @@ def modules() -> dict[str, ModuleType]:
         "rclpy.action": {"ActionServer": ActionServer, "ActionClient": ActionClient, "CancelResponse": CancelResponse},
         "rclpy.callback_groups": {"ReentrantCallbackGroup": SimpleNamespace},
         "rclpy.executors": {"MultiThreadedExecutor": MultiThreadedExecutor},
-        "rclpy.qos": {one.__name__: one for one in (DurabilityPolicy, QoSProfile, ReliabilityPolicy)},
+        "rclpy.qos": {kind.__name__: kind for kind in (DurabilityPolicy, QoSProfile, ReliabilityPolicy)},
         "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO=0)},
         "rosidl_runtime_py": {},
         "rosidl_runtime_py.utilities": {"get_interface": _interface},

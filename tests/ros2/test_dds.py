@@ -62,7 +62,7 @@ def test_states_are_reliable_and_volatile_and_the_description_is_kept_for_late_r
 
 @pytest.fixture(scope="module")
 def exchange(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the node and Fast DDS received of each other."""
+    """Messages that the node and Fast DDS received from each other."""
     if not HEADERS.exists() or shutil.which("g++") is None:
         pytest.skip("Fast DDS is not installed: apt install libfastrtps-dev g++")
     program = tmp_path_factory.mktemp("fast_dds") / "fast_dds"

@@ -1,4 +1,4 @@
-"""What the node publishes, and its action, without a wire: on an arm that moves nothing."""
+"""The node's messages and its action, without a wire, on a fake arm."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_every_topic_is_published(wire: Kept, publications: Publications) -> Non
     assert wire.messages.keys() == OUT.keys()
     shown = wire.messages["gpio_controller/gpio_states"]
     assert shown.interface_groups == ["valves", "io"]
-    assert [one.values.tolist() for one in shown.interface_values] == [[12.5, 1.0], [0.0]]
+    assert [interface_value.values.tolist() for interface_value in shown.interface_values] == [[12.5, 1.0], [0.0]]
     assert shown.interface_values[0].interface_names == ["current", "open"]
     status = wire.messages["robot_status"]
     assert (status.mode.val, status.e_stopped.val, status.error_codes.tolist()) == (2, -1, [7])
@@ -77,10 +77,10 @@ def test_the_transforms_lead_from_base_to_tool(wire: Kept, publications: Publica
     publications.joints(JOINTS, SAMPLE)
     transforms = wire.messages["tf"].transforms
     links = ["base_link", *(f"link{number}" for number in range(1, 7)), "tool0"]
-    assert [(one.header.frame_id, one.child_frame_id) for one in transforms] == list(pairwise(links))
+    assert [(transform.header.frame_id, transform.child_frame_id) for transform in transforms] == list(pairwise(links))
     total = np.eye(4)
-    for one in transforms:
-        moved, q = one.transform.translation, one.transform.rotation
+    for transform in transforms:
+        moved, q = transform.transform.translation, transform.transform.rotation
         w, v = q.w, np.array([q.x, q.y, q.z])
         cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
         step = np.eye(4)
@@ -150,7 +150,7 @@ def action(commands: Commands, wire: Kept) -> Action:
 
 
 def states(wire: Kept) -> list[int]:
-    return [one.status for one in wire.messages["joint_trajectory_action/_action/status"].status_list]
+    return [goal.status for goal in wire.messages["joint_trajectory_action/_action/status"].status_list]
 
 
 def test_the_status_of_a_goal_is_published_with_each_change(

@@ -29,7 +29,7 @@ THERE = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1]
 
 @pytest.fixture
 def prepared() -> Iterator[Platform]:
-    """A platform that forgives what a shared host does, not yet started."""
+    """A platform with the tolerances of a shared host, not yet started."""
     made = Platform()
     made.be_patient(2000)
     yield made
@@ -83,7 +83,7 @@ def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_every
             return {}
         message = decode(GROUP_VALUES, received[-1].payload.to_bytes())
         values = zip(message.interface_groups, message.interface_values, strict=True)
-        return {slave: dict(zip(one.interface_names, one.values.tolist(), strict=True)) for slave, one in values}
+        return {slave: dict(zip(group.interface_names, group.values.tolist(), strict=True)) for slave, group in values}
 
     with open_session(router.address) as session:
         subscriber = session.declare_subscriber(f"0/gpio_controller/gpio_states/{kind}", received.append)
@@ -129,5 +129,5 @@ def test_the_latency_of_each_wire_is_measured_in_the_frames(platform: Platform, 
     command = [sys.executable, "-m", "rtcp.ros.latency", wire, "5"]
     done = subprocess.run(command, env=platform.environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    # Below one cycle where the host is late: the record has the instant at which the cycle was due.
+    # A late host adds less than a cycle: the record has the instant at which the cycle was due.
     assert [cycles > 0.0 for cycles in json.loads(done.stdout)] == [True] * 5

@@ -60,25 +60,25 @@ def test_a_subscriber_receives_joint_states_with_number_and_instant(session: Any
     message = decode("sensor_msgs/msg/JointState", received[0].payload.to_bytes())
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_000, 250_000_000)
     assert (message.name, message.position.tolist()) == (list("abcdef"), list(SAMPLE.position))
-    first, second = (struct.unpack("<qqB16s", one.attachment.to_bytes()) for one in received[:2])
+    first, second = (struct.unpack("<qqB16s", sample.attachment.to_bytes()) for sample in received[:2])
     assert second[0] > first[0] > 0
     assert 0 <= time.time_ns() - first[1] < 3600 * 1e9
     assert first[2:] == (16, second[3])
 
 
 def test_node_topics_and_services_are_in_the_lists(session: Any, wire: ZenohWire) -> None:
-    found = until(lambda: (seen := tokens(session)) and len(seen) >= 18 and seen, "the tokens")
-    [zid] = {token.split("/")[2] for token in found}
-    assert f"@ros2_lv/0/{zid}/0/0/NN/%/%/arm" in found
-    endings = {token.split("/", 5)[5] for token in found}
+    keys = until(lambda: (seen := tokens(session)) and len(seen) >= 18 and seen, "the tokens")
+    [zid] = {token.split("/")[2] for token in keys}
+    assert f"@ros2_lv/0/{zid}/0/0/NN/%/%/arm" in keys
+    endings = {token.split("/", 5)[5] for token in keys}
     kind_and_hash = JOINT_STATES.removeprefix("0/joint_states/")
     assert f"MP/%/%/arm/%joint_states/{kind_and_hash}/::,10:,:,:,," in endings
-    assert any(one.startswith("MP/%/%/arm/%robot_description/") and one.endswith("/:1:,1:,:,:,,") for one in endings)
-    assert any(one.startswith("MS/%/%/arm/%joint_path_command/trajectory_msgs::msg::dds_::Joint") for one in endings)
-    assert any(one.startswith("SS/%/%/arm/%robot_enable/std_srvs::srv::dds_::Trigger_/RIHS01_") for one in endings)
+    assert any(end.startswith("MP/%/%/arm/%robot_description/") and end.endswith("/:1:,1:,:,:,,") for end in endings)
+    assert any(end.startswith("MS/%/%/arm/%joint_path_command/trajectory_msgs::msg::dds_::Joint") for end in endings)
+    assert any(end.startswith("SS/%/%/arm/%robot_enable/std_srvs::srv::dds_::Trigger_/RIHS01_") for end in endings)
     action = "SS/%/%/arm/%joint_trajectory_action%_action%send_goal/control_msgs::action::dds_::FollowJointTrajectory_"
-    assert any(one.startswith(action) for one in endings)
-    assert len({token.split("/")[4] for token in found}) == len(found)
+    assert any(end.startswith(action) for end in endings)
+    assert len({token.split("/")[4] for token in keys}) == len(keys)
 
 
 def test_a_late_subscriber_receives_the_robot_description(session: Any, publications: Publications) -> None:
@@ -92,7 +92,7 @@ def test_a_late_subscriber_receives_the_robot_description(session: Any, publicat
         history=history,
     )
     until(lambda: received, "the description")
-    subscriber.undeclare()
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
     assert decode("std_msgs/msg/String", received[0].payload.to_bytes()).data.startswith("<?xml")
 
 

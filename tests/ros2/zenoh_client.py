@@ -33,7 +33,7 @@ class Router:
         self.session = open_session(self.address, is_router=True)
 
     def close(self) -> None:
-        self.session.close()
+        self.session.close()  # type: ignore[no-untyped-call]
 
 
 def tokens(session: Any) -> set[str]:

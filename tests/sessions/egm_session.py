@@ -18,14 +18,14 @@ from tests.faults.egm import CONFIG, LIMITS, START, Trials
 from tests.sessions.wire_client import DEFECTS, Connection
 
 _MOTIONS = 6
-"""Motions that are begun and not waited for, at most at a time."""
+"""Most motions at a time that are not waited for."""
 _MODES = {
     "jog": ("cartesian",),
     "move_at_velocity": ("velocity",),
     "stream": ("joint",),
     "motion": ("joint", "cartesian"),
 }
-"""Control modes in which commands are accepted: most are given in one of them."""
+"""Control modes in which commands are accepted; most commands are sent in one of them."""
 _REQUESTS: tuple[dict[str, Any], ...] = (
     *({"do": do} for do in ("motors_on", "motors_off", "start_rapid", "stop_rapid")),
     *({"do": "mode", "mode": mode} for mode in ("hand", "auto")),
@@ -43,7 +43,7 @@ _REQUESTS: tuple[dict[str, Any], ...] = (
 
 @dataclass
 class EgmOutcome:
-    """What came of a session."""
+    """Results of a session."""
 
     taken: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
@@ -69,7 +69,7 @@ class EgmSession:
         self._motions: list[tuple[str, Connection]] = []
 
     def run(self, seconds: float) -> EgmOutcome:
-        """Do something at random, again and again for so long; then put things in order, enable and move."""
+        """Run random actions for `seconds`; then recover, enable and move."""
         trials, outcome = self.trials, self.outcome
         tap = trials.platform.directory / "session.tap"
         with trials.capture(tap):
@@ -173,7 +173,7 @@ class EgmSession:
 
     def _refused(self, name: str, kind: str, message: str) -> None:
         self.outcome.refused[name] += 1
-        # A jog lasts for less than a host takes the CPU away for: that it came too late is the right answer.
+        # A host may delay a jog by more than its duration: a refusal as too late is right.
         if kind in DEFECTS and not (name == "jog" and kind == "timeout"):
             self.outcome.failures.append(f"{name} failed by {kind}: {message}")
 

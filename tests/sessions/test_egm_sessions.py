@@ -1,4 +1,4 @@
-"""A random session on the virtual IRC5: no reference breaks a limit, whatever is done."""
+"""A random session on the virtual IRC5: no reference breaks a limit."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""Random sessions, some by fixed seeds and some that hypothesis draws: no frame breaks a limit, whatever is done."""
+"""Random sessions, by fixed seeds and by hypothesis: no frame breaks a limit."""
 
 from __future__ import annotations
-
-from random import Random
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -10,9 +8,9 @@ from hypothesis import strategies as st
 
 from rtcp.ipc.commands import Halt, SetControlMode
 from rtcp.ipc.states import ControlMode, State
+from rtcp.testing.sessions.commander import KINDS
 from tests.samples import SLOW
-from tests.sessions.driver import KINDS
-from tests.sessions.session import Outcome, Session, run_session
+from tests.sessions.session import Outcome, run_session, session_of
 
 SESSIONS, BATCH = (100, 20) if SLOW else (4, 2)
 
@@ -37,46 +35,42 @@ def test_the_sessions_visit_every_state_and_send_every_command() -> None:
 
 
 def test_plans_of_a_session_are_taken_and_move_the_arm() -> None:
-    session = Session(Random(3))
-    driver = session.driver
+    session = session_of(3)
+    commander = session.commander
     try:
-        driver.enable()
+        commander.enable()
         for mode, begin in (ControlMode.JOINT, session.trajectory), (ControlMode.CARTESIAN, session.line):
-            driver.send(SetControlMode(mode))
+            commander.send(SetControlMode(mode))
             for _ in range(20):
                 begin()
-                if driver.state is State.MOVING:
+                if commander.state is State.MOVING:
                     break
-                driver.enable()
-            driver.send(Halt())
-            driver.wait(1000)
-        assert {"run_trajectory", "run_lines"} <= set(driver.taken)
+                commander.enable()
+            commander.send(Halt())
+            commander.wait(1000)
+        assert {"run_trajectory", "run_lines"} <= set(commander.taken)
     finally:
-        driver.close()
+        commander.close()
 
 
-def test_a_session_is_the_same_each_time_it_runs() -> None:
-    assert run_session(77) == run_session(77)
+ACTIONS = len(session_of(1).actions)
 
 
-ACTIONS = len(Session(Random(1)).actions)
-
-
-# A session that breaks a limit is made as short as it can be.
+# Hypothesis shortens a session that breaks a limit.
 @settings(max_examples=60 if SLOW else 3, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 1000),
     steps=st.lists(st.tuples(st.integers(0, ACTIONS - 1), st.integers(0, 10_000)), min_size=1, max_size=20),
 )
 def test_no_frame_of_a_session_that_hypothesis_draws_breaks_a_limit(seed: int, steps: list[tuple[int, int]]) -> None:
-    session = Session(Random(seed))
-    driver = session.driver
+    session = session_of(seed)
+    commander = session.commander
     try:
-        driver.enable()
+        commander.enable()
         for action, number in steps:
             session.random.seed(number)
             session.actions[action][1]()
-            driver.wait(50)
-            assert driver.violations == [], "\n".join(driver.log[-20:])
+            commander.wait(50)
+            assert commander.checker.violations == [], "\n".join(map(str, commander.log[-20:]))
     finally:
-        driver.close()
+        commander.close()

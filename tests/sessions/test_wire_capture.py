@@ -11,10 +11,10 @@ import pytest
 
 from rtcp.ipc.commands import MoveJoints
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Frame
 from rtcp.motion.limits import Values
+from rtcp.testing.simulation import Frame
 from tests.e2e.wire import DRIVE, HEAD, LEAVES, LRW, frame
-from tests.sessions.driver import Driver, configuration, with_start
+from tests.sessions.oracle import commander_of, configuration, with_start
 from tests.sessions.wire_capture import BARRIER_INDEX, EXPECTED_WKC, NOP, Change, exchanges, wider
 from tests.sessions.wire_session import check
 
@@ -58,23 +58,23 @@ class Capture:
 @pytest.fixture(scope="module")
 def moving() -> list[Frame]:
     """Every frame of an arm that is enabled and moves."""
-    driver = Driver(with_start(configuration(), PERIOD_US, "csp"), 1, START)
+    commander = commander_of(with_start(configuration(), PERIOD_US, "csp"), 1, START)
     found: list[Frame] = []
-    checked = driver.simulation.on_frame
+    checked = commander.simulation.on_frame
     assert checked is not None
 
     def see(seen: Frame) -> None:
         found.append(seen)
         checked(seen)
 
-    driver.simulation.on_frame = see
-    driver.enable()
-    assert driver.simulation.until(lambda: driver.state is State.HOLDING, 2.0)
-    driver.wait(50)
-    driver.send(MoveJoints(tuple(q + 0.3 for q in START), 0.4, True))
-    driver.wait(200)
-    driver.close()
-    assert driver.violations == []
+    commander.simulation.on_frame = see
+    commander.enable()
+    commander.simulation.bring_to(State.HOLDING, 2.0)
+    commander.wait(50)
+    commander.send(MoveJoints(tuple(q + 0.3 for q in START), 0.4, True))
+    commander.wait(200)
+    commander.close()
+    assert commander.checker.violations == []
     return found[-300:]
 
 
@@ -111,7 +111,7 @@ def test_one_target_that_is_changed_in_the_file_is_found_with_the_actions_before
     changed = [*moving[:at], spoilt(moving[at], 3, lambda counts: counts + 12), *moving[at + 1 :]]
     actions = [(moving[at].now_ns - 1, "the action before"), (moving[at].now_ns + 1, "the action after")]
     _, failures = check(written(tmp_path / "capture", changed), PERIOD_S, actions=actions)
-    assert "joint 3: step of" in failures[0][0]
+    assert "joint 3: step 0.0016," in failures[0][0]
     assert "the action before" in failures[0][1]
 
 

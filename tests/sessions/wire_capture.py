@@ -1,4 +1,4 @@
-"""The cyclic frames of a capture, as the checker takes them: what was sent, what came back to the master in time."""
+"""The cyclic frames of a capture for the checker: outputs, and the answers that came in time."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rtcp.launch.simulation import Frame
 from rtcp.motion.limits import Corners, Values
+from rtcp.testing.sessions.checker import FrameChecker
+from rtcp.testing.simulation import Frame
 from tests.e2e.wire import BOX_IN, BOX_OUT, DRIVE, DRIVES, LRW, datagrams, frames
-from tests.sessions.frame_checker import FrameChecker
 
 NOP = 0
 BARRIER_INDEX = 0xF0
-"""Of the numbered frame that the master lets pass after an exchange whose answer did not come in time."""
+"""Index of the barrier frame that the master sends after an exchange without an answer in time."""
 OUTPUTS = BOX_OUT + DRIVES * DRIVE.size
 INPUTS = BOX_IN + DRIVES * DRIVE.size
 EXPECTED_WKC = 3 * (DRIVES + 1)
@@ -23,7 +23,7 @@ EXPECTED_WKC = 3 * (DRIVES + 1)
 
 
 class _Exchange:
-    """A frame on its way."""
+    """A sent frame and its answer."""
 
     def __init__(self, now_ns: int, index: int, sent: bytes) -> None:
         self.now_ns, self.index, self.sent = now_ns, index, sent
@@ -61,20 +61,20 @@ def exchanges(path: Path) -> Iterator[Frame]:
 
 
 _LATEST = 8192
-"""So many frames may wait for a segment that stands still."""
+"""Most frames that may wait for a stopped segment."""
 
 
 def _answered(under_way: deque[_Exchange], index: int, data: bytes, wkc: int) -> None:
     # The newest that fits: SOEM's index comes again after 16 frames, and the segment answers no frame that is so old.
-    found = False
+    has_answer = False
     for exchange in reversed(under_way):
         if exchange.received is not None:
             return
-        if found:
-            # Frames do not overtake one another: what is older is not answered any more.
+        if has_answer:
+            # Frames do not overtake one another: older ones get no answer any more.
             exchange.received = b""
         elif exchange.index == index and exchange.sent == data[:OUTPUTS]:
-            found, exchange.received, exchange.wkc = True, data[OUTPUTS:], wkc
+            has_answer, exchange.received, exchange.wkc = True, data[OUTPUTS:], wkc
 
 
 def _frame(exchange: _Exchange, last: bytes) -> Frame:
@@ -142,7 +142,7 @@ class Limiter:
 
 
 def wider(a: Values, b: Values) -> Values:
-    """Return limits that allow what either of two allows."""
+    """Return limits that allow everything that one of two allows."""
     return replace(
         a,
         low=tuple(map(min, a.low, b.low)),
@@ -151,7 +151,7 @@ def wider(a: Values, b: Values) -> Values:
             name: tuple(map(max, getattr(a, name), getattr(b, name))) for name in ("velocity", "acceleration", "torque")
         },
         box=None if a.box is None or b.box is None else _hull(a.box, b.box),
-        keep_out=tuple(_common(one, other) for one, other in zip(a.keep_out, b.keep_out, strict=True)),
+        keep_out=tuple(_common(box, other_box) for box, other_box in zip(a.keep_out, b.keep_out, strict=True)),
     )
 
 
@@ -165,12 +165,14 @@ def _common(a: Corners, b: Corners) -> Corners:
 
 def from_answer(shown: Mapping[str, Any], jerk: tuple[float, ...]) -> Values:
     """Return the limits that an answer to `limits` on the control socket shows (its key `limits`)."""
-    found = {name: tuple(shown[key]) for key, name in _JOINT_KEYS.items()}
-    return Values(**found, jerk=jerk, box=_corners(shown["box"]), keep_out=tuple(map(_box, shown["keep_out"].values())))
+    limits = {name: tuple(shown[key]) for key, name in _JOINT_KEYS.items()}
+    return Values(
+        **limits, jerk=jerk, box=_corners(shown["box"]), keep_out=tuple(map(_box, shown["keep_out"].values()))
+    )
 
 
 def _box(box: Mapping[str, Any]) -> Corners:
-    return (*box["min"], *box["max"])  # type: ignore[return-value]
+    return (*box["min"], *box["max"])
 
 
 def _corners(box: Mapping[str, Any] | None) -> Corners | None:

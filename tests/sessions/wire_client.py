@@ -1,4 +1,4 @@
-"""What a random session asks on the control socket, and the answers: counted, and kept with their time."""
+"""Requests of a random session on the control socket, and the answers: counted, and kept with their time."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from rtcp.ipc.errors import RtcpError
 NAME = "a random session"
 PATIENCE_S = 30.0
 DEFECTS = ("internal", "lost", "not running", "timeout")
-"""Kinds of answers that no request may have, whatever it asks."""
+"""Kinds of errors that no request may cause."""
 
 
 class Connection:
-    """A connection on which something is asked and not waited for; it takes numbers that JSON does not know, too."""
+    """A connection for requests that are not waited for; it also sends numbers that JSON lacks."""
 
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
@@ -30,10 +30,12 @@ class Connection:
         self._received = b""
 
     def begin(self, verb: str, arguments: Mapping[str, Any]) -> None:
-        """Ask."""
+        """Send a request."""
         identify = {"jsonrpc": jsonrpc.VERSION, "method": "identify", "params": {"name": NAME}}
         request = {"jsonrpc": jsonrpc.VERSION, "id": 1, "method": verb, "params": dict(arguments)}
-        self._socket.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in (identify, request)))
+        self._socket.sendall(
+            b"".join(json.dumps(request_line).encode() + b"\n" for request_line in (identify, request))
+        )
 
     def answer(self, patience_s: float) -> dict[str, Any] | None:
         """Return the answer, or None where it has not come in time."""
@@ -53,12 +55,12 @@ class Connection:
             self._received += got
 
     def close(self) -> None:
-        """Go away, whatever was asked."""
+        """Close the connection, with or without an open request."""
         self._socket.close()
 
 
 class WireClient:
-    """Asks, and keeps what was asked: `actions` are (ns of CLOCK_MONOTONIC, sentence)."""
+    """Sends requests and records them: `actions` are (ns of CLOCK_MONOTONIC, sentence)."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -68,11 +70,11 @@ class WireClient:
         self.actions: list[tuple[int, str]] = []
         self.taken: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
-        self.happenings: Counter[str] = Counter()
+        self.faults: Counter[str] = Counter()
         self.defects: list[tuple[int, str]] = []
 
     def ask(self, verb: str, **arguments: Any) -> dict[str, Any] | None:
-        """Ask and wait; return the result, or None where it was refused."""
+        """Send a request; return the result, or None if refused."""
         begun = time.monotonic_ns()
         kind, message, result = "", "", None
         if _is_json(arguments):
@@ -101,14 +103,14 @@ class WireClient:
         return self._client.call("status", timeout_s=PATIENCE_S)
 
     def begin(self, verb: str, **arguments: Any) -> None:
-        """Ask for what takes long on a connection of its own, and do not wait."""
+        """Send a long request on a connection of its own without waiting."""
         self.drop()
         self._long, self._verb = Connection(self._path), verb
         self._long.begin(verb, arguments)
         self.actions.append((time.monotonic_ns(), f"{verb} {_short(arguments)} begins"))
 
     def busy(self, patience_s: float) -> bool:
-        """Whether what was begun has not been answered within this time."""
+        """Whether the long request has no answer within this time."""
         if self._long is None:
             return False
         reply = self._long.answer(patience_s)
@@ -121,21 +123,21 @@ class WireClient:
         return False
 
     def drop(self) -> None:
-        """Close the connection of what was begun; its lease goes with it."""
+        """Close the connection of the long request, and with it its lease."""
         if self._long is not None:
             if self.busy(1e-3):
-                self.happen("connection closed", f"in the middle of {self._verb}")
+                self.count_fault("connection closed", f"in the middle of {self._verb}")
                 self._long.close()
             self._long = None
 
     def hang_up(self) -> None:
-        """Close the connection on which is asked, with its lease, and open another."""
+        """Replace the connection of the requests; its lease ends."""
         self._client.close()
         self._client = ControlClient(NAME, self._path)
 
-    def happen(self, name: str, what: str = "") -> None:
-        """Note what happens."""
-        self.happenings[name] += 1
+    def count_fault(self, name: str, what: str = "") -> None:
+        """Record an action."""
+        self.faults[name] += 1
         self.actions.append((time.monotonic_ns(), f"* {name} {what}"))
 
     def close(self) -> None:
@@ -167,7 +169,7 @@ def _read(reply: dict[str, Any] | None) -> tuple[str, str, dict[str, Any] | None
 
 
 def _short(value: Any) -> str:
-    """The arguments, numbers cut to what one can read."""
+    """The arguments, with rounded numbers."""
     if isinstance(value, dict):
         return " ".join(f"{key}={_short(item)}" for key, item in value.items())
     if isinstance(value, (list, tuple)):

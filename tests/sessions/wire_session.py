@@ -16,10 +16,10 @@ from typing import Any
 from kinematics import forward
 from rtcp.ipc.commands import Command, Halt
 from rtcp.motion.limits import Values
+from rtcp.testing.sessions.actions import CONTROL_MODES, SHARES, RandomActions
+from rtcp.testing.sessions.checker import FrameChecker
 from tests.e2e.conftest import Platform
-from tests.sessions.actions import CONTROL_MODES, SHARES, RandomActions
-from tests.sessions.driver import bounds_of, configuration
-from tests.sessions.frame_checker import FrameChecker
+from tests.sessions.oracle import checker_of, configuration
 from tests.sessions.session import Outcome
 from tests.sessions.wire_capture import EXPECTED_WKC, Change, Limiter, exchanges, from_answer
 from tests.sessions.wire_client import WireClient
@@ -270,16 +270,17 @@ class WireSession(RandomActions):
         self._set(self._all())
 
     def _all(self) -> dict[str, float]:
-        widest, found = self.widest, {}
+        widest = self.widest
+        numbers: dict[str, float] = {}
         keys = {"min": "low", "max": "high", "velocity": "velocity", "acceleration": "acceleration", "jerk": "jerk",
                 "torque": "torque"}  # fmt: skip
         for key, name in keys.items():
-            found |= {f"joint{axis + 1}.{key}": number for axis, number in enumerate(getattr(widest, name))}
+            numbers |= {f"joint{axis + 1}.{key}": number for axis, number in enumerate(getattr(widest, name))}
         boxes = {"box": widest.box} if widest.box is not None else {}
         names = (zone.name for zone in configuration().cartesian.keep_out)
         for name, box in (boxes | dict(zip(names, widest.keep_out, strict=True))).items():
-            found |= {f"{name}.{end}": box[at] for at, (end, _) in enumerate(_ENDS)}
-        return found
+            numbers |= {f"{name}.{end}": box[at] for at, (end, _) in enumerate(_ENDS)}
+        return numbers
 
     def _set(self, changes: dict[str, float]) -> None:
         asked = time.monotonic_ns()
@@ -293,13 +294,13 @@ class WireSession(RandomActions):
     def lost_frames(self) -> None:
         """The segment stands still: frames come late or not at all."""
         seconds = self.random.choice((0.003, 0.01, 0.03, 0.1, 0.3))
-        self.client.happen("segment stopped", f"for {seconds} s")
+        self.client.count_fault("segment stopped", f"for {seconds} s")
         self._stopped("segment", seconds)
 
     def silent_gateway(self) -> None:
         """Nobody renews a lease."""
         seconds = self.random.choice((0.1, 0.7))
-        self.client.happen("gateway stopped", f"for {seconds} s")
+        self.client.count_fault("gateway stopped", f"for {seconds} s")
         self._stopped("gateway", seconds)
 
     def _stopped(self, name: str, seconds: float) -> None:
@@ -313,7 +314,7 @@ class WireSession(RandomActions):
     def slave_leaves_op(self) -> None:
         """A slave falls to SAFE-OP; a drive with torque then has fault 0x8130."""
         position = self.random.randrange(7)
-        self.client.happen("slave to SAFE-OP", str(position))
+        self.client.count_fault("slave to SAFE-OP", str(position))
         self.platform.wire("safeop", str(position))
 
     def drive_fault(self) -> None:
@@ -324,7 +325,7 @@ class WireSession(RandomActions):
         slave = self.random.randrange(2, 8)
         self._narrowed.add(slave)
         self._window(slave, 1, 0)
-        self.client.happen("following error window of 1 count", f"slave {slave}")
+        self.client.count_fault("following error window of 1 count", f"slave {slave}")
         self.client.ask("enable")
         self.client.begin("move_joints", q=self.near(0.5))
         self.client.busy(2.0)
@@ -353,18 +354,18 @@ def check(
 ) -> tuple[FrameChecker, list[list[str]]]:
     """Check a capture; return the checker, and of each violation its sentence and the last actions before it."""
     config = configuration()
-    found = FrameChecker(bounds_of(config), period_s, range(1, 7), EXPECTED_WKC)
-    limiter = Limiter(found, Values.configured(config), changes, round(SLACK_CYCLES * period_s * 1e9))
+    checker = checker_of(config, period_s, EXPECTED_WKC)
+    limiter = Limiter(checker, Values.configured(config), changes, round(SLACK_CYCLES * period_s * 1e9))
     instants = [when for when, _ in actions]
     failures: list[list[str]] = []
     for frame in exchanges(path):
         limiter.at(frame.now_ns)
-        found.check(frame)
-        if len(found.violations) > len(failures):
+        checker.check(frame)
+        if len(checker.violations) > len(failures):
             at = bisect_right(instants, frame.now_ns)
             before = [f"{when * 1e-9:.4f} {action}" for when, action in actions[max(0, at - SHOWN_ACTIONS) : at + 1]]
-            failures += [[sentence, *before] for sentence in found.violations[len(failures) :]]
-    return found, failures
+            failures += [[str(violation), *before] for violation in checker.violations[len(failures) :]]
+    return checker, failures
 
 
 def run_on_the_wire(seed: int, seconds: float, period_us: int, keep: Path | None = None) -> Outcome:
@@ -393,9 +394,9 @@ def run_on_the_wire(seed: int, seconds: float, period_us: int, keep: Path | None
         finally:
             platform.end()
         path.with_suffix(".txt").write_text("".join(f"{when * 1e-9:.4f} {action}\n" for when, action in client.actions))
-        found, failures = check(path, period_s, session.changes, client.actions)
+        checker, failures = check(path, period_s, session.changes, client.actions)
     failures += [[f"{when * 1e-9:.4f} {defect}"] for when, defect in client.defects]
     return Outcome(
-        1, found.frames, found.obeyed, seconds, client.taken, client.refused, client.happenings, session.states,
-        found.largest_step, found.largest_acceleration, [(seed, sentences) for sentences in failures],
+        1, checker.frames, checker.obeyed, seconds, client.taken, client.refused, client.faults, session.states,
+        checker.largest_step, checker.largest_acceleration, [(seed, sentences) for sentences in failures],
     )  # fmt: skip

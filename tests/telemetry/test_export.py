@@ -1,4 +1,4 @@
-"""Recordings in other formats, and as pictures: the same records, all of them; peaks that no picture loses."""
+"""Recordings in other formats and as pictures: all records, and no lost peaks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_mcap_of_a_span_has_the_records_numbers_times_topics_and_messages_of_the
     for topic in ("/cycle", "/joint_states", "/joint_commands", "/joint_targets"):
         assert times(out, topic) == times(path, topic)[200:2001]
     assert times(out, "/tf")
-    # Years later too a viewer's time begins where the recording does.
+    # A viewer's time begins where the recording does, also years later.
     assert times(out, "/robot_description")[0] <= times(out, "/cycle")[0]
 
 
@@ -50,10 +50,10 @@ def test_csv_is_that_of_the_recorder_or_the_chosen_signals(tmp_path: Path) -> No
 
 def test_npz_has_a_name_a_signal_and_seconds(tmp_path: Path) -> None:
     export(Reader(mcap(tmp_path / "a.mcap"), ["sent_position"], 1.0), tmp_path / "b.npz")
-    with np.load(tmp_path / "b.npz") as found:
-        assert set(found) == {"seconds", "number", "time_ns", "sent_position"}
-        assert np.array_equal(found["sent_position"], cycles()["sent_position"][2000:])
-        assert found["seconds"][0] == pytest.approx(1.0)
+    with np.load(tmp_path / "b.npz") as arrays:
+        assert set(arrays) == {"seconds", "number", "time_ns", "sent_position"}
+        assert np.array_equal(arrays["sent_position"], cycles()["sent_position"][2000:])
+        assert arrays["seconds"][0] == pytest.approx(1.0)
 
 
 def test_a_file_that_exists_is_kept_unless_it_is_to_be_replaced_and_the_recording_always(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_an_error_in_the_middle_leaves_nothing_half_written(tmp_path: Path, monk
     monkeypatch.setattr(recorder.CsvWriter, "write", write)
     with pytest.raises(RecordingError, match="No space left on device"):
         export(Reader(path), tmp_path / "b.csv")
-    assert [one.name for one in tmp_path.iterdir()] == ["a.mcap"]
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mcap"]
 
 
 def test_a_recording_of_another_schema_is_exported_and_drawn_with_its_units(tmp_path: Path) -> None:
@@ -111,8 +111,8 @@ def test_a_recording_of_another_schema_is_exported_and_drawn_with_its_units(tmp_
         )
     again = read(tmp_path / "b.csv")
     assert again.records["kiln_zones"][-1].tolist() == [1000.0, 2000.0, 3000.0]
-    with np.load(tmp_path / "b.npz") as found:
-        assert set(found) == {*OTHER.names, "seconds"}
+    with np.load(tmp_path / "b.npz") as arrays:
+        assert set(arrays) == {*OTHER.names, "seconds"}
     drawn = figure(Reader(path))
     assert [axes.get_ylabel() for axes in drawn.axes] == ["actual position\nrad"]
     drawn = figure(Reader(path, ["kiln_*"]))
@@ -135,7 +135,7 @@ def test_an_envelope_keeps_the_extremes_of_any_number_of_values_in_rising_time()
     envelope = Envelope(1e-3, 2)
     for at in range(0, len(values), 700):
         part = values[at : at + 700]
-        envelope.add((at + np.arange(len(part))) * 1e-3, part)
+        envelope.add(np.arange(at, at + len(part), dtype=np.float64) * 1e-3, part)
     times, drawn = envelope.curve()
     assert len(times) <= 8192
     assert (np.diff(times) >= 0).all()

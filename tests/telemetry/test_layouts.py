@@ -1,4 +1,4 @@
-"""The shipped layouts against the topics and fields that there are."""
+"""The shipped layouts against the existing topics and fields."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def values(node: Any, key: str) -> Iterator[Any]:
 def test_the_layout_of_foxglove_shows_panels_and_fields_that_exist() -> None:
     layout = json.loads((LAYOUTS / "foxglove.json").read_text())
     panels = layout["configById"]
-    placed = [one for key in ("first", "second") for one in values(layout["layout"], key) if isinstance(one, str)]
+    placed = [value for key in ("first", "second") for value in values(layout["layout"], key) if isinstance(value, str)]
     assert sorted(placed) == sorted(panels)
     shown = [value.replace(".", " ", 1) for value in values(panels, "value")]
     assert len(shown) == 24

@@ -1,4 +1,4 @@
-"""Recordings read back, as the recorder's own writers leave them: whole, in spans, cut off; and what is none."""
+"""Recordings of the recorder's writers read back: whole, in spans, cut off; and files that are none."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
+from foxglove import Context
 
 from rtcp.api.feed import Records
 from rtcp.config import default_config, load
-from rtcp.ipc.recording import WARNING, About, FaultRecording, RecordingError, cycle_messages, cycle_type, write
+from rtcp.ipc.cycle_channels import CycleChannels, McapFile
+from rtcp.ipc.observer import WARNING
+from rtcp.ipc.recording import RecordingError, cycle_type, write
 from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
 from rtcp.ipc.states import DriveState
 from rtcp.telemetry.channels import Channels, fields_of
 from rtcp.telemetry.reading import Reader, read
 from rtcp.telemetry.recorder import CsvWriter, McapWriter
+from tests.gateway.test_recording import recording
 
 CONFIG = load(default_config())
 PERIOD_NS, OFFSET_NS = 500_000, 1_790_000_000_000_000_000
@@ -67,7 +70,7 @@ OTHER = RecordSchema((
     Field("kiln_kelvin", "float32", "K", "Inside.", part="kiln"),
     replace(SCHEMA["actual_position"], shape=(2,)), Field("kiln_zones", "float64", "W", "Heat.", (3,), "kiln"),
 ))  # fmt: skip
-"""Of another version or platform: fields that nobody here knows, and few of those that are known."""
+"""Schema of another version or platform: unknown fields, and few of the known ones."""
 
 
 def of_another_schema(path: Path) -> Path:
@@ -77,24 +80,19 @@ def of_another_schema(path: Path) -> Path:
     rows["time_ns"] = 7_000_000_000 + rows["number"] * PERIOD_NS
     rows["kiln_kelvin"] = 300 + rows["number"]
     rows["kiln_zones"] = rows["number"][:, None] * [1.0, 2.0, 3.0]
-    with open(path, "wb") as file:
-        writer = Writer(file)
-        writer.start()
-        kind = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", OTHER.definition())
-        channel = writer.register_channel("/cycle", "cdr", kind)
-        for row, message in zip(rows, cycle_messages(rows, rows.dtype), strict=True):
-            when = int(row["time_ns"]) + OFFSET_NS
-            writer.add_message(channel, when, message, when)
-        writer.finish()  # type: ignore[no-untyped-call]
+    channels = CycleChannels(OTHER, OFFSET_NS)
+    file = McapFile(path, channels.context, {})
+    channels.publish(rows)
+    file.complete()
     return path
 
 
 def test_a_recording_of_another_schema_is_read_with_all_that_it_has(tmp_path: Path) -> None:
     path = of_another_schema(tmp_path / "a.mcap")
-    found, reader = read(path), Reader(path)
-    assert found.records.dtype.names == OTHER.names
-    assert found.records["kiln_zones"][-1].tolist() == [1000.0, 2000.0, 3000.0]
-    assert found.period_s == pytest.approx(500e-6)
+    recording, reader = read(path), Reader(path)
+    assert recording.records.dtype.names == OTHER.names
+    assert recording.records["kiln_zones"][-1].tolist() == [1000.0, 2000.0, 3000.0]
+    assert recording.period_s == pytest.approx(500e-6)
     assert len(list(reader)) >= 1
     assert reader.schema == OTHER
     with pytest.raises(
@@ -105,54 +103,49 @@ def test_a_recording_of_another_schema_is_read_with_all_that_it_has(tmp_path: Pa
 
 def test_a_recording_is_read_as_it_was_written(tmp_path: Path) -> None:
     written = cycles()
-    found = read(mcap(tmp_path / "a.mcap"))
-    assert found.config == CONFIG
-    assert found.about["arm"] == CONFIG.name
+    recording = read(mcap(tmp_path / "a.mcap"))
+    assert recording.config == CONFIG
+    assert recording.about["arm"] == CONFIG.name
     for name in written.dtype.names or ():
-        assert np.array_equal(found.records[name], written[name]), name
-    assert (found.period_s, found.missing, found.truncated) == (pytest.approx(500e-6), 0, False)
-    assert found.seconds[[0, -1]] == pytest.approx([0.0, 3999 * 500e-6])
-    assert [(one.message, one.level) for one in found.log] == [("a warning", WARNING)]
-    assert found.log_s == (pytest.approx(250 * 500e-6),)
+        assert np.array_equal(recording.records[name], written[name]), name
+    assert (recording.period_s, recording.missing, recording.truncated) == (pytest.approx(500e-6), 0, False)
+    assert recording.seconds[[0, -1]] == pytest.approx([0.0, 3999 * 500e-6])
+    assert [(line.message, line.level) for line in recording.log] == [("a warning", WARNING)]
+    assert recording.log_s == (pytest.approx(250 * 500e-6),)
 
 
 def test_chosen_signals_of_a_span_are_read_with_numbers_and_times(tmp_path: Path) -> None:
-    found = read(mcap(tmp_path / "a.mcap"), ["sent_*", "wakeup_ns"], 1.0, 1.5)
-    assert found.records.dtype.names == (
+    recording = read(mcap(tmp_path / "a.mcap"), ["sent_*", "wakeup_ns"], 1.0, 1.5)
+    assert recording.records.dtype.names == (
         "number", "time_ns", "wakeup_ns", "sent_position", "sent_velocity", "sent_torque"
     )  # fmt: skip
-    assert found.seconds[[0, -1]] == pytest.approx([1.0, 1.5])
-    assert np.array_equal(found.records["sent_velocity"], cycles()["sent_velocity"][2000:3001])
-    assert found.log == ()
+    assert recording.seconds[[0, -1]] == pytest.approx([1.0, 1.5])
+    assert np.array_equal(recording.records["sent_velocity"], cycles()["sent_velocity"][2000:3001])
+    assert recording.log == ()
 
 
 def test_gaps_are_counted_also_in_a_recording_of_every_tenth_cycle(tmp_path: Path) -> None:
     tenth = cycles()[::10]
-    found = read(mcap(tmp_path / "a.mcap", np.delete(tenth, [5, 6, 7, 300])))
-    assert (found.missing, found.period_s) == (4, pytest.approx(5e-3))
+    recording = read(mcap(tmp_path / "a.mcap", np.delete(tenth, [5, 6, 7, 300])))
+    assert (recording.missing, recording.period_s) == (4, pytest.approx(5e-3))
 
 
 @pytest.mark.parametrize("signals", [(), ("*_position", "wakeup_ns")])
 def test_csv_is_read_as_mcap_is_but_for_what_it_does_not_have(tmp_path: Path, signals: tuple[str, ...]) -> None:
-    found = read(csv(tmp_path / "a.csv", signals=signals), ["actual_position", "sent_position"], 0.5)
+    recording = read(csv(tmp_path / "a.csv", signals=signals), ["actual_position", "sent_position"], 0.5)
     wanted = cycles()[1000:]
     for name in ("actual_position", "sent_position"):
-        assert found.records[name] == pytest.approx(wanted[name], abs=1e-8)
-    assert found.seconds == pytest.approx(np.arange(1000, 4000) * 500e-6)
-    assert (found.config, found.period_s, found.missing) == (None, pytest.approx(500e-6), 0)
+        assert recording.records[name] == pytest.approx(wanted[name], abs=1e-8)
+    assert recording.seconds == pytest.approx(np.arange(1000, 4000) * 500e-6)
+    assert (recording.config, recording.period_s, recording.missing) == (None, pytest.approx(500e-6), 0)
 
 
 def test_a_fault_of_the_black_box_is_read_by_the_same_reader(tmp_path: Path) -> None:
-    records = cycles(100)
-    about = About(
-        number=0, time_ns=OFFSET_NS, what="a fault", before="moving", arm="arm", bus="virtual", period_ns=PERIOD_NS,
-        joints=tuple(joint.name for joint in CONFIG.joints), versions={"rtcp": "1"}, began_ns=5, event=7, at=50,
-        notes=(), timeline=(),
-    )  # fmt: skip
-    _, path = write(tmp_path, FaultRecording(about, {name: records[name] for name in SCHEMA.names}, SCHEMA))
-    found = read(path, ["actual_torque"])
-    assert np.array_equal(found.records["actual_torque"], records["actual_torque"])
-    assert (found.about["fault"], found.period_s, found.config) == ("a fault", pytest.approx(500e-6), None)
+    fault = recording()
+    faulty = read(write(tmp_path, fault)[1], ["actual_position"])
+    assert np.array_equal(faulty.records["actual_position"], fault.records["actual_position"])
+    assert (faulty.about["fault"], faulty.config) == (fault.about.what, None)
+    assert Reader(faulty.path).period_s == pytest.approx(500e-6)
 
 
 @pytest.mark.parametrize("write_file", [mcap, csv])
@@ -163,12 +156,12 @@ def test_of_a_file_cut_off_anywhere_all_that_is_whole_is_read(tmp_path: Path, wr
     for length in [0, 4, 8, *sorted(chance.integers(9, len(whole), 25)), len(whole) - 1]:
         path.write_bytes(whole[:length])
         try:
-            found = read(path, ["number"])
+            recording = read(path, ["number"])
         except RecordingError as error:
             refused.append(error.kind)
             continue
-        numbers = found.records["number"].astype(int)
-        assert found.truncated or (path.suffix == ".csv" and whole[length - 1 : length] == b"\n")
+        numbers = recording.records["number"].astype(int)
+        assert recording.truncated or (path.suffix == ".csv" and whole[length - 1 : length] == b"\n")
         assert len(numbers) >= read_before
         assert np.array_equal(numbers - numbers[0], np.arange(len(numbers)))
         read_before = len(numbers)
@@ -184,31 +177,28 @@ def test_changed_bytes_are_read_up_to_there_or_refused(tmp_path: Path) -> None:
     for at in chance.integers(0, len(whole), 40):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x5A]) + whole[at + 1 :])
         try:
-            found = read(path, ["actual_position"])
+            recording = read(path, ["actual_position"])
         except RecordingError:
             continue
-        count = len(found.records)
-        assert np.array_equal(found.records["actual_position"], cycles()["actual_position"][:count])
-        read_in_part += found.truncated
+        count = len(recording.records)
+        assert np.array_equal(recording.records["actual_position"], cycles()["actual_position"][:count])
+        read_in_part += recording.truncated
     assert read_in_part > 10
 
 
 def test_one_field_of_many_cycles_needs_a_fraction_of_the_files_memory(tmp_path: Path) -> None:
     path = mcap(tmp_path / "a.mcap", cycles(20_000))
     tracemalloc.start()
-    found = read(path, ["wakeup_ns"])
+    recording = read(path, ["wakeup_ns"])
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert len(found.records) == 20_000
+    assert len(recording.records) == 20_000
     assert peak < 4e6 < 20_000 * cycle_type(SCHEMA).itemsize / 2
 
 
 def foreign(path: Path) -> Path:
-    """A recording of somebody else's: MCAP without cycles."""
-    with open(path, "wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.finish()  # type: ignore[no-untyped-call]
+    """A recording of another program: MCAP without cycles."""
+    McapFile(path, Context(), {}).complete()
     return path
 
 

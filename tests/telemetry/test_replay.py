@@ -1,4 +1,4 @@
-"""Recorded motions as trajectories: near what was recorded, few points, accepted by the planner."""
+"""Recorded motions as trajectories: near the recording, few points, accepted by the planner."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ TARGETS = ([0.4, -0.3, 0.5, 0.2, -0.4, 1.0], [0.1, 0.2, 0.9, -0.3, 0.2, 0.0], [0
 
 def moved(count_at_rest: int = 400, targets: Sequence[Sequence[float]] = TARGETS) -> Any:
     """Cycle records of moves as fast as the joints may, with rest between, as a controller sends them."""
-    rows, at = [np.zeros((count_at_rest, 6))], [0.0] * 6
+    rows = [np.zeros((count_at_rest, 6))]
+    at: Sequence[float] = [0.0] * 6
     for target in targets:
         given = InputParameter(6)
         given.current_position, given.target_position = at, target
@@ -73,11 +74,11 @@ def test_setpoints_that_were_sent_again_without_an_answer_are_no_rest_in_the_mot
     again = np.ones(len(whole), int)
     fast = np.flatnonzero(np.abs(np.diff(whole["sent_position"], axis=0)).max(axis=1) > 5e-5)
     again[chance.choice(fast, 80)] += chance.integers(1, 30, 80)
-    held = cycles(int(again.sum()))
-    held["sent_position"] = np.repeat(whole["sent_position"], again, axis=0)
-    held["flags"] = FLAG_ENABLED
-    points = trajectory(read(mcap(tmp_path / "a.mcap", held)), 0.9)
-    plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
+    standing = cycles(int(again.sum()))
+    standing["sent_position"] = np.repeat(whole["sent_position"], again, axis=0)
+    standing["flags"] = FLAG_ENABLED
+    points = trajectory(read(mcap(tmp_path / "a.mcap", standing)), 0.9)
+    plan_trajectory([Point(point["t"], point["q"], point["v"]) for point in points], LIMITS, points[0]["q"])
     assert deviation(points, read(mcap(tmp_path / "b.mcap", whole)), 0.9) < 1e-3
 
 
@@ -93,7 +94,7 @@ def test_the_trajectory_deviates_by_less_than_1_mrad_with_few_points(tmp_path: P
 
 def test_a_motion_at_the_limits_of_the_joints_is_accepted_a_little_slower(tmp_path: Path) -> None:
     points = trajectory(read(mcap(tmp_path / "a.mcap", moved()), ["*_position"]), 0.9)
-    plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
+    plan_trajectory([Point(point["t"], point["q"], point["v"]) for point in points], LIMITS, points[0]["q"])
 
 
 def test_a_motion_that_turns_at_the_end_of_a_range_stays_within_it(tmp_path: Path) -> None:
@@ -101,7 +102,7 @@ def test_a_motion_that_turns_at_the_end_of_a_range_stays_within_it(tmp_path: Pat
     top = LIMITS.high[2]
     targets = ([0.5, -0.3, 0.4, 0.0, -0.2, 1.0], [0.0, 0.2, top, 0.0, 0.6, 0.0], [0.3, 0.2, top, 0.0, 0.6, 0.0])
     points = trajectory(read(mcap(tmp_path / "a.mcap", moved(targets=targets)), ["*_position"]), 0.9)
-    plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
+    plan_trajectory([Point(point["t"], point["q"], point["v"]) for point in points], LIMITS, points[0]["q"])
 
 
 def test_csv_is_replayed_as_mcap_is(tmp_path: Path) -> None:
@@ -140,9 +141,9 @@ def test_a_motion_with_a_gap_or_without_torque_is_not_replayed(tmp_path: Path) -
 def guided() -> Any:
     """Cycle records of a hand: a slow motion with a tremor of 8 Hz, a rest of 3 s, and on."""
     t = np.arange(0.0, 4.0, PERIOD_NS * 1e-9)
-    way = 0.5 * (1.0 - np.cos(np.pi * t / 4.0))
+    progress = 0.5 * (1.0 - np.cos(np.pi * t / 4.0))
     tremor = 0.004 * np.sin(2 * np.pi * 8.0 * t) * np.sin(np.pi * t / 4.0)
-    there = np.outer(way + tremor, [0.4, -0.2, 0.3, 0.1, 0.0, 0.2])
+    there = np.outer(progress + tremor, [0.4, -0.2, 0.3, 0.1, 0.0, 0.2])
     rest = np.tile(there[-1], (round(3.0 / (PERIOD_NS * 1e-9)), 1))
     q = np.concatenate([there, rest, there[-1] + there, np.tile(2 * there[-1], (200, 1))])
     records = cycles(len(q))
@@ -151,7 +152,7 @@ def guided() -> Any:
 
 
 def plan(points: list[dict[str, Any]]) -> None:
-    plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
+    plan_trajectory([Point(point["t"], point["q"], point["v"]) for point in points], LIMITS, points[0]["q"])
 
 
 def test_a_tremor_too_fast_for_the_joints_is_smoothed_away_near_the_recorded_motion(tmp_path: Path) -> None:
@@ -162,9 +163,9 @@ def test_a_tremor_too_fast_for_the_joints_is_smoothed_away_near_the_recorded_mot
     smooth = trajectory(recorded, smooth_hz=1.5)
     plan(smooth)
     assert 0.001 < smoothing_deviation(recorded, 1.5) < 0.01
-    found = np.array([point["q"] for point in smooth])
-    assert (found >= q.min(axis=0) - 1e-6).all()
-    assert (found <= q.max(axis=0) + 1e-6).all()
+    positions = np.array([point["q"] for point in smooth])
+    assert (positions >= q.min(axis=0) - 1e-6).all()
+    assert (positions <= q.max(axis=0) + 1e-6).all()
     assert smooth[0]["v"] == smooth[-1]["v"] == [0.0] * 6
     assert smooth[-1]["q"] == pytest.approx(q[-1], abs=1e-3)
 

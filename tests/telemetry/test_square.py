@@ -1,4 +1,4 @@
-"""The square: where it is put, how it is judged, and its picture."""
+"""The square: its place, its evaluation, and its picture."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def recorded(square: Square, config: ArmConfig, off_m: float) -> Recorded:
     records = np.zeros(len(points), dtype=record_type(arm_schema(6)))
     near = square.start
     for number, (x, y, z) in enumerate(points):
-        found = inverse.solve_near(Pose((x, y, z), rotation), near)
+        solution = inverse.solve_near(Pose((x, y, z), rotation), near)
         beside = inverse.solve_near(Pose((x, y, z + off_m), rotation), near)
-        assert found.q is not None
+        assert solution.q is not None
         assert beside.q is not None
-        near = found.q
-        records[number]["sent_position"], records[number]["actual_position"] = found.q, beside.q
-    seconds = 0.001 * np.arange(len(records))
+        near = solution.q
+        records[number]["sent_position"], records[number]["actual_position"] = solution.q, beside.q
+    seconds = 0.001 * np.arange(len(records), dtype=np.float64)
     return Recorded(Path("square.mcap"), {}, config, records, seconds, 0.001, 0, (), (), False)
 
 

@@ -1,6 +1,8 @@
-"""A real master, pysoem unchanged, that knows no device: `any_child.py PID INTERFACE [OUTPUTS_HEX ...]`; tells in JSON.
+"""A real master, unmodified pysoem, without any device description.
 
-It maps what it finds, brings all to OP, sends these outputs (whole images, slave by slave) and tells the inputs.
+    python -m tests.virtual.any_child PID INTERFACE [OUTPUTS_HEX ...]
+
+brings the slaves in the namespaces of process PID to OP, sends the outputs (one image a slave) and prints JSON.
 """
 
 from __future__ import annotations
@@ -10,7 +12,8 @@ import sys
 import time
 
 import pysoem
-from soem_child import join, without_blocking
+
+from tests.virtual.soem_child import join, without_blocking
 
 PATIENCE_US = 2_000_000
 PERIOD_S = 0.004
@@ -19,7 +22,7 @@ PERIOD_S = 0.004
 def delay(slave: pysoem.CdefSlave) -> int | None:
     try:
         return int.from_bytes(slave._fprd(0x0928, 4), "little")
-    except pysoem.WkcError:  # it has no clock
+    except pysoem.WkcError:  # no clock
         return None
 
 
@@ -30,13 +33,13 @@ def main() -> None:
     pysoem.settings.timeouts.safe = pysoem.settings.timeouts.eeprom = PATIENCE_US
     master = pysoem.Master()
     without_blocking(master, interface)
-    found: dict[str, object] = {"found": master.config_init()}
-    found["names"] = [slave.name for slave in master.slaves]
+    result: dict[str, object] = {"slaves": master.config_init()}
+    result["names"] = [slave.name for slave in master.slaves]
     master.state_check(pysoem.PREOP_STATE, PATIENCE_US)
-    found["bytes"] = master.config_map()
-    found["dc"] = master.config_dc()
-    found["safe_op"] = master.state_check(pysoem.SAFEOP_STATE, PATIENCE_US)
-    found["codes"] = [[slave.state, slave.al_status] for slave in master.slaves]
+    result["bytes"] = master.config_map()
+    result["dc"] = master.config_dc()
+    result["safe_op"] = master.state_check(pysoem.SAFEOP_STATE, PATIENCE_US)
+    result["codes"] = [[slave.state, slave.al_status] for slave in master.slaves]
     for slave, data in zip(master.slaves, outputs, strict=False):
         slave.output = bytes.fromhex(data)
     master.state = pysoem.OP_STATE
@@ -46,17 +49,17 @@ def main() -> None:
         master.send_processdata()
         counters.append(master.receive_processdata(20_000))
         time.sleep(PERIOD_S)
-    found["state"] = master.read_state()
-    found["codes"] = [[slave.state, slave.al_status] for slave in master.slaves]
-    found["expected"] = master.expected_wkc
-    found["counters"] = counters[20:]
-    found["inputs"] = [slave.input.hex() for slave in master.slaves]
-    found["outputs"] = [slave.output.hex() for slave in master.slaves]
-    found["delays"] = [delay(slave) for slave in master.slaves]
+    result["state"] = master.read_state()
+    result["codes"] = [[slave.state, slave.al_status] for slave in master.slaves]
+    result["expected"] = master.expected_wkc
+    result["counters"] = counters[20:]
+    result["inputs"] = [slave.input.hex() for slave in master.slaves]
+    result["outputs"] = [slave.output.hex() for slave in master.slaves]
+    result["delays"] = [delay(slave) for slave in master.slaves]
     master.state = pysoem.INIT_STATE
     master.write_state()
     master.close()
-    print(json.dumps(found))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

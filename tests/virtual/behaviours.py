@@ -1,10 +1,10 @@
-"""Behaviours as a user writes them beside the file of a segment."""
+"""Behaviours as a user writes them for a segment."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 from rtcp.virtual.behaviour import Behaviour, FileBusy, FileRefused, FoeError, Option, SdoAbort
 
@@ -50,7 +50,7 @@ class Raises(Behaviour):
 
 
 class Hangs(Behaviour):
-    """Never comes back in OP, and catches what it can."""
+    """Never returns in OP, and catches every Exception."""
 
     def on_outputs(self, dt: float) -> None:
         while self.outputs_valid:
@@ -61,7 +61,7 @@ class Hangs(Behaviour):
 
 
 class Swallows(Behaviour):
-    """Never comes back, and catches all."""
+    """Never returns, and catches everything."""
 
     def on_outputs(self, dt: float) -> None:
         while True:
@@ -72,25 +72,25 @@ class Swallows(Behaviour):
 
 
 class HangsInC(Behaviour):
-    """Does not come back to Python."""
+    """Stays in C code."""
 
     def on_outputs(self, dt: float) -> None:
         sum(range(10**11))
 
 
 class Breaks(Behaviour):
-    """Leaves behind what the slave cannot use."""
+    """Breaks the slave's own state."""
 
     def on_outputs(self, dt: float) -> None:
         if self.outputs_valid:
-            self.device.objects = None  # type: ignore[assignment]
+            self.device.objects = None
             self.fail()
 
 
 class Rubbish(Behaviour):
-    """Returns and raises what a test puts here."""
+    """Returns or raises whatever `act` does."""
 
-    act: ClassVar[Callable[[], Any]]
+    act: Callable[[], Any]
 
     def read_file(self, name: str) -> Any:
         return self.act()

@@ -1,4 +1,4 @@
-"""A real master, pysoem unchanged, updates firmware in BOOT: `boot_child.py PID INTERFACE`; tells in JSON."""
+"""A real master, unmodified pysoem, updates firmware in BOOT and prints the result as JSON: PID INTERFACE."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import struct
 import sys
 
 import pysoem
-from soem_child import join, without_blocking
+
+from tests.virtual.soem_child import join, without_blocking
 
 PATIENCE_US = 2_000_000
 FIRMWARE = bytes(range(256)) * 20
@@ -34,22 +35,22 @@ def main() -> None:
     slave.amend_mbx("in", tx_start, tx_length)
     slave.state = pysoem.BOOT_STATE
     slave.write_state()
-    found: dict[str, object] = {"boot": slave.state_check(pysoem.BOOT_STATE, PATIENCE_US)}
+    result: dict[str, object] = {"boot": slave.state_check(pysoem.BOOT_STATE, PATIENCE_US)}
     slave.foe_write("firmware", 0x1234, FIRMWARE, PATIENCE_US)
-    found["read"] = slave.foe_read("firmware", 0x1234, len(FIRMWARE) + 1000, PATIENCE_US).hex()
-    found["written"] = FIRMWARE.hex()
+    result["read"] = slave.foe_read("firmware", 0x1234, len(FIRMWARE) + 1000, PATIENCE_US).hex()
+    result["written"] = FIRMWARE.hex()
     try:
         slave.sdo_read(0x1018, 1)
-        found["no_coe_in_boot"] = False
+        result["no_coe_in_boot"] = False
     except (pysoem.SdoError, pysoem.MailboxError, pysoem.PacketError, pysoem.WkcError):
-        found["no_coe_in_boot"] = True
+        result["no_coe_in_boot"] = True
     slave.state = pysoem.INIT_STATE
     slave.write_state()
     slave.state_check(pysoem.INIT_STATE, PATIENCE_US)
     master.config_init()
-    found["after"] = master.state_check(pysoem.PREOP_STATE, PATIENCE_US)
+    result["after"] = master.state_check(pysoem.PREOP_STATE, PATIENCE_US)
     master.close()
-    print(json.dumps(found))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,8 @@ BY_POSITION, BY_STATION, TO_ALL = (1, 2, 3, 13), (4, 5, 6, 14), (7, 8, 9)
 LOGICAL = (10, 11, 12)
 
 
-class Datagram(NamedTuple):
+@dataclass(frozen=True)
+class Datagram:
     """One command of a frame."""
 
     command: int
@@ -70,15 +71,17 @@ def _resolution(options: bytes) -> int:
 
 def datagrams(frame: bytes) -> list[Datagram]:
     """Return the datagrams of an EtherCAT frame."""
-    at, found = 16, []
+    at, parsed = 16, []
     more = True
     while more and at + 12 <= len(frame):
         command, index, station, address, length, _ = struct.unpack_from("<BBHHHH", frame, at)
         more, size = bool(length & 0x8000), length & 0x7FF
         data = frame[at + 10 : at + 10 + size]
-        found.append(Datagram(command, index, station, address, data, *struct.unpack_from("<H", frame, at + 10 + size)))
+        parsed.append(
+            Datagram(command, index, station, address, data, *struct.unpack_from("<H", frame, at + 10 + size))
+        )
         at += 12 + size
-    return found
+    return parsed
 
 
 def exchanges(path: Path) -> Iterator[Exchange]:
@@ -97,18 +100,18 @@ def exchanges(path: Path) -> Iterator[Exchange]:
 def eeproms(path: Path) -> dict[int, bytearray]:
     """Return the EEPROM of each slave as far as the master has read it, by station address; unread bytes are 0xFF."""
     images: dict[int, bytearray] = {}
-    asked: dict[int, int] = {}
+    addresses: dict[int, int] = {}
     for exchange in exchanges(path):
-        for sent, came in zip(datagrams(exchange.request), datagrams(exchange.answer), strict=True):
-            if sent.command in (2, 5, 8) and came.wkc and sent.address == _EEPROM_CONTROL and len(sent.data) >= 6:
+        for sent, answer in zip(datagrams(exchange.request), datagrams(exchange.answer), strict=True):
+            if sent.command in (2, 5, 8) and answer.wkc and sent.address == _EEPROM_CONTROL and len(sent.data) >= 6:
                 station = sent.station
-                asked[station] = int.from_bytes(sent.data[2:6], "little")
-            elif sent.command in (1, 4) and came.wkc:
+                addresses[station] = int.from_bytes(sent.data[2:6], "little")
+            elif sent.command in (1, 4) and answer.wkc:
                 start = _EEPROM_DATA - sent.address
-                if 0 <= start < len(came.data) and sent.station in asked and sent.address >= _EEPROM_CONTROL:
-                    data = came.data[start : start + 8]
+                if 0 <= start < len(answer.data) and sent.station in addresses and sent.address >= _EEPROM_CONTROL:
+                    data = answer.data[start : start + 8]
                     image = images.setdefault(sent.station, bytearray(b"\xff" * 4096))
-                    at = 2 * asked[sent.station]
+                    at = 2 * addresses[sent.station]
                     image[at : at + len(data)] = data
     return images
 

@@ -1,4 +1,4 @@
-"""What tests of described slaves share: a segment in a process, and a master that knows no device."""
+"""Shared by the tests of described slaves: a segment in a process, and a master without device descriptions."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 
+from rtcp.virtual.objects import SdoAbort
+
 ROOT = Path(__file__).parents[2]
 VENDOR = Path(__file__).with_name("vendor.xml")
 
@@ -20,18 +22,25 @@ Master = Callable[..., dict[str, Any]]
 
 @pytest.fixture
 def master(tmp_path: Path) -> Master:
-    """Bring a segment of these entries (YAML) to OP with pysoem, send outputs (hex); return what it found."""
+    """Bring a segment of these entries (YAML) to OP with pysoem, send outputs (hex); return the master's result."""
 
     def run(*entries: str, outputs: tuple[str, ...] = ()) -> dict[str, Any]:
         config = tmp_path / "segment.yaml"
         config.write_text("slaves:\n" + "".join(f"- {{{entry}}}\n" for entry in entries), encoding="utf-8")
         with segment(config) as pid:
-            command = [sys.executable, str(Path(__file__).with_name("any_child.py")), str(pid), "ecat0", *outputs]
+            command = [sys.executable, "-m", "tests.virtual.any_child", str(pid), "ecat0", *outputs]
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT)
-        found: dict[str, Any] = json.loads(done.stdout)
-        return found
+        result: dict[str, Any] = json.loads(done.stdout)
+        return result
 
     return run
+
+
+def abort_of(call: Callable[..., object], *arguments: object) -> int:
+    """Return the code with which an SDO service is aborted."""
+    with pytest.raises(SdoAbort) as caught:
+        call(*arguments)
+    return caught.value.code
 
 
 @contextmanager
@@ -40,7 +49,6 @@ def segment(config: Path, *options: str) -> Iterator[int]:
     command = [sys.executable, "-m", "rtcp.virtual", "--config", str(config), *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
-        assert process.stdout is not None
         yield int(json.loads(process.stdout.readline())["pid"])
     finally:
         process.kill()

@@ -1,4 +1,4 @@
-"""Models as a package of another maker has them: one that serves files over FoE, one that is too long."""
+"""Models of another package: a file server over FoE, and a device with too long process data."""
 
 from __future__ import annotations
 

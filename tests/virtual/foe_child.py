@@ -1,4 +1,4 @@
-"""A real master, pysoem unchanged, reads and writes files over FoE: `foe_child.py PID INTERFACE`; tells in JSON."""
+"""A real master, unmodified pysoem, reads and writes files over FoE and prints them as JSON: PID INTERFACE."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import json
 import sys
 
 import pysoem
-from soem_child import join, without_blocking
+
+from tests.virtual.soem_child import join, without_blocking
 
 PATIENCE_US = 2_000_000
 WRITTEN = bytes(range(200, 0, -1)) * 2
@@ -21,12 +22,12 @@ def main() -> None:
     master.config_init()
     master.state_check(pysoem.PREOP_STATE, PATIENCE_US)
     (slave,) = master.slaves
-    found = {"firmware": slave.foe_read("firmware", 0, 4096, PATIENCE_US).hex()}
+    result = {"firmware": slave.foe_read("firmware", 0, 4096, PATIENCE_US).hex()}
     slave.foe_write("settings", 0, WRITTEN, PATIENCE_US)
-    found["settings"] = slave.foe_read("settings", 0, 4096, PATIENCE_US).hex()
-    found["written"] = WRITTEN.hex()
+    result["settings"] = slave.foe_read("settings", 0, 4096, PATIENCE_US).hex()
+    result["written"] = WRITTEN.hex()
     master.close()
-    print(json.dumps(found))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

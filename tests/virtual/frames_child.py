@@ -1,4 +1,4 @@
-"""A raw master in a process of its own: sends broadcast reads and prints in JSON what came back.
+"""A raw master in a process of its own: sends broadcast reads and prints statistics of the answers as JSON.
 
     python frames_child.py PID INTERFACE FRAMES PERIOD_US [VLAN]
 
@@ -40,11 +40,13 @@ def main() -> None:
     link = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(protocol))
     link.setsockopt(263, PACKET_AUXDATA, 1)
     link.bind((interface, protocol))
-    # The answer's source address tells it from the own frame.
+    # An answer differs from its own frame in the source address.
     link.setblocking(False)
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(60))
-    late, lost, counters, tags = 0, 0, set(), set()
+    late, lost = 0, 0
+    counters: set[int] = set()
+    tags: set[int] = set()
     used = cpu_seconds(pid)
     started = due = time.monotonic()
     rest_at = started
@@ -53,7 +55,7 @@ def main() -> None:
             due += period_us * 1e-6
             time.sleep(max(0.0, due - time.monotonic()))
         elif time.monotonic() > rest_at:
-            # This process is not to be throttled either.
+            # The kernel would throttle this process too.
             time.sleep(0.002)
             rest_at = time.monotonic() + 0.02
         frame = build(Datagram(7, number & 0xFF, 0, 0, bytes(2)))
@@ -76,8 +78,8 @@ def main() -> None:
         else:
             lost += 1
     share = (cpu_seconds(pid) - used) / (time.monotonic() - started)
-    found = {"lost": lost, "late": late, "counters": sorted(counters), "tags": sorted(tags), "cpu_share": share}
-    print(json.dumps(found))
+    result = {"lost": lost, "late": late, "counters": sorted(counters), "tags": sorted(tags), "cpu_share": share}
+    print(json.dumps(result))
 
 
 main()

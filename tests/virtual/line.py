@@ -1,4 +1,4 @@
-"""A segment of tiny devices in simulated time, and the few things a master does to it, with hand-written datagrams."""
+"""A segment in simulated time, and a minimal master with hand-written datagrams."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ class TinyDevice(DeviceModel):
 class Line:
     """The segment, its devices and the time."""
 
-    def __init__(self, devices: Sequence[TinyDevice] | None = None, drifts: Sequence[float] | None = None,
+    def __init__(self, devices: Sequence[DeviceModel] | None = None, drifts: Sequence[float] | None = None,
                  delays: Sequence[int] | None = None, aliases: Sequence[int] | None = None) -> None:  # fmt: skip
-        self.devices = [TinyDevice() for _ in range(3)] if devices is None else list(devices)
+        self.devices: list[DeviceModel] = [TinyDevice() for _ in range(3)] if devices is None else list(devices)
         count = len(self.devices)
         self.now = 50 * MS
         self.slaves = make_slaves(
@@ -74,8 +74,13 @@ class Line:
         )  # fmt: skip
         self.segment = Segment(self.slaves, self.now)
 
+    @property
+    def tiny(self) -> list[TinyDevice]:
+        """The tiny devices among them, in order."""
+        return [device for device in self.devices if isinstance(device, TinyDevice)]
+
     def pass_time(self, ns: int) -> None:
-        """Let time pass, with every event at its instant."""
+        """Advance time; each event runs at its instant."""
         until = self.now + ns
         while self.segment.next_event <= until:
             self.now = max(self.now, self.segment.next_event)
@@ -88,7 +93,7 @@ class Line:
             self.segment.step_one()
 
     def raw(self, frame: bytes) -> bytes | None:
-        """Send a frame as it is; return it as it comes back, None if it does not."""
+        """Send a frame unchanged; return it as it comes back, None if it is lost."""
         buffer = bytearray(frame)
         answered = self.segment.process(buffer, len(frame), self.now)
         self.segment.settle(self.now)
@@ -98,7 +103,6 @@ class Line:
     def send(self, *datagrams: Datagram, after: int = 100_000) -> list[Datagram]:
         self.pass_time(after)
         answer = self.raw(build(*datagrams))
-        assert answer is not None
         return list(parse(answer))
 
     def one(self, command: DatagramCommand, address: int, offset: int, data: bytes) -> Datagram:
@@ -188,6 +192,23 @@ def start_sync0(line: Line, slave: int, cycle: int, first_in: int = 10 * MS) -> 
     line.write(slave, 0x0981, b"\x03")
 
 
+def by_sync0(device: TinyDevice, cycle: int = MS) -> Line:
+    """One slave in OP whose SYNC0 comes half a cycle after each frame."""
+    line = Line([device])
+    line.to_pre_op()
+    line.configure_process_data()
+    start_sync0(line, 0, cycle, first_in=50 * MS)
+    assert line.request(0, SAFE_OP) == (SAFE_OP, 0)
+    due = line.slaves[0].esc.dc.sync0.due
+    line.pass_time((due - line.now) % cycle + cycle // 2)
+    line.write(0, 0x0120, b"\x08\x00")
+    line.pass_time(cycle - 100_000)
+    for _ in range(100):
+        line.exchange(1, after=cycle)
+    assert line.slaves[0].application.state == OP
+    return line
+
+
 def begin(segment: Segment, fault: Fault, t: int, lasts: float | None = None) -> ActiveFault:
-    """Let a fault begin at instant `t`; a call of what is returned ends it."""
+    """Begin a fault at instant `t`; calling the result ends it."""
     return ActiveFault(Planned(fault, lasts=lasts), segment, Frames(lambda frame: None), t)

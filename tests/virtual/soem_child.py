@@ -1,4 +1,4 @@
-"""A real master, pysoem unchanged, in a process of its own: brings a segment to OP and tells in JSON what it found.
+"""A real master, unmodified pysoem, in a process of its own: brings a segment to OP and prints the result as JSON.
 
     python soem_child.py PID|- INTERFACE CYCLES [PID_TO_STOP]
 
@@ -40,7 +40,7 @@ def without_blocking(master: pysoem.Master, interface: str) -> None:
 
 
 def read(slave: pysoem.CdefSlave, register: int) -> int:
-    """A register of four bytes; asked for again where the machine stalled longer than the frame's patience."""
+    """A register of four bytes; read again if the host stalled beyond the frame's timeout."""
     for _ in range(5):
         try:
             return int.from_bytes(slave._fprd(register, 4), "little")
@@ -54,17 +54,17 @@ def main() -> None:
     to_stop = int(sys.argv[4]) if len(sys.argv) > 4 else None
     if pid != "-":
         join(pid)
-    # By default SOEM takes an answer after 2 ms for lost; a shared host stands still for longer.
+    # By default SOEM waits 2 ms for a frame; a shared host stalls for longer.
     pysoem.settings.timeouts.ret = 40_000
     pysoem.settings.timeouts.safe = pysoem.settings.timeouts.eeprom = 2_000_000
     master = pysoem.Master()
     without_blocking(master, interface)
-    result: dict[str, object] = {"found": master.config_init()}
+    result: dict[str, object] = {"slaves": master.config_init()}
     master.state_check(pysoem.PREOP_STATE, 2_000_000)
     synchronous = []
     for slave in master.slaves:
         try:
-            # A stall of the machine that runs the test is not what is tested: no sync error.
+            # No sync error when the host of the test stalls.
             slave.sdo_write(0x10F1, 2, bytes(2))
             synchronous.append(slave)
         except pysoem.SdoError:

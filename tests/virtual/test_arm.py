@@ -18,7 +18,6 @@ from rtcp.virtual.models import CubemarsDrive, create
 from rtcp.virtual.segment import make_segment
 
 ARM = load(default_config())
-assert ARM.arm is not None
 MODEL = ARM.arm
 Q = (0.3, -0.5, 1.4, 0.4, 0.9, -0.7)
 STEP = 1e-5
@@ -26,17 +25,17 @@ STEP = 1e-5
 
 def slopes(function: Callable[[Sequence[float]], float]) -> list[float]:
     """The derivatives of a function of the joints at Q."""
-    found = []
+    derivatives = []
     for joint in range(6):
         ahead, behind = ([q + sign * STEP * (i == joint) for i, q in enumerate(Q)] for sign in (1.0, -1.0))
-        found.append((function(ahead) - function(behind)) / (2.0 * STEP))
-    return found
+        derivatives.append((function(ahead) - function(behind)) / (2.0 * STEP))
+    return derivatives
 
 
 def energy(q: Sequence[float]) -> float:
     """Potential energy of the links, J."""
     links = zip(frames(MODEL, q), MODEL.links, strict=False)
-    heights = ((link.mass, position[2] + applied(turn, link.centre)[2]) for (position, turn), link in links)
+    heights = ((link.mass, position[2] + applied(rotation, link.centre)[2]) for (position, rotation), link in links)
     return sum(9.80665 * mass * height for mass, height in heights)
 
 
@@ -51,13 +50,13 @@ def test_the_joints_feel_the_weight_of_all_links_and_a_push_by_its_work_beside_w
     weight[1] += 5.0
     assert [drive.mechanics.external_torque for drive in drives] == pytest.approx(weight, abs=1e-6)
     end = Push(x=3.0, y=-7.0, z=2.0).start(segment, Frames(lambda frame: None), 0)
-    other = Push(x=1.0).start(segment, Frames(lambda frame: None), 0)
+    end_of_second = Push(x=1.0).start(segment, Frames(lambda frame: None), 0)
     segment.tick(2 * PERIOD)
     work = slopes(lambda q: sum(a * b for a, b in zip((4.0, -7.0, 2.0), forward(MODEL, q).position, strict=True)))
-    wanted = [a + b for a, b in zip(weight, work, strict=True)]
-    assert [drive.mechanics.external_torque for drive in drives] == pytest.approx(wanted, abs=1e-6)
+    expected = [a + b for a, b in zip(weight, work, strict=True)]
+    assert [drive.mechanics.external_torque for drive in drives] == pytest.approx(expected, abs=1e-6)
     end(0)
-    other(0)
+    end_of_second(0)
     segment.tick(3 * PERIOD)
     assert [drive.mechanics.external_torque for drive in drives] == pytest.approx(weight, abs=1e-6)
 

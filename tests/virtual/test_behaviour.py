@@ -1,4 +1,4 @@
-"""Behaviours of described slaves: what a hook can do, and what one that fails must not do."""
+"""Behaviours of described slaves: abilities of their hooks, and limits to the damage of a failing hook."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.protocol import ERROR_FLAG, MailboxType
 from rtcp.virtual.segment import make_segment
 from tests.virtual import behaviours
-from tests.virtual.conftest import ROOT, described
+from tests.virtual.conftest import ROOT, Master, abort_of, described
 from tests.virtual.line import INIT, MS, Line, TinyDevice
 from tests.virtual.test_described import DRIVE, OP, OUTPUTS, TWO, device
 
 PRE_OP, BOOT = 2, 3
-Master = Callable[..., dict[str, Any]]
 
 
 @pytest.mark.alone
 @pytest.mark.parametrize(
-    ("behaviour", "part", "said"),
+    ("behaviour", "part", "message"),
     [
         ("Raises", "on_outputs", "RuntimeError: out of order"),
         ("Hangs", "on_outputs", "it has not returned for "),
@@ -41,18 +40,18 @@ Master = Callable[..., dict[str, Any]]
     ],
 )
 def test_a_hook_that_raises_or_hangs_or_breaks_its_slave_takes_its_own_slave_out_of_op_with_one_sentence(
-    master: Master, behaviour: str, part: str, said: str, capfd: pytest.CaptureFixture[str]
+    master: Master, behaviour: str, part: str, message: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     failing = described(TWO, f"behaviour: 'tests.virtual.behaviours:{behaviour}'")
-    found = master(described(OUTPUTS), failing, described(DRIVE))
-    assert found["safe_op"] == 4
-    assert found["codes"] == [[OP, 0], [4 | 0x10, 0x0001], [OP, 0]]
+    result = master(described(OUTPUTS), failing, described(DRIVE))
+    assert result["safe_op"] == 4
+    assert result["codes"] == [[OP, 0], [4 | 0x10, 0x0001], [OP, 0]]
     sentences = [line for line in capfd.readouterr().err.splitlines() if " failed at " in line]
     assert len(sentences) == 1
     assert f":3: slave 2: {part} failed at {behaviours.__file__}:" in sentences[0]
-    assert said in sentences[0]
-    # The others answer: what the slave in SAFE-OP lacks is its outputs.
-    assert found["counters"][-10:].count(2 + 1 + 3) >= 8
+    assert message in sentences[0]
+    # All answer; the slave in SAFE-OP does not take its outputs.
+    assert result["counters"][-10:].count(2 + 1 + 3) >= 8
 
 
 def config_of(folder: Path, behaviour: str) -> Path:
@@ -65,24 +64,24 @@ def config_of(folder: Path, behaviour: str) -> Path:
 
 @pytest.mark.alone
 @pytest.mark.parametrize(
-    ("behaviour", "code", "said"),
+    ("behaviour", "code", "message"),
     [
         ("Swallows", EXIT_HANGING, "a behaviour cannot be ended at {}:"),
         ("HangsInC", -signal.SIGPROF, 'File "{}", line '),
     ],
 )
 def test_a_hook_that_no_exception_ends_ends_the_process_which_says_where(
-    tmp_path: Path, behaviour: str, code: int, said: str
+    tmp_path: Path, behaviour: str, code: int, message: str
 ) -> None:
     config = config_of(tmp_path, f"tests.virtual.behaviours:{behaviour}")
     command = [sys.executable, "-m", "rtcp.virtual", "--config", str(config)]
     ended = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert ended.returncode == code
-    assert said.format(behaviours.__file__) in ended.stderr
+    assert message.format(behaviours.__file__) in ended.stderr
 
 
 CLASS = "from rtcp.virtual.behaviour import Behaviour\nclass Any(Behaviour):\n"
-MADE = {
+UNUSABLE = {
     "a module that ends the process": ("import sys\nsys.exit(7)", "cannot be loaded: SystemExit: 7"),
     "a module that hangs": ("while True: pass", "HookHangs: it has not returned for "),
     "one that ends the process": (CLASS + " def __init__(self, device): exit(3)", "{}:3: SystemExit: 3"),
@@ -98,13 +97,13 @@ MADE = {
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", UNUSABLE)
 def test_a_behaviour_that_cannot_be_made_is_a_sentence_of_the_segments_file(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(watched, "MAKING", watched.HOOK)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    text, said = MADE[name]
+    text, expected = UNUSABLE[name]
     module = tmp_path / f"{tmp_path.name}.py"  # a name that no test has imported
     module.write_text(text)
     config = config_of(tmp_path, f"{module.stem}:Any")
@@ -112,39 +111,33 @@ def test_a_behaviour_that_cannot_be_made_is_a_sentence_of_the_segments_file(
         try:
             make_segment(load_segment(config), 0)
         except ConfigError as error:
-            found = str(error)
+            message = str(error)
         else:
-            found = capfd.readouterr().err
-    assert said.format(module) in found
-    assert (f"{config}:2: slaves[0].behaviour: " in found) == (name != "a first hook that hangs")
+            message = capfd.readouterr().err
+    assert expected.format(module) in message
+    assert (f"{config}:2: slaves[0].behaviour: " in message) == (name != "a first hook that hangs")
     assert (signal.getitimer(signal.ITIMER_REAL)[1], *signal.getitimer(signal.ITIMER_PROF)) == (0.0, 0.0, 0.0)
 
 
-def abort_of(call: Callable[..., object], *arguments: object) -> int:
-    with pytest.raises(SdoAbort) as caught:
-        call(*arguments)
-    return caught.value.code
-
-
 def test_hooks_answer_and_refuse_sdos_and_send_emergencies() -> None:
-    made = device(DRIVE, behaviours.Talkative)
-    assert read(made.objects, 0x6064, 0, False, PRE_OP) == struct.pack("<i", 4711)
-    assert abort_of(write, made.objects, 0x607A, 0, False, PRE_OP, struct.pack("<i", 13)) == 0x06090030
-    assert (made.objects[0x607A, 0].value, len(made.emergencies)) == (0, 0)
-    write(made.objects, 0x607A, 0, False, PRE_OP, struct.pack("<i", 14))
-    assert made.objects[0x607A, 0].value == 14
-    assert (made.emergencies[0].error_code, made.emergencies[0].data) == (0x5000, b"late\0")
+    drive = device(DRIVE, behaviours.Talkative)
+    assert read(drive.objects, 0x6064, 0, False, PRE_OP) == struct.pack("<i", 4711)
+    assert abort_of(write, drive.objects, 0x607A, 0, False, PRE_OP, struct.pack("<i", 13)) == 0x06090030
+    assert (drive.objects[0x607A, 0].value, len(drive.emergencies)) == (0, 0)
+    write(drive.objects, 0x607A, 0, False, PRE_OP, struct.pack("<i", 14))
+    assert drive.objects[0x607A, 0].value == 14
+    assert (drive.emergencies[0].error_code, drive.emergencies[0].data) == (0x5000, b"late\0")
 
 
-def test_a_hook_of_a_service_that_fails_aborts_it_and_is_told_of_once() -> None:
-    made = device(DRIVE, behaviours.FailsEverywhere)
-    said: list[str] = []
-    made.runner.report = said.append
+def test_a_hook_of_a_service_that_fails_aborts_it_and_is_reported_once() -> None:
+    drive = device(DRIVE, behaviours.FailsEverywhere)
+    reported: list[str] = []
+    drive.runner.report = reported.append
     for _ in range(3):
-        assert abort_of(read, made.objects, 0x6064, 0, False, PRE_OP) == 0x08000000
-        assert abort_of(write, made.objects, 0x607A, 0, False, PRE_OP, bytes(4)) == 0x08000000
-    assert [sentence.split(": ")[1].split(" ")[0] for sentence in said] == ["on_sdo_read", "on_sdo_write"]
-    assert "0x6041:0 Statusword takes 0 to 65535, not 1048576" in said[1]
+        assert abort_of(read, drive.objects, 0x6064, 0, False, PRE_OP) == 0x08000000
+        assert abort_of(write, drive.objects, 0x607A, 0, False, PRE_OP, bytes(4)) == 0x08000000
+    assert [sentence.split(": ")[1].split(" ")[0] for sentence in reported] == ["on_sdo_read", "on_sdo_write"]
+    assert "0x6041:0 Statusword takes 0 to 65535, not 1048576" in reported[1]
 
 
 def raising(error: Callable[..., Exception], *arguments: object) -> Callable[[], None]:
@@ -170,28 +163,30 @@ RUBBISH: list[Callable[[], object]] = [
 
 
 @pytest.mark.parametrize("act", RUBBISH)
-def test_rubbish_of_a_hook_is_answered_as_its_failure_and_told_with_file_and_line(act: Callable[[], object]) -> None:
+def test_rubbish_of_a_hook_is_answered_as_its_failure_and_reported_with_file_and_line(
+    act: Callable[[], object],
+) -> None:
     client = FoeClient(
         type("Any", (behaviours.Rubbish,), {"act": staticmethod(act), "__module__": behaviours.__name__})
     )
-    said: list[str] = []
-    client.device.runner.report = said.append
+    reported: list[str] = []
+    client.device.runner.report = reported.append
     assert client.read("any") == 0x800B
     assert abort_of(read, client.device.objects, 0x6064, 0, False, PRE_OP) == 0x08000000
-    assert [f" failed at {behaviours.__file__}:" in sentence for sentence in said] == [True, True]
+    assert [f" failed at {behaviours.__file__}:" in sentence for sentence in reported] == [True, True]
 
 
 @pytest.mark.parametrize("taken", ["roles", "step"])
 def test_a_slave_whose_own_code_fails_outside_of_hooks_says_so_and_the_others_go_on(taken: str) -> None:
     broken = device(DRIVE, behaviours.Talkative)
     line = Line([broken, TinyDevice()])
-    said: list[str] = []
-    broken.runner.report = said.append
+    reported: list[str] = []
+    broken.runner.report = reported.append
     setattr(broken, taken, None)
     line.address()
     line.request(0, PRE_OP)
     line.pass_time(5 * MS)
-    assert [": the slave failed at " in sentence for sentence in said] == [True]
+    assert [": the slave failed at " in sentence for sentence in reported] == [True]
     assert line.request(1, BOOT) == (INIT | ERROR_FLAG, 0x0013)
 
 
@@ -233,7 +228,6 @@ class FoeClient:
                 answer = self.ask(DATA, packet, part)
             while answer is not None and answer[0] == BUSY:
                 answer = self.ask(DATA, packet, part)
-        assert answer is not None
         return answer[0], answer[1]
 
     def read(self, name: str) -> bytes | int:
@@ -261,10 +255,10 @@ def test_a_behaviour_refuses_a_file_and_is_busy_and_fails() -> None:
     assert client.write("slow", b"late but whole") == (ACKNOWLEDGE, 1)
     assert client.read("slow") == b"late but whole"
     failing = FoeClient(behaviours.FailsEverywhere)
-    said: list[str] = []
-    failing.device.runner.report = said.append
+    reported: list[str] = []
+    failing.device.runner.report = reported.append
     assert failing.write("any", b"1") == (ERROR, 0x800B)
-    assert "on_file failed at" in said[0]
+    assert "on_file failed at" in reported[0]
 
 
 def test_packets_out_of_order_and_messages_that_fit_nothing_are_errors() -> None:
@@ -286,10 +280,10 @@ def test_a_real_master_writes_firmware_in_boot_and_reads_it(tmp_path: Path) -> N
     config = tmp_path / "segment.yaml"
     config.write_text(f"slaves:\n- {{{described(DRIVE)}}}\n")
     with segment(config) as pid:
-        command = [sys.executable, str(Path(__file__).with_name("boot_child.py")), str(pid), "ecat0"]
+        command = [sys.executable, "-m", "tests.virtual.boot_child", str(pid), "ecat0"]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT)
-    found = json.loads(done.stdout)
-    assert found["boot"] == BOOT
-    assert found["read"] == found["written"]
-    assert found["no_coe_in_boot"]
-    assert found["after"] == PRE_OP
+    result = json.loads(done.stdout)
+    assert result["boot"] == BOOT
+    assert result["read"] == result["written"]
+    assert result["no_coe_in_boot"]
+    assert result["after"] == PRE_OP

@@ -1,4 +1,4 @@
-"""The segment answers a master's frames as real devices did, which hang on it by the images of their EEPROMs."""
+"""The segment, made of the EEPROM images of real devices, answers a master's frames as those devices did."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RUNS = {
     "ek1100-el2828-el2889": ([CAPTURES / f"{name}.bin" for name in ("ek1100", "el2828", "el2889")], 500, 0.75),
     "akd": ([FILES / "akd.bin"], 180, 0.85),
 }
-"""Captures: the EEPROMs of the devices, datagrams at least, share of the same answers but for the EEPROM's kind."""
+"""For each capture: EEPROM images, least number of datagrams, least share of equal answers, the EEPROM's kind aside."""
 _AL_CONTROL, _AL_STATUS, _EEPROM_CONTROL, _MAILBOX_STATUS = 0x0120, 0x0130, 0x0502, 0x080D
 _EEPROM_KIND = "the kind of EEPROM"
 _DIFFERENCES = (
@@ -27,7 +27,7 @@ _DIFFERENCES = (
     ("the DL status of an EK1100, whose PDI is no processor", range(0x0110, 0x0112)),
     ("the PDI of another AKD than the one whose EEPROM was published", range(0x0140, 0x0142)),
 )
-"""What an EEPROM does not tell of a device."""
+"""Properties of a device that its EEPROM does not contain."""
 _MAILBOX_AND_SDO_HEADER = 12
 
 
@@ -38,7 +38,7 @@ def reason_of(difference: Difference) -> str:
         if sent.address in addresses and sent.command not in (10, 11, 12):
             return reason
     if sent.address == _EEPROM_CONTROL and ours is not None and device.wkc == ours.wkc:
-        # Emulation, read size; and for how long it is busy with its command. Address width and errors are not.
+        # Emulation, read size and busy time may differ; address width and errors may not.
         changed = int.from_bytes(device.data, "little") ^ int.from_bytes(ours.data, "little")
         return _EEPROM_KIND if not changed & ~0x8F70 else ""
     if ours is None:
@@ -56,7 +56,7 @@ def reason_of(difference: Difference) -> str:
 
 @pytest.mark.interpreted
 @pytest.mark.parametrize("name", RUNS)
-def test_each_datagram_is_answered_as_by_the_devices_but_for_what_no_eeprom_tells(name: str, tmp_path: Path) -> None:
+def test_each_datagram_is_answered_as_by_the_devices_but_for_what_no_eeprom_contains(name: str, tmp_path: Path) -> None:
     eeproms, least, share = RUNS[name]
     file = tmp_path / "segment.yaml"
     file.write_text("slaves:\n" + "".join(f"  - {{sii: {eeprom}}}\n" for eeprom in eeproms))

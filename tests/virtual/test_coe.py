@@ -6,12 +6,12 @@ from hypothesis import strategies as st
 
 from rtcp.virtual.coe import SdoServer, emergency_message
 from rtcp.virtual.device import Emergency
-from rtcp.virtual.objects import Access, DataType, Entry, ObjectCode, ObjectDictionary, SdoAbort
+from rtcp.virtual.objects import Access, DataType, Entry, ObjectCode, ObjectDictionary, SdoAbort, Value
 
 PREOP, SAFEOP, OP = 2, 4, 8
 
 
-def refuse_13(_, value):
+def refuse_13(_: Entry, value: Value) -> None:
     if value == 13:
         raise SdoAbort(0x08000020)
 
@@ -171,7 +171,7 @@ CONVERSATIONS = {
 
 
 @pytest.mark.parametrize("conversation", CONVERSATIONS.values(), ids=CONVERSATIONS.keys())
-def test_sdo_conversation(conversation):
+def test_sdo_conversation(conversation: list[tuple[str, str | None]]) -> None:
     server = SdoServer(dictionary(), 128)
     for sent, received in conversation:
         expected = None if received is None else bytes.fromhex(received)
@@ -199,7 +199,7 @@ SMALL_MAILBOX = {
 
 
 @pytest.mark.parametrize("conversation", SMALL_MAILBOX.values(), ids=SMALL_MAILBOX.keys())
-def test_sdo_conversation_through_a_small_mailbox(conversation):
+def test_sdo_conversation_through_a_small_mailbox(conversation: list[tuple[str, str | None]]) -> None:
     server = SdoServer(dictionary(), 24)
     for sent, received in conversation:
         expected = None if received is None else bytes.fromhex(received)
@@ -207,7 +207,7 @@ def test_sdo_conversation_through_a_small_mailbox(conversation):
 
 
 @pytest.mark.parametrize("state", [PREOP, SAFEOP, OP])
-def test_rights_follow_the_al_state(state):
+def test_rights_follow_the_al_state(state: int) -> None:
     server = SdoServer(dictionary(), 128)
     written = server.answer(bytes.fromhex("2f 0220 00 01000000"), state)
     read = server.answer(bytes.fromhex("40 0720 00 00000000"), state)
@@ -217,17 +217,17 @@ def test_rights_follow_the_al_state(state):
 
 
 @pytest.mark.parametrize("state", [0, 1, 3])
-def test_nothing_is_read_or_written_where_there_is_no_mailbox(state):
+def test_nothing_is_read_or_written_where_there_is_no_mailbox(state: int) -> None:
     server = SdoServer(dictionary(), 128)
     for request in ("40 0020 00 00000000", "2b 0020 00 01000000", "50 0030 00 00000000", "33 0130 00 0a00aa02"):
         assert server.answer(bytes.fromhex(request), state)[4:].hex() == "22000008"
 
 
-def test_the_error_flag_of_the_al_state_changes_no_right():
+def test_the_error_flag_of_the_al_state_changes_no_right() -> None:
     assert SdoServer(dictionary(), 128).answer(bytes.fromhex("2f 0220 00 01000000"), 0x12)[0] == 0x60
 
 
-def test_a_value_becomes_visible_only_after_the_last_segment():
+def test_a_value_becomes_visible_only_after_the_last_segment() -> None:
     objects = dictionary()
     server = SdoServer(objects, 128)
     server.answer(bytes.fromhex("21 0320 00 08000000"), PREOP)
@@ -237,7 +237,7 @@ def test_a_value_becomes_visible_only_after_the_last_segment():
     assert objects[0x2003, 0].value == b"12345678"
 
 
-def test_a_write_hook_sees_the_old_value_stored():
+def test_a_write_hook_sees_the_old_value_stored() -> None:
     objects = ObjectDictionary()
     seen = []
     objects.variable(
@@ -247,7 +247,7 @@ def test_a_write_hook_sees_the_old_value_stored():
     assert seen == [(1, 2)]
 
 
-def test_an_emergency_is_error_code_register_and_five_bytes():
+def test_an_emergency_is_error_code_register_and_five_bytes() -> None:
     # CoE service 1 (ETG.1000.6, 5.6.4): 0x8611 following error, register 0x21.
     assert emergency_message(Emergency(0x8611, 0x21, b"\x01\x02")).hex() == "0010" + "1186" + "21" + "0102000000"
 
@@ -261,7 +261,6 @@ class Client:
 
     def ask(self, request: bytes) -> bytes:
         answer = self.server.answer(request, PREOP)
-        assert answer is not None
         assert len(answer) >= 8
         return answer
 
@@ -298,7 +297,9 @@ class Client:
 
 
 @given(data=st.binary(max_size=300), receive_size=st.integers(16, 140), send_size=st.integers(16, 140))
-def test_what_is_written_is_read_back_through_mailboxes_of_any_size(data, receive_size, send_size):
+def test_what_is_written_is_read_back_through_mailboxes_of_any_size(
+    data: bytes, receive_size: int, send_size: int
+) -> None:
     objects = ObjectDictionary()
     objects.variable(0x2000, "Blob", DataType.OCTET_STRING, bytes(300), Access.RW)
     client = Client(SdoServer(objects, send_size), receive_size)
@@ -307,7 +308,7 @@ def test_what_is_written_is_read_back_through_mailboxes_of_any_size(data, receiv
 
 
 @given(receive_size=st.integers(16, 40), value=st.integers(0, 0x8000))
-def test_a_record_is_written_whole_through_mailboxes_of_any_size(receive_size, value):
+def test_a_record_is_written_whole_through_mailboxes_of_any_size(receive_size: int, value: int) -> None:
     objects = dictionary()
     Client(SdoServer(objects, 128), receive_size).download(
         0x3000, struct.pack("<BxHBBi", 4, value, 0, 1, -value), complete=True

@@ -26,9 +26,9 @@ SDO_READ_NAME = bytes.fromhex("0a00 0000 00 13 0020 40 1810 01 00000000")
 
 @pytest.fixture
 def line() -> Line:
-    made = Line()
-    made.address()
-    return made
+    addressed = Line()
+    addressed.address()
+    return addressed
 
 
 def eeprom_read(line: Line, slave: int, word: int) -> bytes:
@@ -37,7 +37,7 @@ def eeprom_read(line: Line, slave: int, word: int) -> bytes:
     return line.read(slave, 0x0508, 8)
 
 
-def test_a_slave_tells_its_fmmus_sync_managers_memory_and_clocks() -> None:
+def test_a_slave_reports_its_fmmus_sync_managers_memory_and_clocks() -> None:
     line = Line([TinyDevice(), TinyDevice(supports_dc=False)])
     line.address()
     assert line.read(0, 0x0004, 3) == bytes((8, 8, 8))
@@ -65,7 +65,7 @@ def test_clock_registers_of_a_slave_without_a_clock_do_not_count() -> None:
     assert line.one(DatagramCommand.FPRD, STATION, 0x0910, bytes(8)).counter == 0
 
 
-def test_al_control_written_again_before_the_firmware_has_looked_does_not_count(line: Line) -> None:
+def test_al_control_written_again_before_the_firmware_has_read_it_does_not_count(line: Line) -> None:
     control = [Datagram(DatagramCommand.FPWR, number, STATION, 0x0120, bytes((PRE_OP, 0))) for number in range(2)]
     assert [answer.counter for answer in line.send(*control)] == [1, 0]
 
@@ -212,7 +212,7 @@ def test_a_slave_that_went_to_init_has_forgotten_messages_emergencies_transfers_
 def test_a_full_mailbox_refuses_a_second_message(line: Line) -> None:
     line.to_pre_op()
     message = SDO_READ_NAME.ljust(128, b"\0")
-    # Both in one frame: the device has not looked in between.
+    # Both in one frame: the device does not run in between.
     both = line.send(Datagram(DatagramCommand.FPWR, 1, STATION, 0x1000, message),
                      Datagram(DatagramCommand.FPWR, 2, STATION, 0x1000, message))  # fmt: skip
     assert [datagram.counter for datagram in both] == [1, 0]
@@ -255,10 +255,10 @@ def test_a_buffer_is_handed_over_only_when_its_last_byte_is_written(line: Line) 
     line.to_op()
     line.write(0, 0x1100, b"\x34")
     line.pass_time(2 * MS)
-    assert line.devices[0].out.value == 0
+    assert line.tiny[0].out.value == 0
     line.write(0, 0x1101, b"\x12")
     line.pass_time(2 * MS)
-    assert line.devices[0].out.value == 0x1234
+    assert line.tiny[0].out.value == 0x1234
 
 
 def test_the_master_can_neither_read_the_outputs_nor_write_the_inputs(line: Line) -> None:
@@ -330,7 +330,7 @@ def test_the_copies_made_ahead_do_what_a_datagram_does_byte_by_byte(line: Line) 
     line.to_op()
     line.exchange(0x0102, 0x0304, 0x0506)
     whole = line.exchange(0x0102, 0x0304, 0x0506)
-    # The same bytes in datagrams that cut through the buffers go the exact way.
+    # The same bytes in datagrams that cut through the buffers are copied byte by byte.
     outputs = bytes.fromhex("0201 0403 0605")
     counters = [line.logical(DatagramCommand.LRW, at, outputs[at : at + 3]).counter for at in (0, 3)]
     inputs = b"".join(line.logical(DatagramCommand.LRD, 6 + at, bytes(3)).data for at in (0, 3))

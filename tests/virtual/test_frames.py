@@ -21,15 +21,14 @@ def frame(hex_datagrams: str, length: int) -> bytes:
 
 @pytest.fixture
 def line() -> Line:
-    made = Line()
-    made.address()
-    return made
+    addressed = Line()
+    addressed.address()
+    return addressed
 
 
 def test_a_broadcast_read_written_by_hand_comes_back_counted_by_every_slave_and_marked_by_the_first() -> None:
     # BRD, index 0x5A, position 0, register 0x0005 (number of sync managers), 1 byte, counter 0.
     answer = Line().raw(frame("07 5a 0000 0500 0100 0000 00 0000", 13))
-    assert answer is not None
     assert answer[:14].hex(" ") == "ff ff ff ff ff ff 03 01 01 01 01 01 88 a4"
     assert answer[16:29].hex(" ") == "07 5a 03 00 05 00 01 00 00 00 08 03 00"
     assert answer[29:] == bytes(31)
@@ -38,7 +37,6 @@ def test_a_broadcast_read_written_by_hand_comes_back_counted_by_every_slave_and_
 def test_two_datagrams_in_a_frame_are_both_answered() -> None:
     # BRD of 0x0004, more follow; then APRD at position -1 (the second slave) of 0x0006.
     answer = Line().raw(frame("07 01 0000 0400 0180 0000 00 0000  01 01 ffff 0600 0100 0000 00 0000", 26))
-    assert answer is not None
     assert answer[26:29].hex(" ") == "08 03 00"
     assert answer[29:42].hex(" ") == "01 01 02 00 06 00 01 00 00 00 08 01 00"
 
@@ -116,7 +114,7 @@ def test_a_multiple_write_gives_what_the_addressed_slave_holds_to_those_behind_i
     for slave, value in enumerate((1, 2, 3)):
         line.write(slave, USER_RAM, bytes((value,)))
     assert line.one(DatagramCommand.FRMW, STATION + 1, USER_RAM, b"\x77").data == b"\x02"
-    # The slave before the addressed one has seen the datagram as the master sent it.
+    # The slave before the addressed one saw the datagram as the master sent it.
     assert [line.read(slave, USER_RAM, 1)[0] for slave in range(3)] == [0x77, 2, 2]
 
 
@@ -162,7 +160,6 @@ def test_a_datagram_that_is_cut_goes_back_as_it_came_and_those_before_it_are_ans
     # The second datagram claims 200 bytes where the frame ends after its header.
     sent = frame("07 01 0000 0400 0180 0000 00 0000  07 02 0000 0400 c800 0000 11 2233", 26)
     answer = Line().raw(sent)
-    assert answer is not None
     assert answer[26:29].hex(" ") == "08 03 00"
     assert answer[29:] == sent[29:]
 

@@ -14,7 +14,7 @@ SOURCE = 0.012
 
 
 class Row(NamedTuple):
-    """A row of the facts' "own numbers": 0.3 m, 12 V, 12 mohm, 500 C; pairs are for emissivity 0.3 and 0.8."""
+    """Figures of a rod of 0.3 m at 12 V behind 12 mohm, held at 500 C; pairs are for emissivity 0.3 and 0.8."""
 
     diameter: float
     resistance: float
@@ -34,7 +34,7 @@ TABLE = [
     Row(2e-3, 0.085, 28, (37, 55), 114, (0.03, 0.045), 430, (15, 12), 44),
     Row(3.2e-3, 0.033, 22, (50, 80), 248, (0.023, 0.036), 300, (20, 16), 58),
 ]
-"""The facts give one duty a row, 20, 8, 4 and 3 %: these are the hold powers over their V I."""
+"""`duty` is the hold power over the full power, V I."""
 by_diameter = pytest.mark.parametrize("row", TABLE, ids=lambda row: f"{row.diameter * 1e3:g}mm")
 by_emissivity = pytest.mark.parametrize(("case", "emissivity"), [(0, 0.3), (1, 0.8)], ids=["bright", "oxidised"])
 
@@ -265,16 +265,16 @@ def test_drawn_rods_repeat_with_the_seed_and_stay_in_the_ranges() -> None:
     random = Random(3)
     rods = [draw(random) for _ in range(200)]
     assert draw(Random(3)).alloy == rods[0].alloy
-    diameters, lengths = [each.diameter for each in rods], [each.length for each in rods]
+    diameters, lengths = [rod.diameter for rod in rods], [rod.length for rod in rods]
     assert 0.5e-3 <= min(diameters) < 0.6e-3
     assert 3.1e-3 < max(diameters) <= 3.2e-3
     assert 0.2 <= min(lengths) < 0.21
     assert 0.39 < max(lengths) <= 0.4
-    jumps = {each.alloy.resistivity_martensite > each.alloy.resistivity_austenite for each in rods}
+    jumps = {rod.alloy.resistivity_martensite > rod.alloy.resistivity_austenite for rod in rods}
     assert jumps == {False, True}
-    for each in rods[:20]:
-        each.step(2.0, (60.0 / each.resistance) ** 0.5)
-        assert np.isfinite(each.temperature).all()
+    for rod in rods[:20]:
+        rod.step(2.0, (60.0 / rod.resistance) ** 0.5)
+        assert np.isfinite(rod.temperature).all()
 
 
 def test_an_alloy_whose_loop_does_not_close_is_refused() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,13 +17,14 @@ from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.fieldbus import bus as protocol
 from rtcp.fieldbus.errors import BusError, SdoAborted
-from rtcp.ipc.commands import Enable, MoveJoints, Reset
+from rtcp.ipc.commands import MoveJoints, Reset
 from rtcp.ipc.events import SlaveLost
 from rtcp.ipc.states import State as MachineState
-from rtcp.launch.inprocess import InProcessBus, InProcessData
-from rtcp.launch.simulation import Frame, Simulation
+from rtcp.testing.bus import InProcessBus, InProcessData
+from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.described import DescribedDevice
-from rtcp.virtual.models import create
+from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
+from rtcp.virtual.models.cubemars import CubemarsOrh60, CubemarsOrh70
 from rtcp.virtual.protocol import AlState
 from tests.fieldbus.terminals import DEVICES, Echo, slave
 
@@ -31,7 +34,7 @@ DRIVE = struct.Struct("<Hiiib")
 CSP = 8
 WATCHDOG_MS = 20
 SYNC_LIMIT = 120
-"""Of the drive's start-up SDOs."""
+"""Sync error limit in the drive's start-up SDOs."""
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +52,7 @@ def config() -> ArmConfig:
 
 @pytest.fixture(scope="module")
 def segment(config: ArmConfig) -> SegmentConfig:
-    """The slaves that go with it."""
+    """The slaves of `config`."""
     whole = load_segment(config.source.parent / config.bus.segment)
     return replace(whole, slaves=whole.slaves[:3])
 
@@ -58,8 +61,8 @@ class Master:
     """A bus in OP, with frames half a cycle before SYNC0."""
 
     def __init__(self, config: ArmConfig, seed: int = 1, start: bool = True) -> None:
-        self.box = create("diewu-io")
-        self.drives = [create("cubemars-orh70", initial_position=0.5), create("cubemars-orh60")]
+        self.box = DiewuIoBox()
+        self.drives: list[CubemarsDrive] = [CubemarsOrh70(initial_position=0.5), CubemarsOrh60()]
         self.bus = InProcessBus([self.box, *self.drives], seed)
         self.config = config
         if start:
@@ -84,7 +87,7 @@ class Master:
         self.now += cycles * PERIOD_NS
         self.bus.advance_to(self.now - PERIOD_NS)
 
-    def tell(self, slot: int, control: int, position: int = 0, velocity: int = 0, mode: int = CSP) -> None:
+    def set_outputs(self, slot: int, control: int, position: int = 0, velocity: int = 0, mode: int = CSP) -> None:
         """Set a drive's outputs."""
         self.data.set_output(slot, DRIVE.pack(control, position, velocity, 0, mode))
 
@@ -92,7 +95,7 @@ class Master:
         """A drive's statusword, position, velocity, torque and mode in the last answer."""
         return DRIVE.unpack(self.data.input(slot))
 
-    def states(self) -> list[tuple[AlState, bool, int]]:
+    def states(self) -> list[tuple[int, bool, int]]:
         return [(slave.state, slave.error, slave.code) for slave in self.bus.read_states()]
 
 
@@ -108,10 +111,17 @@ def parameters(member: object) -> list[str]:
 # -- what it offers -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("made", "promised"), [(InProcessBus, protocol.Bus), (InProcessData, protocol.ProcessData)])
-def test_it_has_every_method_of_the_protocol_with_the_same_parameters(made: type, promised: type) -> None:
+@pytest.mark.parametrize(
+    ("implementation", "promised"),
+    # Compiled, the methods of a class that tests may change have no signature.
+    [
+        (InProcessBus, protocol.Bus),
+        pytest.param(InProcessData, protocol.ProcessData, marks=pytest.mark.interpreted),
+    ],
+)
+def test_it_has_every_method_of_the_protocol_with_the_same_parameters(implementation: type, promised: type) -> None:
     methods = {name: member for name, member in vars(promised).items() if inspect.isfunction(member) and name[0] != "_"}
-    assert {name: parameters(getattr(made, name)) for name in methods} == {
+    assert {name: parameters(getattr(implementation, name)) for name in methods} == {
         name: parameters(member) for name, member in methods.items()
     }
 
@@ -121,7 +131,7 @@ def test_it_has_every_attribute_of_the_protocols(master: Master) -> None:
     assert [name for name in protocol.Bus.__annotations__ if not hasattr(master.bus, name)] == []
 
 
-# -- the way to OP --------------------------------------------------------------------------------------------------
+# -- on to OP ------------------------------------------------------------------------------------------------------
 
 
 def test_the_slaves_go_from_init_over_safe_op_to_op(config: ArmConfig) -> None:
@@ -149,7 +159,7 @@ def test_the_start_up_objects_are_written_and_the_interpolation_time_is_the_cycl
 
 
 def test_another_slave_than_the_configuration_lists_is_refused_with_both_named(config: ArmConfig) -> None:
-    bus = InProcessBus([create("cubemars-orh70"), create("diewu-io"), create("cubemars-orh70")])
+    bus = InProcessBus([CubemarsOrh70(), DiewuIoBox(), CubemarsOrh70()])
     with pytest.raises(BusError, match=r"position 1 \(io\): expected DIEWU 16DI16DO.*found Cubemars ORH70"):
         bus.configure(config.slaves, PERIOD_NS)
     with pytest.raises(BusError, match=r"3 slaves answer, the configuration .* lists 2"):
@@ -180,7 +190,7 @@ def test_slaves_without_mailbox_or_with_several_sync_managers_a_direction_carry_
 
 
 def test_a_slave_whose_file_has_other_lengths_or_services_is_refused_in_a_sentence() -> None:
-    for kind, config, said in (
+    for kind, config, message in (
         ("bits4", slave("t", "areas"), "position 1 (t): expected Terminal 30"),
         (
             "areas",
@@ -192,7 +202,7 @@ def test_a_slave_whose_file_has_other_lengths_or_services_is_refused_in_a_senten
         bus = InProcessBus([DescribedDevice(DEVICES[kind], lambda alias: b"", None)], 1)
         with pytest.raises(BusError) as refused:
             bus.configure([config], PERIOD_NS)
-        assert said in str(refused.value)
+        assert message in str(refused.value)
 
 
 def test_a_description_that_a_fixed_mapping_does_not_fit_is_refused(config: ArmConfig) -> None:
@@ -217,7 +227,7 @@ def test_op_needs_outputs_that_have_come_lately(master: Master) -> None:
 
 def test_a_drive_takes_outputs_over_at_the_sync0_after_the_frame_and_answers_in_the_next(master: Master) -> None:
     master.exchange(200)
-    master.tell(1, 0x06)
+    master.set_outputs(1, 0x06)
     assert master.exchange() == 9
     assert master.shown(1)[0] & 0x6F == 0x40
     master.exchange()
@@ -294,7 +304,7 @@ def test_sync0_comes_at_whole_cycles_of_the_reference_clock(master: Master) -> N
 def test_outputs_do_not_count_below_op(config: ArmConfig) -> None:
     master = Master(config)
     master.bus.request_state(AlState.SAFE_OP, [2])
-    master.tell(1, 0x06, position=77)
+    master.set_outputs(1, 0x06, position=77)
     assert master.exchange(3) == 9
     assert master.drives[0].objects[0x607A, 0].value == 0
     master.bus.request_state(AlState.OP, [2])
@@ -306,7 +316,7 @@ def test_a_drive_without_sync0_steps_with_the_frames_and_knows_no_sync_error(con
     box, first, second = config.slaves
     free = (box, replace(first, device=replace(first.device, assign_activate=0)), second)
     master = Master(replace(config, slaves=free))
-    master.tell(1, 0, position=55)
+    master.set_outputs(1, 0, position=55)
     master.exchange()
     assert master.drives[0].objects[0x607A, 0].value == 55
     for _ in range(SYNC_LIMIT):
@@ -344,7 +354,7 @@ def test_a_slave_whose_error_is_acknowledged_takes_outputs_again_and_goes_to_op(
 
 def test_a_slave_that_comes_back_to_op_does_not_obey_what_it_was_sent_before(master: Master) -> None:
     master.exchange(200)
-    master.tell(1, 0x06)
+    master.set_outputs(1, 0x06)
     master.exchange(3)
     assert master.drives[0].state == 2
     master.bus.drop(2, AlState.SAFE_OP, 0x001A)
@@ -363,7 +373,7 @@ def test_more_missed_sync0_than_the_limit_allows_are_a_sync_error(master: Master
         master.data.lose(1, heard=False)
         master.exchange(2)
         missed += 1
-    # Three for each that is missed, less one for each that is met.
+    # Each missed SYNC0 adds three, each met one subtracts one.
     assert missed == SYNC_LIMIT // 2
     assert master.states()[1] == (AlState.SAFE_OP, True, 0x001A)
     assert master.states()[0] == (AlState.OP, False, 0)
@@ -372,12 +382,12 @@ def test_more_missed_sync0_than_the_limit_allows_are_a_sync_error(master: Master
 def test_a_drive_that_loses_its_outputs_while_enabled_faults_and_sends_an_emergency(master: Master) -> None:
     master.exchange(200)
     for word in (6, 7, 15, 15):
-        master.tell(1, word, 5000)
+        master.set_outputs(1, word, 5000)
         master.exchange(2)
     assert master.shown(1)[0] & 0x6F == 0x27
     master.bus.drop(2, AlState.SAFE_OP, 0x001A)
     master.exchange(3)
-    assert [(sent.position, sent.error_code) for sent in master.bus.emergencies()] == [(2, 0x8130)]
+    assert [(sent.slave, sent.error_code) for sent in master.bus.emergencies()] == [(2, 0x8130)]
     assert master.bus.emergencies() == ()
 
 
@@ -406,14 +416,7 @@ def test_an_object_written_by_a_service_holds_until_the_next_frame(master: Maste
 @pytest.fixture
 def simulation(config: ArmConfig, segment: SegmentConfig) -> Iterator[Simulation]:
     with Simulation(config, 1, positions=[0.1, -0.2], segment=segment) as simulation:
-        simulation.acquire()
         yield simulation
-
-
-def to_holding(simulation: Simulation) -> None:
-    assert simulation.until(lambda: simulation.state is MachineState.READY, 3.0)
-    assert simulation.send(Enable()).refusal is None
-    assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 3.0)
 
 
 def move(*target: float) -> MoveJoints:
@@ -421,36 +424,53 @@ def move(*target: float) -> MoveJoints:
 
 
 def test_the_loop_follows_the_clock_brings_the_slaves_to_op_and_moves_the_arm(simulation: Simulation) -> None:
-    to_holding(simulation)
-    assert simulation.send(move(0.4, 0.3)).refusal is None
-    assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 5.0)
+    simulation.hold()
+    simulation.do(move(0.4, 0.3))
+    simulation.bring_to(MachineState.HOLDING)
     simulation.run(0.3)
     assert [model.axis.position for model in simulation.models] == pytest.approx([0.4, 0.3], abs=1e-3)
 
 
+def test_a_simulation_leaves_no_file_however_it_ends(
+    config: ArmConfig, segment: SegmentConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rtcp.testing.simulation._SHARED_MEMORY", tmp_path)
+    with pytest.raises(ValueError, match="found 1 numbers, allowed are 2"):
+        Simulation(config, positions=[0.1], segment=segment)
+    with pytest.raises((AttributeError, TypeError)):
+        Simulation(config, segment=segment, partners="none")  # type: ignore[arg-type]
+    with Simulation(config, segment=segment) as simulation:
+        simulation.close()
+        own = os.open(config.source, os.O_RDONLY)
+    os.fstat(own)  # not closed a second time
+    os.close(own)
+    del simulation
+    gc.collect()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_lease_that_is_not_renewed_runs_out_in_simulated_time(simulation: Simulation) -> None:
-    to_holding(simulation)
-    assert simulation.send(move(1.5, 1.5)).refusal is None
+    simulation.hold()
+    simulation.do(move(1.5, 1.5))
     simulation.fall_silent()
-    assert simulation.until(lambda: simulation.state is MachineState.STOPPING, 0.7)
-    assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 1.0)
+    simulation.bring_to(MachineState.STOPPING, 0.7)
+    simulation.bring_to(MachineState.HOLDING, 1.0)
 
 
-def test_slaves_that_left_op_are_found_and_come_back_after_a_reset_and_not_before(
+def test_slaves_that_left_op_are_reported_and_come_back_after_a_reset_and_not_before(
     config: ArmConfig, segment: SegmentConfig
 ) -> None:
-    # The cycle counts what is missing for so long that the service finds the slave first.
+    # 1000 lost cycles are allowed, so that the service notices the slave first.
     patient = replace(config, bus=replace(config.bus, lost_cycles=1000))
     with Simulation(patient, 1, segment=segment) as simulation:
-        simulation.acquire()
-        to_holding(simulation)
+        simulation.hold()
         simulation.bus.drop(2, AlState.SAFE_OP, 0x001A)
-        assert simulation.until(lambda: simulation.state is MachineState.FAULT, 0.3)
+        simulation.bring_to(MachineState.FAULT, 0.3)
         assert [record.event for record in simulation.events if record.event.is_fault] == [SlaveLost(2)]
         simulation.run(0.5)
         assert simulation.state is MachineState.FAULT
-        assert simulation.send(Reset()).refusal is None
-        assert simulation.until(lambda: simulation.state is MachineState.READY, 1.0)
+        simulation.do(Reset())
+        simulation.bring_to(MachineState.READY, 1.0)
         simulation.run(0.3)
         assert simulation.state is MachineState.READY
 
@@ -458,9 +478,8 @@ def test_slaves_that_left_op_are_found_and_come_back_after_a_reset_and_not_befor
 def story(config: ArmConfig, segment: SegmentConfig, seed: int) -> list[Frame]:
     frames: list[Frame] = []
     with Simulation(config, seed, segment=segment) as simulation:
-        simulation.acquire()
         simulation.on_frame = frames.append
-        to_holding(simulation)
+        simulation.hold()
         simulation.send(move(0.2, 0.1))
         simulation.run(0.1)
         simulation.data.lose(3)
@@ -484,3 +503,8 @@ def test_nothing_of_it_is_left_when_it_is_closed(config: ArmConfig, segment: Seg
     assert path.exists()
     simulation.close()
     assert not path.parent.exists()
+
+
+def test_the_example_of_the_page_about_testing_runs() -> None:
+    page = Path(__file__).parents[2] / "docs" / "testing.md"
+    exec(page.read_text().split("```python\n")[1].split("```")[0], {})

@@ -41,9 +41,9 @@ def buffer(text: str, counter: int = 0) -> bytes:
 def drain(box: Mailbox) -> list[bytes]:
     messages = []
     while box.pending():
-        found = box.next_message()
-        assert found is not None
-        messages.append(found)
+        content = box.next_message()
+        assert content is not None
+        messages.append(content)
     return messages
 
 
@@ -71,13 +71,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("sent", "received"), REFUSED.values(), ids=REFUSED.keys())
-def test_a_malformed_message_is_answered_with_its_error(sent, received):
+def test_a_malformed_message_is_answered_with_its_error(sent: str, received: str) -> None:
     box = mailbox()
     box.receive(message(sent), PREOP)
     assert drain(box) == [message(received)]
 
 
-def test_a_request_is_answered_through_the_mailbox():
+def test_a_request_is_answered_through_the_mailbox() -> None:
     box = mailbox()
     assert not box.pending()
     box.receive(buffer(UPLOAD, 1), PREOP)
@@ -85,41 +85,41 @@ def test_a_request_is_answered_through_the_mailbox():
     assert box.next_message() is None
 
 
-def test_the_priority_of_a_message_is_no_part_of_its_channel():
+def test_the_priority_of_a_message_is_no_part_of_its_channel() -> None:
     box = mailbox()
     box.receive(message("0a00 0000 c0 13 0020 40 0010 00 00000000"), PREOP)
     assert drain(box) == [message(UPLOADED, 1)]
 
 
-def test_a_repeated_request_is_answered_once():
+def test_a_repeated_request_is_answered_once() -> None:
     box = mailbox()
     box.receive(buffer(UPLOAD, 3), PREOP)
     box.receive(buffer(UPLOAD, 3), PREOP)
     assert len(drain(box)) == 1
 
 
-def test_requests_without_a_counter_are_all_answered():
+def test_requests_without_a_counter_are_all_answered() -> None:
     box = mailbox()
     box.receive(buffer(UPLOAD), PREOP)
     box.receive(buffer(UPLOAD), PREOP)
     assert len(drain(box)) == 2
 
 
-def test_the_slave_counts_its_own_messages_from_one_to_seven():
+def test_the_slave_counts_its_own_messages_from_one_to_seven() -> None:
     box = mailbox()
     for n in range(8):
         box.receive(buffer(UPLOAD, n % 7 + 1), PREOP)
     assert [sent[5] >> 4 for sent in drain(box)] == [1, 2, 3, 4, 5, 6, 7, 1]
 
 
-def test_answers_come_in_the_order_of_their_requests():
+def test_answers_come_in_the_order_of_their_requests() -> None:
     box = mailbox()
     box.receive(buffer("0a00 0000 00 13 0020 4f 0010 00 00000000"), PREOP)
     box.receive(buffer("0a00 0000 00 23 0020 40 ff7f 00 00000000"), PREOP)
     assert [sent[8] for sent in drain(box)] == [0x43, 0x80]
 
 
-def test_an_emergency_follows_the_answer_of_the_write_that_caused_it():
+def test_an_emergency_follows_the_answer_of_the_write_that_caused_it() -> None:
     emergencies: deque[Emergency] = deque()
     objects = dictionary()
     objects.variable(
@@ -131,7 +131,7 @@ def test_an_emergency_follows_the_answer_of_the_write_that_caused_it():
     assert [sent[7] >> 4 for sent in drain(box)] == [3, 1], "CoE services: SDO response, emergency"
 
 
-def test_emergencies_that_wait_go_first_and_in_their_order():
+def test_emergencies_that_wait_go_first_and_in_their_order() -> None:
     box = mailbox(Emergency(0x8611, 0x21, b"\x01\x02\x03\x04\x05"), Emergency(0x0000, 0))
     box.receive(buffer(UPLOAD, 1), PREOP)
     assert drain(box) == [
@@ -141,15 +141,15 @@ def test_emergencies_that_wait_go_first_and_in_their_order():
     ]
 
 
-def test_sdo_information_comes_as_several_messages():
+def test_sdo_information_comes_as_several_messages() -> None:
     box = mailbox(size=24)
     box.receive(message("0800 0000 00 13 0080 01 00 0000 0100"), PREOP)
     sent = drain(box)
-    assert [bytes(found[6:12]).hex() for found in sent] == ["008082000100", "008002000000"]
-    assert all(len(found) <= 24 and len(found) == 6 + found[0] for found in sent)
+    assert [bytes(part[6:12]).hex() for part in sent] == ["008082000100", "008002000000"]
+    assert all(len(part) <= 24 and len(part) == 6 + part[0] for part in sent)
 
 
-def test_a_master_that_never_reads_exhausts_no_memory():
+def test_a_master_that_never_reads_exhausts_no_memory() -> None:
     box = mailbox()
     for _ in range(10 * MAX_WAITING):
         box.receive(buffer(UPLOAD), PREOP)
@@ -160,7 +160,7 @@ def test_a_master_that_never_reads_exhausts_no_memory():
     assert drain(box)[0][6:] == message(UPLOADED)[6:]
 
 
-def test_a_message_longer_than_the_receive_mailbox_is_refused():
+def test_a_message_longer_than_the_receive_mailbox_is_refused() -> None:
     box = Mailbox(dictionary(), deque(), 16, 16)
     box.receive(message("0b00 0000 00 03 0020 21 0120 00 01000000 31"), PREOP)
     assert drain(box)[0][6:].hex() == "01000800"
@@ -169,12 +169,12 @@ def test_a_message_longer_than_the_receive_mailbox_is_refused():
 @pytest.mark.parametrize(
     ("receive", "send", "named"), [(15, 16, "receive mailbox has 15"), (16, 8, "send mailbox has 8")]
 )
-def test_a_mailbox_too_small_for_an_sdo_is_refused(receive, send, named):
+def test_a_mailbox_too_small_for_an_sdo_is_refused(receive: int, send: int, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         Mailbox(dictionary(), deque(), receive, send)
 
 
-def test_a_protocol_that_a_model_adds_is_answered_and_an_answer_without_room_is_refused():
+def test_a_protocol_that_a_model_adds_is_answered_and_an_answer_without_room_is_refused() -> None:
     answers = [b"ab", bytes(123)]
     box = Mailbox(dictionary(), deque(), 128, 128, protocols={MailboxType.VOE: lambda content, room: answers})
     box.receive(message("0200 0000 00 0f 0102"), PREOP)
@@ -185,7 +185,7 @@ INDICES = st.sampled_from([0x1000, 0x1600, 0x1C12, 0x2000, 0x2001, 0x2002, 0x300
 
 
 @st.composite
-def almost_right(draw):
+def almost_right(draw: st.DrawFn) -> bytes:
     """A mailbox message whose headers are mostly those of a CoE service."""
     service = draw(st.sampled_from([2, 2, 2, 8, 8, 0, 5]))
     head = bytes((0, service << 4)) + draw(st.binary(min_size=1, max_size=1))
@@ -201,12 +201,12 @@ def almost_right(draw):
     state=st.integers(0, 255),
     size=st.integers(16, 140),
 )
-def test_no_message_breaks_the_mailbox(messages, state, size):
+def test_no_message_breaks_the_mailbox(messages: list[bytes], state: int, size: int) -> None:
     box = mailbox(size=size)
     for sent in messages:
         box.receive(sent, state)
-        for found in drain(box):
-            assert len(found) == 6 + int.from_bytes(found[:2], "little") <= size
+        for answer in drain(box):
+            assert len(answer) == 6 + int.from_bytes(answer[:2], "little") <= size
     box.receive(message(UPLOAD), PREOP)
     (answer,) = drain(box)
     assert answer[6:] == message(UPLOADED)[6:]

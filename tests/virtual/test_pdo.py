@@ -3,8 +3,9 @@ import struct
 import pytest
 
 from rtcp.virtual.coe import read, write
-from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary, SdoAbort
+from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
 from rtcp.virtual.pdo import PdoImage, SyncManagerLayout, define_pdo_objects
+from tests.virtual.conftest import abort_of
 
 PREOP, SAFEOP, OP = 2, 4, 8
 RX_MAP, TX_MAP, RX_ASSIGN, TX_ASSIGN = 0x1600, 0x1A00, 0x1C12, 0x1C13
@@ -50,18 +51,12 @@ def map_anew(objects: ObjectDictionary, index: int, mappings: list[int]) -> None
     put(objects, index, 0, len(mappings), 1)
 
 
-def refusal(call, *arguments) -> int:
-    with pytest.raises(SdoAbort) as caught:
-        call(*arguments)
-    return caught.value.code
-
-
-def test_the_default_layout_has_the_mailboxes_and_buffers_where_masters_expect_them():
+def test_the_default_layout_has_the_mailboxes_and_buffers_where_masters_expect_them() -> None:
     registers = [(sm.start, sm.length, sm.control, int(sm.type)) for sm in SyncManagerLayout()]
     assert registers == [(0x1000, 128, 0x26, 1), (0x1080, 128, 0x22, 2), (0x1100, 0, 0x64, 3), (0x1400, 0, 0x20, 4)]
 
 
-def test_outputs_arrive_in_their_entries():
+def test_outputs_arrive_in_their_entries() -> None:
     objects = dictionary()
     image = PdoImage.from_assignment(objects, RX_ASSIGN)
     image.unpack(memoryview(bytes.fromhex("0f00 60799ffe 08")))
@@ -69,7 +64,7 @@ def test_outputs_arrive_in_their_entries():
     assert [entry.value for entry in image.entries] == [0x000F, -23103136, 8]
 
 
-def test_inputs_are_written_at_their_offset_and_nothing_beside_them():
+def test_inputs_are_written_at_their_offset_and_nothing_beside_them() -> None:
     objects = dictionary()
     objects[0x6041, 0].value = 0x1237
     target = bytearray(b"\xee" * 6)
@@ -77,7 +72,7 @@ def test_inputs_are_written_at_their_offset_and_nothing_beside_them():
     assert target.hex() == "eeee3712eeee"
 
 
-def test_two_assigned_pdos_follow_each_other():
+def test_two_assigned_pdos_follow_each_other() -> None:
     objects = dictionary()
     put(objects, RX_ASSIGN, 0, 0, 1)
     put(objects, RX_ASSIGN, 1, 0x1601, 2)
@@ -87,7 +82,7 @@ def test_two_assigned_pdos_follow_each_other():
     assert [hex(entry.index) for entry in image.entries] == ["0x6060", "0x6040", "0x607a", "0x6060"]
 
 
-def test_a_gap_is_passed_over_and_packed_as_zero():
+def test_a_gap_is_passed_over_and_packed_as_zero() -> None:
     objects = dictionary()
     map_anew(objects, RX_MAP, [MODE, 0x00000008, CONTROLWORD])
     image = PdoImage.from_assignment(objects, RX_ASSIGN)
@@ -98,7 +93,7 @@ def test_a_gap_is_passed_over_and_packed_as_zero():
     assert target.hex() == "08000600"
 
 
-def test_bits_and_a_signed_nibble_keep_their_places():
+def test_bits_and_a_signed_nibble_keep_their_places() -> None:
     objects = dictionary()
     map_anew(objects, RX_MAP, [0x70000101, 0x70000201, 0x00000002, 0x70100004, 0x70000301, CONTROLWORD])
     image = PdoImage.from_assignment(objects, RX_ASSIGN)
@@ -112,7 +107,7 @@ def test_bits_and_a_signed_nibble_keep_their_places():
 
 
 @pytest.mark.parametrize("with_bit", [False, True])
-def test_floats_and_octet_strings_are_mapped_too(with_bit):
+def test_floats_and_octet_strings_are_mapped_too(with_bit: bool) -> None:
     objects = dictionary()
     map_anew(objects, RX_MAP, [0x20010020, 0x20020018] + [0x70000101] * with_bit)
     image = PdoImage.from_assignment(objects, RX_ASSIGN)
@@ -124,7 +119,7 @@ def test_floats_and_octet_strings_are_mapped_too(with_bit):
     assert target == wire
 
 
-def test_an_assignment_without_pdos_has_an_empty_image():
+def test_an_assignment_without_pdos_has_an_empty_image() -> None:
     objects = dictionary()
     put(objects, RX_ASSIGN, 0, 0, 1)
     image = PdoImage.from_assignment(objects, RX_ASSIGN)
@@ -132,7 +127,7 @@ def test_an_assignment_without_pdos_has_an_empty_image():
     assert (image.bit_length, image.entries) == (0, ())
 
 
-def test_an_image_longer_than_its_buffer_is_refused_with_both_lengths():
+def test_an_image_longer_than_its_buffer_is_refused_with_both_lengths() -> None:
     objects = dictionary()
     long = [0x2F0000F8] * 9
     for subindex, mapping in enumerate(long, 1):
@@ -142,13 +137,13 @@ def test_an_image_longer_than_its_buffer_is_refused_with_both_lengths():
         PdoImage.from_assignment(objects, RX_ASSIGN)
 
 
-def test_a_fixed_mapping_that_names_no_object_is_refused():
+def test_a_fixed_mapping_that_names_no_object_is_refused() -> None:
     objects = ObjectDictionary()
     define_pdo_objects(objects, {RX_MAP: [(0x7FFF, 0, 8)]}, {}, [RX_MAP], [], True)
-    assert refusal(PdoImage.from_assignment, objects, RX_ASSIGN) == 0x06020000
+    assert abort_of(PdoImage.from_assignment, objects, RX_ASSIGN) == 0x06020000
 
 
-def test_a_new_mapping_changes_the_next_image_and_not_the_present_one():
+def test_a_new_mapping_changes_the_next_image_and_not_the_present_one() -> None:
     objects = dictionary()
     before = PdoImage.from_assignment(objects, RX_ASSIGN)
     map_anew(objects, RX_MAP, [MODE])
@@ -178,49 +173,49 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("index", "writes", "code"), [case[1:] for case in REFUSED], ids=[case[0] for case in REFUSED])
-def test_the_last_of_these_writes_is_refused(index, writes, code):
+def test_the_last_of_these_writes_is_refused(index: int, writes: list[tuple[int, int, int]], code: int) -> None:
     objects = dictionary()
     for subindex, value, size in writes[:-1]:
         put(objects, index, subindex, value, size)
     subindex, value, size = writes[-1]
-    assert refusal(put, objects, index, subindex, value, size) == code
+    assert abort_of(put, objects, index, subindex, value, size) == code
 
 
 @pytest.mark.parametrize("state", [SAFEOP, OP])
 @pytest.mark.parametrize("index", [RX_MAP, TX_MAP, RX_ASSIGN, TX_ASSIGN])
-def test_mapping_and_assignment_change_only_in_preop(index, state):
-    assert refusal(put, dictionary(), index, 0, 0, 1, state) == 0x08000022
+def test_mapping_and_assignment_change_only_in_preop(index: int, state: int) -> None:
+    assert abort_of(put, dictionary(), index, 0, 0, 1, state) == 0x08000022
 
 
 @pytest.mark.parametrize("index", [RX_MAP, TX_MAP, RX_ASSIGN, TX_ASSIGN])
 @pytest.mark.parametrize("complete", [False, True])
-def test_fixed_process_data_cannot_be_written(index, complete):
+def test_fixed_process_data_cannot_be_written(index: int, complete: bool) -> None:
     objects = dictionary(fixed=True)
     data = bytes(2) if complete else bytes(1)
-    assert refusal(write, objects, index, 0, complete, PREOP, data) == 0x06010002
+    assert abort_of(write, objects, index, 0, complete, PREOP, data) == 0x06010002
 
 
-def test_complete_access_maps_anew_in_one_write():
+def test_complete_access_maps_anew_in_one_write() -> None:
     objects = dictionary()
     write(objects, RX_MAP, 0, True, PREOP, struct.pack("<BxII", 2, MODE, CONTROLWORD))
     write(objects, RX_ASSIGN, 0, True, PREOP, struct.pack("<BxH", 1, RX_MAP))
     assert PdoImage.from_assignment(objects, RX_ASSIGN).bit_length == 24
 
 
-def test_a_refused_complete_access_leaves_the_mapping_as_it_was():
+def test_a_refused_complete_access_leaves_the_mapping_as_it_was() -> None:
     objects = dictionary()
     before = read(objects, RX_MAP, 0, True, PREOP)
     wrong = struct.pack("<BxII", 2, MODE, 0x7FFF0010)
-    assert refusal(write, objects, RX_MAP, 0, True, PREOP, wrong) == 0x06020000
+    assert abort_of(write, objects, RX_MAP, 0, True, PREOP, wrong) == 0x06020000
     assert read(objects, RX_MAP, 0, True, PREOP) == before
 
 
-def test_soem_finds_the_types_of_the_sync_managers():
+def test_soem_finds_the_types_of_the_sync_managers() -> None:
     # ec_SMcommtypet: count, one byte unused, one byte a sync manager.
     assert read(dictionary(), 0x1C00, 0, True, PREOP).hex() == "040001020304"
 
 
-def test_soem_reads_assignment_and_mapping_by_complete_access():
+def test_soem_reads_assignment_and_mapping_by_complete_access() -> None:
     # ec_PDOassignt and ec_PDOdesct: count, one byte unused, indices or mappings.
     objects = dictionary()
     assert read(objects, RX_ASSIGN, 0, True, PREOP) == struct.pack("<BxH", 1, RX_MAP)

@@ -6,29 +6,12 @@ import pytest
 
 from rtcp.virtual.protocol import DatagramCommand
 from rtcp.virtual.segment import REPLAYED_PULSES
-from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, Line, TinyDevice, start_sync0
+from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, Line, TinyDevice, by_sync0
 
 
 def in_op() -> Line:
     line = Line([TinyDevice(), TinyDevice()])
     line.to_op()
-    return line
-
-
-def by_sync0(device: TinyDevice, cycle: int = MS) -> Line:
-    """One slave in OP whose SYNC0 comes half a cycle after each frame."""
-    line = Line([device])
-    line.to_pre_op()
-    line.configure_process_data()
-    start_sync0(line, 0, cycle, first_in=50 * MS)
-    assert line.request(0, SAFE_OP) == (SAFE_OP, 0)
-    due = line.slaves[0].esc.dc.sync0.due
-    line.pass_time((due - line.now) % cycle + cycle // 2)
-    line.write(0, 0x0120, b"\x08\x00")
-    line.pass_time(cycle - 100_000)
-    for _ in range(100):
-        line.exchange(1, after=cycle)
-    assert line.slaves[0].application.state == OP
     return line
 
 
@@ -45,8 +28,8 @@ def test_the_watchdog_takes_a_slave_without_outputs_to_safe_op_and_makes_them_sa
     assert line.al(0) == (OP, 0)
     line.pass_time(3 * MS)
     assert [line.al(n) for n in (0, 1)] == [(SAFE_OP | ERROR, 0x001B)] * 2
-    assert [device.valid for device in line.devices] == [[True, False]] * 2
-    assert line.devices[0].out.value == 0
+    assert [device.valid for device in line.tiny] == [[True, False]] * 2
+    assert line.tiny[0].out.value == 0
     assert line.number(0, 0x0440, 2) & 1 == 0
     assert line.number(0, 0x0442, 1) == 1
 
@@ -92,24 +75,24 @@ def test_a_watchdog_time_of_zero_and_a_sync_manager_that_does_not_trigger_it_swi
 def test_a_device_lives_on_without_frames() -> None:
     line = Line([TinyDevice()])
     line.pass_time(1000 * MS)
-    assert line.devices[0].passed == pytest.approx(1.0, abs=0.002)
+    assert line.tiny[0].passed == pytest.approx(1.0, abs=0.002)
 
 
 def test_with_sync0_a_device_makes_one_step_a_cycle_as_long_as_the_cycle() -> None:
     line = by_sync0(TinyDevice())
-    before, passed = line.devices[0].steps, line.devices[0].passed
+    before, passed = line.tiny[0].steps, line.tiny[0].passed
     for _ in range(50):
         line.exchange(1)
-    assert line.devices[0].steps - before == 50
-    assert line.devices[0].passed - passed == pytest.approx(0.050, abs=1e-6)
+    assert line.tiny[0].steps - before == 50
+    assert line.tiny[0].passed - passed == pytest.approx(0.050, abs=1e-6)
 
 
 def test_outputs_take_effect_with_sync0_and_not_before() -> None:
     line = by_sync0(TinyDevice())
     line.exchange(500)
-    assert line.devices[0].out.value == 1
+    assert line.tiny[0].out.value == 1
     line.pass_time(MS // 2 + 10_000)
-    assert line.devices[0].out.value == 500
+    assert line.tiny[0].out.value == 500
 
 
 def test_process_data_that_miss_sync0_twice_are_a_sync_error() -> None:
@@ -154,9 +137,10 @@ def test_without_object_0x10f1_the_models_option_is_the_limit(limit: int, misses
 
 
 def test_a_device_that_uses_no_sync0_misses_none() -> None:
-    device = TinyDevice()
-    device.uses_sync0 = False
-    line = by_sync0(device)
+    class WithoutSync0(TinyDevice):
+        uses_sync0 = False
+
+    line = by_sync0(WithoutSync0())
     line.pass_time(50 * MS)
     assert line.al(0) == (OP, 0)
 
@@ -170,15 +154,15 @@ def test_sync0_that_ends_in_op_is_a_fatal_sync_error() -> None:
 
 def test_after_a_stop_of_the_process_few_pulses_are_made_up_for_and_none_counts_as_missed() -> None:
     line = by_sync0(TinyDevice())
-    steps, passed = line.devices[0].steps, line.devices[0].passed
-    # The process slept for 80 ms: the loop finds time passed without having been called.
+    steps, passed = line.tiny[0].steps, line.tiny[0].passed
+    # The process slept for 80 ms.
     line.now += 80 * MS
     answered = line.exchange(1, after=0)
     line.pass_time(100_000)
     assert answered[1] == 3
     assert line.al(0) == (OP, 0)
-    assert line.devices[0].steps - steps <= REPLAYED_PULSES + 2
-    assert line.devices[0].passed - passed <= 0.045
+    assert line.tiny[0].steps - steps <= REPLAYED_PULSES + 2
+    assert line.tiny[0].passed - passed <= 0.045
     for _ in range(20):
         line.exchange(1)
     assert line.al(0) == (OP, 0)

@@ -59,13 +59,13 @@ CONVERSATIONS = {
 
 
 @pytest.mark.parametrize(("sent", "received"), CONVERSATIONS.values(), ids=CONVERSATIONS.keys())
-def test_sdo_information_conversation(sent, received):
+def test_sdo_information_conversation(sent: str, received: str) -> None:
     answer = SdoInformation(dictionary(), 128).answer(bytes.fromhex(sent))
     assert answer == [bytes.fromhex(received)]
 
 
 @pytest.mark.parametrize("send_size", [16, 17, 23, 24, 64, 128])
-def test_soem_puts_a_fragmented_list_together(send_size):
+def test_soem_puts_a_fragmented_list_together(send_size: int) -> None:
     objects = ObjectDictionary()
     for index in range(0x2000, 0x2000 + 101):
         objects.variable(index, "Number", DataType.UNSIGNED8)
@@ -83,7 +83,7 @@ def test_soem_puts_a_fragmented_list_together(send_size):
     assert indices == list(range(0x2000, 0x2000 + 101))
 
 
-def test_a_long_name_is_told_in_fragments():
+def test_a_long_name_is_sent_in_fragments() -> None:
     objects = ObjectDictionary()
     objects.variable(0x2000, "A name that is longer than the mailbox", DataType.UNSIGNED8)
     fragments = SdoInformation(objects, 32).answer(bytes.fromhex("03 00 0000 0020"))

@@ -68,7 +68,6 @@ def start(config: Path, *options: str, user: int | None = None) -> subprocess.Po
 def running(config: Path, *options: str, user: int | None = None) -> Iterator[Segment]:
     segment = start(config, *options, user=user)
     try:
-        assert segment.stdout is not None
         line = segment.stdout.readline()
         assert line, segment.communicate()[1]
         yield segment, json.loads(line)
@@ -100,13 +99,13 @@ def wait_until_gone(name: str) -> bool:
 
 
 def assert_all_in_op(result: dict[str, Any]) -> None:
-    assert result["found"] == 7
+    assert result["slaves"] == 7
     assert result["delays"] == FACTS
     assert result["safe_op"] == 4
     assert result["sizes"] == [[2, 6], *[[15, 15]] * 6]
     assert (result["state"], result["codes"]) == (8, [0] * 7)
     assert result["expected"] == 21
-    # A frame that this machine delays beyond the master's patience (-1) is no wrong counter.
+    # -1: the host delayed the frame beyond the master's timeout.
     assert {*result["counters"]} <= {21, -1}
     assert result["counters"].count(21) > 0.9 * len(result["counters"])
     assert result["init"] == 1
@@ -129,10 +128,10 @@ def test_a_model_of_another_package_serves_files_over_foe(tmp_path: Path) -> Non
     config = tmp_path / "files.yaml"
     config.write_text("slaves:\n  - model: tests.virtual.file_models:FileServer\n", encoding="utf-8")
     with running(config) as (segment, _):
-        child = [sys.executable, str(CHILD.with_name("foe_child.py")), str(segment.pid), "ecat0"]
-        found = json.loads(subprocess.run(child, stdout=subprocess.PIPE, text=True, check=True).stdout)
-    assert found["firmware"] == (bytes(range(256)) * 2).hex()
-    assert found["settings"] == found["written"]
+        child = [sys.executable, "-m", "tests.virtual.foe_child", str(segment.pid), "ecat0"]
+        files = json.loads(subprocess.run(child, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT).stdout)
+    assert files["firmware"] == (bytes(range(256)) * 2).hex()
+    assert files["settings"] == files["written"]
 
 
 def test_the_next_master_finds_the_slaves_as_the_first_one_did(config: Path) -> None:
@@ -192,18 +191,18 @@ def test_a_cable_that_is_removed_ends_the_process_with_a_sentence(config: Path) 
     with running(config, "--interface", "rtcp-t2") as (segment, _):
         with IPRoute() as links:
             links.link("del", index=socket.if_nametoindex("rtcp-t2"))
-        _, said = segment.communicate(timeout=10)
+        _, stderr = segment.communicate(timeout=10)
         assert segment.returncode == 2
-        assert said == "the cable at rtcp-t2 is gone (Network is down): was it removed?\n"
+        assert stderr == "the cable at rtcp-t2 is gone (Network is down): was it removed?\n"
 
 
 @needs_root
 def test_an_interface_that_exists_is_refused_and_left_alone(config: Path) -> None:
     with running(config, "--interface", "rtcp-t1") as (first, _):
         second = start(config, "--interface", "rtcp-t1")
-        _, said = second.communicate(timeout=20)
+        _, stderr = second.communicate(timeout=20)
         assert second.returncode == 2
-        assert said == (
+        assert stderr == (
             "--interface rtcp-t1 exists already: choose another name, or remove it with 'ip link del'\n"
         )  # fmt: skip
         assert "rtcp-t1" in interfaces()
@@ -258,11 +257,11 @@ def test_what_cannot_be_is_refused_in_a_sentence_with_code_2(
     path = tmp_path / "segment.yaml"
     path.write_text(text, encoding="utf-8")
     segment = start(path, *options)
-    out, said = segment.communicate(timeout=20)
+    out, stderr = segment.communicate(timeout=20)
     assert (segment.returncode, out) == (2, "")
-    assert expected in said
-    assert "Traceback" not in said
-    assert said.count("\n") == 1
+    assert expected in stderr
+    assert "Traceback" not in stderr
+    assert stderr.count("\n") == 1
 
 
 def raw_master(segment: dict[str, Any], frames: int, period_us: int, *more: str) -> dict[str, Any]:
@@ -279,9 +278,9 @@ def test_under_sched_fifo_the_segment_leaves_the_kernel_its_share_of_the_cpu(
     with running(config, *options) as (_, facts):
         if os.sched_getscheduler(facts["pid"]) != os.SCHED_FIFO:
             pytest.skip("no right to SCHED_FIFO")
-        told = raw_master(facts, 2000 if period_us else 10_000, period_us)
-    assert told["cpu_share"] < 0.945, "the kernel throttles SCHED_FIFO above 95 % (sched_rt_runtime_us)"
-    assert told["counters"] == [7]
+        result = raw_master(facts, 2000 if period_us else 10_000, period_us)
+    assert result["cpu_share"] < 0.945, "the kernel throttles SCHED_FIFO above 95 % (sched_rt_runtime_us)"
+    assert result["counters"] == [7]
 
 
 @pytest.mark.slow
@@ -304,8 +303,8 @@ def test_a_frame_arrives_by_the_kernels_stamp_and_never_before_the_frame_before_
 
 def test_a_frame_with_a_vlan_tag_is_answered_with_its_tag(config: Path) -> None:
     with running(config) as (_, facts):
-        told = raw_master(facts, 5, 2000, "5")
-    assert (told["lost"], told["counters"], told["tags"]) == (0, [7], [5])
+        result = raw_master(facts, 5, 2000, "5")
+    assert (result["lost"], result["counters"], result["tags"]) == (0, [7], [5])
 
 
 @needs_root

@@ -1,10 +1,9 @@
-"""The shape setter's virtual slaves: outputs act on circuit and rod, the meter shows pairs of one instant."""
+"""The shape setter's virtual slaves: outputs act on circuit and rod, the meter shows simultaneous pairs."""
 
 from __future__ import annotations
 
 import pytest
 
-from rtcp.virtual.device import create
 from rtcp.virtual.faults.fault import DeviceFault
 from rtcp.virtual.faults.registry import parse
 from rtcp.virtual.heater_circuit import CircuitFault
@@ -15,15 +14,12 @@ VOLTAGE, CURRENT = 15.0 / ((1 << 23) - 1), 1000.0 / ((1 << 23) - 1)
 
 
 class Bench:
-    """Both slaves, stepped as the cable does it."""
+    """Both slaves, stepped in the order of the cable."""
 
     def __init__(self, **options: float) -> None:
-        box, meter = create("shape-setter-box", **options), create("shape-setter-meter")
-        assert isinstance(box, ShapeSetterBox)
-        assert isinstance(meter, ShapeSetterMeter)
-        self.box, self.meter = box, meter
-        for device in (box, meter):
-            device.join([box, meter])
+        self.box, self.meter = ShapeSetterBox(**options), ShapeSetterMeter()
+        for device in (self.box, self.meter):
+            device.join([self.box, self.meter])
             device.set_outputs_valid(True)
 
     def run(self, seconds: float, *, gate: int = 0, relay: int = 0) -> None:
@@ -86,7 +82,6 @@ def test_a_bent_rod_that_was_hot_keeps_its_shape_and_another_one_is_straight() -
     for n in range(1, CELLS + 1):
         bench.box.objects[0x2011, n].value = 4.0
     entry = bench.box.objects[0x2013, 1]
-    assert entry.on_write is not None
     entry.on_write(entry, 1)
     bench.run(0.02, relay=1)
     bench.run(1.1, gate=1, relay=1)
@@ -131,7 +126,6 @@ def test_a_fault_on_command_ends(
     end = planned.fault.begin([bench.box, bench.meter])
     bench.run(DT)
     assert bench.read(index, subindex) == shown[1]
-    assert end is not None
     end(0)
     bench.run(DT)
     assert bench.read(index, subindex) == shown[0]

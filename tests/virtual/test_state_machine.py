@@ -26,9 +26,15 @@ from tests.virtual.line import (
     start_sync0,
 )
 
+
+def to_configured_pre_op(line: Line) -> None:
+    line.to_pre_op()
+    line.configure_process_data()
+
+
 REACH: dict[int, Callable[[Line], None]] = {
     INIT: Line.address,
-    PRE_OP: lambda line: (line.to_pre_op(), line.configure_process_data())[0],
+    PRE_OP: to_configured_pre_op,
     SAFE_OP: Line.to_safe_op,
     OP: Line.to_op,
 }
@@ -41,7 +47,7 @@ def reach(state: int, device: TinyDevice | None = None) -> Line:
 
 
 @pytest.mark.parametrize(
-    ("state", "wanted", "code"),
+    ("state", "requested", "code"),
     [
         (INIT, SAFE_OP, 0x0011),
         (INIT, OP, 0x0011),
@@ -57,14 +63,14 @@ def reach(state: int, device: TinyDevice | None = None) -> Line:
     ],
 )
 def test_a_request_that_the_state_machine_does_not_know_is_answered_with_its_code(
-    state: int, wanted: int, code: int
+    state: int, requested: int, code: int
 ) -> None:
-    assert reach(state).request(0, wanted) == (state | ERROR, code)
+    assert reach(state).request(0, requested) == (state | ERROR, code)
 
 
-@pytest.mark.parametrize(("state", "wanted"), [(a, b) for a in REACH for b in REACH if b <= a])
-def test_every_step_down_and_the_state_itself_is_granted(state: int, wanted: int) -> None:
-    assert reach(state).request(0, wanted) == (wanted, 0)
+@pytest.mark.parametrize(("state", "requested"), [(a, b) for a in REACH for b in REACH if b <= a])
+def test_every_step_down_and_the_state_itself_is_granted(state: int, requested: int) -> None:
+    assert reach(state).request(0, requested) == (requested, 0)
 
 
 @pytest.mark.parametrize(
@@ -182,7 +188,7 @@ def test_op_is_granted_with_the_first_outputs_after_the_request() -> None:
     line.request(0, OP)
     line.exchange(5)
     assert line.al(0) == (OP, 0)
-    assert line.devices[0].valid == [True]
+    assert line.tiny[0].valid == [True]
 
 
 def test_op_with_sync0_that_never_starts_is_refused_with_0x002d() -> None:
@@ -219,13 +225,13 @@ def test_init_is_granted_without_acknowledging() -> None:
     assert line.request(0, INIT) == (INIT, 0)
 
 
-@pytest.mark.parametrize("wanted", [SAFE_OP, PRE_OP, INIT])
-def test_leaving_op_makes_the_outputs_invalid_once(wanted: int) -> None:
+@pytest.mark.parametrize("requested", [SAFE_OP, PRE_OP, INIT])
+def test_leaving_op_makes_the_outputs_invalid_once(requested: int) -> None:
     line = reach(OP)
     line.exchange(99)
-    line.request(0, wanted)
-    assert line.devices[0].valid == [True, False]
-    assert line.devices[0].out.value == 0
+    line.request(0, requested)
+    assert line.tiny[0].valid == [True, False]
+    assert line.tiny[0].out.value == 0
 
 
 @pytest.mark.parametrize(("register", "state", "code"), [(0x0806, INIT, 0x0016), (0x0816, PRE_OP, 0x001D),
@@ -234,14 +240,14 @@ def test_switching_a_sync_manager_off_in_op_makes_the_slave_fall(register: int, 
     line = reach(OP)
     line.write(0, register, b"\x00")
     assert line.al(0) == (state | ERROR, code)
-    assert line.devices[0].valid == [True, False]
+    assert line.tiny[0].valid == [True, False]
 
 
 def test_outputs_sent_before_op_do_not_reach_the_device() -> None:
     line = reach(SAFE_OP)
     assert line.exchange(77)[1] == 3
     line.pass_time(5 * MS)
-    assert line.devices[0].out.value == 0
+    assert line.tiny[0].out.value == 0
 
 
 def test_process_data_are_not_counted_before_safe_op() -> None:

@@ -1,7 +1,7 @@
-"""Frames of Simple Message: bytes in, frames out. No sockets here.
+"""Encoder and decoder of Simple Message frames, without sockets.
 
-A frame is `length, msg_type, comm_type, reply_code`, int32 each, and a body; the length counts all but itself
-(REP-I0006). Frames have no mark and no checksum: after one wrong length nothing can be read any more.
+A frame is `length, msg_type, comm_type, reply_code`, int32 each, and a body; the length excludes itself (REP-I0006).
+Frames have no start mark and no checksum: after one wrong length the stream cannot be read any more.
 """
 
 from __future__ import annotations
@@ -10,38 +10,30 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rtcp.fieldbus.simple_message.messages import (
-    ByteOrder,
-    CommType,
-    Message,
-    MessageError,
-    MessageType,
-    ReplyCode,
-    unpack_message,
-)
+from rtcp.fieldbus.simple_message import messages
 
 LEAST_LENGTH = 12
 MOST_LENGTH = 1023
-"""The reference client receives into 1024 bytes and does not check."""
+"""Greatest length: the reference client receives into 1024 bytes without a check."""
 _LENGTH_BYTES = 4
 
 
 class FrameError(Exception):
-    """Bytes that are no frame: the connection cannot be read on."""
+    """Invalid bytes: the rest of the connection cannot be read."""
 
 
 class LengthError(FrameError):
-    """A length outside 12..1023, negative ones among them; also a frame in the other byte order."""
+    """A length outside 12..1023, also due to the other byte order."""
 
-    def __init__(self, head: bytes, order: ByteOrder | None) -> None:
+    def __init__(self, head: bytes, order: messages.ByteOrder | None) -> None:
         readings = " or ".join(
-            f"{_length(head, each)} ({each.name.lower()} endian)" for each in ([order] if order else ByteOrder)
+            f"{_length(head, each)} ({each.name.lower()} endian)" for each in ([order] if order else messages.ByteOrder)
         )
         super().__init__(f"length {readings} is outside {LEAST_LENGTH}..{MOST_LENGTH}")
 
 
 class HeaderError(FrameError):
-    """A kind of communication that does not exist, or a reply code that does not belong to it."""
+    """An unknown communication type, or a reply code that does not match it."""
 
 
 class TruncatedFrameError(FrameError):
@@ -50,66 +42,68 @@ class TruncatedFrameError(FrameError):
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame; the numbers of its message may be unknown ones."""
+    """One frame; its message type may be unknown."""
 
     msg_type: int
-    comm_type: CommType
-    reply_code: ReplyCode
+    comm_type: messages.CommType
+    reply_code: messages.ReplyCode
     body: bytes = b""
 
     @classmethod
-    def topic(cls, message: Message, order: ByteOrder) -> Frame:
-        """Return a message that nobody answers; raises MessageError."""
-        return cls(message.TYPE, CommType.TOPIC, ReplyCode.INVALID, message.pack(order))
+    def topic(cls, message: messages.Message, order: messages.ByteOrder) -> Frame:
+        """Return the frame of a message without an answer; raises MessageError."""
+        return cls(message.TYPE, messages.CommType.TOPIC, messages.ReplyCode.INVALID, message.pack(order))
 
     @classmethod
-    def request(cls, message: Message, order: ByteOrder) -> Frame:
-        """Return a message that the peer answers; raises MessageError."""
-        return cls(message.TYPE, CommType.SERVICE_REQUEST, ReplyCode.INVALID, message.pack(order))
+    def request(cls, message: messages.Message, order: messages.ByteOrder) -> Frame:
+        """Return the frame of a message that the peer answers; raises MessageError."""
+        return cls(message.TYPE, messages.CommType.SERVICE_REQUEST, messages.ReplyCode.INVALID, message.pack(order))
 
-    def reply(self, code: ReplyCode, body: bytes = b"") -> Frame:
+    def reply(self, code: messages.ReplyCode, body: bytes = b"") -> Frame:
         """Return the answer to this request."""
-        return Frame(self.msg_type, CommType.SERVICE_REPLY, code, body)
+        return Frame(self.msg_type, messages.CommType.SERVICE_REPLY, code, body)
 
-    def pack(self, order: ByteOrder) -> bytes:
+    def pack(self, order: messages.ByteOrder) -> bytes:
         """Return the bytes; raises MessageError for a length above 1023."""
         length = LEAST_LENGTH + len(self.body)
         if length > MOST_LENGTH:
-            raise MessageError(f"message {self.msg_type}: length {length} is above {MOST_LENGTH}")
+            raise messages.MessageError(f"message {self.msg_type}: length {length} is above {MOST_LENGTH}")
         return struct.pack(f"{order.value}4i", length, self.msg_type, self.comm_type, self.reply_code) + self.body
 
-    def message(self, order: ByteOrder) -> Message:
-        """Return what it carries; raises MessageError."""
-        return unpack_message(self.msg_type, self.body, order, self.comm_type is CommType.SERVICE_REPLY)
+    def message(self, order: messages.ByteOrder) -> messages.Message:
+        """Return its message; raises MessageError."""
+        return messages.unpack_message(
+            self.msg_type, self.body, order, self.comm_type is messages.CommType.SERVICE_REPLY
+        )
 
     @property
     def name(self) -> str:
-        """Name of the message, or its number where it is unknown."""
-        known = self.msg_type in MessageType._value2member_map_
-        return MessageType(self.msg_type).name if known else f"message {self.msg_type}"
+        """Name of the message type, or its number where it is unknown."""
+        known = self.msg_type in messages.MessageType._value2member_map_
+        return messages.MessageType(self.msg_type).name if known else f"message {self.msg_type}"
 
 
 class FrameDecoder:
-    """Cuts a stream of bytes into frames.
+    """Splits a stream of bytes into frames.
 
     Args:
-        order: of the peer; None: that in which the first length lies in 12..1023, which only one can.
+        order: byte order of the peer; None: the one in which the first length lies in 12..1023.
 
     Attributes:
-        order: None before it is known.
+        order: byte order; None before it is known.
     """
 
-    def __init__(self, order: ByteOrder | None = None) -> None:
+    def __init__(self, order: messages.ByteOrder | None = None) -> None:
         self.order = order
         self._bytes = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Frame]:
-        """Take bytes, and return the frames that are complete now; going through them raises FrameError."""
+        """Add bytes; the iterator yields the frames that are complete now and raises FrameError."""
         self._bytes += data
         return self._frames()
 
     def end(self) -> None:
-        """The connection has ended; raises TruncatedFrameError within a frame."""
+        """Mark the end of the connection; raises TruncatedFrameError within a frame."""
         if self._bytes:
             raise TruncatedFrameError(f"it ended after {len(self._bytes)} bytes of a frame")
 
@@ -127,21 +121,21 @@ class FrameDecoder:
             yield _frame(frame, order)
 
 
-def _length(head: bytes, order: ByteOrder) -> int:
-    return int.from_bytes(head, "little" if order is ByteOrder.LITTLE else "big", signed=True)
+def _length(head: bytes, order: messages.ByteOrder) -> int:
+    return int.from_bytes(head, "little" if order is messages.ByteOrder.LITTLE else "big", signed=True)
 
 
-def _order_of(head: bytes) -> ByteOrder:
-    for order in ByteOrder:
+def _order_of(head: bytes) -> messages.ByteOrder:
+    for order in messages.ByteOrder:
         if LEAST_LENGTH <= _length(head, order) <= MOST_LENGTH:
             return order
     raise LengthError(head, None)
 
 
-def _frame(data: bytes, order: ByteOrder) -> Frame:
+def _frame(data: bytes, order: messages.ByteOrder) -> Frame:
     _, msg_type, comm_type, reply_code = struct.unpack_from(f"{order.value}4i", data)
-    is_reply = comm_type == CommType.SERVICE_REPLY
-    codes = (ReplyCode.SUCCESS, ReplyCode.FAILURE) if is_reply else (ReplyCode.INVALID,)
-    if comm_type not in CommType._value2member_map_ or reply_code not in codes:
+    is_reply = comm_type == messages.CommType.SERVICE_REPLY
+    codes = (messages.ReplyCode.SUCCESS, messages.ReplyCode.FAILURE) if is_reply else (messages.ReplyCode.INVALID,)
+    if comm_type not in messages.CommType._value2member_map_ or reply_code not in codes:
         raise HeaderError(f"message {msg_type}: comm_type {comm_type} with reply_code {reply_code} does not exist")
-    return Frame(msg_type, CommType(comm_type), ReplyCode(reply_code), data[16:])
+    return Frame(msg_type, messages.CommType(comm_type), messages.ReplyCode(reply_code), data[16:])

@@ -1,7 +1,7 @@
 """The messages of Simple Message and their bytes (ROS-Industrial REP-I0004: numbers, REP-I0006: layouts).
 
 A body has int32 and float32 without padding, in either byte order. Joints are from base to tool. Units: rad, s.
-`JointPoint` is our own: any number of joints, float64.
+`JointPoint` is an extension: any number of joints, float64.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from enum import Enum, IntEnum, IntFlag
 from typing import ClassVar, TypeAlias
 
 MOST_JOINTS = 24
-"""Of JOINT_POSITION and JOINT_TRAJ_PT between two programs that agree on more: four arms of six."""
+"""Most joints of JOINT_POSITION and JOINT_TRAJ_PT between programs that agree on it: four arms of six."""
 JOINTS = 10
-"""Joints of every message but `JointPoint`; those that an arm does not have are 0."""
+"""Joints of every message except `JointPoint`; unused ones are 0."""
 Joints: TypeAlias = tuple[float, ...]
 
 
 class ByteOrder(Enum):
-    """A build option of the peer; nothing in the protocol says it. The values are those of `struct`."""
+    """Byte order, a build option of the peer that the protocol does not announce. Values: codes of `struct`."""
 
     LITTLE = "<"
     BIG = ">"
 
 
 class MessageType(IntEnum):
-    """The messages known here; 12, 20 and 21 are deprecated, and no layout of them is agreed on."""
+    """Supported message types; 12, 20 and 21 are deprecated and have no agreed layout."""
 
     PING = 1
     GET_VERSION = 2
@@ -37,11 +37,11 @@ class MessageType(IntEnum):
     JOINT_TRAJ_PT_FULL = 14
     JOINT_FEEDBACK = 15
     JOINT_POINT = 65000
-    """Ours, from the range that REP-I0004 leaves free."""
+    """An extension, from the range that REP-I0004 leaves free."""
 
 
 class CommType(IntEnum):
-    """How a message is answered: a topic is not."""
+    """Communication type: a topic has no answer."""
 
     TOPIC = 1
     SERVICE_REQUEST = 2
@@ -49,7 +49,7 @@ class CommType(IntEnum):
 
 
 class ReplyCode(IntEnum):
-    """INVALID in all but replies."""
+    """Reply code; INVALID in all messages but replies."""
 
     INVALID = 0
     SUCCESS = 1
@@ -57,7 +57,7 @@ class ReplyCode(IntEnum):
 
 
 class SpecialSequence(IntEnum):
-    """What a sequence number below 0 says; from 0 it counts the points of a trajectory."""
+    """Meaning of a negative sequence number; from 0 it counts the points of a trajectory."""
 
     START_TRAJECTORY_DOWNLOAD = -1
     START_TRAJECTORY_STREAMING = -2
@@ -66,7 +66,7 @@ class SpecialSequence(IntEnum):
 
 
 class ValidFields(IntFlag):
-    """Which fields of a point have a meaning."""
+    """Valid fields of a point."""
 
     TIME = 1
     POSITION = 2
@@ -75,7 +75,7 @@ class ValidFields(IntFlag):
 
 
 class TriState(IntEnum):
-    """A yes or no that may be unknown (industrial_msgs/TriState too)."""
+    """True, false or unknown (industrial_msgs/TriState)."""
 
     UNKNOWN = -1
     FALSE = 0
@@ -83,7 +83,7 @@ class TriState(IntEnum):
 
 
 class RobotMode(IntEnum):
-    """Who may command the arm (industrial_msgs/RobotMode too)."""
+    """Operating mode, which says who may command the arm (industrial_msgs/RobotMode)."""
 
     UNKNOWN = -1
     MANUAL = 1
@@ -91,12 +91,12 @@ class RobotMode(IntEnum):
 
 
 class MessageError(ValueError):
-    """Values that a message cannot carry, or a body of another length than its layout."""
+    """Values that a message cannot represent, or a body whose length differs from the layout."""
 
 
 @dataclass(frozen=True)
 class Ping:
-    """Is the peer there. REP-I0006 has ten zeros behind the header, the reference client none: both are read."""
+    """Checks that the peer answers. REP-I0006 has a body of ten zeros, the reference client none; both are accepted."""
 
     TYPE: ClassVar = MessageType.PING
 
@@ -151,7 +151,7 @@ class Version:
 
 @dataclass(frozen=True)
 class JointPosition:
-    """Where the joints are (state), or shall be now (motion)."""
+    """Positions of the joints: actual (state) or commanded now (motion)."""
 
     TYPE: ClassVar = MessageType.JOINT_POSITION
     sequence: int
@@ -196,7 +196,7 @@ class JointTrajPt:
 
 @dataclass(frozen=True)
 class Status:
-    """The fields of RobotStatus; without arguments: nothing is known."""
+    """The fields of RobotStatus; by default all unknown."""
 
     TYPE: ClassVar = MessageType.STATUS
     drives_powered: TriState = TriState.UNKNOWN
@@ -224,7 +224,7 @@ class Status:
 
 @dataclass(frozen=True)
 class JointTrajPtFull:
-    """A point of a trajectory, with the time since its start; `valid_fields` says which fields count."""
+    """A point of a trajectory, with the time since its start; `valid_fields` names the fields in use."""
 
     TYPE: ClassVar = MessageType.JOINT_TRAJ_PT_FULL
     robot_id: int
@@ -249,7 +249,7 @@ class JointTrajPtFull:
 
 @dataclass(frozen=True)
 class JointFeedback:
-    """Where the joints are, and how they move."""
+    """Actual positions, velocities and accelerations of the joints."""
 
     TYPE: ClassVar = MessageType.JOINT_FEEDBACK
     robot_id: int
@@ -273,9 +273,9 @@ class JointFeedback:
 
 @dataclass(frozen=True)
 class JointPoint:
-    """Any number of joints, in float64: a point of a trajectory (motion) or what is measured (state).
+    """Any number of joints, in float64: a point of a trajectory (motion) or the actual values (state).
 
-    `sequence` and `time` are those of `JointTrajPtFull`. Empty velocities or accelerations are not sent.
+    `sequence` and `time` are as in `JointTrajPtFull`. Empty velocities or accelerations are not sent.
     """
 
     TYPE: ClassVar = MessageType.JOINT_POINT
@@ -325,7 +325,7 @@ Message: TypeAlias = (
 TrajectoryPoint: TypeAlias = JointTrajPt | JointTrajPtFull | JointPoint
 
 MOST_BODY_BYTES = 1023 - 12
-"""The reference client receives into 1024 bytes and does not check; 12 bytes of the length are header."""
+"""Largest body: the reference client receives into 1024 bytes without a check; 12 bytes of the length are header."""
 _POINT_HEAD_BYTES = 20
 _KINDS: dict[int, type[Message]] = {
     kind.TYPE: kind
@@ -334,7 +334,7 @@ _KINDS: dict[int, type[Message]] = {
 
 
 def unpack_message(number: int, body: bytes, order: ByteOrder, is_reply: bool = False) -> Message:
-    """Return the message with this number; raises MessageError for an unknown one or another length."""
+    """Return the message of this type; raises MessageError for an unknown type or a wrong length."""
     if number not in _KINDS:
         raise MessageError(f"message {number} is not known")
     kind = Version if is_reply and number == MessageType.GET_VERSION else _KINDS[number]
@@ -355,13 +355,13 @@ def _unpack(kind: MessageType, order: ByteOrder, layout: str, body: bytes) -> tu
 
 
 def _joints_in(size: int) -> int:
-    """Return how many joints a body has whose positions take `size` bytes; ten where that cannot be."""
+    """Return the number of joints in positions of `size` bytes; ten where `size` is invalid."""
     joints = size // 4
     return joints if size % 4 == 0 and JOINTS <= joints <= MOST_JOINTS else JOINTS
 
 
 def _ten(kind: MessageType, values: Sequence[float], most: int = JOINTS) -> Joints:
-    """Return values filled up to ten."""
+    """Return the values padded with 0 to ten."""
     if len(values) > most:
         raise MessageError(f"{kind.name}: {len(values)} joints; {most} fit, JOINT_POINT has room for more")
     return (*values, *[0.0] * (JOINTS - len(values)))

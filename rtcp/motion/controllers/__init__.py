@@ -1,4 +1,4 @@
-"""Motion controllers: what turns commands into setpoints, a cycle at a time."""
+"""Motion controllers: they turn commands into setpoints, once a cycle."""
 
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
 from rtcp.motion.controllers.jog import JogController

@@ -1,7 +1,7 @@
-"""What every motion controller is: the base class, what it is made from, and how controllers are found.
+"""Base class of the motion controllers, their constructor arguments, and how entry points register them.
 
 A controller turns commands into setpoints, one `update` a cycle while it moves the arm. A new one is a subclass of
-`Controller` and an entry point of the group `rtcp.controllers`, here or in a package outside.
+`Controller` and an entry point of the group `rtcp.controllers`, in this package or another.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from rtcp.motion.tool_in_use import ToolInUse
 
 ENTRY_POINTS = "rtcp.controllers"
 LONGEST_HOLD_S: Final = 1.0
-"""A velocity, a torque or a jog counts for at most this long, s; then it must be commanded again."""
+"""Upper bound on the hold time of a velocity, torque or jog command, s."""
 
 
 @dataclass(frozen=True)
 class ControllerSetup:
-    """What controllers are made from."""
+    """Constructor arguments of a controller."""
 
     config: ArmConfig
     limits: Limits
     """Limits of the joints in force; the lists change in place."""
     trajectory_guard: TrajectoryGuard
-    """Knows the boxes, and the poses of what is commanded."""
+    """Holds the boxes and the frames of the commanded position."""
     period_s: float
-    """The cycle, s."""
+    """Cycle time, s."""
     plan: Callable[[int], memoryview[float]]
     """Returns the rows of a slot of the plan area (`rtcp.motion.planning.plan`)."""
     group: StepGroup = field(default_factory=StepGroup)
@@ -55,23 +55,23 @@ class ControllerSetup:
 
 @mypyc_attr(allow_interpreted_subclasses=True)
 class Controller:
-    """Base of all controllers: phases, the stop of the joints, checks that commands have in common.
+    """Base of all controllers: phases, the joint stop, common checks of commands.
 
-    A subclass names its commands, overrides `accept` and `advance`, and `stop` where it stops along its path. In
-    `advance` it allocates nothing that lasts, raises nothing, blocks and logs nothing.
+    A subclass lists its commands and overrides `accept` and `advance`; it overrides `stop` to stop along its path.
+    `advance` keeps no new objects, raises nothing, never blocks and never logs.
     """
 
     name: ClassVar[str]
     commands: ClassVar[tuple[type[Command], ...]]
-    """Commands that it accepts; no two controllers accept the same one."""
+    """Commands it accepts; each command belongs to one controller."""
     control_modes: ClassVar[frozenset[ControlMode]] = frozenset({ControlMode.JOINT, ControlMode.CARTESIAN})
-    """Control modes in which it accepts them."""
+    """Control modes in which it accepts commands."""
     tolerates_saturation: ClassVar[bool] = False
-    """True where a setpoint that a guard cuts is normal (jog, velocity); False where the motion cannot continue."""
+    """True: a setpoint cut by a guard is normal (jog, velocity). False: a cut ends the motion."""
     pausable: ClassVar[bool] = False
-    """Whether it rests on its path at a speed override of 0, and continues from there."""
+    """True: a speed override of 0 pauses the motion on its path."""
     needs_geometry: ClassVar[bool] = False
-    """Whether it is left out where the geometry of the arm is unknown."""
+    """True: not loaded for an arm without geometry."""
 
     def __init__(self, setup: ControllerSetup) -> None:
         limits = setup.limits
@@ -81,39 +81,39 @@ class Controller:
         self.speed_override = setup.speed_override
         self.phase = Phase.HOLD
         self.ended: MotionEnded | None = None
-        """Why it ended the motion by itself; None from the beginning of each motion on."""
+        """Reason why the controller ended the motion; each new motion resets it to None."""
         self.elapsed_s = self.duration_s = 0.0
-        """Progress; 0 and 0 where there is none."""
+        """Progress, s; both 0 for a motion without a duration."""
         self.held = 0
-        """What keeps the motion below the commanded velocity in this cycle: `HELD_...` of `rtcp.ipc.schema`."""
+        """What slows the motion below its commanded velocity in this cycle: `HELD_...` of `rtcp.ipc.schema`."""
         self.setpoint = Setpoint(len(limits.velocity))
         self.motion = JointMotion(
             setup.period_s, limits.velocity, limits.acceleration, limits.jerk, setup.speed_override
         )
-        """Brings the joints to rest; free for other use before that."""
+        """Brings the joints to rest; a subclass may use it for its own motion."""
         self._rows_in = setup.plan
         self._joints = range(len(limits.velocity))
         self._zero = [0.0] * len(limits.velocity)
         self._braking = False
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Check a command and carry it out from the next `update` on; return why not, and what runs continues.
+        """Check a command and execute it from the next `update`; on a refusal the current motion continues.
 
         Args:
             command: one of `commands`.
-            state: what the motion begins with.
-            continues: whether this controller is moving the arm for the same commander: it is not started anew.
+            state: initial state of the motion.
+            continues: True while this controller already moves the arm for the same commander.
         """
         raise NotImplementedError
 
     def use_tool(self, number: int) -> None:
-        """Use another tool from now on, `ArmConfig.models[number]`; called at rest. Nothing is computed here."""
+        """Switch to tool `ArmConfig.models[number]`. Called at rest; must not compute."""
 
     def advance(self, state: ArmState) -> Setpoint:
-        """Return the setpoints of the next cycle, in the phases MOVE and STOP; they are valid until the next call.
+        """Return the setpoints of the next cycle, valid until the next call; called in the phases MOVE and STOP.
 
-        Fill lists of your own and set them in `setpoint`: after `rest` its lists are those of the state. Set `phase` to
-        HOLD in the cycle that reaches the end; `give_up` ends a motion early.
+        Assign your own lists to `setpoint`: after `rest` it refers to those of the state. Set `phase` to HOLD in the
+        cycle that reaches the end; `give_up` ends a motion early.
         """
         raise NotImplementedError
 
@@ -123,25 +123,25 @@ class Controller:
         self.elapsed_s = self.duration_s = 0.0
 
     def hold(self) -> None:
-        """End the motion where the setpoints are; only at standstill, or where drives have no torque."""
+        """End the motion at the current setpoints. Only at standstill, or while the drives have no torque."""
         self.phase, self._braking = Phase.HOLD, False
         self.motion.hold()
 
     def stop(self, state: ArmState) -> None:
-        """Come to rest under the limits: phase STOP, then HOLD. Does nothing at rest and while it stops."""
+        """Come to rest under the limits: phase STOP, then HOLD. No effect at rest or during a stop."""
         if self.phase is Phase.MOVE:
             self.brake(state)
 
     def brake(self, state: ArmState) -> None:
-        """Bring each joint to rest as fast as its limits allow, whatever the path."""
+        """Bring each joint to rest as fast as its limits allow, off the path if necessary."""
         if self.motion.phase is Phase.STOP:
-            # An earlier stop; a move under way knows its acceleration.
+            # Discard a previous stop; a move in progress keeps its acceleration.
             self.motion.hold()
         self.motion.stop(state)
         self.phase, self._braking = Phase.STOP, True
 
     def give_up(self, state: ArmState, ended: MotionEnded) -> Setpoint:
-        """End the motion with an event and brake; return the setpoints of the next cycle."""
+        """End the motion for the reason `event` and brake; return the setpoints of the next cycle."""
         self.ended = ended
         self.brake(state)
         return self.update(state)
@@ -160,7 +160,7 @@ class Controller:
         return self.follow_motion(state) if self._braking else self.advance(state)
 
     def follow_motion(self, state: ArmState) -> Setpoint:
-        """Return the setpoints of `motion`, and take over its phase."""
+        """Return the setpoints of `motion` and copy its phase."""
         motion = self.motion
         setpoint = motion.update(state)
         self.phase = motion.phase
@@ -169,7 +169,7 @@ class Controller:
         return setpoint
 
     def not_finite(self, values: Sequence[float]) -> Refusal | None:
-        """Return why `values` are not one finite number for each joint, or None."""
+        """Return a refusal unless `values` has one finite number per joint."""
         if len(values) != len(self._zero):
             return WrongCount(len(values), len(self._zero))
         for axis, value in enumerate(values):
@@ -178,7 +178,7 @@ class Controller:
         return None
 
     def not_in_range(self, q: Sequence[float]) -> Refusal | None:
-        """Return why the joints cannot go to `q` (rad), or None."""
+        """Return a refusal unless `q` (rad) is finite and inside the joint ranges."""
         low, high = self.limits.low, self.limits.high
         if (refusal := self.not_finite(q)) is not None:
             return refusal
@@ -194,7 +194,7 @@ class Controller:
         hold_s: float,
         refusal: Callable[[int, float, float], Refusal],
     ) -> Refusal | None:
-        """Return why `values` for `hold_s` seconds are not allowed within +-`bounds`, or None."""
+        """Return a refusal unless `values` are within +-`bounds` and `hold_s` is allowed."""
         if not 0.0 < hold_s <= LONGEST_HOLD_S:
             return HoldTimeOutOfRange(hold_s, LONGEST_HOLD_S)
         if (wrong := self.not_finite(values)) is not None:
@@ -205,13 +205,13 @@ class Controller:
         return None
 
     def rows_of(self, slot: int, rows: int, most: int) -> memoryview[float] | Refusal:
-        """Return the rows of the plan in `slot`, or a refusal: `rows` is not 1 to `most`, or there is no such slot."""
+        """Return the rows of the plan in `slot`; a refusal if `rows` is not 1 to `most` or the slot does not exist."""
         return self._rows_in(slot) if slot in range(PLANS) and 1 <= rows <= most else WrongRowCount(rows, most)
 
 
 @cache
 def installed() -> tuple[type[Controller], ...]:
-    """Return the classes of all controllers that are installed.
+    """Return the classes of all installed controllers.
 
     Raises:
         PluginError: an entry point is not a controller.
@@ -220,21 +220,22 @@ def installed() -> tuple[type[Controller], ...]:
 
 
 def load_controllers(setup: ControllerSetup) -> dict[type[Command], Controller]:
-    """Return for each motion command the controller that accepts it.
+    """Return the controller of each motion command.
 
-    Where the geometry of the arm is unknown, controllers that need it are left out: their commands are refused with
+    For an arm without geometry, controllers that need it are not loaded; their commands are refused with
     `rtcp.ipc.refusals.NoGeometry`.
 
     Raises:
         ConfigError: two controllers accept the same command, or `installed` raises it.
     """
-    made: dict[type[Command], Controller] = {}
+    controllers: dict[type[Command], Controller] = {}
     for kind in installed():
         if kind.needs_geometry and setup.config.arm is None:
             continue
         controller = kind(setup)
         for command in kind.commands:
-            if command in made:
-                raise ConfigError([f"the controllers {made[command].name} and {kind.name} both accept {command.name}"])
-            made[command] = controller
-    return made
+            if command in controllers:
+                other = controllers[command].name
+                raise ConfigError([f"the controllers {other} and {kind.name} both accept {command.name}"])
+            controllers[command] = controller
+    return controllers

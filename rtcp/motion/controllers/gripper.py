@@ -1,4 +1,4 @@
-"""The way of a gripper that a drive moves: to where it is open or closed, and no further than what it grips allows."""
+"""Motion of a gripper with its own drive: open and close, stopping at a gripped object."""
 
 from __future__ import annotations
 
@@ -9,26 +9,25 @@ from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.state import ArmState, Phase
 
 _FIRM_CYCLES: Final = 5
-"""So many cycles in a row at the torque limit are a grip, and no friction when it starts."""
+"""Consecutive cycles at the torque limit that count as a grip; fewer are starting friction."""
 
 
 class GripperMotion:
     """Setpoints of a gripper's joint, whose state the methods get: jerk-limited, one `update` a cycle.
 
-    While it moves, a torque at the joint's limit against the motion for 5 cycles means that it holds something: the
-    setpoint stays, a little inside of what is held. A drive pushes ever harder towards a setpoint that it cannot
-    reach: for as long as the torque is beyond the limit the setpoint yields, under the joint's acceleration. Nothing
-    else ever ends in force: the drive's following error would be a fault. The output limiter keeps what is sent inside
-    range and step.
+    A torque at the joint's limit against the motion for 5 cycles is a grip: the setpoint stays, slightly inside the
+    object. A drive pushes ever harder towards a setpoint it cannot reach, so while the torque is above the limit the
+    setpoint yields under the joint's acceleration; otherwise the following error would become a fault. The output
+    limiter bounds range and step.
 
-    Attributes: `gripped` (it was stopped by what it holds).
+    Attributes: `gripped`: True after a grip stopped it.
     """
 
     def __init__(self, joint: Joint, open_position: float, closed_position: float, period_s: float) -> None:
-        """Make the motion of `joint`; positions in rad inside its range, the cycle in s."""
+        """Positions are in rad, inside the range of `joint`; `period_s` is the cycle time."""
         self._motion = JointMotion(period_s, [joint.velocity], [joint.acceleration], [joint.jerk])
         self._period_s = period_s
-        # A way that begins where the setpoint was cut takes the last cycle's mean acceleration, and errs by so much.
+        # A motion that begins at a cut setpoint uses the mean acceleration of the last cycle: margin for its error.
         self._speed = max(joint.velocity - 0.5 * joint.acceleration * period_s, 0.5 * joint.velocity)
         self._firm_torque = joint.torque
         self._yielding = joint.acceleration * period_s * period_s
@@ -40,22 +39,22 @@ class GripperMotion:
 
     @property
     def moving(self) -> bool:
-        """Whether it is on its way."""
+        """True while it moves or stops."""
         return self._motion.phase is not Phase.HOLD
 
     @property
     def stops(self) -> bool:
-        """Whether it comes to rest on its way."""
+        """True during a stop."""
         return self._motion.phase is Phase.STOP
 
     def hold(self, state: ArmState) -> None:
-        """Rest at the setpoint from now on."""
+        """Rest at the current setpoint."""
         state.commanded_velocity[0] = state.commanded_acceleration[0] = 0.0
         self._motion.hold()
         self._firm = 0
 
     def grip(self, state: ArmState, close: bool) -> bool:
-        """Go to where it is closed, or open, from whatever it does; return False where no way is found."""
+        """Move to the closed or the open position, from any state; return False if ruckig finds no trajectory."""
         if close is self._closing and self._motion.phase is Phase.MOVE:
             return True
         if not self._motion.move_to(state, [self._goals[close]], self._speed):
@@ -70,9 +69,9 @@ class GripperMotion:
         self._motion.stop(state)
 
     def update(self, state: ArmState) -> None:
-        """Move the setpoint on by one cycle."""
+        """Advance the setpoint by one cycle."""
         torque, before = state.actual_torque[0], state.commanded_velocity[0]
-        # A drive pushes in the direction of its setpoint: what resists shows as torque in that direction.
+        # A drive pushes towards its setpoint: an obstacle shows as torque in that direction.
         firm = self.moving and (torque if before > 0.0 else -torque) >= self._firm_torque
         self._firm = self._firm + 1 if firm else 0
         if self._firm >= _FIRM_CYCLES:

@@ -1,12 +1,12 @@
 """Hand guiding in CST: the arm carries its weight and follows the hand, inside its limits and below a bounded speed.
 
-Each joint is tied by a spring to an anchor, which the joint drags along once the spring pulls with more than `hold`: so
-the arm stands where it is let go, with a weight that is somewhat wrong too. Anchors go no faster than the bounds of
-joints and tool, and not beyond ranges, boxes and the arm itself: there the hand feels the spring.
+A spring ties each joint to an anchor, which the joint drags along once the spring pulls with more than `hold`: the arm
+stays where it is let go, even with a slightly wrong weight. Anchors keep to the speed bounds of joints and tool and
+stay inside ranges, outside boxes and clear of the arm itself: at these bounds the hand feels the spring.
 
-The controller adds no energy to what the weight takes: an anchor moves only towards its joint, so a spring gives back
-no more than it got, and damping only brakes. There is no help against friction, which would push where its figure is
-wrong. The setpoint follows the anchors under all limits and through the guards: a stop begins from it, at any time.
+Apart from carrying the weight the controller adds no energy: an anchor moves only towards its joint, so a spring
+returns no more than it stored, and damping only brakes. Friction is not compensated: a wrong figure would push the arm.
+The setpoint follows the anchors under all limits and through the guards: a stop can begin from it at any time.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from rtcp.motion.tool_in_use import Gravity
 
 LONGEST_S: Final = 3600.0
 _VIRTUAL: Final = ("virtual", "inprocess")
-"""Buses on which nobody stands beside the arm."""
+"""Simulated buses: no person stands beside the arm."""
 _STIFF: Final = 2.0
-"""Times `cst_stiffness`: what pulls at a joint from its anchor."""
+"""Stiffness between joint and anchor, as a multiple of `cst_stiffness`."""
 _DAMPED: Final = 3.0
-"""Times `cst_damping`: what brakes a joint that is faster than its anchor."""
+"""Damping of a joint that is faster than its anchor, as a multiple of `cst_damping`."""
 _SHARE: Final = 0.8
-"""Of the speed bounds, which anchors keep to: a hand that pushes hard is faster until the spring is bent."""
+"""Share of the speed bounds for the anchors: until the spring is bent a hand that pushes hard is faster."""
 _TOO_FAST: Final = 1.5
 _FAST_CYCLES: Final = 5
 """The guiding ends when the tool exceeds `_TOO_FAST` times its speed bound for more than this many cycles in a row."""
 _MARGIN_RAD: Final = 0.05
-"""Distance of the anchors from the ends of the range: room for the spring that a leaning hand bends."""
+"""Distance of the anchors from the ends of the range, rad: room to bend the spring."""
 _BRAKES: Final = 0.5
-"""Share of the joints' and the tool's acceleration with which anchors slow down before a range or a box."""
+"""Share of the joint and tool acceleration with which anchors brake before a range end or a box."""
 _FORGET_1_RAD: Final = 10.0
-"""What held the arm beside its weight at the start, mostly friction, is forgotten along the way."""
+"""Decay per rad of motion of the initial torque beyond the weight, mostly friction, 1/rad."""
 _PASSES: Final = 6
 _TOLERANCE: Final = 1e-6
 
@@ -99,18 +99,18 @@ class GuideController(Controller):
         self._wanted, self._row = [0.0] * n, [0.0] * n
         self._bias = [0.0] * n
         self._extra_low, self._extra_high = [0.0] * n, [0.0] * n
-        """A joint that begins nearer to its edge than the margin is not pushed away from it, rad."""
+        """Margin given up for a joint that begins nearer to its range end, so that it is not pushed away, rad."""
         self._until_ns = 0
         self._fresh = True
         self._fast = 0
-        """Cycles in a row in which the tool was too fast."""
+        """Consecutive cycles in which the tool was too fast."""
 
     def use_tool(self, number: int) -> None:
-        """Use another tool from now on."""
+        """Switch to another tool; at rest."""
         self._model, self._bounds = self._models[number], self._bounds_of[number]
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Let the arm be guided from where it rests, until its time is over or it is halted."""
+        """Start guiding, from rest, until the commanded duration is over or a stop."""
         assert isinstance(command, Guide)
         if self._needs_switch:
             return NoEnablingSwitch()
@@ -136,7 +136,7 @@ class GuideController(Controller):
         return None
 
     def advance(self, state: ArmState) -> Setpoint:
-        """Return the setpoints of the next cycle: where the anchors are, and the torque."""
+        """Return the setpoints of the next cycle: position of the anchors, and the torque."""
         if state.now_ns >= self._until_ns:
             self.brake(state)
             return self.update(state)
@@ -158,7 +158,7 @@ class GuideController(Controller):
             last[i] = moved
             step = v * dt * _FORGET_1_RAD
             bias[i] -= bias[i] * (step if step > 0.0 else -step)
-            # Against the anchor, whatever is left of the joint's speed; never on its way.
+            # Damp the joint's speed relative to its anchor; never push in the direction of motion.
             along = moved if 0.0 <= moved <= v or v <= moved <= 0.0 else v if moved * v > 0.0 else 0.0
             pulled = self._stiffness[i] * (anchor[i] - q) - self._damping[i] * (v - along) - self._drag[i] * v
             whole, most = carried[i] + bias[i] + pulled, limits.torque[i]
@@ -172,10 +172,10 @@ class GuideController(Controller):
         return target
 
     def _drag_anchors(self, state: ArmState, poses: Sequence[Pose]) -> None:
-        """Write the speeds of the anchors into `_wanted`: towards their joints, as far as the bounds allow."""
+        """Write the speeds of the anchors to `_wanted`: towards their joints, within the bounds."""
         anchor, wanted, last, limits, dt = self._anchor, self._wanted, self._anchor_speed, self.limits, self.period_s
         bounds, fraction = self._bounds, self.speed_override.fraction
-        bounds.look(poses, anchor, self._fresh)
+        bounds.update(poses, anchor, self._fresh)
         self._fresh = False
         moves = False
         for i in self._joints:
@@ -187,7 +187,7 @@ class GuideController(Controller):
             moves = True
             size = (lag if lag > 0.0 else -lag) / dt
             rate = limits.acceleration[i]
-            # It gains speed as the setpoint may, and loses it at once.
+            # Speed rises with the setpoint's acceleration and falls at once.
             most = rate * dt + max(0.0, last[i] if lag > 0.0 else -last[i])
             fastest = fraction * self._joint_speed[i]
             most = fastest if most > fastest else most
@@ -216,9 +216,9 @@ class GuideController(Controller):
                 wanted[i] *= share
 
     def _keep_clear(self, poses: Sequence[Pose]) -> None:
-        """Take from the anchors' speeds what leads into a box, or the arm into itself; the rest slides along.
+        """Remove from the anchor speeds the part towards a box or the arm itself; the rest slides along.
 
-        What is taken stays in the springs in proportion to each joint's lever: they push along the boundary's normal.
+        The removed part bends the springs in proportion to each joint's lever: they push along the boundary's normal.
         """
         bounds, wanted, row, dt = self._bounds, self._wanted, self._row, self.period_s
         for clearance in bounds.near:
@@ -242,10 +242,10 @@ class GuideController(Controller):
                     towards = row[i] * wanted[i]
                     if towards > 0.0:
                         part = excess * row[i] / (self._stiffness[i] * whole)
-                        # Never turned round: an anchor goes only to its joint.
-                        left = wanted[i] - part
-                        wanted[i] = left if left * wanted[i] > 0.0 else 0.0
-        # Of several together each may have brought back what another took.
+                        # Never reversed: an anchor moves only towards its joint.
+                        reduced = wanted[i] - part
+                        wanted[i] = reduced if reduced * wanted[i] > 0.0 else 0.0
+        # With several boundaries, each correction may undo another: scale the whole motion.
         for clearance in bounds.near:
             allowed = stopping(clearance.distance - STANDOFF_M, self._deceleration, dt)
             x, y, z = clearance.normal
@@ -259,7 +259,7 @@ class GuideController(Controller):
 
 
 def _tool_velocity(poses: Sequence[Pose], speeds: Sequence[float]) -> tuple[float, float, float]:
-    """Return the velocity of the tool, m/s, where joints turn at `speeds` (rad/s)."""
+    """Return the tool velocity, m/s, at the joint speeds `speeds`, rad/s."""
     x = y = z = 0.0
     for v, (a, b, c, _, _, _) in zip(speeds, jacobian_columns(poses), strict=True):
         x += v * a

@@ -1,9 +1,9 @@
-"""A trajectory in step with those of other arms: all begin at one instant, and brake on one time scale.
+"""A trajectory in step with those of other arms: all begin at the same instant and brake on the same time scale.
 
-No arm is the leader. Each follows the same time of the path, which is a function of CLOCK_MONOTONIC: from the common
-instant on it passes as the clock does; from the instant at which the group brakes its speed falls from 1 to 0 along
-one curve. How long that takes is a table that came with the plan, the same for all arms, so that all come to rest at
-the same point of their paths. An arm whose cycles were late makes up for it slowly.
+No arm leads. All follow the same path time, a function of CLOCK_MONOTONIC: from the common instant it runs with the
+clock; from the instant at which the group brakes, its rate falls from 1 to 0 along one curve. The braking time is a
+table in the plan, the same for all arms, so all come to rest at the same point of their paths. An arm whose cycles
+were late catches up slowly.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from rtcp.motion.state import ArmState, Phase, Setpoint
 from rtcp.motion.step_group import StepPhase
 
 LONGEST_WAIT_S: Final = 10.0
-"""How far ahead a motion may be commanded to begin."""
+"""Upper bound on the time between the command and the common instant, s."""
 LONGEST_BRAKE_S: Final = 3.0
-"""Longest that a group takes to brake, s: whoever halts it must see that it stops."""
+"""Upper bound on the braking time of a group, s: its operator must see that it stops."""
 _GAIN: Final = 10.0
-"""1/s: how fast the path's time returns to that of the clock."""
+"""Gain of the correction towards the clock, 1/s."""
 _CORRECTION: Final = 0.05
-"""Share of the speed that a correction adds or takes away at most; the planner leaves room for it."""
+"""Upper bound on a correction, as a share of the speed; the planner leaves room for it."""
 _CORRECTION_RATE: Final = 0.2
-"""1/s: how fast a correction changes."""
+"""Rate of change of a correction, 1/s."""
 _STEEPEST: Final = 1.6
-"""Of the curve of the brakes, 1 / its duration; 1.5 is its slope in the middle."""
+"""Steepest slope allowed on the braking curve, 1 / its duration; the curve's own is 1.5."""
 _MOST_LAG_S: Final = 0.1
 _EXACT_S: Final = 1e-5
 
@@ -64,7 +64,7 @@ class InStepController(TrajectoryController):
         self._speed = 1.0
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Run a plan from the common instant on; the arm has to be at its first waypoint, whose time is 0."""
+        """Run a plan from the common instant; the arm must be at its first waypoint, which has time 0."""
         assert isinstance(command, RunInStep)
         group = self._group
         if continues or self.phase:
@@ -104,7 +104,7 @@ class InStepController(TrajectoryController):
         return None
 
     def stop(self, state: ArmState) -> None:
-        """Announce that the group brakes, and brake with it; before the common instant do not begin."""
+        """Announce the braking of the group and brake with it; before the common instant, cancel the motion."""
         if self.phase is Phase.MOVE:
             if self._group.phase is StepPhase.ARMED:
                 self.hold()
@@ -112,12 +112,12 @@ class InStepController(TrajectoryController):
                 self._brake_at(state.now_ns + self._group.notice_ns)
 
     def hold(self) -> None:
-        """End the motion where the setpoints are."""
+        """End the motion at the current setpoints."""
         super().hold()
         self._group.leave()
 
     def brake(self, state: ArmState) -> None:
-        """Bring each joint to rest as fast as its limits allow; partners see that this arm has left its path."""
+        """Bring each joint to rest as fast as its limits allow; partners see that this arm left its path."""
         super().brake(state)
         self._group.leave()
 
@@ -138,7 +138,7 @@ class InStepController(TrajectoryController):
             if (ended := self._lost(now)) is not None:
                 self.ended = ended
         elif group.braking() >= 0 and group.brake_ns != self._brake_ns:
-            # Two were stopped at once: all keep to the instant that comes first.
+            # Two arms were stopped at the same time: the earlier instant counts.
             self._brake_at(group.brake_ns)
         here_s = self._reference(now)
         lag_s = here_s - self.elapsed_s
@@ -163,7 +163,7 @@ class InStepController(TrajectoryController):
         return target
 
     def _wait(self, now_ns: int) -> MotionEnded | None:
-        """Return why the motion does not begin; at the common instant all partners must have accepted it."""
+        """Return why the motion cannot begin: at the common instant every partner must have accepted it."""
         group = self._group
         silent = group.silent(group.mask, now_ns)
         if silent >= 0:
@@ -172,7 +172,7 @@ class InStepController(TrajectoryController):
         return PartnerNotReady(absent) if absent >= 0 else None
 
     def _lost(self, now_ns: int) -> MotionEnded | None:
-        """Return why this arm has to brake on account of a partner, and begin to, or None."""
+        """Brake if a partner requires it; return the reason, or None."""
         group = self._group
         index = group.braking()
         if index >= 0:
@@ -189,7 +189,7 @@ class InStepController(TrajectoryController):
         return None
 
     def _brake_at(self, instant_ns: int) -> None:
-        """Let the group's speed fall from an instant on; how long that takes is looked up in the plan."""
+        """Start the group's braking at an instant; the plan's table has its duration."""
         group = self._group
         group.brake_ns, group.phase, self.phase = instant_ns, StepPhase.BRAKING, Phase.STOP
         self._brake_ns = instant_ns
@@ -201,22 +201,22 @@ class InStepController(TrajectoryController):
         self._brake_s = max(brakes[at], brakes[min(at + 1, last)])
 
     def _reference(self, at_ns: int) -> float:
-        """Return the common time of the path at an instant, s."""
+        """Return the common path time at an instant, s."""
         group = self._group
         if self.phase is not Phase.STOP or at_ns < group.brake_ns:
             return 1e-9 * (at_ns - self._start_ns)
         x = 1e-9 * (at_ns - group.brake_ns) / self._brake_s
         if x >= 1.0:
             return self._brake_from_s + 0.5 * self._brake_s
-        # The integral of the speed 1 - 3 x^2 + 2 x^3.
+        # Integral of the rate 1 - 3 x^2 + 2 x^3.
         return self._brake_from_s + self._brake_s * x * (1.0 + x * x * (0.5 * x - 1.0))
 
     def _corrected(self, lag_s: float, speed: float) -> float:
-        """Return the speed of the path that makes up for what this arm is behind, or ahead."""
+        """Return the rate of the path time that corrects this arm's lag or lead."""
         wanted = min(max(_GAIN * lag_s, -_CORRECTION), _CORRECTION)
         most = _CORRECTION_RATE * self.period_s
         self._correction += min(max(wanted - self._correction, -most), most)
-        # A cycle that comes late finds the curve further down: no joint follows that at once.
+        # After a late cycle the curve is further down; no joint can follow such a step.
         steepest = (_STEEPEST / self._brake_s if self.phase is Phase.STOP else 0.0) * self.period_s + most
         wanted = 0.0 if speed <= 0.0 and lag_s < _EXACT_S else speed + self._correction
         return max(min(max(wanted, self._speed - steepest), self._speed + steepest), 0.0)

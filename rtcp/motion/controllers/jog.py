@@ -1,12 +1,12 @@
-"""Jogging: the tool moves with the velocity that is commanded, until the command expires.
+"""Jogging: the tool moves at the commanded velocity until the command expires.
 
-The commanded twist passes through `TwistRamp` (Cartesian acceleration and jerk); `JogBounds` takes from it what joint
-ranges, boxes and singularities do not allow; the inverse Jacobian (`JogInverse`) makes it joint speeds; `ScaledTwist`
-scales all joints together, so that the tool keeps its direction. Where joints cannot follow, the ramp continues from
-what was reached: nothing winds up. The tool's drift off its line, some 1e-7 m a cycle, is corrected in the next cycles.
+The commanded twist passes through `TwistRamp` (Cartesian acceleration and jerk); `JogBounds` removes what joint ranges,
+boxes and singularities do not allow; the inverse Jacobian (`JogInverse`) converts it to joint speeds; `ScaledTwist`
+scales all joints together, so that the tool keeps its direction. If joints cannot follow, the ramp continues from the
+velocity reached: no windup. The tool's drift off its line, some 1e-7 m a cycle, is corrected in the next cycles.
 
-Beside a singularity the joint that would have to move without bound is locked, and the tool goes where it still can. A
-stretched elbow is bent by its joints (`jog_inverse.bend`).
+Near a singularity the joint whose speed would be unbounded is locked, and the tool keeps its other directions. Joint
+motion bends a stretched elbow (`jog_inverse.bend`).
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from rtcp.motion.state import ArmState, Phase, Setpoint
 
 FOREVER_NS = 1 << 62
 _FULL: Final = 0.98
-"""Share of the joints' speeds and accelerations that jogging uses: the guard never has to cut."""
+"""Share of the joint speeds and accelerations that jogging uses, so that the guard never cuts."""
 _LAST_RAD: Final = 1e-6
 _BRAKING: Final = 0.7
 """Share of the Cartesian acceleration with which the tool slows before a box."""
 _BACK_1_S: Final = 100.0
-"""How fast the tool returns to its line, 1/s."""
+"""Gain of the tool's return to its line, 1/s."""
 _OFF_LINE_M: Final = 2e-4
-"""Further away than this the line begins anew."""
+"""Drift beyond which the line starts again at the tool, m."""
 _AT_REST: Final = 2e-3
-"""m/s, rad/s: a slower motion counts as rest."""
+"""Speed below which the tool counts as at rest, m/s, rad/s."""
 
 
 class JogController(Controller):
     """Accepts `Jog`, and is commanded by the joystick (`start`, `command`).
 
-    Without geometry it jogs joints only; without a spherical wrist the tool stands.
+    Without geometry it jogs joints only; without a spherical wrist the tool cannot be jogged.
     """
 
     name = "jog"
@@ -76,7 +76,7 @@ class JogController(Controller):
         self.use_tool(setup.tool.number)
         self._ramp = TwistRamp(cartesian)
         self._speed, self._angular_speed = cartesian.speed, cartesian.angular_speed
-        self._asked = [0.0] * 6
+        self._commanded = [0.0] * 6
         self._wanted = [0.0] * 6
         self._scaled = ScaledTwist(limits)
         self._in_tool = False
@@ -88,13 +88,13 @@ class JogController(Controller):
         self._wrist = singularity.wrist
 
     def use_tool(self, number: int) -> None:
-        """Use another tool from now on."""
+        """Switch to another tool; at rest."""
         if self.has_geometry:
             self._model, self._inverse = self._models[number], self._inverses[number]
             self._bounds = self._bounds_of[number]
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Move the tool, or the joints, at the velocities until they expire."""
+        """Move the tool or the joints at the velocities until they expire."""
         assert isinstance(command, Jog)
         continues = continues and self.phase is Phase.MOVE and self._by_joints is (command.frame is JogFrame.JOINTS)
         if command.frame is JogFrame.JOINTS:
@@ -116,18 +116,18 @@ class JogController(Controller):
         return None
 
     def start(self) -> None:
-        """Begin to jog the tool, with velocity 0."""
+        """Start jogging the tool, at velocity 0."""
         self.begin()
         self._by_joints = False
-        self._asked[:] = self._zero
+        self._commanded[:] = self._zero
         self._until_ns = FOREVER_NS
         self._fresh = True
 
     def command(self, twist: Sequence[float], *, in_tool_frame: bool, until_ns: int = FOREVER_NS) -> None:
         """Move the tool at vx, vy, vz (m/s), wx, wy, wz (rad/s) along the axes of its own frame or of the base.
 
-        The twist counts until the instant `until_ns`. It is scaled down to the largest speeds of the configuration;
-        numbers that are not finite stop. Ignored while the controller stops: `start` begins anew.
+        The twist is valid until `until_ns`. It is scaled down to the configured speed limits; numbers that are not
+        finite stop the tool. Ignored during a stop: call `start` again.
         """
         if self.phase is not Phase.MOVE:
             return
@@ -135,19 +135,19 @@ class JogController(Controller):
         self._in_tool = in_tool_frame
         a, b, c, d, e, f = twist
         linear, angular = a * a + b * b + c * c, d * d + e * e + f * f
-        asked = self._asked
+        commanded = self._commanded
         if not linear + angular < 1e30:
-            asked[:] = self._zero
+            commanded[:] = self._zero
             return
-        part, turn = 1.0, 1.0
+        part, rotation_part = 1.0, 1.0
         if linear > self._speed * self._speed:
             part = self._speed / linear**0.5
         if angular > self._angular_speed * self._angular_speed:
-            turn = self._angular_speed / angular**0.5
-        # One factor for both, so that the direction is the one that was asked for.
-        part = part if part < turn else turn
+            rotation_part = self._angular_speed / angular**0.5
+        # One factor for both keeps the commanded direction.
+        part = part if part < rotation_part else rotation_part
         for i in range(6):
-            asked[i] = part * twist[i]
+            commanded[i] = part * twist[i]
 
     def stop(self, state: ArmState) -> None:
         """Come to rest; the tool keeps its direction."""
@@ -156,7 +156,7 @@ class JogController(Controller):
             if self._by_joints:
                 self._velocity.stop(state)
             else:
-                self._asked[:] = self._zero
+                self._commanded[:] = self._zero
 
     def advance(self, state: ArmState) -> Setpoint:
         """Return the setpoints of the next cycle."""
@@ -175,13 +175,13 @@ class JogController(Controller):
         if not (inverse.usable and inverse.at(poses)):
             return self._stand(state)
         if jumped:
-            # The beginning, or the guards have changed what was commanded: go on from where the arm is.
+            # At the start, or after a guard changed the setpoint: continue from the commanded position.
             ramp.begin(_reached(poses, state.commanded_velocity))
             self._line = None
             self._fresh = False
         wanted = self._turned(poses[6])
         ramp.step(wanted, dt)
-        bounds.look(poses, position, jumped)
+        bounds.update(poses, position, jumped)
         twist, speeds = joints.twist, joints.speeds
         twist[:] = ramp.velocity
         self._fit(poses, wanted)
@@ -190,10 +190,10 @@ class JogController(Controller):
         self._back(poses[6])
         if joints.limit(state, dt):
             self._advance(dt, poses[6])
-            ramp.held(twist)
+            ramp.cut_to(twist)
         else:
             self._line = None
-            ramp.held(_reached(poses, speeds))
+            ramp.cut_to(_reached(poses, speeds))
         moving = any(speeds)
         self._posed = moving and bounds.watched
         self.held = bounds.held | (joints.slowest + 1) << HELD_SPEED_AT
@@ -208,29 +208,29 @@ class JogController(Controller):
         return target
 
     def _turned(self, tool: Pose) -> list[float]:
-        """Return what is wanted along the base's axes, at the speed override."""
-        asked, wanted, fraction = self._asked, self._wanted, self.speed_override.fraction
+        """Return the commanded twist along the base's axes, scaled by the speed override."""
+        commanded, wanted, fraction = self._commanded, self._wanted, self.speed_override.fraction
         if fraction != 1.0:
             for i in range(6):
-                wanted[i] = fraction * asked[i]
-            asked = wanted
+                wanted[i] = fraction * commanded[i]
+            commanded = wanted
         if not self._in_tool:
-            return asked
-        a, b, c, d, e, f = asked
+            return commanded
+        a, b, c, d, e, f = commanded
         wanted[0], wanted[1], wanted[2] = applied(tool.rotation, (a, b, c))
         wanted[3], wanted[4], wanted[5] = applied(tool.rotation, (d, e, f))
         return wanted
 
     def _fit(self, poses: Sequence[Pose], wanted: Sequence[float]) -> None:
-        """Bring the twist, and the joint speeds with it, within all bounds."""
+        """Reduce the twist and its joint speeds to all bounds."""
         joints, bounds, rows = self._scaled, self._bounds, self._inverse.rows
         twist = joints.twist
         joints.make(rows)
         if bounds.passed(poses, twist, joints.speeds):
             a, b, c, d, e, f = twist
             moves = any(wanted[:3]) or a * a + b * b + c * c > _AT_REST * _AT_REST
-            turns = any(wanted[3:]) or d * d + e * e + f * f > _AT_REST * _AT_REST
-            if not bounds.slide(poses, twist, moves, turns):
+            rotates = any(wanted[3:]) or d * d + e * e + f * f > _AT_REST * _AT_REST
+            if not bounds.slide(poses, twist, moves, rotates):
                 twist[:] = self._zero
             joints.make(rows)
         joints.scale(bounds.halt(twist))
@@ -238,13 +238,13 @@ class JogController(Controller):
             joints.scale(bounds.stoppable(poses, joints.speeds))
 
     def _back(self, tool: Pose) -> None:
-        """Add to the joint speeds what brings the tool back to its line."""
+        """Correct the joint speeds towards the tool's line."""
         line = self._line
         if line is None or self._bounds.axis >= 0:
             return
         (x, y, z), (a, b, c, d, e, f, g, h, i) = line
         (u, v, w), (j, k, m, n, o, p, q, r, s) = tool
-        # Half the sum of the cross products of the axes: the rotation that is missing.
+        # Half the sum of the cross products of the axes: the rotation error.
         dx, dy, dz = x - u, y - v, z - w
         tx = 0.5 * (n * g - q * d + o * h - r * e + p * i - s * f)
         ty = 0.5 * (q * a - j * g + r * b - k * h + s * c - m * i)
@@ -259,7 +259,7 @@ class JogController(Controller):
             speeds[at] = most if v > most else -most if v < -most else v
 
     def _advance(self, dt: float, tool: Pose) -> None:
-        """Let the line go on with what the tool does in this cycle."""
+        """Advance the line by the tool's motion in this cycle."""
         twist = self._scaled.twist
         if self._inverse.lost or self._bounds.axis >= 0 or not any(twist):
             self._line = None
@@ -267,11 +267,11 @@ class JogController(Controller):
         (x, y, z), rotation = tool if self._line is None else self._line
         a, b, c, d, e, f = twist
         if d or e or f:
-            rotation = times(_turn(d * dt, e * dt, f * dt), rotation)
+            rotation = times(_small_rotation(d * dt, e * dt, f * dt), rotation)
         self._line = Pose((x + a * dt, y + b * dt, z + c * dt), rotation)
 
     def _stand(self, state: ArmState) -> Setpoint:
-        """Each joint brakes as fast as it may: there is no inverse."""
+        """Brake each joint on its own: there is no inverse."""
         speeds = self._scaled.speeds
         speeds[:] = self._zero
         self._scaled.clip(state.commanded_velocity, _FULL * self.period_s)
@@ -279,13 +279,13 @@ class JogController(Controller):
         self._fresh = True
         self._posed = False
         self.ended = NoSolution()
-        if not any(speeds) and (self.phase is Phase.STOP or not any(self._asked)):
+        if not any(speeds) and (self.phase is Phase.STOP or not any(self._commanded)):
             self.phase = Phase.HOLD
         return self._answer(state.commanded, self.period_s)
 
 
 def _reached(poses: Sequence[Pose], speeds: Sequence[float]) -> list[float]:
-    """Return the tool velocity of joint speeds."""
+    """Return the tool twist at joint speeds."""
     twist = [0.0] * 6
     if any(speeds):
         for v, column in zip(speeds, jacobian_columns(poses), strict=True):
@@ -294,22 +294,22 @@ def _reached(poses: Sequence[Pose], speeds: Sequence[float]) -> list[float]:
     return twist
 
 
-def _turn(x: float, y: float, z: float) -> Rotation:
-    """Rotation by a small vector (rad): Rodrigues' formula to second order, orthonormal to 1e-12 for a cycle's turn."""
+def _small_rotation(x: float, y: float, z: float) -> Rotation:
+    """Rotation by a small vector (rad): Rodrigues' formula to second order, orthonormal to 1e-12 over a cycle."""
     angle2 = x * x + y * y + z * z
     half = 0.5 - angle2 / 24.0
-    one = 1.0 - angle2 / 6.0
+    sine = 1.0 - angle2 / 6.0
     return (
-        1.0 - half * (y * y + z * z), half * x * y - one * z, half * x * z + one * y,
-        half * x * y + one * z, 1.0 - half * (x * x + z * z), half * y * z - one * x,
-        half * x * z - one * y, half * y * z + one * x, 1.0 - half * (x * x + y * y),
+        1.0 - half * (y * y + z * z), half * x * y - sine * z, half * x * z + sine * y,
+        half * x * y + sine * z, 1.0 - half * (x * x + z * z), half * y * z - sine * x,
+        half * x * z - sine * y, half * y * z + sine * x, 1.0 - half * (x * x + y * y),
     )  # fmt: skip
 
 
 class TwistRamp:
-    """`velocity`: vx, vy, vz (m/s), wx, wy, wz (rad/s) along the base's axes; `step` leads it to what is wanted.
+    """`velocity`: vx, vy, vz (m/s), wx, wy, wz (rad/s) along the base's axes; `step` moves it towards a goal.
 
-    The six change in one proportion, so that from rest and to rest the tool keeps its direction.
+    All six change in proportion, so that the tool keeps its direction from rest and to rest.
 
     Args:
         config: accelerations and jerks.
@@ -329,7 +329,7 @@ class TwistRamp:
             self.acceleration[i] = 0.0
 
     def step(self, wanted: Sequence[float], dt: float) -> None:
-        """Go one cycle towards `wanted`."""
+        """Advance one cycle towards `wanted`."""
         v, acc = self.velocity, self.acceleration
         if v == wanted:
             for i in range(6):
@@ -344,7 +344,7 @@ class TwistRamp:
             for i in range(6):
                 acc[i] = 0.0
             return
-        # With constant jerk the acceleration has to fall as the root of what is left.
+        # At constant jerk the acceleration falls with the root of the remaining difference.
         full = sqrt(1.6 * time / self._rise)
         full = (1.0 if full > 1.0 else full) / time
         if full * dt > 0.5:
@@ -357,8 +357,8 @@ class TwistRamp:
             acc[i] += part * more
             v[i] += acc[i] * dt
 
-    def held(self, velocity: Sequence[float]) -> None:
-        """Set the velocity to what the bounds left of it; an acceleration against what was cut is given up."""
+    def cut_to(self, velocity: Sequence[float]) -> None:
+        """Set the velocity to its bounded value; drop the acceleration against the bound."""
         v, acc, weight = self.velocity, self.acceleration, self._weight
         a, b, c = velocity[0] - v[0], velocity[1] - v[1], velocity[2] - v[2]
         d, e, f = velocity[3] - v[3], velocity[4] - v[4], velocity[5] - v[5]
@@ -374,7 +374,7 @@ class TwistRamp:
 
 
 class ScaledTwist:
-    """A twist (m/s, rad/s; six, along the base's axes) and its joint speeds (rad/s, six), scaled to what joints allow.
+    """A twist (m/s, rad/s; six, along the base's axes) and its joint speeds (rad/s, six), scaled to the joint limits.
 
     Args:
         limits: of the joints; read every cycle.
@@ -385,10 +385,10 @@ class ScaledTwist:
         self.twist = [0.0] * 6
         self.speeds = [0.0] * 6
         self.slowest = -1
-        """The joint whose speed limit scaled the last twist down; -1: none."""
+        """Joint whose speed limit scaled the last twist down; -1: none."""
 
     def make(self, rows: Sequence[Sequence[float]]) -> None:
-        """Write the joint speeds for the twist, both scaled to what the joints' speeds allow.
+        """Compute the joint speeds of the twist; scale both to the joint speed limits.
 
         Args:
             rows: of the inverse Jacobian, shape (6, 6).
@@ -406,7 +406,7 @@ class ScaledTwist:
         self.scale(part)
 
     def scale(self, part: float) -> None:
-        """Multiply both by `part`, where it is less than 1."""
+        """Multiply twist and joint speeds by `part` if it is less than 1."""
         if part < 1.0:
             twist, speeds = self.twist, self.speeds
             for i in range(6):
@@ -414,11 +414,11 @@ class ScaledTwist:
                 speeds[i] *= part
 
     def limit(self, state: ArmState, dt: float) -> bool:
-        """Bring the joint speeds, and the twist with them, within what the accelerations allow after `state`.
+        """Limit the joint speeds, and the twist with them, to the accelerations possible after `state`.
 
         Returns:
-            Whether all joints are scaled by one factor, so that the tool keeps its direction. Where there is none, each
-                goes towards its speed as fast as it may; so it does, too, where its limits leave no more.
+            True if one factor scales all joints, so that the tool keeps its direction. If no factor exists, each joint
+                moves towards its speed at its own acceleration limit.
         """
         speeds, last, limits = self.speeds, state.commanded_velocity, self._limits
         acceleration = limits.acceleration
@@ -465,7 +465,7 @@ class ScaledTwist:
         if low > high:
             self.clip(last, step)
             return False
-        # Above 1 it brakes as fast as the joints can.
+        # Above 1: brake at the joint limits.
         factor = low if low > 1.0 else high if high < 1.0 else 1.0
         twist = self.twist
         for i in range(6):
@@ -474,7 +474,7 @@ class ScaledTwist:
         return True
 
     def clip(self, last: Sequence[float], step: float) -> None:
-        """Bring each joint's speed to within acceleration x `step` (s) of its `last` (rad/s), whatever the twist."""
+        """Limit each joint's speed to acceleration x `step` (s) around its `last` (rad/s), regardless of the twist."""
         speeds, acceleration = self.speeds, self._limits.acceleration
         for i in range(6):
             most = step * acceleration[i]

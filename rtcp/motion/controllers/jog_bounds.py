@@ -1,7 +1,7 @@
-"""What holds a jogged tool back: joint ranges, boxes and singularities, as bounds of the tool velocity.
+"""Bounds on the velocity of a jogged tool: joint ranges, boxes and singularities.
 
-A bound is a row r and a speed b >= 0: r . (vx, vy, vz, wx, wy, wz) <= b. Where one is passed, the part of the motion
-that passes it is taken away and the rest slides along (`slide`); singularities halt the whole of it instead (`halt`).
+A bound is a row r and a speed b >= 0: r . (vx, vy, vz, wx, wy, wz) <= b. `slide` removes the part of the motion that
+exceeds a bound and keeps the rest; singularities halt the whole motion instead (`halt`).
 """
 
 from __future__ import annotations
@@ -17,14 +17,18 @@ from rtcp.motion.guards.zones import INNER_BOX, Clearance, Zones
 from rtcp.motion.limits import Limits
 
 STANDOFF_M: Final = 0.008
-"""The arm comes so near to a boundary; what the guard's own stop needs beside it is less."""
+"""Distance at which a tool stops before a boundary, m; more than the guard's own stop needs."""
 _GUARD_M: Final = 0.003
+"""Part of a distance that is left to the guard's stop, m."""
 JOINT_MARGIN_RAD: Final = 2e-4
 _BRAKES: Final = 0.5
-"""Part of a joint's acceleration that its braking envelope uses: the rest is for following the path."""
+"""Share of a joint's acceleration for its braking envelope; the rest is for the path."""
 _WITHIN_M: Final = 0.13
+"""Nearer boundaries are bounds, m."""
 _FASTEST_POINT_M_S: Final = 2.0
+"""Upper bound on the speed of any point of the arm, m/s."""
 _PASSES: Final = 6
+"""Limit on the number of bounds that are applied to a twist."""
 _TOLERANCE: Final = 1e-9
 
 
@@ -32,11 +36,11 @@ class JogBounds:
     """Bounds of one arm at one configuration.
 
     Args:
-        limits: of the joints and where the boxes are; read every cycle.
-        zones: tell the clearances; None: there are none.
-        inverse: what the joints do at this configuration.
+        limits: ranges, speeds and accelerations of the joints, and the boxes; read every cycle.
+        zones: measures clearances; None: the arm has no boxes and no bodies.
+        inverse: inverse Jacobian of the current configuration.
         braking: deceleration before a box, m/s^2.
-        singularity: nearest distances, m, rad, rad; 0: none.
+        singularity: smallest distances from shoulder, elbow and wrist singularity, m, rad, rad; 0: no bound.
         dt: the cycle, s.
     """
 
@@ -56,13 +60,21 @@ class JogBounds:
         self.near: Sequence[Clearance] = ()
         self._idle = 0
         self._boxes: object = None
-        self._turn2 = 1.0 / inverse.length**2
+        self._rotation_weight = 1.0 / inverse.length**2
         self.axis = self.box = -2
-        """What held the motion back in this cycle: joint, number of the box or pair (`zones`); -2: none."""
+        """Joint, and box or pair (`zones`), that limited the motion in this cycle; -2: none."""
         self._singular = 0
 
-    def look(self, poses: Sequence[Pose], position: Sequence[float], jumped: bool) -> None:
-        """Find the boundaries that are near. They are looked for again when a point can have come near to one."""
+    def update(self, poses: Sequence[Pose], position: Sequence[float], jumped: bool) -> None:
+        """Find the boundaries within 0.13 m.
+
+        After a search without result the next one waits until a point could have come that near.
+
+        Args:
+            poses: `frames` of the configuration.
+            position: the joints, rad.
+            jumped: whether `position` does not continue that of the last cycle.
+        """
         self.axis = self.box = -2
         self._singular = 0
         self._position = position
@@ -83,16 +95,16 @@ class JogBounds:
 
     @property
     def held(self) -> int:
-        """What held the motion back in this cycle: `HELD_...` of `rtcp.ipc.schema`."""
-        held = self._singular
+        """What limited the motion in this cycle: bits `HELD_...` of `rtcp.ipc.schema`."""
+        bits = self._singular
         if self.axis >= 0:
-            held |= (self.axis + 1) << HELD_RANGE_AT
+            bits |= (self.axis + 1) << HELD_RANGE_AT
         if self.box >= INNER_BOX:
-            held |= (min(self.box, HELD_ITSELF) + 2) << HELD_BOX_AT
-        return held
+            bits |= (min(self.box, HELD_ITSELF) + 2) << HELD_BOX_AT
+        return bits
 
     def passed(self, poses: Sequence[Pose], twist: Sequence[float], speeds: Sequence[float]) -> bool:
-        """Return whether `twist`, with its joint speeds, passes a bound: `slide` is for that."""
+        """Return whether `twist`, with its joint speeds, may exceed a bound, so that `slide` has to check it."""
         if self.near or self._inverse.lost:
             return True
         limits, q = self._limits, self._position
@@ -100,42 +112,42 @@ class JogBounds:
         for i in range(6):
             v = speeds[i]
             stopping_distance = (high[i] - q[i] if v > 0.0 else q[i] - low[i]) - JOINT_MARGIN_RAD
-            # v^2 > 2 a room, with room for the steps of time
+            # v^2 > 2 a s, with a margin for the time steps
             if v * v > 1.8 * _BRAKES * acceleration[i] * stopping_distance and v:
                 return True
         return False
 
-    def slide(self, poses: Sequence[Pose], twist: list[float], moves: bool, turns: bool) -> bool:
-        """Take away from `twist` what the bounds do not allow; return False where nothing is left: the tool stands.
+    def slide(self, poses: Sequence[Pose], twist: list[float], moves: bool, rotates: bool) -> bool:
+        """Remove from `twist` what exceeds a bound; return False where the tool has to stand still.
 
-        A motion that only moves the tool is not made one that turns it, nor the other way round.
+        A pure translation gets no rotation, and a pure rotation no translation.
 
         Args:
             poses: `frames` of the configuration.
             twist: vx, vy, vz, wx, wy, wz along the base's axes; changed.
-            moves: whether positions may be changed.
-            turns: whether directions may.
+            moves: whether the linear part may change.
+            rotates: whether the angular part may change.
         """
-        weight = (1.0 if moves else 0.0, self._turn2 if turns else 0.0)
+        weight = (1.0 if moves else 0.0, self._rotation_weight if rotates else 0.0)
         basis: list[Sequence[float]] = []
-        which = -1
+        locked = -1
         for row in self._inverse.lost:
-            which = self._inverse.locked.index(True, which + 1)
+            locked = self._inverse.locked.index(True, locked + 1)
             along = _along(row, twist)
             if along > _TOLERANCE or along < -_TOLERANCE:
-                self._singular |= HELD_SHOULDER << which
-                if not _taken(twist, row, along, weight, basis):
+                self._singular |= HELD_SHOULDER << locked
+                if not _subtract(twist, row, along, weight, basis):
                     return False
         for _ in range(_PASSES):
             worst, excess = self._worst(poses, twist)
             if worst is None:
                 return True
-            if not _taken(twist, worst, excess, weight, basis):
+            if not _subtract(twist, worst, excess, weight, basis):
                 return False
         return self._worst(poses, twist)[0] is None
 
     def _worst(self, poses: Sequence[Pose], twist: Sequence[float]) -> tuple[Row | None, float]:
-        """Return the bound that is passed most, and by how much; m/s and rad/s count alike."""
+        """Return the most exceeded bound and its excess, m/s or rad/s."""
         limits, dt = self._limits, self._dt
         low, high, acceleration, fastest = limits.low, limits.high, limits.acceleration, limits.velocity
         a, b, c, d, e, f = twist
@@ -165,7 +177,7 @@ class JogBounds:
         return worst, most
 
     def _approach(self, poses: Sequence[Pose], clearance: Clearance) -> Row:
-        """Return the row of the speed with which a point comes nearer to a boundary."""
+        """Return the row whose product with a twist is the speed of a point towards its boundary, m/s."""
         x, y, z = clearance.normal
         x, y, z = -x, -y, -z
         if clearance.zone == INNER_BOX:
@@ -181,34 +193,34 @@ class JogBounds:
         return a, b, c, d, e, f
 
     def halt(self, twist: Sequence[float]) -> float:
-        """Return the part of `twist`, 0 to 1, with which it comes to rest before a singularity."""
+        """Return the part of `twist`, 0 to 1, that can still stop before a singularity."""
         share = 1.0
         inverse, limits = self._inverse, self._limits
-        for which in range(3):
-            nearest = self._nearest[which]
-            distance = inverse.distance[which]
-            if nearest == 0.0 or inverse.locked[which] or distance > 6.0 * nearest + 0.2:
+        for singularity in range(3):
+            nearest = self._nearest[singularity]
+            distance = inverse.distance[singularity]
+            if nearest == 0.0 or inverse.locked[singularity] or distance > 6.0 * nearest + 0.2:
                 continue
-            approach = -_along(inverse.rate[which], twist)
+            approach = -_along(inverse.rate[singularity], twist)
             if approach <= _TOLERANCE:
                 continue
-            # The envelope begins at three times the nearest distance with the greatest speed there is.
+            # From the greatest possible speed, braking begins at three times the smallest distance.
             greatest, rate = 0.25, 0.25
-            if which:
-                joint = 2 * which
+            if singularity:
+                joint = 2 * singularity
                 greatest, rate = limits.velocity[joint], 0.35 * limits.acceleration[joint]
             slow = 0.25 * greatest * greatest / nearest
             allowed = stopping(distance - nearest, slow if slow < rate else rate, self._dt)
             if approach * share > allowed:
                 share = allowed / approach
-                self._singular |= HELD_SHOULDER << which
+                self._singular |= HELD_SHOULDER << singularity
         return share
 
     def stoppable(self, poses: Sequence[Pose], speeds: Sequence[float]) -> float:
-        """Return the part of the joint speeds, 0 to 1, from which each joint's own stop stays out of the boxes.
+        """Return the part of the joint speeds, 0 to 1, from which a stop hits no box.
 
-        That stop bends away from the tool's line. To first order a point is displaced by its lever times v^2 / 2a of
-        each joint; those that lead towards the box are summed up.
+        In a stop each joint decelerates by itself, so the tool leaves its line. To first order a joint displaces a
+        point by its lever times v^2 / 2a; the displacements towards the box are added up.
         """
         share = 1.0
         acceleration = self._limits.acceleration
@@ -231,7 +243,7 @@ class JogBounds:
 
 
 def stopping(stopping_distance: float, rate: float, dt: float) -> float:
-    """Return the speed that comes to rest within `stopping_distance` at the deceleration `rate`, in steps of `dt`."""
+    """Return the speed that stops within `stopping_distance` at the deceleration `rate`, in steps of `dt`."""
     if stopping_distance <= 0.0:
         return 0.0
     half = 0.5 * rate * dt
@@ -239,7 +251,7 @@ def stopping(stopping_distance: float, rate: float, dt: float) -> float:
 
 
 def lever(pose: Pose, px: float, py: float, pz: float, x: float, y: float, z: float) -> float:
-    """Return the speed along (x, y, z) of a point for 1 rad/s about the axis of a frame."""
+    """Return a point's speed along (x, y, z) for 1 rad/s about the axis of a frame."""
     (ox, oy, oz), (_, _, ax, _, _, ay, _, _, az) = pose
     rx, ry, rz = px - ox, py - oy, pz - oz
     return (ay * rz - az * ry) * x + (az * rx - ax * rz) * y + (ax * ry - ay * rx) * z
@@ -251,28 +263,28 @@ def _along(row: Row, twist: Sequence[float]) -> float:
     return a * g + b * h + c * i + d * j + e * k + f * m
 
 
-def _taken(
+def _subtract(
     twist: list[float], row: Row, excess: float, weight: tuple[float, float], basis: list[Sequence[float]]
 ) -> bool:
-    """Take `excess` along a row from the twist and leave what was taken before as it is; False where that cannot be."""
-    move, turn = weight
+    """Remove `excess` along a row from the twist, orthogonal to the previous rows; return False if impossible."""
+    move, rotate = weight
     a, b, c, d, e, f = row
-    g, h, i, j, k, m = move * a, move * b, move * c, turn * d, turn * e, turn * f
+    g, h, i, j, k, m = move * a, move * b, move * c, rotate * d, rotate * e, rotate * f
     whole = a * g + b * h + c * i + d * j + e * k + f * m
-    for other in basis:
-        part = _along(row, other)
-        g, h, i = g - part * other[0], h - part * other[1], i - part * other[2]
-        j, k, m = j - part * other[3], k - part * other[4], m - part * other[5]
-    left = a * g + b * h + c * i + d * j + e * k + f * m
-    if left <= 1e-6 * whole or left <= 1e-12:
+    for basis_row in basis:
+        part = _along(row, basis_row)
+        g, h, i = g - part * basis_row[0], h - part * basis_row[1], i - part * basis_row[2]
+        j, k, m = j - part * basis_row[3], k - part * basis_row[4], m - part * basis_row[5]
+    remaining = a * g + b * h + c * i + d * j + e * k + f * m
+    if remaining <= 1e-6 * whole or remaining <= 1e-12:
         return False
-    part = excess / left
+    part = excess / remaining
     twist[0] -= part * g
     twist[1] -= part * h
     twist[2] -= part * i
     twist[3] -= part * j
     twist[4] -= part * k
     twist[5] -= part * m
-    n = 1.0 / sqrt(left)
+    n = 1.0 / sqrt(remaining)
     basis.append((g * n, h * n, i * n, j * n, k * n, m * n))
     return True

@@ -1,9 +1,8 @@
-"""The inverse of the Jacobian at one configuration, row by row, and how far it is from the singularities.
+"""Inverse of the Jacobian at a configuration, row by row, and the distances to the singularities.
 
-With a spherical wrist it falls apart: joints 1 to 3 move the wrist centre, joints 4 to 6 turn the hand. With axes 2 and
-3 parallel the first part does so again: joint 1 alone moves the centre along axis 2. Beside a singularity
-(`SHOULDER_M`, `SINE`) the joint that would have to move without bound is locked, and the direction that is lost is told
-in `lost`.
+A spherical wrist decouples it: joints 1 to 3 move the wrist centre, joints 4 to 6 rotate the hand. With axes 2 and 3
+parallel the first part decouples too: joint 1 alone moves the centre along axis 2. Near a singularity (`SHOULDER_M`,
+`SINE`) the joint whose speed would be unbounded is locked, and `lost` has the direction that the tool loses.
 """
 
 from __future__ import annotations
@@ -23,26 +22,27 @@ _Triple: TypeAlias = tuple[float, float, float]
 SHOULDER, ELBOW, WRIST = 0, 1, 2
 SHOULDER_M: Final = 0.001
 SINE: Final = 0.002
-"""Nearer to a singularity than this its joint is locked: m of the wrist centre, sine of the bend."""
+"""Distances to a singularity below which its joint is locked: m of the wrist centre; sine of the bend."""
 _ZERO: _Triple = (0.0, 0.0, 0.0)
 _FAR: Final = 1e9
 _INWARD_M_S: Final = 1e-3
-"""An elbow that is stretched bends where the tool is wanted to come inwards faster than this."""
+"""Commanded inward speed of the tool above which a stretched elbow bends, m/s."""
 _STRAIGHT_RAD: Final = 1e-9
 _BENDING: Final = 0.4
-"""Part of the joints' speeds with which it bends."""
+"""Share of the joint speeds with which it bends."""
 _LOST: Final = 1e-3
 
 
 class JogInverse:
-    """What the joints have to do for a tool velocity; `at` computes all of it for one configuration.
+    """Joint speeds for a tool velocity; `at` computes all attributes for a configuration.
 
     `rows`: for each joint the six numbers that give its speed, rad/s, from vx, vy, vz (m/s), wx, wy, wz (rad/s) of the
-    tool along the base's axes. `distance` and `rate`: shoulder (m), elbow, wrist (rad), as `singularity_distances`
-    means them, and the rows of their growth. `locked`: which of them are. `lost`: rows of what the tool cannot do.
+    tool along the base's axes. `distance` and `rate`: distances to the singularities of shoulder (m), elbow and wrist
+    (rad), as in `singularity_distances`, and the rows of their growth. `locked`: the locked ones of the three. `lost`:
+    rows of the directions the tool has lost.
 
     Args:
-        model: an arm with a spherical wrist; `usable` says whether it has one.
+        model: of an arm; `usable` is False unless it has a spherical wrist.
     """
 
     def __init__(self, model: ArmModel) -> None:
@@ -58,16 +58,16 @@ class JogInverse:
         self.lost: list[Row] = []
         self.stretched = True
         self.bend = 0.0
-        """Joint 3 from where the elbow is stretched, rad, in its own sense."""
+        """Angle of joint 3 from the stretched elbow, rad, with the sign of joint 3."""
         self.wrist_sign = 1.0
-        """Which way joint 5 leads away from its singularity."""
+        """Sign of the motion of joint 5 away from its singularity."""
         self.arm: Sequence[_Triple] = (_ZERO, _ZERO, _ZERO)
-        """What joints 1 to 3 do to the wrist centre, m/s for 1 rad/s."""
+        """Velocity of the wrist centre, m/s, for 1 rad/s of joints 1 to 3."""
         self.to_centre = _ZERO
-        """From the tool to the wrist centre, m."""
+        """Vector from the tool to the wrist centre, m."""
 
     def at(self, poses: Sequence[Pose]) -> bool:
-        """Compute for the poses that `frames` gives; return whether there is an inverse, some joints locked perhaps."""
+        """Compute for the poses of `frames`; return whether an inverse exists, possibly with locked joints."""
         (p1x, p1y, p1z), (_, _, ax, _, _, ay, _, _, az) = poses[0]
         (p2x, p2y, p2z), (_, _, bx, _, _, by, _, _, bz) = poses[1]
         (p3x, p3y, p3z), (_, _, cx, _, _, cy, _, _, cz) = poses[2]
@@ -84,7 +84,7 @@ class JogInverse:
         self.lost = lost = []
         locked = self.locked
         locked[0] = locked[1] = locked[2] = False
-        # across: twice the area of joint 2, joint 3 and the wrist centre
+        # across: twice the area of the triangle of joint 2, joint 3 and the wrist centre
         across = (vy * sz - vz * sy) * bx + (vz * sx - vx * sz) * by + (vx * sy - vy * sx) * bz
         if self.parallel:
             lateral = ux * bx + uy * by + uz * bz
@@ -96,9 +96,9 @@ class JogInverse:
                 d1x, d1y, d1z = bx / lateral, by / lateral, bz / lateral
             gx, gy, gz = p3x - p2x, p3y - p2y, p3z - p2z
             along = gx * fx + gy * fy + gz * fz - (gx * bx + gy * by + gz * bz) * (fx * bx + fy * by + fz * bz)
-            turn = 1.0 if bx * cx + by * cy + bz * cz > 0.0 else -1.0
+            sign = 1.0 if bx * cx + by * cy + bz * cz > 0.0 else -1.0
             self.stretched = along > 0.0
-            self.bend = bend = turn * atan2(turn * across, along)
+            self.bend = bend = sign * atan2(sign * across, along)
             if -SINE * abs(along) < across < SINE * abs(along):
                 locked[1] = True
                 n = 1.0 / (vx * vx + vy * vy + vz * vz)
@@ -136,7 +136,7 @@ class JogInverse:
             locked[2] = True
             dot = ix * jx + iy * jy + iz * jz
             n = 1.0 / (1.0 - dot * dot)
-            turns: tuple[_Triple, ...] = (
+            wrist_rows: tuple[_Triple, ...] = (
                 _ZERO,
                 (n * (ix - dot * jx), n * (iy - dot * jy), n * (iz - dot * jz)),
                 (n * (jx - dot * ix), n * (jy - dot * iy), n * (jz - dot * iz)),
@@ -144,7 +144,7 @@ class JogInverse:
             )
         else:
             n = 1.0 / volume
-            turns = (
+            wrist_rows = (
                 (n * nx, n * ny, n * nz),
                 (n * (jy * hz - jz * hy), n * (jz * hx - jx * hz), n * (jx * hy - jy * hx)),
                 (n * (hy * iz - hz * iy), n * (hz * ix - hx * iz), n * (hx * iy - hy * ix)),
@@ -154,7 +154,7 @@ class JogInverse:
             (d2x, d2y, d2z, oy * d2z - oz * d2y, oz * d2x - ox * d2z, ox * d2y - oy * d2x),
             (d3x, d3y, d3z, oy * d3z - oz * d3y, oz * d3x - ox * d3z, ox * d3y - oy * d3x),
         ]
-        for ex, ey, ez in turns:
+        for ex, ey, ez in wrist_rows:
             k1, k2 = ex * ax + ey * ay + ez * az, ex * bx + ey * by + ez * bz
             k3 = ex * cx + ey * cy + ez * cz
             rx, ry = -k1 * d1x - k2 * d2x - k3 * d3x, -k1 * d1y - k2 * d2y - k3 * d3y
@@ -188,7 +188,7 @@ class JogInverse:
         return True
 
     def _of_centre(self, x: float, y: float, z: float) -> Row:
-        """Return the row of the tool velocity that is a component of the wrist centre's velocity."""
+        """Return the row that gives a component of the wrist centre's velocity from the tool twist."""
         ox, oy, oz = self.to_centre
         return x, y, z, oy * z - oz * y, oz * x - ox * z, ox * y - oy * x
 
@@ -209,45 +209,45 @@ def bend(
     limits: Limits,
     wrist_least: float,
 ) -> None:
-    """Bend a stretched (or open a folded) elbow, where the tool is to go that way.
+    """Bend a stretched (or open a folded) elbow, if the commanded twist needs it.
 
-    The joints then move as they can without moving the tool, to first order: joint 2 takes back what joint 3 does
-    to the wrist centre, and the hand keeps its direction. To second order the tool goes the only way that it can.
+    To first order the joints move without moving the tool: joint 2 cancels the effect of joint 3 on the wrist
+    centre, and the hand keeps its orientation. To second order the tool moves in its only possible direction.
 
     Args:
-        inverse: of this cycle, the elbow locked.
-        poses: `frames` of what is commanded.
+        inverse: of this cycle, with the elbow locked.
+        poses: `frames` of the commanded position.
         position: rad, six.
-        wanted: the twist that is wanted, six, along the base's axes.
-        speeds: rad/s, six; what bends is added.
+        wanted: commanded twist, six, along the base's axes.
+        speeds: joint speeds, rad/s, six; the bending motion is added.
         limits: of the joints.
-        wrist_least: as near as the wrist may come to its singularity, rad.
+        wrist_least: least distance of the wrist to its singularity, rad.
     """
     row = inverse.lost[1 if inverse.locked[SHOULDER] else 0]
     x, y, z = row[:3]
     (px, py, pz), (wx, wy, wz) = poses[1].position, poses[4].position
-    outward = sum(one * other for one, other in zip(row, wanted, strict=True))
+    outward = sum(a1 * b1 for a1, b1 in zip(row, wanted, strict=True))
     if (x * (wx - px) + y * (wy - py) + z * (wz - pz) < 0.0) is inverse.stretched:
         outward = -outward
     if outward > -_INWARD_M_S:
         return
-    way = inverse.bend
-    if -_STRAIGHT_RAD < way < _STRAIGHT_RAD:
-        way = 1.0 if limits.high[2] - position[2] >= position[2] - limits.low[2] else -1.0
+    angle = inverse.bend
+    if -_STRAIGHT_RAD < angle < _STRAIGHT_RAD:
+        angle = 1.0 if limits.high[2] - position[2] >= position[2] - limits.low[2] else -1.0
     elif not inverse.stretched:
-        way = -way
-    third = 1.0 if way > 0.0 else -1.0
+        angle = -angle
+    third = 1.0 if angle > 0.0 else -1.0
     _, (a, b, c), (d, e, f) = inverse.arm
     second = -third * (a * d + b * e + c * f) / (a * a + b * b + c * c)
     _, _, x2, _, _, y2, _, _, z2 = poses[1].rotation
     _, _, x3, _, _, y3, _, _, z3 = poses[2].rotation
     x, y, z = -second * x2 - third * x3, -second * y2 - third * y3, -second * z2 - third * z3
     ox, oy, oz = inverse.to_centre
-    # The twist that turns the hand about the wrist centre.
+    # Twist of the hand about the wrist centre.
     hand = (-y * oz + z * oy, -z * ox + x * oz, -x * oy + y * ox, x, y, z)
-    wrist = [sum(one * other for one, other in zip(inverse.rows[i], hand, strict=True)) for i in (3, 4, 5)]
+    wrist = [sum(a1 * b1 for a1, b1 in zip(inverse.rows[i], hand, strict=True)) for i in (3, 4, 5)]
     if inverse.locked[WRIST]:
-        lost = sum(one * other for one, other in zip(inverse.lost[-1], hand, strict=True))
+        lost = sum(a1 * b1 for a1, b1 in zip(inverse.lost[-1], hand, strict=True))
         if abs(lost) > _LOST:
             return
     elif inverse.distance[WRIST] < wrist_least and wrist[1] * inverse.wrist_sign < 0.0:

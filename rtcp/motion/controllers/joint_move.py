@@ -1,4 +1,4 @@
-"""Moves of the joints to a configuration, jerk-limited; a new target begins at what was commanded last."""
+"""Jerk-limited joint moves to a configuration; a new target starts from the last setpoint."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class JointMoveController(Controller):
         self._guard = setup.trajectory_guard
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Move to the target; a move under way is replaced without a stop."""
+        """Move to the target; it replaces a move in progress without a stop."""
         assert isinstance(command, MoveJoints)
         fastest = max(self.limits.velocity)
         if not isfinite(command.speed) or not 0.0 < command.speed <= fastest:

@@ -1,4 +1,4 @@
-"""The joystick's modes: which direction of the tool each deflection is.
+"""Modes of the joystick: tool direction of each deflection.
 
 | mode | forward / backward | left / right |
 |---|---|---|
@@ -21,7 +21,7 @@ _DIRECTIONS = (((0, 1.0), (1, 1.0)), ((2, -1.0), (5, 1.0)), ((3, 1.0), (4, 1.0))
 
 
 class Shown(Protocol):
-    """What the joystick shows; see `rtcp.devices.io_box`."""
+    """State of the joystick; see `rtcp.devices.io_box`."""
 
     forward: int
     side: int
@@ -30,13 +30,13 @@ class Shown(Protocol):
 
 
 class Joystick:
-    """Turns what the joystick shows into a tool velocity, or into the gripper's opening.
+    """Converts the joystick's state to a tool velocity, or to opening and closing of the gripper.
 
-    `twist`: vx, vy, vz (m/s), wx, wy, wz (rad/s) along `frame`; `moves`: whether it is one; `grip`: True to open, False
-    to close, in the cycle in which the joystick asks for it, else None; `mode` as in the table.
+    `twist`: vx, vy, vz (m/s), wx, wy, wz (rad/s) along `frame`; `moves`: whether it is not 0; `grip`: True to open,
+    False to close, in the cycle of the deflection, else None; `mode` as in the table.
 
-    A joystick that is deflected when it begins to count (at the start, after a mode change, when it is given back,
-    after an invalid code) counts only after it has been neutral.
+    A joystick that is deflected when it becomes active (at the start, after a mode change, when it gets the arm back,
+    after an invalid code) is ignored until it has been neutral.
     """
 
     def __init__(self, config: JogConfig) -> None:
@@ -52,47 +52,47 @@ class Joystick:
 
     @property
     def holds_grip(self) -> bool:
-        """Whether the joystick is held where it opens or closes the gripper."""
+        """True while the joystick is deflected to open or close the gripper."""
         return self._gripped != 0
 
     def wait_for_neutral(self) -> None:
-        """Count only after the joystick has been neutral."""
+        """Ignore the joystick until it has been neutral."""
         self._neutral_seen = False
         self._paddle = 0
-        self._rest()
+        self._clear()
 
-    def _rest(self) -> None:
+    def _clear(self) -> None:
         for i in range(6):
             self.twist[i] = 0.0
         self.moves = False
         self.grip = None
         self._gripped = 0
 
-    def update(self, shown: Shown, counts: bool) -> None:
-        """Update from what the joystick shows in this cycle; `counts`: the arm has it, and motion is permitted."""
-        if not (counts and shown.valid):
+    def update(self, joystick: Shown, counts: bool) -> None:
+        """Update from this cycle's state; `counts`: the joystick commands the arm and motion is permitted."""
+        if not (counts and joystick.valid):
             self.wait_for_neutral()
             return
-        if self._paddle and not shown.paddle:
-            # When the paddle is released the mode changes, and the joystick has to be neutral once.
+        if self._paddle and not joystick.paddle:
+            # Releasing the paddle changes the mode; the joystick must then be neutral once.
             self.mode = (self.mode + self._paddle) % MODES
             self.wait_for_neutral()
-        if not (shown.forward or shown.side or shown.paddle):
+        if not (joystick.forward or joystick.side or joystick.paddle):
             self._neutral_seen = True
-            self._rest()
+            self._clear()
             return
         if not self._neutral_seen:
             return
-        self._paddle = shown.paddle
-        if shown.paddle:
-            self._rest()
+        self._paddle = joystick.paddle
+        if joystick.paddle:
+            self._clear()
         elif self.mode == GRIPPER:
-            self.grip = shown.forward > 0 if shown.forward and shown.forward != self._gripped else None
-            self._gripped = shown.forward
+            self.grip = joystick.forward > 0 if joystick.forward and joystick.forward != self._gripped else None
+            self._gripped = joystick.forward
         else:
-            (along, sign), (across, other) = _DIRECTIONS[self.mode]
+            (along, sign), (across, side_sign) = _DIRECTIONS[self.mode]
             for i in range(6):
                 self.twist[i] = 0.0
-            self.twist[along] = sign * shown.forward * self._speeds[along]
-            self.twist[across] = other * shown.side * self._speeds[across]
+            self.twist[along] = sign * joystick.forward * self._speeds[along]
+            self.twist[across] = side_sign * joystick.side * self._speeds[across]
             self.moves = True

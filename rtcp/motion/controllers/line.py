@@ -1,4 +1,4 @@
-"""Straight lines of the tool from rest to rest, with slerp; `rtcp.motion.planning` checked the plan as a whole."""
+"""Straight tool lines from rest to rest, with slerp, of a plan that `rtcp.motion.planning` has checked."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from rtcp.ipc.events import (
 )
 from rtcp.ipc.refusals import DamagedRow, PathNeedsRest, PathStartsElsewhere, Refusal
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.joint_motion import find_way
+from rtcp.motion.joint_motion import find_trajectory
 from rtcp.motion.planning.interpolation import quaternion, rotation, turn_between, turned_by
 from rtcp.motion.planning.plan import MOST_LINES, damaged_line, read_row
 from rtcp.motion.speed_override import TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 AT_START_M, AT_START_RAD = 1e-3, 2e-3
-"""The first piece begins at most this far from where the tool is commanded; the difference fades out."""
+"""Upper bounds on the distance of the first piece from the commanded tool pose, m, rad; the difference fades out."""
 _STILL_RAD_S: Final = 1e-6
 _EXACT: Final = 1e-9
 _LOOK_S: Final = 0.004
 _BETWEEN_SAMPLES: Final = 0.95
-"""Share of the distance that is kept from a singularity: a plan was checked every 2 mm."""
+"""Share of the required distance to a singularity: plans are checked every 2 mm only."""
 _FADED: Final = 0.25
-"""The difference at the start fades out over this fraction of the first piece."""
+"""Fraction of the first piece over which the difference at its start fades out."""
 
 
 class LineController(Controller):
@@ -59,48 +59,48 @@ class LineController(Controller):
         self.use_tool(setup.tool.number)
         self._singularities = Singularities(self._model)
         self._nearest = (singularity.shoulder, singularity.elbow, singularity.wrist)
-        self._every = max(round(_LOOK_S / setup.period_s), 1)
+        self._singularity_cycles = max(round(_LOOK_S / setup.period_s), 1)
         self._wait = 0
         self._otg = Ruckig(1, setup.period_s)
-        self._way, self._halt = InputParameter(1), InputParameter(1)
+        self._inp, self._halt = InputParameter(1), InputParameter(1)
         self._halt.control_interface = ControlInterface.Velocity
         self._halt.target_velocity = [0.0]
-        self._active = self._way
+        self._active = self._inp
         self._time_scale = TimeScale()
         self._plan = Trajectory(1)
-        """Of the rest of the piece, since it became slower than planned."""
+        """Trajectory of the rest of the piece, since the piece became slower than planned."""
         self._is_scaled = False
         self._fraction = self._plan_s = 0.0
-        """How far the tool is on the piece, and since when it is, by the time of its plan, s."""
+        """Fraction of the piece that is done, and its time in the plan, s."""
         self._output = OutputParameter(1)
         self._velocity = [0.0] * n
         self._near = [0.0] * n
-        self._rest = [0.0] * n
-        self._rest_counts = False
+        self._offset = [0.0] * n
+        self._has_offset = False
         self._rows: memoryview[float] | None = None
         self._piece = [0.0] * 20
         self._piece_ended = False
         self._row = self._count = 0
         self._done_s = 0.0
         self._from: Vector = (0.0, 0.0, 0.0)
-        self._way_m: Vector = (0.0, 0.0, 0.0)
+        self._span: Vector = (0.0, 0.0, 0.0)
         self._axis: Vector = (0.0, 0.0, 1.0)
         self._angle = 0.0
         self._rotation = rotation((1.0, 0.0, 0.0, 0.0))
 
     def use_tool(self, number: int) -> None:
-        """Use another tool from now on."""
+        """Switch to another tool; at rest."""
         self._model, self._inverse = self._models[number], self._inverses[number]
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Run a plan of straight pieces (`rtcp.motion.planning.plan`) from `state`, at rest where the first begins."""
+        """Run a plan of straight pieces (`rtcp.motion.planning.plan`) from rest at the start of the first."""
         assert isinstance(command, RunLines)
         rows, count = self.rows_of(command.slot, command.rows, MOST_LINES), command.rows
         if isinstance(rows, Refusal):
             return rows
         first = read_row(rows, 0)
-        if (found := damaged_line(first)) is not None:
-            return DamagedRow(0, found)
+        if (damaged := damaged_line(first)) is not None:
+            return DamagedRow(0, damaged)
         for i, v in enumerate(state.commanded_velocity):
             if not -_STILL_RAD_S <= v <= _STILL_RAD_S:
                 return PathNeedsRest(i, v)
@@ -108,9 +108,9 @@ class LineController(Controller):
         far = hypot(*(a - b for a, b in zip(tool.position, first[0:3], strict=True)))
         if not far <= AT_START_M:
             return PathStartsElsewhere(far)
-        _, turn = turn_between(quaternion(tool.rotation), first[3:7])
-        if not turn <= AT_START_RAD:
-            return PathStartsElsewhere(turn)
+        _, angle = turn_between(quaternion(tool.rotation), first[3:7])
+        if not angle <= AT_START_RAD:
+            return PathStartsElsewhere(angle)
         self.begin()
         self._rows, self._row, self._count = rows, 0, count
         self._done_s = 0.0
@@ -119,28 +119,28 @@ class LineController(Controller):
         return None
 
     def _begin_piece(self, state: ArmState, row: list[float]) -> None:
-        """Make a row the current piece."""
+        """Set a row as the current piece."""
         self._piece, self._piece_ended = row, False
         x, y, z = row[0:3]
         self._from = x, y, z
-        self._way_m = row[7] - x, row[8] - y, row[9] - z
+        self._span = row[7] - x, row[8] - y, row[9] - z
         self._axis, self._angle = turn_between(row[3:7], row[10:14])
         self._rotation = rotation(row[3:7])
         self._near = list(state.commanded)
-        self._rest_counts = False
-        found = self._inverse.solve_near(Pose(self._from, self._rotation), self._near).q
-        if found is not None:
-            # What the arm stands beside the line fades out along it: no jump, and no second line.
+        self._has_offset = False
+        q = self._inverse.solve_near(Pose(self._from, self._rotation), self._near).q
+        if q is not None:
+            # The arm's offset from the line fades out along it, without a jump.
             for i in self._joints:
-                self._rest[i] = rest = state.commanded[i] - found[i]
-                self._rest_counts = self._rest_counts or not -_EXACT < rest < _EXACT
-            self._near = list(found)
-        way = self._way
-        way.current_position, way.current_velocity, way.current_acceleration = [0.0], [0.0], [0.0]
-        way.target_position = [1.0]
-        way.max_velocity, way.max_acceleration, way.max_jerk = [row[14]], [row[15]], [row[16]]
+                self._offset[i] = offset = state.commanded[i] - q[i]
+                self._has_offset = self._has_offset or not -_EXACT < offset < _EXACT
+            self._near = list(q)
+        inp = self._inp
+        inp.current_position, inp.current_velocity, inp.current_acceleration = [0.0], [0.0], [0.0]
+        inp.target_position = [1.0]
+        inp.max_velocity, inp.max_acceleration, inp.max_jerk = [row[14]], [row[15]], [row[16]]
         self._otg.reset()
-        self._active = way
+        self._active = inp
         self._is_scaled = False
 
     def stop(self, state: ArmState) -> None:
@@ -148,10 +148,10 @@ class LineController(Controller):
         if self.phase is not Phase.MOVE:
             return
         self.phase = Phase.STOP
-        way, halt = self._way, self._halt
-        halt.current_position, halt.current_velocity = way.current_position, way.current_velocity
-        halt.current_acceleration = way.current_acceleration
-        halt.max_velocity, halt.max_acceleration, halt.max_jerk = way.max_velocity, way.max_acceleration, way.max_jerk
+        inp, halt = self._inp, self._halt
+        halt.current_position, halt.current_velocity = inp.current_position, inp.current_velocity
+        halt.current_acceleration = inp.current_acceleration
+        halt.max_velocity, halt.max_acceleration, halt.max_jerk = inp.max_velocity, inp.max_acceleration, inp.max_jerk
         self._active = halt
 
     def advance(self, state: ArmState) -> Setpoint:
@@ -162,29 +162,29 @@ class LineController(Controller):
         return self.setpoint if ended is None else self.give_up(state, ended)
 
     def _begin_next(self, state: ArmState) -> PlanDamaged | None:
-        """Begin the next piece, or return that it is damaged or does not begin where the last has ended."""
+        """Begin the next piece; return an error if it is damaged or does not start at the end of the last one."""
         assert self._rows is not None
         self._row += 1
         row, last = read_row(self._rows, self._row), self._piece
-        found = damaged_line(row)
-        if found is None and not hypot(row[0] - last[7], row[1] - last[8], row[2] - last[9]) <= AT_START_M:
-            found = row[0]
-        if found is None and not turn_between(last[10:14], row[3:7])[1] <= AT_START_RAD:
-            found = row[3]
-        if found is not None:
-            return PlanDamaged(self._row, found)
+        damaged = damaged_line(row)
+        if damaged is None and not hypot(row[0] - last[7], row[1] - last[8], row[2] - last[9]) <= AT_START_M:
+            damaged = row[0]
+        if damaged is None and not turn_between(last[10:14], row[3:7])[1] <= AT_START_RAD:
+            damaged = row[3]
+        if damaged is not None:
+            return PlanDamaged(self._row, damaged)
         self._done_s = self.elapsed_s
         self._begin_piece(state, row)
         return None
 
     def _go_along(self, state: ArmState) -> MotionEnded | None:
-        """Write the setpoints of the next cycle, or return why the line cannot go on."""
+        """Write the setpoints of the next cycle, or return why the line cannot continue."""
         result = self._step()
         if result < 0:
             return ControllerFailed()
         fraction: float = self._fraction
         x, y, z = self._from
-        along, across, up = self._way_m
+        along, across, up = self._span
         turned = turned_by(self._rotation, self._axis, fraction * self._angle) if self._angle else self._rotation
         near = self._inverse.solve_near(
             Pose((x + fraction * along, y + fraction * across, z + fraction * up), turned), self._near
@@ -197,20 +197,20 @@ class LineController(Controller):
                 return JointLimitReached(near.limited, q_now, nearer)
             return OutOfReach(near.out_of_reach) if near.out_of_reach > 0.0 else NoSolution()
         position = list(q)
-        if self._rest_counts:
-            left = _left(fraction / _FADED)
+        if self._has_offset:
+            share = _fade(fraction / _FADED)
             for i in self._joints:
-                position[i] += self._rest[i] * left
+                position[i] += self._offset[i] * share
         velocity, before, limits, over = self._velocity, state.commanded, self.limits.velocity, 1.0 / self.period_s
         for i in self._joints:
             velocity[i] = v = (position[i] - before[i]) * over
             if not -limits[i] * 1.000001 <= v <= limits[i] * 1.000001:
                 return SetpointJump(i, v / over, limits[i] / over)
         if self._due():
-            for which, distance in enumerate(self._singularities.distances(frames(self._model, position))):
-                if distance < _BETWEEN_SAMPLES * self._nearest[which]:
-                    return SingularityReached(which, distance, self._nearest[which])
-        self._near = position if not self._rest_counts else list(q)
+            for singularity, distance in enumerate(self._singularities.distances(frames(self._model, position))):
+                if distance < _BETWEEN_SAMPLES * self._nearest[singularity]:
+                    return SingularityReached(singularity, distance, self._nearest[singularity])
+        self._near = position if not self._has_offset else list(q)
         self.setpoint.position, self.setpoint.velocity = position, velocity
         self.elapsed_s = self._done_s + self._plan_s
         if result == Result.Finished:
@@ -220,12 +220,12 @@ class LineController(Controller):
         return None
 
     def _step(self) -> Result:
-        """Go on along the piece by one cycle, at the speed override."""
+        """Advance along the piece by one cycle, at the speed override."""
         if self.phase is Phase.MOVE and (self._is_scaled or self.speed_override.fraction != 1.0):
-            # Without a plan, which is a matter of rounding, it is tried again in the next cycle.
-            if not self._is_scaled and find_way(self._otg, self._way, [self._piece[16]], self._plan):
+            # ruckig may find no plan because of rounding: try again in the next cycle.
+            if not self._is_scaled and find_trajectory(self._otg, self._inp, [self._piece[16]], self._plan):
                 self._is_scaled, self._done_s, self._plan_s = True, self.elapsed_s, 0.0
-                self._time_scale.begin(1.0 if any(self._way.current_velocity) else self.speed_override.fraction)
+                self._time_scale.begin(1.0 if any(self._inp.current_velocity) else self.speed_override.fraction)
             if self._is_scaled:
                 return self._follow_plan()
         output = self._output
@@ -239,32 +239,32 @@ class LineController(Controller):
         return result
 
     def _follow_plan(self) -> Result:
-        way, plan, scale, dt = self._way, self._plan, self._time_scale, self.period_s
+        inp, plan, scale, dt = self._inp, self._plan, self._time_scale, self.period_s
         before, goal = scale.speed, self.speed_override.fraction
         speed = 1.0
         if not goal == before == 1.0:
-            # Where the cycle ends hardly depends on how much u changes.
+            # The end point of the cycle hardly depends on the change of u.
             _, along, _ = plan.at_time(self._plan_s + (before + 0.5 * scale.rate * dt) * dt)
-            speed = scale.step(goal, along, way.current_velocity, way.max_acceleration, way.max_jerk, dt)
+            speed = scale.step(goal, along, inp.current_velocity, inp.max_acceleration, inp.max_jerk, dt)
         self._plan_s = min(self._plan_s + 0.5 * (before + speed) * dt, plan.duration)
         position, (along_it,), (bend,) = plan.at_time(self._plan_s)
         self._fraction = position[0]
-        # What a stop begins with.
-        way.current_position, way.current_velocity = position, [speed * along_it]
-        way.current_acceleration = [speed * speed * bend + scale.rate * along_it]
+        # Initial state of a stop.
+        inp.current_position, inp.current_velocity = position, [speed * along_it]
+        inp.current_acceleration = [speed * speed * bend + scale.rate * along_it]
         return Result.Finished if self._plan_s >= plan.duration else Result.Working
 
     def _due(self) -> bool:
-        """Whether some ms have passed since the singularities were looked at: the tool has moved 1 mm at most."""
+        """Whether the singularities are due for a check; between two checks the tool moves at most 1 mm."""
         self._wait -= 1
         if self._wait > 0:
             return False
-        self._wait = self._every
+        self._wait = self._singularity_cycles
         return True
 
 
-def _left(x: float) -> float:
-    """1 to 0 with speed and acceleration 0 at both ends."""
+def _fade(x: float) -> float:
+    """Return 1 to 0 for `x` from 0 to 1, with slope and curvature 0 at both ends."""
     return 1.0 - x * x * x * (10.0 + x * (6.0 * x - 15.0)) if x < 1.0 else 0.0
 
 
@@ -272,7 +272,7 @@ _SOMEWHERE = [0.2] * JOINTS
 
 
 class Distances(NamedTuple):
-    """Shoulder: m of the wrist centre from the plane of axes 1 and 2; elbow, wrist: rad. Infinite: there is none."""
+    """Shoulder: distance of the wrist centre from the plane of axes 1 and 2, m; elbow, wrist: rad; inf: none exists."""
 
     shoulder: float
     elbow: float
@@ -280,12 +280,12 @@ class Distances(NamedTuple):
 
 
 class Singularities:
-    """The singularities of an arm, as `kinematics.singularity_distances` finds them, which takes too long for a cycle.
+    """The singularities of an arm: `kinematics.singularity_distances`, fast enough for a cycle.
 
     With axis 2 parallel to axis 3 and a spherical wrist, each distance is one factor of the Jacobian's determinant.
 
     Args:
-        model: the geometry; which of the three it has is found out once.
+        model: the geometry; the constructor finds out which of the three it has.
     """
 
     def __init__(self, model: ArmModel) -> None:
@@ -294,7 +294,7 @@ class Singularities:
         self._scale = 1.0 / (model.constants[4][0] * model.constants[5][0]) if self._has_wrist else 0.0
 
     def distances(self, poses: Sequence[Pose]) -> Distances:
-        """Return the three for the `frames` of a configuration."""
+        """Return the three distances for the `frames` of a configuration."""
         shoulder = elbow = wrist = float("inf")
         fourth, fifth = poses[3], poses[4]
         if self._has_wrist:
@@ -314,7 +314,7 @@ class Singularities:
             shoulder = off if off >= 0.0 else -off
             ux, uy, uz, fx, fy, fz = ex - sx, ey - sy, ez - sz, wx - ex, wy - ey, wz - ez
             across = bx * (uy * fz - uz * fy) + by * (uz * fx - ux * fz) + bz * (ux * fy - uy * fx)
-            # Along axis 2 both may be displaced, which moves nothing: only what is perpendicular to it counts.
+            # A displacement along axis 2 has no effect: only the perpendicular part counts.
             along = ux * fx + uy * fy + uz * fz - (ux * bx + uy * by + uz * bz) * (fx * bx + fy * by + fz * bz)
             elbow = atan2(across if across >= 0.0 else -across, along if along >= 0.0 else -along)
         return Distances(shoulder, elbow, wrist)

@@ -1,4 +1,4 @@
-"""Joint targets from outside, at any rate: followed smoothly under the limits, and to rest when they cease."""
+"""Joint targets from outside, at any rate: followed smoothly under the limits, to rest when they end."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from rtcp.ipc.events import (
 from rtcp.ipc.layout import SETPOINT_ENDS, SETPOINT_HAS_ACCELERATION, SETPOINT_HAS_VELOCITY
 from rtcp.ipc.refusals import Malformed, Refusal, StampNotFinite, StreamPointDropped
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.joint_motion import allowed_accelerations, find_way, leaves_range, stoppable_speed
+from rtcp.motion.joint_motion import allowed_accelerations, find_trajectory, leaves_range, stoppable_speed
 from rtcp.motion.state import ArmState, Phase, Setpoint
 from rtcp.motion.step_group import StepPhase
 
 TIMEOUT_S: Final = 0.2
-"""A stream that is silent for this long has ended."""
+"""Silence after which a stream has ended, s."""
 _LOOK_AHEAD_S: Final = 0.2
-"""Longest time ahead at which a target is met, s."""
+"""Upper bound on the time to meet a target, s."""
 _LATE: Final = 2.5
-"""A target is missing this many intervals after the last one; until then the speed is kept."""
+"""Intervals after the last target until one counts as missing; until then the joints keep their speed."""
 _INSIDE = 1.0 - 1e-6
 _SHARE: Final = 0.2
 """Weight of a new interval in the mean."""
 _OVER_S: Final = 0.01
-"""Shortest time over which a target's speed is estimated, s: an encoder's steps and noise average out."""
+"""Shortest time base for a target's speed, s: averages out encoder steps and noise."""
 _AT_LEAST_S: Final = 0.01
-"""Shortest time to meet a target, s: in less, a rounding error could only be corrected by a detour."""
+"""Shortest time to meet a target, s: in less, correcting a rounding error takes a detour."""
 _MOST_LATE_S: Final = 1e9
-"""Most that is reported of how late a target came, s: the difference of two stamps may be infinite."""
+"""Upper bound on a reported lateness, s: the difference of two stamps may be infinite."""
 _LONGER: Final = 1.05
-"""Factor on the shortest time: with no time to spare, rounding can leave no solution."""
+"""Factor on the shortest time: without a margin, rounding can leave no solution."""
 _DRIFT: Final = 1e-4
-"""The sender's clock may be slower than ours by this fraction."""
+"""Fraction by which the sender's clock may be slower than ours."""
 _TIMEOUT_NS = round(TIMEOUT_S * 1e9)
 
 
 class StreamController(Controller):
-    """Accepts `StreamPosition` and `OpenStream`, and what is `put` into an open stream.
+    """Accepts `StreamPosition` and `OpenStream`, and the setpoints `put` into an open stream.
 
-    A `StreamPosition` that is late by more than the timeout, or out of order, is dropped; in an open stream, whose
-    sender waits for no answer, it ends the stream.
+    A `StreamPosition` that is out of order or late by more than the timeout is dropped; in an open stream, whose sender
+    waits for no answer, such a setpoint ends the stream.
     """
 
     name = "stream"
@@ -62,12 +62,12 @@ class StreamController(Controller):
         n = len(self._zero)
         self._period_s = setup.period_s
         self._otg = Ruckig(n, setup.period_s)
-        self._way, self._found = InputParameter(n), Trajectory(n)
-        # The same way as the moving target sees it, whose duration tells where the two meet.
+        self._inp, self._trajectory = InputParameter(n), Trajectory(n)
+        # The motion relative to the moving target; its duration gives the meeting point.
         self._relative, self._catch_up = InputParameter(n), Trajectory(n)
         self._wanted = [0.0] * n
         self._speed = [0.0] * n
-        # Earlier targets, from which the speed is estimated.
+        # Earlier targets, for the speed estimate.
         self._older, self._newer = [0.0] * n, [0.0] * n
         self._older_s = self._newer_s = 0.0
         self._last, self._acceleration = [0.0] * n, [0.0] * n
@@ -82,14 +82,14 @@ class StreamController(Controller):
         self._fresh = self._tracks = False
         self._keeps_speed = False
         self._rate = [0.0] * n
-        """What the sender says of the target's acceleration, rad/s^2."""
+        """Target acceleration as sent, rad/s^2."""
         self.stream = 0
-        """Number of the open stream; 0: there is none, or it has ended."""
+        """Number of the open stream; 0: none, or it has ended."""
         self._group = setup.group
         self._in_step = False
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Follow the target from the next cycle on."""
+        """Follow the target from the next cycle."""
         if isinstance(command, OpenStream):
             if command.stream <= 0:
                 return Malformed(command.number)
@@ -112,7 +112,7 @@ class StreamController(Controller):
         return None if late_s is None else StreamPointDropped(late_s)
 
     def put(self, state: ArmState, bits: int, stamp_s: float, numbers: Sequence[float]) -> None:
-        """Follow a setpoint of the open stream; one that cannot be followed ends it.
+        """Follow a setpoint of the open stream; an invalid one ends the stream.
 
         Args:
             state: of the arm.
@@ -151,12 +151,12 @@ class StreamController(Controller):
         self.brake(state)
 
     def hold(self) -> None:
-        """End the motion where the setpoints are."""
+        """End the motion at the current setpoints."""
         super().hold()
         self._leave()
 
     def brake(self, state: ArmState) -> None:
-        """Bring each joint to rest; an open stream has ended."""
+        """Bring each joint to rest; ends an open stream."""
         super().brake(state)
         self._leave()
 
@@ -177,13 +177,13 @@ class StreamController(Controller):
         self._speed = list(self._zero)
 
     def _take(self, q: Sequence[float], stamp_s: float, now_ns: int) -> float | None:
-        """Accept a target, or drop it and return how late it is, s."""
+        """Accept a target, or drop it and return its lateness, s."""
         lag = now_ns * 1e-9 - stamp_s
         step = stamp_s - self._stamp_s
         if not self._first:
             if step <= 0.0:
                 return min(-step, _MOST_LATE_S)
-            # The least lag is the difference of the clocks: what exceeds it is how late a target came.
+            # The least lag is the clock difference: the excess over it is the lateness of a target.
             self._lag_s = min(lag, self._lag_s + _DRIFT * step)
             if lag - self._lag_s > TIMEOUT_S:
                 return lag - self._lag_s
@@ -203,7 +203,7 @@ class StreamController(Controller):
         return None
 
     def _learn(self, q: Sequence[float], stamp_s: float, step: float) -> None:
-        """Estimate the interval, and the target's speed over 10 to 20 ms, or over a longer last interval."""
+        """Estimate the interval, and the target's speed over 10 to 20 ms or over a longer last interval."""
         interval = self._interval_s
         self._interval_s = step if interval == 0.0 else interval + _SHARE * (step - interval)
         if stamp_s - self._newer_s >= _OVER_S:
@@ -222,7 +222,7 @@ class StreamController(Controller):
         target = self.setpoint
         if self._in_step:
             if self._group.is_finished():
-                # Its commander has closed the stream of one arm: that ends all.
+                # The commander closed the stream of one arm: that ends all.
                 self._group.phase, self._in_step = StepPhase.DONE, False
                 self.stop(state)
                 return self.update(state)
@@ -245,10 +245,10 @@ class StreamController(Controller):
         if not self._tracks:
             return self.give_up(state, ControllerFailed())
         self._elapsed_s += self._period_s
-        # After its end the way goes on at the target's speed.
-        target.position, target.velocity, self._acceleration = self._found.at_time(self._elapsed_s)
+        # After its end the motion continues at the target's speed.
+        target.position, target.velocity, self._acceleration = self._trajectory.at_time(self._elapsed_s)
         self._last = target.position
-        self._tracks = self._elapsed_s < self._found.duration or self._keeps_speed
+        self._tracks = self._elapsed_s < self._trajectory.duration or self._keeps_speed
         return target
 
     def _is_own(self, state: ArmState) -> bool:
@@ -256,24 +256,24 @@ class StreamController(Controller):
         return self._tracks and state.commanded == self._last
 
     def _begin(self, state: ArmState) -> None:
-        """Set the state, and the limits in force, as the start of the next plan."""
-        way, limits = self._way, self.limits
-        way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
-        # Where nothing was cut the way's own acceleration is known better.
-        way.current_acceleration = allowed_accelerations(
+        """Set the state and the limits in force as the start of the next plan."""
+        inp, limits = self._inp, self.limits
+        inp.current_position, inp.current_velocity = state.commanded, state.commanded_velocity
+        # Unless a guard cut the setpoint, the plan's own acceleration is more exact.
+        inp.current_acceleration = allowed_accelerations(
             self._acceleration if self._is_own(state) else state.commanded_acceleration,
             state, limits.velocity, limits.acceleration, limits.jerk,
         )  # fmt: skip
-        way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.commanded_velocity, strict=True)]
-        way.max_acceleration = limits.acceleration
+        inp.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.commanded_velocity, strict=True)]
+        inp.max_acceleration = limits.acceleration
 
     def _aim(self, state: ArmState) -> None:
-        """Plan to where the newest target is met if it keeps its speed; where that cannot be, to rest at it."""
+        """Plan to meet the newest target, assumed at constant speed; if that is impossible, to rest at it."""
         wanted, speed, limits = self._wanted, self._speed, self.limits
         bounds = (*limits.velocity, *limits.acceleration, *limits.jerk)
         moves = any(speed)
-        # Replanning to the same rest may, by rounding, choose another profile that overshoots.
-        if not moves and self._is_own(state) and self._way.target_position == wanted and bounds == self._bounds:
+        # Replanning to the same goal may, by rounding, choose a profile that overshoots.
+        if not moves and self._is_own(state) and self._inp.target_position == wanted and bounds == self._bounds:
             return
         self._bounds = bounds
         self._begin(state)
@@ -281,7 +281,7 @@ class StreamController(Controller):
             duration = self._time_to_meet(state)
             ahead = duration + self._late_s
             for i in self._joints:
-                # Where the two meet, the joint must still be able to stop inside its range.
+                # At the meeting point the joint must still be able to stop inside its range.
                 v, most = speed[i], self._stoppable(i, speed[i], wanted[i], ahead)
                 speed[i] = most if v > most else -most if v < -most else v
             rate = self._rate
@@ -290,40 +290,40 @@ class StreamController(Controller):
                 for i in self._joints:
                     v, most = speed[i] + rate[i] * ahead, self._stoppable(i, speed[i], meets[i])
                     speed[i] = most if v > most else -most if v < -most else v
-            if self._plan(meets, speed, duration) and leaves_range(self._found, state.commanded, limits) is None:
+            if self._plan(meets, speed, duration) and leaves_range(self._trajectory, state.commanded, limits) is None:
                 self._tracks = True
                 return
         self._tracks = self._plan(wanted, self._zero)
 
     def _time_to_meet(self, state: ArmState) -> float:
-        """Return the shortest time in which the joints can meet the moving target, with a margin, s; at most 0.2 s."""
-        seen, wanted, speed, n = self._relative, self._wanted, self._speed, self._joints
-        q, v, late_s, most = state.commanded, state.commanded_velocity, self._late_s, self._way.max_velocity
-        seen.current_position = [q[i] - wanted[i] - speed[i] * late_s for i in n]
-        seen.current_velocity = [v[i] - speed[i] for i in n]
-        seen.current_acceleration = self._way.current_acceleration
-        seen.max_velocity = [most[i] - speed[i] for i in n]
-        seen.min_velocity = [-most[i] - speed[i] for i in n]
-        seen.max_acceleration = self.limits.acceleration
-        if not find_way(self._otg, seen, self.limits.jerk, self._catch_up):
-            # The target is as fast as the joint may be.
+        """Return the shortest time to meet the moving target, with a margin, s; at most 0.2 s."""
+        relative, wanted, speed, n = self._relative, self._wanted, self._speed, self._joints
+        q, v, late_s, most = state.commanded, state.commanded_velocity, self._late_s, self._inp.max_velocity
+        relative.current_position = [q[i] - wanted[i] - speed[i] * late_s for i in n]
+        relative.current_velocity = [v[i] - speed[i] for i in n]
+        relative.current_acceleration = self._inp.current_acceleration
+        relative.max_velocity = [most[i] - speed[i] for i in n]
+        relative.min_velocity = [-most[i] - speed[i] for i in n]
+        relative.max_acceleration = self.limits.acceleration
+        if not find_trajectory(self._otg, relative, self.limits.jerk, self._catch_up):
+            # The target moves at the joint's speed limit.
             return _LOOK_AHEAD_S
         duration: float = self._catch_up.duration
         return min(_LOOK_AHEAD_S, _AT_LEAST_S + _LONGER * duration)
 
     def _plan(self, position: list[float], velocity: list[float], duration_s: float | None = None) -> bool:
-        """Plan to a position, rad, and velocity, rad/s, with a minimum duration; return whether there is a plan."""
-        way = self._way
+        """Plan to a position, rad, and velocity, rad/s, with a minimum duration; return whether a plan exists."""
+        inp = self._inp
         self._keeps_speed = any(velocity)
-        way.target_position, way.target_velocity, way.minimum_duration = position, velocity, duration_s
+        inp.target_position, inp.target_velocity, inp.minimum_duration = position, velocity, duration_s
         self._elapsed_s = 0.0
-        return find_way(self._otg, way, self.limits.jerk, self._found)
+        return find_trajectory(self._otg, inp, self.limits.jerk, self._trajectory)
 
     def _may_go_on(self, state: ArmState) -> bool:
-        """Whether a target may just be late, and joints that have met it can still stop inside their range."""
+        """Whether the next target may merely be late, and the joints can still stop inside their ranges."""
         if (state.now_ns - self._came_ns) * 1e-9 > _LATE * self._interval_s:
             return False
-        if self._elapsed_s < self._found.duration:
+        if self._elapsed_s < self._trajectory.duration:
             return True
         speed, position = self._speed, state.commanded
         for i in self._joints:  # noqa: SIM110  a generator allocates in the cycle
@@ -332,7 +332,7 @@ class StreamController(Controller):
         return True
 
     def _stoppable(self, i: int, v: float, position: float, kept_s: float = 0.0) -> float:
-        """Return the highest speed towards v, rad/s, kept for `kept_s`, that still stops inside the range."""
+        """Return the highest speed towards v, rad/s, held for `kept_s`, that still stops inside the range."""
         limits = self.limits
         distance = limits.high[i] - position if v > 0.0 else position - limits.low[i]
         return stoppable_speed(0.9 * distance, limits.acceleration[i], limits.jerk[i], kept_s)

@@ -1,4 +1,4 @@
-"""Joint torques in CST: gravity is carried, the commanded torque comes on top, and speed and range bound its effect."""
+"""Joint torques in CST: gravity compensation plus the commanded torque, bounded by speed and range."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from rtcp.motion.state import ArmState, Phase, Setpoint
 from rtcp.motion.tool_in_use import Gravity
 
 _RATE_S: Final = 0.1
-"""A torque goes from 0 to the joint's largest in no less."""
+"""Shortest time for a torque from 0 to the joint's limit, s."""
 _FADE: Final = 0.3
-"""Torque fades out over the last part of the speed that a joint may have in its direction."""
+"""Last part of the allowed speed, as a share, over which the torque fades out."""
 _FREE = 1.0 - _FADE
 _STILL_RAD_S: Final = 0.01
 _AHEAD_RAD_S: Final = 0.1
-"""Torque fades out by where the arm is so much faster than its setpoint; twice as much is damped."""
+"""Speed above that of the setpoint at which the torque has faded out, rad/s; twice as much is damped."""
 _CATCH_UP: Final = 20.0
-"""1/s: how fast the setpoint goes to where the arm is, on the last bit of the way."""
+"""Gain with which the setpoint approaches the arm's position at the end, 1/s."""
 _MARGIN_RAD: Final = 0.02
-"""So far inside its range a joint is brought to rest; beyond, a spring of its `cst_stiffness` pushes it back."""
+"""Distance from the range end at which a joint comes to rest; beyond it a spring of `cst_stiffness` pushes it back."""
 
 
 class TorqueController(Controller):
     """Accepts `ApplyTorque`.
 
     In phase MOVE `Setpoint.direct` is true: the torque is the whole torque of each joint. The setpoint follows the arm
-    under the joints' speed and acceleration; torque that would carry the arm away from it faster fades out, so that the
-    arm keeps to them too. While it stops, and at rest, the position loop of CST holds the setpoint.
+    under the joints' speed and acceleration limits; a torque that would move the arm faster fades out, so the arm keeps
+    to them too. During a stop and at rest, the position loop of CST holds the setpoint.
 
-    Gravity is computed where the geometry has masses; else what holds the arm at the start is kept.
+    Gravity is computed from the masses of the geometry; without masses the torque at the start is kept.
     """
 
     name = "torque"
@@ -52,16 +52,16 @@ class TorqueController(Controller):
         self._direct.direct = True
         self._position = [0.0] * n
         self._wanted = [0.0] * n
-        self._given = [0.0] * n
+        self._applied = [0.0] * n
         self._bias = [0.0] * n
         self._about = [0.0] * n
         self._extra_low, self._extra_high = [0.0] * n, [0.0] * n
-        """A joint that begins nearer to its edge than the margin is not pushed away from it, rad."""
+        """Margin given up for a joint that begins nearer to its range end, so that it is not pushed away, rad."""
         self._stiff = self._damped = 0.0
         self._until_ns = 0
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Apply the torques, Nm, from the next cycle on; a stiffness that rises from 0 acts about where the arm is."""
+        """Apply the torques, Nm, from the next cycle; a stiffness that rises from 0 acts about the current position."""
         assert isinstance(command, ApplyTorque)
         if (
             refusal := self.not_within(command.torque, self.limits.torque, command.hold_s, TorqueOutOfRange)
@@ -82,47 +82,47 @@ class TorqueController(Controller):
     def _start(self, state: ArmState) -> None:
         """Begin with the torques that hold the arm now, so that it does not sag."""
         carried = self._gravity.torques(state.actual)
-        # In motion a torque holds nothing: what held the arm before is kept.
+        # During motion the actual torque does not show the weight: keep the previous bias.
         rests = not any(abs(v) > _STILL_RAD_S for v in state.actual_velocity)
         for i in self._joints:
             if rests:
                 self._bias[i] = state.actual_torque[i] - carried[i]
-            self._given[i] = 0.0
+            self._applied[i] = 0.0
             q, limits = state.actual[i], self.limits
             self._extra_low[i] = max(0.0, limits.low[i] + _MARGIN_RAD - q)
             self._extra_high[i] = max(0.0, q - limits.high[i] + _MARGIN_RAD)
         self._stiff = 0.0
-        # A stiffness may be commanded before the first `advance`: it acts about here.
+        # A stiffness commanded before the first `advance` acts about this position.
         self._position[:] = state.commanded
         self.begin()
 
     def advance(self, state: ArmState) -> Setpoint:
-        """Return the setpoints of the next cycle: where the arm is, and the torque."""
+        """Return the setpoints of the next cycle: position of the arm, and the torque."""
         if state.now_ns > self._until_ns:
             return self.give_up(state, CommandExpired())
         target, dt = self._direct, self.period_s
         limits = self.limits
         low, high, fastest, slowing, most = limits.low, limits.high, limits.velocity, limits.acceleration, limits.torque
         carried = self._gravity.torques(state.actual)
-        position, given = self._position, self._given
+        position, applied = self._position, self._applied
         torque, follows, speeds = target.torque, target.position, target.velocity
         for i in self._joints:
             q, v = state.actual[i], state.actual_velocity[i]
             step = most[i] * dt / _RATE_S
-            change = self._wanted[i] - given[i]
-            given[i] += step if change > step else -step if change < -step else change
-            pushed = given[i] + self._stiff * self._stiffness[i] * (self._about[i] - q)
+            change = self._wanted[i] - applied[i]
+            applied[i] += step if change > step else -step if change < -step else change
+            pushed = applied[i] + self._stiff * self._stiffness[i] * (self._about[i] - q)
             above = high[i] - _MARGIN_RAD + self._extra_high[i] - q
             below = q - low[i] - _MARGIN_RAD + self._extra_low[i]
             top, slow = fastest[i], slowing[i]
             up, down = _bound(above, top, slow), _bound(below, top, slow)
-            # Towards the edge nothing is left of a torque, whether the joint moves or stands.
-            left = (up - v if pushed > 0.0 else down + v) / (_FADE * top)
-            # Nor where the arm runs away from its setpoint, which keeps to the acceleration.
+            # At the range end no torque towards it remains, whether the joint moves or not.
+            share = (up - v if pushed > 0.0 else down + v) / (_FADE * top)
+            # Nor while the arm is ahead of its setpoint, which keeps to the acceleration limit.
             ahead = v - state.commanded_velocity[i]
             slack = 1.0 - (ahead if pushed > 0.0 else -ahead) / _AHEAD_RAD_S
-            left = slack if slack < left else left
-            pushed *= 0.0 if left < 0.0 else left if left < 1.0 else 1.0
+            share = slack if slack < share else share
+            pushed *= 0.0 if share < 0.0 else share if share < 1.0 else 1.0
             drag = self._damped * v
             if v > up * _FREE:
                 drag += v - up * _FREE
@@ -142,13 +142,13 @@ class TorqueController(Controller):
 
 
 def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
-    """The speed that stops within `stopping_distance` rad."""
+    """Return the speed that stops within `stopping_distance` rad."""
     bound = sqrt(2.0 * slowing * stopping_distance) if stopping_distance > 0.0 else 0.0
     return bound if bound < fastest else fastest
 
 
 def chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
-    """The setpoint's next speed: it catches up with the arm, `lag` rad away at `speed`, and has its speed there."""
+    """Return the setpoint's next speed, to meet the arm, which is `lag` rad away and moves at `speed`."""
     far = lag if lag >= 0.0 else -lag
     closing = sqrt(acceleration * far)
     closing = closing if closing < _CATCH_UP * far else _CATCH_UP * far

@@ -1,7 +1,7 @@
-"""Timed joint waypoints, cubic or quintic in between; `rtcp.motion.planning` checked the plan as a whole.
+"""Timed joint waypoints joined by cubics or quintics, of a plan that `rtcp.motion.planning` has checked.
 
-The arm gets to a first waypoint that is later than 0 by an `Approach`; by a `TimeScale` it stops along the path, and
-follows the speed override.
+An `Approach` leads to a first waypoint with a time above 0; a `TimeScale` stops the arm along the path and applies the
+speed override.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rtcp.ipc.refusals import (
     Refusal,
 )
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.joint_motion import allowed_acceleration, find_way, leaves_range
+from rtcp.motion.joint_motion import allowed_acceleration, find_trajectory, leaves_range
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import Coefficients, cubic, quintic
 from rtcp.motion.planning.plan import (
@@ -42,9 +42,9 @@ from rtcp.motion.speed_override import STOP, TimeScale
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 AT_START_RAD: Final = 1e-3
-"""A plan with a waypoint at time 0 begins at most this far from what is commanded; the difference fades out."""
+"""Upper bound on the distance of a waypoint at time 0 from the setpoint, rad; the difference fades out."""
 AT_START_RAD_S: Final = 1e-2
-"""And with a velocity that differs at most this much."""
+"""Upper bound on the difference of their velocities, rad/s."""
 _FADE_S: Final = 0.5
 _EXACT: Final = 1e-12
 _AT_ONCE_S: Final = 1e-9
@@ -53,14 +53,14 @@ _INSIDE = 1.0 - 1e-9
 
 
 class NoApproach(NamedTuple):
-    """Why no approach was found: a joint that would leave its range, and how far, rad; or -1."""
+    """Why no approach exists: joint that would leave its range, and its extreme, rad; -1: any other reason."""
 
     axis: int
     extreme: float
 
 
 class Approach:
-    """A way to a waypoint that takes as long as the waypoint's time says, or longer where the limits demand it.
+    """A trajectory to a waypoint that arrives at the waypoint's time, or later if the limits require it.
 
     Args:
         limits: of the joints; read in each `plan`.
@@ -70,15 +70,15 @@ class Approach:
         n = len(limits.velocity)
         self._limits = limits
         self._otg = Ruckig(n, 0.001)
-        self._way = InputParameter(n)
-        # A way is planned beside the one that is gone, and takes over only when the plan succeeds.
-        self._found, self._spare = Trajectory(n), Trajectory(n)
+        self._inp = InputParameter(n)
+        # Double buffer: a new plan replaces the current one only if planning succeeds.
+        self._trajectory, self._spare = Trajectory(n), Trajectory(n)
         self.duration_s = 0.0
 
     def at(self, time_s: float) -> tuple[list[float], list[float], list[float]]:
         """Return position, velocity and acceleration of each joint."""
-        found: tuple[list[float], list[float], list[float]] = self._found.at_time(time_s)
-        return found
+        state: tuple[list[float], list[float], list[float]] = self._trajectory.at_time(time_s)
+        return state
 
     def plan(
         self,
@@ -87,35 +87,35 @@ class Approach:
         acceleration: Sequence[float],
         waypoint: Sequence[float],
     ) -> NoApproach | None:
-        """Plan the way from a state (rad, rad/s, rad/s^2) to a waypoint; return why not, or None."""
-        way, limits, n = self._way, self._limits, len(position)
+        """Plan from a state (rad, rad/s, rad/s^2) to a waypoint; return why it fails, or None."""
+        inp, limits, n = self._inp, self._limits, len(position)
         bounds = limits.acceleration
-        way.current_position, way.current_velocity = list(position), list(velocity)
-        way.current_acceleration = [
+        inp.current_position, inp.current_velocity = list(position), list(velocity)
+        inp.current_acceleration = [
             allowed_acceleration(acceleration[i], velocity[i], limits.velocity[i], bounds[i], limits.jerk[i])
             for i in range(n)
         ]
-        way.target_position, way.target_velocity = (
+        inp.target_position, inp.target_velocity = (
             list(waypoint[POSITIONS : POSITIONS + n]),
             list(waypoint[VELOCITIES : VELOCITIES + n]),
         )
-        # A cubic begins with any acceleration.
+        # The acceleration at the start of a cubic is free.
         wanted = waypoint[ACCELERATIONS : ACCELERATIONS + n] if waypoint[KIND] == QUINTIC else [0.0] * n
-        way.target_acceleration = [min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(wanted, bounds, strict=True)]
-        way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, velocity, strict=True)]
-        way.max_acceleration = list(bounds)
-        way.minimum_duration = waypoint[0]
-        if not find_way(self._otg, way, limits.jerk, self._spare) or self._spare.duration > LONGEST_S:
+        inp.target_acceleration = [min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(wanted, bounds, strict=True)]
+        inp.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, velocity, strict=True)]
+        inp.max_acceleration = list(bounds)
+        inp.minimum_duration = waypoint[0]
+        if not find_trajectory(self._otg, inp, limits.jerk, self._spare) or self._spare.duration > LONGEST_S:
             return NoApproach(-1, 0.0)
-        if (left := leaves_range(self._spare, position, limits)) is not None:
-            return NoApproach(*left)
-        self._found, self._spare = self._spare, self._found
-        self.duration_s = self._found.duration
+        if (departure := leaves_range(self._spare, position, limits)) is not None:
+            return NoApproach(*departure)
+        self._trajectory, self._spare = self._spare, self._trajectory
+        self.duration_s = self._trajectory.duration
         return None
 
 
 class TrajectoryController(Controller):
-    """Accepts `RunTrajectory`, and `ExtendTrajectory` while an open one is under way."""
+    """Accepts `RunTrajectory`, and `ExtendTrajectory` during an open one."""
 
     name = "trajectory"
     pausable = True
@@ -143,9 +143,9 @@ class TrajectoryController(Controller):
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Run a plan of waypoints (`rtcp.motion.planning.plan`) from `state`.
 
-        Where the first waypoint's time is 0, the arm has to be there. Otherwise an approach leads there under the
-        joints' limits; it ends at the waypoint's time, or later where the limits demand it, and what follows is as much
-        later. Where it is refused, what was under way continues.
+        If the first waypoint's time is 0, the arm must be there. Otherwise an approach leads there under the joint
+        limits; it ends at the waypoint's time, or later if the limits require it, which delays all that follows. After
+        a refusal the current motion continues.
         """
         if isinstance(command, ExtendTrajectory):
             return self._extend(command, continues)
@@ -153,14 +153,14 @@ class TrajectoryController(Controller):
         return self.take(command.slot, command.rows, command.open, state)
 
     def take(self, slot: int, count: int, is_open: bool, state: ArmState) -> Refusal | None:
-        """Begin with the rows in a slot of the plan area, or return why not and change nothing."""
+        """Begin with the rows in a slot of the plan area, or return a refusal and change nothing."""
         rows = self.rows_of(slot, count, PLAN_ROWS)
         if isinstance(rows, Refusal):
             return rows
         first, last = read_row(rows, 0), read_row(rows, count - 1)
         for index, row in ((0, first), (count - 1, last)):
-            if (found := self._damage(row)) is not None:
-                return DamagedRow(index, found)
+            if (damaged := self._damage(row)) is not None:
+                return DamagedRow(index, damaged)
         refusal = self._is_elsewhere(state, first) if first[0] == 0.0 else self._approach_to(first, state)
         if refusal is not None:
             return refusal
@@ -182,12 +182,12 @@ class TrajectoryController(Controller):
         rows, count = self._rows, command.rows
         if not (continues and self._open and self.phase is Phase.MOVE) or rows is None:
             return NotOpen()
-        # The row that the arm is on its way from is still needed where the piece is made.
+        # The row that the current piece starts from is still in use.
         if not (self._count <= count <= self._row + PLAN_ROWS):
             return NoRoomForPoints(count - self._row, PLAN_ROWS)
         last = read_row(rows, (count - 1) % PLAN_ROWS)
-        if (found := self._damage(last)) is not None:
-            return DamagedRow(count - 1, found)
+        if (damaged := self._damage(last)) is not None:
+            return DamagedRow(count - 1, damaged)
         self._count, self._open = count, not command.ends
         self.duration_s = last[0] + self._delay_s
         return None
@@ -197,7 +197,7 @@ class TrajectoryController(Controller):
         return None if refused is None else ApproachImpossible()
 
     def _damage(self, row: list[float]) -> float | None:
-        """Return the number in a row that cannot be, or None."""
+        """Return the invalid number of a damaged row, or None."""
         column = first_not_finite(row)
         if column >= 0:
             return row[min(column, KIND)]
@@ -233,7 +233,7 @@ class TrajectoryController(Controller):
             self._fade[i] = quintic(ahead, faster, 0.0, 0.0, 0.0, 0.0, min(_FADE_S, last_s))
 
     def stop(self, state: ArmState) -> None:
-        """Brake along the path, as fast as the joints' limits allow."""
+        """Brake along the path as fast as the joint limits allow."""
         if self.phase is Phase.MOVE:
             self.phase = Phase.STOP
 
@@ -250,7 +250,7 @@ class TrajectoryController(Controller):
             speed = 1.0
         else:
             limits = self.limits
-            # Where the cycle ends hardly depends on how much u changes.
+            # The end point of the cycle hardly depends on the change of u.
             if (damaged := self._go_to(self.elapsed_s + (before + 0.5 * scale.rate * dt) * dt)) is not None:
                 return self.give_up(state, damaged)
             speed = scale.step(goal, self._velocity, state.commanded_velocity, limits.acceleration, limits.jerk, dt)
@@ -268,7 +268,7 @@ class TrajectoryController(Controller):
         return target
 
     def _arrive(self) -> MotionEnded | None:
-        """Come to rest at the end; or return that more rows should have come, or that the plan does not end at rest."""
+        """Come to rest at the end; return an error if rows are missing or the plan does not end at rest."""
         self.phase = Phase.HOLD
         for i in self._joints:
             speed = self._velocity[i]
@@ -280,7 +280,7 @@ class TrajectoryController(Controller):
         return None
 
     def _go_to(self, at_s: float) -> PlanDamaged | None:
-        """Write position and velocity of the path at its time `at_s`, or return where the plan is damaged."""
+        """Write position and velocity at path time `at_s`, or return where the plan is damaged."""
         position, velocity = self._position, self._velocity
         if at_s < self._approach_s:
             position[:], velocity[:], _ = self._approach.at(at_s)
@@ -308,17 +308,17 @@ class TrajectoryController(Controller):
         return None
 
     def _next(self) -> PlanDamaged | None:
-        """Make what leads to the next waypoint the current piece, or return that it is damaged."""
+        """Set the piece to the next waypoint as the current one, or return that it is damaged."""
         rows = self._rows
         assert rows is not None
         index = self._row + 1
         before, waypoint = self._waypoint, read_row(rows, index % PLAN_ROWS)
-        found = self._damage(waypoint)
+        damaged = self._damage(waypoint)
         length = waypoint[0] - before[0]
-        if found is None and not 0.0 < length <= LONGEST_S:
-            found = waypoint[0]
-        if found is not None:
-            return PlanDamaged(index, found)
+        if damaged is None and not 0.0 < length <= LONGEST_S:
+            damaged = waypoint[0]
+        if damaged is not None:
+            return PlanDamaged(index, damaged)
         pieces = self._pieces
         if waypoint[KIND] == CUBIC:
             for i in self._joints:

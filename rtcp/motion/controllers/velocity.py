@@ -1,4 +1,4 @@
-"""Joint velocities with ramps, which expire unless they are renewed."""
+"""Ramped joint velocities, which expire unless renewed."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _POSITION, _VELOCITY = ControlInterface.Position, ControlInterface.Velocity
 _HALT = [0.0, 0.0, 0.0, 0.0]
 _EARLY: Final = 1.5
 _NEAR_RAD: Final = 0.02
-"""A joint heads for the edge of its range when it is this much nearer than it takes to stop."""
+"""Margin on the stopping distance inside which the range end becomes the joint's target, rad."""
 _SLOWEST_RAD_S: Final = 1e-5
 
 
 class VelocityController(Controller):
-    """Accepts `MoveAtVelocity`: each joint's velocity is reached under its acceleration and jerk."""
+    """Accepts `MoveAtVelocity`: each joint ramps to its velocity under its acceleration and jerk limits."""
 
     name = "velocity"
     commands = (MoveAtVelocity,)
@@ -36,21 +36,21 @@ class VelocityController(Controller):
         super().__init__(setup)
         n = len(self._zero)
         self._otg = Ruckig(n, setup.period_s)
-        self._way, self._output = InputParameter(n), OutputParameter(n)
-        self._way.synchronization = Synchronization.No
-        self._way.target_acceleration = [0.0] * n
+        self._inp, self._output = InputParameter(n), OutputParameter(n)
+        self._inp.synchronization = Synchronization.No
+        self._inp.target_acceleration = [0.0] * n
         self._wanted = [0.0] * n
         self._goals_before: list[float] = []
         self._until_ns = 0
         self._last: list[float] = []
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
-        """Ramp to the velocities, and to rest when they expire."""
+        """Ramp to the velocities, then to rest when they expire."""
         assert isinstance(command, MoveAtVelocity)
         return self.ramp_to(command.velocity, command.hold_s, state, continues)
 
     def ramp_to(self, velocity: Sequence[float], hold_s: float, state: ArmState, continues: bool) -> Refusal | None:
-        """Ramp to joint velocities, rad/s, for `hold_s` s; return why not."""
+        """Ramp to joint velocities, rad/s, for `hold_s` s; or return a refusal."""
         refusal = self.not_within(velocity, self.limits.velocity, hold_s, JointSpeedOutOfRange)
         if refusal is not None:
             return refusal
@@ -74,16 +74,16 @@ class VelocityController(Controller):
             if any(self._wanted):
                 self.ended = CommandExpired()
             self.stop(state)
-        way, output = self._way, self._output
+        inp, output = self._inp, self._output
         goals = self._goals(state)
-        # What the guards changed, or what is asked for anew, begins at the state; else the ramp goes on.
+        # After a cut by a guard, or a new command, start from the state; otherwise continue the ramp.
         moved = state.commanded != self._last
         if moved or goals != self._goals_before:
             self._aim(state, goals, moved)
         self._goals_before = goals
         result = self._step()
         if result < 0:
-            # ruckig finds no way to an edge where a distance is exactly a border between two profiles: a ramp it finds.
+            # ruckig finds no profile for a distance exactly between two profile types; a ramp always works.
             self._aim(state, _HALT * len(self._wanted), moved=True)
             self._goals_before = []
             result = self._step()
@@ -93,14 +93,14 @@ class VelocityController(Controller):
         target.position, target.velocity = output.new_position, output.new_velocity
         self._last = output.new_position
         self._note_range(goals, target.velocity, state.commanded_velocity)
-        output.pass_to_input(way)
+        output.pass_to_input(inp)
         if self.phase is Phase.STOP and result == Result.Finished:
             self.phase = Phase.HOLD
             target.velocity = self._zero
         return target
 
     def _note_range(self, goals: list[float], speeds: Sequence[float], before: Sequence[float]) -> None:
-        """Set `held` to the first joint that the edge of its range makes slower than it is wanted, rad/s."""
+        """Set `held` to the first joint that its range end makes slower than commanded."""
         fraction = self.speed_override.fraction
         for i, wanted in enumerate(self._wanted):
             speed = abs(speeds[i])
@@ -110,16 +110,16 @@ class VelocityController(Controller):
 
     def _step(self) -> Result:
         try:
-            return self._otg.update(self._way, self._output)
+            return self._otg.update(self._inp, self._output)
         except (RuckigError, ValueError):
             return Result.Error
 
     def _goals(self, state: ArmState) -> list[float]:
-        """Return what each joint goes to: four numbers each, of which the first says whether it is a position."""
+        """Return four numbers per joint: 1 for a position goal or 0 for a velocity, the goal, two bounds."""
         goals: list[float] = []
         limits, fraction = self.limits, self.speed_override.fraction
-        for i, asked in enumerate(self._wanted):
-            wanted = fraction * asked
+        for i, commanded in enumerate(self._wanted):
+            wanted = fraction * commanded
             acceleration, jerk, now = limits.acceleration[i], limits.jerk[i], state.commanded_velocity[i]
             edge = limits.high[i] if wanted > 0.0 else limits.low[i]
             stopping_distance = edge - state.commanded[i] if wanted > 0.0 else state.commanded[i] - edge
@@ -127,25 +127,25 @@ class VelocityController(Controller):
             fast = (fast if fast > faster else faster) + 0.5 * acceleration * acceleration / jerk
             near = stopping_distance < _EARLY * fast * (0.5 * fast / acceleration + acceleration / jerk) + _NEAR_RAD
             if wanted and near:
-                # Rounding beside the edge; and ruckig knows no ways that take hours.
+                # Guards against rounding at the range end; ruckig also fails on trajectories of hours.
                 goals += (1.0, edge, faster, jerk) if faster > _SLOWEST_RAD_S else (0.0, 0.0, acceleration, jerk)
             else:
                 goals += (0.0, wanted, acceleration, jerk)
         return goals
 
     def _aim(self, state: ArmState, goals: list[float], moved: bool) -> None:
-        """Set ruckig's goals: a speed, or, near an edge of the range, the edge, no faster than the speed."""
-        way, limits = self._way, self.limits
+        """Set ruckig's goals: the speed or, near a range end, that position at no more than the speed."""
+        inp, limits = self._inp, self.limits
         kinds, targets = [goal == 1.0 for goal in goals[::4]], goals[1::4]
-        way.per_dof_control_interface = [_POSITION if kind else _VELOCITY for kind in kinds]
-        way.target_position = [target if kind else 0.0 for kind, target in zip(kinds, targets, strict=True)]
-        way.target_velocity = [0.0 if kind else target for kind, target in zip(kinds, targets, strict=True)]
-        way.max_velocity = [
+        inp.per_dof_control_interface = [_POSITION if kind else _VELOCITY for kind in kinds]
+        inp.target_position = [target if kind else 0.0 for kind, target in zip(kinds, targets, strict=True)]
+        inp.target_velocity = [0.0 if kind else target for kind, target in zip(kinds, targets, strict=True)]
+        inp.max_velocity = [
             goals[4 * i + 2] if kind else limits.velocity[i] for i, kind in enumerate(kinds)
         ]  # fmt: skip
-        way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
-        way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
+        inp.current_position, inp.current_velocity = state.commanded, state.commanded_velocity
+        inp.max_acceleration, inp.max_jerk = limits.acceleration, limits.jerk
         if moved:
-            way.current_acceleration = allowed_accelerations(
+            inp.current_acceleration = allowed_accelerations(
                 state.commanded_acceleration, state, limits.velocity, limits.acceleration, limits.jerk
             )

@@ -1,1 +1,1 @@
-"""What stands between a controller and the drives."""
+"""Guards between a controller and the drives."""

@@ -1,6 +1,6 @@
-"""The guard's own stop: how far it can carry the arm, and whether it touches a box or the arm itself.
+"""The guard's own stop: its length, and whether it touches a box or the arm itself.
 
-From the mean speeds w of a cycle on, each joint's speed falls by u = a dt a cycle; where less than u is left, to 0.
+From the mean speeds w of a cycle, each joint's speed falls by u = a dt per cycle; a rest below u falls to 0.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from kinematics.pose import Pose
 from rtcp.motion.guards.zones import INNER_BOX, ITSELF, Gap, Zones
 
 _MOST_SAMPLES: Final = 16
-"""A way that needs more, beside a box at full speed, counts as touching it: a cycle has no time for all of them."""
+"""Upper bound on the samples of a stop, for lack of time in a cycle; a stop that needs more counts as touching."""
 _ROUNDING_M: Final = 1e-12
 _INSIDE_SAMPLES: Final = 8
 
@@ -22,12 +22,12 @@ _INSIDE_SAMPLES: Final = 8
 def fastest_stoppable(stopping_distance: float, u: float, dt: float) -> float:
     """Return the greatest mean speed of a cycle after which the stop ends within `stopping_distance`.
 
-    With n = floor(w / u) the cycle and its stop travel ((n + 1) w - u n (n + 1) / 2) dt, which is solved for w.
+    With n = floor(w / u) the cycle and its stop travel ((n + 1) w - u n (n + 1) / 2) dt, solved for w.
 
     Args:
-        stopping_distance: rad; nothing is left of it below 0.
-        u: what the speed falls by in a cycle, rad/s.
-        dt: the cycle, s.
+        stopping_distance: rad; below 0 counts as 0.
+        u: decrease of the speed per cycle, rad/s.
+        dt: cycle time, s.
     """
     if stopping_distance <= 0.0:
         return 0.0
@@ -38,7 +38,7 @@ def fastest_stoppable(stopping_distance: float, u: float, dt: float) -> float:
 def travel(
     mean: Sequence[float], acceleration: Sequence[float], reach: Sequence[float], dt: float
 ) -> tuple[float, float]:
-    """Return how far what has this reach moves at most, m: in a cycle with these mean speeds, and with its stop."""
+    """Return the upper bound on the motion of a point, m, in a cycle at these mean speeds, and including its stop."""
     step = stop = 0.0
     for i, w in enumerate(mean):
         if w:
@@ -61,18 +61,18 @@ def touched(
 ) -> tuple[int, float] | None:
     """Return the box or pair (`zones`) that a cycle and its stop would touch, with a signed distance (m), or None.
 
-    Between two samples a point is no farther from its chord than `_Stop.bend`: bodies that a plane parts with so much
-    to spare, at both ends, do not touch. What overlaps may only come apart. In one cycle, of less than the bodies'
-    thickness, it is enough that they come apart: what may lie between is no more than a cycle's bend.
+    Between two samples a point is no farther from its chord than `_Stop.bend`: bodies do not touch if a plane separates
+    them at both ends with that margin. Overlapping bodies may only move apart. In a single cycle that moves by less
+    than the bodies' thickness moving apart is enough: in between they approach by no more than a cycle's bend.
 
     Args:
         zones: the boxes and the arm.
-        before: `frames` of what is commanded now.
+        before: `frames` of the commanded position.
         poses: `frames` of `q`.
-        q: what is to be commanded, rad.
-        mean: mean speeds of the cycle that leads there, rad/s.
+        q: next setpoint, rad.
+        mean: mean speeds of the cycle to `q`, rad/s.
         acceleration: of each joint, rad/s^2.
-        dt: the cycle, s.
+        dt: cycle time, s.
     """
     step, whole = travel(mean, acceleration, zones.reach, dt)
     pair_step, pair_whole = travel(mean, acceleration, zones.pair_reach, dt)
@@ -84,17 +84,17 @@ def touched(
     if bad is not None:
         return bad.zone, bad.distance
     time, length = 0.0, 0.0
-    left, pair_left = stop.left(0.0)
+    remaining, pair_remaining = stop.remaining(0.0)
     for _ in range(_MOST_SAMPLES):
-        if time >= stop.duration or _beyond(gaps, left, pair_left):
+        if time >= stop.duration or _beyond(gaps, remaining, pair_remaining):
             return None
         length = min(length or stop.stride(gaps), stop.duration - time)
         once = length < 1.5 * dt
-        ahead, pair_ahead = stop.left(time + length)
+        ahead, pair_ahead = stop.remaining(time + length)
         there = frames(zones.model, stop.at(time + length))
-        after, bad = _next(zones, gaps, there, stop.bend(length), left - ahead, pair_left - pair_ahead, once)
+        after, bad = _next(zones, gaps, there, stop.bend(length), remaining - ahead, pair_remaining - pair_ahead, once)
         if bad is None:
-            gaps, time, left, pair_left, length = after, time + length, ahead, pair_ahead, 0.0
+            gaps, time, remaining, pair_remaining, length = after, time + length, ahead, pair_ahead, 0.0
         elif once or bad.distance < 0.0:
             return bad.zone, bad.distance
         else:
@@ -103,9 +103,9 @@ def touched(
     return nearest.zone, nearest.distance
 
 
-def _beyond(gaps: Sequence[Gap], left: float, pair_left: float) -> bool:
-    """Return whether all gaps are wider than what is left to travel."""
-    return all([gap.distance > gap.share * (left if gap.zone < ITSELF else pair_left) for gap in gaps])  # noqa: C419 no generator
+def _beyond(gaps: Sequence[Gap], remaining: float, pair_remaining: float) -> bool:
+    """Return whether all gaps exceed the remaining travel."""
+    return all([gap.distance > gap.share * (remaining if gap.zone < ITSELF else pair_remaining) for gap in gaps])  # noqa: C419 no generator
 
 
 def _next(
@@ -117,9 +117,9 @@ def _next(
     pair_length: float,
     once: bool,
 ) -> tuple[list[Gap], Gap | None]:
-    """Return the gaps at the next sample, at most `length` (m) along the way, and the first that is not free.
+    """Return the gaps at the next sample, at most `length` (m) further, and the first that is not free.
 
-    Where all are free the bodies there are `zones.before`.
+    If all are free, `zones.before` has the bodies at that sample.
     """
     after: list[Gap] = []
     zones.after.place(poses)
@@ -133,7 +133,7 @@ def _next(
         else:
             moved = gap.share * (length if gap.zone < ITSELF else pair_length)
             free = near + distance > moved or zones.parted(gap, bent)
-            # Nor is it apart that something thin lies between: what was outside stays on the same side.
+            # Nor may a thin body have passed through: a body outside stays on its side.
             slow = moved < zones.thickness(gap)
             out = free or near < -_ROUNDING_M or slow or zones.parted(gap, -_ROUNDING_M)
             slow = slow or near < bent
@@ -145,7 +145,7 @@ def _next(
 
 
 class _Stop:
-    """The way of a stop from `q` (rad) with the mean speeds `mean` (rad/s); times from its beginning, s."""
+    """A stop from `q` (rad) with the mean speeds `mean` (rad/s); times in s from its start."""
 
     def __init__(
         self,
@@ -170,42 +170,42 @@ class _Stop:
                 speeds += speed
                 swept += speed * reach
         self._bound = bound + speeds * swept
-        """No point's second derivative is greater, m/s^2."""
+        """Upper bound on the second derivative of any point, m/s^2."""
 
     def at(self, time: float) -> list[float]:
-        """Return where the joints are."""
+        """Return the joint positions, rad."""
         q, dt = list(self._q), self._dt
         for i, speed, sign, rate, ends, _, _ in self._moving:
             t = time if time < ends else ends
             q[i] += sign * (speed - 0.5 * rate * (t + dt)) * t
         return q
 
-    def left(self, time: float) -> tuple[float, float]:
-        """Return how far any point still moves at most, and by how much a pair's distance still changes, m."""
-        left, pair_left, dt = 0.0, 0.0, self._dt
+    def remaining(self, time: float) -> tuple[float, float]:
+        """Return upper bounds on the remaining motion of any point and change of a pair's distance, m."""
+        remaining, pair_remaining, dt = 0.0, 0.0, self._dt
         for _, speed, _, rate, ends, reach, pair_reach in self._moving:
             if time < ends:
                 angle = (speed - 0.5 * rate * (ends + dt)) * ends - (speed - 0.5 * rate * (time + dt)) * time
-                left += reach * angle
-                pair_left += pair_reach * angle
-        return left, pair_left
+                remaining += reach * angle
+                pair_remaining += pair_reach * angle
+        return remaining, pair_remaining
 
     def bend(self, length: float) -> float:
-        """Return how far a point is from the chord of a piece so long (s) at most, m.
+        """Return the upper bound on a point's distance from its chord over `length` s, m.
 
-        A speed that jumps by up to u / 2 where a joint comes to rest counts as well: u length / 8.
+        Includes the speed step of up to u / 2 of a joint that comes to rest: u length / 8.
         """
         return 0.125 * self._bound * length * (length + self._dt)
 
     def stride(self, gaps: Sequence[Gap]) -> float:
-        """Return how far to go to the next sample, s: whole cycles, in which no point bends by half of its distance."""
+        """Return the time to the next sample, s: whole cycles in which no point bends by half of its distance."""
         dt, least, most = self._dt, inf, self.duration
         for gap in gaps:
             if gap.distance < 0.0:
                 most = self.duration / _INSIDE_SAMPLES
             else:
                 least = min(least, gap.distance / gap.bend)
-        # A joint whose axis goes through the tool moves no point: nothing bends.
+        # A bound of 0: the moving joints' axes go through the tool, and no point moves.
         if least < inf and self._bound > 0.0:
             most = min(most, sqrt(0.25 * dt * dt + 4.0 * least / self._bound) - 0.5 * dt)
         return max(int(most / dt), 1) * dt

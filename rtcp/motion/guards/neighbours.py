@@ -1,8 +1,8 @@
-"""The guard between two arms of a cell: their bodies keep apart, also while both come to rest.
+"""The guard between two arms of a cell: their bodies keep a clearance, also while both come to rest.
 
-A distance that is certain is found in two ways, and the greater one counts: what both are apart now, less all that any
-point of them can travel until both stand; or the lesser of what they are apart now and at the ends of both stops, less
-half of that. The distance is worked out anew only when what was travelled since may have used it up.
+The guaranteed distance is the greater of two bounds: the present distance less the travel of any point until both arms
+stand; and the lesser of the distances now and at the ends of both stops, less half of that travel. The distance is
+computed again only when the travel since may have used it up.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from rtcp.ipc.events import MotionEnded, PartnerForeign, PartnerNear
 from rtcp.motion.step_group import StepGroup
 
 _SLOW_M: Final = 0.02
-"""Who is too near already may move away: with stops that are shorter than this, m."""
+"""Arms that are too near may move apart with stops up to this length, m."""
 
 
 def reach_of(model: ArmModel) -> list[float]:
-    """Return for each joint how far from its axis a body's axis can be at most, m."""
+    """Return for each joint the upper bound on the distance of a body's axis from the joint's, m."""
     lengths = [hypot(row.a, row.d) for row in model.rows]
     tool = hypot(*model.tool.position)
     beyond = max((hypot(*end) for body in capsules(model) for end in (body.start, body.end)), default=0.0)
@@ -32,12 +32,12 @@ def reach_of(model: ArmModel) -> list[float]:
 
 
 class Body:
-    """An arm in the world, as the guard needs it.
+    """The bodies of an arm in the world frame.
 
     Args:
         model: its geometry.
-        base: where its base stands.
-        acceleration: with which its joints stop at least, rad/s^2; may change in place.
+        base: pose of its base.
+        acceleration: least deceleration of its joints in a stop, rad/s^2; may change in place.
     """
 
     def __init__(self, model: ArmModel, base: Pose, acceleration: Sequence[float]) -> None:
@@ -49,37 +49,37 @@ class Body:
         self.end = [0.0] * JOINTS
 
     def place(self, q: Sequence[float]) -> None:
-        """Put the bodies where the joints are at `q`, rad."""
+        """Place the bodies at the joint positions `q`, rad."""
         self.placed.place(frames(self.model, q), self.base)
 
     def travel(self, velocity: Sequence[float], delay_s: float) -> float:
-        """Return how far a point moves at most until the arm stands, m: it goes on for `delay_s` and stops then."""
-        way = 0.0
+        """Return the upper bound on a point's travel until the arm, which stops after `delay_s`, stands, m."""
+        distance = 0.0
         for i, reach in enumerate(self.reach):
             speed = velocity[i] if velocity[i] >= 0.0 else -velocity[i]
-            way += reach * speed * (delay_s + 0.5 * speed / self.acceleration[i])
-        return way
+            distance += reach * speed * (delay_s + 0.5 * speed / self.acceleration[i])
+        return distance
 
     def stop(self, q: Sequence[float], velocity: Sequence[float], delay_s: float) -> None:
-        """Put the bodies where the arm comes to rest."""
+        """Place the bodies where the arm comes to rest."""
         for i in range(JOINTS):
             speed = velocity[i] if velocity[i] >= 0.0 else -velocity[i]
             self.end[i] = q[i] + velocity[i] * (delay_s + 0.5 * speed / self.acceleration[i])
         self.place(self.end)
 
     def moved(self, before: Sequence[float], q: Sequence[float]) -> float:
-        """Return how far a point has moved at most between two configurations, m."""
-        way = 0.0
+        """Return the upper bound on a point's motion between two configurations, m."""
+        distance = 0.0
         for i, reach in enumerate(self.reach):
             turned = q[i] - before[i]
-            way += reach * (turned if turned >= 0.0 else -turned)
-        return way
+            distance += reach * (turned if turned >= 0.0 else -turned)
+        return distance
 
 
 def body_of(member: Member, acceleration: Sequence[float] | None = None) -> Body | None:
-    """Return an arm of a cell, with its configured accelerations or others; None: its geometry is not known.
+    """Return the body of an arm, with its configured accelerations or others; None: unknown geometry.
 
-    It has the bodies of all its tools: whichever it uses, partners keep away from them, and it from partners.
+    It includes the bodies of all its tools: partners keep clear of each of them.
     """
     models, base = member.config.models, member.base
     if not models:
@@ -97,12 +97,12 @@ def certain(
     w: Sequence[float],
     delays_s: tuple[float, float],
 ) -> tuple[float, float, float]:
-    """Return the distance that two arms keep for certain while both come to rest, m; now; and where both stand.
+    """Return the guaranteed distance of two arms during their stops, the distance now, and that at rest, m.
 
     Args:
-        a: one arm, at `q`, rad, with the speeds `v`, rad/s.
-        b: the other one, at `p` with `w`.
-        delays_s: how long each goes on before it stops.
+        a: first arm, at `q`, rad, with the speeds `v`, rad/s.
+        b: second arm, at `p` with `w`.
+        delays_s: time before each begins to stop.
     """
     a.place(q)
     b.place(p)
@@ -117,15 +117,15 @@ def certain(
 
 
 class Neighbours:
-    """Watches the distance of an arm to its partners.
+    """Guards the distance of an arm to its partners.
 
     Args:
         own: this arm.
-        partners: in the order of the cell; None: of one without geometry.
-        group: what they publish.
-        clearance: m.
-        period_s: the cycle.
-        delay_s: how long a partner may go on before it stops, beyond the age of its record.
+        partners: in the order of the cell; None: without geometry.
+        group: records of the partners.
+        clearance: required distance, m.
+        period_s: cycle time.
+        delay_s: time before a partner begins to stop, beyond the age of its record.
     """
 
     def __init__(
@@ -143,31 +143,31 @@ class Neighbours:
         self._clearance = clearance
         self._period_s, self._delay_s = period_s, delay_s
         self._room = [0.0] * len(self._partners)
-        """No two bodies were nearer when this arm was at `_here` and the partner at `_there`, m."""
+        """Least distance of two bodies with this arm at `_here` and the partner at `_there`, m."""
         self._here = [[0.0] * JOINTS for _ in self._partners]
         self._there = [[0.0] * JOINTS for _ in self._partners]
 
     def ahead(self, q: Sequence[float], velocity: Sequence[float]) -> MotionEnded | None:
-        """Return why this arm may not go on to `q`, rad, with these speeds, rad/s, or None."""
+        """Return why this arm may not move to `q`, rad, at these speeds, rad/s, or None."""
         if not any(velocity):
             return None
         if self._group.foreign >= 0:
             return PartnerForeign(self._group.foreign)
         own, dt = self._own, self._period_s
-        way = own.travel(velocity, dt)
+        own_travel = own.travel(velocity, dt)
         for index, body in enumerate(self._partners):
             partner = self._group.members[index]
             if body is None or not partner.time_ns:
                 continue
             there, theirs = partner.position, partner.velocity
-            whole = way + body.travel(theirs, self._delay_s)
+            whole = own_travel + body.travel(theirs, self._delay_s)
             used = own.moved(self._here[index], q) + body.moved(self._there[index], there)
             if self._room[index] - used - whole > self._clearance:
                 continue
-            kept, here, then = certain(own, q, velocity, body, there, theirs, (dt, self._delay_s))
+            least, here, then = certain(own, q, velocity, body, there, theirs, (dt, self._delay_s))
             self._room[index] = here
             self._here[index][:], self._there[index][:] = q, there
-            if kept > self._clearance or (then > here and whole < _SLOW_M):
+            if least > self._clearance or (then > here and whole < _SLOW_M):
                 continue
             return PartnerNear(index, max(min(here, then), 0.0))
         return None

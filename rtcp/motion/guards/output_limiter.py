@@ -1,9 +1,8 @@
-"""The last place before the drives: no target outside a limit passes, whatever asked for it.
+"""Last check before the drives: clamps every target to its limits, whatever its origin.
 
 Position inside the joint's range, no step beyond speed x cycle, speed and torque inside their bounds, finite numbers
-only; and no target velocity that changes by more than acceleration x cycle,
-whatever the position loop that is closed in CSV makes of a disturbance. A joint that was enabled outside its range is
-led back into it.
+only; no change of target velocity beyond acceleration x cycle, whatever the position loop closed in CSV makes of a
+disturbance. A joint that was enabled outside its range returns slowly.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from rtcp.motion.guards.braking import fastest_stoppable
 from rtcp.motion.limits import Limits
 
 BACK_RAD_S: Final = 0.05
-"""A joint that stands beyond its range is led back to the edge no faster: nobody has asked it to move. At a reach of
-1.3 m it is 65 mm/s, below the 250 mm/s of reduced speed (ISO 10218-1)."""
+"""Speed limit of the uncommanded return of a joint into its range, rad/s. At a reach of 1.3 m it is 65 mm/s, below the
+250 mm/s of reduced speed (ISO 10218-1)."""
 
 
 class OutputLimiter:
-    """Clamps the targets of all drives, once a cycle, after the mode.
+    """Clamps the targets of all drives, once a cycle, after the drive writer.
 
-    `held` is a bit mask of the joints whose target was changed in the last call; `sent` are the target positions sent
-    last, rad.
+    `held` is a bit mask of the joints whose target was clamped in the last call; `sent` has the last target positions,
+    rad.
     """
 
     def __init__(self, limits: Limits, period_s: float) -> None:
@@ -33,21 +32,21 @@ class OutputLimiter:
         self.take(limits)
         self.sent = [0.0] * len(self._low)
         self._pace = [0.0] * len(self._low)
-        """Speed, rad/s, of the next step back of a joint that is led back into its range; 0 of all others."""
+        """Present return speed of each joint outside its range, rad/s; 0 for all others."""
         self._velocity = [0.0] * len(self._low)
         self.held = 0
 
     def take(self, limits: Limits) -> None:
-        """Check against other limits from now on."""
+        """Replace the limits."""
         self._low, self._high = limits.low, limits.high
         self._speed, self._torque = limits.velocity, limits.torque
-        # Rounding of the setpoints is no violation.
+        # Rounding of setpoints is not a violation.
         self._change = [acceleration * self._period_s for acceleration in limits.acceleration]
         self._step = [velocity * self._period_s * (1 + 1e-6) for velocity in limits.velocity]
         self._back = [min(BACK_RAD_S, velocity) for velocity in limits.velocity]
 
     def latch(self, axis: int, position: float) -> None:
-        """Set the target sent last to `position`, rad: while a drive has no torque, its target is where it is."""
+        """Set the last target to `position`, rad: without torque, a drive's target follows its actual position."""
         self.sent[axis] = position
         self._pace[axis] = self._velocity[axis] = 0.0
 
@@ -58,7 +57,7 @@ class OutputLimiter:
         held = 0
         for i, drive in enumerate(drives):
             wanted, before, lowest, highest, step = drive.target_position, sent[i], lows[i], highs[i], steps[i]
-            # A comparison with NaN is false: what is no number fails it, and the target stays.
+            # A comparison with NaN is false: NaN is clamped too, and the target stays.
             if not (lowest <= wanted <= highest and lowest <= before <= highest and -step <= wanted - before <= step):
                 allowed = self._allowed(i, wanted)
                 if allowed != wanted:
@@ -67,7 +66,7 @@ class OutputLimiter:
             sent[i] = wanted
             speed = drive.target_velocity
             if speed == 0.0 == drive.target_torque and velocity[i] == 0.0:
-                continue  # as in CSP: zero is inside every bound, and changes nothing
+                continue  # as in CSP: zero is inside every bound
             bound = fastest[i]
             if not (-bound <= speed <= bound):
                 held |= 1 << i
@@ -77,7 +76,7 @@ class OutputLimiter:
             if not (-bound <= torque <= bound):
                 held |= 1 << i
                 torque = bound if torque > bound else -bound if torque < -bound else 0.0
-            # Beyond the range nothing drives further out.
+            # Outside the range no target leads further out.
             position = drive.position
             if position > highest:
                 outward = speed > 0.0 or torque > 0.0
@@ -99,7 +98,7 @@ class OutputLimiter:
         self.held = held
 
     def _allowed(self, i: int, wanted: float) -> float:
-        """Return the allowed target, rad, that is nearest to `wanted`; the last one where that is no number."""
+        """Return the allowed target nearest to `wanted`, rad; for NaN the last target."""
         before, lowest, highest = self.sent[i], self._low[i], self._high[i]
         if not lowest <= before <= highest:
             return self._led_back(i)
@@ -109,15 +108,15 @@ class OutputLimiter:
         return min(max(wanted, lowest, before - step), highest, before + step)
 
     def _led_back(self, i: int) -> float:
-        """Return the next target, rad, of a joint whose last lay outside its range: nearer to the edge, gently.
+        """Return the next target, rad, of a joint whose last target was outside its range: nearer to the edge.
 
-        The first after `latch` is the last itself. From there on the speed is bounded by `BACK_RAD_S` and the joint's
-        own, and rises and falls under the joint's acceleration.
+        The first one after `latch` equals the last. Then the speed rises and falls under the joint's acceleration,
+        up to `BACK_RAD_S` or the joint's own limit.
         """
         before, dt = self.sent[i], self._period_s
         edge = self._high[i] if before > self._high[i] else self._low[i]
         pace = self._pace[i]
-        left = max(abs(before - edge) - pace * dt, 0.0)
+        remaining = max(abs(before - edge) - pace * dt, 0.0)
         change = self._change[i]
-        self._pace[i] = min(pace + change, self._back[i], fastest_stoppable(left, change, dt))
-        return edge + copysign(left, before - edge)
+        self._pace[i] = min(pace + change, self._back[i], fastest_stoppable(remaining, change, dt))
+        return edge + copysign(remaining, before - edge)

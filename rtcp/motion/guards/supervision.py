@@ -1,4 +1,4 @@
-"""What is measured against its limit, cycle by cycle: speed, torque, following error."""
+"""Supervision of the measured speed, torque and following error, each against its limit in every cycle."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from rtcp.motion.state import ArmState
 
 
 class Supervision:
-    """Counts the cycles in a row in which a joint is beyond a limit.
+    """Counts consecutive cycles in which a joint is beyond a limit.
 
     Args:
-        config: factors, and how many cycles are too many.
+        config: factors, and allowed numbers of cycles.
         limits: of the joints.
         first: axis number of the first joint.
     """
@@ -28,29 +28,29 @@ class Supervision:
         self._joints = range(n)
         self._counts = [[0] * n, [0] * n, [0] * n]
         self._counted = False
-        """Whether a count is not 0."""
+        """True while any count is above 0."""
 
     def take(self, limits: Limits) -> None:
-        """Check against other limits from now on."""
+        """Replace the limits."""
         self._fastest = [self._speed * velocity for velocity in limits.velocity]
         self._strongest = [self._torque * torque for torque in limits.torque]
 
     def reset(self) -> None:
-        """Begin to count anew."""
+        """Reset all counts."""
         self._counted = False
         for counts in self._counts:
             for i in self._joints:
                 counts[i] = 0
 
     def check(self, state: ArmState) -> EmergencyStop | None:
-        """Check the measurements of a cycle; return what was beyond its limit for too long, or None."""
+        """Check the measurements of a cycle; return the first fault, or None."""
         error, cycles, fastest, strongest = self.following_error, self._cycles, self._fastest, self._strongest
         speeds, torques, errors = self._counts
         actual, commanded = state.actual, state.commanded
         actual_velocity, actual_torque = state.actual_velocity, state.actual_torque
         if not self._counted:
             for i in self._joints:
-                # What is no number is inside nothing.
+                # NaN counts as beyond the limit.
                 if not (
                     -fastest[i] <= actual_velocity[i] <= fastest[i]
                     and -strongest[i] <= actual_torque[i] <= strongest[i]

@@ -1,10 +1,9 @@
-"""The guards of the setpoints: behind every controller, before the writer of the drive mode.
+"""The guards of the setpoints: between every controller and the drive writer.
 
 For each joint the mean speed of the next cycle is within its limit, differs from the last by no more than
-acceleration x cycle, and leaves room to stop inside the range (`braking.fastest_stoppable`). Whoever keeps to this
-once can keep to it for ever: what a stop leaves of the speed in the next cycle fulfils it there. Boxes and the arm's
-own bodies are kept clear in the same way: a setpoint is passed on only if the stop from it touches none, so that the
-stop from the last one, which was examined a cycle ago, is always at hand.
+acceleration x cycle, and leaves room to stop inside the range (`braking.fastest_stoppable`). These conditions stay
+satisfiable: the next step of a stop always fulfils them. Boxes and the arm's own bodies are guarded in the same way: a
+setpoint passes only if the stop from it touches nothing, so that the stop from the last setpoint is always possible.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from rtcp.motion.guards.zones import ITSELF, Zones
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint
 
-# So much beyond a limit is the generators' own arithmetic: of the range; times the speed, and times its change in a
-# cycle; and of a change that a limit demands.
+# Tolerances for round-off of the generators: position beyond the range, factors on a joint's speed and on its change in
+# a cycle, and slack of the change that a lowered limit requires.
 _ROUNDING_RAD: Final = 1e-7
 _SPEED: Final = 1.0 + 5e-7
 _CHANGE: Final = 1.0 + 5e-5
@@ -35,25 +34,25 @@ _ROUNDING_RAD_S: Final = 1e-10
 
 
 class GuardResult(IntEnum):
-    """What became of a target."""
+    """Effect of the guard on a target."""
 
     PASS = 0
     CLAMPED = 1
     STOPPING = 2
-    """The guard brakes; targets are not looked at until the arm stands."""
+    """The guard brakes and ignores targets until the arm stands."""
     STOPPED = 3
-    """The guard's stop has come to rest in this cycle."""
+    """The guard's stop came to rest in this cycle."""
 
 
 class TrajectoryGuard:
     """Guards the setpoints of one arm.
 
-    After a cut, `held` is the bit mask of the joints that were clamped.
+    After a cut, `held` is the bit mask of the clamped joints.
 
     Args:
-        config: the arm; without its geometry neither boxes nor the arm itself are looked at.
-        limits: read every cycle.
-        dt: the cycle, s.
+        config: the arm; without geometry neither boxes nor the arm itself are guarded.
+        limits: the limits in force, read every cycle.
+        dt: cycle time, s.
     """
 
     def __init__(self, config: ArmConfig, limits: Limits, dt: float) -> None:
@@ -67,52 +66,53 @@ class TrajectoryGuard:
         self.zones: Zones | None = None
         self._joints = range(n)
         self._mean = [0.0] * n
-        """Mean speed of each joint in the last cycle: what its acceleration is counted from."""
+        """Mean speed of each joint in the last cycle, rad/s: reference for its acceleration."""
         self._next = [0.0] * n
+        """Allowed mean speed of each joint in the next cycle, rad/s."""
         self._position = [0.0] * n
         self._state = ArmState(n)
         self._poses: Sequence[Pose] | None = None
         self._room = self._room_then = 0.0
-        """`Zones.room` of what is commanded, m, or less; 0: not known."""
+        """Lower bound on `Zones.room` of the commanded position, m; 0: unknown."""
         self._poses_then: Sequence[Pose] | None = None
         self._box, self._keep_out = limits.box, limits.keep_out
         self._rests = False
-        """Whether the last setpoint was at rest where the arm is commanded, and no guard held it."""
+        """Whether the last setpoint was at rest at the commanded position, not cut by a guard."""
         self.neighbours: Neighbours | None = None
-        """Guards the distance to the partners in a cell; None: there are none."""
+        """Guards the distance to the partners in a cell; None: no partners."""
         self.stopping = False
         self.held = 0
         self.ended: MotionEnded | None = None
-        """What the last stop of the guard was for."""
+        """Reason for the last stop of the guard."""
 
         self.use_tool(0)
 
     def use_tool(self, number: int) -> None:
-        """Guard the arm with another tool from now on; at rest."""
+        """Switch to another tool; at rest."""
         if self._models:
             self._model, self.zones = self._models[number], self._zones[number]
             self._poses, self._room = None, 0.0
 
     def zones_of(self, number: int) -> Zones | None:
-        """Return what is guarded with a tool."""
+        """Return the zones for a tool."""
         return self._zones[number] if self._models else None
 
     def zone_with(self, number: int, q: Sequence[float]) -> int | None:
-        """Return the number of the box or pair whose bounds the arm at `q` (rad) would pass with a tool, or None."""
+        """Return the box or pair that the arm would violate at `q` (rad) with a tool, or None."""
         if not self._models:
             return None
-        distance, which = self._zones[number].distance(frames(self._models[number], q))
-        return which if distance < 0.0 else None
+        distance, zone = self._zones[number].distance(frames(self._models[number], q))
+        return zone if distance < 0.0 else None
 
     @property
     def poses(self) -> Sequence[Pose]:
-        """`frames` of what is commanded; empty without geometry."""
+        """`frames` of the commanded position; empty without geometry."""
         if self._poses is None:
             self._poses = () if self._model is None else frames(self._model, self._state.commanded)
         return self._poses
 
     def latch(self, state: ArmState) -> None:
-        """Begin at rest where `state` is."""
+        """Start at rest at `state`."""
         for i in self._joints:
             self._mean[i] = state.commanded_velocity[i] = state.commanded_acceleration[i] = 0.0
         self.stopping = self._rests = False
@@ -121,18 +121,18 @@ class TrajectoryGuard:
         self._poses, self._room = None, 0.0
 
     def zone_at(self, q: Sequence[float]) -> int | None:
-        """Return the number of the box or pair (`zones`) whose bounds the arm would pass at `q` (rad), or None."""
-        distance, which = self.nearest_box(q)
-        return which if distance < 0.0 else None
+        """Return the box or pair (`zones`) that the arm would violate at `q` (rad), or None."""
+        distance, zone = self.nearest_box(q)
+        return zone if distance < 0.0 else None
 
     def nearest_box(self, q: Sequence[float]) -> tuple[float, int]:
-        """Return how far the arm at `q` (rad) is from the nearest box or itself, m, below 0: beyond; and which."""
+        """Return the arm's signed distance at `q` (rad) from the nearest box or itself, m, and the box or pair."""
         if self.zones is None or self._model is None:
             return inf, 0
         return self.zones.distance(frames(self._model, q))
 
     def _reached(self, zone: int, ahead: float) -> MotionEnded:
-        """Return what ends the motion: its stop would come as near as `ahead`, m, or the arm is there already."""
+        """Return the reason of a stop: the box or pair that the arm would reach, `ahead` m away, or has reached."""
         assert self.zones is not None
         here, nearest = self.zones.distance(self.poses)
         if here < 0.0 and nearest == zone:
@@ -144,34 +144,34 @@ class TrajectoryGuard:
         )
 
     def refusal_of(self, state: ArmState, new: Values) -> Refusal | None:
-        """Return why `new` limits cannot come into force now: the arm is, or would come to rest, outside; or None."""
+        """Return a refusal of `new` limits if the arm is, or would come to rest, outside them; or None."""
         refused = self._limits.check(new, state.commanded, self._mean)
         if refused is not None or self._model is None:
             return refused
         limits, mean = self._limits, self._mean
-        same = new.box == limits.box and new.keep_out == limits.keep_out
+        same_boxes = new.box == limits.box and new.keep_out == limits.keep_out
         slower = any(rate < now for rate, now in zip(new.acceleration, limits.acceleration, strict=True))
-        # Also where the arm is on the wrong side of a box already: nothing becomes worse.
-        if same and not (slower and any(mean)):
+        # Accepted even if the arm already violates a box: the new limits make that no worse.
+        if same_boxes and not (slower and any(mean)):
             return None
         zones, poses = Zones(self._model, new, self._clearance), frames(self._model, state.commanded)
-        distance, which = zones.box_distance(poses)
+        distance, zone = zones.box_distance(poses)
         if distance >= 0.0:
             stop = touched(zones, poses, poses, state.commanded, mean, new.acceleration, self._dt)
             if stop is None:
                 return None
-            which, _ = stop
-        return LimitsExcludeArm(which)
+            zone, _ = stop
+        return LimitsExcludeArm(zone)
 
     def apply(self, state: ArmState, target: Setpoint, tolerates_saturation: bool) -> GuardResult:
-        """Write what may be commanded of `target` into `state`: position, velocity, acceleration.
+        """Write the allowed part of `target` to `state`: position, velocity, acceleration.
 
-        A speed that does not go with the position is replaced by the one that does.
+        A velocity that does not match the positions is replaced by their mean speed.
 
         Args:
-            state: what was commanded in the last cycle.
-            target: what the mode wants; numbers that are none are cut as any other.
-            tolerates_saturation: whether the controller tolerates a cut setpoint; otherwise a cut starts a stop.
+            state: with the commanded values of the last cycle.
+            target: setpoint of the controller; NaN is cut too.
+            tolerates_saturation: whether the controller continues after a cut; otherwise a cut starts a stop.
         """
         self._state = state
         if self.stopping:
@@ -181,7 +181,7 @@ class TrajectoryGuard:
         if wanted is not state.commanded:
             self._rests = False
         elif self._rests and not any(target.velocity):
-            return GuardResult.PASS  # a controller that holds hands back the state itself
+            return GuardResult.PASS  # at rest a controller returns the state itself
         self.held = held = self._bound(state, wanted)
         position, mean, last, dt = self._position, self._next, self._mean, self._dt
         if held:
@@ -190,9 +190,9 @@ class TrajectoryGuard:
             for i in self._joints:
                 position[i] = state.commanded[i] + mean[i] * dt if held >> i & 1 else wanted[i]
             wanted = position
-        found = self._touches(state, wanted)
-        if found is not None:
-            return self._stop(state, self._reached(*found))
+        contact = self._touches(state, wanted)
+        if contact is not None:
+            return self._stop(state, self._reached(*contact))
         if self.neighbours is not None and (near := self.neighbours.ahead(wanted, mean)) is not None:
             return self._stop(state, near)
         self._poses, self._room = self._poses_then, self._room_then
@@ -213,7 +213,7 @@ class TrajectoryGuard:
         return GuardResult.PASS
 
     def _bound(self, state: ArmState, wanted: Sequence[float]) -> int:
-        """Put the allowed mean speeds into `_next`; return the mask of the joints whose target was cut."""
+        """Write the allowed mean speeds to `_next`; return the mask of the joints whose target was cut."""
         limits, dt, last, allowed, here = self._limits, self._dt, self._mean, self._next, state.commanded
         lows, highs, most, rates = limits.low, limits.high, limits.velocity, limits.acceleration
         held = 0
@@ -225,7 +225,7 @@ class TrajectoryGuard:
                 speed, slower, room = w, v - w, highs[i] - q + _ROUNDING_RAD
             else:
                 speed, slower, room = -w, w - v, q - lows[i] + _ROUNDING_RAD
-            # No joint slows down faster than it may: what is beyond a limit comes back at that rate.
+            # A speed above a lowered limit has to decrease at the joint's acceleration, and cannot decrease faster.
             if (-u * _CHANGE <= slower <= u * _CHANGE) and (
                 (
                     speed <= most[i] * _SPEED
@@ -240,7 +240,7 @@ class TrajectoryGuard:
         return held
 
     def _cut(self, w: float, q: float, v: float, i: int) -> float:
-        """Return the nearest mean speed that is allowed; what is no number brakes."""
+        """Return the nearest allowed mean speed; NaN brakes."""
         limits, dt = self._limits, self._dt
         fastest, u = limits.velocity[i], limits.acceleration[i] * dt
         high = min(fastest, fastest_stoppable(limits.high[i] - q, u, dt))
@@ -250,7 +250,7 @@ class TrajectoryGuard:
         return min(max(w if isfinite(w) else 0.0, low), high)
 
     def _touches(self, state: ArmState, position: Sequence[float]) -> tuple[int, float] | None:
-        """Return the box or pair that `position` with the speeds `_next`, or the stop from there, would touch."""
+        """Return the box or pair that `position` at the speeds `_next`, or the stop from there, would touch."""
         zones, model, mean, limits = self.zones, self._model, self._next, self._limits
         self._poses_then, self._room_then = None, self._room
         if zones is None or model is None:
@@ -270,7 +270,7 @@ class TrajectoryGuard:
         return touched(zones, self.poses, self._poses_then, position, mean, limits.acceleration, self._dt)
 
     def _excess(self, state: ArmState, wanted: Sequence[float]) -> JointLimitReached:
-        """Return the first joint that was cut, what was wanted of it and what is allowed."""
+        """Return the first joint that was cut, with its commanded and its allowed value."""
         axis = (self.held & -self.held).bit_length() - 1
         target, limits = wanted[axis], self._limits
         if target > limits.high[axis]:

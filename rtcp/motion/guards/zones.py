@@ -1,9 +1,9 @@
-"""Where the arm may be: the tool inside one box, the arm's bodies clear of the keep-out boxes and of each other.
+"""The arm's workspace: the tool inside a box, the bodies clear of the keep-out boxes and of each other.
 
-Distances are signed, m: positive where it is allowed to be, negative where it is not. Bodies are capsules
-(`kinematics.capsules`); they keep `cartesian.clearance` from keep-out boxes and from each other, and a distance is what
-is left beyond it. A body that no joint moves, the base, is not compared with boxes. Where an end of one stays in its
-place, as the upper arm's in the shoulder, and is nearer to a box than the clearance, the rest may come as near.
+Distances are signed, m: positive inside the workspace, negative outside. Bodies are capsules (`kinematics.capsules`);
+they keep `cartesian.clearance` from keep-out boxes and from each other, and distances are measured beyond it. A body
+that no joint moves, the base, is not compared with boxes. If a fixed end of a body, as the upper arm's in the
+shoulder, is nearer to a box than the clearance, the rest of that body may come as near.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from rtcp.config.model import MOST_TOOLS
 from rtcp.motion.limits import Corners
 
 TOOL: Final = 6
-"""Place of the tool in `frames`."""
+"""Index of the tool in `frames`."""
 INNER_BOX: Final = -1
-"""Number of the box that the tool stays inside; the keep-out boxes are numbered from 0."""
+"""Zone number of the box around the tool; the keep-out boxes are numbered from 0."""
 ITSELF: Final = 1000
-"""Number of the first pair of the arm's own bodies."""
+"""Zone number of the first pair of the arm's own bodies."""
 _FAR: Final = 1e9
-"""m, where there is nothing."""
+"""Distance without any boundary, m."""
 _FIXED_M: Final = 0.005
-"""So much nearer to a box than its end that stays in its place a body may come: that end leaves it no room."""
+"""How much nearer to a box than its fixed end a body may come, m."""
 _NO_SHARE: Final = 1e-6
 _SAME_M: Final = 1e-9
 
 
 class Boxes(Protocol):
-    """Whoever has boxes: limits in force, or those that are to be."""
+    """Holder of boxes: the limits in force, or new ones."""
 
     @property
     def box(self) -> Corners | None:
-        """The tool stays inside it."""
+        """Box that the tool stays inside."""
         ...
 
     @property
     def keep_out(self) -> tuple[Corners, ...]:
-        """The arm's bodies stay outside them."""
+        """Boxes that the arm's bodies stay outside of."""
         ...
 
 
 class Clearance(NamedTuple):
-    """How far a point of the arm is from something, m, signed.
+    """Signed distance of a point of the arm from a boundary, m.
 
-    `zone`: number of the box or pair. The point is at `place`, m, and moves with `link`; `normal` is its way out, a
-    unit vector. What it comes near to moves with the link `other`; 0: it does not move.
+    `zone`: number of the box or pair. The point is at `place`, m, and moves with `link`; the unit vector `normal`
+    points away from the boundary, which moves with the link `other`; 0: fixed.
     """
 
     distance: float
@@ -66,8 +66,8 @@ class Clearance(NamedTuple):
 class Gap(NamedTuple):
     """A pair of bodies, a body and a keep-out box, or the tool and its box: signed distance (m), number, first body.
 
-    Where the farthest point of the arm may move by some way, the distance changes by `share` of it at most; where that
-    point bends from its chord by something, what the gap is of bends by `bend` of it.
+    A motion of the arm's farthest point changes the distance by at most `share` of it; a bend of that point from its
+    chord bends the bodies of the gap by at most `bend` of it.
     """
 
     distance: float
@@ -78,7 +78,7 @@ class Gap(NamedTuple):
 
 
 def inside(x: float, y: float, z: float, box: Corners) -> float:
-    """Return how far a point is from the nearest wall of the box that it is in; negative: how far beyond it."""
+    """Return the distance of a point from the nearest wall of the box around it; negative: outside."""
     a, b, c, d, e, f = box
     return min(x - a, d - x, y - b, e - y, z - c, f - z)
 
@@ -89,7 +89,7 @@ class Zones:
     Args:
         model: the geometry.
         boxes: read every time.
-        clearance: what bodies keep from boxes and from each other, m.
+        clearance: least distance of bodies from boxes and from each other, m.
     """
 
     def __init__(self, model: ArmModel, boxes: Boxes, clearance: float) -> None:
@@ -101,48 +101,48 @@ class Zones:
         self._pair_shares, self._all_shares = geometry.pair_shares, geometry.all_shares
         self.reach, self.pair_reach = geometry.reach, geometry.pair_reach
         self.before, self.after = Placed(geometry.bodies), Placed(geometry.bodies)
-        """The bodies at the two ends of a piece of the way."""
-        self._moving = [which for which, body in enumerate(geometry.bodies) if body.link]
+        """The bodies at the two ends of a piece of the motion."""
+        self._moving = [number for number, body in enumerate(geometry.bodies) if body.link]
         self._whole = [1.0] * (len(geometry.bodies) + len(self._pairs))
 
     @property
     def any(self) -> bool:
-        """Whether there is anything to come near to."""
+        """Whether there are boxes or pairs of bodies."""
         return self._boxes.box is not None or bool(self._boxes.keep_out) or bool(self._pairs)
 
     def links(self, zone: int) -> tuple[int, int]:
         """Return the links of a pair of the arm's own bodies, the inner one first."""
         i, j = self._pairs[zone - ITSELF]
-        one, other = self.before.bodies[i].link, self.before.bodies[j].link
-        return (one, other) if one < other else (other, one)
+        first, second = self.before.bodies[i].link, self.before.bodies[j].link
+        return (first, second) if first < second else (second, first)
 
     def distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
-        """Return the least signed distance for the frames of a configuration, and the number of its box or pair."""
-        least, which = self.box_distance(poses)
+        """Return the least signed distance at the frames of a configuration, and its box or pair."""
+        least, zone = self.box_distance(poses)
         own, pair = self.own_distance(poses)
-        return (own, pair) if own < least else (least, which)
+        return (own, pair) if own < least else (least, zone)
 
     def box_distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
-        """Return the least signed distance from the boxes, and the number of the box."""
+        """Return the least signed distance from the boxes, and that box."""
         return self._from_boxes(poses, self._whole)
 
     def own_distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
-        """Return the least signed distance of the arm's bodies from each other, and the number of the pair."""
+        """Return the least signed distance of the arm's bodies from each other, and that pair."""
         return self._from_itself(poses, self._whole)
 
     def room(self, poses: Sequence[Pose]) -> float:
-        """Return how far the farthest point of the arm may move before anything can touch, m."""
+        """Return the least motion of the arm's farthest point before a contact is possible, m."""
         return min(self._from_boxes(poses, self._shares)[0], self._from_itself(poses, self._all_shares)[0])
 
-    def _kept(self, body: int, box: Corners) -> float:
-        """Return the distance that a body keeps from a box, m."""
+    def _margin(self, body: int, box: Corners) -> float:
+        """Return the required distance of a body from a box, m."""
         least = self._clearance
         for place in self._fixed[body]:
             least = min(least, outside(*place, box) - self.before.radii[body] - _FIXED_M)
         return least
 
     def _from_boxes(self, poses: Sequence[Pose], shares: Sequence[float]) -> tuple[float, int]:
-        least, which = _FAR, INNER_BOX
+        least, zone = _FAR, INNER_BOX
         boxes, placed = self._boxes, self.before
         if boxes.box is not None:
             x, y, z = poses[TOOL][0]
@@ -151,103 +151,103 @@ class Zones:
             placed.place(poses)
             for number, box in enumerate(boxes.keep_out):
                 for body in self._moving:
-                    share, kept = shares[body], self._kept(body, box)
-                    found = (from_box(placed, body, box, least * share + kept)[0] - kept) / share
-                    if found < least:
-                        least, which = found, number
-        return least, which
+                    share, clearance = shares[body], self._margin(body, box)
+                    room = (from_box(placed, body, box, least * share + clearance)[0] - clearance) / share
+                    if room < least:
+                        least, zone = room, number
+        return least, zone
 
     def _from_itself(self, poses: Sequence[Pose], shares: Sequence[float]) -> tuple[float, int]:
-        least, which = _FAR, ITSELF
+        least, zone = _FAR, ITSELF
         placed = self.before
         if self._pairs:
             placed.place(poses)
             for number, pair in enumerate(self._pairs):
-                found = (distance(placed, placed, (pair,))[0] - self._clearance) / shares[number]
-                if found < least:
-                    least, which = found, ITSELF + number
-        return least, which
+                room = (distance(placed, placed, (pair,))[0] - self._clearance) / shares[number]
+                if room < least:
+                    least, zone = room, ITSELF + number
+        return least, zone
 
     def gaps(self, poses: Sequence[Pose], within: float, pairs_within: float) -> list[Gap]:
-        """Return what could touch where the arm moves by `within`, and pairs by `pairs_within`, m; places `before`."""
+        """Return possible contacts if the arm moves by `within`, and pairs by `pairs_within`, m; places `before`."""
         boxes, placed, clearance, shares = self._boxes, self.before, self._clearance, self._shares
         placed.place(poses)
-        found = []
+        gaps = []
         if boxes.box is not None:
             x, y, z = poses[TOOL][0]
             apart = inside(x, y, z, boxes.box)
             if apart <= within:
-                found.append(Gap(apart, INNER_BOX, TOOL, 1.0, 1.0))
+                gaps.append(Gap(apart, INNER_BOX, TOOL, 1.0, 1.0))
         for number, box in enumerate(boxes.keep_out):
             for body in self._moving:
-                share, kept = shares[body], self._kept(body, box)
-                apart = from_box(placed, body, box, share * within + kept)[0] - kept
+                share, margin = shares[body], self._margin(body, box)
+                apart = from_box(placed, body, box, share * within + margin)[0] - margin
                 if apart <= share * within:
-                    found.append(Gap(apart, number, body, share, share))
+                    gaps.append(Gap(apart, number, body, share, share))
         for number, (i, j) in enumerate(self._pairs):
             share = self._pair_shares[number]
             apart = distance(placed, placed, ((i, j),))[0] - clearance
             if apart <= share * pairs_within:
-                found.append(Gap(apart, ITSELF + number, i, share, shares[i] + shares[j]))
-        return found
+                gaps.append(Gap(apart, ITSELF + number, i, share, shares[i] + shares[j]))
+        return gaps
 
     def remeasure(self, gap: Gap, poses: Sequence[Pose]) -> float:
-        """Return the distance (m) of a gap at `poses`, where the bodies `after` are."""
+        """Return the distance of a gap at `poses`, m; `after` must have been placed there."""
         boxes, placed = self._boxes, self.after
         if gap.zone == INNER_BOX:
             assert boxes.box is not None
             return inside(*poses[TOOL][0], boxes.box)
         if gap.zone < ITSELF:
             box = boxes.keep_out[gap.zone]
-            return from_box(placed, gap.body, box)[0] - self._kept(gap.body, box)
+            return from_box(placed, gap.body, box)[0] - self._margin(gap.body, box)
         return distance(placed, placed, (self._pairs[gap.zone - ITSELF],))[0] - self._clearance
 
     def parted(self, gap: Gap, margin: float) -> bool:
-        """Return whether a plane lies between what a gap is of, on both ends of a piece: `before` and `after`.
+        """Return whether one plane separates the two sides of a gap at both ends of a piece, `before` and `after`.
 
-        What goes straight from one end to the other stays on its side.
+        A point that moves straight between the ends stays on its side.
 
         Args:
             gap: of a body and a box, or of two bodies.
-            margin: what is to be left, beyond radius and clearance, m.
+            margin: required distance beyond radius and clearance, m.
         """
-        one, before, after = 6 * gap.body, self.before.axes, self.after.axes
+        own_at, before, after = 6 * gap.body, self.before.axes, self.after.axes
         margin += self.thickness(gap)
-        other = -1
+        other_at = -1
         if gap.zone >= ITSELF:
             j = self._pairs[gap.zone - ITSELF][1]
-            other = 6 * j
+            other_at = 6 * j
         for placed in (self.before, self.after):
-            if other < 0:
+            if other_at < 0:
                 box = self._boxes.keep_out[gap.zone]
-                x, y, z = _way_out(point_at(placed.axes, one, from_box(placed, gap.body, box)[1]), box)
+                x, y, z = _way_out(point_at(placed.axes, own_at, from_box(placed, gap.body, box)[1]), box)
                 far = max(x * box[0], x * box[3]) + max(y * box[1], y * box[4]) + max(z * box[2], z * box[5])
             else:
-                x, y, z = _apart(placed.axes, one, other)[2]
-                far = max(_greatest(before, other, x, y, z), _greatest(after, other, x, y, z))
-            near = -max(_greatest(before, one, -x, -y, -z), _greatest(after, one, -x, -y, -z))
+                x, y, z = _apart(placed.axes, own_at, other_at)[2]
+                far = max(_greatest(before, other_at, x, y, z), _greatest(after, other_at, x, y, z))
+            near = -max(_greatest(before, own_at, -x, -y, -z), _greatest(after, own_at, -x, -y, -z))
             if near - far >= margin:
                 return True
         return False
 
     def thickness(self, gap: Gap) -> float:
-        """Return how far from each other the axes of two bodies, or an axis and a box, are where the gap is 0, m."""
+        """Return the distance of the axes of two bodies, or of an axis and a box, at a gap of 0, m."""
         radius = self.before.radii[gap.body]
         if gap.zone < ITSELF:
-            return radius + self._kept(gap.body, self._boxes.keep_out[gap.zone])
+            return radius + self._margin(gap.body, self._boxes.keep_out[gap.zone])
         return radius + self.before.radii[self._pairs[gap.zone - ITSELF][1]] + self._clearance
 
     def swap(self) -> None:
-        """Let what is `after` be `before`."""
+        """Make `after` the new `before`."""
         self.before, self.after = self.after, self.before
 
     def clearances(self, poses: Sequence[Pose], within: float) -> list[Clearance]:
-        """Return every boundary nearer than `within` (m), the nearest first: for who slows down and slides.
+        """Return the boundaries nearer than `within` (m), nearest first, for controllers that slow down and slide.
 
-        Of what moves less than the farthest point of the arm, the nearer ones: as `room` counts.
-        A body beside a box has one at its nearest point and one at each end: a turn brings these nearer.
+        `within` is scaled to the share of each body, as in `room`. A body near a box has a boundary at its nearest
+        point and one at each end, which a rotation may bring nearer.
         """
-        found: list[Clearance] = []
+        clearances: list[Clearance] = []
         boxes, placed, clearance = self._boxes, self.before, self._clearance
         placed.place(poses)
         if boxes.box is not None:
@@ -258,37 +258,37 @@ class Zones:
                     (boxes.box[axis + 3] - position[axis], -1.0),
                 ):
                     if apart < within:
-                        found.append(Clearance(apart, INNER_BOX, TOOL, 0, position, _unit(axis, sign)))
+                        clearances.append(Clearance(apart, INNER_BOX, TOOL, 0, position, _unit(axis, sign)))
         for number, box in enumerate(boxes.keep_out):
             for body in self._moving:
-                near, kept = self._shares[body] * within, self._kept(body, box)
-                apart, part = from_box(placed, body, box, near + kept)
-                if apart - kept < near:
-                    beyond = placed.radii[body] + kept
+                near, margin = self._shares[body] * within, self._margin(body, box)
+                apart, part = from_box(placed, body, box, near + margin)
+                if apart - margin < near:
+                    beyond = placed.radii[body] + margin
                     for at in sorted({part, 0.0, 1.0}):
                         place = point_at(placed.axes, 6 * body, at)
                         apart = outside(*place, box) - beyond
                         if apart < near:
                             link = placed.bodies[body].link
-                            found.append(Clearance(apart, number, link, 0, place, _way_out(place, box)))
+                            clearances.append(Clearance(apart, number, link, 0, place, _way_out(place, box)))
         for number, (i, j) in enumerate(self._pairs):
             if distance(placed, placed, ((i, j),))[0] - clearance < self._all_shares[number] * within:
                 beyond = placed.radii[i] + placed.radii[j] + clearance
-                # Of the outer body, which moves against the inner one.
+                # Of the outer body, relative to the inner one.
                 apart, place, normal = _apart(placed.axes, 6 * j, 6 * i)
                 links = placed.bodies[j].link, placed.bodies[i].link
-                found.append(Clearance(apart - beyond, ITSELF + number, *links, place, normal))
-        found.sort(key=lambda clearance: clearance.distance)
-        return found
+                clearances.append(Clearance(apart - beyond, ITSELF + number, *links, place, normal))
+        clearances.sort(key=lambda clearance: clearance.distance)
+        return clearances
 
 
 class _Geometry(NamedTuple):
-    """What a model says of its bodies, once for all.
+    """Constants of the bodies of a model.
 
-    `pairs` may collide, the inner body first. `reach`: how far from each joint's axis the farthest point of a body's
-    axis, or the tool, can be, m. `pair_reach`: by how much a joint changes the distance of a pair at most, m/rad.
-    `shares`: what part of `reach` the points of each body have at most; `pair_shares`: of `pair_reach`, each pair;
-    `all_shares`: of `reach`, each pair. `fixed`: the ends of each body that no joint moves, where they are, m.
+    `pairs`: pairs that may collide, the inner body first. `reach`: upper bound on the distance of a body's axis, or the
+    tool, from each joint's axis, m. `pair_reach`: upper bound on the change of a pair's distance by each joint, m/rad.
+    `shares`: largest part of `reach` of each body; `pair_shares`: of `pair_reach`, of each pair; `all_shares`: of
+    `reach`, of each pair. `fixed`: positions of the ends of each body that no joint moves, m.
     """
 
     bodies: tuple[Capsule, ...]
@@ -311,33 +311,32 @@ def _geometry(model: ArmModel) -> _Geometry:
     reach = [max(of_joint) for of_joint in zip(tool, *reaches, strict=True)]
     swept = [_swept(model, lengths, bodies[i], bodies[j].link, reaches[j]) for i, j in pairs]
     pair_reach = [max(of_joint) for of_joint in zip([0.0] * JOINTS, *swept, strict=True)]
-    shares = [_share(one, reach) for one in reaches]
-    pair_shares, all_shares = ([_share(one, whole) for one in swept] for whole in (pair_reach, reach))
+    shares = [_share(levers, reach) for levers in reaches]
+    pair_shares, all_shares = ([_share(levers, whole) for levers in swept] for whole in (pair_reach, reach))
     return _Geometry(bodies, pairs, reach, pair_reach, shares, pair_shares, all_shares, _fixed(model, bodies))
 
 
 def _fixed(model: ArmModel, bodies: Sequence[Capsule]) -> list[list[Vector]]:
-    """Return the ends of each body that are in one place in configurations without any symmetry."""
+    """Return the ends of each body with the same position in three configurations without symmetry."""
     placed, places = Placed(bodies), []
     for q in ((0.3, -0.7, 1.1, 0.5, -0.9, 0.2), (-1.2, 0.4, -0.6, 1.7, 0.8, -2.1), (2.2, 1.3, 0.4, -0.8, 1.9, 0.7)):
         placed.place(frames(model, q))
-        places.append([[point_at(placed.axes, 6 * which, end) for end in (0.0, 1.0)] for which in range(len(bodies))])
-    one, other, third = places
+        places.append([[point_at(placed.axes, 6 * body, end) for end in (0.0, 1.0)] for body in range(len(bodies))])
     return [
         [a for a, b, c in zip(*ends, strict=True) if max(dist(a, b), dist(a, c)) < _SAME_M]
-        for ends in zip(one, other, third, strict=True)
+        for ends in zip(*places, strict=True)
     ]
 
 
 def _reach(lengths: Sequence[float], link: int, beyond: float) -> list[float]:
-    """Return how far from each joint's axis a point can be that is `beyond` (m) off the origin of a link's frame."""
+    """Return the upper bound on the distance of a point, `beyond` m off a link's origin, from each joint's axis, m."""
     return [sum(lengths[joint + 1 : link]) + beyond if joint < link else 0.0 for joint in range(JOINTS)]
 
 
 def _swept(model: ArmModel, lengths: Sequence[float], inner: Capsule, link: int, reach: Sequence[float]) -> list[float]:
-    """Return by how much each joint changes the distance of a body from an outer one, of a link and a reach, m/rad.
+    """Return the upper bound on the change of a body's distance from an outer body by each joint, m/rad.
 
-    Turning the outer one about a joint's axis is turning the inner one back: the one that is nearer to the axis counts.
+    Rotating the outer body about an axis equals rotating the inner one back: the one nearer to the axis counts.
     """
     sine, cosine, a, d, _ = model.constants[inner.link]
     ends = (inner.start, inner.end)
@@ -353,14 +352,14 @@ def _swept(model: ArmModel, lengths: Sequence[float], inner: Capsule, link: int,
 
 
 def _share(part: Sequence[float], whole: Sequence[float]) -> float:
-    """Return the greatest part of something that has it of each joint; a little where it has none: to divide by it."""
+    """Return the greatest ratio of `part` to `whole` over all joints; at least `_NO_SHARE`, as callers divide by it."""
     return max([_NO_SHARE, *[a / b for a, b in zip(part, whole, strict=True) if b > 0.0]])
 
 
-def _apart(axes: Sequence[float], one: int, other: int) -> tuple[float, Vector, Vector]:
-    """Return the distance of two axes, m, the nearest point of the one, and the unit vector to it from the other."""
-    square, s, t = between_axes(axes, one, axes, other)
-    place, (x, y, z) = point_at(axes, one, s), point_at(axes, other, t)
+def _apart(axes: Sequence[float], first: int, second: int) -> tuple[float, Vector, Vector]:
+    """Return the distance of two axes, m, the nearest point of the first, and the unit vector to it from the second."""
+    square, s, t = between_axes(axes, first, axes, second)
+    place, (x, y, z) = point_at(axes, first, s), point_at(axes, second, t)
     apart = sqrt(square)
     if apart == 0.0:
         return 0.0, place, (0.0, 0.0, 1.0)
@@ -368,7 +367,7 @@ def _apart(axes: Sequence[float], one: int, other: int) -> tuple[float, Vector, 
 
 
 def _greatest(axes: Sequence[float], at: int, x: float, y: float, z: float) -> float:
-    """Return how far along (x, y, z) the farther end of an axis is, m."""
+    """Return the coordinate along (x, y, z) of the farther end of an axis, m."""
     start = x * axes[at] + y * axes[at + 1] + z * axes[at + 2]
     along = x * axes[at + 3] + y * axes[at + 4] + z * axes[at + 5]
     return start + along if along > 0.0 else start

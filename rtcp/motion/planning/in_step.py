@@ -1,7 +1,7 @@
-"""Plans of motions in step: the ways of several arms with one time, and how the group brakes at each point of it.
+"""Plans of motions in step: paths of several arms over one time, and the braking time of the group at each point.
 
-A brake lasts T and takes the speed u of the path's time from 1 to 0 along 1 - 3 x^2 + 2 x^3, x = t / T. A joint whose
-path is p(s) then has the acceleration p'' u^2 + p' du/dt. T is the shortest that every joint of every arm can follow.
+Braking takes the rate u of the path time from 1 to 0 within T along 1 - 3 x^2 + 2 x^3, x = t / T. A joint with the path
+p(s) then has the acceleration p'' u^2 + p' du/dt. T is the shortest time that every joint of every arm can follow.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from kinematics.model import JOINTS
 from rtcp.config.model import Point
 from rtcp.motion.controllers.in_step import LONGEST_BRAKE_S
 from rtcp.motion.guards.neighbours import Body, certain
-from rtcp.motion.joint_motion import find_way
+from rtcp.motion.joint_motion import find_trajectory
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import cubic, quintic
 from rtcp.motion.planning.plan import (
@@ -36,13 +36,13 @@ from rtcp.motion.planning.plan import (
 from rtcp.motion.planning.trajectories import SHORTEST_S
 
 SPEED_SHARE: Final = 0.93
-"""Of a joint's limits of speed and acceleration a motion in step uses so much: an arm that was late needs some to catch
-up, and to brake while the path itself slows down takes more."""
+"""Shares of a joint's speed and acceleration limits for a motion in step: a late arm needs the rest to catch up, and
+braking takes more while the path itself slows down."""
 ACCELERATION_SHARE: Final = 0.7
 _MOST_SPEED, _MOST_ACCELERATION = 0.95, 0.88
-"""Of what was planned elsewhere: times 1.05, and its square, that is within the limits."""
+"""Upper bounds for plans made elsewhere, as shares of the limits: times 1.05, and its square, they are within them."""
 _BRAKE_SHARE: Final = 0.88
-"""The curve may be followed a little more steeply than it is (`rtcp.motion.controllers.in_step`)."""
+"""Share of the limits for the braking curve, which arms may follow more steeply (`rtcp.motion.controllers.in_step`)."""
 _SAMPLE_S: Final = 0.02
 _MOST_SAMPLES: Final = 1000
 _LONGEST_IN_STEP_S: Final = 3600.0
@@ -54,7 +54,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Way:
-    """What one arm has to do: from where to where it moves, rad, under which limits."""
+    """The move of one arm: its limits, start and target, rad."""
 
     limits: Limits
     q_now: Sequence[float]
@@ -63,56 +63,56 @@ class Way:
 
 @dataclass(frozen=True)
 class Brakes:
-    """How long the group takes to brake, s, at every `step_s` of the path."""
+    """Braking time of the group, s, at every `step_s` of the path."""
 
     step_s: float
     times: tuple[float, ...]
 
 
-def plan_moves(ways: Mapping[str, Way], speed: float | None) -> dict[str, tuple[Point, ...]]:
-    """Return the points of a joint move of several arms: all joints of all arms begin and end together.
+def plan_moves(moves: Mapping[str, Way], speed: float | None) -> dict[str, tuple[Point, ...]]:
+    """Return the points of a synchronized joint move of several arms.
 
     Args:
-        ways: by the names of the arms.
+        moves: by the names of the arms.
         speed: of the fastest joint, rad/s; None: the limits.
 
     Raises:
-        PlanRefused: a target outside a limit, or none is found.
+        PlanRefused: a target is outside a limit, or no motion is found.
     """
-    for name, way in ways.items():
-        if len(way.q) != len(way.q_now):
-            raise PlanRefused(f"{name}: found {len(way.q)} joint positions, allowed are {len(way.q_now)}")
-        for i, wanted in enumerate(way.q):
-            least, most = way.limits.low[i], way.limits.high[i]
+    for name, move in moves.items():
+        if len(move.q) != len(move.q_now):
+            raise PlanRefused(f"{name}: found {len(move.q)} joint positions, allowed are {len(move.q_now)}")
+        for i, wanted in enumerate(move.q):
+            least, most = move.limits.low[i], move.limits.high[i]
             if not least <= wanted <= most:
                 raise PlanRefused(
                     f"{name}: joint {i + 1}: found {wanted:.6g} rad, allowed is {least:.6g} to {most:.6g} rad"
                 )
     if speed is not None and not speed > 0.0:
         raise PlanRefused(f"speed: found {speed:g} rad/s, allowed is a number greater than 0")
-    begin = [one for way in ways.values() for one in way.q_now]
-    fastest = [one * SPEED_SHARE for way in ways.values() for one in way.limits.velocity]
+    begin = [q for move in moves.values() for q in move.q_now]
+    fastest = [v * SPEED_SHARE for move in moves.values() for v in move.limits.velocity]
     joints = len(begin)
-    otg, asked, found = Ruckig(joints, 0.001), InputParameter(joints), Trajectory(joints)
-    asked.current_position, asked.target_position = begin, [one for way in ways.values() for one in way.q]
-    asked.max_velocity = fastest if speed is None else [min(one, speed) for one in fastest]
-    asked.max_acceleration = [one * ACCELERATION_SHARE for way in ways.values() for one in way.limits.acceleration]
-    asked.synchronization = Synchronization.Phase
-    if not find_way(otg, asked, [one for way in ways.values() for one in way.limits.jerk], found):
+    otg, inp, trajectory = Ruckig(joints, 0.001), InputParameter(joints), Trajectory(joints)
+    inp.current_position, inp.target_position = begin, [q for move in moves.values() for q in move.q]
+    inp.max_velocity = fastest if speed is None else [min(v, speed) for v in fastest]
+    inp.max_acceleration = [a * ACCELERATION_SHARE for move in moves.values() for a in move.limits.acceleration]
+    inp.synchronization = Synchronization.Phase
+    if not find_trajectory(otg, inp, [jerk for move in moves.values() for jerk in move.limits.jerk], trajectory):
         raise PlanRefused("no motion of all joints is found: choose another speed or target")
-    duration = found.duration
+    duration = trajectory.duration
     if duration > LONGEST_S:
         raise PlanRefused(f"the motion would take {duration:g} s, allowed are {LONGEST_S:g} s: choose a higher speed")
     count = min(max(ceil(duration / _SAMPLE_S), 1), _MOST_SAMPLES)
-    samples = [(duration * k / count, found.at_time(duration * k / count)) for k in range(count + 1)]
-    if duration < SHORTEST_S:  # all are there
+    samples = [(duration * k / count, trajectory.at_time(duration * k / count)) for k in range(count + 1)]
+    if duration < SHORTEST_S:  # all arms are at their targets
         samples = [(0.0, samples[0][1]), (_SAMPLE_S, samples[-1][1])]
     points, at = {}, 0
-    for name, way in ways.items():
-        end = at + len(way.q)
-        low, high = way.limits.low, way.limits.high
+    for name, move in moves.items():
+        end = at + len(move.q)
+        low, high = move.limits.low, move.limits.high
         points[name] = tuple(
-            # A sum of the generator's own ends beyond a range by its rounding.
+            # The generator's sums may exceed a range by rounding.
             Point(t, tuple(map(_clamp, q[at:end], low, high)), tuple(v[at:end]), tuple(a[at:end]))
             for t, (q, v, a) in samples
         )
@@ -127,17 +127,17 @@ def check_apart(
     clearance: float,
     delay_s: float,
 ) -> None:
-    """Check that the bodies of any two arms keep apart along the whole way, as the guards in the loops will.
+    """Check the clearance between any two arms along the whole motion, as the guards in the loops will.
 
     Args:
         paths: of the arms that move.
         bodies: of all arms of the cell whose geometry is known.
-        rests: where the others stand, rad.
-        clearance: m.
-        delay_s: how long an arm goes on before it stops with its partner.
+        rests: positions of the arms that do not move, rad.
+        clearance: required distance, m.
+        delay_s: time before an arm stops with its partner.
 
     Raises:
-        PlanRefused: which arms would come too near, and when.
+        PlanRefused: with the arms that would come too near, and the time.
     """
     duration = max(path.duration_s for path in paths.values())
     if duration > _LONGEST_IN_STEP_S:
@@ -167,14 +167,14 @@ def check_apart(
                     f"after {times[k]:.2f} s the bodies of {a} and {b} would be {max(here, 0.0):.3f} m apart; with "
                     f"their stops they could come nearer than {clearance:g} m: choose another way, or move more slowly"
                 )
-            # On to the first sample at which what has moved since, and the stops, may have used up the distance.
+            # Skip to the first sample at which the motion since, and the stops, may have used up the distance.
             later = slice(k + 1, k + 1 + _MOST_SAMPLES)
             near = here - (moved[later] - moved[k]) - stops[later] - between[later] <= clearance
             k += 1 + (int(np.argmax(near)) if near.any() else len(near))
 
 
 def _moved(body: Body, q: Array) -> Array:
-    """Return how far a point of an arm has moved at most since the first row of joint positions, m, at each row."""
+    """Return at each row the upper bound on a point's motion since the first row, m."""
     steps = np.abs(np.diff(q[:, :JOINTS], axis=0)) @ np.array(body.reach)
     return np.concatenate(([0.0], np.cumsum(steps)))
 
@@ -191,7 +191,7 @@ def _clamp(value: float, low: float, high: float) -> float:
 
 
 class Curve:
-    """The way of one arm by the rows of its plan, evaluated at many times at once.
+    """The path of an arm from the rows of its plan, evaluated at many times at once.
 
     Args:
         rows: of the plan (`rtcp.motion.planning.plan`); the first at time 0.
@@ -218,7 +218,7 @@ class Curve:
         self.duration_s = float(self._times[-1])
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """Return position, first and second derivative by s, shape (*s.shape, joints); beyond the end it rests."""
+        """Return position, first and second derivative by s, shape (*s.shape, joints); at rest beyond the end."""
         index = np.clip(np.searchsorted(self._times, s, side="right") - 1, 0, len(self._pieces) - 1)
         length = self._lengths[index][..., None]
         x = np.clip((s - self._times[index]) / self._lengths[index], 0.0, 1.0)[..., None]
@@ -230,10 +230,10 @@ class Curve:
 
 
 def plan_brakes(paths: Mapping[str, Curve], limits: Mapping[str, Limits]) -> Brakes:
-    """Return how long the group takes to brake at each point of its paths.
+    """Return the braking time of the group at each point of its paths.
 
     Raises:
-        PlanTooFast: the paths leave no room for it, or none to catch up.
+        PlanTooFast: the paths leave no room to brake, or none to catch up.
     """
     duration = max(path.duration_s for path in paths.values())
     step = max(_SAMPLE_S, duration / _MOST_BRAKES)
@@ -276,4 +276,4 @@ def plan_brakes(paths: Mapping[str, Curve], limits: Mapping[str, Limits]) -> Bra
             f"at {at:.2f} s the arms could not brake together on their paths: the accelerations there are too near to "
             f"the limits; give the motion more time"
         )
-    return Brakes(step, tuple(float(one) for one in times))
+    return Brakes(step, tuple(float(duration) for duration in times))

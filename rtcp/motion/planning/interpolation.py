@@ -1,8 +1,8 @@
-"""Curves between points: polynomials of a joint and their exact extremes, the spline through points, turns of the tool.
+"""Interpolation: polynomials of a joint and their exact extremes, splines through points, rotations of the tool.
 
-A polynomial runs over the fraction x = (t - t0) / T from 0 to 1, its coefficients rise: c[0] + c[1] x + .. Derivatives
-are by x: a speed is the first over T, an acceleration the second over T^2. Orientations are unit quaternions
-(w, x, y, z) outside the cycle, and a turn about a fixed axis in it.
+A polynomial c[0] + c[1] x + .. is a function of the fraction x = (t - t0) / T from 0 to 1. Derivatives are by x: a
+speed is the first over T, an acceleration the second over T^2. Orientations are unit quaternions (w, x, y, z) outside
+the cycle and a rotation about a fixed axis in it.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 Coefficients: TypeAlias = tuple[float, float, float, float, float, float]
 _NO_TURN: Final = 1e-12
 _NEARLY: Final = 1e-15
-"""A root is known so closely, as a fraction of the piece."""
+"""Tolerance of a root, as a fraction of the piece."""
 
 
 def cubic(q0: float, v0: float, q1: float, v1: float, duration: float) -> Coefficients:
     """Return the cubic with these positions and velocities (rad, rad/s) at both ends of `duration` s."""
-    v0, v1, way = v0 * duration, v1 * duration, q1 - q0
-    return q0, v0, 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way, 0.0, 0.0
+    v0, v1, distance = v0 * duration, v1 * duration, q1 - q0
+    return q0, v0, 3.0 * distance - 2.0 * v0 - v1, v0 + v1 - 2.0 * distance, 0.0, 0.0
 
 
 def quintic(q0: float, v0: float, a0: float, q1: float, v1: float, a1: float, duration: float) -> Coefficients:
     """Return the quintic with these positions, velocities and accelerations at both ends of `duration` s."""
     v0, v1 = v0 * duration, v1 * duration
     a0, a1 = 0.5 * a0 * duration * duration, 0.5 * a1 * duration * duration
-    way = q1 - q0
+    distance = q1 - q0
     return (
         q0,
         v0,
         a0,
-        10.0 * way - 6.0 * v0 - 4.0 * v1 - 3.0 * a0 + a1,
-        -15.0 * way + 8.0 * v0 + 7.0 * v1 + 3.0 * a0 - 2.0 * a1,
-        6.0 * way - 3.0 * (v0 + v1) - a0 + a1,
+        10.0 * distance - 6.0 * v0 - 4.0 * v1 - 3.0 * a0 + a1,
+        -15.0 * distance + 8.0 * v0 + 7.0 * v1 + 3.0 * a0 - 2.0 * a1,
+        6.0 * distance - 3.0 * (v0 + v1) - a0 + a1,
     )
 
 
@@ -56,24 +56,24 @@ def derivative(coefficients: Sequence[float]) -> list[float]:
 
 
 def sign_changes(coefficients: Sequence[float]) -> list[float]:
-    """Return where in (0, 1) the polynomial changes its sign, rising.
+    """Return the places in (0, 1) where the polynomial changes its sign, in rising order.
 
-    Between two neighbouring sign changes of its derivative a polynomial is monotone, and has one root at most: the
-    roots of each derivative are found from those of the next, down to a straight line.
+    Between two neighbouring sign changes of its derivative a polynomial is monotone and has at most one root: the roots
+    follow from those of the derivative, recursively down to a straight line.
     """
     if not any(coefficients[1:]):
         return []
     edges = [0.0, *sign_changes(derivative(coefficients)), 1.0]
     values = [value(coefficients, x) for x in edges]
-    found: list[float] = []
+    roots: list[float] = []
     for low, high, at_low, at_high in zip(edges, edges[1:], values, values[1:], strict=False):
         if at_low * at_high < 0.0:
-            found.append(_root(coefficients, low, high, at_low < 0.0))
-    return found
+            roots.append(_root(coefficients, low, high, at_low < 0.0))
+    return roots
 
 
 def _root(coefficients: Sequence[float], low: float, high: float, rising: bool) -> float:
-    """Newton's steps inside an interval that halves where they leave it or are slow."""
+    """Newton's method in an interval, with bisection for steps that leave it or converge slowly."""
     slope = derivative(coefficients)
     x = 0.5 * (low + high)
     last = high - low
@@ -97,7 +97,7 @@ def _root(coefficients: Sequence[float], low: float, high: float, rising: bool) 
 
 
 def extremes(coefficients: Sequence[float]) -> tuple[float, float, float, float]:
-    """Return the least value on [0, 1], where it is, the largest and where it is; exact but for rounding."""
+    """Return the least value on [0, 1] and its place, the largest and its place; exact but for rounding."""
     places = [0.0, *sign_changes(derivative(coefficients)), 1.0]
     values = [value(coefficients, x) for x in places]
     least, largest = min(values), max(values)
@@ -105,8 +105,8 @@ def extremes(coefficients: Sequence[float]) -> tuple[float, float, float, float]
 
 
 def beyond(coefficients: Sequence[float], low: float, high: float) -> tuple[float, float] | None:
-    """Return the extreme outside [low, high] that the polynomial has on [0, 1] and where it is, or None."""
-    # The hull of Bernstein's coefficients holds the curve: most pieces are inside at this glance.
+    """Return an extreme of the polynomial on [0, 1] that is outside [low, high], and its place; or None."""
+    # The hull of the Bernstein coefficients contains the curve: a quick check that most pieces pass.
     if _hull_is_inside(coefficients, low, high):
         return None
     least, at_least, largest, at_largest = extremes(coefficients)
@@ -165,7 +165,7 @@ def spline_velocities(times: Sequence[float], values: Sequence[float]) -> list[f
 
 
 def spline_accelerations(times: Sequence[float], values: Sequence[float], velocities: Sequence[float]) -> list[float]:
-    """Return the spline's acceleration at each point; 0 at both ends, where the motion begins and ends gently."""
+    """Return the spline's acceleration at each point; 0 at both ends, for a smooth start and end."""
     accelerations = [0.0] * len(times)
     for i in range(1, len(times) - 1):
         h = times[i + 1] - times[i]
@@ -183,7 +183,7 @@ def quaternion(rotation: Rotation) -> Quaternion:
     z = copysign(sqrt(max(0.0, 1.0 - a - e + i)), d - b)
     largest = max(w, fabs(x), fabs(y), fabs(z))
     if largest > w:
-        # Near a half turn the differences that give the signs vanish: the products of the largest give them.
+        # Near a half turn the differences that give the signs vanish: take the signs from products with the largest.
         if largest == fabs(x):
             w, x, y, z = (h - f) / largest, largest, (b + d) / largest, (c + g) / largest
         elif largest == fabs(y):
@@ -195,7 +195,7 @@ def quaternion(rotation: Rotation) -> Quaternion:
 
 
 def rotation(q: Sequence[float]) -> Rotation:
-    """Return the rotation of a quaternion, whose size does not matter."""
+    """Return the rotation of a quaternion of any norm."""
     w, x, y, z = q
     s = 2.0 / (w * w + x * x + y * y + z * z)
     return (
@@ -206,7 +206,7 @@ def rotation(q: Sequence[float]) -> Rotation:
 
 
 def turn_between(start: Sequence[float], end: Sequence[float]) -> tuple[Vector, float]:
-    """Return axis, in the frame of `start`, and angle, 0 to pi, of the shorter turn between two orientations."""
+    """Return axis, in the frame of `start`, and angle, 0 to pi, of the shorter rotation between two orientations."""
     (a, b, c, d), (w, x, y, z) = start, end
     # conj(start) * end
     turn_w = a * w + b * x + c * y + d * z

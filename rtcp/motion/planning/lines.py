@@ -1,4 +1,4 @@
-"""Plans of straight lines: every point in reach on one branch, off singularities, inside limits and zones."""
+"""Plans of straight lines: every point in reach on one branch, away from singularities, inside limits and zones."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
 PoseAt = Callable[[float], Pose]
-"""The poses of a line or an arc, by the fraction of it, 0 to 1."""
+"""Maps the fraction of a line or an arc, 0 to 1, to its pose."""
 SAMPLE_M, SAMPLE_RAD = 0.002, 0.01
-"""A line is looked at whenever the tool has moved or turned so far."""
+"""Largest tool motion between two checked samples of a line."""
 _JUMP_RAD: Final = 0.3
-"""A joint that moves by more between two samples changes its branch, or is at a singularity."""
+"""A larger joint motion between two samples is a change of branch or a singularity."""
 _UNUSED = (0.0,) * (KIND - 19)
 NO_WAY_M, NO_WAY_RAD = 1e-6, 1e-6
 OF_LIMIT: Final = 0.95
-"""Of a joint's limits a line uses so much: between the samples they hold too."""
+"""Share of the joint limits that a line uses, so that they also hold between the samples."""
 _SAME_RAD: Final = 1e-3
 _TRIES, _A_LITTLE_LESS = 3, 1.0 - 1e-4
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """A straight piece, the joints along it, and where it stands in the list of stops."""
+    """A straight piece, the joints along it, and the number of its stop."""
 
     number: int
     start: Pose
@@ -59,19 +59,19 @@ def plan_lines(
     speed: float | None = None,
     zone_at: ZoneAt | None = None,
 ) -> Plan:
-    """Return the plan of straight lines for `LineController`, from the arm's position to each stop, at rest at each.
+    """Return the plan of straight lines for `LineController`, from the arm's position, at rest at each stop.
 
     Args:
         model: the arm.
-        limits: of the joints; where a line would break them it is slowed down.
-        cartesian: speeds, accelerations and jerks of the tool, and how near to a singularity it may come.
-        q_now: where the arm is commanded, at rest, rad, shape (6,).
-        stops: at least one; a stop where the tool is already is passed over.
-        speed: m/s, where a stop has none of its own; None: that of `cartesian`.
-        zone_at: looked at in every sample.
+        limits: of the joints; a line that would exceed them is slowed down.
+        cartesian: speeds, accelerations and jerks of the tool, and its least distances to singularities.
+        q_now: commanded position, at rest, rad, shape (6,).
+        stops: at least one; a stop at the tool's present pose is skipped.
+        speed: for stops without their own, m/s; None: that of `cartesian`.
+        zone_at: called for every sample.
 
     Raises:
-        PlanRefused: with the stop, the distance along its line, what was found and what is allowed.
+        PlanRefused: with the stop, the distance along its line, the value and its limit.
     """
     if not stops:
         raise PlanRefused("the path has no poses, at least one is needed")
@@ -86,15 +86,15 @@ def plan_lines(
         where = f"the line to pose {number}" if len(stops) > 1 else "the line"
         goal = goal_of(model, stop, where)
         fast = speed_of(stop, speed, cartesian, where)
-        turns = quaternion(here.rotation), quaternion(goal.rotation)
-        way = hypot(*(b - a for a, b in zip(here.position, goal.position, strict=True)))
-        _, angle = turn_between(*turns)
-        if way > NO_WAY_M or angle > NO_WAY_RAD:
-            joints = follow(inverse, limits, cartesian, straight(here, goal), (way, angle), q, where, zone_at)
-            piece = _Piece(number, here, goal, turns, way, angle, joints, fast)
+        orientations = quaternion(here.rotation), quaternion(goal.rotation)
+        distance = hypot(*(b - a for a, b in zip(here.position, goal.position, strict=True)))
+        _, angle = turn_between(*orientations)
+        if distance > NO_WAY_M or angle > NO_WAY_RAD:
+            joints = follow(inverse, limits, cartesian, straight(here, goal), (distance, angle), q, where, zone_at)
+            piece = _Piece(number, here, goal, orientations, distance, angle, joints, fast)
             row, part = _timed(piece, limits, cartesian, where)
             rows.append(row)
-            length, slowed = length + way, min(slowed, part)
+            length, slowed = length + distance, min(slowed, part)
             q, here = joints[-1], goal
         check_branch(stop, q, where, model)
     if not rows:
@@ -110,19 +110,19 @@ def plan_lines(
 
 def goal_of(model: ArmModel, stop: Stop, where: str) -> Pose:
     """Return the pose of a stop, or raise PlanRefused."""
-    given = stop.pose if stop.q is None else stop.q
-    if given is None or (stop.pose is not None and stop.q is not None):
+    target = stop.pose if stop.q is None else stop.q
+    if target is None or (stop.pose is not None and stop.q is not None):
         raise PlanRefused(f"{where}: either a pose or joint positions are needed")
-    if len(given) != 6:
-        raise PlanRefused(f"{where}: found {len(given)} numbers, 6 are needed")
-    for number in given:
+    if len(target) != 6:
+        raise PlanRefused(f"{where}: found {len(target)} numbers, 6 are needed")
+    for number in target:
         if not isfinite(number):
             raise PlanRefused(f"{where}: found {number} in its end, numbers are needed")
-    return Pose.from_xyzrpy(*given) if stop.q is None else forward(model, given)
+    return Pose.from_xyzrpy(*target) if stop.q is None else forward(model, target)
 
 
 def speed_of(stop: Stop, of_path: float | None, cartesian: CartesianConfig, where: str) -> float:
-    """Return the tool's speed on the way to a stop, m/s, or raise PlanRefused."""
+    """Return the tool's speed towards a stop, m/s, or raise PlanRefused."""
     speed = stop.speed if stop.speed is not None else of_path if of_path is not None else cartesian.speed
     if not isfinite(speed) or not 0.0 < speed <= cartesian.speed:
         raise PlanRefused(
@@ -133,14 +133,14 @@ def speed_of(stop: Stop, of_path: float | None, cartesian: CartesianConfig, wher
 
 
 def straight(start: Pose, end: Pose) -> PoseAt:
-    """Return the poses of a straight line, by the fraction of it."""
+    """Return the poses of a straight line as a function of its fraction."""
     from_q, to_q = quaternion(start.rotation), quaternion(end.rotation)
     axis, angle = turn_between(from_q, to_q)
-    way = [b - a for a, b in zip(start.position, end.position, strict=True)]
+    direction = [b - a for a, b in zip(start.position, end.position, strict=True)]
     turned = rotation(from_q)
 
     def pose_at(x: float) -> Pose:
-        px, py, pz = (a + x * w for a, w in zip(start.position, way, strict=True))
+        px, py, pz = (a + x * w for a, w in zip(start.position, direction, strict=True))
         return Pose((px, py, pz), turned_by(turned, axis, x * angle))
 
     return pose_at
@@ -157,25 +157,25 @@ def follow(
     zone_at: ZoneAt | None,
     least: int = 0,
 ) -> list[tuple[float, ...]]:
-    """Return the joints along a line or an arc, at even fractions of it, each looked at.
+    """Return the joints along a line or an arc, at even fractions of it, each checked.
 
     Args:
         inverse: of the arm.
         limits: of the joints.
-        cartesian: how near to a singularity it may come.
-        pose_at: the poses by the fraction, 0 to 1.
-        extent: how far the tool moves, m, and turns, rad.
-        q: where it begins, rad.
-        where: names it in what is raised.
-        zone_at: looked at in every sample.
-        least: count of samples.
+        cartesian: least distances to singularities.
+        pose_at: maps the fraction, 0 to 1, to the pose.
+        extent: distance, m, and angle, rad, of the tool's motion.
+        q: joints at the start, rad.
+        where: name of the line in error messages.
+        zone_at: called for every sample.
+        least: lower bound on the number of samples.
 
     Raises:
-        PlanRefused: with the place on it, what was found and what is allowed.
+        PlanRefused: with the place on the line, the value and its limit.
     """
     length, angle = extent
     count = max(8, least, ceil(length / SAMPLE_M), ceil(angle / SAMPLE_RAD))
-    found: list[tuple[float, ...]] = []
+    path: list[tuple[float, ...]] = []
     names = inverse.model.joint_names
     for k in range(count + 1):
         x = k / count
@@ -197,42 +197,42 @@ def follow(
         if zone_at is not None and (box := zone_at(near.q)) is not None:
             raise PlanRefused(f"{place}: the arm would be in {box}")
         q = near.q
-        found.append(q)
-    return found
+        path.append(q)
+    return path
 
 
 def check_singular(model: ArmModel, q: Sequence[float], cartesian: CartesianConfig, place: str) -> None:
-    """Raise PlanRefused where a configuration is nearer to a singularity than is allowed."""
+    """Raise PlanRefused if a configuration is too near to a singularity."""
     distances = singularity_distances(model, q)
     allowed = cartesian.singularity
-    for what, unit, found, least in (
+    for name, unit, distance, least in (
         ("shoulder", "m", distances.shoulder, allowed.shoulder),
         ("elbow", "rad", distances.elbow, allowed.elbow),
         ("wrist", "rad", distances.wrist, allowed.wrist),
     ):
-        if found is not None and found < least:
+        if distance is not None and distance < least:
             raise PlanRefused(
-                f"{place}: the {what} is {found:.4f} {unit} from its singularity, allowed is at least {least:g} {unit} "
-                f"(cartesian.singularity.{what})"
+                f"{place}: the {name} is {distance:.4f} {unit} from its singularity, allowed is at least {least:g} "
+                f"{unit} (cartesian.singularity.{name})"
             )
 
 
 def _timed(piece: _Piece, limits: Limits, cartesian: CartesianConfig, where: str) -> tuple[tuple[float, ...], float]:
-    """Return the row of a piece, and the part of its speed that the joints allow."""
+    """Return the row of a piece, and the share of its speed that the joints allow."""
     length, angle = piece.length, piece.angle
 
-    def both(linear: float, angular: float) -> float:
+    def of_both(linear: float, angular: float) -> float:
         return min(linear / length if length > NO_WAY_M else inf, angular / angle if angle > NO_WAY_RAD else inf)
 
-    wanted = speed = both(piece.speed, cartesian.angular_speed)
-    acceleration = both(cartesian.acceleration, cartesian.angular_acceleration)
-    jerk = both(cartesian.jerk, cartesian.angular_jerk)
+    wanted = speed = of_both(piece.speed, cartesian.angular_speed)
+    acceleration = of_both(cartesian.acceleration, cartesian.angular_acceleration)
+    jerk = of_both(cartesian.jerk, cartesian.angular_jerk)
     joints = piece.joints
     count = len(joints) - 1
     bends = []
     for k in range(1, count):
         for i, (before, here, after) in enumerate(zip(joints[k - 1], joints[k], joints[k + 1], strict=True)):
-            # dq/ds by the steeper side, d2q/ds2 by the second difference; s is the fraction.
+            # dq/ds from the steeper side, d2q/ds2 from the second difference; s is the fraction.
             first = count * max(abs(here - before), abs(after - here))
             second = count * count * abs(after - 2.0 * here + before)
             bends.append((i, first, second))
@@ -242,8 +242,8 @@ def _timed(piece: _Piece, limits: Limits, cartesian: CartesianConfig, where: str
                 speed = min(speed, sqrt(0.5 * OF_LIMIT * limits.acceleration[i] / second))
     for i, first, second in bends:
         if first > 0.0:
-            left = OF_LIMIT * limits.acceleration[i] - second * speed * speed
-            acceleration = min(acceleration, left / first)
+            remaining = OF_LIMIT * limits.acceleration[i] - second * speed * speed
+            acceleration = min(acceleration, remaining / first)
     duration, acceleration = _duration(speed, acceleration, jerk, where)
     row = (
         *piece.start.position, *piece.turns[0], *piece.end.position, *piece.turns[1],
@@ -253,29 +253,29 @@ def _timed(piece: _Piece, limits: Limits, cartesian: CartesianConfig, where: str
 
 
 def _duration(speed: float, acceleration: float, jerk: float, where: str) -> tuple[float, float]:
-    """Return how long the fraction takes, and the acceleration by which that was found."""
-    way, found = InputParameter(1), Trajectory(1)
-    way.target_position = [1.0]
-    way.max_velocity, way.max_jerk = [speed], [jerk]
+    """Return the duration of the fraction from 0 to 1, s, and the acceleration it needs."""
+    inp, trajectory = InputParameter(1), Trajectory(1)
+    inp.target_position = [1.0]
+    inp.max_velocity, inp.max_jerk = [speed], [jerk]
     for _ in range(_TRIES):
-        way.max_acceleration = [acceleration]
+        inp.max_acceleration = [acceleration]
         try:
-            if Ruckig(1, 0.001).calculate(way, found) >= 0:
-                return float(found.duration), acceleration
+            if Ruckig(1, 0.001).calculate(inp, trajectory) >= 0:
+                return float(trajectory.duration), acceleration
         except (RuckigError, ValueError):
             pass
-        # Where the acceleration is only just reached, as on 10 mm with 0.5 m/s^2 and 5 m/s^3, ruckig finds nothing.
+        # If the acceleration is only just reached, as on 10 mm with 0.5 m/s^2 and 5 m/s^3, ruckig finds no solution.
         acceleration *= _A_LITTLE_LESS
     raise PlanRefused(f"{where}: no motion along it was found")
 
 
 def check_branch(stop: Stop, q: Sequence[float], where: str, model: ArmModel) -> None:
-    """Raise PlanRefused where a line has led to other joints than those of its stop."""
+    """Raise PlanRefused if a line ends at other joint positions than those of its stop."""
     if stop.q is None:
         return
-    for name, wanted, found in zip(model.joint_names, stop.q, q, strict=True):
-        if abs(wanted - found) > _SAME_RAD:
+    for name, wanted, reached in zip(model.joint_names, stop.q, q, strict=True):
+        if abs(wanted - reached) > _SAME_RAD:
             raise PlanRefused(
-                f"{where}: it ends with {name} at {found:.3f} rad, not at {wanted:.3f} rad: a straight line does not "
+                f"{where}: it ends with {name} at {reached:.3f} rad, not at {wanted:.3f} rad: a straight line does not "
                 f"change the branch; move there by the joints"
             )

@@ -1,10 +1,9 @@
-"""Plans of paths that do not rest at each stop: lines, arcs and joint moves, their corners blended, in one trajectory.
+"""Plans of blended paths: lines, arcs and joint moves in one trajectory without a rest at each stop.
 
-Every leg is a curve of the joints over its nominal time, at which the tool, or by the joints the fastest of them, has
-the commanded speed. A corner with a radius is replaced by a quintic of the joints, from where the tool comes that near
-to the corner to where it has left it: position, velocity and acceleration go over, whatever two legs meet. The time law
-(`time_law`) then finds how fast all of it may pass, and rows for `TrajectoryController` are taken from it, as many as a
-quintic between two of them needs.
+Every leg is a curve of the joints over its nominal time, with the tool (in a joint move the fastest joint) at the
+commanded speed. A corner with a radius is replaced by a quintic of the joints within that radius of the tool; position,
+velocity and acceleration are continuous for any two legs. The time law (`time_law`) then determines the rate of the
+nominal time, and the rows for `TrajectoryController` are sampled densely enough for quintics between them.
 """
 
 from __future__ import annotations
@@ -46,38 +45,44 @@ if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
 _FLAT: Final = 1e-4
-"""Sine below which three points of an arc are on a line."""
+"""Sine below which three points of an arc count as on a line."""
 _LONGEST_TURN: Final = 100.0 * tau
 _NEAR_M, _NEAR_SHARE = 0.001, 0.05
-"""Smallest distance between the three places of an arc, m and as a share of the largest: below it rounding errors
-decide the circle."""
+"""Smallest distance between the three places of an arc, m and as a share of the largest: below, rounding determines
+the circle."""
 _ARC_SAMPLE_RAD: Final = 0.1
+"""Largest angle of an arc between two samples."""
 _LEAST_BLEND_M: Final = 1e-4
 _MOST_SAMPLES_OF_LEGS: Final = 50_000
 _MOST_STOPS: Final = 1000
 _FIRST_ROWS: Final = 1000
+"""Limit on the number of rows before their refinement."""
 _SHRINK, _SHRINKS = 0.7, 8
+"""Factor on the radius of a blend that leaves its ball around the corner, and limit on such attempts."""
 _IN_BALL: Final = 1.02
+"""Farthest distance of a blend from its corner, relative to that of its ends, up to which it is within its ball."""
 _BLEND_SAMPLES: Final = 17
 _FITS, _SHORTEST = 5, 0.3
-"""How often the nominal time of a blend is adapted, and its least share of that of the corner."""
+"""Number of adaptations of a blend's nominal time, and its least share of the corner's."""
 _PITCH_M, _PITCH_RAD = 0.001, 0.005
-"""Largest motion of the tool, and of a joint, between two places at which the bounds are evaluated."""
+"""Largest motion of the tool, and of a joint, between two evaluations of the bounds."""
 _LEAST_SAMPLES, _MOST_SAMPLES = 24, 200_000
 _OF_JERK: Final = 0.6
-"""Share of a joint's jerk for the change of the rate; the rest is for the path's own bends. What both do together,
-where the rate changes in a bend, is not bounded: some tenths of the limit more."""
+"""Share of a joint's jerk for changes of the rate; the rest is for the curvature of the path. Their sum is not bounded:
+a change of the rate in a bend may exceed the limit by some tenths."""
 _MOST_RATE, _MOST_ACCELERATION, _MOST_JERK = 1.5, 1e3, 1e5
-"""Of the parameter, where nothing bounds it."""
+"""Bounds of the rate and its derivatives, 1, 1/s, 1/s^2, where nothing else bounds them."""
 _ROW_S, _LEAST_ROW_S = 0.1, 0.002
+"""Interval of the first rows, and least interval of refined ones, s."""
 _ROW_RAD, _ROW_RAD_S = 2e-6, 2e-4
-"""Rows are as dense as the quintics between them need to be so exact."""
+"""Tolerances of the quintics between rows, which determine the density of the rows."""
 _STRETCH, _STRETCHES = 1.02, 20
+"""Factor on the duration of a plan that exceeds a limit, and limit on such attempts."""
 
 
 @dataclass(frozen=True)
 class _Leg:
-    """A way between two corners; `curve(x, nu)` gives the joints, (k, n), or their derivative, at nominal times, s.
+    """The path between two corners; `curve(x, nu)` gives the joints, (k, n), or a derivative, at nominal times, s.
 
     speed: of the tool, m/s; None: by the joints.
     """
@@ -90,7 +95,7 @@ class _Leg:
     end: tuple[float, ...]
     blend: float
     reach_s: float
-    """How far from an end a blend may go, s of nominal time: on an arc the tool comes back to its corner."""
+    """Upper bound on a blend's extent from an end, s of nominal time: on an arc the tool returns to its corner."""
     samples: int = 0
 
 
@@ -98,7 +103,7 @@ class _Leg:
 class _Piece:
     """A part of a leg, or a blend: its curve from `start` on, for a nominal time, and the tool's speed at both ends.
 
-    is_blend: between two legs of the tool: there it may go faster than nominal, to keep the tool's speed.
+    is_blend: between two legs of the tool; it may run faster than nominal to keep the tool's speed.
     """
 
     curve: Callable[..., Array]
@@ -122,15 +127,15 @@ def plan_path(
 
     Args:
         model: the arm.
-        limits: of the joints; where the path would break them it is slowed down.
-        cartesian: speeds, accelerations and jerks of the tool, and how near to a singularity it may come.
-        q_now: where the arm is commanded, at rest, rad, shape (6,).
-        stops: at least one; one where the arm is already is passed over.
-        speed: m/s, where a line or an arc has none of its own; None: that of `cartesian`.
-        zone_at: looked at along the whole way.
+        limits: of the joints; a path that would exceed them is slowed down.
+        cartesian: speeds, accelerations and jerks of the tool, and its least distances to singularities.
+        q_now: commanded position, at rest, rad, shape (6,).
+        stops: at least one; a stop at the arm's present position is skipped.
+        speed: for lines and arcs without their own, m/s; None: that of `cartesian`.
+        zone_at: called along the whole path.
 
     Raises:
-        PlanRefused: with the stop, what was found and what is allowed.
+        PlanRefused: with the stop, the value and its limit.
     """
     if not stops:
         raise PlanRefused("the path has no stops, at least one is needed")
@@ -146,7 +151,7 @@ def plan_path(
     legs = _legs(model, limits, cartesian, q_now, stops, speed, zone_at)
     if not legs:
         raise AlreadyThere("the arm is already where the path leads, there is nothing to move")
-    points: list[Point] = [_rest(0.0, tuple(q_now))]
+    points: list[Point] = [_standstill(0.0, tuple(q_now))]
     slowed = 1.0
     for section in _sections(model, cartesian, legs):
         path = _Path(section)
@@ -162,12 +167,12 @@ def plan_path(
         try:
             plan = plan_trajectory(points, limits, q_now, names=names, zone_at=zone_at)
         except PlanTooFast:
-            # between two samples, or by more than what the bounds along the path take into account
+            # A limit is exceeded between two samples, or by an effect that the bounds along the path neglect.
             points = [_slower(point) for point in points]
             slowed /= _STRETCH
             continue
         return replace(plan, length_m=sum(leg.length_m for leg in legs), slowed=slowed)
-    raise PlanRefused("no time law was found that keeps the joints' limits: choose another way")
+    raise PlanRefused("no time law was found that keeps the joints' limits: choose another path")
 
 
 def _legs(
@@ -184,18 +189,18 @@ def _legs(
     samples = 0
     q, here = tuple(q_now), forward(model, q_now)
     for number, stop in enumerate(stops, 1):
-        what = "the move" if stop.by_joints else "the line" if stop.via is None else "the arc"
-        where = f"{what} to stop {number}" if len(stops) > 1 else what
+        kind = "the move" if stop.by_joints else "the line" if stop.via is None else "the arc"
+        where = f"{kind} to stop {number}" if len(stops) > 1 else kind
         goal = goal_of(model, stop, where)
         if stop.by_joints:
             leg = _by_joints(inverse, limits, q, stop, goal, where)
         else:
-            pose_at, extent, turn = (
+            pose_at, extent, angle = (
                 (straight(here, goal), _extent(here, goal), 0.0)
                 if stop.via is None
                 else _arc(here, stop.via, goal, stop.angle, where)
             )
-            leg = _of_tool(inverse, limits, cartesian, q, pose_at, extent, turn, stop, speed, where, zone_at)
+            leg = _of_tool(inverse, limits, cartesian, q, pose_at, extent, angle, stop, speed, where, zone_at)
         if leg is not None:
             legs.append(leg)
             q, here = leg.end, forward(model, leg.end)
@@ -231,15 +236,15 @@ def _by_joints(
     for name, at, low, high in zip(inverse.model.joint_names, end, limits.low, limits.high, strict=True):
         if not low <= at <= high:
             raise PlanRefused(f"{where}: {name} would be at {at:.4f} rad, allowed is {low:g} to {high:g} rad")
-    ways = [b - a for a, b in zip(q, end, strict=True)]
+    distances = [b - a for a, b in zip(q, end, strict=True)]
     duration = max(
-        abs(way) / min(OF_LIMIT * most, inf if stop.speed is None else stop.speed)
-        for way, most in zip(ways, limits.velocity, strict=True)
+        abs(distance) / min(OF_LIMIT * most, inf if stop.speed is None else stop.speed)
+        for distance, most in zip(distances, limits.velocity, strict=True)
     )
     if duration <= 1e-6:
         return None
     _check_duration(duration, where)
-    curve = PPoly(np.array([[[way / duration for way in ways]], [list(q)]]), [0.0, duration])
+    curve = PPoly(np.array([[[distance / duration for distance in distances]], [list(q)]]), [0.0, duration])
     length = dist(forward(inverse.model, q).position, forward(inverse.model, end).position)
     return _Leg(where, curve, duration, None, length, end, stop.blend, 0.5 * duration)
 
@@ -247,19 +252,19 @@ def _by_joints(
 def _arc(
     start: Pose, via: Sequence[float], end: Pose, angle: float | None, where: str
 ) -> tuple[PoseAt, tuple[float, float], float]:
-    """Return the poses of the arc from a pose through a point to a pose, how far the tool moves and turns, its angle.
+    """Return the poses of the arc from a pose through a point to a pose, the tool's motion and rotation, its angle.
 
-    With an angle it is travelled on the circle through the three places, and the tool keeps its orientation.
+    A given angle is travelled on the circle through the three places, with constant tool orientation.
     """
-    a, b, c = (np.array(one, dtype=np.float64) for one in (start.position, via, end.position))
+    a, b, c = (np.array(place, dtype=np.float64) for place in (start.position, via, end.position))
     u, w = b - a, c - a
     normal = np.cross(u, w)
-    sides = [float(np.linalg.norm(one)) for one in (u, w, c - b)]
+    sides = [float(np.linalg.norm(side)) for side in (u, w, c - b)]
     across = float(np.linalg.norm(normal))
     if not (min(sides) >= max(_NEAR_M, _NEAR_SHARE * max(sides)) and across > _FLAT * sides[0] * sides[1]):
         raise PlanRefused(
-            f"{where}: its start, its via and its end are on one line or not three places at least 1 mm apart: give a "
-            "via beside the line, and as the end of a circle a place far from its start"
+            f"{where}: its start, its via and its end are on one line or not three places at least 1 mm apart: choose "
+            "a via off the line and, for a circle, an end farther from its start"
         )
     # the centre of the circle through three points
     to_centre = (np.cross(normal, u) * float(w @ w) + np.cross(w, normal) * float(u @ u)) / (2.0 * across * across)
@@ -268,20 +273,20 @@ def _arc(
     second = np.cross(normal / across, first)
     if angle is None:
         out = c - centre
-        turn = atan2(float(out @ second), float(out @ first)) % tau
+        swept = atan2(float(out @ second), float(out @ first)) % tau
         axis, tool_turn = turn_between(quaternion(start.rotation), quaternion(end.rotation))
     else:
         if not 0.0 < abs(angle) <= _LONGEST_TURN:
             raise PlanRefused(f"{where}: found an angle of {angle:g} rad, allowed is up to {_LONGEST_TURN:g}, not 0")
-        turn, axis, tool_turn = angle, (0.0, 0.0, 1.0), 0.0
+        swept, axis, tool_turn = angle, (0.0, 0.0, 1.0), 0.0
     turned = rotation(quaternion(start.rotation))
 
     def pose_at(x: float) -> Pose:
-        place = centre + radius * (np.cos(x * turn) * first + np.sin(x * turn) * second)
+        place = centre + radius * (np.cos(x * swept) * first + np.sin(x * swept) * second)
         at: Vector = (float(place[0]), float(place[1]), float(place[2]))
         return Pose(at, turned_by(turned, axis, x * tool_turn) if tool_turn else turned)
 
-    return pose_at, (radius * abs(turn), tool_turn), abs(turn)
+    return pose_at, (radius * abs(swept), tool_turn), abs(swept)
 
 
 def _of_tool(
@@ -291,7 +296,7 @@ def _of_tool(
     q: tuple[float, ...],
     pose_at: PoseAt,
     extent: tuple[float, float],
-    turn: float,
+    swept: float,
     stop: Stop,
     speed: float | None,
     where: str,
@@ -303,12 +308,12 @@ def _of_tool(
         return None
     duration = max(length / fast, angle / cartesian.angular_speed)
     _check_duration(duration, where)
-    least = ceil(turn / _ARC_SAMPLE_RAD)
+    least = ceil(swept / _ARC_SAMPLE_RAD)
     if length / SAMPLE_M + angle / SAMPLE_RAD + least > _MOST_SAMPLES_OF_LEGS:
         raise PlanRefused(f"{where}: it is too long to be planned whole: run it in several parts")
     joints = follow(inverse, limits, cartesian, pose_at, extent, q, where, zone_at, least)
     curve = CubicSpline(np.linspace(0.0, duration, len(joints)), np.array(joints))
-    reach = 0.5 * duration * min(1.0, pi / turn if turn else 1.0)
+    reach = 0.5 * duration * min(1.0, pi / swept if swept else 1.0)
     return _Leg(where, curve, duration, fast, length, joints[-1], stop.blend, reach, len(joints))
 
 
@@ -318,7 +323,7 @@ def _check_duration(duration: float, where: str) -> None:
 
 
 def _sections(model: ArmModel, cartesian: CartesianConfig, legs: Sequence[_Leg]) -> list[list[_Piece]]:
-    """Return what lies between two rests: legs without what their blends replace, and the blends."""
+    """Return the pieces of each section, from one rest to the next: the legs, shortened by their blends, and blends."""
     sections: list[list[_Piece]] = [[]]
     begin = 0.0
     for leg, following in zip(legs, [*legs[1:], None], strict=True):
@@ -337,7 +342,7 @@ def _sections(model: ArmModel, cartesian: CartesianConfig, legs: Sequence[_Leg])
 def _blend(
     model: ArmModel, cartesian: CartesianConfig, leg: _Leg, following: _Leg, begin: float
 ) -> tuple[float, _Piece, float]:
-    """Return where a leg is left, the blend, and where the following leg is entered."""
+    """Return the end time on a leg, the blend, and the start time on the next leg."""
     corner = forward(model, leg.end).position
     radius = leg.blend
     of_tool = leg.speed is not None and following.speed is not None
@@ -351,7 +356,7 @@ def _blend(
             curve = BPoly.from_derivatives([0.0, duration], ends)
             joints = curve(np.linspace(0.0, duration, _BLEND_SAMPLES))
             places = [forward(model, q).position for q in joints.tolist()]
-            # As long as its way takes at the speeds of its ends: that bends least.
+            # Its length divided by the mean speed of its ends: with this duration the curve bends least.
             length = sum(map(dist, places[1:], places[:-1]))
             duration = min(max(length / speed if speed else inf, _SHORTEST * whole), whole)
         far = max(dist(places[0], corner), dist(places[-1], corner))
@@ -375,9 +380,9 @@ def _tool_speed(model: ArmModel, leg: _Leg, x: float) -> float:
 
 
 def _within(model: ArmModel, leg: _Leg, corner: Vector, radius: float, end: float) -> float:
-    """Return the nominal time at which the tool is `radius` from the corner at an `end` of a leg; at most half of it.
+    """Return the nominal time at which the tool is `radius` from the corner at an `end`; at most half of the leg.
 
-    Half of a joint move at which the tool does not move is all of it that a blend takes.
+    A blend takes half of a joint move in which the tool does not leave the radius.
     """
 
     def far(x: float) -> float:
@@ -406,28 +411,32 @@ class _Path:
 
     def at(self, x: Array, nu: int) -> Array:
         """Return the joints, (k, n), or a derivative of them, at nominal times, (k,), s."""
-        which = np.minimum(np.searchsorted(self._ends, x), len(self._pieces) - 1)
-        found: Array | None = None
-        for number in np.unique(which):
-            piece, here = self._pieces[number], which == number
+        pieces = np.minimum(np.searchsorted(self._ends, x), len(self._pieces) - 1)
+        result: Array | None = None
+        for number in np.unique(pieces):
+            piece, here = self._pieces[number], pieces == number
             local = np.clip(x[here] - (self._ends[number] - piece.duration_s), 0.0, piece.duration_s) + piece.start_s
             values = piece.curve(local, nu)
-            if found is None:
-                found = np.empty((len(x), values.shape[1]))
-            found[here] = values
-        assert found is not None
-        return found
+            if result is None:
+                result = np.empty((len(x), values.shape[1]))
+            result[here] = values
+        assert result is not None
+        return result
 
     def bounds(self, model: ArmModel, limits: Limits, cartesian: CartesianConfig) -> tuple[Bounds, float]:
-        """Return the bounds of the time law, and the part of the commanded speed that they leave to the tool."""
+        """Return the bounds of the time law, and the share of the commanded speed that they leave to the tool.
+
+        With x the nominal time, q(x) the joints and r = dx/dt the rate, the speed of a joint is q' r, its acceleration
+        q'' r^2 + q' dr/dt, and its jerk q''' r^3 + ... + q' d2r/dt2.
+        """
         grid = self._grid(limits, cartesian)
         pitch = float(grid[1])
         first, second, third = (np.abs(self.at(grid, nu)) for nu in (1, 2, 3))
-        places, turns = forward_batch(model, self.at(grid, 0))
+        places, rotations = forward_batch(model, self.at(grid, 0))
         velocity = np.gradient(places, pitch, axis=0)
         speed = np.linalg.norm(velocity, axis=1)
         bow = np.linalg.norm(np.gradient(velocity, pitch, axis=0), axis=1)
-        step = np.einsum("kji,kjl->kil", turns[:-1], turns[1:])
+        step = np.einsum("kji,kjl->kil", rotations[:-1], rotations[1:])
         spin = (
             0.5
             / pitch
@@ -437,21 +446,23 @@ class _Path:
         )
         spin = np.maximum(np.append(spin, 0.0), np.append(0.0, spin))
         wanted, of_tool = self._wanted(grid, speed, spin, cartesian)
-        fastest, strongest, jerkiest = (np.array(one) for one in (limits.velocity, limits.acceleration, limits.jerk))
+        fastest, strongest, jerkiest = (
+            np.array(limit) for limit in (limits.velocity, limits.acceleration, limits.jerk)
+        )
         with np.errstate(divide="ignore"):
             rate = np.minimum(wanted, (OF_LIMIT * fastest / first).min(axis=1))
             rate = np.minimum(rate, np.sqrt((0.5 * OF_LIMIT * strongest / second).min(axis=1)))
             rate = np.minimum(rate, np.cbrt(((1.0 - _OF_JERK) * jerkiest / third).min(axis=1)))
             rate = np.where(of_tool, np.minimum(rate, np.sqrt(cartesian.acceleration / bow)), rate)
-            left = np.maximum(OF_LIMIT * strongest - second * (rate * rate)[:, None], 0.0)
-            acceleration, jerk = (left / first).min(axis=1), (_OF_JERK * jerkiest / first).min(axis=1)
+            remaining = np.maximum(OF_LIMIT * strongest - second * (rate * rate)[:, None], 0.0)
+            acceleration, jerk = (remaining / first).min(axis=1), (_OF_JERK * jerkiest / first).min(axis=1)
             for bound, linear, angular in (
                 (acceleration, cartesian.acceleration, cartesian.angular_acceleration),
                 (jerk, cartesian.jerk, cartesian.angular_jerk),
             ):
                 of_both = np.minimum(linear / speed, angular / spin)
                 np.minimum(bound, np.where(of_tool, of_both, inf), out=bound)
-        # The longest window that a jerk is spread over.
+        # The time law spreads a change of acceleration over this window at most.
         acceleration = np.minimum(acceleration, jerk * LONGEST_WINDOW_S)
         part = float((rate / wanted)[of_tool].min(initial=1.0))
         return Bounds(
@@ -472,7 +483,7 @@ class _Path:
         return np.linspace(0.0, self.duration_s, count + 1)
 
     def _wanted(self, grid: Array, speed: Array, spin: Array, cartesian: CartesianConfig) -> tuple[Array, Array]:
-        """Return the rate at which the tool has the commanded speed, and where there is one."""
+        """Return the rate for the commanded tool speed, and where the tool moves."""
         wanted, of_tool = np.ones(len(grid)), np.zeros(len(grid), dtype=bool)
         for piece, end in zip(self._pieces, self._ends, strict=True):
             if piece.speeds is None:
@@ -487,7 +498,7 @@ class _Path:
         return wanted, of_tool
 
 
-def _rest(t: float, q: tuple[float, ...]) -> Point:
+def _standstill(t: float, q: tuple[float, ...]) -> Point:
     still = (0.0,) * len(q)
     return Point(t, q, still, still)
 
@@ -501,7 +512,7 @@ def _slower(point: Point) -> Point:
 
 
 def _rows(path: _Path, law: TimeLaw, begin_s: float) -> list[Point]:
-    """Return the points of a section behind its first, dense enough for quintics between them."""
+    """Return the points of a section after its first, dense enough for quintics between them."""
     times = np.linspace(0.0, law.duration_s, min(max(ceil(law.duration_s / _ROW_S), 2), _FIRST_ROWS) + 1)
 
     def at(when: Array) -> tuple[Array, Array, Array]:
@@ -529,5 +540,5 @@ def _rows(path: _Path, law: TimeLaw, begin_s: float) -> list[Point]:
         Point(begin_s + float(t), tuple(row_q), tuple(row_v), tuple(row_a))
         for t, row_q, row_v, row_a in zip(times[1:], q[1:].tolist(), v[1:].tolist(), a[1:].tolist(), strict=True)
     ]
-    points[-1] = _rest(points[-1].t, points[-1].q)
+    points[-1] = _standstill(points[-1].t, points[-1].q)
     return points

@@ -1,14 +1,14 @@
-"""Plans: rows of `COLUMNS` doubles, written outside the cycle (`rtcp.motion.planning`) and read in it, row by row.
+"""Plans: rows of `COLUMNS` doubles, written outside the cycle (`rtcp.motion.planning`) and read in it one by one.
 
 A waypoint of a trajectory (`WAYPOINT`), for up to `MOST_AXES` joints:
 
     column 0              t, s from the start of the motion; rising from waypoint to waypoint
-    POSITIONS and on      position of each joint, rad          (those beyond the joints are 0)
+    POSITIONS and on      position of each joint, rad          (unused columns are 0)
     VELOCITIES and on     velocity of each joint, rad/s
     ACCELERATIONS and on  acceleration of each joint, rad/s^2
     column KIND           the piece that ends here: `CUBIC` (its accelerations are ignored) or `QUINTIC`
 
-A straight piece of a path (`LINE`), from rest to rest, travelled by a fraction that goes from 0 to 1:
+A straight piece of a path (`LINE`), from rest to rest, parametrized by a fraction from 0 to 1:
 
     columns 0 .. 2    position of the tool at its start, m
     columns 3 .. 6    orientation there, unit quaternion w, x, y, z
@@ -32,40 +32,40 @@ from rtcp.ipc.layout import PLAN_COLUMNS
 
 COLUMNS = PLAN_COLUMNS
 MOST_LINES: Final = 256
-"""Straight pieces of a plan."""
+"""Upper bound on the straight pieces of a plan."""
 POSITIONS, VELOCITIES, ACCELERATIONS = 1, 1 + MOST_AXES, 1 + 2 * MOST_AXES
 KIND = COLUMNS - 1
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
 LONGEST_S: Final = 86_400.0
-"""Longest duration of a plan."""
+"""Upper bound on the duration of a plan."""
 _UNIT: Final = 1e-6
 _FASTEST: Final = 1e9
 _LONGEST_M: Final = 1e3
 
 
 ZoneAt = Callable[[Sequence[float]], "str | None"]
-"""Answers for joint angles, rad, which box the arm would be in, in words ("the keep-out box user"), or None."""
+"""Returns the box that the arm would be in at joint angles, rad, in words ("the keep-out box user"), or None."""
 
 
 class PlanRefused(ValueError):
-    """The plan cannot be carried out; the message is a sentence with the place, what was found and what is allowed."""
+    """The plan cannot be executed; the message is a sentence with the place, the value and its limit."""
 
 
 class AlreadyThere(PlanRefused):
-    """The arm is where the motion leads."""
+    """The arm is already at the end of the motion."""
 
 
 class PlanTooFast(PlanRefused):
-    """A joint would exceed its limit of velocity, acceleration or jerk: the same plan in more time may pass."""
+    """A joint would exceed its limit of velocity, acceleration or jerk; a slower plan may be accepted."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What the loop is given.
+    """A checked plan, ready for the loop.
 
     rows: of `COLUMNS` doubles each, `len(rows)` is the count of the command. duration_s: from the start to rest.
-    length_m: of the lines, 0 for a trajectory. slowed: 1 where the lines keep the speed asked for, less where a joint's
-    limits made them slower. end: the joints' position at the end, rad. tool: number of the tool for which it was made.
+    length_m: of the lines, 0 for a trajectory. slowed: ratio of the lines' speed to the commanded speed; below 1 the
+    joint limits made them slower. end: joint positions at the end, rad. tool: number of the tool it was made for.
     """
 
     rows: tuple[tuple[float, ...], ...]
@@ -83,8 +83,8 @@ def read_row(rows: memoryview[float], index: int) -> list[float]:
 
 
 def first_not_finite(row: list[float]) -> int:
-    """Return the first column that is no finite number, or -1."""
-    # A sum is finite where all numbers are that a plan can hold.
+    """Return the first column that is not finite, or -1."""
+    # The sum of valid numbers of a plan is finite.
     if isfinite(sum(row)):
         return -1
     for column, number in enumerate(row):
@@ -94,7 +94,7 @@ def first_not_finite(row: list[float]) -> int:
 
 
 def damaged_line(row: list[float]) -> float | None:
-    """Return the number in a straight piece that cannot be, or None."""
+    """Return the invalid number of a damaged straight piece, or None."""
     column = first_not_finite(row)
     if column >= 0:
         return row[min(column, KIND)]

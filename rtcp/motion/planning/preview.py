@@ -1,4 +1,4 @@
-"""The joints along a motion before it begins: what a person is shown, and where on its way it would meet a box."""
+"""The joints along a motion before it begins: for the display, and for checks against the boxes."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from rtcp.motion.planning.plan import ACCELERATIONS, CUBIC, KIND, LINE, POSITION
 from rtcp.motion.state import ArmState
 
 SAMPLES: Final = 60
-"""Configurations of a preview at least, where the motion has an extent."""
+"""Least number of configurations in the preview of a motion."""
 
 JointPath = list[tuple[float, ...]]
-"""Joint positions along the way, rad, begin and end included."""
+"""Joint positions along the motion, rad, including start and end."""
 
 
 def joint_move(
     limits: Limits, q_now: Sequence[float], q: Sequence[float], speed: float, synchronized: bool
 ) -> tuple[JointPath, float] | None:
-    """Return the way of a joint move from rest and its duration, s; None: no plan is found."""
+    """Return the path of a joint move from rest and its duration, s; None: no plan is found."""
     motion, state = JointMotion(1e-3, limits.velocity, limits.acceleration, limits.jerk), ArmState(len(q_now))
     state.commanded = list(q_now)
     if not motion.move_to(state, q, speed, synchronized=synchronized):
@@ -36,7 +36,7 @@ def joint_move(
 
 
 def planned(plan: Plan, q_now: Sequence[float], model: ArmModel | None) -> JointPath:
-    """Return the way of a plan, evenly in the time of a trajectory and in the length of a path."""
+    """Return the path of a plan, in even steps of a trajectory's time or of a line's length."""
     if not plan.rows:
         return [tuple(q_now), plan.end]
     if plan.rows[0][KIND] == LINE:
@@ -48,11 +48,11 @@ def planned(plan: Plan, q_now: Sequence[float], model: ArmModel | None) -> Joint
 def _lines(plan: Plan, q_now: Sequence[float], model: ArmModel) -> JointPath:
     inverse, q = InverseKinematics(model), tuple(q_now)
     path = [q]
-    each = max(2, SAMPLES // len(plan.rows))
+    samples = max(2, SAMPLES // len(plan.rows))
     for row in plan.rows:
         start, (axis, angle) = rotation(row[3:7]), turn_between(row[3:7], row[10:14])
-        for k in range(1, each + 1):
-            s = k / each
+        for k in range(1, samples + 1):
+            s = k / samples
             position = tuple(a + s * (b - a) for a, b in zip(row[0:3], row[7:10], strict=True))
             pose = Pose((position[0], position[1], position[2]), turned_by(start, axis, s * angle))
             q = inverse.solve_near(pose, q).q or q
@@ -67,7 +67,7 @@ def _trajectory(plan: Plan, q_now: Sequence[float]) -> JointPath:
     for k in range(1, SAMPLES + 1):
         t = plan.duration_s * k / SAMPLES
         if t <= times[0] or not pieces:
-            continue  # on the way to the first waypoint, which the joints choose
+            continue  # before the first waypoint: the approach is planned in the loop
         before, after = pieces[min(bisect_left(times, t), len(pieces)) - 1]
         length = after[0] - before[0]
         row = []

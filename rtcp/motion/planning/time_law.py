@@ -1,10 +1,10 @@
-"""The time law of a path: how fast its parameter may pass, everywhere, from rest to rest.
+"""The time law of a path: the fastest rate of its parameter, from rest to rest.
 
-The parameter x of a path is its nominal time, s: at the rate dx/dt = 1 it is passed as commanded. Bounds of the rate
-and of its derivatives are given on an even grid. A forward and a backward pass over the squared rate give the fastest
+The parameter x of a path is its nominal time, s: the rate dx/dt = 1 is the commanded speed. Bounds of the rate and of
+its derivatives are given on an even grid. A forward and a backward pass over the squared rate give the fastest
 law with bounded acceleration (as in Bobrow, Dubowsky, Gibson, IJRR 4, 1985, with the joints' coupling bounded
-beforehand); its mean over a window of time bounds the jerk. toppra does the first half by more exact limits; it has no
-jerk, and no wheels for aarch64.
+beforehand); its mean over a window of time bounds the jerk. toppra does the first half with more exact limits, but has
+no jerk limit and no wheels for aarch64.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class TimeLaw:
 
     def __init__(self, bounds: Bounds) -> None:
         window = float(np.clip((bounds.acceleration / bounds.jerk).max(), _LEAST_WINDOW_S, LONGEST_WINDOW_S))
-        # The mean over the window at one place has the rates of all places that are passed within half of it: the
-        # bounds of those hold there too. The law without them is faster, so it passes no fewer places.
+        # The mean over the window mixes the rates of all places passed within half of it: each place keeps the bounds
+        # of all of them. The law without this condition is faster, so it passes no fewer places.
         near = _times(_passes(bounds.rate, bounds.acceleration, bounds.pitch), bounds.pitch)
-        rate, acceleration = (_least_near(one, near, 0.5 * window) for one in (bounds.rate, bounds.acceleration))
+        rate, acceleration = (_least_near(bound, near, 0.5 * window) for bound in (bounds.rate, bounds.acceleration))
         rates = _passes(rate, acceleration, bounds.pitch)
         times = _times(rates, bounds.pitch)
         slopes = np.diff(rates) / np.diff(times)
@@ -58,7 +58,7 @@ class TimeLaw:
         self._length = float(self._place(self._end))
         self._scale = bounds.pitch * (len(rates) - 1) / self._length
         self.duration_s = self._end + window
-        """From rest to rest, s."""
+        """Duration from rest to rest, s."""
 
     def at(self, times: Array) -> tuple[Array, Array, Array]:
         """Return parameter, rate and derivative of the rate at times, (k,), s."""
@@ -81,13 +81,13 @@ class TimeLaw:
 
 
 def _times(rates: Array, pitch: float) -> Array:
-    """Return when each point of the grid is passed, s."""
+    """Return the time at each point of the grid, s."""
     return np.append(0.0, np.cumsum(2.0 * pitch / (rates[1:] + rates[:-1])))
 
 
 def _least_near(values: Array, times: Array, within_s: float) -> Array:
-    """Return the least value among the points that are passed within a time of each."""
-    found, least = [0.0] * len(values), deque[int]()
+    """Return for each point the least value among the points passed within `within_s` of it."""
+    result, least = [0.0] * len(values), deque[int]()
     numbers, first, last = values.tolist(), np.searchsorted(times, times - within_s), 0
     after = np.searchsorted(times, times + within_s, side="right")
     for k, (low, high) in enumerate(zip(first.tolist(), after.tolist(), strict=True)):
@@ -98,8 +98,8 @@ def _least_near(values: Array, times: Array, within_s: float) -> Array:
             last += 1
         while least[0] < low:
             least.popleft()
-        found[k] = numbers[least[0]]
-    return np.array(found)
+        result[k] = numbers[least[0]]
+    return np.array(result)
 
 
 def _passes(rate: Array, acceleration: Array, pitch: float) -> Array:

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
 SHORTEST_S: Final = 1e-3
-"""Between two points there is at least so much time."""
+"""Least time between two points."""
 ZONE_STEP_RAD: Final = 0.01
-"""Zones are looked at whenever a joint has moved so far."""
+"""Largest joint motion between two checks of the zones."""
 _ROUNDING: Final = 1e-9
 _STILL: Final = 1e-9
 _AT_ONCE_S: Final = 1e-12
@@ -44,22 +44,22 @@ def plan_trajectory(
 ) -> Plan:
     """Return the plan of a trajectory for `TrajectoryController`.
 
-    Points with positions only are joined by quintics that have the velocities and accelerations of the cubic spline
-    through them; points with velocities too by cubics; with accelerations too by quintics. All points are of one kind.
-    It begins at rest at `q_now` (time 0: there, within `AT_START_RAD`; later: it is led there) and ends at rest.
+    Points with only positions are joined by quintics with the velocities and accelerations of the cubic spline through
+    them; points with velocities by cubics; with accelerations by quintics. All points are of one kind. The plan starts
+    at rest at `q_now` (a first point at time 0 must be there within `AT_START_RAD`; an approach leads to a later one)
+    and ends at rest.
 
     Args:
         points: at least one, at most `MOST_POINTS`, times rising by `SHORTEST_S` at least.
-        limits: position, velocity and acceleration of every joint, kept over the whole of each piece: the extremes of
-            its polynomials are looked at, no samples.
-        q_now: where the arm is commanded, rad, shape (n,).
-        names: of the joints, for the sentences.
-        zone_at: looked at every `ZONE_STEP_RAD` of any joint's way.
-        moving: it replaces a motion, which has passed `q_now` when it begins: a first point at time 0 with others
-            behind it is left out, and only the loop knows the way to the next.
+        limits: position, velocity and acceleration of every joint, checked at the extremes of each polynomial.
+        q_now: commanded position, rad, shape (n,).
+        names: of the joints, for messages.
+        zone_at: called every `ZONE_STEP_RAD` of joint motion.
+        moving: the plan replaces a motion, which will have passed `q_now`: a first point at time 0 followed by others
+            is dropped, and the loop plans the approach to the next.
 
     Raises:
-        PlanRefused: with the point, the joint, what was found and what is allowed.
+        PlanRefused: with the point, the joint, the value and its limit.
     """
     joints = len(q_now)
     names = list(names) or [f"joint{i + 1}" for i in range(joints)]
@@ -92,21 +92,21 @@ def _check_points(points: Sequence[Point], names: Sequence[str], first: int = 1)
                 f"point {number}: its time is {point.t:g} s after {points[at - 1].t:g} s, "
                 f"times must rise by at least {SHORTEST_S:g} s"
             )
-        for what, unit, given in (
+        for quantity, unit, numbers in (
             ("position", "rad", point.q),
             ("velocity", "rad/s", point.v),
             ("acceleration", "rad/s^2", point.a),
         ):
-            if given is None:
+            if numbers is None:
                 continue
-            if len(given) != len(names):
+            if len(numbers) != len(names):
                 raise PlanRefused(
-                    f"point {number}: it has {len(given)} numbers for the {what}, {len(names)} are needed"
+                    f"point {number}: it has {len(numbers)} numbers for the {quantity}, {len(names)} are needed"
                 )
-            for name, number_given in zip(names, given, strict=True):
+            for name, number_given in zip(names, numbers, strict=True):
                 if not isfinite(number_given):
                     raise PlanRefused(
-                        f"point {number}: the {what} of {name} is {number_given} {unit}, a number is needed"
+                        f"point {number}: the {quantity} of {name} is {number_given} {unit}, a number is needed"
                     )
         if (point.v is None) != (points[0].v is None) or (point.a is None) != (points[0].a is None):
             raise PlanRefused(f"point {number}: velocities and accelerations must be given for all points or for none")
@@ -115,7 +115,7 @@ def _check_points(points: Sequence[Point], names: Sequence[str], first: int = 1)
 
 
 class _Knot:
-    """A point with all its numbers, and the kind of the piece that leads to it."""
+    """A point with all its numbers, and the kind of the piece before it."""
 
     __slots__ = ("a", "kind", "q", "t", "v")
 
@@ -129,7 +129,7 @@ def _waypoints(points: Sequence[Point], q_now: Sequence[float]) -> list[_Knot]:
     if points[0].v is not None:
         kind = CUBIC if points[0].a is None else QUINTIC
         return [_Knot(p.t, p.q, p.v or zero, p.a or zero, kind) for p in points]
-    # Led to its first point the arm does not stand still there: the spline begins where the arm is.
+    # An approach does not rest at the first point: the spline starts at the arm's position.
     led = points[0].t > _AT_ONCE_S
     times = [0.0] * led + [p.t for p in points]
     columns = []
@@ -171,10 +171,10 @@ def _check_waypoint(waypoint: _Knot, where: str, limits: Limits, names: Sequence
 def _check_approach(
     first: _Knot, limits: Limits, q_now: Sequence[float], names: Sequence[str], zone_at: ZoneAt | None
 ) -> None:
-    """The way to the first point, as `TrajectoryController.start` makes it from rest."""
-    approach, rest = Approach(limits), [0.0] * len(q_now)
+    """Check the approach to the first point that `TrajectoryController` will plan from rest."""
+    approach, still = Approach(limits), [0.0] * len(q_now)
     _check_derivatives(first, "point 1", limits, names)
-    refused = approach.plan(q_now, rest, rest, _row(first))
+    refused = approach.plan(q_now, still, still, _row(first))
     if refused is not None and refused.axis >= 0:
         raise PlanRefused(
             f"point 1: on the way there {names[refused.axis]} would be at {refused.extreme:.6g} rad, allowed is "
@@ -193,17 +193,17 @@ def _check_approach(
 
 
 def _check_derivatives(waypoint: _Knot, where: str, limits: Limits, names: Sequence[str]) -> None:
-    for what, unit, found, allowed in (
+    for verb, unit, values, allowed in (
         ("moves at", "rad/s", waypoint.v, limits.velocity),
         ("accelerates with", "rad/s^2", waypoint.a, limits.acceleration),
     ):
-        for name, number, most in zip(names, found, allowed, strict=True):
+        for name, number, most in zip(names, values, allowed, strict=True):
             if abs(number) > most * (1.0 + _ROUNDING):
-                raise PlanTooFast(f"{where}: {name} {what} {number:.4g} {unit}, allowed is at most {most:g} {unit}")
+                raise PlanTooFast(f"{where}: {name} {verb} {number:.4g} {unit}, allowed is at most {most:g} {unit}")
 
 
 def _steps(duration: float, limits: Limits) -> int:
-    """Into how many parts a piece is divided, so that no joint moves by more than `ZONE_STEP_RAD` in one."""
+    """Return the number of parts of a piece in which no joint moves by more than `ZONE_STEP_RAD`."""
     fastest: float = max(limits.velocity)
     return max(2, ceil(fastest * duration / ZONE_STEP_RAD))
 
@@ -223,21 +223,21 @@ def _check_piece(
     for i, (name, position) in enumerate(zip(names, pieces, strict=True)):
         velocity = derivative(position)
         low, high = limits.low[i] - _ROUNDING, limits.high[i] + _ROUNDING
-        if (found := beyond(position, low, high)) is not None:
-            at = before.t + found[1] * length
+        if (extreme := beyond(position, low, high)) is not None:
+            at = before.t + extreme[1] * length
             raise PlanRefused(
-                f"{where}: {name} would be at {found[0]:.6g} rad at {at:.3f} s, allowed is "
+                f"{where}: {name} would be at {extreme[0]:.6g} rad at {at:.3f} s, allowed is "
                 f"{limits.low[i]:g} to {limits.high[i]:g} rad"
             )
-        for what, unit, curve, most, scale in (
+        for verb, unit, curve, most, scale in (
             ("move at", "rad/s", velocity, limits.velocity[i], length),
             ("accelerate with", "rad/s^2", derivative(velocity), limits.acceleration[i], length * length),
         ):
             bound = most * scale * (1.0 + _ROUNDING)
-            if (found := beyond(curve, -bound, bound)) is not None:
-                at = before.t + found[1] * length
+            if (extreme := beyond(curve, -bound, bound)) is not None:
+                at = before.t + extreme[1] * length
                 raise PlanTooFast(
-                    f"{where}: {name} would {what} {found[0] / scale:.4g} {unit} at {at:.3f} s, "
+                    f"{where}: {name} would {verb} {extreme[0] / scale:.4g} {unit} at {at:.3f} s, "
                     f"allowed is at most {most:g} {unit}"
                 )
     if zone_at is not None:
@@ -253,19 +253,19 @@ def _check_zone(q: Sequence[float], at_s: float, where: str, zone_at: ZoneAt) ->
 
 
 def _row(waypoint: _Knot) -> tuple[float, ...]:
-    rest = (0.0,) * (MOST_AXES - len(waypoint.q))
-    return (waypoint.t, *waypoint.q, *rest, *waypoint.v, *rest, *waypoint.a, *rest, waypoint.kind)
+    padding = (0.0,) * (MOST_AXES - len(waypoint.q))
+    return (waypoint.t, *waypoint.q, *padding, *waypoint.v, *padding, *waypoint.a, *padding, waypoint.kind)
 
 
 class OpenPlan:
-    """A trajectory that is open at its end: rows as points come, checked as those of `plan_trajectory`.
+    """A trajectory with an open end: returns rows for each new point, checked as in `plan_trajectory`.
 
-    Points with positions only get velocities by the slopes before and behind them, of one sign or 0: so the last one
-    waits for the next. Whatever raises changes nothing.
+    The velocity of a point with only a position follows from the slopes before and after it (0 if they differ in sign),
+    so the last point waits for the next one. An exception changes nothing.
 
     Args:
         limits, names, zone_at: as of `plan_trajectory`.
-        q_now: where the arm is commanded, rad.
+        q_now: commanded position, rad.
         moving: as of `plan_trajectory`.
     """
 
@@ -281,13 +281,13 @@ class OpenPlan:
         self._limits, self._q_now, self._names, self._zone_at, self._moving = limits, q_now, names, zone_at, moving
         self._last: _Knot | None = None
         self._waiting: Point | None = None
-        self._given: Point | None = None
+        self._last_point: Point | None = None
         self.times: list[float] = []
-        """Of all rows, s."""
+        """Times of all rows, s."""
 
     @property
     def end(self) -> tuple[float, ...]:
-        """Where the rows end, rad."""
+        """Joint positions at the last row, rad."""
         return tuple(self._q_now) if self._last is None else self._last.q
 
     @property
@@ -296,15 +296,15 @@ class OpenPlan:
         return self._waiting is not None
 
     def append(self, points: Sequence[Point], rest: bool = False) -> list[tuple[float, ...]]:
-        """Return the next rows; with `rest` those of all points, so that the arm is at rest at the last.
+        """Return the next rows; with `rest` the rows of all points, ending at rest at the last.
 
         Raises:
-            PlanRefused: with the point, the joint, what was found and what is allowed.
+            PlanRefused: with the point, the joint, the value and its limit.
         """
         number = len(self.times) + self.waits + 1
         if self._last is None and self._moving and len(points) > 1 and points[0].t <= _AT_ONCE_S:
             points = points[1:]
-        known = [] if self._given is None else [self._given]
+        known = [] if self._last_point is None else [self._last_point]
         if [*known, *points]:
             _check_points([*known, *points], self._names, number - len(known))
         todo = [*([] if self._waiting is None else [self._waiting]), *points]
@@ -332,19 +332,19 @@ class OpenPlan:
                 if abs(speed) > _STILL:
                     raise PlanRefused(f"the last point must be at rest, {name} has {speed:g} rad/s")
         self._last, self._waiting = last, waiting
-        self._given = todo[-1] if todo else self._given
+        self._last_point = todo[-1] if todo else self._last_point
         self.times += [row[0] for row in rows]
         return rows
 
     def _check_way(self, before: _Knot | None, after: _Knot, where: str) -> None:
-        """Refuse a point that no velocity there makes possible: at once, and not with the point behind it."""
+        """Refuse at once a point that no velocity makes reachable, without waiting for the next point."""
         if before is None:
             return
         h = after.t - before.t
         for name, here, there, most in zip(self._names, before.q, after.q, self._limits.velocity, strict=True):
             if abs(there - here) > most * h * (1.0 + _ROUNDING):
-                found = f"{name} would move at {(there - here) / h:.4g} rad/s on the mean"
-                raise PlanTooFast(f"before {where}: {found}, allowed is at most {most:g} rad/s")
+                speed = f"{name} would move at {(there - here) / h:.4g} rad/s on the mean"
+                raise PlanTooFast(f"before {where}: {speed}, allowed is at most {most:g} rad/s")
 
     def _knot(self, before: _Knot | None, point: Point, ahead: Point | None) -> _Knot:
         zero = (0.0,) * len(point.q)
@@ -358,8 +358,8 @@ class OpenPlan:
         velocities = []
         for was, here, then in zip(from_q, point.q, ahead.q, strict=True):
             slope, next_slope = (here - was) / h, (then - here) / k
-            # Fritsch and Butland 1984: between points the cubic passes neither of them.
+            # Fritsch and Butland 1984: no overshoot between points.
             weights = (2 * k + h, k + 2 * h)
-            same = slope * next_slope > 0.0
-            velocities.append(sum(weights) / (weights[0] / slope + weights[1] / next_slope) if same else 0.0)
+            same_sign = slope * next_slope > 0.0
+            velocities.append(sum(weights) / (weights[0] / slope + weights[1] / next_slope) if same_sign else 0.0)
         return _Knot(point.t, point.q, velocities, zero, CUBIC)

@@ -1,4 +1,4 @@
-"""Alarms: what a person has to know of, with what to do, until it is acknowledged; all events; recorded faults."""
+"""Alarms: events that need a person, with the remedy, until they are acknowledged; all events; recorded faults."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TO_DO = {
     "limit": "Reset, then move away from the limit",
     "warning": "Nothing has to be reset: look at the cause",
 }
-"""Severity of an event -> what a person does about it."""
+"""Severity of an event -> the person's task."""
 _MOST = 50
 
 
@@ -30,10 +30,10 @@ def build(view: View) -> None:
 
 
 def _alarms(view: View) -> None:
-    said = text("p", "", role="status")
-    everything = button("Acknowledge all", lambda: acknowledge(list(shown)))
+    notice = text("p", "", role="status")
+    everything = button("Acknowledge all", lambda: acknowledge(list(listed)))
     place = ui.element("div").classes("page")
-    shown: list[EventRecord] = []
+    listed: list[EventRecord] = []
     drawn: list[object] = []
 
     def acknowledge(alarms: list[EventRecord]) -> None:
@@ -43,27 +43,27 @@ def _alarms(view: View) -> None:
 
     def refresh() -> None:
         alarms = view.live.alarms
-        state = [(one, view.live.acknowledged_by(one)) for one in alarms]
+        state = [(alarm, view.live.acknowledged_by(alarm)) for alarm in alarms]
         if state == drawn and place.default_slot.children:
             return
-        drawn[:], shown[:] = state, alarms
+        drawn[:], listed[:] = state, alarms
         waiting = sum(not by for _, by in state)
-        said.text = f"{waiting} not acknowledged" if alarms else "Nothing has happened that needs a person."
+        notice.text = f"{waiting} not acknowledged" if alarms else "Nothing has happened that needs a person."
         everything.set_visibility(waiting > 1)
         place.clear()
         if not alarms:
             return
         with place:
             body = table(("Time", "Kind", "What happened", "What to do", "Acknowledged"), "Alarms", "stack")
-        for one, by in reversed(state[-_MOST:]):
-            kind, message = one.severity.replace("_", " "), one.message.replace("`", "")
-            with row(body, _time(one), kind, message, _TO_DO[one.severity]) as made, ui.element("td"):
-                made.props["data-severity"] = one.severity
+        for alarm, by in reversed(state[-_MOST:]):
+            kind, message = alarm.severity.replace("_", " "), alarm.message.replace("`", "")
+            with row(body, _time(alarm), kind, message, _TO_DO[alarm.severity]) as line, ui.element("td"):
+                line.props["data-severity"] = alarm.severity
                 if by:
                     text("span", f"by {by}")
                 else:
-                    made.classes("waits")
-                    button("Acknowledge", partial(acknowledge, [one]), plain=True)
+                    line.classes("waits")
+                    button("Acknowledge", partial(acknowledge, [alarm]), plain=True)
 
     refresh()
     ui.timer(0.5, refresh)
@@ -86,8 +86,8 @@ def _events(view: View) -> None:
         place.clear()
         with place:
             body = table(("#", "Time", "Event", "Message"), "Events", "stack")
-        for one in reversed(events):
-            row(body, str(one.number), _time(one), one.name.replace("_", " "), one.message.replace("`", ""))
+        for event in reversed(events):
+            row(body, str(event.number), _time(event), event.name.replace("_", " "), event.message.replace("`", ""))
 
     refresh()
     ui.timer(1.0, refresh)
@@ -104,16 +104,16 @@ def _faults(view: View) -> None:
         if code:
             view.warn(out)
             return
-        found = json.loads(out)["faults"]
+        faults = json.loads(out)["faults"]
         with place:
-            if not found:
+            if not faults:
                 text("p", "None has been recorded.")
                 return
             body = table(("#", "Time", "What", ""), "Recorded faults")
-        for one in reversed(found[-20:]):
-            what = str(one.get("what") or one.get("error"))
-            with row(body, str(one["number"]), str(one.get("time", "-"))[:19], what), ui.element("td"):
-                button(f"Picture of fault {one['number']}", partial(draw, one["number"]), plain=True)
+        for fault in reversed(faults[-20:]):
+            event = str(fault.get("what") or fault.get("error"))
+            with row(body, str(fault["number"]), str(fault.get("time", "-"))[:19], event), ui.element("td"):
+                button(f"Picture of fault {fault['number']}", partial(draw, fault["number"]), plain=True)
 
     async def draw(number: int) -> None:
         code, out = await view.rtcp("faults", "show", str(number), "--json")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 from rtcp.config.model import ArmConfig
-from rtcp.panel.page import View, no_platform, shown, table, text, tool_pose
+from rtcp.panel.page import View, live_value, no_platform, table, text, tool_pose
 
 
 def build(view: View) -> None:
@@ -17,13 +17,13 @@ def build(view: View) -> None:
         return
     with ui.element("p"):
         text("span", "Mode ")
-        shown("control_mode", tag="b")
+        live_value("control_mode", tag="b")
         text("span", ", drives in ")
-        shown("drive_mode", tag="b")
+        live_value("drive_mode", tag="b")
         text("span", ", bus ")
-        shown("bus", tag="b")
+        live_value("bus", tag="b")
         text("span", ", tool ")
-        shown("tool_name", tag="b")
+        live_value("tool_name", tag="b")
     _joints(config)
     if config.arm is None:
         return
@@ -34,7 +34,7 @@ def build(view: View) -> None:
     with table(("", *distances), "Distances from the singularities", "numbers"), ui.element("tr"):
         text("th", "distance", scope="row")
         for at, (_, unit) in enumerate(distances):
-            shown(f"singular.{at}", 3, unit=unit)
+            live_value(f"singular.{at}", 3, unit=unit)
 
 
 def _joints(config: ArmConfig) -> None:
@@ -54,15 +54,15 @@ def _joints(config: ArmConfig) -> None:
         for at, joint in enumerate(config.joints):
             with ui.element("tr"):
                 text("th", joint.name, scope="row")
-                shown(f"drive.{at}").classes("text")
-                shown(f"actual_position.{at}", 4, unit="rad")
+                live_value(f"drive.{at}").classes("text")
+                live_value(f"actual_position.{at}", 4, unit="rad")
                 _bar(f"actual_position.{at}", "min max", "rad")
-                shown(f"actual_velocity.{at}", 3, unit="rad/s")
+                live_value(f"actual_velocity.{at}", 3, unit="rad/s")
                 _bar(f"actual_velocity.{at}", "velocity", "rad/s")
-                shown(f"actual_torque.{at}", 2)
+                live_value(f"actual_torque.{at}", 2)
                 _bar(f"actual_torque.{at}", "torque", "Nm")
-                shown(f"error.{at}", 5, unit="rad")
-                shown(f"temperature.{at}", 1)
+                live_value(f"error.{at}", 5, unit="rad")
+                live_value(f"temperature.{at}", 1)
 
 
 def _bar(name: str, limits: str, unit: str) -> None:

@@ -9,7 +9,7 @@ from nicegui import ui
 from rtcp.api import RtcpError
 from rtcp.config.cell import CellConfig, Member
 from rtcp.config.numbers import angle, plain_number
-from rtcp.panel.page import Field, View, button, field, number, shown, table, text
+from rtcp.panel.page import Field, View, button, field, live_value, number, table, text
 from rtcp.panel.partners import arm_state
 
 
@@ -31,20 +31,20 @@ def build(view: View) -> None:
         button("Reset all", lambda: view.act_in_cell(lambda arms: arms.reset(), "Reset"), plain=True)
         button("Halt all", view.halt, plain=True)
     InStep(view, cell)
-    others = ", ".join(f"rtcp --name {one.name} panel --port 8081" for one in cell.arms if one is not own)
-    text("p", f"This panel operates {own.name}, and STOP stops all. A panel of another arm: {others}")
+    commands = ", ".join(f"rtcp --name {arm.name} panel --port 8081" for arm in cell.arms if arm is not own)
+    text("p", f"This panel operates {own.name}, and STOP stops all. A panel of another arm: {commands}")
 
 
 def _arms(cell: CellConfig, own: Member) -> None:
     with table(("Arm", "State", "In step", "Commanded by", "What happened last"), "Arms"):
-        for one in cell.arms:
-            where = "" if one is own else f"partners.{one.name}."
-            with ui.element("tr").props(f"data-arm={one.name}"):
-                text("th", one.name, scope="row")
+        for arm in cell.arms:
+            where = "" if arm is own else f"partners.{arm.name}."
+            with ui.element("tr").props(f"data-arm={arm.name}"):
+                text("th", arm.name, scope="row")
                 with ui.element("td"):
-                    shown(f"{where}state", tag="span")
+                    live_value(f"{where}state", tag="span")
                 for key in ("step", "holder", "message"):
-                    shown(f"{where}{key}")
+                    live_value(f"{where}{key}")
 
 
 class InStep:
@@ -54,37 +54,37 @@ class InStep:
         self._view = view
         text("h2", "Motion in step")
         with ui.element("div").classes("page"):
-            self._joints = {one.name: field(f"Joints of {one.name}, rad (empty: it stays)") for one in cell.arms}
+            self._joints = {arm.name: field(f"Joints of {arm.name}, rad (empty: it stays)") for arm in cell.arms}
         with ui.element("div").classes("fields"):
             self._speed = number("Speed (empty: the limit)", unit="rad/s", min="0")
         with ui.element("div").classes("buttons"):
             button("Here", self._here, plain=True)
             button("Move in step", self._move)
-        self._said = text("p", "", role="status", **{"aria-live": "polite"})
+        self._notice = text("p", "", role="status", **{"aria-live": "polite"})
 
     def _here(self) -> None:
         live = self._view.live
         states = {name: arm_state(live.feed) for name in self._joints} | live.partners.state()
-        for name, one in self._joints.items():
-            one.value = ", ".join(f"{q:.4g}" for q in states[name].get("q", ()))
+        for name, control in self._joints.items():
+            control.value = ", ".join(f"{q:.4g}" for q in states[name].get("q", ()))
 
     async def _move(self) -> None:
         try:
-            targets = {name: _numbers(name, one) for name, one in self._joints.items() if one.value.strip()}
+            targets = {name: _numbers(name, control) for name, control in self._joints.items() if control.value.strip()}
             speed = self._speed.number() if self._speed.value.strip() else None
         except RtcpError as error:
             self._view.warn(error.message)
             return
-        self._said.text = "Moving"
+        self._notice.text = "Moving"
         arrived = await self._view.act_in_cell(lambda arms: arms.move_joints(targets, speed))
-        errors = (f"{name} {one.error:.5f} rad" for name, one in (arrived or {}).items())
-        self._said.text = "" if arrived is None else f"There; largest errors of a joint: {', '.join(errors)}"
+        errors = (f"{name} {end.error:.5f} rad" for name, end in (arrived or {}).items())
+        self._notice.text = "" if arrived is None else f"There; largest errors of a joint: {', '.join(errors)}"
 
 
-def _numbers(name: str, given: Field) -> Sequence[float]:
+def _numbers(name: str, control: Field) -> Sequence[float]:
     """Return the joint positions of a field; raises Invalid."""
     try:
-        return [plain_number(angle(one.strip())) for one in given.value.split(",")]
+        return [plain_number(angle(value.strip())) for value in control.value.split(",")]
     except ValueError:
         allowed = "allowed are joint positions, rad, with commas between"
-        raise RtcpError("invalid", f'joints of {name}: found "{given.value}", {allowed}') from None
+        raise RtcpError("invalid", f'joints of {name}: found "{control.value}", {allowed}') from None

@@ -41,7 +41,7 @@ def build(view: View) -> None:
         body.clear()
         for name, key in (("wake-up", "wakeup_us"), ("exchange", "exchange_us"), ("compute", "compute_us")):
             figures = status.raw[key]
-            row(body, name, *(f"{figures[one]:.1f}" for one in ("p50", "p99", "p999", "max")))
+            row(body, name, *(f"{figures[quantile]:.1f}" for quantile in ("p50", "p99", "p999", "max")))
         why = status.raw["skipped_ticks"]
         skipped.text = f"{status.raw['missed']} of {status.raw['cycles']} cycles skipped" + (
             f": {why['message']}; {why['remedy']}".replace("`", "") if why else ""
@@ -56,14 +56,14 @@ def build(view: View) -> None:
         except RtcpError:
             close()
             return
-        for key, (path, told) in charts.items():
+        for key, (path, caption) in charts.items():
             recent[key] = np.concatenate([recent[key], records[key] / 1e3])[-_MOST:]
             if not len(recent[key]):
                 continue
             high = max(1.0, float(np.percentile(recent[key], 99.9)))
             counts, _ = np.histogram(recent[key], bins=_BINS, range=(0.0, high))
             path.props["d"] = _bars(counts)
-            told.text = f" 0 to {high:.0f} us, {len(recent[key])} cycles, logarithmic"
+            caption.text = f" 0 to {high:.0f} us, {len(recent[key])} cycles, logarithmic"
 
     def close() -> None:
         if reader[0] is not None:
@@ -106,14 +106,14 @@ def _trends(view: View) -> None:
         with place:
             body = table(("", "60 min ago to now", "least", "largest", "now", ""), "Trends", "numbers trends")
         now = time.monotonic()
-        for one in view.live.trends.all.values():
-            values = [value for _, value in one.samples]
+        for trend in view.live.trends.all.values():
+            values = [value for _, value in trend.samples]
             least, largest = min(values), max(values)
             figures = (f"{value:.4g}" for value in (least, largest, values[-1]))
-            with row(body, one.name) as made, ui.element("td"):
-                _line(one.line(now), least, largest)
-            with made:
-                for figure in (*figures, one.unit):
+            with row(body, trend.name) as line, ui.element("td"):
+                _line(trend.line(now), least, largest)
+            with line:
+                for figure in (*figures, trend.unit):
                     text("td", figure)
 
     refresh()

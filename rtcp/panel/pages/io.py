@@ -14,7 +14,7 @@ from rtcp.panel.page import View, button, no_platform, number, on_click, table, 
 _INTERVAL_S = 0.2
 _JOYSTICK = ("forward", "backward", "left", "right", "mode_up", "mode_down")
 Places = dict[str, tuple[TextElement, TextElement | None, Level | None]]
-"""Name -> where its word and its level stand, and the level at which it is on."""
+"""Name -> elements of its word and its level, and the level at which it is on."""
 
 
 async def build(view: View) -> None:
@@ -23,14 +23,14 @@ async def build(view: View) -> None:
     if view.live.config is None:
         no_platform()
         return
-    found = await view.query(lambda robot: robot.read_io())
-    if not (found.inputs or found.outputs or found.channels):
+    answer = await view.query(lambda robot: robot.read_io())
+    if not (answer.inputs or answer.outputs or answer.channels):
         text("p", "This platform has no box with inputs or outputs.")
         return
     with ui.element("div").classes("columns"):
-        inputs = _terminals("Inputs", found.inputs, lambda name: text("span", "", "level"), _active(view.live.config))
-        outputs = _terminals("Outputs", found.outputs, lambda name: _switch(view, name), {})
-    channels = _channels(view, found.channels) if found.channels else {}
+        inputs = _terminals("Inputs", answer.inputs, lambda name: text("span", "", "level"), _active(view.live.config))
+        outputs = _terminals("Outputs", answer.outputs, lambda name: _switch(view, name), {})
+    channels = _channels(view, answer.channels) if answer.channels else {}
     text("p", "An output that the gripper, a lamp or a process drives is set again by it.")
 
     def show(places: Places, levels: Levels) -> None:
@@ -55,50 +55,50 @@ async def build(view: View) -> None:
         for name, place in channels.items():
             place.text = f"{now.channels[name].value:.6g}"
 
-    show(inputs, found.inputs)
-    show(outputs, found.outputs)
+    show(inputs, answer.inputs)
+    show(outputs, answer.outputs)
     ui.timer(_INTERVAL_S, refresh)
 
 
 def _active(config: ArmConfig) -> dict[str, Level]:
     """Return the levels at which the inputs with a function are on."""
     inputs = config.inputs
-    found = {one: getattr(inputs, one) for one in ("arm_toggle", "enabling_switch", "emergency_stop")}
+    levels = {name: getattr(inputs, name) for name in ("arm_toggle", "enabling_switch", "emergency_stop")}
     joystick = dict.fromkeys(_JOYSTICK, inputs.joystick.active) if inputs.joystick is not None else {}
-    return joystick | {name: one.active for name, one in found.items() if one is not None}
+    return joystick | {name: level.active for name, level in levels.items() if level is not None}
 
 
 def _terminals(
     title: str, levels: Levels, control: Callable[[str], TextElement], active: Mapping[str, Level]
 ) -> Places:
-    """Show terminals, those with a meaning first; return where each one's level stands."""
-    made: Places = {}
+    """Show terminals, those with a meaning first; return their elements."""
+    places: Places = {}
     with ui.element("section").classes("page"):
         text("h2", title)
         with ui.element("ul").classes("terminals"):
-            for name, place in sorted(levels.places.items(), key=lambda one: one[0] == one[1]):
+            for name, place in sorted(levels.places.items(), key=lambda item: item[0] == item[1]):
                 with ui.element("li"):
                     text("span", name.replace("_", " "))
                     with ui.element("small"):
                         text("span", f"{place} " if name != place else "")
                         beside = text("span", "") if name in active else None
-                    made[name] = control(name), beside, active.get(name)
-    return made
+                    places[name] = control(name), beside, active.get(name)
+    return places
 
 
 def _channels(view: View, channels: Mapping[str, Channel]) -> dict[str, TextElement]:
-    """Show channels with a number, with a field for those that can be set; return where each one's value stands."""
-    made: dict[str, TextElement] = {}
+    """Show numeric channels, with a field for those that can be set; return the elements of their values."""
+    elements: dict[str, TextElement] = {}
     with table(("Channel", "Value", "Unit", "Set"), "Channels", "numbers"):
-        for name, one in channels.items():
+        for name, channel in channels.items():
             with ui.element("tr"):
                 text("th", name, scope="row")
-                made[name] = text("td", f"{one.value:.6g}")
-                text("td", one.unit, "text")
+                elements[name] = text("td", f"{channel.value:.6g}")
+                text("td", channel.unit, "text")
                 with ui.element("td"):
-                    if one.settable:
-                        _setting(view, one)
-    return made
+                    if channel.settable:
+                        _setting(view, channel)
+    return elements
 
 
 def _setting(view: View, channel: Channel) -> None:
@@ -119,11 +119,11 @@ def _setting(view: View, channel: Channel) -> None:
 
 
 def _switch(view: View, name: str) -> TextElement:
-    made = text("button", "", "act plain level", type="button", role="switch", **{"aria-label": name})
+    control = text("button", "", "act plain level", type="button", role="switch", **{"aria-label": name})
 
-    async def turn() -> None:
-        value = made.props.get("aria-checked") != "true"
+    async def toggle() -> None:
+        value = control.props.get("aria-checked") != "true"
         await view.act(lambda robot: robot.set_output(name, value))
 
-    on_click(made, turn)
-    return made
+    on_click(control, toggle)
+    return control

@@ -27,7 +27,7 @@ from rtcp.panel.page import (
 
 FRAMES = {"base": "Base frame", "tool": "Tool frame", "joints": "Joints"}
 _STEPS = {"fine": (1e-3, math.radians(1.0)), "coarse": (1e-2, math.radians(5.0))}
-"""Of the tool, m, and about an axis or of a joint, rad."""
+"""Steps of the tool, m, and about an axis or of a joint, rad."""
 _MOVEMENTS = {"": "while held", "fine": "step 1 mm or 1 deg", "coarse": "step 10 mm or 5 deg"}
 _PADS = {
     "X and Y": ("x+ Forward, +X", "y+ Left, +Y", "y- Right, \N{MINUS SIGN}Y", "x- Back, \N{MINUS SIGN}X"),
@@ -44,7 +44,7 @@ _KEYS = (
     "w and s, cross up and down",
     "q and e, right stick",
 )
-"""What moves each joint, in the frame of the joints."""
+"""Motion of each joint, in the frame of the joints."""
 
 
 def build(view: View) -> None:
@@ -57,12 +57,12 @@ def build(view: View) -> None:
 
 
 class Jog:
-    """The pads of one arm; what they do while they are held stands in `panel.js`."""
+    """The pads of one arm; `panel.js` jogs while they are held."""
 
     def __init__(self, view: View, config: ArmConfig) -> None:
         self._view, self._config = view, config
         self._kept: dict[str, str] = view.kept.setdefault("jog", {})
-        """What `panel.js` jogs with."""
+        """Settings that `panel.js` jogs with."""
         with ui.element("div").classes("page jog-area").props("tabindex=0 role=group") as self._area:
             self._area.props["aria-label"] = (
                 "Jog by keys: arrows X and Y, page up and down Z, q and e yaw, a and d roll, w and s pitch, "
@@ -82,12 +82,12 @@ class Jog:
                 self._of_the_tool = ui.element("div").style("display: contents")
                 with self._of_the_tool:
                     self._speed = self._limited("Speed", "m/s", config.jog.speed, "data-jog-speed")
-                    self._turn = self._limited("Turning", "rad/s", config.jog.angular_speed, "data-jog-turn")
+                    self._turn_speed = self._limited("Turning", "rad/s", config.jog.angular_speed, "data-jog-turn")
                 self._joint = number(
                     "Speed of joints", self._kept.get("data-jog-joint", "0.1"), "rad/s", min="0", step="0.01"
                 )
-            for one in (self._movement, self._frame, self._speed, self._turn, self._joint):
-                one.on_change(self._settle)
+            for control in (self._movement, self._frame, self._speed, self._turn_speed, self._joint):
+                control.on_change(self._settle)
             self._settle()
         text(
             "p",
@@ -108,8 +108,8 @@ class Jog:
                 with ui.element("div"):
                     text("h2", name)
                     with ui.element("div").classes("pad"):
-                        for place, one in zip(_PLACES, buttons, strict=True):
-                            part, _, label = one.partition(" ")
+                        for place, spec in zip(_PLACES, buttons, strict=True):
+                            part, _, label = spec.partition(" ")
                             self._pad(label, part).style(f"grid-area: {place}")
         with self._single:
             for at, motor in enumerate(self._config.joints):
@@ -121,8 +121,8 @@ class Jog:
 
     def _pad(self, label: str, part: str) -> Element:
         """Return a button that jogs while it is held, or steps where its page shows that it does."""
-        made = button(label, when="holding moving")
-        made.props["data-jog"] = part
+        pad = button(label, when="holding moving")
+        pad.props["data-jog"] = part
 
         async def clicked(event: Any) -> None:
             token_ns, movement = event.args
@@ -130,16 +130,16 @@ class Jog:
             if movement == self._movement.value:
                 await self._step(part)
 
-        made.on("click", clicked, js_handler="() => rtcp.stepping && emit([rtcp.token, rtcp.stepping])")
-        return made
+        pad.on("click", clicked, js_handler="() => rtcp.stepping && emit([rtcp.token, rtcp.stepping])")
+        return pad
 
     def _settle(self) -> None:
-        # Numbers that are none, or beyond what is configured, move nothing: the platform refuses them.
+        # The platform refuses what is no number, or beyond the configuration.
         self._kept.update(
             {
                 "data-jog-frame": self._frame.value,
                 "data-jog-speed": self._speed.value,
-                "data-jog-turn": self._turn.value,
+                "data-jog-turn": self._turn_speed.value,
                 "data-jog-joint": self._joint.value,
                 "data-jog-step": self._movement.value,
             }
@@ -155,14 +155,14 @@ class Jog:
         operator, view = self._view.live.operator, self._view
         if operator is not None and operator.page is view.page and operator.moves:
             return
-        length, turn = _STEPS[self._movement.value]
+        length, angle = _STEPS[self._movement.value]
         axes = [name for name, _ in POSE]
         by_joint = part[:-1] not in axes
         axis = int(part[:-1]) if by_joint else axes.index(part[:-1])
         offset = [0.0] * (len(self._config.joints) if by_joint else len(axes))
-        offset[axis] = math.copysign(turn if by_joint or axis > 2 else length, 1.0 if part[-1] == "+" else -1.0)
+        offset[axis] = math.copysign(angle if by_joint or axis > 2 else length, 1.0 if part[-1] == "+" else -1.0)
         try:
-            # A line has no speed of turning: that of the configuration holds.
+            # A line has no angular speed: the configured one holds.
             speed = self._joint.number() if by_joint else self._speed.number() if axis <= 2 else None
         except RtcpError as error:
             view.warn(error.message)
@@ -183,12 +183,12 @@ def _gripper(view: View) -> None:
                 ("Open", _PLACES[0], True, "The gripper is open"),
                 ("Close", _PLACES[3], False, "The gripper has closed"),
             ):
-                made = button(label, move(opens, done), when=ENABLED).style(f"grid-area: {place}")
-                made.props.update({"data-gripper": label.lower(), "aria-label": f"{label} gripper"})
+                control = button(label, move(opens, done), when=ENABLED).style(f"grid-area: {place}")
+                control.props.update({"data-gripper": label.lower(), "aria-label": f"{label} gripper"})
 
 
 def _tool_and_hand(view: View, config: ArmConfig) -> None:
-    """Choose the tool and what it holds; let the arm be guided by hand."""
+    """Choose the tool and its payload; let the arm be guided by hand."""
     state = view.live.state()
     with ui.element("div").classes("fields"):
         tool = choice("Tool", config.tool_names, state.get("tool_name", config.tool_names[0]))

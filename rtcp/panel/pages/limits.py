@@ -1,4 +1,4 @@
-"""Limits of joints and space: what is in force, what the file allows, narrowed while the platform runs."""
+"""Limits of joints and space: in force and configured; they are narrowed while the platform runs."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ async def build(view: View) -> None:
         "Narrower than the file allows, until the platform ends. A field says what is in force; below it stands what "
         "the file allows. The tool stays inside the box, and out of the other spaces.",
     )
-    found = await view.live.view(lambda robot: robot.limits())
+    limits = await view.live.view(lambda robot: robot.limits())
     fields: dict[str, Field] = {}
 
     async def apply() -> None:
         try:
-            changes = {key: one.number() for key, one in fields.items() if one.value != kept[key]}
+            changes = {key: control.number() for key, control in fields.items() if control.value != kept[key]}
         except RtcpError as error:
             view.warn(error.message)
             return
@@ -38,31 +38,31 @@ async def build(view: View) -> None:
             kept.update({key: fields[key].value for key in changes})
 
     async def widest() -> None:
-        changes = dict(_all(found["configured"], found["joint_names"]))
+        changes = dict(_all(limits["configured"], limits["joint_names"]))
         if await view.act(lambda robot: robot.set_limits(changes), "The limits of the file are in force") is not None:
             for key, value in changes.items():
                 fields[key].value = kept[key] = f"{value:g}"
 
     with table(("Joint", *_JOINT.items()), "Limits of the joints", "numbers"):
-        for at, name in enumerate(found["joint_names"]):
+        for at, name in enumerate(limits["joint_names"]):
             with ui.element("tr"):
                 text("th", name, scope="row")
                 for key, unit in _JOINT.items():
                     with ui.element("td"):
                         fields[f"{name}.{key}"] = _field(
-                            f"{name} {key}", found["limits"][key][at], found["configured"][key][at], unit
+                            f"{name} {key}", limits["limits"][key][at], limits["configured"][key][at], unit
                         )
     with table(("Space", "Corner", *POSE[:3]), "Limits of the space", "numbers"):
-        for box in _boxes(found["limits"]):
+        for box in _boxes(limits["limits"]):
             for side in ("min", "max"):
                 with ui.element("tr"):
                     text("th", box.replace("_", " "), scope="row")
                     text("td", "lower" if side == "min" else "upper", "text")
                     for axis, letter in enumerate("xyz"):
-                        now, allowed = (_boxes(found[which])[box][side][axis] for which in ("limits", "configured"))
+                        now, allowed = (_boxes(limits[which])[box][side][axis] for which in ("limits", "configured"))
                         with ui.element("td"):
                             fields[f"{box}.{side}.{letter}"] = _field(f"{box} {side} {letter}", now, allowed, "m")
-    kept = {key: one.value for key, one in fields.items()}
+    kept = {key: control.value for key, control in fields.items()}
     when = f"ready {ENABLED} stopped_by_limit fault"
     with ui.element("div").classes("buttons"):
         button("Set the limits", apply, when=when)
@@ -70,11 +70,11 @@ async def build(view: View) -> None:
 
 
 def _field(name: str, now: float, allowed: float, unit: str) -> Field:
-    made = number(name, f"{now:g}", unit)
+    control = number(name, f"{now:g}", unit)
     with ui.element("small"):
         text("span", "file: ")
         quantity(allowed, unit)
-    return made
+    return control
 
 
 def _boxes(limits: dict[str, Any]) -> dict[str, Any]:

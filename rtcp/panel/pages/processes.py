@@ -1,16 +1,16 @@
-"""Processes: what each one publishes, its lamps, its commands and its picture, all made from its description."""
+"""Processes: fields, lamps, commands and picture of each, made from its description."""
 
 from __future__ import annotations
 
 import dataclasses
 from enum import IntEnum
-from typing import Any, get_type_hints
+from typing import Any
 
 from nicegui import ui
 
 from rtcp.api import RtcpError
 from rtcp.config.model import ProcessConfig
-from rtcp.panel.page import Field, View, button, choice, no_platform, number, shown, table, text
+from rtcp.panel.page import Field, View, button, choice, live_value, no_platform, number, table, text
 from rtcp.panel.pages.scope import ScopeView
 from rtcp.panel.scope import Scope, signals_of
 
@@ -30,7 +30,7 @@ def build(view: View) -> None:
         text("h2", process.name)
         with ui.element("p"):
             text("span", f"{process.kind}: ")
-            shown(f"processes.{process.name}.state", tag="span")
+            live_value(f"processes.{process.name}.state", tag="span")
         _lamps(process)
         _commands(view, process)
         _fields(view, process)
@@ -49,7 +49,7 @@ def _lamps(process: ProcessConfig) -> None:
         for colour, channel in process.LAMPS.items():
             with ui.element("span").classes("lamp").props(f"data-colour={colour}"):
                 text("span", f"{colour}: ")
-                shown(f"processes.{process.name}.lamps.{channel}", tag="span")
+                live_value(f"processes.{process.name}.lamps.{channel}", tag="span")
 
 
 def _fields(view: View, process: ProcessConfig) -> None:
@@ -60,16 +60,16 @@ def _fields(view: View, process: ProcessConfig) -> None:
                 continue
             with ui.element("tr"):
                 text("th", field.local_name.replace("_", " "), scope="row")
-                shown(f"processes.{process.name}.fields.{field.local_name}")
+                live_value(f"processes.{process.name}.fields.{field.local_name}")
                 text("td", field.unit)
                 text("td", field.description)
 
 
 def _limits(process: ProcessConfig) -> None:
     numbers = {
-        one.name: value
-        for one in dataclasses.fields(process)
-        if isinstance(value := getattr(process, one.name), int | float) and not isinstance(value, bool)
+        field.name: value
+        for field in dataclasses.fields(process)
+        if isinstance(value := getattr(process, field.name), int | float) and not isinstance(value, bool)
     }
     if not numbers:
         return
@@ -82,18 +82,17 @@ def _limits(process: ProcessConfig) -> None:
 
 
 def _commands(view: View, process: ProcessConfig) -> None:
-    plain = [kind for kind in process.COMMANDS if not dataclasses.fields(kind)]
+    plain = [kind for kind in process.COMMANDS if not kind.field_types]
     with ui.element("div").classes("buttons"):
         for kind in plain:
             _button(view, kind, {})
     for kind in process.COMMANDS:
         if kind in plain:
             continue
-        hints = get_type_hints(kind)
         with ui.element("fieldset"):
             text("legend", _words(kind))
             with ui.element("div").classes("fields"):
-                controls = {one.name: _control(one.name, hints[one.name]) for one in dataclasses.fields(kind)}
+                controls = {name: _control(name, hint) for name, hint in kind.field_types.items()}
             with ui.element("div").classes("buttons"):
                 _button(view, kind, controls)
 
@@ -101,7 +100,7 @@ def _commands(view: View, process: ProcessConfig) -> None:
 def _control(name: str, hint: Any) -> Field:
     label = name.replace("_", " ").capitalize()
     if isinstance(hint, type) and issubclass(hint, IntEnum):
-        return choice(label, [one.name.lower() for one in hint], next(iter(hint)).name.lower())
+        return choice(label, [member.name.lower() for member in hint], next(iter(hint)).name.lower())
     if hint is bool:
         return choice(label, ("no", "yes"), "no")
     return number(label)
@@ -109,15 +108,14 @@ def _control(name: str, hint: Any) -> Field:
 
 def _button(view: View, kind: type[Any], controls: dict[str, Field]) -> None:
     async def send() -> None:
-        hints = get_type_hints(kind)
         try:
-            given = {name: _value(control, hints[name]) for name, control in controls.items()}
+            values = {name: _value(control, kind.field_types[name]) for name, control in controls.items()}
         except RtcpError as error:
             view.warn(error.message)
             return
-        # What only makes it safer ends what this page has begun.
+        # A command without lease only makes the process safer: it ends the command of this page.
         done, instead = f"{_words(kind)}: done", not kind.needs_lease
-        await view.act(lambda robot: robot.command(kind.name, **given), done, instead=instead)
+        await view.act(lambda robot: robot.command(kind.name, **values), done, instead=instead)
 
     button(_words(kind), send, plain=not kind.needs_lease)
 

@@ -32,7 +32,7 @@ _MOST_OFFERED: Final = 24
 
 
 def programs_directory() -> Path:
-    """Return where the panel keeps programs."""
+    """Return the directory of the panel's programs."""
     return state_directory() / "programs"
 
 
@@ -42,36 +42,37 @@ def build(view: View) -> None:
     if view.live.config is None or view.live.status is None:
         no_platform()
         return
-    kept = view.kept.setdefault("program", ProgramSession())
-    assert isinstance(kept, ProgramSession)
-    ProgramPage(view, kept)
+    session = view.kept.setdefault("program", ProgramSession())
+    assert isinstance(session, ProgramSession)
+    ProgramPage(view, session)
 
 
 class ProgramPage:
     """The page: each click changes the file at once, and `Undo` takes it back."""
 
-    def __init__(self, view: View, kept: ProgramSession) -> None:
-        self._view, self._kept = view, kept
+    def __init__(self, view: View, session: ProgramSession) -> None:
+        self._view, self._session = view, session
         with ui.element("div").classes("fields"):
-            self._name = field("Program", kept.file.path.stem if kept.file else "", list="programs", maxlength="60")
+            name = session.file.path.stem if session.file else ""
+            self._name = field("Program", name, list="programs", maxlength="60")
             with ui.element("datalist").props("id=programs"):
                 for path in sorted(programs_directory().glob("*.yaml")):
                     ui.element("option").props["value"] = path.stem
         with ui.element("div").classes("buttons"):
             button("Open", self._open)
             self._undo = button("Undo", partial(self._change, lambda file: file.undo()), plain=True)
-        self._said = text("p", "", role="status", **{"aria-live": "polite"})
+        self._notice = text("p", "", role="status", **{"aria-live": "polite"})
         self._place = ui.element("div").classes("page")
-        kept.changed = self._show
+        session.changed = self._show
         view.leaving.append(self._left)
         self._show()
 
     def _left(self) -> None:
-        self._kept.changed = lambda: None
+        self._session.changed = lambda: None
 
-    def _say(self, said: str) -> None:
-        self._kept.said = said
-        self._kept.changed()
+    def _say(self, notice: str) -> None:
+        self._session.notice = notice
+        self._session.changed()
 
     # -- the file -----------------------------------------------------------------------------------------------------
 
@@ -80,24 +81,24 @@ class ProgramPage:
         if not name or name != Path(name).name or name.startswith("."):
             self._view.warn(f'Program: found the text "{name}", allowed is a name for its file')
             return
-        if self._kept.running:
+        if self._session.running:
             self._view.warn("The program runs: stop it first")
             return
         try:
-            self._kept.file = ProgramFile(programs_directory() / f"{name}.yaml")
+            self._session.file = ProgramFile(programs_directory() / f"{name}.yaml")
         except ConfigError as error:
             self._view.warn(str(error))
             return
-        self._kept.at = 0
-        path = self._kept.file.path
+        self._session.at = 0
+        path = self._session.file.path
         self._say(f"Opened {path}" if path.exists() else f"New; saved as {path} with its first pose")
 
     def _change(self, change: Callable[[ProgramFile], object]) -> bool:
         """Change the file; return whether it was changed."""
-        file = self._kept.file
+        file = self._session.file
         if file is None or not self._view.may_command():
             return False
-        if self._kept.running:
+        if self._session.running:
             self._view.warn("The program runs: it is changed when it has ended")
             return False
         try:
@@ -105,16 +106,16 @@ class ProgramPage:
         except ConfigError as error:
             self._view.warn("\n".join(error.problems))
             return False
-        self._kept.at = min(self._kept.at, len(file.motion.program))
-        self._kept.changed()
+        self._session.at = min(self._session.at, len(file.motion.program))
+        self._session.changed()
         return True
 
-    # -- what is shown ------------------------------------------------------------------------------------------------
+    # -- display ------------------------------------------------------------------------------------------------------
 
     def _show(self) -> None:
-        kept, file = self._kept, self._kept.file
-        self._said.text = kept.said
-        self._undo.props["disabled"] = file is None or not file.can_undo or kept.running
+        session, file = self._session, self._session.file
+        self._notice.text = session.notice
+        self._undo.props["disabled"] = file is None or not file.can_undo or session.running
         self._place.clear()
         if file is None:
             with self._place:
@@ -124,24 +125,24 @@ class ProgramPage:
             self._show_run(file)
             self._show_steps(file)
             if not file.motion.poses:
-                self._show_poses(file)  # what comes first
+                self._show_poses(file)  # the first task of a new program
             self._show_new_step(file)
             if file.motion.poses:
                 self._show_poses(file)
             self._show_speed(file)
 
     def _show_run(self, file: ProgramFile) -> None:
-        kept = self._kept
+        session = self._session
         is_empty = not file.motion.program
         with ui.element("div").classes("buttons").props('role=group aria-label="Run"'):
             for label, handler, blocked in (
-                ("Check", self._check, is_empty or kept.running),
-                ("Run", partial(self._run, 0, None), is_empty or kept.running),
-                ("Step back", self._step_back, kept.running or kept.at == 0),
-                ("Step", self._step, kept.running or kept.at >= len(file.motion.program)),
+                ("Check", self._check, is_empty or session.running),
+                ("Run", partial(self._run, 0, None), is_empty or session.running),
+                ("Step back", self._step_back, session.running or session.at == 0),
+                ("Step", self._step, session.running or session.at >= len(file.motion.program)),
             ):
-                made = button(label, handler, plain=label != "Run")
-                made.props["disabled"] = blocked
+                control = button(label, handler, plain=label != "Run")
+                control.props["disabled"] = blocked
 
     def _show_known(self) -> None:
         """Offer the programs that exist."""
@@ -180,10 +181,10 @@ class ProgramPage:
                 return
             body = table(("#", "Step", ""), "Steps of the program", "stack steps")
         for at, step in enumerate(steps):
-            shown = row(body, f"▶ {at + 1}" if at == self._kept.at else str(at + 1), described(step))
-            if at == self._kept.at:
-                shown.props["aria-current"] = "step"
-            with shown, ui.element("td"), ui.element("div").classes("buttons"):
+            line = row(body, f"▶ {at + 1}" if at == self._session.at else str(at + 1), described(step))
+            if at == self._session.at:
+                line.props["aria-current"] = "step"
+            with line, ui.element("td"), ui.element("div").classes("buttons"):
                 for label, spoken, handler in (
                     ("Up", f"Move step {at + 1} up", partial(self._move, at, at - 1)),
                     ("Down", f"Move step {at + 1} down", partial(self._move, at, at + 1)),
@@ -195,7 +196,7 @@ class ProgramPage:
     def _show_new_step(self, file: ProgramFile) -> None:
         config = self._view.live.config
         assert config is not None
-        poses, parts = [one.name for one in file.motion.poses], [one.name for one in file.motion.parts]
+        poses, parts = [entry.name for entry in file.motion.poses], [entry.name for entry in file.motion.parts]
         kinds = {
             key: name for key, name in _KINDS.items() if (poses or key not in _MOTIONS) and (parts or key != "run")
         }
@@ -241,11 +242,11 @@ class ProgramPage:
                 if self._view.live.config is not None and self._view.live.config.arm is not None
                 else {}
             )
-            what = choice("Kept as", kinds, "q")
+            kind = choice("Kept as", kinds, "q")
         with ui.element("div").classes("buttons"):
             button(
                 "Keep where the arm is",
-                lambda: self._keep(name.value.strip(), what.value),
+                lambda: self._keep(name.value.strip(), kind.value),
                 plain=bool(file.motion.poses),
             )
         if not file.motion.poses:
@@ -264,18 +265,18 @@ class ProgramPage:
                 ):
                     button(label, handler, plain=True).props["aria-label"] = spoken
 
-    # -- what is done -------------------------------------------------------------------------------------------------
+    # -- actions ------------------------------------------------------------------------------------------------------
 
-    def _keep(self, name: str, what: str) -> None:
+    def _keep(self, name: str, kind: str) -> None:
         status = self._view.live.status
         if status is None:
             self._view.warn("No platform runs: nothing is kept")
             return
-        values = status.commanded_positions if what == "q" else status.commanded_pose
+        values = status.commanded_positions if kind == "q" else status.commanded_pose
         if values is None:
             self._view.warn("The pose of the tool is not known: nothing is kept")
             return
-        if self._change(lambda file: file.keep(name, **{what: values})):
+        if self._change(lambda file: file.keep(name, **{kind: values})):
             self._view.say(f"{name} is kept")
 
     def _forget(self, name: str) -> None:
@@ -285,7 +286,7 @@ class ProgramPage:
         self._change(lambda file: file.remove(at))
 
     def _move(self, at: int, to: int) -> None:
-        file = self._kept.file
+        file = self._session.file
         if file is not None and 0 <= to < len(file.motion.program):
             self._change(lambda changed: changed.move(at, to))
 
@@ -296,9 +297,9 @@ class ProgramPage:
         )
 
     def _program(self) -> Program | None:
-        assert self._kept.file is not None
+        assert self._session.file is not None
         try:
-            return Program(self._kept.file.path)
+            return Program(self._session.file.path)
         except ConfigError as error:
             self._view.warn("\n".join(error.problems))
             return None
@@ -307,10 +308,10 @@ class ProgramPage:
         program = self._program()
         if program is None:
             return
-        found = await self._view.ask(lambda robot: robot.in_thread(program.check))
-        if found is None:
+        motions = await self._view.ask(lambda robot: robot.in_thread(program.check))
+        if motions is None:
             return
-        plans = [one.plan for one in found]
+        plans = [motion.plan for motion in motions]
         duration_s = sum(plan.duration_s for plan in plans)
         if self._view.arm is not None:
             self._view.arm.preview([list(q) for plan in plans for q in plan.path], duration_s)
@@ -318,75 +319,75 @@ class ProgramPage:
 
     async def _run(self, start: int, end: int | None) -> None:
         """Run from a step on, and show what begins."""
-        program, kept = self._program(), self._kept
-        if program is None or kept.running:
+        program, session = self._program(), self._session
+        if program is None or session.running:
             return
         loop = asyncio.get_running_loop()
 
-        def begun(one: Begun) -> None:
-            kept.at = one.number
-            self._say(f"Step {one.number + 1}: {one.text}")
+        def begun(start: Begun) -> None:
+            session.at = start.number
+            self._say(f"Step {start.number + 1}: {start.text}")
 
-        def say(one: Begun) -> None:
-            loop.call_soon_threadsafe(begun, one)
+        def say(start: Begun) -> None:
+            loop.call_soon_threadsafe(begun, start)
 
         def run(robot: Robot) -> bool:
-            program.run(robot, say, start=start, end=end, between=kept.between)
+            program.run(robot, say, start=start, end=end, between=session.between)
             return True
 
-        kept.begin()
+        session.begin()
         self._say("It is planned")
         done = None
         try:
             done = await self._view.act_beyond_visit(lambda robot: robot.in_thread(run))
         finally:
-            kept.end()
+            session.end()
             last = len(program.steps) if end is None else end
             if done:
-                kept.at = last if end is not None or last < len(program.steps) else 0
+                session.at = last if end is not None or last < len(program.steps) else 0
             self._say(("Done" if end is None else f"Step {start + 1} is done") if done else "It has ended early")
 
     async def _step(self) -> None:
-        await self._run(self._kept.at, self._kept.at + 1)
+        await self._run(self._session.at, self._session.at + 1)
 
     async def _step_back(self) -> None:
-        program, kept = self._program(), self._kept
-        if program is None or kept.running:
+        program, session = self._program(), self._session
+        if program is None or session.running:
             return
-        number = kept.at - 1
+        number = session.at - 1
 
         def step_back(robot: Robot) -> bool:
             program.step_back(robot, number)
             return True
 
-        kept.begin()
+        session.begin()
         self._say(f"Back over step {number + 1}")
         done = None
         try:
             done = await self._view.act_beyond_visit(lambda robot: robot.in_thread(step_back))
         finally:
-            kept.end()
+            session.end()
             if done:
-                kept.at = number
+                session.at = number
             self._say(f"Step {number + 1} is next" if done else "It has ended early")
 
 
 def _fields_of(
     kind: str, poses: Sequence[str], parts: Sequence[str], tools: Sequence[str]
 ) -> Mapping[str, Callable[[], Any]]:
-    """Make the fields of a kind of step; return what reads each key."""
-    found: dict[str, Callable[[], Any]] = {}
+    """Make the fields of a kind of step; return a reader for each key."""
+    readers: dict[str, Callable[[], Any]] = {}
 
     def optional(key: str, label: str, unit: str) -> None:
-        made = number(label, unit=unit, min="0")
-        found[key] = lambda: made.number() if made.value.strip() else None
+        control = number(label, unit=unit, min="0")
+        readers[key] = lambda: control.number() if control.value.strip() else None
 
     if kind in _MOTIONS:
         pose = choice("Pose", poses, poses[-1])
-        found[kind] = lambda: pose.value
+        readers[kind] = lambda: pose.value
         if kind == "arc":
             via = choice("Through", poses, poses[0])
-            found["via"] = lambda: via.value
+            readers["via"] = lambda: via.value
             optional("angle", "Angle of the circle (empty: up to the pose)", "rad")
         if kind == "move":
             optional("speed", "Speed (empty: the limit)", "rad/s")
@@ -395,36 +396,36 @@ def _fields_of(
         optional("blend", "Blend (empty: it rests)", "m")
     elif kind == "gripper":
         grip = choice("Gripper", ("open", "close"), "close")
-        found[kind] = lambda: grip.value
+        readers[kind] = lambda: grip.value
     elif kind in ("output", "wait_for"):
         name = field("Output" if kind == "output" else "Input")
         level = choice("Level", {"true": "on", "": "off"}, "true")
-        found[kind] = lambda: str(name.value).strip()
-        found["value"] = lambda: bool(level.value)
+        readers[kind] = lambda: str(name.value).strip()
+        readers["value"] = lambda: bool(level.value)
         if kind == "wait_for":
             optional("timeout_s", "At most (empty: for ever)", "s")
     elif kind == "wait_s":
         seconds = number("Time, s", "1", min="0")
-        found[kind] = seconds.number
+        readers[kind] = seconds.number
     elif kind == "tool":
         tool = choice("Tool", tools, tools[0])
-        found[kind] = lambda: tool.value
+        readers[kind] = lambda: tool.value
     else:
         part = choice("Part", parts, parts[0])
         times = number("Times (0: for ever)", "1", min="0", step="1")
-        found[kind] = lambda: part.value
-        found["times"] = lambda: int(times.number())
-    return found
+        readers[kind] = lambda: part.value
+        readers["times"] = lambda: int(times.number())
+    return readers
 
 
 def described(step: Step) -> str:
     """Return a step in words."""
     if (name := step.move or step.line or step.arc) is not None:
-        way = "move" if step.move else "line" if step.line else f"arc through {step.via}"
+        verb = "move" if step.move else "line" if step.line else f"arc through {step.via}"
         unit = "rad/s" if step.move else "m/s"
         speed = "" if step.speed is None else f" at {step.speed:g} {unit}"
         angle = "" if step.angle is None else f", {step.angle:.4g} rad of the circle"
-        return f"{way} to {name}{speed}{angle}" + (f", blend {step.blend:g} m" if step.blend else "")
+        return f"{verb} to {name}{speed}{angle}" + (f", blend {step.blend:g} m" if step.blend else "")
     if step.gripper is not None:
         return f"gripper: {step.gripper}"
     if step.tool is not None:

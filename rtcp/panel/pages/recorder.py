@@ -19,7 +19,7 @@ _MOST_SHOWN = 30
 
 
 def recordings_directory() -> Path:
-    """Return where the panel records, and offers files from."""
+    """Return the directory in which the panel records, and from which it offers files."""
     return state_directory() / "recordings"
 
 
@@ -35,7 +35,7 @@ def build(view: View) -> None:
         end = button("Stop recording", plain=True)
         end.props["disabled"] = True
         again = button("Show the files", plain=True)
-    said = text("p", "", role="status")
+    notice = text("p", "", role="status")
     files = ui.element("div").classes("page")
 
     async def start() -> None:
@@ -45,41 +45,41 @@ def build(view: View) -> None:
         directory = recordings_directory()
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         wanted = Path(name.value.strip()).name.lstrip(".") or f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
-        found = formats.value.split(",")
+        endings = formats.value.split(",")
         # One format: a file of that name; several: a folder.
-        out = directory / (f"{wanted}.{found[0]}" if len(found) == 1 else wanted)
+        out = directory / (f"{wanted}.{endings[0]}" if len(endings) == 1 else wanted)
         chosen = signals.value.replace(",", " ").split()
-        if await view.ask(lambda robot: robot.record_start(out, formats=found, signals=chosen)) is not None:
+        if await view.ask(lambda robot: robot.record_start(out, formats=endings, signals=chosen)) is not None:
             await refresh()
 
     async def stop() -> None:
         if not view.may_command():
             return
         ended = await view.ask(lambda robot: robot.record_stop())
-        for one in ended or ():
-            view.say(f"{one.records} cycles, {one.missing} missing, {one.bytes / 1e6:.1f} MB")
+        for recording in ended or ():
+            view.say(f"{recording.records} cycles, {recording.missing} missing, {recording.bytes / 1e6:.1f} MB")
         await refresh()
 
     async def refresh() -> None:
         try:
-            running = [one for one in await view.query(lambda robot: robot.record_status()) if one.running]
+            running = [entry for entry in await view.query(lambda robot: robot.record_status()) if entry.running]
         except RtcpError as error:
             running = []
-            said.text = error.message
+            notice.text = error.message
         else:
             lines = []
-            for one in running:
-                names = ", ".join(Path(file).name for file in one.files)
-                lines.append(f"{names}: {one.records} samples, {one.missing} missing, {one.seconds:.0f} s")
-            said.text = "; ".join(lines) or "Nothing is recorded"
+            for entry in running:
+                names = ", ".join(Path(file).name for file in entry.files)
+                lines.append(f"{names}: {entry.records} samples, {entry.missing} missing, {entry.seconds:.0f} s")
+            notice.text = "; ".join(lines) or "Nothing is recorded"
         end.props["disabled"] = not running
 
     def show_files() -> None:
         files.clear()
         with files:
             body = table(("File", "MB", "", ""), "Recordings")
-        found = sorted(_files(), key=lambda path: path.stat().st_mtime, reverse=True)[:_MOST_SHOWN]
-        for path in found:
+        paths = sorted(_files(), key=lambda path: path.stat().st_mtime, reverse=True)[:_MOST_SHOWN]
+        for path in paths:
             where = str(path.relative_to(recordings_directory()))
             with row(body, where, f"{path.stat().st_size / 1e6:.1f}"):
                 with ui.element("td"):
@@ -125,7 +125,7 @@ def _programs(view: View) -> None:
     with ui.element("datalist").props("id=programs"):
         for path in sorted(_motion_files()):
             ui.element("option").props["value"] = str(path)
-    said = text("p", "", role="status", **{"aria-live": "polite"})
+    notice = text("p", "", role="status", **{"aria-live": "polite"})
     bar = ui.element("progress").props("max=1 value=0 aria-label=Progress")
 
     async def check() -> bool:
@@ -133,27 +133,27 @@ def _programs(view: View) -> None:
             return False
         path, first = file.value.strip(), bool(approach.value)
         try:
-            found = await view.query(lambda robot: robot.preview(file=path, approach=first))
+            preview = await view.query(lambda robot: robot.preview(file=path, approach=first))
         except RtcpError as error:
-            said.text = f"No: {error.message}"
+            notice.text = f"No: {error.message}"
             return False
-        said.text = f"It can be run: {found.duration_s:.1f} s"
+        notice.text = f"It can be run: {preview.duration_s:.1f} s"
         if view.arm is not None:
-            view.arm.preview([list(q) for q in found.path], found.duration_s)
+            view.arm.preview([list(q) for q in preview.path], preview.duration_s)
         return True
 
     def progress(now: Progress) -> None:
         if bar.is_deleted:
             return  # the page was left; the program goes on
         bar.props["value"] = round(now.fraction, 3)
-        said.text = f"{now.fraction:.0%}, {now.remaining_s:.1f} s left"
+        notice.text = f"{now.fraction:.0%}, {now.remaining_s:.1f} s left"
 
     async def run() -> None:
         if await check():
             path, first = file.value.strip(), bool(approach.value)
             arrival = await view.act(lambda robot: robot.run(path, first, progress))
             bar.props["value"] = 1 if arrival else 0
-            said.text = "Done" if arrival else "It has not reached its end"
+            notice.text = "Done" if arrival else "It has not reached its end"
 
     with ui.element("div").classes("buttons"):
         button("Check", check, plain=True)

@@ -16,7 +16,7 @@ _ECHARTS = Path(nicegui.__file__).parent / "elements" / "echart" / "dist"
 
 
 class ScopeView(Element, component="../static/scope_view.js", esm={"nicegui-echart": str(_ECHARTS)}):
-    """The picture; `names`: what a person reads for each signal."""
+    """The picture; `names`: label of each signal."""
 
     def __init__(self, names: dict[str, str]) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ def build(view: View) -> None:
             "Trigger",
             {
                 "": "none, it rolls",
-                **{key: f"when {what}" for key, what in EVENTS.items()},
+                **{key: f"when {label}" for key, label in EVENTS.items()},
                 **{key: f"{name} rises through" for key, name in allowed.items()},
             },
             "",
@@ -50,7 +50,7 @@ def build(view: View) -> None:
     picture = ScopeView(allowed)
 
     def apply() -> None:
-        names = ", ".join(allowed[one] for one in chosen)
+        names = ", ".join(allowed[signal] for signal in chosen)
         listed.text = f"Shown: {names or 'nothing'} (at most {MOST_SIGNALS})"
         if not chosen:
             view.page.scope = None
@@ -81,6 +81,6 @@ def build(view: View) -> None:
         button("Remove all", clear, plain=True)
         hold = button("Freeze", pause, plain=True)
         button("CSV of what is shown", lambda: picture.run_method("csv"), plain=True)
-    for one in (span, trigger, level):
-        one.on_change(apply)
+    for control in (span, trigger, level):
+        control.on_change(apply)
     apply()

@@ -32,17 +32,17 @@ async def build(view: View) -> None:
     text("h1", "Segment")
     slaves = ui.element("div").classes("page")
     clock = text("p", "", role="status")
-    shown: list[object] = [None]
+    drawn: list[object] = [None]
 
     def refresh() -> None:
         status = view.live.status
-        found = [_cells(one) for one in (status.raw["slaves"] if status is not None else ())]
-        if found != shown[0] or not slaves.default_slot.children:
-            shown[0] = found
+        rows = [_cells(slave) for slave in (status.raw["slaves"] if status is not None else ())]
+        if rows != drawn[0] or not slaves.default_slot.children:
+            drawn[0] = rows
             slaves.clear()
             with slaves:
                 body = table(_COUNTERS, "Slaves in the order of the cable", "lines")
-            for cells in found:
+            for cells in rows:
                 row(body, *cells).classes("bad" if cells[2] == "no answer" else "")
         if status is not None:
             dc, wkc = status.raw["dc"], status.raw["wkc"]
@@ -67,7 +67,7 @@ async def build(view: View) -> None:
         status = view.live.status
         if status is not None:
             lines = zip(status.raw["message_times"], status.raw["messages"], strict=True)
-            messages.text = "\n".join(f"{when[11:23]}  {what}" for when, what in lines).replace("`", "")
+            messages.text = "\n".join(f"{when[11:23]}  {message}" for when, message in lines).replace("`", "")
 
     read_messages()
     ui.timer(0.5, read_messages)
@@ -91,7 +91,7 @@ def _objects(view: View) -> None:
         index = field("Index, hex", "6041")
         subindex = number("Subindex", "0", min="0", max="255", step="1")
         data = field("Bytes, hex (to write)")
-    said = text("p", "", role="status", **{"aria-live": "polite"})
+    notice = text("p", "", role="status", **{"aria-live": "polite"})
 
     def place() -> tuple[int, int, int]:
         try:
@@ -102,19 +102,19 @@ def _objects(view: View) -> None:
     async def read() -> None:
         try:
             where = place()
-            found = await view.query(lambda robot: robot.sdo_read(*where))
+            value = await view.query(lambda robot: robot.sdo_read(*where))
         except RtcpError as error:
-            said.text = error.message
+            notice.text = error.message
             return
-        said.text = f"0x{where[1]:04X}:{where[2]} = {found.hex(' ')} ({int.from_bytes(found, 'little')})"
+        notice.text = f"0x{where[1]:04X}:{where[2]} = {value.hex(' ')} ({int.from_bytes(value, 'little')})"
 
     async def write() -> None:
         try:
             where, value = place(), bytes.fromhex(data.value)
         except (RtcpError, ValueError) as error:
-            said.text = str(error)
+            notice.text = str(error)
             return
-        said.text = ""
+        notice.text = ""
         await view.act(lambda robot: robot.sdo_write(*where, value), "Written")
 
     with ui.element("div").classes("buttons"):
@@ -133,7 +133,7 @@ async def _faults(view: View) -> None:
         if code:
             view.warn(out)
             return
-        _KINDS.update({one["name"]: one for one in json.loads(out)})
+        _KINDS.update({kind["name"]: kind for kind in json.loads(out)})
     kinds = _KINDS
     keys: dict[str, Field] = {}
     with place:
@@ -157,9 +157,9 @@ async def _faults(view: View) -> None:
     async def make() -> None:
         if not view.claim():
             return
-        given = [f"{name}={one.value.strip()}" for name, one in keys.items() if one.value.strip()]
+        fields = [f"{name}={control.value.strip()}" for name, control in keys.items() if control.value.strip()]
         more = ["--lasts", lasts.value] if lasts.value.strip() else []
-        code, out = await view.rtcp("segment", "fault", kind.value, *given, *more)
+        code, out = await view.rtcp("segment", "fault", kind.value, *fields, *more)
         view.warn(out) if code else view.say(out)
         await show()
 
@@ -173,8 +173,8 @@ async def _faults(view: View) -> None:
         code, out = await view.rtcp("segment", "faults", "--json")
         active.clear()
         with active:
-            for one in json.loads(out) if code == 0 else ():
-                text("p", f"fault {one['id']}: {one['fault']['fault']}, for {one['since_s']:.1f} s")
+            for fault in json.loads(out) if code == 0 else ():
+                text("p", f"fault {fault['id']}: {fault['fault']['fault']}, for {fault['since_s']:.1f} s")
 
     with place:
         buttons = ui.element("div").classes("buttons")

@@ -1,4 +1,4 @@
-"""Start: bus, configuration, modes, cycle; start and stop; what stands in the way of real time, with remedies."""
+"""Start: bus, configuration, modes, cycle; start and stop; obstacles to real time, with remedies."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ def build(view: View) -> None:
         )
         check = button("Check this host", plain=True)
         scan = button("Scan the bus", plain=True)
-    said = text("pre", "", "text", **{"aria-live": "polite"})
-    found = ui.element("div").classes("page")
+    notice = text("pre", "", "text", **{"aria-live": "polite"})
+    results = ui.element("div").classes("page")
 
     def where() -> list[str]:
         arguments = ["--bus", bus.value]
         return [*arguments, "--config", config.value] if config.value.strip() else arguments
 
     def show(line: str) -> None:
-        said.text = f"{said.text}\n{line}".strip()[-8000:]
+        notice.text = f"{notice.text}\n{line}".strip()[-8000:]
 
     async def start() -> None:
-        said.text = ""
+        notice.text = ""
         cell = view.live.partners.cell
         arguments = where() if cell is None else ["--bus", bus.value, "--cell", str(cell.source)]
         if mode.value != _CONFIGURED:
@@ -64,34 +64,34 @@ def build(view: View) -> None:
             view.warn("The platform was not started: the reason stands below the buttons")
 
     async def doctor() -> None:
-        said.text = "..."
+        notice.text = "..."
         _, out = await view.rtcp("doctor", "--json", *where())
-        found.clear()
+        results.clear()
         try:
             findings = json.loads(out[out.index("{") :])["findings"]
         except (ValueError, LookupError):
-            said.text = out
+            notice.text = out
             return
-        said.text = ""
-        with found:
+        notice.text = ""
+        with results:
             body = table(("Check", "", "Found", "Why it matters", "To fix it, as root"), "This host", "stack")
-            for one in findings:
-                with row(body, one["key"].replace("_", " "), one["severity"], one["found"], one["why"]) as made:
-                    made.props["data-severity"] = one["severity"]
+            for entry in findings:
+                with row(body, entry["key"].replace("_", " "), entry["severity"], entry["found"], entry["why"]) as line:
+                    line.props["data-severity"] = entry["severity"]
                     with ui.element("td"):
-                        text("pre", "\n".join(one["remedy"]), "text remedy")
+                        text("pre", "\n".join(entry["remedy"]), "text remedy")
 
     async def scan_bus() -> None:
         if not view.claim():
             return
-        said.text = "..."
+        notice.text = "..."
         code, out = await view.rtcp("scan", "--json", *(["--bus", bus.value] if view.live.status is None else []))
-        found.clear()
+        results.clear()
         if code:
-            said.text = out
+            notice.text = out
             return
-        said.text = ""
-        with found:
+        notice.text = ""
+        with results:
             body = table(("Slave", "Name", "State", "Vendor", "Product"), "Slaves in the order of the cable")
             for slave in json.loads(out):
                 identity = (f"0x{slave[key]:08X}" for key in ("vendor_id", "product_code"))
@@ -120,7 +120,7 @@ def build(view: View) -> None:
 
 
 async def start_virtual(view: View) -> None:
-    """Start the virtual arm as it is configured; show what keeps it from that."""
+    """Start the virtual arm as it is configured; show a failure."""
     lines: list[str] = []
     view.say("The virtual arm starts")
     cell = view.live.partners.cell
@@ -152,7 +152,7 @@ async def _end(view: View) -> None:
 
 
 def _interfaces() -> list[str]:
-    return [VIRTUAL, *sorted(one for one in os.listdir("/sys/class/net") if one != "lo")]
+    return [VIRTUAL, *sorted(interface for interface in os.listdir("/sys/class/net") if interface != "lo")]
 
 
 def _default() -> str:

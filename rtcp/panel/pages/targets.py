@@ -20,7 +20,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.config.zero import state_directory
 from rtcp.panel.page import POSE, Field, View, button, choice, field, no_platform, number, quantity, row, table, text
 
-_WAYS = {"joints": "Joint positions", "pose": "Pose, by the joints", "line": "Pose, on a straight line"}
+_KINDS = {"joints": "Joint positions", "pose": "Pose, by the joints", "line": "Pose, on a straight line"}
 _LONGEST_NAME = 40
 _SAME_RAD = 1e-3
 
@@ -37,36 +37,36 @@ def build(view: View) -> None:
 
 @dataclass(frozen=True)
 class Target:
-    """What the fields say."""
+    """A target, as the fields have it."""
 
     values: tuple[float, ...]
     """Joint positions, rad; or a pose, m and rad."""
-    way: str
+    kind: str
     speed: float | None
 
     def preview(self, robot: AsyncRobot) -> Awaitable[Preview]:
-        """Plan the way there."""
-        if self.way == "joints":
+        """Plan the motion."""
+        if self.kind == "joints":
             return robot.preview(q=self.values, speed=self.speed)
-        return robot.preview(pose=self.values, speed=self.speed, line=self.way == "line")
+        return robot.preview(pose=self.values, speed=self.speed, line=self.kind == "line")
 
     def move(self, robot: AsyncRobot) -> Awaitable[Arrival]:
-        """Move there."""
-        if self.way == "joints":
+        """Carry it out."""
+        if self.kind == "joints":
             return robot.move_joints(self.values, self.speed)
-        return robot.move_pose(self.values, self.speed, self.way == "line")
+        return robot.move_pose(self.values, self.speed, self.kind == "line")
 
 
 class Targets:
-    """The page of one arm: `Plan` shows a way, and only what was shown is sent."""
+    """The page of one arm: `Plan` shows a path, and only a path that was shown is sent."""
 
     def __init__(self, view: View, config: ArmConfig) -> None:
         self._view, self._config = view, config
         self._planned: Target | None = None
         self._begin: Sequence[float] = ()
-        """Where what was shown begins, rad."""
+        """Start of the path that was shown, rad."""
         with ui.element("div").classes("fields"):
-            self._way = choice("Target", _WAYS if config.arm else {"joints": _WAYS["joints"]}, "joints")
+            self._kind = choice("Target", _KINDS if config.arm else {"joints": _KINDS["joints"]}, "joints")
             self._speeds = {unit: number("Speed (empty: the limit)", unit=unit, min="0") for unit in ("rad/s", "m/s")}
         self._joints_part = ui.element("div").classes("fields")
         with self._joints_part:
@@ -81,22 +81,22 @@ class Targets:
             button("Plan", self._plan, when="ready holding")
             self._send_button = button("Send", self._send)
             self._solve_button = button("Solutions", self._solve, plain=True) if config.arm is not None else None
-        self._said = text("p", "", role="status", **{"aria-live": "polite"})
-        self._found = ui.element("div").classes("page")
+        self._notice = text("p", "", role="status", **{"aria-live": "polite"})
+        self._solutions = ui.element("div").classes("page")
         text("h2", "Named poses")
         with ui.element("div").classes("buttons"):
             self._name = field("Name", maxlength=str(_LONGEST_NAME))
             button("Keep these joint positions", self._keep, plain=True)
         self._named = ui.element("div").classes("page")
         self._show_named()
-        for one in (self._way, *self._speeds.values(), *self._pose):
-            one.on_change(self._changed)
+        for control in (self._kind, *self._speeds.values(), *self._pose):
+            control.on_change(self._changed)
         self._here()
         self._changed()
 
     def _with_slider(self, name: str, low: float, high: float) -> Field:
         with ui.element("div"):
-            made = number(name, unit="rad")
+            control = number(name, unit="rad")
             slider = ui.element("input")
             slider.props.update(
                 {
@@ -105,34 +105,34 @@ class Targets:
                     "max": f"{high:g}",
                     "step": "0.001",
                     "aria-label": f"{name}, slider",
-                    "data-slider": made.control.html_id,
+                    "data-slider": control.control.html_id,
                 }
             )
-        made.on_change(self._changed)
-        return made
+        control.on_change(self._changed)
+        return control
 
     @property
     def _speed(self) -> Field:
-        """That of the joints, or of the tool on a line."""
-        return self._speeds["m/s" if self._way.value == "line" else "rad/s"]
+        """Speed of the joints, or of the tool on a line."""
+        return self._speeds["m/s" if self._kind.value == "line" else "rad/s"]
 
     def _changed(self) -> None:
-        """What was planned is not what the fields say any more."""
-        for one in self._speeds.values():
-            one.place.set_visibility(one is self._speed)
+        """Discard the plan: the fields have changed."""
+        for control in self._speeds.values():
+            control.place.set_visibility(control is self._speed)
         self._planned = None
         self._send_button.props["disabled"] = True
-        self._joints_part.set_visibility(self._way.value == "joints")
-        self._pose_part.set_visibility(self._way.value != "joints")
+        self._joints_part.set_visibility(self._kind.value == "joints")
+        self._pose_part.set_visibility(self._kind.value != "joints")
         if self._solve_button is not None:
-            self._solve_button.set_visibility(self._way.value != "joints")
+            self._solve_button.set_visibility(self._kind.value != "joints")
         if self._view.arm is not None:
             self._view.arm.preview([], 0.0)
 
     def _here(self) -> None:
         state = self._view.live.state()
         if "joints" in state:
-            # Where it holds it is what it was told to hold: the same target again moves nothing.
+            # Where it holds, the commanded positions: the same target again moves nothing.
             which = "commanded_position" if state["state"] == "holding" else "actual_position"
             self._fill(self._joints, state["joints"][which])
             self._fill(self._pose, state.get("tool", ()))
@@ -140,32 +140,32 @@ class Targets:
 
     @staticmethod
     def _fill(fields: Sequence[Field], values: Sequence[float]) -> None:
-        for one, value in zip(fields, values, strict=False):
-            one.value = f"{round(value, 6) + 0.0:.5g}"  # no -0
+        for control, value in zip(fields, values, strict=False):
+            control.value = f"{round(value, 6) + 0.0:.5g}"  # no -0
 
     def _target(self) -> Target:
-        """Return what the fields say; raises Invalid."""
+        """Return the target in the fields; raises Invalid."""
         speed = self._speed.number() if self._speed.value.strip() else None
-        fields = self._joints if self._way.value == "joints" else self._pose
-        return Target(tuple(one.number() for one in fields), self._way.value, speed)
+        fields = self._joints if self._kind.value == "joints" else self._pose
+        return Target(tuple(control.number() for control in fields), self._kind.value, speed)
 
     async def _plan(self) -> None:
         self._changed()
         try:
             target = self._target()
-            found = await self._view.query(target.preview)
+            plan = await self._view.query(target.preview)
         except RtcpError as error:
-            self._said.text = f"No: {error.message}"
+            self._notice.text = f"No: {error.message}"
             return
         if target != self._target():
             return  # changed meanwhile
-        length = "" if found.length_m is None else f", {found.length_m:.3f} m"
-        look = "" if self._view.arm is None else "look at the ghost, then "
-        self._said.text = f"{found.duration_s:.1f} s{length}: {look}send it"
+        length = "" if plan.length_m is None else f", {plan.length_m:.3f} m"
+        hint = "" if self._view.arm is None else "look at the ghost, then "
+        self._notice.text = f"{plan.duration_s:.1f} s{length}: {hint}send it"
         if self._view.arm is not None:
-            self._view.arm.preview([list(q) for q in found.path], found.duration_s)
+            self._view.arm.preview([list(q) for q in plan.path], plan.duration_s)
             ui.run_javascript("rtcp.showArm()")
-        self._planned, self._begin = target, found.path[0]
+        self._planned, self._begin = target, plan.path[0]
         self._send_button.props["disabled"] = False
 
     async def _send(self) -> None:
@@ -174,44 +174,44 @@ class Targets:
             return
         now = self._view.live.state().get("joints", {}).get("commanded_position", ())
         if len(now) != len(begin) or max(abs(a - b) for a, b in zip(now, begin, strict=True)) > _SAME_RAD:
-            self._said.text = "The arm has moved since: plan again"
+            self._notice.text = "The arm has moved since: plan again"
             return
-        self._said.text = "Moving"
+        self._notice.text = "Moving"
         arrival = await self._view.act(target.move)
         self._changed()
-        self._said.text = "" if arrival is None else f"There; largest error of a joint {arrival.error:.5f} rad"
+        self._notice.text = "" if arrival is None else f"There; largest error of a joint {arrival.error:.5f} rad"
 
     async def _solve(self) -> None:
         """Show every configuration that reaches the pose, under the limits in force."""
-        self._found.clear()
+        self._solutions.clear()
         try:
-            pose, state = Pose.from_xyzrpy(*(one.number() for one in self._pose)), self._view.live.state()
+            pose, state = Pose.from_xyzrpy(*(control.number() for control in self._pose)), self._view.live.state()
             model = self._config.model_of(state["tool_name"])
             assert model is not None
-            found = InverseKinematics(model).solve(pose, state["joints"]["actual_position"])
+            result = InverseKinematics(model).solve(pose, state["joints"]["actual_position"])
             in_force = (await self._view.query(lambda robot: robot.limits()))["limits"]
         except (Invalid, ValueError, LookupError) as error:
-            self._said.text = f"No: {error}"
+            self._notice.text = f"No: {error}"
             return
-        if not found.solutions:
-            self._said.text = f"No: {found.reason}"
+        if not result.solutions:
+            self._notice.text = f"No: {result.reason}"
             return
-        with self._found:
+        with self._solutions:
             names = [joint.name for joint in self._config.joints]
             body = table(("#", "Branch", *((name, "rad") for name in names), "Limits", ""), "Solutions of the pose")
-        for count, one in enumerate(found.solutions, 1):
+        for count, solution in enumerate(result.solutions, 1):
             outside = [
-                name for name, q, low, high in zip(names, one.q, in_force["min"], in_force["max"], strict=True)
+                name for name, q, low, high in zip(names, solution.q, in_force["min"], in_force["max"], strict=True)
                 if not low <= q <= high
             ]  # fmt: skip
             limits = f"outside: {', '.join(outside)}" if outside else "inside"
-            angles: list[tuple[float, str, int]] = [(q, "rad", 4) for q in one.q]
-            with row(body, str(count), str(one.branch or "-"), *angles, limits), ui.element("td"):
-                button(f"Use solution {count}", partial(self._use, one.q), plain=True)
+            angles: list[tuple[float, str, int]] = [(q, "rad", 4) for q in solution.q]
+            with row(body, str(count), str(solution.branch or "-"), *angles, limits), ui.element("td"):
+                button(f"Use solution {count}", partial(self._use, solution.q), plain=True)
 
     def _use(self, q: Sequence[float]) -> None:
         self._fill(self._joints, q)
-        self._way.value = "joints"
+        self._kind.value = "joints"
         self._changed()
 
     # -- named poses --------------------------------------------------------------------------------------------------
@@ -224,7 +224,7 @@ class Targets:
             self._view.warn("Name: found nothing, allowed is a name of the pose")
             return
         try:
-            write_named({**read_named(), name: [one.number() for one in self._joints]})
+            write_named({**read_named(), name: [control.number() for control in self._joints]})
         except (RtcpError, OSError) as error:
             self._view.warn(str(error))
         self._show_named()
@@ -251,8 +251,8 @@ class Targets:
                 with ui.element("div").classes("buttons"):
                     button(name, partial(self._use, q), plain=True)
                     with ui.element("span").classes("values"):
-                        for one in q:
-                            quantity(one, "rad", 3)
+                        for angle in q:
+                            quantity(angle, "rad", 3)
                     button(f"Remove {name}", partial(self._forget, name), plain=True)
 
 
@@ -271,8 +271,8 @@ def read_named() -> dict[str, list[float]]:
     if not path.exists():
         return {}
     try:
-        found = YAML(typ="safe").load(path.read_text()) or {}
-        return {str(name): [float(one) for one in q] for name, q in found.items()}
+        poses = YAML(typ="safe").load(path.read_text()) or {}
+        return {str(name): [float(angle) for angle in q] for name, q in poses.items()}
     except (OSError, YAMLError, ValueError, TypeError, AttributeError) as error:
         message = f"{path}: found no names with joint positions ({error}): mend or remove it"
         raise RtcpError("invalid", message) from error

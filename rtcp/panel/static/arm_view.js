@@ -14,8 +14,8 @@ function place(object, { xyz, rpy }) {
 }
 
 class Chain {
-  constructor(scene, links, look = {}) { // look: a color and opacity of all links
-    const { color, opacity = 1 } = look;
+  constructor(scene, links, style = {}) { // style: a color and opacity of all links
+    const { color, opacity = 1 } = style;
     this.joints = [];
     this.links = new Map();
     this.materials = [];
@@ -28,7 +28,7 @@ class Chain {
       if (link.joint >= 0) this.joints[link.joint] = [turning, new THREE.Vector3(...link.axis)];
       for (const visual of link.visuals) {
         const material = new THREE.MeshPhongMaterial({ color: color ?? (visual.drawn ? "#868e96" : "#4a6da7"),
-          transparent: opacity < 1, opacity, depthWrite: look !== GHOST });
+          transparent: opacity < 1, opacity, depthWrite: style !== GHOST });
         const mesh = new THREE.Mesh(shape(visual), material);
         const holder = new THREE.Group();
         place(holder, visual);
@@ -62,7 +62,7 @@ class Partner { // another arm of the cell, at its base, with its name over it
   }
   show(q) {
     this.place.visible = Boolean(q);
-    return q && [this.name, this.chain.toolAt(q).toArray().map((one) => +one.toFixed(4))];
+    return q && [this.name, this.chain.toolAt(q).toArray().map((value) => +value.toFixed(4))];
   }
 }
 
@@ -76,10 +76,10 @@ function sign(text) {
   brush.font = font;
   brush.fillStyle = "#fff";
   brush.fillText(text, 12, 42);
-  const made = new THREE.Sprite(new THREE.SpriteMaterial({ map: new THREE.CanvasTexture(canvas) }));
-  made.scale.set(0.1 * canvas.width / canvas.height, 0.1, 1);
-  made.position.set(0, 0, -0.08);
-  return made;
+  const sprite = new THREE.Sprite(new THREE.SpriteMaterial({ map: new THREE.CanvasTexture(canvas) }));
+  sprite.scale.set(0.1 * canvas.width / canvas.height, 0.1, 1);
+  sprite.position.set(0, 0, -0.08);
+  return sprite;
 }
 
 function shape({ kind, size }) {
@@ -92,10 +92,10 @@ function line(color, count) {
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * count), 3));
   geometry.setDrawRange(0, 0);
-  const made = new THREE.Line(geometry, new THREE.LineBasicMaterial({ color, depthTest: false }));
-  made.renderOrder = 1; // seen through the arm
-  made.frustumCulled = false;
-  return made;
+  const line = new THREE.Line(geometry, new THREE.LineBasicMaterial({ color, depthTest: false }));
+  line.renderOrder = 1; // seen through the arm
+  line.frustumCulled = false;
+  return line;
 }
 
 export default {
@@ -149,12 +149,12 @@ export default {
   },
   methods: {
     show(state) {
-      if (state.goal && this.plan) { // what moves counts more than what is planned
+      if (state.goal && this.plan) { // a motion under way replaces a plan
         this.plan = null;
         if (!state.mine) this.path.geometry.setDrawRange(0, 0);
       }
       if (!this.plan) this.aim(state.goal);
-      const places = this.others.map((one) => one.show(state.partners?.[one.name]?.q)).filter(Boolean);
+      const places = this.others.map((partner) => partner.show(state.partners?.[partner.name]?.q)).filter(Boolean);
       const around = JSON.stringify(Object.fromEntries(places));
       if (around !== this.$el.dataset.partners) { this.$el.dataset.partners = around; this.draw(); }
       this.drawRod(state.rod ?? []);
@@ -164,25 +164,25 @@ export default {
       const before = this.drawn;
       if (state.tool) this.trail(state.tool);
       if (state.singular) {
-        const [shoulder, elbow, wrist] = state.singular.map((one) => one ?? Infinity);
+        const [shoulder, elbow, wrist] = state.singular.map((distance) => distance ?? Infinity);
         const near = 1 - Math.min(1, shoulder / 0.1, elbow / 0.2, wrist / 0.2);
         for (const material of this.arm.materials) material.color.copy(NORMAL).lerp(NEAR, near);
         this.$el.dataset.near = near.toFixed(2);
       }
       if (state.limits) this.drawBoxes(state.limits);
       if (this.plan) this.follow();
-      // Drawn only where something has changed: an arm at rest costs its viewers nothing.
+      // Draw only on a change: an arm at rest costs its viewers nothing.
       this.drawn = [this.points?.map(([at]) => at), this.$el.dataset.boxes, state.joints.actual_position.map((q) => q.toFixed(4)), state.goal].join();
       if (this.plan || this.drawn !== before) this.draw();
     },
-    drawRod(curves) { // the rod along its bend, as it is planned: the last curve is the wanted one
+    drawRod(curves) { // the planned curves of the rod along its bend; the last one is the wanted shape
       const drawn = JSON.stringify(curves);
       if (drawn === (this.$el.dataset.rod ?? "[]")) return;
       this.$el.dataset.rod = drawn;
-      for (const one of this.rods.children) { one.geometry.dispose(); one.material.dispose(); }
+      for (const curve of this.rods.children) { curve.geometry.dispose(); curve.material.dispose(); }
       this.rods.clear();
       curves.forEach((points, at) => {
-        const geometry = new THREE.BufferGeometry().setFromPoints(points.map((one) => new THREE.Vector3(...one)));
+        const geometry = new THREE.BufferGeometry().setFromPoints(points.map((point) => new THREE.Vector3(...point)));
         const opacity = at + 1 === curves.length ? 1 : 0.35;
         this.rods.add(new THREE.Line(geometry, new THREE.LineBasicMaterial({ color: GHOST.color, transparent: true, opacity })));
       });
@@ -199,29 +199,29 @@ export default {
       this.$el.dataset.trail = this.points.length;
     },
     drawBoxes({ box, keep_out }) {
-      const found = [...(box ? [[box, false]] : []), ...Object.values(keep_out).map((one) => [one, true])];
-      const drawn = JSON.stringify(found);
+      const boxes = [...(box ? [[box, false]] : []), ...Object.values(keep_out).map((zone) => [zone, true])];
+      const drawn = JSON.stringify(boxes);
       if (drawn === this.$el.dataset.boxes) return;
       this.$el.dataset.boxes = drawn;
-      for (const one of this.boxes.children) { one.geometry.dispose(); one.material.dispose(); }
+      for (const part of this.boxes.children) { part.geometry.dispose(); part.material.dispose(); }
       this.boxes.clear();
-      for (const [{ min, max }, isKeptOut] of found) {
+      for (const [{ min, max }, isKeptOut] of boxes) {
         const size = max.map((value, at) => value - min[at]), color = isKeptOut ? "#c92a2a" : "#2f9e44";
         const geometry = new THREE.BoxGeometry(...size);
         const solid = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ color, transparent: true,
           opacity: isKeptOut ? 0.2 : 0.03, depthWrite: false }));
         const edges = new THREE.LineSegments(new THREE.EdgesGeometry(geometry), new THREE.LineBasicMaterial({ color }));
-        for (const one of [solid, edges]) { one.position.set(...min.map((value, at) => value + size[at] / 2)); this.boxes.add(one); }
+        for (const part of [solid, edges]) { part.position.set(...min.map((value, at) => value + size[at] / 2)); this.boxes.add(part); }
       }
     },
     preview(path, duration_s) {
       if (!this.ghost) return;
       this.plan = path?.length ? { path, duration_s: Math.max(0.5, duration_s), began: performance.now() } : null;
       const points = this.path.geometry.attributes.position;
-      const shown = (path ?? []).slice(0, 400);
-      shown.forEach((q, at) => points.array.set(this.ghost.toolAt(q).toArray(), 3 * at));
+      const drawn = (path ?? []).slice(0, 400);
+      drawn.forEach((q, at) => points.array.set(this.ghost.toolAt(q).toArray(), 3 * at));
       points.needsUpdate = true;
-      this.path.geometry.setDrawRange(0, shown.length);
+      this.path.geometry.setDrawRange(0, drawn.length);
       this.aim(path?.at(-1) ?? window.rtcp.state.goal);
       this.draw();
     },
@@ -244,7 +244,7 @@ export default {
       if (zoom) seen.multiplyScalar(zoom);
       else {
         seen.applyAxisAngle(up, turn[0]);
-        // Not over the top: what is above stays above.
+        // Not over the top: the view never turns upside down.
         const polar = seen.angleTo(up), wanted = Math.min(Math.PI - 0.05, Math.max(0.05, polar - turn[1]));
         seen.applyAxisAngle(up.clone().cross(seen).normalize(), wanted - polar);
       }

@@ -1,8 +1,8 @@
-// What a page does all the time without asking the server's pages: show the state, answer it, and pass on the hand of
-// the operator. The socket and its tokens: rtcp/panel/live.py.
+// What every page does: it shows the state, answers it, and sends the operator's input. The socket and its tokens:
+// rtcp/panel/live.py.
 "use strict";
 window.rtcp = (() => {
-  const STALE_MS = 500; // without a message for so long the page says so
+  const STALE_MS = 500; // time without a message after which the page says so
   const OLD_S = 0.5; // joint values older than this are marked; a bar that comes and goes would move the buttons
   let socket = null, token = 0, heard = 0, state = {}, connected = false;
   const listeners = new Set(), pictures = new Set();
@@ -24,22 +24,22 @@ window.rtcp = (() => {
       socket.send(JSON.stringify({ seen: token, visible: !document.hidden, ...message }));
     }
   }
-  function receive(found) {
-    if (found.scope) {
-      for (const picture of pictures) picture(found.scope);
+  function receive(message) {
+    if (message.scope) {
+      for (const picture of pictures) picture(message.scope);
       return;
     }
     const now = performance.now();
-    // After a stall of this page what was pressed before counts no more.
+    // After a stall of this page, keys pressed before it are ignored.
     if (heard && now - heard > 200) release();
     heard = now;
-    token = found.token;
-    state = found;
+    token = message.token;
+    state = message;
     gamepad();
     send(pressed.size || pad ? jogMessage() : {});
-    for (const note of found.notes) say(note);
+    for (const note of message.notes) say(note);
     show();
-    for (const listener of listeners) listener(found);
+    for (const listener of listeners) listener(message);
   }
   function say(text) {
     const box = document.getElementById("notes");
@@ -61,7 +61,7 @@ window.rtcp = (() => {
   // Values are SI everywhere; what a person reads and types is in the units that this browser keeps.
   const UNITS = { rad: { rad: 1, deg: 180 / Math.PI }, m: { m: 1, mm: 1000 } };
   const chosen = { rad: "rad", m: "m", ...kept(() => JSON.parse(localStorage.getItem("rtcp-units"))) };
-  function unit(si) { // the name of what is shown for a unit of the interfaces, and how many of it make one
+  function unit(si) { // the shown unit for a unit of the interfaces, and the factor between them
     const [base, ...rest] = si.split("/"), name = Object.hasOwn(chosen, base) ? chosen[base] : "";
     return name ? [[name, ...rest].join("/"), UNITS[base][name] ?? 1] : [si, 1];
   }
@@ -70,7 +70,7 @@ window.rtcp = (() => {
     return digits ? (value * factor).toFixed(Math.max(0, digits - fewer)) : String(factor === 1 ? value : +(value * factor).toPrecision(5));
   }
   function isNumber(text) { return text.trim() !== "" && Number.isFinite(+text); }
-  function measure(field) { // show what a field says in the chosen unit
+  function measure(field) { // show the value of a field in the chosen unit
     const factor = unit(field.dataset.in)[1], before = +(field.dataset.factor ?? 1);
     if (field.dataset.factor === String(factor)) return;
     field.dataset.factor = factor;
@@ -91,9 +91,9 @@ window.rtcp = (() => {
     if (dataset.in) dataset.si = si;
     return si;
   }
-  function showUnits(which = ":not([data-measured])") { // of what has been added since
-    const found = ["[data-unit]", "[data-si]", "input[data-in]", "[data-units]"].map((kind) => kind + which);
-    for (const element of document.querySelectorAll(found.join())) {
+  function showUnits(which = ":not([data-measured])") { // of the elements added since
+    const selectors = ["[data-unit]", "[data-si]", "input[data-in]", "[data-units]"].map((kind) => kind + which);
+    for (const element of document.querySelectorAll(selectors.join())) {
       const { unit: of, units, si } = element.dataset;
       if (of) put(element, unit(of)[0]);
       else if (units) element.value = chosen[units];
@@ -128,10 +128,10 @@ window.rtcp = (() => {
       const isState = element.dataset.live.endsWith("state");
       if (!connected) value = isState ? "no connection" : undefined;
       const empty = value === undefined || value === null || value === "";
-      const said = empty ? "–" : typeof value === "number" ? figure(value, element.dataset) : String(value);
-      put(element, (isState ? said.replaceAll("_", " ") : said) + (empty ? "" : element.dataset.suffix ?? ""));
+      const label = empty ? "–" : typeof value === "number" ? figure(value, element.dataset) : String(value);
+      put(element, (isState ? label.replaceAll("_", " ") : label) + (empty ? "" : element.dataset.suffix ?? ""));
       if (isState) element.dataset.state = String(value);
-      else if (name === "drive") element.dataset.value = said;
+      else if (name === "drive") element.dataset.value = label;
     }
     showUnits();
     for (const element of document.querySelectorAll("[data-bar]")) {
@@ -183,7 +183,7 @@ window.rtcp = (() => {
   let overridden = 0; // when somebody moved the slider of the override
   document.addEventListener("input", (event) => { if (event.target.dataset?.override === "") overridden = performance.now(); });
 
-  // The first steps of somebody for whom no platform runs: start, enable, move.
+  // The first steps while no platform runs: start, enable, move.
   const LED = "rtcp-led";
   let done = null;
   function lead() {
@@ -194,10 +194,10 @@ window.rtcp = (() => {
     if (!["off", "starting"].includes(state.state)) done.add("start");
     if (["holding", "moving"].includes(state.state)) done.add("enable");
     if (state.state === "moving") done.add("move");
-    const steps = [...box.querySelectorAll("[data-step]")], next = steps.find((one) => !done.has(one.dataset.step));
-    for (const one of steps) {
-      one.dataset.done = done.has(one.dataset.step);
-      one.toggleAttribute("aria-current", one === next);
+    const steps = [...box.querySelectorAll("[data-step]")], next = steps.find((step) => !done.has(step.dataset.step));
+    for (const step of steps) {
+      step.dataset.done = done.has(step.dataset.step);
+      step.toggleAttribute("aria-current", step === next);
     }
     box.hidden = false;
     if (!next) setTimeout(endLead, 4000);
@@ -231,7 +231,7 @@ window.rtcp = (() => {
 
   // -- the operator's hand -----------------------------------------------------------------------------------------------
 
-  const pressed = new Map(); // what holds -> the six parts of the speed that it asks for
+  const pressed = new Map(); // key or button -> its axis and sign
   let press = 0, pad = null, padEnded = false;
   const AXES = ["x", "y", "z", "rx", "ry", "rz"];
   function stepping() { return document.querySelector("[data-jog-frame]")?.dataset.jogStep ?? ""; }
@@ -261,7 +261,7 @@ window.rtcp = (() => {
     const frame = parts.jogFrame ?? "base";
     const count = frame === "joints" ? (state.joints?.actual_position.length ?? 6) : 6;
     const jog = Array(count).fill(0);
-    for (const one of pressed.keys()) if (one.isConnected === false || one.disabled) pressed.delete(one);
+    for (const key of pressed.keys()) if (key.isConnected === false || key.disabled) pressed.delete(key);
     for (const [axis, sign] of pressed.values()) if (axis < count) jog[axis] += sign;
     if (pad) pad.forEach((value, axis) => { if (axis < count) jog[axis] += value; });
     const speeds = frame === "joints" ? Array(count).fill(+parts.jogJoint || 0)
@@ -283,19 +283,19 @@ window.rtcp = (() => {
     return [button, at >= 0 ? at : +axis, sign];
   }
   document.addEventListener("pointerdown", (event) => {
-    const found = jogOf(event.target);
-    if (!found || event.button > 0 || stepping()) return;
+    const jog = jogOf(event.target);
+    if (!jog || event.button > 0 || stepping()) return;
     event.preventDefault();
-    found[0].focus();
-    found[0].setPointerCapture?.(event.pointerId);
-    begin(...found);
+    jog[0].focus();
+    jog[0].setPointerCapture?.(event.pointerId);
+    begin(...jog);
   });
   for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
     document.addEventListener(name, (event) => end(padOf(event.target)));
   }
   document.addEventListener("contextmenu", (event) => { if (jogOf(event.target)) event.preventDefault(); });
 
-  // By the place of a key: its letter changes with Shift and Caps Lock between press and release.
+  // By the position of a key: its letter changes with Shift and Caps Lock between press and release.
   const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [1, 1], ArrowRight: [1, -1], PageUp: [2, 1],
     PageDown: [2, -1], KeyQ: [5, 1], KeyE: [5, -1], KeyA: [3, 1], KeyD: [3, -1], KeyW: [4, 1], KeyS: [4, -1] };
   const GRIPPER = { KeyO: "open", KeyC: "close" };
@@ -316,16 +316,16 @@ window.rtcp = (() => {
     const area = event.target.closest?.("[data-jog-frame]");
     if (!area || event.ctrlKey || event.altKey || event.metaKey) return;
     if (GRIPPER[event.code] && !event.repeat) gripper(GRIPPER[event.code]);
-    const found = KEYS[event.code];
-    if (!found) return;
+    const movement = KEYS[event.code];
+    if (!movement) return;
     event.preventDefault();
     if (event.repeat) return;
-    if (stepping()) step(...found);
-    else begin(event.code, ...found);
+    if (stepping()) step(...movement);
+    else begin(event.code, ...movement);
   });
   function step(axis, sign) {
     const names = [AXES[axis], axis].map((name) => `[data-jog="${name}${sign > 0 ? "+" : "-"}"]`);
-    [...document.querySelectorAll(names.join())].find((one) => one.checkVisibility())?.click();
+    [...document.querySelectorAll(names.join())].find((button) => button.checkVisibility())?.click();
   }
   document.addEventListener("keyup", (event) => {
     if (event.key === " " || event.key === "Enter") end(padOf(event.target));
@@ -341,24 +341,24 @@ window.rtcp = (() => {
   let lastGripper = "";
   function gamepad() {
     const area = document.querySelector("[data-jog-frame]");
-    const found = area && !document.hidden && document.hasFocus() && [...navigator.getGamepads()].find((one) => one?.connected);
-    const held = found && !stepping() && found.buttons[4]?.pressed;
-    const wanted = !found ? "" : found.buttons[0]?.pressed ? "close" : found.buttons[1]?.pressed ? "open" : "";
+    const device = area && !document.hidden && document.hasFocus() && [...navigator.getGamepads()].find((gamepad) => gamepad?.connected);
+    const enabled = device && !stepping() && device.buttons[4]?.pressed;
+    const wanted = !device ? "" : device.buttons[0]?.pressed ? "close" : device.buttons[1]?.pressed ? "open" : "";
     const begins = wanted && wanted !== lastGripper;
     lastGripper = wanted;
-    if (held && begins) { gripper(wanted); return; }
-    if (!held) padEnded = false;
-    if (!held || padEnded) { if (pad) { pad = null; if (!pressed.size) { send(jogMessage()); press += 1; } } return; }
+    if (enabled && begins) { gripper(wanted); return; }
+    if (!enabled) padEnded = false;
+    if (!enabled || padEnded) { if (pad) { pad = null; if (!pressed.size) { send(jogMessage()); press += 1; } } return; }
     if (!pad && !pressed.size) press += 1;
-    const stick = (at) => (Math.abs(found.axes[at] ?? 0) > 0.15 ? found.axes[at] : 0);
-    const cross = (plus, minus) => (found.buttons[plus]?.pressed ? 1 : 0) - (found.buttons[minus]?.pressed ? 1 : 0);
+    const stick = (at) => (Math.abs(device.axes[at] ?? 0) > 0.15 ? device.axes[at] : 0);
+    const cross = (plus, minus) => (device.buttons[plus]?.pressed ? 1 : 0) - (device.buttons[minus]?.pressed ? 1 : 0);
     pad = [-stick(1), -stick(0), -stick(3), cross(15, 14), cross(12, 13), -stick(2)];
   }
 
   function stop() {
     release();
     if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ seen: token, visible: true, stop: true }));
-    // By another way as well: the socket may hang.
+    // Over HTTP as well: the socket may hang.
     fetch("/stop", { method: "POST", keepalive: true })
       .then(async (answer) => { if (!answer.ok) say(`STOP was not carried out: ${await answer.text()}`); })
       .catch(() => say("STOP did not reach the panel: use the emergency stop"));
@@ -391,7 +391,7 @@ window.rtcp = (() => {
       if (!pageKey()) return;
       clearInterval(wait);
       connect();
-      const head = document.getElementById("head"); // what is told lies below it
+      const head = document.getElementById("head"); // notifications lie below it
       new ResizeObserver(() => document.body.style.setProperty("--head", `${head.offsetHeight}px`)).observe(head);
     }, 50);
   });

@@ -35,13 +35,13 @@ export default {
       }, Math.max(0, this.free_at - performance.now()));
     },
     pause(value) { this.paused = value; },
-    shown() {
+    range() {
       const { t } = this.block, { start = 0, end = 100 } = this.chart.getOption().dataZoom[0];
       return [start, end].map((percent) => t[0] + (percent / 100) * (t.at(-1) - t[0]));
     },
     keys(event) {
       if (!this.block || event.ctrlKey || event.altKey || event.metaKey) return;
-      const [from, to] = this.shown(), middle = (from + to) / 2, last = this.marks.length - 1;
+      const [from, to] = this.range(), middle = (from + to) / 2, last = this.marks.length - 1;
       const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key], wider = { "+": 0.5, "-": 2 }[event.key];
       if (event.key === "Enter") this.marks = [...this.marks, middle].slice(-2);
       else if (step && this.marks.length) this.marks[last] = Math.min(to, Math.max(from, this.marks[last] + (step * (to - from)) / (event.shiftKey ? 20 : 200)));
@@ -78,18 +78,18 @@ export default {
     },
     read() {
       const { t, y, signals } = this.block;
-      const at = (mark) => t.reduce((best, one, k) => (Math.abs(one - mark) < Math.abs(t[best] - mark) ? k : best), 0);
+      const at = (mark) => t.reduce((best, instant, k) => (Math.abs(instant - mark) < Math.abs(t[best] - mark) ? k : best), 0);
       const [a, b] = this.marks.map(at);
-      const one = (k) => signals.map((name, line) => `${this.names[name]} ${y[line][k].toPrecision(5)}`).join(", ");
-      if (b === undefined) return `A ${t[a].toFixed(4)} s: ${one(a)}`;
+      const values = (k) => signals.map((name, line) => `${this.names[name]} ${y[line][k].toPrecision(5)}`).join(", ");
+      if (b === undefined) return `A ${t[a].toFixed(4)} s: ${values(a)}`;
       const change = signals.map((name, line) => `${this.names[name]} ${(y[line][b] - y[line][a]).toPrecision(4)}`).join(", ");
       return `A ${t[a].toFixed(4)} s, B ${t[b].toFixed(4)} s, B - A ${(t[b] - t[a]).toFixed(4)} s: ${change}`;
     },
     csv() {
       if (!this.block) return;
       const { t, y, signals } = this.block;
-      const [from, to] = this.shown();
-      const rows = t.map((one, k) => [one, ...y.map((line) => line[k])]).filter(([one]) => from <= one && one <= to);
+      const [from, to] = this.range();
+      const rows = t.map((instant, k) => [instant, ...y.map((line) => line[k])]).filter(([instant]) => from <= instant && instant <= to);
       const lines = [["Time", ...signals], ...rows].map((row) => row.join(","));
       const link = Object.assign(document.createElement("a"), { download: "scope.csv",
         href: URL.createObjectURL(new Blob([lines.join("\n") + "\n"], { type: "text/csv" })) });

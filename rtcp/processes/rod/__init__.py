@@ -1,4 +1,4 @@
-"""A rod that two arms hold: its equilibria, ways between them, its set shape, and the motion that bends it."""
+"""A rod that two arms hold: its equilibria, paths between them, its set shape, and the motion that bends it."""
 
 from rtcp.processes.rod.bending import BendingPlan, Chuck, plan_bending, plan_motion
 from rtcp.processes.rod.continuation import Form, bend, follow_parameters, follow_pose, pre_bend, sample_equilibrium

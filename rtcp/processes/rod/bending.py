@@ -35,18 +35,18 @@ Array = npt.NDArray[np.float64]
 HALF_TURN: Final = Pose((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0))
 """From the end of the rod, whose e1 points into the second chuck, to the mouth of that chuck."""
 _LARGEST_JOINT_STEP: Final = 0.3
-"""Of a joint between two steps of the rod, rad; more is another branch."""
+"""Largest step of a joint between two steps of the rod, rad; a larger one changes the branch."""
 _POINT_S: Final = 0.1
 _SMALLEST_PART: Final = 1e-4
 _STRETCH: Final = 1.25
 _ATTEMPTS: Final = 8
 _WRIST: Final = 4
-"""The first link that is too near to a chuck for a distance between them to mean anything."""
+"""The first link that is always near the chuck: its distance to it is not checked."""
 _OWN_ARC: Final = 20.0
-"""Diameters; two places of the rod that are nearer along it belong to one bend: 8 % strain makes a circle of 39."""
+"""Distance along the rod, in diameters, below which two places belong to one bend: a circle of 8 % strain has 39."""
 _SAME_RAD: Final = 1e-4
 _NEAR_STRAIGHT_RAD: Final = 0.1
-"""Between the ends. Below it the rod is too near to the singular straight one to be solved again by its end pose."""
+"""Angle between the ends below which the rod is too near to the singular straight one to be solved by its end pose."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class BendingPlan:
 
     arms: points of each arm; both begin at rest with the straight rod. steps: the rod, in the frame of its start.
     times: of the steps, s. starts: poses of the rod's start in the world. curves: the rod in the world,
-    (steps, nodes, 3), m. clearance: least distance of the rod to what does not hold it, m.
+    (steps, nodes, 3), m. clearance: least distance of the rod to any other body, m.
     """
 
     arms: Mapping[str, tuple[Point, ...]]
@@ -82,12 +82,12 @@ class BendingPlan:
 
     @property
     def begin(self) -> dict[str, tuple[float, ...]]:
-        """Where the arms hold the straight rod, rad."""
+        """Joint positions at which the arms hold the straight rod, rad."""
         return {name: points[0].q for name, points in self.arms.items()}
 
     @property
     def duration_s(self) -> float:
-        """How long it takes."""
+        """Duration, s."""
         return self.times[-1]
 
 
@@ -114,7 +114,7 @@ def plan_motion(
     held: Pose,
     near: Mapping[str, Sequence[float]],
 ) -> BendingPlan:
-    """Return the plan of a way of the rod, which is a continuous one (`rtcp.processes.rod.continuation`).
+    """Return the plan of a continuous path of the rod (`rtcp.processes.rod.continuation`).
 
     Args:
         cell: with the two arms.
@@ -125,10 +125,10 @@ def plan_motion(
 
     Raises:
         Invalid: not two arms of the cell, or not a number in `near` for each joint.
-        Refused: `arm_out_of_reach`, `rod_collision`, `arms_too_near`, `rod_strain`, `rod_unstable`, with what, where,
-            the value and what is allowed; nothing is begun.
+        Refused: `arm_out_of_reach`, `rod_collision`, `arms_too_near`, `rod_strain`, `rod_unstable`, with subject,
+            place, value and limit; nothing is begun.
     """
-    names = [one.name for one in cell.arms]
+    names = [arm.name for arm in cell.arms]
     if len(chucks) != 2 or not set(chucks) <= set(names) or set(near) != set(chucks):
         raise RtcpError(
             "invalid",
@@ -143,7 +143,7 @@ def plan_motion(
     holders = {name: _Holder(cell.member(name), chuck, cell.clearance) for name, chuck in chucks.items()}
     starts = tuple(held @ step.pose(len(step.s) // 2).inverse() for step in steps)
     tools = (starts, [start @ step.end @ HALF_TURN for start, step in zip(starts, steps, strict=True)])
-    ways = [list(holder.ways(poses, near[name])) for (name, holder), poses in zip(holders.items(), tools, strict=True)]
+    ways = [list(holder.paths(poses, near[name])) for (name, holder), poses in zip(holders.items(), tools, strict=True)]
     curves = np.array(
         [
             step.p @ np.reshape(start.rotation, (3, 3)).T + np.array(start.position)
@@ -175,7 +175,7 @@ def plan_approach(
 ) -> dict[str, list[dict[str, Any]]] | None:
     """Return the straight motion of all joints to where a plan begins, as `Cell.run_trajectory` takes it.
 
-    It is checked as the bend is, the chucks among the bodies, which the loops do not know.
+    It is checked as the bend is, with the chucks among the bodies, which the loops do not know.
 
     Args:
         cell: with the two arms.
@@ -188,7 +188,7 @@ def plan_approach(
         The points by arm; None: they are there.
 
     Raises:
-        Refused: `arms_too_near`, with what is in the way; nothing is begun.
+        Refused: `arms_too_near`, with the obstacle; nothing is begun.
     """
     if all(abs(a - b) < _SAME_RAD for name, q in begin.items() for a, b in zip(now[name], q, strict=True)):
         return None
@@ -229,7 +229,7 @@ class _Holder:
         ]
 
     def zone_at(self, q: Sequence[float]) -> str | None:
-        """Return what the chuck would be too near to, in words: a keep-out box or its own arm; None: nothing."""
+        """Return the obstacle too near to the chuck, in words: a keep-out box or its own arm; None: nothing."""
         self._local.place(frames(self.body.model, q))
         for name, box in self._boxes:
             if from_box(self._local, self._chuck, box)[0] < self._clearance:
@@ -239,27 +239,27 @@ class _Holder:
             return f"a collision with itself (chuck of {self.name} and link {self._local.bodies[link].link})"
         return None
 
-    def ways(self, poses: Sequence[Pose], near: Sequence[float]) -> Iterator[list[tuple[float, ...]]]:
+    def paths(self, poses: Sequence[Pose], near: Sequence[float]) -> Iterator[list[tuple[float, ...]]]:
         """Yield the continuous joint paths that lead the chuck through poses in the world, the nearest first.
 
         Raises:
-            Refused: there is none; with why the one that comes farthest ends.
+            Refused: there is none; with the reason for the end of the longest one.
         """
         back = self.body.base.inverse()
         local = [back @ pose for pose in poses]
         first = self._solver.solve(local[0], near)
-        starts = [one.q for one in first.solutions if one.within_limits]
-        starts.sort(key=lambda q: max(abs(one - other) for one, other in zip(q, near, strict=True)))
+        starts = [solution.q for solution in first.solutions if solution.within_limits]
+        starts.sort(key=lambda q: max(abs(a - b) for a, b in zip(q, near, strict=True)))
         farthest, reason, count = 0, first.reason or "every configuration there is beyond a joint limit", 0
         for start in starts:
-            way = [start]
+            path = [start]
             for number, pose in enumerate(local[1:], 1):
-                following = self._solver.solve_near(pose, way[-1])
+                following = self._solver.solve_near(pose, path[-1])
                 problem = following.reason
                 if following.q is not None:
-                    step = max(abs(one - other) for one, other in zip(following.q, way[-1], strict=True))
+                    step = max(abs(a - b) for a, b in zip(following.q, path[-1], strict=True))
                     if step <= _LARGEST_JOINT_STEP:
-                        way.append(following.q)
+                        path.append(following.q)
                         continue
                     problem = f"a joint would jump by {step:.3g} rad, {_LARGEST_JOINT_STEP:g} rad is allowed"
                 if number > farthest:
@@ -267,7 +267,7 @@ class _Holder:
                 break
             else:
                 count += 1
-                yield [tuple(q) for q in way]
+                yield [tuple(q) for q in path]
         if not count:
             raise RtcpError(
                 "refused",
@@ -285,12 +285,12 @@ def _check_curves(cell: CellConfig, curves: Array, diameter: float) -> None:
     own = [(i, j) for i in range(count) for j in range(i + gap, count)]
     for number, curve in enumerate(curves):
         rod = _placed(curve, 0.5 * diameter)
-        apart, place, other = distance(rod, rod, own)
+        apart, place, second = distance(rod, rod, own)
         if apart <= 0.0:
             raise RtcpError(
                 "refused",
                 f"at step {number} of {len(curves) - 1} the rod would touch itself, {place * segment:.3f} and "
-                f"{other * segment:.3f} m from its start: bend it less",
+                f"{second * segment:.3f} m from its start: bend it less",
                 "rod_collision",
                 {"step": number, "distance": apart, "s": place * segment},
             )
@@ -327,9 +327,9 @@ def _check_rod(
     diameter: float,
     clearance: float,
 ) -> float:
-    """Return the least distance of the rod to arms and chucks, half of what moves between two steps taken off.
+    """Return the least distance of the rod to arms and chucks, less half of the motion between two steps.
 
-    To its own chuck the rod may be nearer than the clearance, and beside its mouth it is in it.
+    The rod may be nearer to its own chuck than the clearance: its end is inside.
     """
     least, count = np.inf, curves.shape[1] - 1
     segment = float(np.linalg.norm(np.diff(curves[0], axis=0), axis=1)[0])
@@ -342,12 +342,12 @@ def _check_rod(
             placed = holder.body.placed
             axes = np.array(placed.axes)
             ends = np.concatenate([axes.reshape(-1, 6)[:, :3], axes.reshape(-1, 6)[:, :3] + axes.reshape(-1, 6)[:, 3:]])
-            way = float(np.linalg.norm(ends - before[name], axis=1).max()) if number else 0.0
+            travel = float(np.linalg.norm(ends - before[name], axis=1).max()) if number else 0.0
             before[name] = ends
             own = len(placed.radii) - 1
             inside = min(ceil(2.0 * holder.chuck.radius / segment), count)
             beyond = range(inside, count) if index == 0 else range(count - inside)
-            between = 0.5 * (float(moved[number]) + way)
+            between = 0.5 * (float(moved[number]) + travel)
             for pairs, allowed in (
                 (product(range(count), range(own)), clearance),
                 (product(beyond, (own,)), 0.0),
@@ -388,9 +388,9 @@ def _timed(
     position, speed, acceleration = _by_time(spline, x)
     jerk = np.gradient(acceleration, x, axis=0)
     limits = [holder.limits for holder in holders.values()]
-    fastest = np.minimum(SPEED_SHARE * np.concatenate([one.velocity for one in limits]), most)
-    strongest = ACCELERATION_SHARE * np.concatenate([one.acceleration for one in limits])
-    jerkiest = np.concatenate([one.jerk for one in limits])
+    fastest = np.minimum(SPEED_SHARE * np.concatenate([limit.velocity for limit in limits]), most)
+    strongest = ACCELERATION_SHARE * np.concatenate([limit.acceleration for limit in limits])
+    jerkiest = np.concatenate([limit.jerk for limit in limits])
     duration = max(
         float((np.abs(speed) / fastest).max()),
         float((np.abs(acceleration) / strongest).max()) ** 0.5,
@@ -425,7 +425,7 @@ def _timed(
             duration *= _STRETCH
             continue
         break
-    return arms, tuple(float(one) for one in duration * np.interp(along, law, x))
+    return arms, tuple(float(t) for t in duration * np.interp(along, law, x))
 
 
 def _by_time(spline: CubicSpline, x: Array) -> tuple[Array, Array, Array]:
@@ -440,7 +440,7 @@ def _check_motion(cell: CellConfig, holders: Mapping[str, _Holder], arms: Mappin
     """Check all that the gateway will check, with the chucks as bodies; raises PlanRefused."""
     curves = {}
     for name, points in arms.items():
-        names = [f"{name} {one.name}" for one in cell.member(name).config.joints]
+        names = [f"{name} {joint.name}" for joint in cell.member(name).config.joints]
         holder = holders[name]
         plan = plan_trajectory(points, holder.limits, points[0].q, names=names, zone_at=holder.zone_at)
         curves[name] = Curve(plan.rows, len(points[0].q))
@@ -458,10 +458,10 @@ def _check_between(
     """Check the rod at the points of the motion: the arms are there where no step is; raises Refused."""
     first, second = holders
     rod = steps[0].rod
-    for point, other in zip(arms[first], arms[second], strict=True):
+    for point, opposite in zip(arms[first], arms[second], strict=True):
         nearest = steps[int(np.abs(np.array(times) - point.t).argmin())]
         if float(nearest.rotations[-1][0, 0]) > np.cos(_NEAR_STRAIGHT_RAD):
             continue
         start = holders[first].body.base @ forward(holders[first].body.model, point.q)
-        end = holders[second].body.base @ forward(holders[second].body.model, other.q) @ HALF_TURN
+        end = holders[second].body.base @ forward(holders[second].body.model, opposite.q) @ HALF_TURN
         check(shoot(rod, start.inverse() @ end, nearest))

@@ -1,4 +1,4 @@
-"""Ways of a rod from straight to a wanted end pose or wanted parameters, through stable equilibria only.
+"""Paths of a rod from straight to a wanted end pose or wanted parameters, through stable equilibria only.
 
 The straight rod is singular: no step of its end pose leads away from it. But an arc of constant curvature needs end
 moments alone, its end pose is known, and it is stable from the smallest angle on. So a straight rod is first bent to a
@@ -25,7 +25,7 @@ from rtcp.processes.rod.statics import STEPS, Equilibrium, Rod, integrate, pose_
 PRE_BENT_RAD: Final = 0.4
 """Angle between the ends of the arc from which the end pose moves on."""
 _LARGEST_MOVE: Final = 0.025
-"""Of any node in a step, in lengths of the rod."""
+"""Largest move of a node in a step, in lengths of the rod."""
 _LARGEST_STEP, _SMALLEST_STEP = 0.1, 1e-4
 _STRAIGHT: Final = 1e-3
 _ATTEMPTS: Final = 2000
@@ -60,7 +60,7 @@ def bend(rod: Rod, end: Pose, side: tuple[float, float] | None = None) -> tuple[
 
     Args:
         rod: unloaded and straight.
-        end: its rotation is less than half a turn; further ones by `follow_pose` from what this returns.
+        end: its rotation is less than half a turn; further ones by `follow_pose` from the last equilibrium.
         side: the direction in e2, e3 in which it begins to bend; None: that of the end pose.
 
     Raises:
@@ -86,7 +86,7 @@ def bend(rod: Rod, end: Pose, side: tuple[float, float] | None = None) -> tuple[
     if side is None:
         _, _, _, ey, _, _, ez, _, _ = end.rotation
         lateral = [(end.position[1], end.position[2]), (ey * rod.length, ez * rod.length), (rod.length, 0.0)]
-        side = next(one for one in lateral if hypot(*one) > _STRAIGHT * rod.length)
+        side = next(vector for vector in lateral if hypot(*vector) > _STRAIGHT * rod.length)
     arcs = pre_bend(rod, side)
     return (*arcs, *follow_pose(arcs[-1], end)[1:])
 
@@ -98,12 +98,12 @@ def follow_pose(start: Equilibrium, end: Pose) -> tuple[Equilibrium, ...]:
         Refused: as `bend`.
     """
     error = pose_error(start, end)
-    turn = np.reshape(start.end.rotation, (3, 3))
-    begin, way = np.array(start.end.position), np.array(end.position) - np.array(start.end.position)
+    orientation = np.reshape(start.end.rotation, (3, 3))
+    begin, offset = np.array(start.end.position), np.array(end.position) - np.array(start.end.position)
 
     def solve(part: float, before: Equilibrium) -> Equilibrium:
-        rotation = turn @ Rotation.from_rotvec(part * error[:3]).as_matrix()
-        x, y, z = (begin + part * way).tolist()
+        rotation = orientation @ Rotation.from_rotvec(part * error[:3]).as_matrix()
+        x, y, z = (begin + part * offset).tolist()
         return shoot(start.rod, Pose((x, y, z), cast(Rows, tuple(rotation.ravel().tolist()))), before)
 
     return _advance(start, solve)
@@ -188,22 +188,22 @@ def _has_form(drawn: Equilibrium, form: Form) -> bool:
 
 
 def _advance(start: Equilibrium, solve: Callable[[float, Equilibrium], Equilibrium]) -> tuple[Equilibrium, ...]:
-    """Equilibria from part 0 to part 1 of a way, in steps that are halved where one is refused or moves too far."""
+    """Equilibria from part 0 to part 1 of a path, in steps that are halved where one is refused or moves too far."""
     check(start)
     passed, part, step = [start], 0.0, _LARGEST_STEP
     while part < 1.0:
         following = min(part + step, 1.0)
         try:
-            found = solve(following, passed[-1])
-            check(found)
-            _check_beside(passed[-1], found)
+            equilibrium = solve(following, passed[-1])
+            check(equilibrium)
+            _check_beside(passed[-1], equilibrium)
         except Refused as refused:
             step *= 0.5
             if step < _SMALLEST_STEP:
                 message = f"at {part:.1%} of the way {refused.message}"
                 raise RtcpError("refused", message, refused.reason, {**refused.fields, "part": part}) from None
             continue
-        passed.append(found)
+        passed.append(equilibrium)
         part, step = following, min(1.5 * step, _LARGEST_STEP)
     return tuple(passed)
 

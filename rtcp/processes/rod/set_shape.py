@@ -24,7 +24,7 @@ _ZERO_C: Final = 273.15
 
 @dataclass(frozen=True)
 class Kinetics:
-    """How fast Nitinol takes a shape.
+    """Kinetics of shape setting in Nitinol.
 
     The time constant makes 0.5 min at 500 C set 95 % (industry practice: 0.5 min and more at 500 to 550 C). The
     activation energy is chosen, not measured: at 400 C it makes the same take 18 min.
@@ -47,8 +47,8 @@ class Kinetics:
 class Release:
     """A rod after its release.
 
-    shape: the unloaded rod. error: of each node against the wanted shape after the best rigid alignment, (n + 1,), m.
-    straight_start, straight_end: lengths from either end of which less than half is set, m.
+    shape: the unloaded rod. error: distance of each node from the wanted shape after the best rigid alignment,
+    (n + 1,), m. straight_start, straight_end: lengths at the two ends with a set fraction below one half, m.
     """
 
     shape: Equilibrium
@@ -58,7 +58,7 @@ class Release:
 
 
 def set_fraction(times: npt.ArrayLike, temperatures: npt.ArrayLike, kinetics: Kinetics | None = None) -> Array:
-    """Return which part of the held shape is set at each node, (n + 1,), 0 to 1.
+    """Return the share of the held shape that is set at each node, (n + 1,), 0 to 1.
 
     Args:
         times: s, rising, (k,).
@@ -90,7 +90,7 @@ def relax(held: Equilibrium, fraction: npt.ArrayLike) -> Array:
 
 
 def release(held: Equilibrium, fraction: npt.ArrayLike, wanted: Array | None = None) -> Release:
-    """Return the rod that was held, had a fraction of its shape set, (n + 1,), and is let go.
+    """Return the unloaded rod after a fraction of its shape was set, (n + 1,).
 
     `wanted`: points of the wanted shape at the same nodes, (n + 1, 3), m; None: the held shape.
 

@@ -40,7 +40,7 @@ STEPS: Final = 60
 GRAVITY: Final = 9.80665
 """m/s^2."""
 _FIRST_NODE: Final = 0.05
-"""Part of the length before which det J is lost in rounding; it is no place of a conjugate point."""
+"""Share of the length in which det J is lost in rounding; no conjugate point lies there."""
 _SINGULAR: Final = 1e-18
 _ITERATIONS: Final = 30
 _CLOSE: Final = 1e-10
@@ -131,13 +131,13 @@ class Rod:
 
     def _moment(self, kappa: float) -> tuple[float, float]:
         """Moment and its derivative: the section integral of y stress(kappa y), piece by piece."""
-        whole = pi * self.diameter**4 / 64.0
+        inertia = pi * self.diameter**4 / 64.0
         elastic, elastic_slope = self._clipped(kappa, self.linear_strain)
         soft, soft_slope = self._clipped(kappa, self.linear_strain + self.plateau_strain)
         plateau = self._plateau_modulus
         first, third = self.youngs_modulus - plateau, self.martensite_modulus - plateau
-        value = first * elastic + plateau * whole * kappa + third * (whole * kappa - soft)
-        return value, first * elastic_slope + plateau * whole + third * (whole - soft_slope)
+        value = first * elastic + plateau * inertia * kappa + third * (inertia * kappa - soft)
+        return value, first * elastic_slope + plateau * inertia + third * (inertia - soft_slope)
 
     def _clipped(self, kappa: float, strain: float) -> tuple[float, float]:
         """Integral of y min(kappa y, strain) over the round section, m^3, and its derivative by kappa, m^4."""
@@ -154,7 +154,7 @@ class Rod:
 class Equilibrium:
     """A rod in equilibrium at n + 1 nodes, in the frame of its start; arrays are not to be changed.
 
-    rod: what it is. a: parameters, (6,), units of EI/L and EI/L^2. s: arc length, (n + 1,), m. p: position,
+    rod: dimensions and alloy. a: parameters, (6,), units of EI/L and EI/L^2. s: arc length, (n + 1,), m. p: position,
     (n + 1, 3), m. q: orientation w, x, y, z, (n + 1, 4). m, f: moment, N m, and force, N, in the body frame,
     (n + 1, 3). u: twist rate and curvatures, (n + 1, 3), 1/m. jacobian: of the pose by a, (n + 1, 6, 6), rad and L.
     set_shape: u0 at the nodes, (n + 1, 3), 1/m. weight: in the frame of the start, (3,), N/m.
@@ -231,7 +231,7 @@ def integrate(
     """Return the equilibrium with parameters `a`, by the fourth-order Runge-Kutta method.
 
     Args:
-        rod: what is bent.
+        rod: the rod.
         a: moment and force at the start, (6,), units of EI/L and EI/L^2.
         set_shape: u0 at the nodes, (steps + 1, 3), 1/m; None: straight.
         weight: per length, in the frame of the start, N/m.
@@ -240,28 +240,28 @@ def integrate(
     length, stiffness = rod.length, rod.bending_stiffness
     shape = np.zeros((steps + 1, 3)) if set_shape is None else set_shape
     shapes = (length * np.stack([shape[:-1], 0.5 * (shape[:-1] + shape[1:]), shape[1:]], axis=1)).tolist()
-    w = [one * length**3 / stiffness for one in weight]
+    w = [component * length**3 / stiffness for component in weight]
     h = 1.0 / steps
     y = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *np.asarray(a, dtype=np.float64).tolist()]
     nodes, stages, between = [y], [], []
     for first, middle, last in shapes:
         k1 = _rates(rod, y, first, w)
-        y2 = [one + 0.5 * h * k for one, k in zip(y, k1, strict=True)]
+        y2 = [v + 0.5 * h * k for v, k in zip(y, k1, strict=True)]
         k2 = _rates(rod, y2, middle, w)
-        y3 = [one + 0.5 * h * k for one, k in zip(y, k2, strict=True)]
+        y3 = [v + 0.5 * h * k for v, k in zip(y, k2, strict=True)]
         k3 = _rates(rod, y3, middle, w)
-        y4 = [one + h * k for one, k in zip(y, k3, strict=True)]
+        y4 = [v + h * k for v, k in zip(y, k3, strict=True)]
         k4 = _rates(rod, y4, last, w)
         stages.append([y, y2, y3, y4])
         between.append([first, middle, middle, last])
-        y = [one + h / 6.0 * (b + 2.0 * c + 2.0 * d + e) for one, b, c, d, e in zip(y, k1, k2, k3, k4, strict=True)]
+        y = [v + h / 6.0 * (b + 2.0 * c + 2.0 * d + e) for v, b, c, d, e in zip(y, k1, k2, k3, k4, strict=True)]
         nodes.append(y)
-    found = np.array(nodes)
-    q = found[:, :4] / np.linalg.norm(found[:, :4], axis=1, keepdims=True)
-    u = length * shape + _strains(rod, found[:, 7:10])[0]
+    states = np.array(nodes)
+    q = states[:, :4] / np.linalg.norm(states[:, :4], axis=1, keepdims=True)
+    u = length * shape + _strains(rod, states[:, 7:10])[0]
     return Equilibrium(
-        rod=rod, a=found[0, 7:].copy(), s=np.linspace(0.0, length, steps + 1), p=length * found[:, 4:7], q=q,
-        m=found[:, 7:10] * stiffness / length, f=found[:, 10:] * stiffness / length**2, u=u / length,
+        rod=rod, a=states[0, 7:].copy(), s=np.linspace(0.0, length, steps + 1), p=length * states[:, 4:7], q=q,
+        m=states[:, 7:10] * stiffness / length, f=states[:, 10:] * stiffness / length**2, u=u / length,
         jacobian=_jacobians(rod, np.array(stages), np.array(between), np.array(w)), set_shape=shape,
         weight=np.array(weight, dtype=np.float64),
     )  # fmt: skip
@@ -270,25 +270,25 @@ def integrate(
 def shoot(rod: Rod, end: Pose, start: Equilibrium) -> Equilibrium:
     """Return the equilibrium whose end has a pose (frame of the start), by Newton's method from one beside it.
 
-    `start` gives parameters, set shape and weight. Whether the result is stable is for the caller to look at.
+    `start` gives parameters, set shape and weight. The caller checks whether the result is stable.
 
     Raises:
         Refused: the method does not converge.
     """
-    found = start
+    current = start
     for _ in range(_ITERATIONS):
-        error = pose_error(found, end)
+        error = pose_error(current, end)
         if np.abs(error).max() < _CLOSE:
-            return found
+            return current
         try:
-            change = np.linalg.solve(found.jacobian[-1], error)
+            change = np.linalg.solve(current.jacobian[-1], error)
         except np.linalg.LinAlgError:
             break
         change *= min(1.0, _LARGEST_CHANGE / (np.abs(change).max() + 1e-300))
-        found = integrate(rod, found.a + change, start.set_shape, start.weight.tolist(), len(start.s) - 1)
-        if not np.isfinite(found.jacobian[-1]).all():
+        current = integrate(rod, current.a + change, start.set_shape, start.weight.tolist(), len(start.s) - 1)
+        if not np.isfinite(current.jacobian[-1]).all():
             break
-    miss = float(np.abs(pose_error(found, end)).max())
+    miss = float(np.abs(pose_error(current, end)).max())
     raise RtcpError(
         "refused",
         f"no equilibrium with this end pose was found: its error is {miss:.3g} (rad, lengths of the rod), allowed is "
@@ -299,10 +299,10 @@ def shoot(rod: Rod, end: Pose, start: Equilibrium) -> Equilibrium:
 
 
 def pose_error(equilibrium: Equilibrium, end: Pose) -> Array:
-    """Return what the end lacks to a pose, in the frame of the end: rotation vector, rad, and position, L; (6,)."""
+    """Return the error of the end to a pose, in the frame of the end: rotation vector, rad, and position, L; (6,)."""
     own = equilibrium.rotations[-1]
-    turn = Rotation.from_matrix(own.T @ np.reshape(end.rotation, (3, 3))).as_rotvec()
-    return np.concatenate([turn, own.T @ (np.array(end.position) - equilibrium.p[-1]) / equilibrium.rod.length])
+    rotation = Rotation.from_matrix(own.T @ np.reshape(end.rotation, (3, 3))).as_rotvec()
+    return np.concatenate([rotation, own.T @ (np.array(end.position) - equilibrium.p[-1]) / equilibrium.rod.length])
 
 
 def _rates(rod: Rod, y: Sequence[float], u0: Sequence[float], w: Sequence[float]) -> list[float]:
@@ -335,7 +335,7 @@ def _bending(rod: Rod, moment: float) -> tuple[float, float]:
 def _strains(rod: Rod, m: Array) -> tuple[Array, Array]:
     """K(m), (..., 3), and its derivative k, (..., 3, 3), in units of L and EI."""
     size = np.hypot(m[..., 1], m[..., 2])
-    pairs = np.array([_bending(rod, one) for one in size.ravel().tolist()]).reshape(*size.shape, 2)
+    pairs = np.array([_bending(rod, moment) for moment in size.ravel().tolist()]).reshape(*size.shape, 2)
     secant, tangent = pairs[..., 0], pairs[..., 1]
     k = np.zeros((*m.shape, 3))
     direction = m[..., 1:] / np.where(size > 0.0, size, 1.0)[..., None]
@@ -363,12 +363,12 @@ def _jacobians(rod: Rod, stages: Array, shapes: Array, w: Array) -> Array:
     if w.any():
         turns = Rotation.from_quat(np.roll(stages[..., :4].reshape(-1, 4), -1, axis=1)).inv()
         rates[..., 3:6, 6:9] = -hat(turns.apply(w).reshape(count, 4, 3))
-    one = np.eye(12)
+    unit = np.eye(12)
     k1 = rates[:, 0]
-    k2 = rates[:, 1] @ (one + 0.5 * h * k1)
-    k3 = rates[:, 2] @ (one + 0.5 * h * k2)
-    k4 = rates[:, 3] @ (one + h * k3)
-    maps = one + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    k2 = rates[:, 1] @ (unit + 0.5 * h * k1)
+    k3 = rates[:, 2] @ (unit + 0.5 * h * k2)
+    k4 = rates[:, 3] @ (unit + h * k3)
+    maps = unit + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     derivatives = np.zeros((count + 1, 12, 6))
     derivatives[0, :6] = np.eye(6)
     for at, step in enumerate(maps):

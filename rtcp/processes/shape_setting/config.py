@@ -9,6 +9,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
 
+from rtcp.config.findings import Finding
 from rtcp.config.model import DeviceDescription, InputChannel, OutputChannel, ProcessConfig
 from rtcp.config.numbers import Name, NotNegative, Positive
 from rtcp.processes.shape_setting.messages import (
@@ -44,8 +45,8 @@ class ShapeSettingConfig(ProcessConfig):
     LAMPS = MappingProxyType({"green": "lamp_green", "yellow": "lamp_yellow", "red": "relay_closed"})
     PLOT = ("setpoint_middle", "middle_temperature", "mean_temperature", "average_current")
 
-    def findings(self, devices: Mapping[str, DeviceDescription]) -> Iterator[tuple[tuple[str | int, ...], str]]:
-        """Yield what does not suit the slaves, channels missing or used twice, and limits out of order."""
+    def findings(self, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
+        """Yield mistakes against the slaves, channels missing or used twice, and limits out of order."""
         yield from super().findings(devices)
         first: dict[str, str] = {}
         types = {
@@ -58,14 +59,16 @@ class ShapeSettingConfig(ProcessConfig):
             text = getattr(self, entry.name)
             if entry.name in _ANALOG or entry.name in _DIGITAL:
                 if not text:
-                    yield (entry.name,), "found an empty text, allowed is SLAVE.CHANNEL"
+                    yield Finding((entry.name,), "length", found=text, allowed="SLAVE.CHANNEL")
                 elif first.setdefault(text, entry.name) != entry.name:
-                    yield (entry.name,), f'found the text "{text}", the channel of {first[text]}; each needs its own'
+                    yield Finding((entry.name,), "repeated", found=text, what="channel", of=first[text])
                 elif entry.name in _DIGITAL and types.get(text, "bool") not in ("bool", "uint8"):
-                    yield (entry.name,), f'found the text "{text}" of type {types[text]}, allowed are bool and uint8'
+                    wanted = "a channel of type bool or uint8"
+                    yield Finding((entry.name,), "type_of_channel", found=types[text], channel=text, allowed=wanted)
         for low, high in _ORDERED:
             if not getattr(self, low) < getattr(self, high):
-                yield (low,), f"found {getattr(self, low):g}, allowed is less than {high}, {getattr(self, high):g}"
+                wanted = f"less than {high}, {getattr(self, high):g}"
+                yield Finding((low,), "too_high", found=getattr(self, low), allowed=wanted)
 
     voltage: InputChannel = "measure.voltage"
     """Voltage between two points of the rod, V: of the same instant as `current`."""

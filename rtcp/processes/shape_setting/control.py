@@ -35,7 +35,7 @@ class CurrentControl:
         """Whether a limit holds the target."""
 
     def reset(self) -> None:
-        """Begin anew; the average goes on."""
+        """Restart; the average continues."""
         self.target = self._integral = self._setpoint = self._ratio = self._slope = self._held_s = 0.0
         self.is_limited = False
 
@@ -47,9 +47,9 @@ class CurrentControl:
         """Set the target for a cycle.
 
         Args:
-            setpoint: ratio wanted.
-            ratio: the measured one, or the one before where there is none in this cycle.
-            full_current: with the gate on, A.
+            setpoint: wanted ratio.
+            ratio: newest measured ratio.
+            full_current: current with the gate on, A.
             limit: greatest average current, A.
         """
         error = setpoint - ratio
@@ -57,7 +57,7 @@ class CurrentControl:
         if ratio != self._ratio:
             self._slope = (ratio - self._ratio) / self._held_s if self._ratio else 0.0
             self._held_s = 0.0
-        # What a ramp needs would be too much when it ends, and the rod cannot be cooled: it is left to the proportion.
+        # The integral does not learn a ramp, whose current is too much at its end: the rod cannot be cooled.
         step = self._ki * error * self._period_s if setpoint == self._setpoint else 0.0
         self._ratio, self._setpoint = ratio, setpoint
         wanted = (self._kp * error + self._integral + step - self._kd * self._slope) * full_current

@@ -1,4 +1,4 @@
-"""The interlocks of the heater as one table, rows x (Off, Manual, Auto), and what walks it.
+"""The interlocks of the heater as one table, rows x (Off, Manual, Auto), and their evaluation.
 
 Modelled on IEC 60204-1, 9.2 (mode selector, start, stop, reset), hold-to-run and two-channel inputs of ISO 13849-1, and
 feedback of contactors (EDM). Software is no safety function: relay chain, fuse and key are hardware
@@ -22,7 +22,7 @@ class Mode(IntEnum):
 
 
 class Row(IntEnum):
-    """What is true or not in a cycle; the first rows are the operator's, those from `KEY_DISCREPANCY` on faults."""
+    """Statements about a cycle; the first rows are the operator's, those from `KEY_DISCREPANCY` on are faults."""
 
     KEY = 0
     BUTTON = 1
@@ -52,7 +52,7 @@ class Row(IntEnum):
 
 
 class Cell(IntEnum):
-    """What a mode asks of a row."""
+    """Requirement of a mode on a row."""
 
     IGNORED = 0
     MUST_HOLD = 1
@@ -105,7 +105,7 @@ TABLE: Final = (
     Rule(Row.LOST_CYCLE, (_I, _F, _F), "the inputs are missing for `lost_cycles`; the gate is off meanwhile"),
     Rule(Row.STALE_INPUT, (_I, _F, _F), "a slave's counter stands still for `stale_cycles`"),
 )
-"""While the relay is open the column Off decides what latches; the column of the mode decides whether it may close."""
+"""While the relay is open the column Off decides which rows latch; that of the mode decides whether it may close."""
 OPERATOR: Final = (1 << Row.KEY_DISCREPANCY) - 1
 """Rows, a bit each, that end heating; a new start is needed. The others latch until they are reset."""
 
@@ -129,7 +129,7 @@ def first_row(rows: int) -> Row:
 
 
 class Interlocks:
-    """The latch of the table's rows, and what may be on.
+    """The latch of the table's rows, and the permission of relay and gate.
 
     Relay and gate are permitted from `close` on, until the first cycle in which a row forbids it: nothing but another
     `close` permits them again.

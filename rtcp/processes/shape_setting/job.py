@@ -1,4 +1,4 @@
-"""What `rtcp shape-set` does: the rod, its shape, who holds it where, and the profile of the heat; a YAML file."""
+"""Jobs of `rtcp shape-set`: the rod, its shape, its chucks and place, and the profile of the heat; a YAML file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from annotated_types import Ge, Gt, Le, MaxLen, MinLen
 
 from kinematics import Pose
 from rtcp.config.cell import Base
-from rtcp.config.document import Finding, read
+from rtcp.config.document import read
+from rtcp.config.findings import Finding
 from rtcp.config.model import MOST_AXES, ConfigError
 from rtcp.config.numbers import FractionOfPi, Name
 from rtcp.config.validation import Checker, rule
@@ -63,7 +64,7 @@ class Job:
     """A shape to set. It has either `arc` or `end`."""
 
     heat: Name
-    """File of the heat profile, from this file's directory on."""
+    """File of the heat profile, relative to this file's directory."""
     rod: RodKeys
     held: _Place
     """The rod's middle in the world, x along the straight rod; it stays there."""
@@ -82,15 +83,15 @@ class Job:
     @property
     def holders(self) -> dict[str, Chuck]:
         """The chucks by their arms."""
-        return {one.arm: Chuck(pose_of(one.pose), one.radius) for one in self.chucks}
+        return {chuck.arm: Chuck(pose_of(chuck.pose), chuck.radius) for chuck in self.chucks}
 
     @property
     def near(self) -> dict[str, tuple[float, ...]]:
         """Joint positions by arm, rad."""
-        return {one.arm: one.near for one in self.chucks}
+        return {chuck.arm: chuck.near for chuck in self.chucks}
 
     def steps(self) -> tuple[Equilibrium, ...]:
-        """Return the way of the rod from straight to the shape; raises Refused as `pre_bend` and `bend`."""
+        """Return the path of the rod from straight to the shape; raises Refused as `pre_bend` and `bend`."""
         if self.arc is not None:
             return pre_bend(self.mechanics, (self.arc.side[0], self.arc.side[1]), self.arc.angle)
         assert self.end is not None
@@ -100,11 +101,12 @@ class Job:
 @rule(Job, "arc", "end", "chucks")
 def _shape(job: Job) -> Iterator[Finding]:
     if (job.arc is None) == (job.end is None):
-        yield (), f"found {'neither' if job.arc is None else 'both'} of arc and end, allowed is one of them"
+        count = "neither" if job.arc is None else "both"
+        yield Finding((), "one_of_both", found=f"{count} of arc and end", allowed="one of them")
     if job.arc is not None and not any(job.arc.side):
-        yield ("arc", "side"), "found 0, 0, allowed is a direction"
+        yield Finding(("arc", "side"), "no_direction", text="found 0, 0, allowed is a direction")
     if job.chucks[0].arm == job.chucks[1].arm:
-        yield ("chucks", 1, "arm"), f'found "{job.chucks[1].arm}" twice, allowed are two arms'
+        yield Finding(("chucks", 1, "arm"), "twice", found=job.chucks[1].arm, unit=" twice", allowed="another arm")
 
 
 _FILE = Checker(Job)
@@ -126,5 +128,5 @@ def read_job(path: Path) -> tuple[Job, HeatProfile]:
     profile = read_profile(path.parent / job.heat)
     if abs(profile.ends.length - job.rod.length) > _SAME_M:
         text = f"found {job.rod.length:g} m, the profile {job.heat} has ends.length {profile.ends.length:g} m: one rod"
-        raise ConfigError(document.sentences([(("rod", "length"), text)]))
+        raise ConfigError(document.placed([Finding(("rod", "length"), "other_length", text=text)]))
     return job, profile

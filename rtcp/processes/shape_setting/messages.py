@@ -1,4 +1,4 @@
-"""What the heater is commanded, why it refuses, and what it reports. Events have the numbers 127 to 149."""
+"""Commands, refusals and events of the heater. Events have the numbers 127 to 149."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rtcp.processes.shape_setting.interlocks import Mode, Row
 
 
 class HeaterState(IntEnum):
-    """What the heater is doing."""
+    """State of the heater."""
 
     OFF = 0
     """The key is at Off."""
@@ -94,7 +94,7 @@ PROFILE_RANGES: Final = MappingProxyType({
 
 
 class SetHeatProfile(Command):
-    """Set what is heated to next: a profile's numbers (`rtcp.processes.shape_setting.profile`, `PROFILE_RANGES`)."""
+    """Set the profile of the next heating (`rtcp.processes.shape_setting.profile`, `PROFILE_RANGES`)."""
 
     states = AT_REST
     initial_c: float

@@ -14,61 +14,27 @@ from rtcp.ipc.refusals import Refusal
 from rtcp.ipc.schema import Field
 from rtcp.ipc.states import State
 from rtcp.motion.step_group import Partner
+from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.control import CurrentControl, Ramp
 from rtcp.processes.shape_setting.interlocks import Interlocks, Mode, Row, first_row
-from rtcp.processes.shape_setting.messages import (
-    PROFILE_RANGES,
-    ArmedTooLong,
-    ArmHeater,
-    BatteryLow,
-    CauseRemains,
-    CoolingBegun,
-    CoolingOutOfRange,
-    CoolingTooLong,
-    HeatEnded,
-    HeaterArmed,
-    HeaterState,
-    HeaterTripped,
-    HeatForbidden,
-    HeatingStarted,
-    HeatStopped,
-    HoldBegun,
-    MeasureResistance,
-    NoHeatProfile,
-    ProfileKey,
-    ProfileNumberOutOfRange,
-    ProfileOutOfRange,
-    ResetTrips,
-    ResistanceMeasured,
-    ResistanceNotMeasured,
-    ResistanceUncertain,
-    RodNotConfirmed,
-    RodPhase,
-    RodStillHot,
-    SetHeatProfile,
-    ShapeSet,
-    StopHeating,
-    TargetNotReached,
-    TripLatched,
-    TripsReset,
-    WrongHeaterState,
-)
 from rtcp.processes.shape_setting.resistance import InitialResistance, ResistanceMeter
 from rtcp.processes.shape_setting.supervision import Inputs, Supervision
 from rtcp.processes.shape_setting.temperature import RatioScale
 
-_AT_REST: Final = frozenset({HeaterState.OFF, HeaterState.READY, HeaterState.DONE, HeaterState.TRIPPED})
-_HEAT: Final = frozenset({HeaterState.HEATING, HeaterState.HOLDING})
-_BUSY: Final = _HEAT | {HeaterState.MEASURING, HeaterState.COOLING}
-_HOT: Final = _HEAT | {HeaterState.COOLING}
+_AT_REST: Final = frozenset(
+    {messages.HeaterState.OFF, messages.HeaterState.READY, messages.HeaterState.DONE, messages.HeaterState.TRIPPED}
+)
+_HEAT: Final = frozenset({messages.HeaterState.HEATING, messages.HeaterState.HOLDING})
+_BUSY: Final = _HEAT | {messages.HeaterState.MEASURING, messages.HeaterState.COOLING}
+_HOT: Final = _HEAT | {messages.HeaterState.COOLING}
 _HALF: Final = 0.5
-"""Between the levels of a digital channel."""
+"""Threshold between the levels of a digital channel."""
 _BELOW_K: Final = 20.0
-"""A rod that seems colder than room and chucks by more than this has a changed contact."""
+"""A rod that seems colder than room and chucks by more than this, K, has a changed contact."""
 _DEAD: Final = 1 << Row.LOST_CYCLE | 1 << Row.STALE_INPUT
 _NO_AGE: Final = 9999.0
-"""s; a record is also written as JSON, which has no infinity."""
+"""Age of a value that was never received, s; a record is also written as JSON, which has no infinity."""
 _FIELDS: Final = (
     Field("state", "uint8", "", "What it is doing (HeaterState)."),
     Field("busy", "uint8", "", "1: it measures, heats, holds or cools."),
@@ -107,7 +73,7 @@ class ShapeSetting(Process):
         self._config = config
         period_s = setup.period_s
         self._passed_s, self._before_ns = 0.0, 0
-        """Since the cycle before, s: longer than a period where ticks were skipped."""
+        """Time since the cycle before, s: longer than a period where ticks were skipped."""
         signals = setup.signals
         self._digital = [
             (name, signals[getattr(config, name)])
@@ -120,7 +86,7 @@ class ShapeSetting(Process):
         ]
         self._gate_output, self._relay_output = signals[config.gate], signals[config.relay]
         self._green, self._yellow = signals[config.lamp_green], signals[config.lamp_yellow]
-        # An arm that the cell does not have is one that never was alive.
+        # An arm that the cell does not have counts as one that was never alive.
         arms = [setup.partners.get(name) or Partner(0) for name in config.arms]
         self.inputs = Inputs()
         self.interlocks = Interlocks()
@@ -131,38 +97,38 @@ class ShapeSetting(Process):
             period_s, config.average_s, config.proportional, config.integral, config.derivative
         )  # fmt: skip
         self.ramp = Ramp()
-        self.state = HeaterState.OFF
-        self._profile: SetHeatProfile | None = None
+        self.state = messages.HeaterState.OFF
+        self._profile: messages.SetHeatProfile | None = None
         self._scale = RatioScale(0.0, 1.0, 0.0, 1.0)
         self.gate = False
         self.energy = self.uncertainty_k = 0.0
         self._lease = 0
         self._elapsed_s = self._pulse_s = self._hold_s = 0.0
-        # What was heated before this start is not known here.
+        # A heating before this start is not known here.
         self._since_heat_s = 0.0
-        """Since the rod was, or may have been, heated, s."""
+        """Time since the rod was, or may have been, heated, s."""
         self._pending: list[Event] = []
         """Events of commands and of `safe`; the next cycle reports them."""
 
     def fields(self) -> Sequence[Field]:
-        """Return what it publishes."""
+        """Return the fields of `_FIELDS`."""
         return _FIELDS
 
     # -- commands -----------------------------------------------------------------------------------------------------
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
         """Carry out a command, or return why not."""
-        if isinstance(command, StopHeating):
+        if isinstance(command, messages.StopHeating):
             return self._stop()
-        if isinstance(command, ResetTrips):
+        if isinstance(command, messages.ResetTrips):
             return self._reset_trips()
-        if isinstance(command, SetHeatProfile):
+        if isinstance(command, messages.SetHeatProfile):
             return self._set_profile(command)
-        if isinstance(command, ArmHeater):
+        if isinstance(command, messages.ArmHeater):
             return self._arm()
-        if self.state is not HeaterState.ARMED:
-            return WrongHeaterState(self.state, HeaterState.ARMED)
-        if isinstance(command, MeasureResistance):
+        if self.state is not messages.HeaterState.ARMED:
+            return messages.WrongHeaterState(self.state, messages.HeaterState.ARMED)
+        if isinstance(command, messages.MeasureResistance):
             return self._measure(command, lease)
         return self._start(lease)
 
@@ -173,82 +139,87 @@ class ShapeSetting(Process):
     def _reset_trips(self) -> Refusal | None:
         was, remains = self.interlocks.latched, self.interlocks.reset(self.supervision.holds)
         if remains:
-            return CauseRemains(first_row(remains))
+            return messages.CauseRemains(first_row(remains))
         if was:
-            self._pending.append(TripsReset())
+            self._pending.append(messages.TripsReset())
         return None
 
-    def _set_profile(self, command: SetHeatProfile) -> Refusal | None:
-        if self.state not in _AT_REST and self.state is not HeaterState.ARMED:
-            return WrongHeaterState(self.state, HeaterState.ARMED)
+    def _set_profile(self, command: messages.SetHeatProfile) -> Refusal | None:
+        if self.state not in _AT_REST and self.state is not messages.HeaterState.ARMED:
+            return messages.WrongHeaterState(self.state, messages.HeaterState.ARMED)
         config = self._config
-        greatest_of = {ProfileKey.TARGET_C: config.greatest_target_c, ProfileKey.HOLD_S: config.longest_s}
-        for key, (least, most) in PROFILE_RANGES.items():
+        greatest_of = {
+            messages.ProfileKey.TARGET_C: config.greatest_target_c,
+            messages.ProfileKey.HOLD_S: config.longest_s,
+        }
+        for key, (least, most) in messages.PROFILE_RANGES.items():
             value, greatest = getattr(command, key.name.lower()), min(most, greatest_of.get(key, most))
             if not least <= value <= greatest:
-                return ProfileNumberOutOfRange(key, value, least, greatest)
+                return messages.ProfileNumberOutOfRange(key, value, least, greatest)
         ramp_s = (command.target_c - command.initial_c) / command.ramp_k_s
         if not command.hold_s + ramp_s <= config.longest_s:
-            return ProfileNumberOutOfRange(ProfileKey.HOLD_S, command.hold_s, 0.0, max(config.longest_s - ramp_s, 0.0))
+            return messages.ProfileNumberOutOfRange(
+                messages.ProfileKey.HOLD_S, command.hold_s, 0.0, max(config.longest_s - ramp_s, 0.0)
+            )
         if not command.initial_c < command.cool_c < command.target_c:
-            return CoolingOutOfRange(command.cool_c, command.initial_c, command.target_c)
+            return messages.CoolingOutOfRange(command.cool_c, command.initial_c, command.target_c)
         scale = RatioScale(
             command.initial_c, command.kelvin_per_ratio, command.chuck_c, command.mean_by_middle
         )  # fmt: skip
         ratio = scale.ratio_for_middle(command.target_c)
         if not ratio < config.greatest_ratio:
-            return ProfileOutOfRange(command.target_c, ratio, config.greatest_ratio)
+            return messages.ProfileOutOfRange(command.target_c, ratio, config.greatest_ratio)
         self._profile, self._scale = command, scale
         return None
 
     def _arm(self) -> Refusal | None:
         interlocks, config = self.interlocks, self._config
         if interlocks.latched:
-            return TripLatched(first_row(interlocks.latched))
+            return messages.TripLatched(first_row(interlocks.latched))
         if self.state not in _AT_REST:
-            return WrongHeaterState(self.state, HeaterState.READY)
+            return messages.WrongHeaterState(self.state, messages.HeaterState.READY)
         holds = self.supervision.holds
         if self.inputs.relay_closed:
-            return HeatForbidden(Row.RELAY_FEEDBACK, interlocks.mode)
+            return messages.HeatForbidden(Row.RELAY_FEEDBACK, interlocks.mode)
         if not interlocks.close(holds):
-            return HeatForbidden(first_row(interlocks.forbids(holds)), interlocks.mode)
+            return messages.HeatForbidden(first_row(interlocks.forbids(holds)), interlocks.mode)
         voltage = self.inputs.battery_voltage
         if voltage < config.least_battery_voltage:
             interlocks.open()
-            return BatteryLow(voltage, config.least_battery_voltage)
-        self.state, self._elapsed_s = HeaterState.ARMED, 0.0
+            return messages.BatteryLow(voltage, config.least_battery_voltage)
+        self.state, self._elapsed_s = messages.HeaterState.ARMED, 0.0
         self.control.reset()
-        self._pending.append(HeaterArmed(interlocks.mode))
+        self._pending.append(messages.HeaterArmed(interlocks.mode))
         return None
 
-    def _measure(self, command: MeasureResistance, lease: int) -> Refusal | None:
-        if not command.straight_and_unloaded or command.phase is not RodPhase.AUSTENITE:
-            return RodNotConfirmed(command.phase)
+    def _measure(self, command: messages.MeasureResistance, lease: int) -> Refusal | None:
+        if not command.straight_and_unloaded or command.phase is not messages.RodPhase.AUSTENITE:
+            return messages.RodNotConfirmed(command.phase)
         if not self.inputs.relay_closed:
-            return HeatForbidden(Row.RELAY_FEEDBACK, self.interlocks.mode)
+            return messages.HeatForbidden(Row.RELAY_FEEDBACK, self.interlocks.mode)
         if self._since_heat_s < self._config.rod_cooling_s:
-            return RodStillHot(self._since_heat_s, self._config.rod_cooling_s)
+            return messages.RodStillHot(self._since_heat_s, self._config.rod_cooling_s)
         self.initial.begin()
         self._pulse_s, self._lease = 0.0, lease
-        self.state = HeaterState.MEASURING
+        self.state = messages.HeaterState.MEASURING
         return None
 
     def _start(self, lease: int) -> Refusal | None:
         profile = self._profile
         if profile is None:
-            return NoHeatProfile()
+            return messages.NoHeatProfile()
         if not self.initial.value:
-            return ResistanceNotMeasured()
+            return messages.ResistanceNotMeasured()
         if not self.inputs.relay_closed:
-            return HeatForbidden(Row.RELAY_FEEDBACK, self.interlocks.mode)
+            return messages.HeatForbidden(Row.RELAY_FEEDBACK, self.interlocks.mode)
         measured = profile.kelvin_per_ratio / profile.mean_by_middle * self.initial.uncertainty / self.initial.value
         self.uncertainty_k = hypot(profile.uncertainty_k, measured)
         self.ramp.begin(self._scale.middle(1.0), profile.target_c, profile.ramp_k_s)
         self.control.reset()
         self.energy = self._elapsed_s = 0.0
         self._lease = lease
-        self.state = HeaterState.HEATING
-        self._pending.append(HeatingStarted(profile.target_c, self._scale.ratio_for_middle(profile.target_c)))
+        self.state = messages.HeaterState.HEATING
+        self._pending.append(messages.HeatingStarted(profile.target_c, self._scale.ratio_for_middle(profile.target_c)))
         return None
 
     # -- the cycle ----------------------------------------------------------------------------------------------------
@@ -303,9 +274,9 @@ class ShapeSetting(Process):
     def _report_cause(self, context: PartContext, latches: int) -> None:
         row, supervision = self.interlocks.cause, self.supervision
         if latches:
-            context.report(HeaterTripped(row, supervision.values[row], supervision.limits[row]))
+            context.report(messages.HeaterTripped(row, supervision.values[row], supervision.limits[row]))
         else:
-            context.report(HeatEnded(row, self.interlocks.mode))
+            context.report(messages.HeatEnded(row, self.interlocks.mode))
 
     def _rest(self) -> None:
         """Show why the relay is open."""
@@ -316,28 +287,28 @@ class ShapeSetting(Process):
         if self.interlocks.latched:
             # Contacts, wires or the rod itself may have changed.
             self.initial.forget()
-            self.state = HeaterState.TRIPPED
+            self.state = messages.HeaterState.TRIPPED
         elif mode is Mode.OFF:
-            self.state = HeaterState.OFF
-        elif self.state is not HeaterState.DONE:
-            self.state = HeaterState.READY
+            self.state = messages.HeaterState.OFF
+        elif self.state is not messages.HeaterState.DONE:
+            self.state = messages.HeaterState.READY
 
     def _work(self, context: PartContext) -> None:
         """Decide on the gate for this cycle."""
-        if self.state is HeaterState.ARMED:
+        if self.state is messages.HeaterState.ARMED:
             self._wait(context)
-        elif self.state is HeaterState.MEASURING:
+        elif self.state is messages.HeaterState.MEASURING:
             self._pulse(context)
-        elif self.state is HeaterState.COOLING:
+        elif self.state is messages.HeaterState.COOLING:
             self._cool(context)
         else:
             self._heat(context)
 
     def _wait(self, context: PartContext) -> None:
-        """Open a relay that nobody uses: no commander watches over an armed heater."""
+        """Open a relay that is not used: no commander supervises an armed heater."""
         self._elapsed_s += self._passed_s
         if self._elapsed_s > self._config.armed_s:
-            context.report(ArmedTooLong(self._config.armed_s))
+            context.report(messages.ArmedTooLong(self._config.armed_s))
             self._open()
 
     def _pulse(self, context: PartContext) -> None:
@@ -349,13 +320,13 @@ class ShapeSetting(Process):
             self.gate, self._pulse_s = False, 0.0
             if initial.pulses == config.pulses:
                 initial.finish()
-                self.state, self._lease, self._elapsed_s = HeaterState.ARMED, 0, 0.0
+                self.state, self._lease, self._elapsed_s = messages.HeaterState.ARMED, 0, 0.0
                 if initial.uncertainty > config.greatest_initial_uncertainty * initial.value:
                     percent, limit = initial.uncertainty / initial.value, config.greatest_initial_uncertainty
-                    context.report(ResistanceUncertain(initial.value, 100.0 * percent, 100.0 * limit))
+                    context.report(messages.ResistanceUncertain(initial.value, 100.0 * percent, 100.0 * limit))
                     initial.forget()
                 else:
-                    context.report(ResistanceMeasured(initial.value, initial.uncertainty, initial.pulses))
+                    context.report(messages.ResistanceMeasured(initial.value, initial.uncertainty, initial.pulses))
         elif self._pulse_s >= config.pulse_interval_s or not initial.pulses:
             self.gate = True
 
@@ -370,18 +341,18 @@ class ShapeSetting(Process):
             setpoint = scale.ratio_for_middle(self.ramp.setpoint_c)
             control.update(setpoint, self.ratio, meter.current, limit)
         self.gate = control.gate or meter.age_s >= config.sense_interval_s
-        if self.state is HeaterState.HEATING and reached:
-            self.state, self._hold_s = HeaterState.HOLDING, 0.0
-            context.report(HoldBegun(middle, profile.hold_s))
-        elif self.state is HeaterState.HOLDING:
+        if self.state is messages.HeaterState.HEATING and reached:
+            self.state, self._hold_s = messages.HeaterState.HOLDING, 0.0
+            context.report(messages.HoldBegun(middle, profile.hold_s))
+        elif self.state is messages.HeaterState.HOLDING:
             self._hold_s += self._passed_s
             if self._hold_s >= profile.hold_s:
-                self.state, self.gate, self._hold_s = HeaterState.COOLING, False, 0.0
+                self.state, self.gate, self._hold_s = messages.HeaterState.COOLING, False, 0.0
                 control.reset()
-                context.report(CoolingBegun(self.energy))
+                context.report(messages.CoolingBegun(self.energy))
                 return
         if self._elapsed_s > config.longest_s:
-            context.report(TargetNotReached(middle, config.longest_s))
+            context.report(messages.TargetNotReached(middle, config.longest_s))
             self._open()
 
     def _cool(self, context: PartContext) -> None:
@@ -391,14 +362,14 @@ class ShapeSetting(Process):
         self._hold_s += self._passed_s
         least = min(self._profile.initial_c, self._profile.chuck_c) - _BELOW_K
         if self.meter.fresh and least <= middle <= self._profile.cool_c:
-            context.report(ShapeSet(middle))
+            context.report(messages.ShapeSet(middle))
             self._open()
-            # The rod is taken out now: the next one is measured anew.
+            # The rod is removed now: the next one is measured again.
             self.initial.forget()
-            self.state = HeaterState.DONE
+            self.state = messages.HeaterState.DONE
             self._since_heat_s = self._hold_s
         elif self._hold_s > self._config.longest_cooling_s:
-            context.report(CoolingTooLong(middle, self._config.longest_cooling_s))
+            context.report(messages.CoolingTooLong(middle, self._config.longest_cooling_s))
             self._open()
 
     def _write(self, context: PartContext) -> None:
@@ -413,7 +384,7 @@ class ShapeSetting(Process):
     def safe(self) -> None:
         """Turn gate and relay off; they stay off until the heater is armed again."""
         if self.interlocks.closed:
-            self._pending.append(HeatStopped())
+            self._pending.append(messages.HeatStopped())
         self._open()
 
     def _open(self) -> None:
@@ -425,7 +396,7 @@ class ShapeSetting(Process):
         self.meter.forget()
         self.supervision.forget_gradient()
         if self.state not in _AT_REST:
-            self.state = HeaterState.READY
+            self.state = messages.HeaterState.READY
 
     def publish(self, values: list[Any], at: int) -> None:
         """Write the values of `_FIELDS`."""

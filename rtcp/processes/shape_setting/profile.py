@@ -14,20 +14,14 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Le
 
-from rtcp.config.document import Finding, read
+from rtcp.config.document import read
+from rtcp.config.findings import Finding
 from rtcp.config.numbers import NotNegative
 from rtcp.config.validation import Checker, rule
+from rtcp.processes.shape_setting import temperature
 from rtcp.processes.shape_setting.messages import PROFILE_RANGES, ProfileKey, SetHeatProfile
-from rtcp.processes.shape_setting.temperature import (
-    Alloy,
-    ColdEnds,
-    Temperature,
-    mean_temperature,
-    middle_temperature,
-    ratio_scale,
-)
 
-# What the loop checks again.
+# The ranges that the loop checks again.
 _RANGES = {key: (Ge(least), Le(greatest)) for key, (least, greatest) in PROFILE_RANGES.items()}
 _ROOM, _TARGET, _RAMP = _RANGES[ProfileKey.INITIAL_C], _RANGES[ProfileKey.TARGET_C], _RANGES[ProfileKey.RAMP_K_S]
 _COOL, _CURRENT, _POWER = (_RANGES[key] for key in (ProfileKey.COOL_C, ProfileKey.MAX_CURRENT, ProfileKey.MAX_POWER))
@@ -36,7 +30,7 @@ _Room = Annotated[float, _ROOM[0], _ROOM[1]]
 
 @dataclass(frozen=True)
 class Limits:
-    """What the heater does not exceed with this rod."""
+    """Limits of the heater with this rod."""
 
     current: Annotated[float, _CURRENT[0], _CURRENT[1]] = 50.0
     """Greatest average current, A."""
@@ -46,10 +40,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class HeatProfile:
-    """A profile: what is heated to which temperature, for how long."""
+    """A profile: temperature, time at it, and the rod's properties."""
 
-    alloy: Alloy
-    ends: ColdEnds
+    alloy: temperature.Alloy
+    ends: temperature.ColdEnds
     target_c: Annotated[float, _TARGET[0], _TARGET[1]]
     """Temperature in the middle of the rod, C; Nitinol loses its structure above 600 C."""
     hold_s: NotNegative
@@ -73,9 +67,11 @@ class HeatProfile:
 def _order(profile: HeatProfile) -> Iterator[Finding]:
     for key in ("cool_c", "initial_c"):
         if getattr(profile, key) >= profile.target_c:
-            yield (key,), f"found {getattr(profile, key):g}, allowed is less than target_c, {profile.target_c:g}"
+            wanted = f"less than target_c, {profile.target_c:g}"
+            yield Finding((key,), "too_high", found=getattr(profile, key), allowed=wanted)
     if profile.cool_c <= profile.initial_c:
-        yield ("cool_c",), f"found {profile.cool_c:g}, allowed is more than initial_c, {profile.initial_c:g}"
+        wanted = f"more than initial_c, {profile.initial_c:g}"
+        yield Finding(("cool_c",), "too_low", found=profile.cool_c, allowed=wanted)
 
 
 _FILE = Checker(HeatProfile)
@@ -92,17 +88,17 @@ def read_profile(path: Path) -> HeatProfile:
 
 def target_ratio(profile: HeatProfile) -> float:
     """Return the ratio of resistances at which the middle has its target temperature."""
-    scale = ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
+    scale = temperature.ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
     return scale.ratio_for_middle(profile.target_c)
 
 
-def target_temperatures(profile: HeatProfile) -> tuple[Temperature, Temperature]:
+def target_temperatures(profile: HeatProfile) -> tuple[temperature.Temperature, temperature.Temperature]:
     """Return the temperatures of mean and middle at the target, with their uncertainties."""
-    scale = ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
-    mean = mean_temperature(
+    scale = temperature.ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
+    mean = temperature.mean_temperature(
         profile.alloy, scale, target_ratio(profile), profile.ratio_uncertainty, profile.initial_uncertainty_k
     )
-    return mean, middle_temperature(profile.ends, scale, mean)
+    return mean, temperature.middle_temperature(profile.ends, scale, mean)
 
 
 def temperatures_along(
@@ -125,7 +121,7 @@ def temperatures_along(
 
 def heat_command(profile: HeatProfile) -> SetHeatProfile:
     """Return the command that brings a profile to the loop."""
-    scale = ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
+    scale = temperature.ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
     return SetHeatProfile(
         initial_c=scale.initial_c,
         chuck_c=scale.chuck_c,

@@ -1,4 +1,4 @@
-"""What a run of shape setting came to: a page with pictures, and the same as JSON."""
+"""Report of a run of shape setting: a page with pictures, and the same as JSON."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PLACES, _MOST_TIMES = 61, 300
 
 
 def write_report(folder: Path, job: Job, profile: HeatProfile, outcome: Outcome, problem: str) -> Path:
-    """Write `report.html`, `report.json` and, of what is known, `shape.png`, `heat.png`, `along.png`, `set.png`.
+    """Write `report.html`, `report.json` and, as far as measured, `shape.png`, `heat.png`, `along.png`, `set.png`.
 
     Returns the page.
 
@@ -28,8 +28,8 @@ def write_report(folder: Path, job: Job, profile: HeatProfile, outcome: Outcome,
         folder: which exists.
         job: the shape.
         profile: of the heat.
-        outcome: what was measured.
-        problem: what ended the run early; empty: nothing.
+        outcome: results of the run.
+        problem: cause of an early end; empty: none.
     """
     along = _temperatures(profile, outcome)
     facts = _facts(job, profile, outcome, problem)
@@ -37,7 +37,7 @@ def write_report(folder: Path, job: Job, profile: HeatProfile, outcome: Outcome,
     drawn = (_shapes(folder, outcome), _heat(folder, outcome), _along(folder, along), _set(folder, outcome))
     pictures = [picture for picture in drawn if picture]
     rows = "".join(f"<tr><th scope=row>{html.escape(k)}<td>{html.escape(str(v))}" for k, v in facts.items())
-    steps = "".join(f"<tr><td>{at:.1f} s<td>{html.escape(what)}" for at, what in outcome.steps)
+    steps = "".join(f"<tr><td>{at:.1f} s<td>{html.escape(event)}" for at, event in outcome.steps)
     interlocks = "".join(f"<tr><th scope=row>{name}<td>{state}" for name, state in outcome.interlocks.items())
     images = "".join(
         f'<figure><img src="{name}" alt="{html.escape(text)}"><figcaption>{html.escape(text)}</figcaption></figure>'
@@ -71,10 +71,10 @@ def _facts(job: Job, profile: HeatProfile, outcome: Outcome, problem: str) -> di
     if outcome.released is not None:
         largest, mean_square = outcome.error
         facts["released rod against the wanted one"] = f"{1e3 * mean_square:.2f} mm rms, {1e3 * largest:.2f} mm at most"
-        whole = sum(outcome.straight) >= job.rod.length
-        ends = " and ".join(f"{1e3 * one:.0f} mm" for one in outcome.straight)
+        is_straight = sum(outcome.straight) >= job.rod.length
+        ends = " and ".join(f"{1e3 * length:.0f} mm" for length in outcome.straight)
         facts["ends that stay straight"] = (
-            "the whole rod: less than half of the bend is set anywhere" if whole else ends
+            "the whole rod: less than half of the bend is set anywhere" if is_straight else ends
         )
     return facts
 
@@ -90,13 +90,13 @@ def _temperatures(profile: HeatProfile, outcome: Outcome) -> tuple[Array, Array,
 
 
 def _plain(facts: dict[str, str], outcome: Outcome, along: tuple[Array, Array, Array] | None) -> dict[str, Any]:
-    made: dict[str, Any] = {"facts": facts}
+    content: dict[str, Any] = {"facts": facts}
     if along is not None:
         times, places, grid = along
-        made["along"] = {"times": times.tolist(), "s": places.tolist(), "celsius": grid.round(1).tolist()}
+        content["along"] = {"times": times.tolist(), "s": places.tolist(), "celsius": grid.round(1).tolist()}
     for name, value in vars(outcome).items():
-        made[name] = value.tolist() if isinstance(value, np.ndarray) else value
-    return made
+        content[name] = value.tolist() if isinstance(value, np.ndarray) else value
+    return content
 
 
 def _shapes(folder: Path, outcome: Outcome) -> tuple[str, str] | None:
@@ -154,8 +154,8 @@ def _along(folder: Path, along: tuple[Array, Array, Array] | None) -> tuple[str,
 
     times, places, grid = along
     figure, axis = plt.subplots(figsize=(10, 3.5), layout="constrained")
-    shown = axis.pcolormesh(times, 1e3 * places, grid, cmap="inferno", shading="gouraud")
-    figure.colorbar(shown, ax=axis, label="C")
+    mesh = axis.pcolormesh(times, 1e3 * places, grid, cmap="inferno", shading="gouraud")
+    figure.colorbar(mesh, ax=axis, label="C")
     axis.set_xlabel("s")
     axis.set_ylabel("along the rod, mm")
     figure.savefig(folder / "along.png", dpi=120)
@@ -173,9 +173,9 @@ def _set(folder: Path, outcome: Outcome) -> tuple[str, str] | None:
     axis.set_ylabel("highest temperature, C")
     axis.set_xlabel("along the rod, mm")
     axis.grid(visible=True)
-    other = axis.twinx()
-    other.plot(1e3 * outcome.s, outcome.fraction, "tab:blue")
-    other.set_ylabel("set, 0 to 1")
+    right_axis = axis.twinx()
+    right_axis.plot(1e3 * outcome.s, outcome.fraction, "tab:blue")
+    right_axis.set_ylabel("set, 0 to 1")
     figure.savefig(folder / "set.png", dpi=120)
     plt.close(figure)
     return "set.png", "highest temperature along the rod, red, and which part of the bend is set, blue"

@@ -6,11 +6,11 @@ from math import inf, sqrt
 from typing import Final
 
 _LEAST_CURRENT: Final = 0.5
-"""A; far above the noise, far below the current of any rod: less is an open circuit."""
+"""Least current of a measurement, A: far above the noise, far below the current of any rod; less is an open circuit."""
 
 
 class ResistanceMeter:
-    """Resistance of the rod: from a conversion during which the gate was on throughout, else the one before.
+    """Resistance of the rod, from the newest conversion during which the gate was on throughout.
 
     Args:
         period_s: the cycle, s.
@@ -22,15 +22,15 @@ class ResistanceMeter:
         self._period_s, self._short, self._open = period_s, short, open_
         self._sample = -1.0
         self.resistance = 0.0
-        """The newest, ohm; 0: none yet."""
+        """Newest resistance, ohm; 0: none yet."""
         self.voltage = self.current = 0.0
-        """Of the same conversion, V and A: with the gate on."""
+        """Voltage and current of the same conversion, V and A, with the gate on."""
         self.age_s = inf
         """Time since its conversion was received, s."""
         self.fresh = False
-        """Whether it is of this cycle."""
+        """Whether the resistance is of this cycle."""
         self.seen = 0.0
-        """Of the newest conversion with the gate on, ohm, also of an open or short circuit."""
+        """Resistance of the newest conversion with the gate on, ohm, open and short circuits included."""
         self.is_open = self.is_short = False
         """Whether the conversion of this cycle shows an open or a short circuit; the resistance is held then."""
 
@@ -61,12 +61,12 @@ class InitialResistance:
 
     def __init__(self) -> None:
         self.value = self.uncertainty = 0.0
-        """ohm; 0: not measured."""
+        """Initial resistance and its uncertainty, ohm; 0: not measured."""
         self.pulses = 0
         self._mean = self._squares = self._first = 0.0
 
     def forget(self) -> None:
-        """Drop what was measured: another rod may be gripped."""
+        """Forget the measurement: another rod may be gripped."""
         self.value = self.uncertainty = 0.0
 
     def begin(self) -> None:
@@ -85,7 +85,7 @@ class InitialResistance:
         self._last = resistance
 
     def finish(self) -> None:
-        """Take the mean of at least two pulses.
+        """Compute the mean of at least two pulses.
 
         The uncertainty is that of the mean (GUM, 4.2.3) and, as a rectangular distribution, that of the drift: each
         pulse heats the rod a little.

@@ -53,12 +53,16 @@ _FIELDS: Final = (
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)
 _VIRTUAL_BOX: Final = (0x00000A55, 0x00000010)
 _BEND, _ACT, _FRACTION, _CELLS_AT, _HIGHEST = 0x2010, 0x2013, 0x2021, 0x2025, 0x2026
+"""Objects of the virtual control box: curvature (one object per axis), action; of each cell of the rod: set fraction of
+the bend, position, m, highest temperature, C."""
+_IMPOSE, _SPRING_BACK, _RENEW = 1, 2, 3
+"""Actions."""
 _CELLS: Final = 48
 
 
 @dataclass
 class Outcome:
-    """What a run came to; the shapes are curves of points, (n, 3), m, in the frame of the rod's start.
+    """Results of a run; the shapes are curves of points, (n, 3), m, in the frame of the rod's start.
 
     times, samples: of the heater's fields by name. wanted, held, released: curves; released is an estimate from the
     temperatures along the rod. straight: lengths at the two ends that are not set, m. error: of the released rod
@@ -80,7 +84,7 @@ class Outcome:
     energy: float = 0.0
     interlocks: dict[str, str] = field(default_factory=dict)
     steps: list[tuple[float, str]] = field(default_factory=list)
-    """Time since the beginning, s, and what began."""
+    """Time since the beginning, s, and name of each step."""
 
 
 class ShapeSettingRun:
@@ -90,11 +94,11 @@ class ShapeSettingRun:
         cell: two arms and the heater.
         job: the shape.
         profile: of the heat.
-        say: called with what begins.
-        confirm: called where people do something at the rod; returns when they have.
+        say: called with the name of each step at its start.
+        confirm: called with what people have to do at the rod; returns when they have done it.
 
     Raises:
-        Refused: the cell has no heater, another run works with it, somebody uses the heater, the rod may be hot, or the
+        Refused: the cell has no heater, another run uses it, another client uses the heater, the rod may be hot, or the
             bend cannot be planned; nothing has moved.
     """
 
@@ -106,7 +110,7 @@ class ShapeSettingRun:
         self._member, self._name = _heater_of(cell)
         self._robot = cell.processes[self._member.name]
         self._heater = self._robot.processes[self._name]
-        config = next(one for one in self._member.config.processes if one.name == self._name)
+        config = next(process for process in self._member.config.processes if process.name == self._name)
         assert isinstance(config, ShapeSettingConfig)
         self._config = config
         self.outcome = Outcome()
@@ -114,7 +118,7 @@ class ShapeSettingRun:
         """Whether a run that ended early has measured that relay, gate and current are off."""
         self._lock = _lock(self._member.directory.parent / "shape-set.lock")
         self._check_heater()
-        # Before anything moves: of a profile that the loop refuses nothing begins.
+        # Before anything moves: a profile that the loop refuses ends the run here.
         self._set_profile()
         self._began = time.monotonic()
         self.plan: BendingPlan = plan_motion(cell.config, job.holders, job.steps(), pose_of(job.held), job.near)
@@ -122,50 +126,50 @@ class ShapeSettingRun:
         self._check_arms()
 
     def run(self) -> Outcome:
-        """Do all of it; whatever ends it early turns the heat off first, then stops the arms.
+        """Do the whole run; an early end turns the heat off first, then stops the arms.
 
         Raises:
-            RtcpError: what ended it.
+            RtcpError: the cause of an early end.
         """
-        ghost = rod_file(self._member.directory.parent)
+        curves_file = rod_file(self._member.directory.parent)
         try:
-            self._draw(ghost)
+            self._draw(curves_file)
             self._steps()
         except BaseException:
             self._stop()
             raise
         finally:
             with contextlib.suppress(OSError):
-                ghost.unlink(missing_ok=True)
+                curves_file.unlink(missing_ok=True)
             self._lock.close()
         return self.outcome
 
     @property
     def middle_c(self) -> float | None:
         """Newest temperature in the middle of the rod, C; None: none was measured."""
-        return next((one for one in reversed(self.outcome.samples["middle_temperature"]) if one), None)
+        return next((value for value in reversed(self.outcome.samples["middle_temperature"]) if value), None)
 
     def _check_heater(self) -> None:
-        """Raise where the heater is another's, or where arms would move with a hot rod."""
+        """Raise where the heater has tripped, is not measured as off, is in use, or the rod may be hot."""
         fields = self._heater.fields
         if fields["latched"]:
             raise RtcpError(
                 "refused",
-                f"the heater has tripped: mend the cause, then `rtcp --name {self._member.name} process {self._name} "
+                f"the heater has tripped: clear the cause, then `rtcp --name {self._member.name} process {self._name} "
                 "reset_trips`",
                 "heater_tripped",
             )
         if not self._is_off(fields):
             raise RtcpError(
                 "refused",
-                "relay, gate and current of the heater are not measured as off, or its inputs do not change: look at "
+                "relay, gate and current of the heater are not measured as off, or its inputs do not change: see "
                 f"`rtcp --name {self._member.name} process {self._name}`",
                 "heater_not_off",
             )
         if fields["busy"] or fields["relay"]:
             raise RtcpError(
                 "refused",
-                f"the heater is {self._heater.state}: somebody uses it; `rtcp --name {self._member.name} process "
+                f"the heater is {self._heater.state}: another client uses it; `rtcp --name {self._member.name} process "
                 f"{self._name} stop_heating` ends that",
                 "heater_in_use",
             )
@@ -190,26 +194,26 @@ class ShapeSettingRun:
             )
 
     def _draw(self, path: Path) -> None:
-        """Let the panels of the arms draw the rod along its bend: some curves of points in the world, m."""
+        """Write curves of the rod along its bend, points in the world, m, which the panels of the arms draw."""
         curves = self.plan.curves
         chosen = np.linspace(0, len(curves) - 1, min(_GHOSTS, len(curves))).round().astype(int)
-        made = path.with_suffix(".new")
-        # What a panel does not draw is no reason not to begin.
+        draft = path.with_suffix(".new")
+        # The panels are not needed: the run continues if the file cannot be written.
         with contextlib.suppress(OSError):
             points = curves[chosen][:, ::_GHOST_STRIDE].round(4).tolist()
-            made.write_text(json.dumps({"pid": os.getpid(), "curves": points}))
-            made.replace(path)
+            draft.write_text(json.dumps({"pid": os.getpid(), "curves": points}))
+            draft.replace(path)
 
-    def _begin(self, what: str) -> None:
-        self.outcome.steps.append((time.monotonic() - self._began, what))
-        self._say(what)
+    def _begin(self, step: str) -> None:
+        self.outcome.steps.append((time.monotonic() - self._began, step))
+        self._say(step)
 
     def _steps(self) -> None:
         cell, heater = self._cell, self._heater
         last = self.plan.steps[-1]
         self.outcome.wanted, self.outcome.s, self.outcome.strain = last.p, last.s, last.largest_strain
         self._confirm("the chucks hold nothing, nothing stands between the arms")
-        # Hours may have passed at the question.
+        # The confirmation may have taken hours.
         self._check_heater()
         self._begin("arms are enabled and go to where the straight rod is gripped")
         for name in self._job.holders:
@@ -241,7 +245,7 @@ class ShapeSettingRun:
             virtual.bend(held)
         self._begin(f"heating to {self._profile.target_c:g} C in the middle, hold {self._profile.hold_s:g} s, cooling")
         self._arm()
-        since = max((one.number for one in self._robot.events()), default=0)
+        since = max((event.number for event in self._robot.events()), default=0)
         self._set_profile()
         with self._sampling():
             heater.command("start_heating")
@@ -255,34 +259,34 @@ class ShapeSettingRun:
 
     def _check_resistance(self) -> None:
         """Compare the initial resistance with that of the rod by its alloy and dimensions."""
-        rod, found = self._job.rod, self.outcome.initial_resistance
+        rod, value = self._job.rod, self.outcome.initial_resistance
         area = 0.25 * np.pi * rod.diameter**2
         expected = float(self._profile.alloy.resistivity(self._profile.initial_c) * rod.length / area)
-        if not abs(found / expected - 1.0) <= _RESISTANCE_SHARE:
+        if not abs(value / expected - 1.0) <= _RESISTANCE_SHARE:
             raise RtcpError(
                 "refused",
-                f"the initial resistance is {found:.4g} ohm, by alloy and dimensions {expected:.4g} ohm are expected, "
+                f"the initial resistance is {value:.4g} ohm, by alloy and dimensions {expected:.4g} ohm are expected, "
                 f"{100 * _RESISTANCE_SHARE:g} % off at most: check rod, phase, contacts and the profile's alloy",
                 "implausible_resistance",
-                {"resistance": found, "expected": expected},
+                {"resistance": value, "expected": expected},
             )
 
     def _set_profile(self) -> None:
         self._heater.command("set_heat_profile", **asdict(heat_command(self._profile)))
 
     def _check_target(self, since: int) -> None:
-        """Raise where the heating since an event was not to this profile: another client may set one at any time."""
+        """Raise where the heating since event `since` had another profile: any client may set one at any time."""
         expected = self._profile.target_c, target_ratio(self._profile)
         heated = [
-            (one.fields["target_c"], one.fields["ratio"])
-            for one in self._robot.events(since)
-            if one.name == HeatingStarted.name
+            (event.fields["target_c"], event.fields["ratio"])
+            for event in self._robot.events(since)
+            if event.name == HeatingStarted.name
         ]
         if not heated or not np.allclose(heated, expected, rtol=1e-6, atol=0.0):
-            found = ", ".join(f"{target:g} C at the ratio {ratio:.5g}" for target, ratio in heated) or "nothing"
+            targets = ", ".join(f"{target:g} C at the ratio {ratio:.5g}" for target, ratio in heated) or "nothing"
             raise RtcpError(
                 "fault",
-                f"the heater was to heat to {expected[0]:g} C at the ratio {expected[1]:.5g}, it reports {found}: "
+                f"the heater was to heat to {expected[0]:g} C at the ratio {expected[1]:.5g}, it reports {targets}: "
                 "another client has changed the profile; this rod is not set as the report says",
                 "profile_changed",
             )
@@ -305,8 +309,8 @@ class ShapeSettingRun:
         until = time.monotonic() + _RELAY_S
         while bool(self._heater.fields["relay_closed"]) is not closed:
             if time.monotonic() > until:
-                what = "close" if closed else "open"
-                raise RtcpError("fault", f"the heater's relay did not {what} within {_RELAY_S:g} s: see its feedback")
+                verb = "close" if closed else "open"
+                raise RtcpError("fault", f"the heater's relay did not {verb} within {_RELAY_S:g} s: see its feedback")
             time.sleep(0.02)
 
     def _socket(self) -> Path:
@@ -314,7 +318,7 @@ class ShapeSettingRun:
 
     @contextlib.contextmanager
     def _sampling(self) -> Iterator[None]:
-        """Keep the heater's fields meanwhile, over a connection of their own."""
+        """Record the heater's fields during the block, over a separate connection."""
         ended = threading.Event()
         outcome, began = self.outcome, time.monotonic()
 
@@ -332,7 +336,7 @@ class ShapeSettingRun:
             yield
         finally:
             ended.set()
-        # Only after a whole heating: what ends one early has to turn the heat off first.
+        # Only after a whole heating: an early end has to turn the heat off first.
         thread.join(_RELAY_S)
 
     def _held(self) -> Equilibrium:
@@ -356,7 +360,7 @@ class ShapeSettingRun:
             outcome.fraction, outcome.highest = np.interp(held.s, at, fraction), np.interp(held.s, at, highest)
             virtual.release()
         elif len(outcome.times) < 2:
-            # The connection over which they come was lost: nothing is known of the heat.
+            # The connection for the samples was lost: nothing is known of the heat.
             return
         else:
             grid = temperatures_along(self._profile, held.s, outcome.samples["middle_temperature"])
@@ -374,13 +378,13 @@ class ShapeSettingRun:
             self.outcome.interlocks[rule.row.name.lower()] = state
 
     def _stop(self) -> None:
-        """Heat first, then motion; what does not answer keeps nothing from stopping."""
+        """Stop heat first, then motion; a platform that does not answer does not delay the others."""
         with undisturbed():
             self._stop_all()
 
     def _stop_all(self) -> None:
-        # Over connections of their own: an interrupt has left those of the cell in the middle of an answer. In threads
-        # that nobody has to wait for: a frozen gateway answers after its timeout, or never.
+        # Over separate connections: the interrupt may have left those of the cell in the middle of an answer. In daemon
+        # threads: a frozen gateway answers after its timeout, or never.
         until = time.monotonic() + _STOP_S
         commanded = threading.Event()
         threads = [begin_thread(self._stop_heat, commanded)]
@@ -390,7 +394,7 @@ class ShapeSettingRun:
             thread.join(max(0.0, until - time.monotonic()))
 
     def _await_off(self, heater: Process) -> bool:
-        """Wait for the relay to open; return whether relay, gate and current are off by what is measured."""
+        """Wait for the relay to open; return whether relay, gate and current are measured as off."""
         until = time.monotonic() + _RELAY_S
         while not (is_off := self._is_off(heater.fields)) and time.monotonic() < until:
             time.sleep(0.02)
@@ -419,7 +423,7 @@ def _halt(member: Member) -> None:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Ignore a second Ctrl-C, and what else ends a command, meanwhile."""
+    """Ignore a second Ctrl-C and other signals that end a command, during the block."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -432,7 +436,7 @@ def undisturbed() -> Iterator[None]:
 
 
 class VirtualRod:
-    """The rod of the virtual control box, which cannot see what the virtual arms do: by SDO.
+    """The rod in the virtual control box. The box does not see the virtual arms: SDOs tell it what they do to the rod.
 
     Args:
         robot: the heater's platform; it is disabled for each change, since objects are written in state ready only.
@@ -441,12 +445,12 @@ class VirtualRod:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._slave = next(
-            one["position"] for one in robot.scan() if (one["vendor_id"], one["product_code"]) == _VIRTUAL_BOX
+            slave["position"] for slave in robot.scan() if (slave["vendor_id"], slave["product_code"]) == _VIRTUAL_BOX
         )
 
     def renew(self) -> None:
         """Grip another rod, cold and straight."""
-        self._act(3)
+        self._act(_RENEW)
 
     def bend(self, held: Equilibrium) -> None:
         """Impose the shape in which the arms hold it."""
@@ -455,31 +459,31 @@ class VirtualRod:
         for axis in range(3):
             for number, value in enumerate(np.interp(at, held.s, held.u[:, axis]).tolist(), 1):
                 self._robot.sdo_write(self._slave, _BEND + axis, number, struct.pack("<f", value))
-        self._act(1)
+        self._act(_IMPOSE)
 
     def release(self) -> None:
         """Let it spring back."""
-        self._act(2)
+        self._act(_SPRING_BACK)
 
     def read(self) -> tuple[Array, Array, Array]:
-        """Return where its cells are, m, which part of the bend is set there, and how hot each was at most, C."""
+        """Return for each of its cells: position, m, set part of the bend, and highest temperature, C."""
         return self._column(_CELLS_AT), self._column(_FRACTION), self._column(_HIGHEST)
 
     def _column(self, index: int) -> Array:
         cells = (self._robot.sdo_read(self._slave, index, number) for number in range(1, _CELLS + 1))
-        return np.array([struct.unpack("<f", one)[0] for one in cells], dtype=np.float64)
+        return np.array([struct.unpack("<f", cell)[0] for cell in cells], dtype=np.float64)
 
     def _disable(self) -> None:
         if self._robot.state is State.HOLDING:
             self._robot.disable()
 
-    def _act(self, what: int) -> None:
+    def _act(self, action: int) -> None:
         self._disable()
-        self._robot.sdo_write(self._slave, _ACT, 1, bytes((what,)))
+        self._robot.sdo_write(self._slave, _ACT, 1, bytes((action,)))
 
 
 def _warmth(middle_c: float | None) -> str:
-    """Return how hot the middle of the rod is, in words."""
+    """Return the temperature in the middle of the rod, in words."""
     if middle_c is None:
         return "the temperature of the rod is not known: do not touch it"
     return f"its middle has {middle_c:.0f} C" + (": HOT, do not touch it" if middle_c > _TOUCH_C else "")

@@ -12,12 +12,12 @@ from rtcp.processes.shape_setting.interlocks import TABLE, Mode, Row
 from rtcp.processes.shape_setting.resistance import ResistanceMeter
 
 _PLATFORM: Final = frozenset({State.HOLDING, State.MOVING})
-"""Enabled: every emergency stop, that of a partner too, every fault and `rtcp disable` lead out of these."""
+"""States with enabled drives: every emergency stop, also a partner's, every fault and `rtcp disable` leave them."""
 
 _COOLING: Final = 0.06
 """Greatest fall of the ratio of a rod that cools, 1/s: twice that of the virtual one of 0.5 mm at 500 C."""
 _STEP: Final = 0.01
-"""Fall of the ratio that passes at once: noise and contacts."""
+"""Fall of the ratio that is accepted at once: noise and contacts."""
 
 
 class Inputs:
@@ -41,7 +41,7 @@ class Inputs:
 
 
 class Steadiness:
-    """For how many cycles something has been true."""
+    """Counts the cycles for which a condition has been true."""
 
     def __init__(self, limit: float) -> None:
         self.limit = limit
@@ -54,7 +54,7 @@ class Steadiness:
 
 
 class Feedback:
-    """A command and what shows that it was carried out, after a time; then a difference counts at once."""
+    """Compares a command with its feedback, which has its time after a change; then a difference counts at once."""
 
     def __init__(self, on_cycles: float, off_cycles: float) -> None:
         self._cycles = (off_cycles, on_cycles)
@@ -63,7 +63,7 @@ class Feedback:
         """Cycles since the command has changed."""
 
     def follow(self, command: bool) -> None:
-        """Note a command of a cycle whose feedback is missing: what comes later may still answer it."""
+        """Note a command of a cycle whose feedback is missing: later feedback may still answer it."""
         if command is not self._command:
             self._command, self.waited = command, 0
 
@@ -99,7 +99,7 @@ class Supervision:
         self.holds = 0
         """Rows whose statement is true, a bit each."""
         self.values = [0.0] * len(TABLE)
-        """What a row was judged by, in the unit of its limit."""
+        """Value that a row was judged by, in the unit of its limit."""
         self.limits = [1.0] * len(TABLE)
         for row in (Row.KEY_DISCREPANCY, Row.BUTTON_DISCREPANCY, Row.CIRCUIT_DISCREPANCY):
             self.limits[row] = config.discrepancy_s
@@ -116,7 +116,7 @@ class Supervision:
         self.limits[Row.STALE_INPUT] = config.stale_cycles * period_s
 
     def forget_gradient(self) -> None:
-        """Begin the gradient anew: the circuit was opened."""
+        """Restart the gradient: the circuit was opened."""
         self._anchor = 0.0
 
     def update(
@@ -137,8 +137,8 @@ class Supervision:
             initial: resistance, ohm; 0: not measured.
             context: of the cycle.
             lease: of who commanded pulses or heat; 0: there are none.
-            relay: what the relay was commanded last.
-            gate: what the gate was commanded last.
+            relay: last command of the relay.
+            gate: last command of the gate.
         """
         config, values, good = self._config, self.values, context.good
         holds = 0
@@ -159,7 +159,7 @@ class Supervision:
         is_lost = self._lost.exceeds(not good)
         values[Row.LOST_CYCLE] = float(self._lost.cycles)
         if not good:
-            # Inputs are those of a cycle before: no time runs.
+            # Inputs are those of an earlier cycle: timers stand still.
             self._relay.follow(relay)
             self._gate.follow(gate)
             self._leakage.follow(gate)

@@ -16,7 +16,7 @@ from annotated_types import Ge, Gt, Le, Lt
 
 _RELATIVE = Annotated[float, Ge(0), Lt(1)]
 _LONGEST_FIN = 350.0
-"""Half a length by the cold end's length from where on cosh would overflow: the middle does not feel the ends."""
+"""Half a length by the cold end's length from which on cosh would overflow; the ends do not reach the middle then."""
 
 
 class Place(Enum):
@@ -56,7 +56,7 @@ class Alloy:
 
 @dataclass(frozen=True)
 class ColdEnds:
-    """What the chucks do to the temperature along the rod."""
+    """Effect of the chucks on the temperature along the rod."""
 
     length: Annotated[float, Ge(0.02), Le(2)]
     """Length of the rod between the chucks, m."""

@@ -1,3 +1,3 @@
-"""Simple Message, the protocol of ROS-Industrial drivers: a server of this arm, a client of other makers'
+"""Simple Message, the protocol of ROS-Industrial drivers: a server for this arm, a client for robot controllers
 (`docs/simple_message.md`).
 """

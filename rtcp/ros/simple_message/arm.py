@@ -1,4 +1,4 @@
-"""What the server needs of an arm."""
+"""Interface of an arm for the server."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Point(NamedTuple):
     """A point of a trajectory: rad, rad/s, rad/s^2, one number a joint; all points have the same fields."""
 
     time: float
-    """s from the start. A first point later than 0 says how long the way to it takes; one at 0 is where the arm is."""
+    """s from the start. A first point at 0 is the arm's position; to a later one the arm moves within its time."""
     positions: Joints
     velocities: Joints | None = None
     accelerations: Joints | None = None
@@ -35,33 +35,33 @@ class ArmState:
 
 
 class OpenTrajectory(Protocol):
-    """A trajectory under way to which points are appended. Errors are `RtcpError`."""
+    """A trajectory in progress to which points can be appended. Errors are `RtcpError`."""
 
     async def append(self, points: Sequence[Point]) -> None:
-        """Add points behind the last one; raises what the arm refuses them with, or that it has ended."""
+        """Append points; raises if the arm refuses them or the trajectory has ended."""
 
     async def finish(self) -> None:
-        """Say that no more points come."""
+        """End the trajectory at its last point."""
 
     async def wait(self) -> None:
-        """Return when the arm rests at the last point, or has run out of points; raises where it ended otherwise."""
+        """Return when the arm rests at the last point, or has run out of points; raises if it ended otherwise."""
 
 
 class Arm(Protocol):
     """An arm as the server commands it. Errors are `RtcpError`; a motion whose task is cancelled ends with a stop.
 
-    A motion takes the place of the one under way, whose call then ends soon, in whatever way.
+    A motion replaces the one in progress, whose call then soon returns or raises.
     """
 
     @property
     def state(self) -> ArmState | None:
-        """The newest sample; None: the platform is not there."""
+        """The newest sample; None: the platform is not running."""
 
     async def run_trajectory(self, points: Sequence[Point]) -> None:
         """Run a trajectory; return at its end."""
 
     async def open_trajectory(self, points: Sequence[Point]) -> OpenTrajectory:
-        """Begin a trajectory whose end is open; return when it was accepted."""
+        """Begin a trajectory with an open end; return when it is accepted."""
 
     async def move_joints(self, positions: Joints) -> None:
         """Move to joint positions, rad; return on arrival."""

@@ -1,6 +1,6 @@
-"""A client of controllers that speak Simple Message, other makers' too: their state, and motion.
+"""A client for robot controllers of any maker that speak Simple Message: their state, and motion.
 
-Each connection is made again once a second while there is none, as the driver specification of ROS-Industrial asks.
+A lost connection is tried again once a second (ROS-Industrial driver specification, 1.2.2).
 """
 
 from __future__ import annotations
@@ -10,17 +10,8 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
+from rtcp.fieldbus.simple_message import messages
 from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder, FrameError
-from rtcp.fieldbus.simple_message.messages import (
-    JOINTS,
-    ByteOrder,
-    CommType,
-    JointTrajPt,
-    Message,
-    MessageError,
-    ReplyCode,
-    SpecialSequence,
-)
 from rtcp.ros.simple_message.server import MOTION_PORT, STATE_PORT, notice_lost_peer
 
 RECONNECT_S = 1.0
@@ -30,31 +21,31 @@ log = logging.getLogger(__name__)
 
 
 class _Connection:
-    """A connection that is made again while `run` runs.
+    """A connection that `run` keeps open.
 
     Args:
-        host: name or address.
-        port: of the controller.
-        order: its byte order; None: that of its first length.
+        host: name or address of the controller.
+        port: its port.
+        order: its byte order; None: detected from the length field of its first message.
     """
 
-    def __init__(self, host: str, port: int, order: ByteOrder | None) -> None:
+    def __init__(self, host: str, port: int, order: messages.ByteOrder | None) -> None:
         self._host, self._port, self._order = host, port, order
         self._writer: asyncio.StreamWriter | None = None
         self._problem = ""
 
     @property
     def is_connected(self) -> bool:
-        """Whether the controller is there, as far as is known."""
+        """Whether the connection is open, as far as is known."""
         return self._writer is not None
 
     async def run(self) -> None:
-        """Connect and receive, again and again, until cancelled; a problem is logged once for as long as it lasts."""
+        """Connect and receive, repeatedly, until cancelled; a problem is logged once while it persists."""
         while True:
             try:
                 await self._serve()
                 problem = "the controller closed the connection"
-            except (FrameError, MessageError, OSError) as error:
+            except (FrameError, messages.MessageError, OSError) as error:
                 problem = str(error)
             if problem != self._problem:
                 log.warning("controller %s:%d: %s", self._host, self._port, problem)
@@ -71,14 +62,14 @@ class _Connection:
             while data := await reader.read(_READ_BYTES):
                 for frame in decoder.feed(data):
                     self._problem = ""
-                    self._receive(frame, decoder.order or ByteOrder.LITTLE)
+                    self._receive(frame, decoder.order or messages.ByteOrder.LITTLE)
             decoder.end()
         finally:
             self._writer = None
             writer.transport.abort()
             self._disconnected()
 
-    def _receive(self, frame: Frame, order: ByteOrder) -> None:
+    def _receive(self, frame: Frame, order: messages.ByteOrder) -> None:
         raise NotImplementedError
 
     def _disconnected(self) -> None:
@@ -89,64 +80,68 @@ class StateClient(_Connection):
     """Receives the state of a controller.
 
     Args:
-        host: name or address.
-        receive: called with each message; unknown ones are left out.
-        port: of the controller.
-        order: its byte order; None: that of its first length.
+        host: name or address of the controller.
+        receive: called with each message; messages of unknown types are ignored.
+        port: its port.
+        order: its byte order; None: detected from the length field of its first message.
     """
 
     def __init__(
         self,
         host: str,
-        receive: Callable[[Message], None],
+        receive: Callable[[messages.Message], None],
         port: int = STATE_PORT,
-        order: ByteOrder | None = None,
+        order: messages.ByteOrder | None = None,
     ) -> None:
         super().__init__(host, port, order)
         self._received = receive
 
-    def _receive(self, frame: Frame, order: ByteOrder) -> None:
-        code = ReplyCode.SUCCESS
+    def _receive(self, frame: Frame, order: messages.ByteOrder) -> None:
+        code = messages.ReplyCode.SUCCESS
         try:
             self._received(frame.message(order))
-        except MessageError as error:
-            code = ReplyCode.FAILURE
+        except messages.MessageError as error:
+            code = messages.ReplyCode.FAILURE
             log.debug("controller %s:%d: %s", self._host, self._port, error)
-        if frame.comm_type is CommType.SERVICE_REQUEST and self._writer is not None:
+        if frame.comm_type is messages.CommType.SERVICE_REQUEST and self._writer is not None:
             self._writer.write(frame.reply(code).pack(order))
 
 
 class MotionClient(_Connection):
-    """Sends motion to a controller; `run` it beside.
+    """Sends motion to a controller; `run` has to run as a task.
 
     Args:
-        host: name or address.
-        port: of the controller.
-        order: its byte order, in which the client speaks first.
-        joints: of all its arms; 12 for two.
+        host: name or address of the controller.
+        port: its port.
+        order: its byte order.
+        joints: number of joints of all its arms; 12 for two.
     """
 
     def __init__(
-        self, host: str, port: int = MOTION_PORT, order: ByteOrder = ByteOrder.LITTLE, joints: int = JOINTS
+        self,
+        host: str,
+        port: int = MOTION_PORT,
+        order: messages.ByteOrder = messages.ByteOrder.LITTLE,
+        joints: int = messages.JOINTS,
     ) -> None:
         super().__init__(host, port, order)
         self._joints = joints
-        self._speaks = order
+        self._send_order = order
         self._pending: deque[asyncio.Future[Frame]] = deque()
         """Requests in the order in which their replies come."""
 
-    def send(self, message: Message) -> None:
-        """Send a topic, which nobody answers; raises ConnectionError where there is no connection."""
-        self._write(Frame.topic(message, self._speaks))
+    def send(self, message: messages.Message) -> None:
+        """Send a topic, which has no reply; raises ConnectionError without a connection."""
+        self._write(Frame.topic(message, self._send_order))
 
-    async def request(self, message: Message) -> Frame:
-        """Send a request and return its reply; it waits for no other one.
+    async def request(self, message: messages.Message) -> Frame:
+        """Send a request at once, also while others wait for their replies, and return its reply.
 
         Raises:
             ConnectionError: no connection, or it was lost before the reply.
-            TimeoutError: no reply in 5 s; the connection is closed, so that none comes in the place of a later one.
+            TimeoutError: no reply in 5 s; the connection is closed, so that a late reply is not taken for another's.
         """
-        self._write(Frame.request(message, self._speaks))
+        self._write(Frame.request(message, self._send_order))
         reply: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
         self._pending.append(reply)
         try:
@@ -157,17 +152,17 @@ class MotionClient(_Connection):
             raise TimeoutError(f"no reply to {message.TYPE.name} in {REPLY_TIMEOUT_S:g} s") from None
 
     async def stop(self) -> bool:
-        """Stop the robot; return whether the controller says that it does. Errors as of `request`."""
-        stop = JointTrajPt(SpecialSequence.STOP_TRAJECTORY, (0.0,) * self._joints, 0.0, 0.0)
-        return (await self.request(stop)).reply_code is ReplyCode.SUCCESS
+        """Stop the robot; return whether the controller confirms it. Errors as in `request`."""
+        stop = messages.JointTrajPt(messages.SpecialSequence.STOP_TRAJECTORY, (0.0,) * self._joints, 0.0, 0.0)
+        return (await self.request(stop)).reply_code is messages.ReplyCode.SUCCESS
 
     def _write(self, frame: Frame) -> None:
         if self._writer is None:
             raise ConnectionError(f"no connection to the controller {self._host}:{self._port}")
-        self._writer.write(frame.pack(self._speaks))
+        self._writer.write(frame.pack(self._send_order))
 
-    def _receive(self, frame: Frame, order: ByteOrder) -> None:
-        if frame.comm_type is CommType.SERVICE_REPLY and self._pending:
+    def _receive(self, frame: Frame, order: messages.ByteOrder) -> None:
+        if frame.comm_type is messages.CommType.SERVICE_REPLY and self._pending:
             reply = self._pending.popleft()
             if not reply.done():  # else nobody waits for it any more
                 reply.set_result(frame)

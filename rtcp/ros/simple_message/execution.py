@@ -1,4 +1,4 @@
-"""Orders of a motion client, carried out on the arm: each at once, the newest in the place of what moves."""
+"""Executes the orders of a motion client on the arm: each at once, the newest replaces the present motion."""
 
 from __future__ import annotations
 
@@ -8,74 +8,64 @@ from collections.abc import Callable, Coroutine, Sequence
 
 from rtcp.api import RtcpError
 from rtcp.fieldbus.simple_message.messages import Joints
+from rtcp.ros.simple_message import sequence
 from rtcp.ros.simple_message.arm import Arm, OpenTrajectory, Point
-from rtcp.ros.simple_message.sequence import (
-    BUFFER_POINTS,
-    Append,
-    Begin,
-    Execute,
-    Finish,
-    Halt,
-    Order,
-    PointRefused,
-    Target,
-)
 
 LEAD_S = 0.2
-"""Motion that is buffered before a streamed trajectory begins: the client sends 130 to 180 points/s at most."""
+"""Motion buffered before a streamed trajectory begins, s: the client sends 130 to 180 points/s at most."""
 QUIET_S = 0.1
-"""Or it begins when no point has come for this long: a short trajectory has no end mark either."""
+"""Time without a point after which it begins earlier, s: a short trajectory may have no end mark."""
 _TARGETS_UNDER_WAY = 2
-"""Calls of real-time points: the one that the arm follows, and the one that takes its place."""
+"""Most pending calls of real-time points: the present one and the one that replaces it."""
 log = logging.getLogger(__name__)
 
 
 class _Stream:
-    """Points of a streamed trajectory that the arm has not got yet."""
+    """Points of a streamed trajectory that were not yet sent to the arm."""
 
     def __init__(self, series: int) -> None:
         self.series = series
         self.points: list[Point] = []
         self.begin = 0.0
-        """Time of the client at which the arm last stood, s: points count from there."""
+        """Client time of the last standstill, s, from which the times of points count."""
         self.is_finished = False
         self.is_running = False
         self.changed = asyncio.Event()
-        """A point came, the last one came, or the arm has run out of them."""
+        """Set when a point or the last one was received, or the arm has run out of points."""
 
     def add(self, point: Point) -> None:
-        """Put a point behind the others."""
-        if len(self.points) == BUFFER_POINTS:
-            raise PointRefused(f"the buffer is full: {BUFFER_POINTS} points wait to be executed")
+        """Append a point."""
+        if len(self.points) == sequence.BUFFER_POINTS:
+            raise sequence.PointRefused(f"the buffer is full: {sequence.BUFFER_POINTS} points wait to be executed")
         self.points.append(point)
         self.changed.set()
 
     def take(self) -> list[Point]:
-        """Remove all points; their times count from `begin`."""
+        """Remove and return all points, with times from `begin`."""
         points = [point._replace(time=point.time - self.begin) for point in self.points]
         self.points.clear()
         return points
 
     async def buffered(self) -> None:
-        """Return when enough motion waits, or no point has come for a while."""
+        """Return when `LEAD_S` of motion is buffered, or no point has come for `QUIET_S`."""
         while not self.is_finished:
             self.changed.clear()
             span = self.points[-1].time - self.begin
             if span >= LEAD_S:
                 return
             try:
-                # A first point where the arm is, alone, is no motion yet.
+                # A single first point at the arm's position is not yet a motion.
                 await asyncio.wait_for(self.changed.wait(), QUIET_S if span > 0.0 else None)
             except asyncio.TimeoutError:
                 return
 
 
 class MotionExecutor:
-    """Carries orders out, one client's at a time.
+    """Executes orders, of one client at a time.
 
     Args:
-        arm: what moves.
-        refused: called with the reason when the arm has refused a motion or ended it with an error; the arm stops then.
+        arm: the arm.
+        refused: called with the reason when the arm has refused a motion or ended it with an error, and stops.
     """
 
     def __init__(self, arm: Arm, refused: Callable[[str], None]) -> None:
@@ -83,47 +73,47 @@ class MotionExecutor:
         self._refused = refused
         self._motions: set[asyncio.Task[None]] = set()
         self._series = 0
-        """Number of the newest motion, or series of real-time points: how older ones end is of no interest."""
+        """Number of the newest motion, or series of real-time points; the ends of older ones are ignored."""
         self._stream: _Stream | None = None
         self._target: Joints | None = None
-        """A real-time point that no call was made for yet."""
+        """Real-time point that is not yet part of a call."""
         self._is_targeting = False
         self._moves = 0
-        """Calls for real-time points under way."""
+        """Number of pending calls of real-time points."""
         self._halts: set[asyncio.Task[None]] = set()
         self._releases: set[asyncio.Task[None]] = set()
 
     @property
     def is_releasing(self) -> bool:
-        """Whether the arm stops because a client was lost: give it no orders meanwhile."""
+        """Whether the arm stops because a client was lost; it accepts no orders meanwhile."""
         return bool(self._releases)
 
-    def carry_out(self, order: Order) -> None:
+    def carry_out(self, order: sequence.Order) -> None:
         """Begin an order; returns at once. Raises PointRefused where the buffer is full."""
         match order:
-            case Begin(point):
+            case sequence.Begin(point):
                 self._supersede()
                 self._stream = _Stream(self._series)
                 self._add(self._stream, point)
-            case Append(point) if self._stream:
+            case sequence.Append(point) if self._stream:
                 self._add(self._stream, point)
-            case Finish() if self._stream:
+            case sequence.Finish() if self._stream:
                 self._stream.is_finished = True
                 self._stream.changed.set()
-            case Execute(points):
+            case sequence.Execute(points):
                 self._supersede()
                 self._start(self._run(points))
-            case Target(positions):
+            case sequence.Target(positions):
                 if not self._is_targeting:
                     self._supersede()
                     self._is_targeting = True
                 self._target = positions
                 self._move_to_target()
-            case Halt():
+            case sequence.Halt():
                 self.halt()
 
     def halt(self) -> None:
-        """Stop now, whoever moves the arm."""
+        """Stop any motion now, of any commander."""
         self._supersede()
         for motion in self._motions:
             motion.cancel()
@@ -131,7 +121,7 @@ class MotionExecutor:
             self._keep(self._halts, self._try(self._arm.halt))
 
     def halt_own(self) -> None:
-        """Stop what this client moves; another commander's motion goes on."""
+        """Stop this client's motion; another commander's motion continues."""
         self._supersede()
         if self._motions:
             self.halt()
@@ -144,7 +134,7 @@ class MotionExecutor:
         self._keep(self._releases, self._try(self._arm.halt, self._arm.disable))
 
     async def released(self) -> None:
-        """Return when every release is done."""
+        """Return when every release has finished."""
         while self._releases:
             await asyncio.wait(self._releases)
 
@@ -154,7 +144,7 @@ class MotionExecutor:
         self._is_targeting = False
 
     def _start(self, motion: Coroutine[None, None, None], series: int | None = None) -> asyncio.Task[None]:
-        """Run a part of the newest motion, or of that with this number."""
+        """Run a part of the newest motion, or of the motion `series`."""
         series, task = self._series if series is None else series, asyncio.create_task(motion)
         self._motions.add(task)
 
@@ -162,7 +152,7 @@ class MotionExecutor:
             self._motions.discard(task)
             if task.cancelled() or (error := task.exception()) is None:
                 return
-            if not isinstance(error, RtcpError | PointRefused):
+            if not isinstance(error, RtcpError | sequence.PointRefused):
                 log.error("a motion met a defect", exc_info=error)
             if series == self._series:
                 self.halt_own()
@@ -185,10 +175,10 @@ class MotionExecutor:
             except RtcpError as error:
                 log.warning("%s", error)
             except Exception:
-                log.exception("the arm could not be stopped")  # the drives are disabled all the same
+                log.exception("the arm could not be stopped")  # the drives are disabled nevertheless
 
     async def _standstill(self) -> None:
-        """Return when no stop is under way."""
+        """Return when no stop is in progress."""
         while self._halts:
             await asyncio.wait(self._halts)
 
@@ -199,7 +189,7 @@ class MotionExecutor:
     # -- real-time points ---------------------------------------------------------------------------------------------
 
     def _move_to_target(self) -> None:
-        # A call ends soon after another took its place: so no more are made than the arm takes.
+        # A call ends soon after another replaces it, which limits the calls to the arm's rate.
         if self._target is not None and self._moves < _TARGETS_UNDER_WAY:
             positions, self._target = self._target, None
             self._moves += 1
@@ -222,7 +212,7 @@ class MotionExecutor:
             self._start(self._run_stream(stream))
 
     async def _run_stream(self, stream: _Stream) -> None:
-        """Run the points; where the arm has run out of them and more come, it begins again from where it rests."""
+        """Run the points; if the arm runs out of them and more come, begin again from its position at rest."""
         await self._standstill()
         while stream is self._stream and stream.points:
             await stream.buffered()
@@ -245,7 +235,7 @@ class MotionExecutor:
                 except RtcpError:
                     if not ended.done():
                         raise
-                    stream.points[:0] = points  # they came too late for it
+                    stream.points[:0] = points  # too late for this trajectory
             elif stream.is_finished:
                 await trajectory.finish()
                 await asyncio.wait({ended})

@@ -11,29 +11,31 @@ from rtcp.fieldbus.simple_message.messages import Joints, RobotMode, Status, Tri
 from rtcp.ros.simple_message.arm import ArmState, Point
 
 _RECONNECT_S = 1.0
-_WATCH_S = 0.1
-_LOOK_S = 0.05
+_CHECK_S = 0.1
+"""Interval between two checks of the connection, s."""
+_POLL_S = 0.05
+"""Interval between two checks whether a trajectory has ended, s."""
 _OVER = ("out_of_points", "not_open")
 """Reasons with which an open trajectory ends at its last point."""
 
 
 class RobotArm:
-    """An `Arm`: a connection to the platform, made again once a second while there is none; `run` it beside."""
+    """An `Arm`: a connection to the platform, tried again once a second; `run` has to run as a task."""
 
     def __init__(self) -> None:
         self._robot: rtcp.AsyncRobot | None = None
         self._feed: rtcp.Feed | None = None
         self._state: ArmState | None = None
         self._motions = 0
-        """Motions begun: the open trajectory of an earlier one is over."""
+        """Number of begun motions; the newest one has ended all earlier ones."""
 
     async def run(self) -> None:
-        """Keep the connection until cancelled; the end of it stops what the arm does through it."""
+        """Keep the connection until cancelled; its end stops the motion commanded over it."""
         while True:
             try:
                 await self._follow()
             except rtcp.RtcpError:
-                pass  # its absence is seen in the state
+                pass  # `state` is None then
             await asyncio.sleep(_RECONNECT_S)
 
     async def _follow(self) -> None:
@@ -42,7 +44,7 @@ class RobotArm:
             async with rtcp.connect_async("Simple Message") as robot:
                 self._robot, self._feed = robot, feed
                 while robot.is_open and not feed.ended(0.0):
-                    await asyncio.sleep(_WATCH_S)
+                    await asyncio.sleep(_CHECK_S)
         finally:
             self._robot = self._feed = self._state = None
             feed.close()
@@ -63,11 +65,11 @@ class RobotArm:
         return self._robot
 
     async def run_trajectory(self, points: Sequence[Point]) -> None:
-        """Run a trajectory in the place of what moves."""
+        """Run a trajectory, which replaces the present motion."""
         await self._moved(self._connected.run_trajectory(_as_json(points), replace=True))
 
     async def move_joints(self, positions: Joints) -> None:
-        """Move to joint positions in the place of what moves."""
+        """Move to joint positions, rad, which replaces the present motion."""
         await self._moved(self._connected.move_joints(positions, replace=True))
 
     async def _moved(self, motion: Awaitable[object]) -> None:
@@ -78,7 +80,7 @@ class RobotArm:
             pass
 
     async def open_trajectory(self, points: Sequence[Point]) -> RobotTrajectory:
-        """Begin a trajectory in the place of what moves."""
+        """Begin a trajectory with an open end, which replaces the present motion."""
         self._motions += 1
         trajectory = RobotTrajectory(self, self._connected, self._motions)
         await self._connected.open_trajectory(_as_json(points), replace=True)
@@ -108,18 +110,18 @@ class RobotTrajectory:
         await self._robot.append(_as_json(points))
 
     async def finish(self) -> None:
-        """Come to rest at the last point; returns there."""
+        """Come to rest at the last point; return then."""
         await self._robot.finish_trajectory()
 
     async def wait(self) -> None:
-        """Return when the arm has come to rest; how it ended comes only as the answer to a call."""
+        """Return when the arm has come to rest at the last point; raises RtcpError if the motion ended otherwise."""
         while self._arm.is_newest(self._motion):
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_POLL_S)
             state = self._arm.state
             if state is not None and state.status.in_motion is TriState.TRUE:
                 continue
             try:
-                await self._robot.append([])
+                await self._robot.append([])  # its refusal has the reason of the end
             except rtcp.RtcpError as error:
                 if error.reason in _OVER or isinstance(error, rtcp.Replaced):
                     return
@@ -127,23 +129,23 @@ class RobotTrajectory:
 
 
 def _as_json(points: Sequence[Point]) -> list[dict[str, Any]]:
-    given: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     for time, positions, velocities, accelerations in points:
         optional = {"v": velocities, "a": accelerations}
-        given.append({"t": time, "q": positions, **{key: value for key, value in optional.items() if value}})
-    return given
+        rows.append({"t": time, "q": positions, **{key: value for key, value in optional.items() if value}})
+    return rows
 
 
 def _state_of(record: Mapping[str, Any]) -> ArmState:
-    found = rtcp.RobotStatus.of_record(record)
+    reported = rtcp.RobotStatus.of_record(record)
     status = Status(
-        drives_powered=TriState(found.drives_powered),
-        e_stopped=TriState(found.e_stopped),
-        error_code=found.error_code,
-        in_error=TriState(found.in_error),
-        in_motion=TriState(found.in_motion),
-        mode=RobotMode.MANUAL if found.mode == "manual" else RobotMode.AUTO,
-        motion_possible=TriState(found.motion_possible),
+        drives_powered=TriState(reported.drives_powered),
+        e_stopped=TriState(reported.e_stopped),
+        error_code=reported.error_code,
+        in_error=TriState(reported.in_error),
+        in_motion=TriState(reported.in_motion),
+        mode=RobotMode.MANUAL if reported.mode == "manual" else RobotMode.AUTO,
+        motion_possible=TriState(reported.motion_possible),
     )
     return ArmState(
         stamp_ns=int(record["time_ns"]),

@@ -1,8 +1,8 @@
-"""What the points of a motion client mean: sequence numbers and times in, orders to the arm out. Nothing waits here.
+"""Converts a motion client's points, by their sequence numbers and times, to orders for the arm. Never blocks.
 
-The sequence number alone says where a trajectory begins and, by downloading, where it ends (REP-I0006). The reference
-client does not read reply codes and goes on sending after a refusal or a stop: what follows is ignored up to the next
-beginning (`docs/simple_message.md`).
+Only the sequence number marks the begin of a trajectory and, when downloading, its end (REP-I0006). The reference
+client ignores reply codes and continues to send after a refusal or a stop: these points are ignored up to the next
+begin (`docs/simple_message.md`).
 """
 
 from __future__ import annotations
@@ -13,71 +13,61 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TypeAlias
 
-from rtcp.fieldbus.simple_message.messages import (
-    JointPoint,
-    JointPosition,
-    Joints,
-    JointTrajPt,
-    JointTrajPtFull,
-    SpecialSequence,
-    TrajectoryPoint,
-    TriState,
-    ValidFields,
-)
+from rtcp.fieldbus.simple_message import messages
 from rtcp.ros.simple_message.arm import ArmState, Point
 
 BUFFER_POINTS = 4096
-"""Points that wait to be executed."""
+"""Most points that wait for execution."""
 AT_START_RAD = math.radians(0.1)
-"""A first point no joint of which is farther from what is commanded is where the arm is: its time says nothing."""
+"""Largest distance of a joint, rad, at which a first point is the commanded position; its time is then ignored."""
 REALTIME_PAUSE_S = 0.5
-"""Real-time points have no beginning that could be told by its number: after a stop or a refusal a pause makes one."""
+"""Time without real-time points after a stop or a refusal before new ones are executed, s: no number marks a begin."""
 
 
 class PointIgnored(Exception):
-    """A point behind a stop or a refusal: answered with FAILURE and not logged."""
+    """A point after a stop or a refusal: answered with FAILURE and not logged."""
 
 
 class PointRefused(Exception):
-    """A point that is not executed, with the reason; what follows is ignored up to the next beginning."""
+    """A point that is not executed, with the reason; later points are ignored up to the next begin."""
 
 
 @dataclass(frozen=True)
 class Begin:
-    """A trajectory whose end is open, in the place of what moves."""
+    """Begin a trajectory with an open end, which replaces the present motion."""
 
     point: Point
 
 
 @dataclass(frozen=True)
 class Append:
-    """The next point of it."""
+    """Append a point to the open trajectory."""
 
     point: Point
 
 
 @dataclass(frozen=True)
 class Finish:
-    """It has no more points."""
+    """End the open trajectory: it has no more points."""
 
 
 @dataclass(frozen=True)
 class Execute:
-    """A whole trajectory, in the place of what moves."""
+    """Execute a whole trajectory, which replaces the present motion."""
 
     points: tuple[Point, ...]
 
 
 @dataclass(frozen=True)
 class Target:
-    """A real-time point, in the place of what moves."""
+    """Move to a real-time point, which replaces the present motion."""
 
-    positions: Joints
+    positions: messages.Joints
 
 
 @dataclass(frozen=True)
 class Halt:
-    """Stop now."""
+    """Stop any motion now."""
 
 
 Order: TypeAlias = Begin | Append | Finish | Execute | Target | Halt
@@ -92,8 +82,8 @@ class _Mode(Enum):
 
 _BEGINNINGS = {
     0: _Mode.STREAMING,
-    SpecialSequence.START_TRAJECTORY_STREAMING: _Mode.STREAMING,
-    SpecialSequence.START_TRAJECTORY_DOWNLOAD: _Mode.DOWNLOADING,
+    messages.SpecialSequence.START_TRAJECTORY_STREAMING: _Mode.STREAMING,
+    messages.SpecialSequence.START_TRAJECTORY_DOWNLOAD: _Mode.DOWNLOADING,
 }
 
 
@@ -102,51 +92,55 @@ class PointSequence:
 
     def __init__(self) -> None:
         self._ignore_targets_until = -math.inf
-        self._commanded: Joints = ()
-        """Where the arm was commanded at the beginning, rad."""
+        self._commanded: messages.Joints = ()
+        """Commanded position of the arm at the begin, rad."""
         self._begin(_Mode.IDLE)
 
     def _begin(self, mode: _Mode) -> None:
         self._mode = mode
         self._next: tuple[int, ...] = ()
         """Sequence numbers that continue the trajectory."""
-        self._last: TrajectoryPoint | None = None
+        self._last: messages.TrajectoryPoint | None = None
         self._first: Point | None = None
         self._offset = 0.0
-        """Time of the client at which the trajectory begins, s."""
+        """Client time at the begin of the trajectory, s."""
         self._time = 0.0
-        """Of the last point, s from the beginning."""
+        """Time of the last point, s from the begin."""
         self._downloaded: list[Point] = []
 
     def ignore(self, now: float) -> None:
-        """Ignore what follows up to the next beginning: the arm has stopped or refused; `now`: s."""
+        """Ignore points up to the next begin, as the arm has stopped or refused; `now`: s."""
         self._begin(_Mode.IGNORING)
         self._ignore_targets_until = now + REALTIME_PAUSE_S
 
-    def receive(self, message: JointPosition | TrajectoryPoint, state: ArmState | None, now: float) -> list[Order]:
-        """Return what the arm is to do.
+    def receive(
+        self, message: messages.JointPosition | messages.TrajectoryPoint, state: ArmState | None, now: float
+    ) -> list[Order]:
+        """Return the orders of a point.
 
         Args:
             message: the point.
-            state: of the arm.
-            now: s, of a clock that only goes forward.
+            state: state of the arm.
+            now: instant of a monotonic clock, s.
 
         Raises:
-            PointRefused: it is not executed, and why.
-            PointIgnored: it belongs to what was stopped or refused before.
+            PointRefused: it is not executed, with the reason.
+            PointIgnored: it belongs to a motion that was stopped or refused before.
         """
-        if message.sequence == SpecialSequence.STOP_TRAJECTORY:
+        if message.sequence == messages.SpecialSequence.STOP_TRAJECTORY:
             self.ignore(now)
             return [Halt()]
         try:
             return (
-                self._target(message, state, now) if isinstance(message, JointPosition) else self._point(message, state)
+                self._target(message, state, now)
+                if isinstance(message, messages.JointPosition)
+                else self._point(message, state)
             )
         except PointRefused:
             self.ignore(now)
             raise
 
-    def _target(self, message: JointPosition, state: ArmState | None, now: float) -> list[Order]:
+    def _target(self, message: messages.JointPosition, state: ArmState | None, now: float) -> list[Order]:
         if now < self._ignore_targets_until:
             self._ignore_targets_until = now + REALTIME_PAUSE_S
             raise PointIgnored
@@ -154,7 +148,7 @@ class PointSequence:
         self._commanded = _commanded_by(state)
         return [Target(self._checked("position", message.positions))]
 
-    def _point(self, message: TrajectoryPoint, state: ArmState | None) -> list[Order]:
+    def _point(self, message: messages.TrajectoryPoint, state: ArmState | None) -> list[Order]:
         number = message.sequence
         is_mark = number < 0 and _is_bare(message)
         if number in _BEGINNINGS and number not in self._next:
@@ -167,9 +161,9 @@ class PointSequence:
         if self._mode is _Mode.IGNORING:
             raise PointIgnored
         if message == self._last:
-            return []  # the client could not read the reply, and sends the point again
-        if number == SpecialSequence.END_TRAJECTORY and self._mode is not _Mode.IDLE:
-            # The reference client sends a trajectory of one point as its begin and as its end.
+            return []  # a repetition, as the client did not read the reply
+        if number == messages.SpecialSequence.END_TRAJECTORY and self._mode is not _Mode.IDLE:
+            # The reference client sends a trajectory of one point as begin and as end.
             is_repeated = self._last is not None and message == replace(self._last, sequence=number)
             added = [] if is_mark or is_repeated else self._add(message)
             return [*added, *self._end(message)]
@@ -178,8 +172,8 @@ class PointSequence:
             raise PointRefused(f"sequence {number} came where {expected} follows: the motion is aborted")
         return self._add(message)
 
-    def _add(self, message: TrajectoryPoint) -> list[Order]:
-        """Take the next point of the trajectory."""
+    def _add(self, message: messages.TrajectoryPoint) -> list[Order]:
+        """Add the next point of the trajectory."""
         point = self._point_of(message)
         is_first, self._first = self._first is None, self._first or point
         if [each is None for each in point] != [each is None for each in self._first]:
@@ -193,7 +187,7 @@ class PointSequence:
         self._downloaded.append(point)
         return []
 
-    def _end(self, message: TrajectoryPoint) -> list[Order]:
+    def _end(self, message: messages.TrajectoryPoint) -> list[Order]:
         mode, points, first = self._mode, tuple(self._downloaded), self._first
         if first is None:
             raise PointRefused("the trajectory ends without a point")
@@ -201,25 +195,25 @@ class PointSequence:
         self._last = message
         if mode is _Mode.STREAMING:
             return [Finish()]
-        return [Execute(points)] if points[-1].time > 0.0 else []  # the arm is at its only point already
+        return [Execute(points)] if points[-1].time > 0.0 else []  # else the arm is already at its only point
 
-    def _point_of(self, message: TrajectoryPoint) -> Point:
+    def _point_of(self, message: messages.TrajectoryPoint) -> Point:
         """Return the point with its time from the start of the trajectory."""
-        velocities: Joints = ()
-        accelerations: Joints = ()
-        if isinstance(message, JointTrajPt):
+        velocities: messages.Joints = ()
+        accelerations: messages.Joints = ()
+        if isinstance(message, messages.JointTrajPt):
             time = self._time + message.duration
         else:
             time, velocities, accelerations = message.time - self._offset, message.velocities, message.accelerations
-        if isinstance(message, JointTrajPtFull):
+        if isinstance(message, messages.JointTrajPtFull):
             if message.robot_id != 0:
                 raise PointRefused(f"robot_id {message.robot_id}: this is robot 0, the only one")
             valid = message.valid_fields
-            if not valid & ValidFields.TIME or not valid & ValidFields.POSITION:
+            if not valid & messages.ValidFields.TIME or not valid & messages.ValidFields.POSITION:
                 raise PointRefused(f"valid_fields {valid:d}: a point needs a time (1) and positions (2)")
-            velocities = velocities if valid & ValidFields.VELOCITY else ()
-            accelerations = accelerations if valid & ValidFields.ACCELERATION else ()
-        elif isinstance(message, JointPoint) and len(message.positions) != len(self._commanded):
+            velocities = velocities if valid & messages.ValidFields.VELOCITY else ()
+            accelerations = accelerations if valid & messages.ValidFields.ACCELERATION else ()
+        elif isinstance(message, messages.JointPoint) and len(message.positions) != len(self._commanded):
             raise PointRefused(f"found {len(message.positions)} joints, and the arm has {len(self._commanded)}")
         positions = self._checked("position", message.positions)
         if accelerations and not velocities:
@@ -227,7 +221,7 @@ class PointSequence:
         if not math.isfinite(time):
             raise PointRefused(f"sequence {message.sequence}: a time of {time} s is not finite")
         if self._first is None and self._is_at_start(positions):
-            self._offset, time = (0.0 if isinstance(message, JointTrajPt) else time), 0.0
+            self._offset, time = (0.0 if isinstance(message, messages.JointTrajPt) else time), 0.0
             positions = self._commanded
         elif time <= self._time:
             raise PointRefused(
@@ -241,12 +235,12 @@ class PointSequence:
             self._checked("acceleration", accelerations) if accelerations else None,
         )
 
-    def _is_at_start(self, positions: Joints) -> bool:
+    def _is_at_start(self, positions: messages.Joints) -> bool:
         pairs = zip(positions, self._commanded, strict=True)
         return all(abs(wanted - commanded) <= AT_START_RAD for wanted, commanded in pairs)
 
-    def _checked(self, name: str, values: Sequence[float]) -> Joints:
-        """Return the arm's share of a message's numbers; the rest of ten must be 0."""
+    def _checked(self, name: str, values: Sequence[float]) -> messages.Joints:
+        """Return the values of the arm's joints in a message; the others of ten must be 0."""
         count = len(self._commanded)
         for joint, value in enumerate(values, start=1):
             if not math.isfinite(value):
@@ -258,20 +252,24 @@ class PointSequence:
         return tuple(values[:count])
 
 
-def _is_bare(message: TrajectoryPoint) -> bool:
-    """Whether it is a mark alone: no arm is anywhere in no time."""
-    time = message.duration if isinstance(message, JointTrajPt) else message.time
+def _is_bare(message: messages.TrajectoryPoint) -> bool:
+    """Whether it is only an end mark: its time and positions are 0."""
+    time = message.duration if isinstance(message, messages.JointTrajPt) else message.time
     return time == 0.0 and not any(message.positions)
 
 
-def _commanded_by(state: ArmState | None) -> Joints:
-    """Return where the arm is commanded, rad; raises PointRefused where it cannot move."""
+def _commanded_by(state: ArmState | None) -> messages.Joints:
+    """Return the commanded position, rad; raises PointRefused where the arm cannot move."""
     if state is None:
         raise PointRefused("the platform is not there: start it with `rtcp start`")
     for field, value, problem in (
-        (state.status.e_stopped, TriState.TRUE, "an emergency stop is active: release it, then `rtcp reset`"),
-        (state.status.in_error, TriState.TRUE, "the arm is in a fault: `rtcp status` names it, `rtcp reset` leaves it"),
-        (state.status.drives_powered, TriState.FALSE, "the drives are disabled: `rtcp enable`"),
+        (state.status.e_stopped, messages.TriState.TRUE, "an emergency stop is active: release it, then `rtcp reset`"),
+        (
+            state.status.in_error,
+            messages.TriState.TRUE,
+            "the arm is in a fault: `rtcp status` names it, `rtcp reset` leaves it",
+        ),
+        (state.status.drives_powered, messages.TriState.FALSE, "the drives are disabled: `rtcp enable`"),
     ):
         if field is value:
             raise PointRefused(problem)

@@ -1,7 +1,7 @@
 """The arm as a robot controller of ROS-Industrial: asyncio servers for motion and state (`docs/simple_message.md`).
 
-Every request is answered in the turn of the event loop in which it was read: the reference client waits for replies
-without a limit of time, and takes a late one for the answer to its stop.
+Every request is answered in the iteration of the event loop in which it was read: the reference client waits for
+replies without a timeout, and would take a late one for the reply to its stop.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ MOTION_PORT = 11000
 STATE_PORT = 11002
 STATE_PERIOD_S = 0.01
 STALE_S = 0.5
-"""A sample older than this says nothing on the arm: all of RobotStatus is unknown."""
+"""Age of a sample above which all of RobotStatus is unknown, s."""
 _UNREAD_LIMIT = 1 << 16
-"""Bytes: a client that reads nothing is dropped."""
+"""Unread data at which a client that does not read is disconnected, bytes."""
 _KEEPALIVE_IDLE_S, _KEEPALIVE_INTERVAL_S, _KEEPALIVE_PROBES = 1, 1, 3
 _USER_TIMEOUT_MS = 4000
 _POINTS = (
@@ -59,7 +59,7 @@ _POINTS = (
 )
 _VERSION = Version(*(int(part) for part in __version__.split(".")[:3]))
 _UNKNOWN = Status(motion_possible=TriState.FALSE)
-"""RobotStatus has no field `connected`: this is how one says that it is not."""
+"""Status without a running platform: RobotStatus has no field `connected`."""
 log = logging.getLogger(__name__)
 
 
@@ -72,14 +72,14 @@ class ServerOptions:
     """0: a free one."""
     state_port: int = STATE_PORT
     byte_order: ByteOrder | None = None
-    """None: that of a client's first length; for a state client that sends nothing, that of the motion client at its
-    address, else little endian."""
+    """None: detected from the length field of a client's first message; for a state client that sends nothing, that of
+    the motion client with the same address, else little endian."""
     joint_feedback: bool = False
-    """Send JOINT_FEEDBACK, which the reference client reports as an error each time."""
+    """Whether to send JOINT_FEEDBACK, which the reference client reports as an error each time."""
 
 
 def notice_lost_peer(connection: socket.socket) -> None:
-    """Let a connection fail some seconds after its cable was pulled, whether data waits for the peer or not."""
+    """Let a connection fail some seconds after its peer was lost, whether data waits for acknowledgement or not."""
     for level, option, value in (
         (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
         (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, _KEEPALIVE_IDLE_S),
@@ -104,11 +104,11 @@ class _Client:
 
     @property
     def order(self) -> ByteOrder | None:
-        """None before its first frame."""
+        """Byte order of the client; None: unknown before its first frame."""
         return self._decoder.order
 
     async def serve(self, reader: asyncio.StreamReader, answer: Callable[[Frame, ByteOrder], Frame | None]) -> str:
-        """Answer frames until the connection ends; return why it did."""
+        """Answer frames until the connection ends; return the reason of the end."""
         try:
             while (data := await reader.read(_UNREAD_LIMIT)) and not self._writer.is_closing():
                 for frame in self._decoder.feed(data):
@@ -137,7 +137,7 @@ class _Client:
 
 
 class _MotionSession:
-    """What one motion client asks of the arm."""
+    """Session of one motion client."""
 
     def __init__(self, client: _Client, arm: Arm, executor: MotionExecutor) -> None:
         self.client = client
@@ -149,20 +149,20 @@ class _MotionSession:
         self.has_commanded = False
 
     def end(self) -> None:
-        """The client is lost: stop the arm and disable its drives if it has moved it; a second time is harmless."""
+        """End the session: if the client has moved the arm, stop it and disable its drives. May be called twice."""
         if self.has_commanded and not self._has_ended:
             self._executor.release()
         self._has_ended = True
 
     def answer(self, frame: Frame, order: ByteOrder) -> Frame | None:
-        """Carry a frame out as far as it can be now; return its reply, or None for a topic."""
+        """Begin to execute a frame; return its reply, or None for a topic."""
         if frame.msg_type not in _POINTS or frame.comm_type is CommType.SERVICE_REPLY:
             return answer_basics(frame, order)
         code = self._receive(frame, order)
         return frame.reply(code) if frame.comm_type is CommType.SERVICE_REQUEST else None
 
     def refuse(self, reason: str) -> None:
-        """Stop what the client moves, ignore what follows up to the next beginning, and say why."""
+        """Stop the client's motion, ignore its points up to the next begin, and log the reason."""
         log.warning("%s: %s", self.client.name, reason)
         self._is_refusing = True
         self._sequence.ignore(time.monotonic())
@@ -183,7 +183,7 @@ class _MotionSession:
             self.refuse(str(error))
             return ReplyCode.FAILURE
         except MessageError as error:
-            # Its sequence number is not known, so a client of another build would cause a line with every point.
+            # Its sequence number is unknown: a client of another build would cause a log line with every point.
             if not self._is_refusing:
                 self.refuse(str(error))
             return ReplyCode.FAILURE
@@ -192,7 +192,7 @@ class _MotionSession:
 
 
 def answer_basics(frame: Frame, order: ByteOrder) -> Frame | None:
-    """Answer what every server understands; any other request with FAILURE, a topic and a reply with nothing."""
+    """Answer PING and GET_VERSION, and any other request with FAILURE; topics and replies have no answer."""
     if frame.comm_type is not CommType.SERVICE_REQUEST:
         return None
     try:
@@ -208,8 +208,8 @@ class SimpleMessageServer:
     """Serves an arm: `async with SimpleMessageServer(arm) as server: await asyncio.Event().wait()`.
 
     Args:
-        arm: what moves.
-        options: where and how.
+        arm: the arm.
+        options: addresses, byte order and messages.
     """
 
     def __init__(self, arm: Arm, options: ServerOptions | None = None) -> None:
@@ -222,13 +222,13 @@ class SimpleMessageServer:
         self._orders: dict[str, ByteOrder] = {}
         """Byte order of the last motion client at each address."""
         self._turned_away = ""
-        """Whom the log has named already."""
+        """Client already named in the log."""
         self._held_up = HeldUp(self._was_held_up)
         self._servers: list[asyncio.Server] = []
         self._serving: set[asyncio.Task[None]] = set()
 
     async def __aenter__(self) -> SimpleMessageServer:
-        """Listen; raises OSError where a port is taken."""
+        """Listen; raises OSError if a port is in use."""
         options = self._options
         for serve, port in ((self._serve_motion, options.motion_port), (self._serve_state, options.state_port)):
             try:
@@ -253,7 +253,7 @@ class SimpleMessageServer:
 
     @property
     def ports(self) -> tuple[int, int]:
-        """Those of motion and state."""
+        """Ports of the motion and the state server."""
         motion, state = (int(server.sockets[0].getsockname()[1]) for server in self._servers)
         return motion, state
 
@@ -284,7 +284,7 @@ class SimpleMessageServer:
     async def _serve_motion(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connected("motion", writer) as client:
             if not self._held_up.is_timely():
-                return  # what it has sent may be old: it connects again
+                return  # its data may be old; it connects again
             before = self._motion
             if before is not None and before.client.host != client.host:
                 if client.host != self._turned_away:
@@ -292,7 +292,7 @@ class SimpleMessageServer:
                 self._turned_away = client.host
                 return
             if before is not None:
-                # A client that crashed is back while its old connection still looks alive.
+                # A client that crashed may be back before the loss of its old connection is detected.
                 before.client.close(f"{client.name} takes its place")
                 before.end()
             log.info("%s: connected", client.name)
@@ -300,7 +300,7 @@ class SimpleMessageServer:
             session = self._motion = _MotionSession(client, self._arm, self._executor)
 
             def answer(frame: Frame, order: ByteOrder) -> Frame | None:
-                self._held_up.look()
+                self._held_up.check()
                 if client.why_closed:
                     return None
                 self._orders[client.host] = order
@@ -332,10 +332,10 @@ class SimpleMessageServer:
             log.info("%s: %s", client.name, why)
 
     async def _publish(self) -> None:
-        """Send state at a fixed rate: positions once a sample, the status always."""
+        """Send the state at a fixed rate: each sample of positions once, the status in every period."""
         stamp, begin, fresh_at = 0, 0, -math.inf
         while True:
-            self._held_up.look()
+            self._held_up.check()
             state, now = self._arm.state, time.monotonic()
             messages: list[Message] = []
             if state is not None and state.stamp_ns != stamp:
@@ -349,7 +349,7 @@ class SimpleMessageServer:
             await asyncio.sleep(STATE_PERIOD_S)
 
     def _positions(self, state: ArmState, seconds: float) -> list[Message]:
-        """Return the messages on the joints; `seconds`: of the sample since the first one."""
+        """Return the messages with the joints; `seconds`: time of the sample from the first one, s."""
         if len(state.positions) > JOINTS:
             return [JointPoint(0, seconds, state.positions, state.velocities)]
         messages: list[Message] = [JointPosition(0, state.positions)]

@@ -1,4 +1,4 @@
-"""The experiments of the source documents, each repeated by one command: `rtcp experiment NAME`."""
+"""The experiments of the thesis, each repeated by one command: `rtcp experiment NAME`."""
 
 from rtcp.telemetry.experiments.experiment import Experiment
 from rtcp.telemetry.experiments.latency import LatencyExperiment
@@ -7,6 +7,11 @@ from rtcp.telemetry.experiments.resources import ResourcesExperiment
 from rtcp.telemetry.experiments.timing import CycleExperiment, DelaysExperiment
 from rtcp.telemetry.experiments.tracking import TrackingExperiment
 
+__all__ = [
+    "EXPERIMENTS", "CycleExperiment", "DelaysExperiment", "Experiment", "LatencyExperiment", "PicksExperiment",
+    "ResourcesExperiment", "SquareExperiment", "StepExperiment", "TrackingExperiment",
+]  # fmt: skip
+
 EXPERIMENTS: dict[str, type[Experiment]] = {
     kind.name: kind
     for kind in (
@@ -14,4 +19,4 @@ EXPERIMENTS: dict[str, type[Experiment]] = {
         ResourcesExperiment, TrackingExperiment,
     )
 }  # fmt: skip
-"""By name, in the order of `rtcp experiment all`."""
+"""Name -> experiment, in the order of `rtcp experiment all`."""

@@ -1,6 +1,6 @@
-"""What an experiment is: a platform of its own, recordings, pictures, and rows that stand beside the source's figures.
+"""An experiment: starts a platform, records, draws pictures, and compares its figures with the thesis.
 
-Its folder holds `recording*.mcap`, each picture as PNG and SVG, and `result.json`, from which a report is made.
+Its folder holds `recording*.mcap`, each picture as PNG and SVG, and `result.json`, the input of a report.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 RESULT = "result.json"
 SPEED_RAD_S = 0.2
-"""Of the moves to and from where something is measured."""
+"""Speed of the moves before and after a measurement, rad/s."""
 LOCK_TIMEOUT_S = 10.0
 Source = float | str | None
 
@@ -48,16 +48,16 @@ Source = float | str | None
 _FAILURES = (
     RecordingError, ServerAway, RequestRefused, SessionError, BlackboardError, psutil.Error, RuntimeError,
 )  # fmt: skip
-"""What a platform that ends meanwhile, or a fit without a solution, may raise."""
+"""Exceptions when the platform ends during an experiment, or a fit has no solution."""
 
 
 class ExperimentFailed(Exception):
-    """An experiment cannot be carried out or judged; the message says why."""
+    """An experiment cannot be carried out or evaluated; the message says why."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A figure: the source's, the one measured here, and between which bounds it is to lie."""
+    """A figure: the thesis' value (`source`), the value measured here, and the bounds of the aim."""
 
     figure: str
     unit: str
@@ -68,14 +68,14 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether it lies between its bounds; None: it has none. A figure that is no number misses them."""
+        """Whether it lies between its bounds; None: it has none. NaN misses them."""
         if self.least is None and self.most is None:
             return None
         return bool((self.least is None or self.here >= self.least) and (self.most is None or self.here <= self.most))
 
     @property
     def verdict(self) -> str:
-        """The same in a word."""
+        """`met` in a word."""
         return {None: "", True: "met", False: "missed"}[self.met]
 
     @property
@@ -87,7 +87,7 @@ class Row:
 
 
 def shown(value: Source) -> str:
-    """Return a figure as tables show it: four digits, and 0 for what is rounding."""
+    """Return a figure as text: four digits, and 0 for round-off."""
     if value is None or isinstance(value, str):
         return value or ""
     return "not measured" if not isfinite(value) else "0" if abs(value) < 1e-9 else f"{value:.4g}"
@@ -95,24 +95,24 @@ def shown(value: Source) -> str:
 
 @dataclass(frozen=True)
 class Result:
-    """What came of an experiment."""
+    """Result of an experiment."""
 
     name: str
     title: str
     command: str
-    """The command that repeats it."""
+    """Command that repeats it."""
     began: str
-    """ISO 8601, local time."""
+    """Time of its begin, ISO 8601, local time."""
     seconds: float
     host: Mapping[str, str]
     rows: tuple[Row, ...]
     pictures: tuple[str, ...] = ()
-    """Names of the files, without their endings."""
+    """Names of the picture files, without their endings."""
     notes: tuple[str, ...] = ()
 
     @property
     def met(self) -> bool:
-        """Whether no row misses its aim."""
+        """Whether no row misses its bounds."""
         return not any(row.met is False for row in self.rows)
 
     def write(self, folder: Path) -> None:
@@ -128,35 +128,35 @@ def read_result(folder: Path) -> Result:
     """Return the result in a folder.
 
     Raises:
-        ExperimentFailed: there is none, or it is not of this version.
+        ExperimentFailed: there is none, or it is of another version.
     """
     path = folder / RESULT
     try:
-        found = json.loads(path.read_bytes())
-        rows = tuple(map(_row, found["rows"]))
-        texts = {name: tuple(map(str, found[name])) for name in ("pictures", "notes")}
-        typed = {"seconds": float(found["seconds"]), "host": dict(found["host"])}
-        return Result(**{**found, **texts, **typed, "rows": rows})
+        values = json.loads(path.read_bytes())
+        rows = tuple(map(_row, values["rows"]))
+        texts = {name: tuple(map(str, values[name])) for name in ("pictures", "notes")}
+        typed = {"seconds": float(values["seconds"]), "host": dict(values["host"])}
+        return Result(**{**values, **texts, **typed, "rows": rows})
     except OSError as error:
         raise ExperimentFailed(f"{path}: it cannot be read: {error.strerror}") from error
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise ExperimentFailed(f"{path}: it is no result of an experiment: {error}") from error
 
 
-def _row(found: Mapping[str, Any]) -> Row:
-    values = {name: value for name, value in found.items() if name != "met"}
-    return Row(**{**values, "here": nan if found["here"] is None else float(found["here"])})
+def _row(values: Mapping[str, Any]) -> Row:
+    others = {name: value for name, value in values.items() if name != "met"}
+    return Row(**{**others, "here": nan if values["here"] is None else float(values["here"])})
 
 
 @dataclass
 class Setup:
-    """Where an experiment runs, and what it leaves behind.
+    """Environment of an experiment: platform, folder and notes.
 
     Args:
-        folder: of the experiment; it exists.
-        start: runs a platform while inside, and leaves nothing running.
+        folder: folder of the experiment; it exists.
+        start: context in which a platform runs; it leaves nothing running.
         report: receives each step in a sentence.
-        config: file of the arm; None: the one that `rtcp start` takes.
+        config: file of the arm; None: the one of `rtcp start`.
         bus: name of the bus; None: the configured one.
     """
 
@@ -175,7 +175,7 @@ class Setup:
 
     @property
     def is_virtual(self) -> bool:
-        """Whether the arm is the one in software."""
+        """Whether the arm is on the virtual segment."""
         return (self.bus or self.arm.bus.interface) == VIRTUAL
 
     def note(self, text: str) -> None:
@@ -185,7 +185,7 @@ class Setup:
 
     @contextmanager
     def platform(self, cycle_us: float | None = None, enabled: bool = True) -> Iterator[Robot]:
-        """Run a platform while inside, its clocks locked and its drives enabled.
+        """Run a platform in a context, its clocks locked and its drives enabled.
 
         Raises:
             ExperimentFailed: the clocks do not lock.
@@ -204,7 +204,7 @@ class Setup:
 
     @contextmanager
     def recording(self, robot: Robot, name: str = "recording", signals: Sequence[str] = ()) -> Iterator[Path]:
-        """Record every cycle while inside; yield the file, which is complete afterwards."""
+        """Record every cycle in a context; yield the file, which is complete afterwards."""
         path = self.folder / f"{name}.mcap"
         pid = robot.record_start(path, signals=signals).pid
         try:
@@ -213,9 +213,9 @@ class Setup:
             with suppress(RtcpError):
                 robot.record_stop(pid)
             raise
-        for one in robot.record_stop(pid):
-            if one.problem or one.missing:
-                self.note(f"{name}: {one.problem or f'{one.missing} cycles are missing in the recording'}")
+        for file in robot.record_stop(pid):
+            if file.problem or file.missing:
+                self.note(f"{name}: {file.problem or f'{file.missing} cycles are missing in the recording'}")
 
     def draw(self, name: str, figure: Figure) -> None:
         """Save a picture as PNG and SVG; raises OSError."""
@@ -226,10 +226,10 @@ class Setup:
     def with_limits(self, joint: int, **limits: float) -> Setup:
         """Return a setup whose joint (from 0) has at least these limits, on the virtual arm.
 
-        The configuration that says so is copied into the folder; without need, or with a real arm, nothing changes.
+        The changed configuration is written to the folder; without need, or with a real arm, nothing changes.
         """
-        found = self.arm.joints[joint]
-        raised = {key: value for key, value in limits.items() if getattr(found, key) < value}
+        limited = self.arm.joints[joint]
+        raised = {key: value for key, value in limits.items() if getattr(limited, key) < value}
         if not raised or not self.is_virtual:
             return self
         source = find_config(self.config)
@@ -242,13 +242,13 @@ class Setup:
         document = yaml.load(source)
         document["joints"][joint].update(raised)
         yaml.dump(document, copy / source.name)
-        text = ", ".join(f"{key} {value:.3g} instead of {getattr(found, key):g}" for key, value in raised.items())
-        self.note(f"{found.name} of the virtual arm has other limits for this experiment (configuration/): {text}")
+        text = ", ".join(f"{key} {value:.3g} instead of {getattr(limited, key):g}" for key, value in raised.items())
+        self.note(f"{limited.name} of the virtual arm has other limits for this experiment (configuration/): {text}")
         return replace(self, config=copy / source.name)
 
 
 def returned(records: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
-    """Return the cycles whose frame came back whole; of another one a record repeats the values before it."""
+    """Return a mask of the cycles with the expected working counter; the records of others repeat old values."""
     matches: npt.NDArray[np.bool_] = records["wkc"] == records["wkc_expected"]
     return matches
 
@@ -264,7 +264,7 @@ class Experiment(ABC):
         """Carry it out and return its figures.
 
         Raises:
-            ExperimentFailed: it cannot be carried out or judged.
+            ExperimentFailed: it cannot be carried out or evaluated.
             RtcpError: the platform refuses or fails.
         """
 
@@ -273,7 +273,7 @@ def carry_out(experiment: Experiment, setup: Setup, command: str) -> Result:
     """Carry out an experiment in its folder and write its result, also where it fails.
 
     Raises:
-        ExperimentFailed: it could not be carried out or judged.
+        ExperimentFailed: it could not be carried out or evaluated.
         RtcpError: the platform refused or failed.
         OSError: the result cannot be written.
     """
@@ -306,7 +306,7 @@ def carry_out(experiment: Experiment, setup: Setup, command: str) -> Result:
 
 
 def host(setup: Setup) -> dict[str, str]:
-    """Return what figures depend on: machine, versions, arm, bus and cycle."""
+    """Return the conditions of the figures: machine, versions, arm, bus and cycle."""
     arm = setup.arm
     return {
         "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",

@@ -1,7 +1,7 @@
-"""The latency from a streamed command to the motion: a sine, fitted in the commands and in what the drives did.
+"""The latency from a streamed command to the motion: a sine, fitted to the commands and to the actual positions.
 
-The source's second document streams a sine over a range of pi/8 rad with a period of 2 s at 30 Hz, and finds that the
-feedback lags by 455 ms, of which 33 ms are the period of the commands.
+The second thesis, on ABB arms under ROS-Industrial, streams a sine over a range of pi/8 rad with a period of 2 s at
+30 Hz, and finds that the feedback lags by 455 ms, of which 33 ms are the period of the commands.
 """
 
 from __future__ import annotations
@@ -36,23 +36,24 @@ Send = Callable[[Sequence[float]], bool]
 """Sends joint positions, rad; returns whether it did."""
 
 AMPLITUDE_RAD, PERIOD_S = pi / 16, 2.0
-_SOURCE_MS: Mapping[str, float | str] = {"ethercat": 455.0, "rapid": 455.0, "egm": "8 to 20"}
-"""Of each kind of bus. That of EGM the thesis quotes; it measured RAPID."""
+_THESIS_MS: Mapping[str, float | str] = {"ethercat": 455.0, "rapid": 455.0, "egm": "8 to 20"}
+"""Kind of bus -> latency in the second thesis, ms: measured over RAPID, quoted for EGM."""
 _REPORTED_MS = "-5, -1, 12"
-"""By how much reported positions were behind an accelerometer, in three runs by RAPID."""
-_FASTER = 1.05
-"""A stream may be this much faster than the cycle."""
+"""Lag of reported positions behind an accelerometer in the second thesis, ms: three runs over RAPID."""
+_LARGEST_RATE_RATIO = 1.05
+"""Greatest ratio of a stream's rate to the cycle's rate."""
 AIM_CYCLES = 3.0
+"""Aim for the time from a command to its frame, cycles."""
 _JOINT = 0
 _POLL_S = 0.2
 _UNDER_WAY = 4
-"""Commands that wait for their answers."""
+"""Most commands without an answer."""
 _REFUSED = 10
-"""Commands of a stream that may be refused: a host that stalls makes some come too late."""
+"""Most refused commands of a stream: a host that stalls delays some too long."""
 _MOST_BY_SOCKET_HZ = 1000.0
 _REST_S = 10.0
 _SPARE = 4.0
-"""Limits beside what the sine needs: with less the way to each target, and not the platform, takes the time."""
+"""Ratio of the limits to the sine's needs: with less the motion to each target, not the platform, takes the time."""
 _PROBES, _PROBE_INTERVAL_S = 200, 0.02
 _PROBE_TIMEOUT_NS = 1_000_000_000
 
@@ -74,9 +75,9 @@ def fit_sine(t: Array, y: Array, period_s: float, origin_s: float) -> Sine:
     Args:
         t: s, shape (n,), n of at least 5.
         y: shape (n,).
-        period_s: near the true one.
-        origin_s: from which delays count, near the middle of the data, where they do not depend on the error of the
-            period; the same for all that are compared.
+        period_s: estimate of the period.
+        origin_s: origin of the delays, near the middle of the data, where they do not depend on the error of the
+            period; the same for all sines that are compared.
     """
     x = t - origin_s
     w = tau / period_s
@@ -91,7 +92,7 @@ def fit_sine(t: Array, y: Array, period_s: float, origin_s: float) -> Sine:
 
 
 def behind(feedback: Sine, command: Sine) -> tuple[float, float]:
-    """Return how far a sine is behind another, s, at most half a period ahead, and the standard error."""
+    """Return the lag of a sine behind another, s, from minus to plus half a period, and its standard error."""
     delay = (feedback.delay_s - command.delay_s + 0.5 * command.period_s) % command.period_s - 0.5 * command.period_s
     return delay, float(np.hypot(feedback.error_s, command.error_s))
 
@@ -108,7 +109,7 @@ def _by_api(robot: Robot) -> Iterator[Send]:
 
 
 class _Answers(threading.Thread):
-    """Counts the answers, lines each, that come from a socket."""
+    """Counts the answers, one line each, from a socket."""
 
     def __init__(self, connection: socket.socket) -> None:
         super().__init__(daemon=True)
@@ -124,7 +125,7 @@ class _Answers(threading.Thread):
 
 @contextmanager
 def _by_socket(robot: Robot) -> Iterator[Send]:
-    """Write lines of JSON-RPC to the control socket without waiting for each answer; some may be under way."""
+    """Write lines of JSON-RPC to the control socket, with up to `_UNDER_WAY` unanswered."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.connect(str(control_socket(runtime_directory())))
         answers = _Answers(connection)
@@ -133,7 +134,7 @@ def _by_socket(robot: Robot) -> Iterator[Send]:
 
         def send(q: Sequence[float]) -> bool:
             nonlocal number
-            # What waits in the socket would be late: a stream leaves it out.
+            # A command that waits in the socket would be late: a stream skips it.
             if number - answers.count >= _UNDER_WAY:
                 return False
             if answers.refused > _REFUSED:
@@ -150,44 +151,45 @@ def _by_socket(robot: Robot) -> Iterator[Send]:
 
 @contextmanager
 def _accelerometer(setup: Setup) -> Iterator[list[tuple[float, float]]]:
-    """Yield a list that has the acceleration of the flange along y over the time of CLOCK_MONOTONIC afterwards.
+    """Yield a list, filled when the block ends: CLOCK_MONOTONIC, s, and acceleration of the flange along y, m/s^2.
 
-    Joint 1 moves the flange along y, near its zero. Only the virtual robot controller has an accelerometer.
+    Near its zero joint 1 moves the flange along y. The list stays empty without a virtual robot controller, which alone
+    has an accelerometer.
     """
-    felt: list[tuple[float, float]] = []
+    samples: list[tuple[float, float]] = []
     if not (setup.is_virtual and isinstance(setup.arm.bus, ControllerBus)):
-        yield felt
+        yield samples
         return
     ended = threading.Event()
 
     def poll(client: RequestClient) -> None:
         while not ended.wait(_POLL_S):
-            for samples in client.ask({"do": "accelerometer"}).values():
-                felt.extend((stamp, y) for stamp, _, y, _ in samples)
+            for newest in client.ask({"do": "accelerometer"}).values():
+                samples.extend((stamp, y) for stamp, _, y, _ in newest)
 
     with RequestClient(irc5_control(runtime_directory()), server="virtual IRC5") as client:
-        client.ask({"do": "accelerometer"})  # what was before
+        client.ask({"do": "accelerometer"})  # drops older samples
         polling = threading.Thread(target=poll, args=(client,), daemon=True)
         polling.start()
         try:
-            yield felt
+            yield samples
         finally:
             ended.set()
             polling.join()
 
 
-WAYS: Mapping[str, Callable[[Robot], contextlib.AbstractContextManager[Send]]] = {
+INTERFACES: Mapping[str, Callable[[Robot], contextlib.AbstractContextManager[Send]]] = {
     "Python API": _by_api,
     "socket": _by_socket,
 }
 
 
 class LatencyExperiment(Experiment):
-    """The sine, streamed by each way in at each rate.
+    """The sine, streamed through each interface at each rate.
 
     Args:
-        rates_hz: of the commands.
-        periods: of the sine; the first one does not count.
+        rates_hz: rates of the commands, Hz.
+        periods: number of periods of the sine; the first one is not evaluated.
     """
 
     name = "latency"
@@ -197,7 +199,7 @@ class LatencyExperiment(Experiment):
         self._rates_hz = rates_hz
         self._periods = periods
         self._drive_us: Array = np.empty(0)
-        """By how much each actual position of the last stream is behind the sent ones."""
+        """Lag of each actual position of the last stream behind the sent ones, us."""
 
     def run(self, setup: Setup) -> list[Row]:
         """See `Experiment.run`."""
@@ -209,13 +211,13 @@ class LatencyExperiment(Experiment):
         if share < 1.0:
             setup.note(f"the sine has {share:.2f} of its amplitude: the limits of {limits.name} allow no more")
         rows: list[Row] = []
-        fastest = _FASTER * 1e6 / setup.arm.cycle.period_us
+        fastest = _LARGEST_RATE_RATIO * 1e6 / setup.arm.cycle.period_us
         with setup.platform() as robot:
-            for way in WAYS:
+            for input_name in INTERFACES:
                 for rate in self._rates_hz:
-                    if rate > fastest or (way == "socket" and rate > _MOST_BY_SOCKET_HZ):
+                    if rate > fastest or (input_name == "socket" and rate > _MOST_BY_SOCKET_HZ):
                         continue  # by the socket each command is a line of JSON, and answered
-                    rows += self._stream(setup, robot, way, rate, share * AMPLITUDE_RAD)
+                    rows += self._stream(setup, robot, input_name, rate, share * AMPLITUDE_RAD)
             if isinstance(setup.arm.bus, ControllerBus):
                 return rows  # the rest is the platform's own, and the same on every bus
             rows += self._parts(setup, robot)
@@ -224,44 +226,44 @@ class LatencyExperiment(Experiment):
             rows += _by_node(setup)
         return rows
 
-    def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
-        label, name = f"{way}, {rate:g} Hz", f"{way}-{rate:g}-Hz".replace(" ", "-")
+    def _stream(self, setup: Setup, robot: Robot, input_name: str, rate: float, amplitude: float) -> list[Row]:
+        label, name = f"{input_name}, {rate:g} Hz", f"{input_name}-{rate:g}-Hz".replace(" ", "-")
         base = list(robot.status().positions)
         sign = 1.0 if base[_JOINT] + 2 * amplitude < setup.arm.joints[_JOINT].position.max else -1.0
         times: list[float] = []
         values: list[float] = []
         with setup.recording(robot, f"recording-{name}", ("*_position",)) as path:
-            with WAYS[way](robot) as send, _accelerometer(setup) as felt:
+            with INTERFACES[input_name](robot) as send, _accelerometer(setup) as accelerations:
                 begun, number = time.monotonic(), 0
                 while (now := time.monotonic() - begun) < self._periods * PERIOD_S:
                     q = base[_JOINT] + sign * amplitude * (1.0 - cos(tau * now / PERIOD_S))
                     if send([q, *base[1:]]):
                         times.append(begun + now)
                         values.append(q)
-                    # A tick that was missed is left out: commands are never sent in a burst.
+                    # A missed tick is skipped: commands are never sent in a burst.
                     number = max(number + 1, int((time.monotonic() - begun) * rate))
                     time.sleep(max(0.0, begun + number / rate - time.monotonic()))
             _wait_until_it_rests(robot)
         robot.move_joints(base, speed=SPEED_RAD_S)
         recorded = read(path, ("time_ns", "*_position"))
         series = {"command": (np.array(times), np.array(values)), **_recorded_series(recorded)}
-        # Of the times only what lies inside the sine, and not its beginning.
+        # Evaluate only times within the sine, without its first period.
         first, last = begun + PERIOD_S, times[-1]
         sines = {}
-        for one, (t, y) in series.items():
+        for signal, (t, y) in series.items():
             inside = (t >= first) & (t <= last)
-            sines[one] = fit_sine(t[inside], y[inside], PERIOD_S, 0.5 * (first + last))
+            sines[signal] = fit_sine(t[inside], y[inside], PERIOD_S, 0.5 * (first + last))
         command = sines["command"]
         latency, error = behind(sines["actual"], command)
         wire, _ = behind(sines["sent"], command)
         cycles = wire / recorded.period_s
         aim = (0.0, AIM_CYCLES) if rate >= 1000.0 else ()
-        source = _SOURCE_MS.get(setup.arm.bus.kind) if rate == 30.0 else None
+        thesis_ms = _THESIS_MS.get(setup.arm.bus.kind) if rate == 30.0 else None
         self._drive_us = 1e6 * _behind_each(*series["sent"], *series["actual"], first, last)
-        self._draw(setup, name, label, {one: (t - begun, y) for one, (t, y) in series.items()})
+        self._draw(setup, name, label, {signal: (t - begun, y) for signal, (t, y) in series.items()})
         of_robot = []
-        if felt:
-            t, y = np.array(felt).T
+        if accelerations:
+            t, y = np.array(accelerations).T
             inside = (t >= first) & (t <= last)
             flange = fit_sine(t[inside], -y[inside], PERIOD_S, 0.5 * (first + last))
             lag, lag_error = behind(sines["actual"], flange)
@@ -275,7 +277,7 @@ class LatencyExperiment(Experiment):
         )
         return [
             Row(f"{label}: rate", "Hz", (len(times) - 1) / (times[-1] - times[0]), least=0.95 * rate),
-            Row(f"{label}: latency to the motion", "ms", 1e3 * latency, source),
+            Row(f"{label}: latency to the motion", "ms", 1e3 * latency, thesis_ms),
             Row(f"{label}: its standard error", "ms", 1e3 * error),
             *of_robot,
             Row(f"{label}: command to the wire", "cycles", cycles, None, *aim),
@@ -284,11 +286,11 @@ class LatencyExperiment(Experiment):
         ]
 
     def _parts(self, setup: Setup, robot: Robot) -> list[Row]:
-        """Measure single commands on their way through socket, ring, cycle and wire, and what the drive adds."""
+        """Measure the delays of single commands in socket, ring, cycle, wire and drive."""
         observer = Observer(blackboard_file(runtime_directory()))
         base = list(robot.status().positions)
         into_ring: list[float] = []
-        taken: list[float] = []
+        read_delays: list[float] = []
         instants: list[int] = []
         begun = observer.head
         with contextlib.closing(observer), _by_socket(robot) as send:
@@ -299,18 +301,18 @@ class LatencyExperiment(Experiment):
                 ringed = _spin_until(number, lambda: observer.commands_sent)
                 arrived = _spin_until(number, lambda: observer.commands_taken)
                 into_ring.append(1e-3 * (ringed - sent))
-                taken.append(1e-3 * (arrived - ringed))
+                read_delays.append(1e-3 * (arrived - ringed))
                 instants.append(arrived)
                 time.sleep(_PROBE_INTERVAL_S)
             records, _ = observer.since(begun)
         _wait_until_it_rests(robot)
-        # What a cycle has computed leaves with the beginning of the next one.
+        # The outputs of a cycle leave at the beginning of the next one.
         at = np.searchsorted(records["time_ns"], instants)
         known = at < len(records)
         left = records["time_ns"][at[known]] - np.array(instants)[known]
         parts = {
             "socket": np.array(into_ring),
-            "ring": np.array(taken),
+            "ring": np.array(read_delays),
             "cycle": 1e-3 * left,
             "wire": 1e-3 * records["exchange_ns"][at[known]],
             "drive": self._drive_us,
@@ -323,7 +325,7 @@ class LatencyExperiment(Experiment):
 
     @staticmethod
     def _to_frame(robot: Robot) -> list[Row]:
-        """Measure how long setpoints of an open stream take from `send` until the frame has left, in cycles."""
+        """Measure the time of an open stream's setpoints from `send` until the frame has left, in cycles."""
         observer = Observer(blackboard_file(runtime_directory()))
         base = list(robot.status().positions)
         sent_at, instants, begun = [], [], observer.head
@@ -347,7 +349,7 @@ class LatencyExperiment(Experiment):
 
     @staticmethod
     def _by_ros(setup: Setup, robot: Robot) -> list[Row]:
-        """Measure commands of a ROS 1 client until the frame has left, where ROS 1 is installed."""
+        """Measure the time of a ROS 1 client's commands until the frame has left, where ROS 1 is installed."""
         until = time.monotonic() + _REST_S
         while robot.status().holder and time.monotonic() < until:  # the lease of the last stream
             time.sleep(0.05)
@@ -358,8 +360,8 @@ class LatencyExperiment(Experiment):
             setup.note(f"no figures for ROS 1: {done.stderr.strip()}")
             return []
         return [
-            Row(f"ROS 1 {way}: command to frame, p{p}", "cycles", float(np.percentile(seconds, p)) / period_s)
-            for way, seconds in json.loads(done.stdout).items()
+            Row(f"ROS 1 {input_name}: command to frame, p{p}", "cycles", float(np.percentile(seconds, p)) / period_s)
+            for input_name, seconds in json.loads(done.stdout).items()
             for p in (50, 99)
         ]
 
@@ -369,9 +371,9 @@ class LatencyExperiment(Experiment):
 
         figure = Figure(figsize=(9.0, 4.5), layout="constrained")
         axes = figure.add_subplot()
-        for one, (t, y) in series.items():
-            shown = (t >= PERIOD_S) & (t <= 2 * PERIOD_S)
-            axes.plot(t[shown], y[shown], "." if one == "command" else "-", ms=4, lw=1.2, label=one)
+        for signal, (t, y) in series.items():
+            inside = (t >= PERIOD_S) & (t <= 2 * PERIOD_S)
+            axes.plot(t[inside], y[inside], "." if signal == "command" else "-", ms=4, lw=1.2, label=signal)
         axes.set(xlabel="time, s", ylabel="joint 1, rad", title=title)
         axes.legend()
         axes.grid(alpha=0.3)
@@ -379,7 +381,7 @@ class LatencyExperiment(Experiment):
 
 
 def _by_node(setup: Setup) -> list[Row]:
-    """Measure commands of ROS 2 and Simple Message until the frame has left, over each wire that is installed."""
+    """Measure the time of commands by ROS 2 and Simple Message until the frame has left, over each installed wire."""
     rows: list[Row] = []
     for wire in ("DDS", "Zenoh", "Simple Message"):  # the last one leaves the drives disabled
         command = [sys.executable, "-m", "rtcp.ros.latency", wire.lower().replace(" ", "-")]
@@ -396,7 +398,7 @@ def _recorded_series(recorded: Recorded) -> dict[str, tuple[Array, Array]]:
     """Return sent and actual position over the time of CLOCK_MONOTONIC, s."""
     records = recorded.records
     t = records["time_ns"] * 1e-9
-    # What a record calls sent leaves with the beginning of the next cycle.
+    # The sent values of a record leave at the beginning of the next cycle.
     leaves = np.append(t[1:], t[-1] + recorded.period_s)
     return {
         "sent": (leaves, records["sent_position"][:, _JOINT]),
@@ -405,7 +407,7 @@ def _recorded_series(recorded: Recorded) -> dict[str, tuple[Array, Array]]:
 
 
 def _behind_each(sent_at: Array, sent: Array, at: Array, actual: Array, first: float, last: float) -> Array:
-    """Return how long each actual position is behind the sent ones, s, while these move at half speed at least."""
+    """Return the lag of each actual position behind the sent ones, s, where the sent speed exceeds half its maximum."""
     speed = np.gradient(sent, sent_at)
     moves = (np.abs(speed) > 0.5 * np.abs(speed).max()) & (at > first) & (at < last)
     delays: Array = (np.interp(at, sent_at, sent) - actual)[moves] / speed[moves]
@@ -413,7 +415,7 @@ def _behind_each(sent_at: Array, sent: Array, at: Array, actual: Array, first: f
 
 
 def _spin_until(number: int, count: Callable[[], int]) -> int:
-    """Return the instant, ns, at which a count has reached a number."""
+    """Poll until a count has reached a number; return the instant, ns."""
     until = time.monotonic_ns() + _PROBE_TIMEOUT_NS
     while count() < number:
         if time.monotonic_ns() > until:

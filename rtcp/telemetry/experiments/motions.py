@@ -1,4 +1,4 @@
-"""Experiments that move the arm as the source did: the step, the square, the picks by joystick."""
+"""Experiments that move the arm as in the thesis: the step, the square, the picks by joystick."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SOURCE_ERROR_RAD = 0.0007
 
 
 def geometry(setup: Setup) -> ArmModel:
-    """Return the arm's geometry; raises ExperimentFailed where it is not known."""
+    """Return the arm's geometry; raises ExperimentFailed where it is unknown."""
     model = setup.arm.arm
     if model is None:
         raise ExperimentFailed("the arm's geometry is not known (key kinematics)")
@@ -51,7 +51,7 @@ class StepExperiment(Experiment):
                 time.sleep(0.5)
             robot.move_joints(start, speed=SPEED_RAD_S)
         recorded = read(path, ("wkc*", "commanded_position", "actual_position"))
-        # A cycle whose frame does not return holds the setpoints: its time is the host's and not the arm's.
+        # A cycle whose frame does not return holds the setpoints: its time does not count.
         records = recorded.records[returned(recorded.records)]
         commanded, actual = records["commanded_position"][:, 0], records["actual_position"][:, 0]
         moving = np.flatnonzero(np.diff(commanded))
@@ -96,7 +96,7 @@ class SquareExperiment(Experiment):
     """The square of 200 mm at 50 mm/s in a plane.
 
     Args:
-        planes: of `xy`, `yz`, `xz`.
+        planes: some of `xy`, `yz`, `xz`.
     """
 
     name = "square"
@@ -140,24 +140,24 @@ ITEMS: Mapping[str, tuple[float, float, float]] = {
     "ground": (-0.50, 0.15, 0.05 - BASE_ABOVE_GROUND_M),
     "shelf": (-0.65, 0.2375, 0.80 - BASE_ABOVE_GROUND_M),
 }
-"""Where the items are, m from the base: the highest 0.8 m above the ground, the furthest 0.692 m away (the source)."""
+"""Positions of the items from the base, m; as in the thesis the highest 0.8 m above ground, the furthest 0.692 m."""
 LEVEL = Pose.from_xyzrpy(-0.5, 0.0, 0.3, 0.0, -pi / 2, 0.0)
-"""Where the arm begins: the gripper level, pointing away from the user."""
+"""First pose of the tool: the gripper level, pointing away from the user."""
 LIFT_M = 0.1
 _NEAR_M, _FAR_M = 0.004, 0.04
 _MOST_PUSHES = 400
 
 
 def begin_pose(model: ArmModel) -> tuple[float, ...]:
-    """Return the joints, rad, from which the picks begin; raises ExperimentFailed."""
-    found = InverseKinematics(model).solve_near(LEVEL, (0.0, 0.23, 2.38, 0.0, 0.57, 0.0)).q
-    if found is None:
+    """Return the joint positions, rad, at the begin of the picks; raises ExperimentFailed."""
+    joints = InverseKinematics(model).solve_near(LEVEL, (0.0, 0.23, 2.38, 0.0, 0.57, 0.0)).q
+    if joints is None:
         raise ExperimentFailed("the arm does not reach the pose from which the picks begin")
-    return tuple(found)
+    return tuple(joints)
 
 
 class Arm(Protocol):
-    """What a person sees and holds."""
+    """A person's view of the arm, and the joystick."""
 
     @property
     def tool(self) -> tuple[float, float, float]:
@@ -165,20 +165,20 @@ class Arm(Protocol):
 
     @property
     def mode(self) -> int:
-        """The joystick's mode: X-Y, Z-yaw, roll-pitch, gripper."""
+        """Mode of the joystick: 0 X-Y, 1 Z-yaw, 2 roll-pitch, 3 gripper."""
 
     def hold(self, code: int, seconds: float) -> None:
         """Hold the joystick at the byte `code` for a time, s."""
 
 
 class Person:
-    """Looks at the tool and moves the joystick: nothing else reaches the arm."""
+    """A simulated person who observes the tool and moves the joystick, the arm's only command."""
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
 
     def pick(self, item: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Pick an item and lift it; return where the gripper closed, m."""
+        """Pick an item and lift it; return the tool's position when the gripper closed, m."""
         self._grip(close=False)
         self._bring(item)
         closed_at = self._arm.tool
@@ -207,7 +207,7 @@ class Person:
             for axis, plus, minus in ways:
                 error = target[axis] - self._arm.tool[axis]
                 if abs(error) > _NEAR_M:
-                    # Active low: a direction takes its bit away.
+                    # Active low: a direction clears its bit.
                     code &= plus if error > 0 else minus
                     far = max(far, abs(error)) if far == 0.0 else min(far, abs(error))
             if code == NEUTRAL:
@@ -224,7 +224,7 @@ class Person:
 
 
 class _VirtualJoystick:
-    """The arm of a running platform, its virtual joystick held by requests."""
+    """The arm of a running platform, with its virtual joystick moved by requests."""
 
     def __init__(self, robot: Robot, model: ArmModel) -> None:
         self._robot = robot
@@ -247,7 +247,7 @@ class PicksExperiment(Experiment):
     """Three items picked by joystick bytes alone: from the table, the ground and the shelf.
 
     Args:
-        items: of `ITEMS`.
+        items: some of `ITEMS`.
     """
 
     name = "picks"

@@ -13,7 +13,7 @@ from rtcp.ipc.session import read_processes
 from rtcp.telemetry.experiments.experiment import SPEED_RAD_S, Experiment, Row, Setup
 
 SOURCE_PERCENT = 30.0
-"""Of a quad core, the platform computer of the source; its slaves were hardware, so a segment in software is apart."""
+"""CPU load of the thesis' quad core computer, %; its slaves were hardware, so the virtual segment does not count."""
 SOURCE_CORES = 4
 _REACH_RAD = 0.2
 _JOG_RAD_S, _JOG_INTERVAL_S, _JOG_TURN_S = 0.05, 0.05, 2.0
@@ -21,10 +21,10 @@ _MB = 1e6
 
 
 class ResourcesExperiment(Experiment):
-    """What the processes of the platform take.
+    """CPU and memory of the platform's processes.
 
     Args:
-        seconds: of each activity.
+        seconds: duration of each activity, s.
     """
 
     name = "resources"
@@ -61,7 +61,7 @@ class ResourcesExperiment(Experiment):
         return rows
 
     def _measure(self, robot: Robot, do: Callable[[float], None]) -> tuple[dict[str, float], dict[str, float]]:
-        """Return by process its share of a core, and its resident memory, MB, while something is done."""
+        """Return, for each process, its share of a core and its resident memory, MB, during an activity."""
         processes = dict(_processes())
         before = {name: process.cpu_times() for name, process in processes.items()}
         begun = time.monotonic()
@@ -73,15 +73,15 @@ class ResourcesExperiment(Experiment):
             cores[name] = (now.user + now.system - then.user - then.system) / seconds
             ended = now.children_user + now.children_system - then.children_user - then.children_system
             if ended:
-                cores["recorder"] = ended / seconds  # the gateway's child, begun and ended meanwhile
+                cores["recorder"] = ended / seconds  # a child of the gateway, started and ended meanwhile
         memory = {name: process.memory_info().rss / _MB for name, process in processes.items()}
         return cores, memory
 
     def _record(self, setup: Setup, robot: Robot, until: float) -> dict[str, float]:
         with setup.recording(robot) as path:
             time.sleep(max(0.0, until - time.monotonic()))
-            # The arm's file may have started another one.
-            pid = next(one.pid for one in robot.record_status() if str(path.absolute()) in one.files)
+            # The arm's configuration may have started another recorder.
+            pid = next(status.pid for status in robot.record_status() if str(path.absolute()) in status.files)
             return {"recorder": psutil.Process(pid).memory_info().rss / _MB}
 
     @staticmethod
@@ -99,9 +99,9 @@ class ResourcesExperiment(Experiment):
 
 
 def _processes() -> Iterator[tuple[str, psutil.Process]]:
-    found = read_processes(runtime_directory())
+    pids = read_processes(runtime_directory())
     for name in ("loop", "gateway", "segment"):
-        if pid := getattr(found, name):
+        if pid := getattr(pids, name):
             yield name, psutil.Process(pid)
 
 

@@ -1,4 +1,4 @@
-"""Experiments on time: the cycle, seen from inside and at an output of the IO box, and the propagation delays."""
+"""Experiments on time: the cycle, measured inside and at an output of the IO box, and the propagation delays."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ SOURCE_CYCLES = {
     600.0: (558.0, 7.0, 67.0), 700.0: (654.0, 6.57, 40.0), 800.0: (758.0, 6.5, 42.0), 900.0: (843.0, 6.33, 56.0),
     1000.0: (940.0, 6.0, 60.0), 2000.0: (1879.0, 6.04, 120.0),
 }  # fmt: skip
-"""Target -> mean, us, percent error, average deviation, us: the source's table 7 and its run of 1000 samples."""
+"""Target -> mean, us, percent error, average deviation, us: the thesis' table 7 and its run of 1000 samples."""
 SOURCE_DELAYS_NS = (0, 820, 1660, 2500, 3320, 4160, 5020)
 _READ_INTERVAL_S = 0.1
-"""The segment keeps 1024 edges: 0.2 s at 200 us."""
+"""Interval of reading, s: the segment keeps 1024 edges, 0.2 s at 200 us."""
 
 
 def spread(intervals_us: Array, target_us: float) -> tuple[float, float, float]:
@@ -36,11 +36,11 @@ def spread(intervals_us: Array, target_us: float) -> tuple[float, float, float]:
 
 
 class CycleExperiment(Experiment):
-    """The ten cycle targets of the source, six drives enabled, from inside and from outside.
+    """The ten cycle targets of the thesis, six drives enabled, measured inside and outside.
 
     Args:
-        targets_us: cycles.
-        seconds: of each.
+        targets_us: periods of the cycle, us.
+        seconds: duration of each, s.
     """
 
     name = "cycle"
@@ -53,15 +53,15 @@ class CycleExperiment(Experiment):
     def run(self, setup: Setup) -> list[Row]:
         """See `Experiment.run`; a target that the host cannot keep is a note."""
         rows: list[Row] = []
-        found: dict[float, dict[str, Array]] = {}
+        times: dict[float, dict[str, Array]] = {}
         for target in self._targets_us:
             try:
-                found[target] = self._measure(setup, target)
+                times[target] = self._measure(setup, target)
             except (RtcpError, ExperimentFailed) as error:
                 setup.note(f"{target:g} us: not measured: {error}")
                 rows.append(Row(f"{target:g} us: mean", "us", nan, SOURCE_CYCLES.get(target, (None,))[0], least=0.0))
                 continue
-            for side, intervals in found[target].items():
+            for side, intervals in times[target].items():
                 mean, percent, deviation = spread(intervals, target)
                 source = SOURCE_CYCLES.get(target, (None, None, None))
                 label = f"{target:g} us, {side}"
@@ -73,9 +73,9 @@ class CycleExperiment(Experiment):
                 setup.report(
                     f"{label}: mean {mean:.2f} us, error {percent:.3f} %, average deviation {deviation:.2f} us"
                 )
-        if not found:
+        if not times:
             raise ExperimentFailed("no cycle could be measured: " + "; ".join(setup.notes))
-        self._draw(setup, found)
+        self._draw(setup, times)
         return rows
 
     def _measure(self, setup: Setup, target_us: float) -> dict[str, Array]:
@@ -93,36 +93,36 @@ class CycleExperiment(Experiment):
         return np.empty(0)
 
     def _edges(self, setup: Setup, output: int) -> Array:
-        """Return when the output changed, ns of the IO box's own clock."""
+        """Return the instants of the output's edges, ns of the IO box's own clock."""
         arm = setup.arm
-        slave = next(at for at, one in enumerate(arm.slaves, 1) if one.device.is_box)
+        slave = next(at for at, entry in enumerate(arm.slaves, 1) if entry.device.is_box)
         stamps: list[int] = []
         control = read_session(runtime_directory()).segment_control
         assert control is not None
         with SegmentClient(control) as segment:
-            segment.edges(slave, output)  # from the first question on they are kept
+            segment.edges(slave, output)  # the segment records edges from the first request on
             until = time.monotonic() + self._seconds
             while time.monotonic() < until:
                 time.sleep(_READ_INTERVAL_S)
-                found = segment.edges(slave, output)
-                if len(found) >= EDGES:
+                edges = segment.edges(slave, output)
+                if len(edges) >= EDGES:
                     raise ExperimentFailed("this process was kept waiting: edges of the output were not read in time")
-                stamps += found
+                stamps += edges
         return np.array(stamps, np.float64)
 
     @staticmethod
-    def _draw(setup: Setup, found: dict[float, dict[str, Array]]) -> None:
+    def _draw(setup: Setup, times: dict[float, dict[str, Array]]) -> None:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(11.0, 5.0), layout="constrained")
         means, spreads = figure.subplots(1, 2)
-        targets = [target for target in found if target in SOURCE_CYCLES]
+        targets = [target for target in times if target in SOURCE_CYCLES]
         for at, (axes, unit) in enumerate(((means, "error of the mean, %"), (spreads, "average deviation, us")), 1):
-            axes.plot(targets, [SOURCE_CYCLES[target][at] for target in targets], "o--", label="source")
+            axes.plot(targets, [SOURCE_CYCLES[target][at] for target in targets], "o--", label="thesis")
             for side in ("inside", "outside"):
-                known = [target for target in found if side in found[target]]
+                known = [target for target in times if side in times[target]]
                 if known:
-                    axes.plot(known, [spread(found[target][side], target)[at] for target in known], "o-", label=side)
+                    axes.plot(known, [spread(times[target][side], target)[at] for target in known], "o-", label=side)
             axes.set(xlabel="target, us", ylabel=unit, yscale="log")
             axes.grid(alpha=0.3)
             axes.legend()
@@ -143,7 +143,7 @@ class DelaysExperiment(Experiment):
         clocks: dict[int, float] = {}
         for at, slave in enumerate(slaves):
             source = SOURCE_DELAYS_NS[at] if at < len(SOURCE_DELAYS_NS) else None
-            # The virtual cable has the source's delays; a real one has its own.
+            # The virtual cable has the thesis' delays; a real one has its own.
             bounds = {} if source is None or not setup.is_virtual else {"least": source - 20.0, "most": source + 20.0}
             if slave["dc"]:
                 clocks[at + 1] = float(slave["delay_ns"])
@@ -160,7 +160,7 @@ class DelaysExperiment(Experiment):
         figure = Figure(figsize=(7.0, 4.5), layout="constrained")
         axes = figure.subplots()
         axes.bar(list(clocks), list(clocks.values()), width=0.5, label="here")
-        axes.plot(range(1, len(SOURCE_DELAYS_NS) + 1), SOURCE_DELAYS_NS, "o", color="tab:orange", label="source")
+        axes.plot(range(1, len(SOURCE_DELAYS_NS) + 1), SOURCE_DELAYS_NS, "o", color="tab:orange", label="thesis")
         axes.set(xlabel="slave, in the order of the cable", ylabel="propagation delay, ns")
         axes.grid(axis="y", alpha=0.3)
         axes.legend()

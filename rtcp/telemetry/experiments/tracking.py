@@ -1,4 +1,4 @@
-"""How a joint follows: frequency response from sent to actual position, and friction and inertia by least squares."""
+"""Tracking of a joint: frequency response from sent to actual position, friction and inertia by least squares."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Array = npt.NDArray[np.float64]
 FREQUENCIES_HZ = (0.25, 0.5, 1.0, 2.0, 4.0)
 _PERIODS_MIN, _SWEEP_S = 3, 2.0
 _SHARE = 0.6
-"""Of a joint's limits of velocity, acceleration and jerk that a sweep takes."""
+"""Fraction of a joint's limits of velocity, acceleration and jerk that a sweep uses."""
 _REACH_RAD = 0.4
 _SAMPLES = 24
-"""Points of the trajectory in a period: a spline through them with their velocities and accelerations is the sine."""
+"""Points of the trajectory in a period: a spline through their positions, velocities, accelerations is the sine."""
 _WINDOW_S = 0.01
 _SETTLING_S = 0.01
-"""Time after a gap between two samples during which the torque still shows what happened in the gap, s."""
+"""Time after a gap between two samples in which the torque still depends on the gap, s."""
 _MOVING_RAD_S = 0.02
 _EXACT_NM = 1e-6
 _TOLERANCE = 0.05
@@ -39,7 +39,7 @@ _TOLERANCE = 0.05
 
 @dataclass(frozen=True)
 class Friction:
-    """What turns with a joint and what holds it: kg m^2, Nm, Nm s/rad; Nm of gravity at sin(q) and cos(q)."""
+    """Inertia, dry and viscous friction of a joint: kg m^2, Nm, Nm s/rad; gravity torques at sin(q) and cos(q), Nm."""
 
     inertia: float
     coulomb: float
@@ -49,39 +49,39 @@ class Friction:
 
 @dataclass(frozen=True)
 class Response:
-    """From sent to actual position at a frequency."""
+    """Response from sent to actual position at a frequency."""
 
     frequency_hz: float
     gain: float
     phase_rad: float
     error_rad: float
-    """Largest following error."""
+    """Largest following error, rad."""
 
 
 def sine(frequency_hz: float, amplitude: float) -> Iterator[tuple[float, float, float, float]]:
-    """Yield a motion of whole sines from rest to rest: t, s, and position, velocity, acceleration, from its beginning.
+    """Yield a motion of whole sines from rest to rest: t, s, and position, velocity, acceleration, from its begin.
 
     Args:
-        frequency_hz: Hz
+        frequency_hz: frequency, Hz.
         amplitude: rad; the joint moves by twice that, to one side.
     """
     w, periods = tau * frequency_hz, max(_PERIODS_MIN, round(_SWEEP_S * frequency_hz))
     for at in range(periods * _SAMPLES + 1):
         t = at / (_SAMPLES * frequency_hz)
         q, v, a = amplitude * (1.0 - cos(w * t)), amplitude * w * sin(w * t), amplitude * w * w * cos(w * t)
-        yield round(t, 9), round(q, 9), round(v, 9), round(a, 9)  # as a request carries them
+        yield round(t, 9), round(q, 9), round(v, 9), round(a, 9)  # precision of a request
 
 
 def identify(seconds: Array, torque: Array, velocity: Array, position: Array) -> Friction:
     """Identify a joint by least squares from samples of its motion, shape (n,) each, s, Nm, rad/s, rad.
 
-    torque = J a + c sign(v) + b v - g1 sin(q) - g2 cos(q), each side integrated over short windows: the acceleration
-    need not be had from the noise of the velocity. Windows in which the joint hardly moves or turns round tell nothing
-    of dry friction, and those with a gap between two samples, or just after one, nothing of what was in it: they are
-    left out. What a stall of the host disturbs further weighs little (loss "soft_l1").
+    torque = J a + c sign(v) + b v - g1 sin(q) - g2 cos(q), each side integrated over short windows, which avoids
+    differentiating a noisy velocity. Windows in which the joint hardly moves or reverses (dry friction undefined), and
+    windows with a gap between two samples or just after one, are left out. Other disturbances by stalls of the host
+    have little weight (loss "soft_l1").
 
     Raises:
-        ExperimentFailed: it hardly moved.
+        ExperimentFailed: the joint hardly moved.
     """
     period_s = float(np.median(np.diff(seconds)))
     width = max(2, round(_WINDOW_S / period_s))
@@ -89,7 +89,7 @@ def identify(seconds: Array, torque: Array, velocity: Array, position: Array) ->
     ends = np.arange(count + 1) * width
 
     def mean(values: Array) -> Array:
-        # The trapezoid rule: the integral belongs to the change from the first to the last sample of a window.
+        # The trapezoid rule matches the change from the first to the last sample of a window.
         halves = 0.5 * (values[: count * width] + values[1 : count * width + 1])
         means: Array = halves.reshape(count, width).mean(axis=1)
         return means
@@ -115,10 +115,10 @@ def identify(seconds: Array, torque: Array, velocity: Array, position: Array) ->
 
 
 class TrackingExperiment(Experiment):
-    """A sweep of each joint by itself.
+    """A sweep of each joint separately.
 
     Args:
-        joints: from 0; None: all.
+        joints: indices of the joints, from 0; None: all.
     """
 
     name = "tracking"
@@ -131,12 +131,12 @@ class TrackingExperiment(Experiment):
     def run(self, setup: Setup) -> list[Row]:
         """See `Experiment.run`."""
         rows: list[Row] = []
-        found: dict[str, list[Response]] = {}
+        responses_of: dict[str, list[Response]] = {}
         truth = _truth(setup) if setup.is_virtual else {}
         with setup.platform() as robot:
             for joint in range(len(setup.arm.joints)) if self._joints is None else self._joints:
                 name = setup.arm.joints[joint].name
-                recorded, found[name] = _drive(setup, robot, joint, self._amplitudes(setup, joint))
+                recorded, responses_of[name] = _drive(setup, robot, joint, self._amplitudes(setup, joint))
                 came = returned(recorded.records)
                 torque, velocity, position = (
                     recorded.column(f"actual_{key}")[came, joint] for key in ("torque", "velocity", "position")
@@ -146,8 +146,8 @@ class TrackingExperiment(Experiment):
                     f"{name}: inertia {values.inertia:.3f} kg m^2, friction {values.coulomb:.3f} Nm and "
                     f"{values.viscous:.3f} Nm s/rad"
                 )
-                rows += _rows(name, found[name], values, truth.get(name))
-        self._draw(setup, found)
+                rows += _rows(name, responses_of[name], values, truth.get(name))
+        self._draw(setup, responses_of)
         return rows
 
     def _amplitudes(self, setup: Setup, joint: int) -> dict[float, float]:
@@ -159,16 +159,16 @@ class TrackingExperiment(Experiment):
             amplitudes[f] = min(_SHARE * most, _REACH_RAD)
         return amplitudes
 
-    def _draw(self, setup: Setup, found: Mapping[str, Sequence[Response]]) -> None:
+    def _draw(self, setup: Setup, responses_of: Mapping[str, Sequence[Response]]) -> None:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(9.0, 8.0), layout="constrained")
         gain, phase, error = figure.subplots(3, 1, sharex=True)
         frequencies = self._frequencies_hz
-        for name, responses in found.items():
-            gain.plot(frequencies, [20 * np.log10(one.gain) for one in responses], "o-", label=name)
-            phase.plot(frequencies, [np.degrees(one.phase_rad) for one in responses], "o-")
-            error.plot(frequencies, [1e3 * one.error_rad for one in responses], "o-")
+        for name, responses in responses_of.items():
+            gain.plot(frequencies, [20 * np.log10(response.gain) for response in responses], "o-", label=name)
+            phase.plot(frequencies, [np.degrees(response.phase_rad) for response in responses], "o-")
+            error.plot(frequencies, [1e3 * response.error_rad for response in responses], "o-")
         gain.set(ylabel="gain, dB", xscale="log", title="sent to actual position")
         gain.legend(ncols=3)
         phase.set(ylabel="phase, degrees")
@@ -183,7 +183,7 @@ class TrackingExperiment(Experiment):
 def _drive(
     setup: Setup, robot: Robot, joint: int, amplitudes: Mapping[float, float]
 ) -> tuple[Recorded, list[Response]]:
-    """Move one joint at each frequency; return the recording, and how it followed."""
+    """Move one joint at each frequency; return the recording and the responses."""
     base = list(robot.status().positions)
     n, name = len(base), setup.arm.joints[joint].name
     away = 2 * max(amplitudes.values())
@@ -205,51 +205,51 @@ def _drive(
 
 
 def _response(recorded: Recorded, joint: int, f: float, span: tuple[int, int]) -> Response:
-    """Return how a joint followed a sine between two instants, ns."""
+    """Return the response of a joint to a sine between two instants, ns."""
     records = recorded.records[slice(*np.searchsorted(recorded.records["time_ns"], span))]
-    # What a record has as sent leaves with the next cycle, and a cycle whose frame did not return shows nothing new.
+    # The sent values of a record leave with the next cycle; a cycle whose frame did not return has no new values.
     came = returned(records)[1:]
     sent, actual = records["sent_position"][:-1, joint][came], records["actual_position"][1:, joint][came]
     moving = np.flatnonzero(np.diff(sent))
     if not len(moving):
         raise ExperimentFailed(f"the joint was not commanded to move at {f:g} Hz")
-    # Without the first period, in which what came before dies down.
+    # Without the first period, which has transients.
     instants = records["time_ns"][1:][came]
     t = (instants - instants[moving[0]]) * 1e-9
     inside = (t >= 1 / f) & (np.arange(len(t)) <= moving[-1])
-    one, other = (fit_sine(t[inside], values[inside], 1 / f, t[inside].mean()) for values in (actual, sent))
-    delay, _ = behind(one, other)
+    actual_sine, sent_sine = (fit_sine(t[inside], values[inside], 1 / f, t[inside].mean()) for values in (actual, sent))
+    delay, _ = behind(actual_sine, sent_sine)
     error = float(np.abs(actual - sent)[inside].max())
-    return Response(f, one.amplitude / other.amplitude, -tau * f * delay, error)
+    return Response(f, actual_sine.amplitude / sent_sine.amplitude, -tau * f * delay, error)
 
 
 def _truth(setup: Setup) -> dict[str, Friction]:
-    """Return what the models of the virtual drives were given, by joint."""
+    """Return joint name -> parameters of the virtual drive's model."""
     arm = setup.arm
     slots = {slave.name: entry for slave, entry in zip(arm.slaves, load_segment(segment_path(arm)).slaves, strict=True)}
     descriptions = Descriptions(segment_path(arm).parent)
-    found = {}
+    frictions = {}
     for joint in arm.joints:
         entry = slots[joint.slave]
         model = descriptions.make(entry)
         if isinstance(model, CubemarsDrive):
             mechanics = model.mechanics
-            found[joint.name] = Friction(mechanics.inertia, mechanics.coulomb, mechanics.viscous)
-    return found
+            frictions[joint.name] = Friction(mechanics.inertia, mechanics.coulomb, mechanics.viscous)
+    return frictions
 
 
 def _rows(name: str, responses: Sequence[Response], values: Friction, truth: Friction | None) -> list[Row]:
     rows = []
     for key, unit in (("inertia", "kg m^2"), ("coulomb", "Nm"), ("viscous", "Nm s/rad")):
         here = getattr(values, key)
-        given = None if truth is None else getattr(truth, key)
-        if given is None:
+        modelled = None if truth is None else getattr(truth, key)
+        if modelled is None:
             rows.append(Row(f"{name}: {key}", unit, here))
         else:
-            bounds = (1 - _TOLERANCE) * given, (1 + _TOLERANCE) * given
-            rows.append(Row(f"{name}: {key}", unit, here, f"model: {given:g}", *bounds))
-    for one in responses:
-        rows.append(Row(f"{name}, {one.frequency_hz:g} Hz: gain", "", one.gain))
-        rows.append(Row(f"{name}, {one.frequency_hz:g} Hz: phase", "degrees", one.phase_rad * 180 / pi))
-        rows.append(Row(f"{name}, {one.frequency_hz:g} Hz: following error", "mrad", 1e3 * one.error_rad))
+            bounds = (1 - _TOLERANCE) * modelled, (1 + _TOLERANCE) * modelled
+            rows.append(Row(f"{name}: {key}", unit, here, f"model: {modelled:g}", *bounds))
+    for response in responses:
+        rows.append(Row(f"{name}, {response.frequency_hz:g} Hz: gain", "", response.gain))
+        rows.append(Row(f"{name}, {response.frequency_hz:g} Hz: phase", "degrees", response.phase_rad * 180 / pi))
+        rows.append(Row(f"{name}, {response.frequency_hz:g} Hz: following error", "mrad", 1e3 * response.error_rad))
     return rows

@@ -1,1 +1,1 @@
-"""Faults made on the virtual segment while it runs: by command over a socket, and by a script with times."""
+"""Faults on the running virtual segment, by command over a socket or by a timed script."""

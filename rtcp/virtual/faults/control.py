@@ -1,6 +1,6 @@
-"""The requests to a segment, both ends: other processes begin and clear faults, and ask, while it runs.
+"""Requests to a running segment, server and client: begin and clear faults, query the state.
 
-What the joints truly do, whatever the master hears of it, is among the questions.
+Queries include the true motion of the joints, independent of the bus.
 """
 
 from __future__ import annotations
@@ -12,29 +12,30 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rtcp.config.document import shown
+from rtcp.config.findings import shown
 from rtcp.virtual.behaviour import set_value
+from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.faults.fault import FaultRefused
-from rtcp.virtual.faults.registry import FaultRegistry, installed, parse, sentence_of
+from rtcp.virtual.faults.registry import FaultRegistry, installed, parse
 from rtcp.virtual.models.diewu import CHANNELS, DiewuIoBox
 from rtcp.virtual.models.servo import ServoAxis
-from rtcp.virtual.objects import Entry
+from rtcp.virtual.objects import Entry, ObjectDictionary
 from rtcp.virtual.request_socket import RequestClient, RequestSocket, choose
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import Slave
 
 MOST_KEYS = 10
-"""What is read between two frames is short: no sentence takes long to find."""
+"""Upper bound on the keys of a fault, so that messages are found fast between two frames."""
 STANDSTILL = 0.002
-"""A joint slower than this, rad/s, stands."""
+"""Speed below which a joint counts as at rest, rad/s."""
 PATIENCE = 10_000_000_000
-"""Time without a request after which joints and outputs are no longer watched, ns."""
+"""Time without a request after which monitoring of joints and outputs ends, ns."""
 EDGES = 1024
-"""Edges of an output that are kept between two questions: what is sent in one answer must not keep a frame waiting."""
+"""Upper bound on stored edges of an output between two requests: sending an answer must not delay a frame."""
 
 
 class Control(RequestSocket):
-    """The requests that a segment answers."""
+    """Request server of a segment."""
 
     def __init__(self, listener: socket.socket, registry: FaultRegistry, truth: GroundTruth) -> None:
         super().__init__(listener, self._request)
@@ -50,9 +51,9 @@ class Control(RequestSocket):
             "get": (("slave", "index", "subindex"), self._get),
             "set": (("slave", "index", "subindex", "value"), self._set),
         }
-        """What a request can ask for: its keys, and what answers it."""
+        """Verb of a request -> its keys and its handler."""
         for name in installed():
-            # What a kind allows is worked out when it is first named, which takes longer than a frame may wait.
+            # Build the checkers now: at the first use it would delay a frame too long.
             parse({"fault": name})
 
     def _request(self, request: dict[str, Any]) -> Any:
@@ -66,7 +67,7 @@ class Control(RequestSocket):
             raise FaultRefused(f"a fault has at most {MOST_KEYS} keys, found {len(mapping)}")
         planned, findings = parse(mapping)
         if planned is None:
-            raise FaultRefused("; ".join(map(sentence_of, findings)))
+            raise FaultRefused("; ".join(map(str, findings)))
         if planned.at:
             raise FaultRefused("at: a fault that is asked for begins at once; only a script has times")
         return {"id": self._registry.begin(planned, now)}
@@ -78,16 +79,14 @@ class Control(RequestSocket):
         return self._truth.edges(slave, output, now)
 
     def _get(self, request: dict[str, Any], now: int) -> list[dict[str, Any]]:
-        slave = self._truth.slave_of(request.get("slave"))
+        device = self._device_of(request)
         if "index" in request:
-            return [_shown_entry(_entry_of(slave, request))]
-        roles = slave.device.roles
-        images = [slave.device.image(index) for index in roles.outputs + roles.inputs]
+            return [_shown_entry(_entry_of(device, request))]
+        images = [device.image(index) for index in device.roles.outputs + device.roles.inputs]
         return [_shown_entry(entry) for image in images if image is not None for entry in image.entries]
 
     def _set(self, request: dict[str, Any], now: int) -> dict[str, Any]:
-        slave = self._truth.slave_of(request.get("slave"))
-        entry, value = _entry_of(slave, request), request.get("value")
+        entry, value = _entry_of(self._device_of(request), request), request.get("value")
         try:
             if entry.is_bytes and isinstance(value, str):
                 value = bytes.fromhex(value[2:]) if value.startswith("0x") else value.encode()
@@ -96,6 +95,12 @@ class Control(RequestSocket):
             raise FaultRefused(f"value: {error}") from error
         return _shown_entry(entry)
 
+    def _device_of(self, request: dict[str, Any]) -> DeviceModel:
+        device = self._truth.slave_of(request.get("slave")).device
+        if not isinstance(device.objects, ObjectDictionary):
+            raise FaultRefused(f"slave: the behaviour of {device.identity.name} has set its `objects` to another thing")
+        return device
+
     def _clear(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
         number = request.get("id")
         if number is not None and type(number) is not int:
@@ -103,13 +108,13 @@ class Control(RequestSocket):
         return {"cleared": self._registry.clear(number, now)}
 
 
-def _entry_of(slave: Slave, request: dict[str, Any]) -> Entry:
+def _entry_of(device: DeviceModel, request: dict[str, Any]) -> Entry:
     index, subindex = request.get("index"), request.get("subindex", 0)
     if type(index) is not int or type(subindex) is not int:
         raise FaultRefused(f"found object {shown(index)}:{shown(subindex)}, allowed are two numbers")
-    if (index, subindex) not in slave.device.objects:
-        raise FaultRefused(f"{slave.device.identity.name} has no object 0x{index:04X}:{subindex}")
-    return slave.device.objects[index, subindex]
+    if (index, subindex) not in device.objects:
+        raise FaultRefused(f"{device.identity.name} has no object 0x{index:04X}:{subindex}")
+    return device.objects[index, subindex]
 
 
 def _shown_entry(entry: Entry) -> dict[str, Any]:
@@ -118,7 +123,7 @@ def _shown_entry(entry: Entry) -> dict[str, Any]:
 
 
 class _Joint:
-    """A drive that is watched: when it last moved, how fast it was at most."""
+    """A monitored joint: time of its last motion, peak speed."""
 
     __slots__ = ("drive", "moved", "peak")
 
@@ -127,8 +132,8 @@ class _Joint:
         self.moved = 0
         self.peak = 0.0
 
-    def look(self, now: int) -> None:
-        """Remember what it does now."""
+    def update(self, now: int) -> None:
+        """Record the present motion."""
         speed = abs(self.drive.mechanics.velocity)
         if speed > STANDSTILL:
             self.moved = now
@@ -136,7 +141,7 @@ class _Joint:
 
 
 class _Output:
-    """A digital output that is watched: when frames changed it, ns of its slave's own clock."""
+    """A monitored digital output: times of its changes by frames, ns of its slave's own clock."""
 
     __slots__ = ("_byte", "_level", "_mask", "_slave", "edges")
 
@@ -147,8 +152,8 @@ class _Output:
         self._level: int | None = None
         self.edges: deque[int] = deque(maxlen=EDGES)
 
-    def look(self, outputs: memoryview, t: int) -> None:
-        """Remember the instant where the outputs that arrived at `t` change it."""
+    def update(self, outputs: memoryview, t: int) -> None:
+        """Record `t` if the outputs that arrived then change it."""
         level = outputs[self._byte] & self._mask
         if level != self._level:
             if self._level is not None and self._slave.clock is not None:
@@ -157,15 +162,15 @@ class _Output:
 
 
 class GroundTruth:
-    """Watches joints and outputs from the first question on, while requests come: else a segment pays nothing.
+    """Monitors joints and outputs from the first request until requests cease; costs nothing otherwise.
 
-    While `watching`, `look` is to be called after each step of a device.
+    While `watching`, call `update` after each step of a device.
     """
 
     def __init__(self, segment: Segment, models: Sequence[str]) -> None:
         self.watching = False
         self._asked: int | None = None
-        """Instant of the last request; None: nobody has ever asked for the truth."""
+        """Instant of the last request; None: no request for the truth yet."""
         self._segment = segment
         self._models = tuple(models)
         self._joints = {
@@ -173,16 +178,16 @@ class GroundTruth:
         }
         self._output: tuple[int, int, _Output] | None = None
 
-    def look(self, slave: Slave, now: int) -> None:
-        """See whether the joint of `slave`, which was stepped, moves at instant `now`."""
+    def update(self, slave: Slave, now: int) -> None:
+        """Record the joint of `slave`, just stepped, at instant `now`."""
         for joint in self._joints.get(slave, ()):
-            joint.look(now)
+            joint.update(now)
         if self._asked is not None and now - self._asked > PATIENCE:
             self.watching = False
             self._release_output()
 
     def requested(self, now: int) -> None:
-        """Somebody asked for something: who has once asked for the truth may ask for it again."""
+        """Prolong the monitoring, at any request."""
         if self._asked is not None:
             self._watch(now)
 
@@ -191,19 +196,19 @@ class GroundTruth:
         self._asked = now
 
     def clear_peaks(self, now: int) -> None:
-        """Forget how fast the joints were."""
+        """Reset the peak speeds."""
         self._watch(now)
         for joints in self._joints.values():
             for joint in joints:
                 joint.peak = 0.0
 
     def edges(self, position: int, output: int, now: int) -> list[int]:
-        """Return when frames changed an output since the last question, ns of its slave's own clock.
+        """Return the times of changes of an output since the last call, ns of its slave's own clock.
 
-        The first question begins; one about another output ends it.
+        The first call starts the recording; a call for another output ends it.
 
         Raises:
-            FaultRefused: there is no such output.
+            FaultRefused: unknown output.
         """
         slaves = self._segment.slaves
         box = slaves[position - 1].device if 1 <= position <= len(slaves) else None
@@ -214,22 +219,22 @@ class GroundTruth:
         if watched is None or watched[:2] != (position, output):
             self._release_output()
             self._output = watched = position, output, _Output(slave, output)
-        # A slave that had no supply has a new application.
-        slave.application.outputs_watch = watched[2].look
-        found = list(watched[2].edges)
+        # After a power cycle a slave has a new application.
+        slave.application.outputs_watch = watched[2].update
+        edges = list(watched[2].edges)
         watched[2].edges.clear()
-        return found
+        return edges
 
     def slave_of(self, wanted: object) -> Slave:
-        """Return the slave at a position from 1, or of a label; raises FaultRefused."""
+        """Return the slave at a position from 1 or with a label; raises FaultRefused."""
         slaves = self._segment.slaves
         if type(wanted) is int and 1 <= wanted <= len(slaves):
             return slaves[wanted - 1]
         places = [place for place, label in enumerate(self._models) if label == wanted]
         if len(places) != 1:
             named = f'called "{wanted[:60]}"' if isinstance(wanted, str) else shown(wanted)
-            found = f"{len(places)} slaves are {named}" if places else f"there is no slave {named}"
-            raise FaultRefused(f"slave: {found}; give a position from 1 to {len(slaves)}, or a name")
+            count = f"{len(places)} slaves are {named}" if places else f"there is no slave {named}"
+            raise FaultRefused(f"slave: {count}; give a position from 1 to {len(slaves)}, or a name")
         return slaves[places[0]]
 
     def _release_output(self) -> None:
@@ -238,11 +243,11 @@ class GroundTruth:
             self._output = None
 
     def answer(self, now: int) -> dict[str, Any]:
-        """Return what is true at instant `now`, slave by slave."""
+        """Return the true state of each slave at instant `now`."""
         self._watch(now)
         for joints in self._joints.values():
             for joint in joints:
-                joint.look(now)
+                joint.update(now)
         slaves = zip(self._segment.slaves, self._models, strict=True)
         return {
             "time_ns": now,
@@ -250,19 +255,19 @@ class GroundTruth:
         }
 
     def _of(self, position: int, slave: Slave, model: str) -> dict[str, Any]:
-        found: dict[str, Any] = {
+        report: dict[str, Any] = {
             "position": position,
             "model": model,
             "al": slave.application.state.name.replace("_", "-"),
             "reachable": slave in self._segment.topology.reached,
         }
-        found |= slave.device.truth()
+        report |= slave.device.truth()
         joints = [_truth_of(joint) for joint in self._joints.get(slave, ())]
         if joints:
-            found |= joints[0]
+            report |= joints[0]
         if len(joints) > 1:
-            found["axes"] = joints
-        return found
+            report["axes"] = joints
+        return report
 
 
 def _truth_of(joint: _Joint) -> dict[str, Any]:
@@ -278,17 +283,17 @@ def _truth_of(joint: _Joint) -> dict[str, Any]:
 
 
 class SegmentClient(RequestClient):
-    """A connection to the segment whose control socket is at `path`; raises what `RequestClient` does."""
+    """A connection to the control socket of a segment at `path`; raises the errors of `RequestClient`."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "segment")
 
     def fault(self, fault: Mapping[str, Any]) -> int:
-        """Let a fault begin, as `{"fault": "cable", "after": 3, "lasts": 1.5}`; return its number."""
+        """Begin a fault, as `{"fault": "cable", "after": 3, "lasts": 1.5}`; return its number."""
         return int(self.ask({"do": "fault", "fault": dict(fault)})["id"])
 
     def clear(self, number: int | None = None) -> list[int]:
-        """End a fault, or all of them; return the numbers of those that were active."""
+        """End a fault or all; return the numbers of those that were active."""
         request = {"do": "clear"} if number is None else {"do": "clear", "id": number}
         return list(self.ask(request)["cleared"])
 
@@ -297,32 +302,32 @@ class SegmentClient(RequestClient):
         return list(self.ask({"do": "faults"}))
 
     def truth(self) -> dict[str, Any]:
-        """Return what the slaves truly do, also when no frame comes back.
+        """Return the true state of the slaves, independent of the bus.
 
         `time_ns` (CLOCK_MONOTONIC) and `slaves`, a list with `position`, `model`, `al` (as "SAFE-OP"), `reachable`; of
         drives `position_rad`, `velocity_rad_s`, `state` (CiA 402), `torque_on`, `moved_ns` (last instant at which it
         was faster than 0.002 rad/s; 0: not since the first question) and `peak_rad_s` (since `clear_peaks`), of drives
         with several axes those of the first, and of each in `axes`; of a shape
-        setter's box `gate`, `relay`, `relay_closed`, `current` (A) and `middle_temperature` (C). Who asks for nothing
-        for 10 s misses what moves until the next request.
+        setter's box `gate`, `relay`, `relay_closed`, `current` (A) and `middle_temperature` (C). Monitoring pauses
+        after 10 s without a request.
         """
         return dict(self.ask({"do": "truth"}))
 
     def clear_peaks(self) -> None:
-        """Let `peak_rad_s` count from now."""
+        """Reset `peak_rad_s`."""
         self.ask({"do": "clear_peaks"})
 
     def edges(self, slave: int, output: int) -> list[int]:
-        """Return when an output (from 1) of the IO box at position `slave` changed, ns of the box's own clock.
+        """Return the times of changes of an output (from 1) of the IO box at position `slave`, ns of the box's clock.
 
-        The first question begins; each returns what came since the one before it, of which 1024 edges are kept.
+        The first call starts the recording; each further one returns up to 1024 edges since the last.
         """
         return list(self.ask({"do": "edges", "slave": slave, "output": output}))
 
     def get(self, slave: int | str, index: int | None = None, subindex: int = 0) -> list[dict[str, Any]]:
-        """Return an object of a slave, which is a position from 1 or a name; without `index` all of its process data.
+        """Return an object of a slave (a position from 1 or a name); without `index` all of its process data.
 
-        Each has `index`, `subindex`, `name` and `value`; a string of bytes is `0x` and its digits.
+        Each has `index`, `subindex`, `name` and `value`; bytes are `0x` and hexadecimal digits.
         """
         request: dict[str, Any] = {"do": "get", "slave": slave}
         if index is not None:
@@ -330,6 +335,6 @@ class SegmentClient(RequestClient):
         return list(self.ask(request))
 
     def set(self, slave: int | str, index: int, subindex: int, value: float | str) -> dict[str, Any]:
-        """Give an object of a slave a value past all rights, as its inputs; return it as `get` does."""
+        """Set an object of a slave, as an input, without access checks; return it as `get` does."""
         request = {"do": "set", "slave": slave, "index": index, "subindex": subindex, "value": value}
         return dict(self.ask(request))

@@ -1,4 +1,4 @@
-"""The kinds of faults of the frames between the segment's socket and its first slave."""
+"""Faults of the frames between the segment's socket and its first slave."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from rtcp.virtual.faults.fault import MOST_AT_ONCE, FrameFault, Frames, Seed, Se
 from rtcp.virtual.protocol import DATAGRAM_HEADER, ETHERTYPE, HEADER, LENGTH_MASK, MORE_FOLLOWS
 
 LONGEST_BEHIND = 20_000_000
-"""Noise that is late by more than this many ns, because the process was stopped, is left out."""
+"""Upper bound on the lateness of noise, ns; later noise (the process was stopped) is dropped."""
 
 
-# -- the kinds that strike frames that pass -------------------------------------------------------------------------
+# -- faults of passing frames -------------------------------------------------------------------------
 
 
 @dataclass
 class Loss(StrikingFault, FrameFault):
     """Frames are lost: each with the probability `rate`, or the next `burst` of them and no more.
 
-    Half of what is lost never reaches the slaves, the other half is lost on its way back.
+    Half of them never reach the slaves; the other half is lost on the return path.
     """
 
     name = "loss"
     counted = ("lost_before", "lost_behind")
 
     def prepare(self, t: int) -> None:
-        """Begin anew."""
+        """Reset."""
         super().prepare(t)
         self._behind = False
 
     @property
     def over(self) -> bool:
-        """Whether the burst has passed, and the answers that it takes."""
+        """Whether the burst and its answers are complete."""
         return super().over and not self._behind
 
     def arrives(self) -> bool:
-        """Choose whether the frame is lost, and where."""
+        """Decide whether and where the frame is lost."""
         self._behind = False
         if not self._next():
             return True
@@ -52,7 +52,7 @@ class Loss(StrikingFault, FrameFault):
         return self._behind
 
     def answer(self, answers: list[bytes], t: int, frames: Frames) -> list[bytes]:
-        """Lose the answer, where that was chosen."""
+        """Drop the answer if so decided."""
         if not self._behind:
             return answers
         self._behind = False
@@ -62,23 +62,23 @@ class Loss(StrikingFault, FrameFault):
 
 @dataclass
 class AnswerFault(StrikingFault, FrameFault):
-    """Base of the faults that strike answers alone."""
+    """Base of the faults of answers."""
 
     def answer(self, answers: list[bytes], t: int, frames: Frames) -> list[bytes]:
-        """Strike some of the answers."""
+        """Affect some of the answers."""
         passing: list[bytes] = []
         for frame in answers:
             passing += self.strike(frame, t, frames) if self.strikes() else (frame,)
         return passing
 
     def strike(self, frame: bytes, t: int, frames: Frames) -> tuple[bytes, ...]:
-        """Return what goes back to the master now instead of `frame`."""
+        """Return the frames to send now in place of `frame`."""
         raise NotImplementedError
 
 
 @dataclass
 class Garble(AnswerFault):
-    """`bits` bits of answers are turned over behind the last checksum: what no Ethernet card would notice."""
+    """`bits` bits of answers are inverted after the last checksum, unnoticed by an Ethernet card."""
 
     name = "garble"
     counted = ("garbled",)
@@ -86,7 +86,7 @@ class Garble(AnswerFault):
     bits: Annotated[int, Ge(1), Le(1000)] = 1
 
     def strike(self, frame: bytes, t: int, frames: Frames) -> tuple[bytes, ...]:
-        """Turn bits over."""
+        """Invert bits."""
         turned = bytearray(frame)
         count = 8 * len(frame)
         for bit in self.random.sample(range(count), min(self.bits, count)):
@@ -96,24 +96,24 @@ class Garble(AnswerFault):
 
 @dataclass
 class Reorder(StrikingFault, FrameFault):
-    """An answer comes after the one that follows it."""
+    """An answer arrives after the following one."""
 
     name = "reorder"
     counted = ("reordered",)
     stage = 2
 
     def prepare(self, t: int) -> None:
-        """Begin anew."""
+        """Reset."""
         super().prepare(t)
         self._kept: bytes | None = None
 
     @property
     def over(self) -> bool:
-        """Whether the burst has passed, and nothing is kept of it."""
+        """Whether the burst is complete and no answer is retained."""
         return super().over and self._kept is None
 
     def answer(self, answers: list[bytes], t: int, frames: Frames) -> list[bytes]:
-        """Keep one answer until the next one has gone."""
+        """Retain an answer until the next one is sent."""
         passing: list[bytes] = []
         for frame in answers:
             if self._kept is not None:
@@ -126,14 +126,14 @@ class Reorder(StrikingFault, FrameFault):
         return passing
 
     def kept(self) -> list[bytes]:
-        """Return the answer that it has kept."""
-        kept, self._kept = self._kept, None
-        return [] if kept is None else [kept]
+        """Return the retained answer."""
+        frame, self._kept = self._kept, None
+        return [] if frame is None else [frame]
 
 
 @dataclass
 class Duplicate(AnswerFault):
-    """Answers come twice."""
+    """Answers arrive twice."""
 
     name = "duplicate"
     counted = ("duplicated",)
@@ -146,7 +146,7 @@ class Duplicate(AnswerFault):
 
 @dataclass
 class Delay(AnswerFault):
-    """Answers come `ms` late."""
+    """Answers arrive `ms` late."""
 
     name = "delay"
     counted = ("delayed",)
@@ -164,7 +164,7 @@ class Delay(AnswerFault):
 
 @dataclass
 class Noise(FrameFault):
-    """Frames of other protocols, and malformed ones of EtherCAT's type, `rate_hz` of them a second."""
+    """Frames of other protocols, and malformed EtherCAT frames, at `rate_hz`."""
 
     name = "noise"
     strikes_passing = False
@@ -173,7 +173,7 @@ class Noise(FrameFault):
     seed: Seed = 0
 
     def prepare(self, t: int) -> None:
-        """Begin anew."""
+        """Reset."""
         self._random = Random(self.seed)
         self._period = max(1, round(1e9 / self.rate_hz))
         self.due = t + self._period
@@ -211,16 +211,16 @@ def _address(random: Random) -> bytes:
 
 
 def arp(random: Random) -> bytes:
-    """Return a request for somebody's address (RFC 826)."""
+    """Return an ARP request (RFC 826)."""
     source = b"\x02" + random.randbytes(5)
-    asked = _ARP.pack(1, 0x0800, 6, 4, 1, source, _address(random), bytes(6), _address(random))
-    return _ethernet(random, _BROADCAST, 0x0806, asked)
+    request = _ARP.pack(1, 0x0800, 6, 4, 1, source, _address(random), bytes(6), _address(random))
+    return _ethernet(random, _BROADCAST, 0x0806, request)
 
 
 def ip(random: Random) -> bytes:
-    """Return a UDP datagram to everybody (RFC 791, 768)."""
-    said = random.randbytes(random.randrange(1, 600))
-    udp = _UDP.pack(random.randrange(1024, 65536), 5353, _UDP.size + len(said), 0) + said
+    """Return a UDP broadcast (RFC 791, 768)."""
+    payload = random.randbytes(random.randrange(1, 600))
+    udp = _UDP.pack(random.randrange(1024, 65536), 5353, _UDP.size + len(payload), 0) + payload
     header = bytearray(
         _IP.pack(0x45, 0, _IP.size + len(udp), random.randrange(65536), 0, 64, 17, 0, _address(random), b"\xff" * 4)
     )
@@ -231,27 +231,27 @@ def ip(random: Random) -> bytes:
 
 
 def lldp(random: Random) -> bytes:
-    """Return what a switch tells its neighbour: chassis, port, how long that holds (IEEE 802.1AB, 8.5)."""
+    """Return an LLDP frame: chassis, port, time to live (IEEE 802.1AB, 8.5)."""
     chassis = b"\x02\x07\x04" + b"\x02" + random.randbytes(5)
     port = b"\x04\x04\x05" + f"e{random.randrange(10)}".encode().ljust(3, b"0")
     return _ethernet(random, _LLDP_GROUP, 0x88CC, chassis + port + b"\x06\x02\x00\x78" + b"\x00\x00")
 
 
 def ethercat(random: Random) -> bytes:
-    """Return a frame of EtherCAT's type that no slave and no master may take for one."""
+    """Return an invalid frame with the EtherCAT EtherType, which every slave and master must ignore."""
     length = random.randrange(1, 200)
     header = HEADER.pack(random.randrange(15, 256), random.randrange(256), random.randrange(65536),
                          random.randrange(65536), length, 0)  # fmt: skip
     datagram = header + random.randbytes(length) + bytes(2)
     of_datagrams = 1 << 12
     forms: tuple[bytes, ...] = (
-        # of no known command; longer than it is; of another type; with a datagram longer than the frame
+        # unknown command; excessive length; other type; datagram longer than the frame
         (len(datagram) | of_datagrams).to_bytes(2, "little") + datagram,
         (LENGTH_MASK | of_datagrams).to_bytes(2, "little") + datagram,
         (len(datagram) | random.randrange(2, 16) << 12).to_bytes(2, "little") + datagram,
         (len(datagram) | of_datagrams).to_bytes(2, "little")
         + datagram[:6] + (LENGTH_MASK | MORE_FOLLOWS).to_bytes(2, "little") + datagram[8:],
-        # cut in the header of its first datagram; nothing but chance
+        # truncated in the header of the first datagram; random bytes
         (DATAGRAM_HEADER | of_datagrams).to_bytes(2, "little") + header[: random.randrange(DATAGRAM_HEADER)],
         random.randbytes(random.randrange(2, 1500)),
     )  # fmt: skip
@@ -261,4 +261,4 @@ def ethercat(random: Random) -> bytes:
 MAKERS: MappingProxyType[str, Callable[[Random], bytes]] = MappingProxyType(
     {"arp": arp, "ip": ip, "lldp": lldp, "ethercat": ethercat}
 )
-"""What makes a frame, by the protocol's name."""
+"""Protocol -> function that makes a frame."""

@@ -1,4 +1,4 @@
-"""Faults and people at the shape setter's control box."""
+"""Faults of the shape setter's control box, and its manual contacts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ What = Literal[
 
 
 def _box_at(devices: Sequence[DeviceModel], number: int) -> ShapeSetterBox:
-    # Here: it loads numpy, and every segment loads the faults.
+    # Imported late: it loads numpy, and every segment loads the faults.
     from rtcp.virtual.models.shape_setter import ShapeSetterBox
 
     device = devices[place_of(devices, number)]
@@ -33,14 +33,14 @@ def _box_at(devices: Sequence[DeviceModel], number: int) -> ShapeSetterBox:
 
 @dataclass(frozen=True)
 class CircuitOfHeater(DeviceFault):
-    """Something in the heater's circuit is defect; a blown fuse is put in anew at the end."""
+    """A part of the heater's circuit is defective; a blown fuse is replaced at the end."""
 
     name = "circuit"
     slave: Position
     what: What
 
     def begin(self, devices: Sequence[DeviceModel]) -> End:
-        """Let it be there."""
+        """Inject the fault."""
         circuit, fault = _box_at(devices, self.slave).circuit, CircuitFault[self.what.upper()]
         circuit.inject(fault)
         return lambda _: circuit.clear(fault)
@@ -48,14 +48,14 @@ class CircuitOfHeater(DeviceFault):
 
 @dataclass(frozen=True)
 class Contacts(DeviceFault):
-    """Closed contacts at the heater's box: bits 0 key at Auto, 1 at Manual, 2, 3 button, 4, 5 robot's circuit."""
+    """Closed contacts of the heater's box: bit 0 key in Auto, 1 in Manual, 2 and 3 button, 4 and 5 robot's circuit."""
 
     name = "contacts"
     slave: Position
     closed: Annotated[int, Ge(0), Le(0x3F)]
 
     def begin(self, devices: Sequence[DeviceModel]) -> End:
-        """Set them; at the end they are as they were."""
+        """Set the contacts; restore them at the end."""
         box = _box_at(devices, self.slave)
         before, box.contacts = box.contacts, self.closed
 

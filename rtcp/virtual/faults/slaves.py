@@ -1,4 +1,4 @@
-"""The kinds of faults of slaves, of the cables between them and of their devices."""
+"""Faults of slaves, of the cables between them and of their devices."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ DriveError = Literal[
     "over-current", "over-voltage", "under-voltage", "over-temperature", "encoder", "over-speed", "following-error"
 ]
 JOYSTICK = 0x3F
-"""The joystick's lines: the six first inputs."""
+"""The joystick's lines: the first six inputs."""
 
 _D = TypeVar("_D", bound=DeviceModel)
 
@@ -47,7 +47,7 @@ _D = TypeVar("_D", bound=DeviceModel)
 
 @dataclass(frozen=True)
 class CableFault(Fault):
-    """The cable behind slave `after` is broken: frames turn round there, the slaves behind hear nothing."""
+    """The cable behind slave `after` is broken: frames return there and do not reach the slaves beyond."""
 
     name = "cable"
     after: Cable
@@ -68,7 +68,7 @@ class CableFault(Fault):
 
 @dataclass(frozen=True)
 class PowerFault(SlaveFault):
-    """A slave has no supply: no frame passes it. When it comes back its registers are those of power-on, in INIT."""
+    """A slave has no supply: no frame passes it. After power-on its registers are reset, in INIT."""
 
     name = "power"
 
@@ -87,11 +87,11 @@ class PowerFault(SlaveFault):
 
 @dataclass
 class Corrupt(StrikingFault):
-    """Frames are damaged on the cable behind slave `after`, on their way `out` or `back`: their checksum is wrong.
+    """Frames are damaged on the cable behind slave `after`, on the way `out` or `back`: their checksum is wrong.
 
-    Out: the slaves before it have worked; the next one counts an error (0x0300), those behind it count a forwarded one
-    (0x0308). Back: all slaves have worked; slave `after` counts an error at port 1 (0x0302), those before it count a
-    forwarded one (0x0309). Either way the master gets nothing.
+    Out: the slaves before it have processed the frame; the next one counts an error (0x0300), those beyond count a
+    forwarded one (0x0308). Back: all slaves have processed it; slave `after` counts an error at port 1 (0x0302), those
+    before it count a forwarded one (0x0309). In both cases the master receives nothing.
     """
 
     name = "corrupt"
@@ -101,7 +101,7 @@ class Corrupt(StrikingFault):
     port: Port = 1
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
-        """Damage frames from now on."""
+        """Begin to damage frames."""
         damage = Damage(cable_of(segment, self.after, self.port), self.strikes, self.way == "back")
         return self.listed(segment.damages, damage)
 
@@ -118,7 +118,7 @@ class AlRefuse(SlaveFault):
     code: AlCode = 0x0001
 
     def begin(self, slave: Slave, t: int) -> End:
-        """Refuse from now on."""
+        """Begin to refuse."""
         refusals, refusal = slave.faults.refusals, (_state(self.state), self.code)
         refusals.append(refusal)
         return lambda _: refusals.remove(refusal)
@@ -126,12 +126,12 @@ class AlRefuse(SlaveFault):
 
 @dataclass(frozen=True)
 class AlHang(SlaveFault):
-    """A slave hangs in its AL state: what is asked of it is neither done nor refused."""
+    """A slave hangs in its AL state: it neither executes nor refuses requests."""
 
     name = "al_hang"
 
     def begin(self, slave: Slave, t: int) -> End:
-        """Hang from now on; what is asked meanwhile is done at the end."""
+        """Begin to hang; requests received meanwhile are executed at the end."""
 
         def go_on(t: int) -> None:
             slave.faults.hangs -= 1
@@ -160,13 +160,13 @@ class AlFall(SlaveFault):
 
 @dataclass(frozen=True)
 class SdoLate(SlaveFault):
-    """A slave answers each SDO `ms` later than it would."""
+    """A slave answers each SDO `ms` late."""
 
     name = "sdo_late"
     ms: Annotated[float, Gt(0), Le(60_000)]
 
     def begin(self, slave: Slave, t: int) -> End:
-        """Delay the answers from now on."""
+        """Begin to delay the answers."""
         delays, delay = slave.faults.sdo_delays, round(self.ms * 1e6)
         delays.append(delay)
         return lambda _: delays.remove(delay)
@@ -174,14 +174,14 @@ class SdoLate(SlaveFault):
 
 @dataclass(frozen=True)
 class SdoAbort(SlaveFault):
-    """A slave aborts each SDO service (of object `index` only, unless that is 0) with `code`."""
+    """A slave aborts each SDO service with `code`; `index` selects an object, 0: all."""
 
     name = "sdo_abort"
     code: Annotated[int, Ge(1), Le(0xFFFFFFFF)] = 0x08000020
     index: Annotated[int, Ge(0), Le(0xFFFF)] = 0
 
     def begin(self, slave: Slave, t: int) -> End:
-        """Abort from now on."""
+        """Begin to abort."""
         aborts, abort = slave.faults.sdo_aborts, (self.index, self.code)
         aborts.append(abort)
         return lambda _: aborts.remove(abort)
@@ -189,14 +189,14 @@ class SdoAbort(SlaveFault):
 
 @dataclass
 class WorkingCounter(StrikingFault):
-    """A slave takes part in process data but does not count itself in the working counter."""
+    """A slave processes process data but does not increment the working counter."""
 
     name = "wkc"
     counted = ("not_counted",)
     slave: Position
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
-        """Leave the slave out from now on."""
+        """Begin to omit the slave."""
         return self.listed(segment.miscounts, (slave_at(segment, self.slave), self.strikes))
 
 
@@ -212,13 +212,13 @@ class ClockFault(SlaveFault):
     """Base of the faults of a distributed clock."""
 
     def begin(self, slave: Slave, t: int) -> End | None:
-        """Let it begin in a slave that has a clock."""
+        """Begin in a slave with a clock."""
         if slave.clock is None:
             raise FaultRefused(f"slave {self.slave} ({slave.device.identity.name}) has no distributed clock")
         return self.disturb(slave, slave.clock, t)
 
     def disturb(self, slave: Slave, clock: Clock, t: int) -> End | None:
-        """Let it begin in the clock of `slave`, as `start`."""
+        """Begin in the clock of `slave`, as `start`."""
         raise NotImplementedError
 
 
@@ -259,17 +259,17 @@ class ClockJump(ClockFault):
 
 @dataclass(frozen=True)
 class ClockDrift(ClockFault):
-    """A slave's own clock runs fast by `ppm` more than it did."""
+    """The drift of a slave's own clock increases by `ppm`."""
 
     name = "clock_drift"
     ppm: Annotated[float, Ge(-1000), Le(1000)] = 200.0
 
     def disturb(self, slave: Slave, clock: Clock, t: int) -> End:
-        """Drift from now on."""
+        """Begin to drift."""
 
         def change(ppm: float, t: int) -> None:
             slave.faults.drift_ppm += ppm
-            # Not the clock of before: the supply may have been away meanwhile.
+            # The present clock: a power cycle may have replaced it.
             if slave.clock is not None:
                 slave.clock.change_drift(ppm, t)
 
@@ -286,9 +286,9 @@ def _sync0(slave: Slave) -> SyncGenerator | None:
 
 @dataclass(frozen=True)
 class DriveErrorFault(DeviceFault):
-    """A drive meets an error, sends its emergency message and reacts as its fault reaction says.
+    """A drive has an error, sends its emergency message and executes its fault reaction.
 
-    While the fault lasts a fault reset is refused; `lasts` left out: a single occurrence, which a reset clears.
+    While the fault lasts a fault reset is refused; without `lasts` it is a single event, which a reset clears.
     """
 
     name = "drive"
@@ -298,7 +298,7 @@ class DriveErrorFault(DeviceFault):
     axis: Annotated[int, Ge(1), Le(8)] = 1
 
     def begin(self, devices: Sequence[DeviceModel]) -> End:
-        """Let the drive meet the error."""
+        """Trigger the error."""
         device = devices[place_of(devices, self.slave)]
         if not device.servos:
             raise FaultRefused(f"slave {self.slave} ({device.identity.name}) is no drive")
@@ -312,7 +312,7 @@ class DriveErrorFault(DeviceFault):
 
 @dataclass(frozen=True)
 class InputsFrozen(DeviceFault):
-    """Inputs and counters of a box or meter keep their value, as if its processor hung; frames are answered as ever."""
+    """Inputs and counters of a box or meter freeze, as if its processor hung; it still answers frames."""
 
     name = "input_frozen"
     slave: Position
@@ -342,7 +342,7 @@ Newton = Annotated[float, Ge(-500), Le(500)]
 
 @dataclass(frozen=True)
 class Push(Fault):
-    """A force (N) and a torque (Nm) act at the tool, along and about the axes of the base."""
+    """A force (N) and a torque (Nm) act at the tool, in the axes of the base."""
 
     name = "push"
     x: Newton = 0.0
@@ -353,7 +353,7 @@ class Push(Fault):
     rz: Newton = 0.0
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
-        """Push from now on."""
+        """Begin to push."""
         if segment.arm is None:
             raise FaultRefused("no arm to push: the segment's file names none with geometry, or has no six drives")
         return segment.arm.push((self.x, self.y, self.z, self.rx, self.ry, self.rz))
@@ -372,7 +372,7 @@ class TerminalsFault(DeviceFault):
         return lambda _: box.broken.remove(broken)
 
     def broken(self, inputs: int) -> BrokenTerminals:
-        """Return which terminals are broken, and how; `inputs` are the levels of now."""
+        """Return the broken terminals; `inputs`: present levels."""
         raise NotImplementedError
 
 
@@ -386,7 +386,7 @@ class TerminalFault(TerminalsFault):
     ms: Annotated[float, Gt(0), Le(1000)] = 2.0
 
     def broken(self, inputs: int) -> BrokenTerminals:
-        """Return one terminal; the first thing that is seen of one that bounces is the other level."""
+        """Return the terminal; a bouncing one starts at the opposite level."""
         mask = 1 << self.number - 1
         if self.how == "bounce":
             return BrokenTerminals(mask, ~inputs, self.ms * 1e-3)
@@ -395,7 +395,7 @@ class TerminalFault(TerminalsFault):
 
 @dataclass(frozen=True)
 class JoystickCode(TerminalsFault):
-    """The joystick's six inputs show `value`, whatever its lever does; 63 is neutral, most values mean nothing."""
+    """The joystick's six inputs are stuck at `value`; 63 is neutral, most values are invalid."""
 
     name = "joystick_code"
     value: Annotated[int, Ge(0), Le(63)]

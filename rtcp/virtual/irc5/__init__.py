@@ -1,1 +1,1 @@
-"""A virtual ABB IRC5: up to four mechanical units that speak EGM. Degrees, mm and s inside, as in ABB's manuals."""
+"""A virtual ABB IRC5: up to four mechanical units with EGM. Units inside are degrees, mm and s, as in ABB's manuals."""

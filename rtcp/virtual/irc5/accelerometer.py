@@ -1,4 +1,4 @@
-"""A virtual accelerometer at the flange: what the arm does, beside what the controller reports of it."""
+"""A virtual accelerometer at the flange: true motion of the arm, independent of the controller's feedback."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from collections.abc import Sequence
 from rtcp.virtual.irc5.geometry import MM_PER_M, Geometry
 
 _KEPT = 1000
-"""Samples: 4 s."""
+"""Buffered samples: 4 s."""
 Sample = tuple[float, float, float, float]
 """CLOCK_MONOTONIC of the sample, s; acceleration along the axes of the base, m/s^2, without gravity."""
 
 
 class Accelerometer:
-    """A sample a period, from the true joints.
+    """One sample per period, from the true joint positions.
 
     Args:
         geometry: of the arm.
-        period_s: of the samples.
+        period_s: sample period.
     """
 
     def __init__(self, geometry: Geometry, period_s: float) -> None:
@@ -28,7 +28,7 @@ class Accelerometer:
         self._samples: deque[Sample] = deque(maxlen=_KEPT)
 
     def sample(self, joints: Sequence[float], stamp_s: float) -> None:
-        """Take the joints of this period, degrees."""
+        """Add a sample for the joints of this period, degrees."""
         self._positions.append((stamp_s, self._geometry.flange(joints).position))
         if len(self._positions) == 3:
             (_, first), (middle_s, middle), (_, last) = self._positions
@@ -37,7 +37,7 @@ class Accelerometer:
             self._samples.append((middle_s, x, y, z))
 
     def take(self) -> list[Sample]:
-        """Return the samples since the last call, the newest 4 s of them."""
-        taken = list(self._samples)
+        """Return the samples since the last call, at most the newest 4 s."""
+        samples = list(self._samples)
         self._samples.clear()
-        return taken
+        return samples

@@ -14,7 +14,7 @@ from rtcp.virtual.irc5.config import EgmConfig
 
 
 class ControlLaw:
-    """The speeds of all joints of a unit; its state is the low pass and the ramp."""
+    """Speeds of all joints of a unit, with the state of the low pass and the ramp."""
 
     def __init__(self, config: EgmConfig, speed_limits: Sequence[float]) -> None:
         """`speed_limits`: of each joint, degrees/s."""
@@ -25,11 +25,11 @@ class ControlLaw:
         self._speed_limits = tuple(speed_limits)
         self._filtered = [0.0] * len(speed_limits)
         self.utilization = 0.0
-        """Largest share of a joint's speed limit that was asked for in the last step, %."""
+        """Largest requested share of a joint's speed limit in the last step, %."""
         self._elapsed = 0.0
 
     def restart(self, speeds: Sequence[float]) -> None:
-        """Begin at these speeds, degrees/s, with the ramp."""
+        """Start the ramp at these speeds, degrees/s."""
         self._filtered = list(speeds)
         self.utilization = 0.0
         self._elapsed = 0.0
@@ -41,7 +41,7 @@ class ControlLaw:
         speed_reference: Sequence[float] | None,
         dt: float,
     ) -> list[float]:
-        """Return speeds, degrees/s: all are scaled alike until none exceeds its limit."""
+        """Return the speeds, degrees/s, scaled by one factor to their limits."""
         self._elapsed += dt
         ramp = 1.0 if self._elapsed >= self._ramp_in else self._elapsed / self._ramp_in
         share = 1.0 if self._cutoff == 0.0 else 1.0 - exp(-self._cutoff * dt)

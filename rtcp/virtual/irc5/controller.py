@@ -1,4 +1,4 @@
-"""The controller: one panel, its mechanical units with the ways of their datagrams, and the requests of an operator."""
+"""The controller: its panel, its mechanical units with their datagrams, and the operator's requests."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import Any
 
-from rtcp.config.document import shown
+from rtcp.config.findings import shown
 from rtcp.virtual.irc5.config import Irc5Config, UnitConfig
 from rtcp.virtual.irc5.faults import SHARES, DatagramFaults
 from rtcp.virtual.irc5.mechanical_unit import MechanicalUnit
@@ -15,7 +15,7 @@ from rtcp.virtual.irc5.streaming import STREAMING_FAULTS, RapidStreaming
 from rtcp.virtual.request_socket import RequestRefused, choose
 
 _LONGEST_DELAY = 250
-"""Cycles that a datagram may be late: 1 s."""
+"""Upper bound on the delay of a datagram, cycles: 1 s."""
 _HIGHEST_UTILIZATION = 1000.0
 """%."""
 _ONCE: dict[str, Callable[[MechanicalUnit], None]] = {
@@ -25,10 +25,10 @@ _ONCE: dict[str, Callable[[MechanicalUnit], None]] = {
     "mci_error": lambda unit: unit.fail("50453 move not allowed (a fault on command)"),
     "collision": lambda unit: unit.fail("a collision was detected (a fault on command)", collision=True),
 }
-"""Faults that happen and are over."""
+"""Faults without duration."""
 _FAULTS = (*_ONCE, "utilization", "silent", "late", *SHARES)
 _UNIT_FAULTS_OF_STREAMING = ("arm_lost", "rapid_stop", "mci_error", "collision")
-"""Those of a unit that exist without EGM too, and the loss of an arm."""
+"""Faults of a unit that also exist without EGM, and the loss of an arm."""
 
 
 class Unit:
@@ -39,14 +39,14 @@ class Unit:
         self.to_pc, self.from_pc = DatagramFaults(config.port), DatagramFaults(config.port + 1)
 
     def step(self, received: Iterable[bytes], clock_s: float) -> list[bytes]:
-        """Let one period of the unit pass with what the PC sent in it; return what goes to the PC."""
+        """Advance by one period with the PC's datagrams; return the datagrams to the PC."""
         for datagram in self.from_pc.cycle(received):
             self.mechanical.receive(datagram)
         sent = self.mechanical.step(clock_s)
         return self.to_pc.cycle(() if sent is None else (sent,))
 
     def clear(self) -> None:
-        """End the faults that last."""
+        """End all faults."""
         self.to_pc.clear()
         self.from_pc.clear()
         self.mechanical.utilization_override = None
@@ -75,7 +75,7 @@ class Unit:
             datagrams.shares[kind] = _number(request, 1.0)
 
     def status(self) -> dict[str, Any]:
-        """Return what the unit does, as plain values."""
+        """Return the state of the unit as plain values."""
         unit = self.mechanical
         return {
             "remote": f"{unit.config.remote}:{unit.config.port}",
@@ -90,13 +90,13 @@ class Unit:
 
 
 class Controller:
-    """An IRC5 in simulated time: `panel.advance` and each unit's `step` let time pass."""
+    """An IRC5 in simulated time, advanced by `panel.advance` and each unit's `step`."""
 
     def __init__(self, config: Irc5Config) -> None:
-        """Build the controller; with `autostart`, in Auto, its motors are on and RAPID runs.
+        """With `autostart`, in Auto, motors are on and RAPID runs.
 
         Raises:
-            ConfigError: the file of an arm does not exist or is wrong, or a unit begins outside its ranges.
+            ConfigError: the file of an arm is missing or invalid, or a unit starts outside its ranges.
         """
         self.panel = Panel(Mode(config.mode), config.emergency_stop_category)
         resume = not config.do_not_restart_after_motors_off
@@ -111,7 +111,7 @@ class Controller:
                 unit.mechanical.start_rapid()
 
     def request(self, request: dict[str, Any]) -> Any:
-        """Do what an operator asks for, as `{"do": "stop", "circuit": "emergency"}`; return plain values.
+        """Execute an operator's request, as `{"do": "stop", "circuit": "emergency"}`; return plain values.
 
         Raises:
             RequestRefused: with a sentence.
@@ -161,7 +161,7 @@ class Controller:
                 unit.fault(request)
 
     def status(self) -> dict[str, Any]:
-        """Return what the controller and its units do, as plain values."""
+        """Return the state of the controller and its units as plain values."""
         panel = self.panel
         return {
             "mode": panel.mode.value,
@@ -181,11 +181,11 @@ def _number(request: dict[str, Any], most: float) -> float:
 
 
 def _choice(kind: type[Enum], request: dict[str, Any], key: str) -> Enum:
-    found = request.get(key)
+    value = request.get(key)
     for choice in kind:
-        if choice.value == found:
+        if choice.value == value:
             return choice
-    raise RequestRefused(f"{key}: found {shown(found)}, allowed is one of {', '.join(c.value for c in kind)}")
+    raise RequestRefused(f"{key}: found {shown(value)}, allowed is one of {', '.join(c.value for c in kind)}")
 
 
 _Do = Callable[[Controller, dict[str, Any]], Any]
@@ -195,11 +195,11 @@ def _press(button: Callable[[Panel], None]) -> _Do:
     return lambda controller, _: button(controller.panel)
 
 
-def _turn(switch: Callable[[Panel, Any], None], key: str, kind: type[Enum]) -> _Do:
+def _switch(switch: Callable[[Panel, Any], None], key: str, kind: type[Enum]) -> _Do:
     return lambda controller, request: switch(controller.panel, _choice(kind, request, key))
 
 
-def _each(do: Callable[[MechanicalUnit], None]) -> _Do:
+def _for_each(do: Callable[[MechanicalUnit], None]) -> _Do:
     def of_units(controller: Controller, request: dict[str, Any]) -> None:
         for unit in controller.named(request.get("unit")):
             do(unit.mechanical)
@@ -211,12 +211,12 @@ _VERBS: dict[str, tuple[tuple[str, ...], _Do]] = {
     "status": ((), lambda controller, _: controller.status()),
     "motors_on": ((), _press(Panel.press_motors_on)),
     "motors_off": ((), _press(Panel.switch_motors_off)),
-    "mode": (("mode",), _turn(Panel.select_mode, "mode", Mode)),
-    "enabling": (("position",), _turn(Panel.hold_enabling, "position", Enabling)),
-    "stop": (("circuit",), _turn(Panel.open_circuit, "circuit", Stop)),
-    "release": (("circuit",), _turn(Panel.close_circuit, "circuit", Stop)),
-    "start_rapid": (("unit",), _each(MechanicalUnit.start_rapid)),
-    "stop_rapid": (("unit",), _each(MechanicalUnit.stop_rapid)),
+    "mode": (("mode",), _switch(Panel.select_mode, "mode", Mode)),
+    "enabling": (("position",), _switch(Panel.hold_enabling, "position", Enabling)),
+    "stop": (("circuit",), _switch(Panel.open_circuit, "circuit", Stop)),
+    "release": (("circuit",), _switch(Panel.close_circuit, "circuit", Stop)),
+    "start_rapid": (("unit",), _for_each(MechanicalUnit.start_rapid)),
+    "stop_rapid": (("unit",), _for_each(MechanicalUnit.stop_rapid)),
     "clear": (("unit",), Controller.clear),
     "accelerometer": (
         ("unit",),
@@ -227,4 +227,4 @@ _VERBS: dict[str, tuple[tuple[str, ...], _Do]] = {
     ),
     "fault": (("unit", "fault", "value", "direction"), Controller.fault),
 }
-"""Request -> its keys, and what does it."""
+"""Verb of a request -> its keys and its handler."""

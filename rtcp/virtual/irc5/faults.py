@@ -1,4 +1,4 @@
-"""What goes wrong with a unit's datagrams, in one direction."""
+"""Faults of a unit's datagrams in one direction."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterable
 from random import Random
 
 SHARES = ("lost", "doubled", "old")
-"""Faults that take a share of the datagrams, 0 to 1."""
+"""Faults that affect a share of the datagrams, 0 to 1."""
 _REMEMBERED = 25
-"""Datagrams that may come back as old ones: 0.1 s of them."""
+"""Datagrams that may be repeated as old ones: 0.1 s."""
 
 
 class DatagramFaults:
-    """The way of datagrams: all come through, but for what is set here. The same seed gives the same losses."""
+    """Path of datagrams with the faults set here. The same seed gives the same losses."""
 
     def __init__(self, seed: int) -> None:
         self._random = Random(seed)
@@ -23,14 +23,14 @@ class DatagramFaults:
         self.clear()
 
     def clear(self) -> None:
-        """End all faults; datagrams that are under way still arrive."""
+        """End all faults; delayed datagrams still arrive."""
         self.silent = False
         self.late = 0
         """Delay, cycles."""
         self.shares = dict.fromkeys(SHARES, 0.0)
 
     def cycle(self, datagrams: Iterable[bytes]) -> list[bytes]:
-        """Take what is sent in a cycle and return what arrives in it."""
+        """Take the datagrams sent in a cycle and return those that arrive in it."""
         self._cycle += 1
         for datagram in datagrams:
             self._sent.append(datagram)

@@ -1,6 +1,6 @@
-"""Where the flange is: forward kinematics of the controller, from the rows of an arm's file in `config/`.
+"""Forward kinematics of the controller, from the rows of an arm's file in `config/`.
 
-Written apart from `kinematics`, which the master's side uses.
+Independent of `kinematics`, which the master's side uses.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class Geometry:
         self._rows = tuple((cos(alpha), sin(alpha), a, d, offset) for alpha, a, d, offset in rows)
 
     def flange(self, joints: Sequence[float]) -> FlangePose:
-        """Return the pose at joint angles in degrees; axes beyond the sixth do not count."""
+        """Return the pose at joint angles in degrees; axes beyond the sixth are ignored."""
         # Orientation, by columns (xx, xy, xz), (yx, yy, yz), (zx, zy, zz), and position, m, of the current frame.
         xx = yy = zz = 1.0
         xy = xz = yx = yz = zx = zy = px = py = pz = 0.0
         for (ca, sa, a, d, offset), joint in zip(self._rows, joints, strict=False):
             angle = radians(joint) + offset
             c, s = cos(angle), sin(angle)
-            # Rx(alpha): y and z turned about x.
+            # Rx(alpha) rotates y and z about x.
             bx, by, bz = ca * yx + sa * zx, ca * yy + sa * zy, ca * yz + sa * zz
             zx, zy, zz = ca * zx - sa * yx, ca * zy - sa * yy, ca * zz - sa * yz
             px, py, pz = px + a * xx + d * zx, py + a * xy + d * zy, pz + a * xz + d * zz
-            # Rz(theta): x and y turned about z.
+            # Rz(theta) rotates x and y about z.
             yx, yy, yz, xx, xy, xz = (
                 c * bx - s * xx, c * by - s * xy, c * bz - s * xz, c * xx + s * bx, c * xy + s * by, c * xz + s * bz,
             )  # fmt: skip
@@ -49,7 +49,7 @@ class Geometry:
 
 def _quaternion(xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float,
                 zz: float) -> tuple[float, float, float, float]:  # fmt: skip
-    """Quaternion of a rotation given by columns; from its largest component (Shepperd 1978)."""
+    """Return the quaternion of a rotation given by columns, from its largest component (Shepperd 1978)."""
     trace = xx + yy + zz
     largest = max(trace, xx, yy, zz)
     if largest == trace:

@@ -1,6 +1,6 @@
 """A mechanical unit in simulated time: its RAPID task, its EGM session and its joints. Degrees and s.
 
-The planned position follows the control law; the actual one is the planned one after the servo's dead time.
+The planned position follows the control law; the actual position is the planned one delayed by the servo's dead time.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from rtcp.virtual.request_socket import RequestRefused
 HAND_SPEED = 250.0
 """Largest speed of the flange in Hand, mm/s (ISO 10218-1)."""
 RAPID_PAUSE_S = 0.02
-"""Time that RAPID takes from the end of one EGMRunJoint to the next (assumed)."""
+"""Time from the end of one EGMRunJoint to the next (assumed)."""
 QUEUE = 64
-"""Datagrams that wait for their cycle; more are lost (assumed, as the depth of a socket's buffer)."""
+"""Upper bound on queued datagrams; further ones are lost (assumed, as for a socket's buffer)."""
 MOST_EVENTS = 50
 
 
 class RapidRefused(RequestRefused):
-    """RAPID cannot be started now: a sentence."""
+    """RAPID cannot start; the message is a sentence."""
 
 
 class MechanicalUnit:
-    """One arm of the controller. `receive` takes datagrams, `step` lets one period pass and returns what is sent."""
+    """An arm of the controller. `receive` queues datagrams; `step` advances by one period and returns its message."""
 
     def __init__(
         self, config: UnitConfig, panel: Panel, resume_after_motors_off: bool = True, uses_egm: bool = True
     ) -> None:
-        """Build the unit at rest with RAPID stopped; without EGM it is moved by `follow`.
+        """The unit starts at rest with RAPID stopped; without EGM `follow` moves it.
 
         Raises:
-            ConfigError: the arm's file does not exist or is wrong, or the initial position is outside its ranges.
+            ConfigError: the arm's file is missing or invalid, or the initial position is outside its ranges.
         """
         arm = load_mechanics(find_arm(config.arm))
         self.config = config
@@ -61,17 +61,17 @@ class MechanicalUnit:
             self.speed_limits.append(config.external_joint.velocity)
         for i, (position, (low, high)) in enumerate(zip(config.initial_position, self.ranges, strict=True)):
             if not low <= position <= high:
-                found = f"found {position:g} for joint {i + 1}, allowed is a number from {low:g} to {high:g}"
-                raise ConfigError([f"initial_position of {config.name}: {found}"])
+                mistake = f"found {position:g} for joint {i + 1}, allowed is a number from {low:g} to {high:g}"
+                raise ConfigError([f"initial_position of {config.name}: {mistake}"])
         self.planned = list(config.initial_position)
         self.speeds = [0.0] * len(self.planned)
         """Planned speeds of the last period, degrees/s."""
         self.mci = MciState.STOPPED
         self.rapid_running = False
         self.counts: Counter[str] = Counter()
-        """Datagrams by what became of them."""
+        """Number of datagrams by result."""
         self.events: deque[str] = deque(maxlen=MOST_EVENTS)
-        """Sentences with ABB's event numbers where they are known."""
+        """Sentences, with ABB's event numbers if known."""
         self.collision = False
         self.utilization_override: float | None = None
         """%, a fault; None: as computed."""
@@ -86,18 +86,18 @@ class MechanicalUnit:
         self._reference: Reference | None = None
         length = math.ceil(config.dead_time_s / config.period_s) + 1
         self._servo = deque([tuple(self.planned)] * length, length)
-        """Planned positions on their way to the joints; the first is the actual one."""
+        """Delayed planned positions; the first is the actual one."""
         self._start = tuple(self.planned)
         self._seqno = 0
         self._move_index = 0
         self._silence_s = self._converged_s = self._pause_s = 0.0
         self._stop_from = self.speeds
         self._stop_left = self._stop_rate = 0.0
-        """Share of the speed at the stop's beginning that is left, and what it loses, 1/s."""
+        """Remaining share of the stop's initial speed, and its rate of decrease, 1/s."""
         self._in_instruction = False
-        """Whether program start goes on within EGMRunJoint."""
+        """True: program start continues within EGMRunJoint."""
         self._suspended = False
-        """Whether EGMRunJoint goes on when motors are on again."""
+        """True: EGMRunJoint continues when motors are on again."""
 
     @property
     def actual(self) -> tuple[float, ...]:
@@ -112,7 +112,7 @@ class MechanicalUnit:
     # -- the operator -------------------------------------------------------------------------------------------------
 
     def start_rapid(self) -> None:
-        """Start the program: it resumes EGMRunJoint where it was stopped in it, else a new session begins.
+        """Start the program: it resumes an interrupted EGMRunJoint, or begins a new session.
 
         Raises:
             RapidRefused: motors are off.
@@ -131,14 +131,14 @@ class MechanicalUnit:
             self._begin_session()
 
     def stop_rapid(self) -> None:
-        """Stop the program: motion ends in the default ramp time; program start resumes it."""
+        """Stop the program: motion ends within the default ramp time; program start resumes it."""
         self._suspended = False
         if self.rapid_running:
             self.rapid_running = False
             self._leave(MciState.STOPPED, self.config.egm.ramp_s)
 
     def restart_session(self) -> None:
-        """Let RAPID go back to EGMReset and EGMSetupUC.
+        """Return RAPID to EGMReset and EGMSetupUC.
 
         Raises:
             RapidRefused: RAPID is stopped.
@@ -149,10 +149,10 @@ class MechanicalUnit:
         self._begin_session()
 
     def end_by_convergence(self) -> None:
-        """End EGMRunJoint as if all joints had been within the window for CondTime.
+        """End EGMRunJoint as by convergence of all joints for CondTime.
 
         Raises:
-            RapidRefused: EGMRunJoint does not run.
+            RapidRefused: EGMRunJoint is not active.
         """
         if self.mci is not MciState.RUNNING:
             raise RapidRefused(f"{self.config.name} is in MCI_{self.mci.name}: only MCI_RUNNING ends by convergence")
@@ -160,7 +160,7 @@ class MechanicalUnit:
         self._end_instruction("EGMRunJoint has converged")
 
     def fail(self, sentence: str, collision: bool = False) -> None:
-        """End the session with MCI_ERROR: RAPID stops, and its next start makes a new session."""
+        """End the session with MCI_ERROR: RAPID stops, and its next start begins a new session."""
         self.events.append(sentence)
         self.rapid_running = self._in_instruction = self._suspended = False
         self.collision = collision
@@ -169,14 +169,14 @@ class MechanicalUnit:
     # -- the cycle ----------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes) -> None:
-        """Put a datagram into the queue, of which each cycle reads one."""
+        """Queue a datagram; each cycle reads one."""
         if len(self._queue) < QUEUE:
             self._queue.append(datagram)
         else:
             self.counts["overflow"] += 1
 
     def step(self, clock_s: float) -> bytes | None:
-        """Let one period pass; return the message of this cycle, None where the unit is silent.
+        """Advance by one period; return the message of this cycle, None: the unit is silent.
 
         `clock_s`: the controller's clock, s since 1970.
         """
@@ -197,7 +197,7 @@ class MechanicalUnit:
         return self._codec.encode(self._state(clock_s))
 
     def follow(self, position: Sequence[float], dt: float) -> None:
-        """Let one period pass in which RAPID's move instructions plan this position, degrees."""
+        """Advance by one period to a position planned by RAPID's move instructions, degrees."""
         self._follow_motors()
         self.speeds = [(now - then) / dt for now, then in zip(position, self.planned, strict=True)]
         self.planned = list(position)
@@ -228,7 +228,7 @@ class MechanicalUnit:
             return
         self._silence_s = 0.0
         if self._reference is not None and reference.seqno <= self._reference.seqno:
-            self.counts["not_newer"] += 1  # EGM uses it all the same
+            self.counts["not_newer"] += 1  # EGM still uses it
         if self.mci is not MciState.RUNNING:
             self.counts["unused"] += 1
             return
@@ -239,7 +239,7 @@ class MechanicalUnit:
         self._reference = reference
 
     def _follow_motors(self) -> None:
-        """Stop with the motors, and go on with them where the configuration lets corrections resume."""
+        """Stop with the motors; resume with them if the configuration allows it."""
         if self._panel.motors is Motors.ON:
             if self._suspended:
                 self._suspended = False
@@ -252,7 +252,7 @@ class MechanicalUnit:
             self.events.append("motors are off: RAPID stopped")
 
     def _run(self) -> None:
-        """Enter EGMRunJoint; earlier references are not used, and a stop goes on until a new one comes."""
+        """Enter EGMRunJoint; earlier references are void, and a stop continues until a new one arrives."""
         self.mci = MciState.RUNNING
         self._in_instruction = True
         self._reference = None
@@ -260,7 +260,7 @@ class MechanicalUnit:
         self._move_index += 1
 
     def _begin_session(self) -> None:
-        """EGMReset, EGMSetupUC, EGMActJoint, EGMRunJoint: seqno counts from 0, the queue is empty."""
+        """Execute EGMReset, EGMSetupUC, EGMActJoint, EGMRunJoint: seqno restarts at 0 with an empty queue."""
         self._seqno = 0
         self._queue.clear()
         self.collision = False
@@ -271,7 +271,7 @@ class MechanicalUnit:
         """Leave MCI_RUNNING and come to rest within `time_s`."""
         if self.mci is MciState.RUNNING and self._reference is not None:
             self._stop_from, self._stop_left, self._stop_rate = self.speeds, 1.0, 1.0 / time_s
-        else:  # a stop under way goes on
+        else:  # a stop in progress continues
             self._stop_rate = max(self._stop_rate, self._stop_left / time_s)
         self.mci = state
         self._pause_s = 0.0
@@ -286,7 +286,7 @@ class MechanicalUnit:
             self.rapid_running = self._in_instruction = False
 
     def _advance(self, dt: float) -> None:
-        """One period of EGMRunJoint: the control law, its limits, and the ends of the instruction."""
+        """Execute a period of EGMRunJoint: control law, limits, and the ends of the instruction."""
         egm, reference = self.config.egm, self._reference
         if self._silence_s > egm.comm_timeout_s:
             self._end_instruction(f"41822 no data for {egm.comm_timeout_s:g} s: ERR_UDPUC_COMM")
@@ -325,7 +325,7 @@ class MechanicalUnit:
         return [speed * scale for speed in speeds]
 
     def _move(self, speeds: Sequence[float], dt: float) -> None:
-        """Move the planned position, within the joints' ranges and MaxPosDeviation."""
+        """Move the planned position within the joint ranges and MaxPosDeviation."""
         before, deviation = self.planned, self.config.egm.max_pos_deviation
         self.planned = [
             min(max(position + speed * dt, low, start - deviation), high, start + deviation)

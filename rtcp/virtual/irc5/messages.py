@@ -1,7 +1,7 @@
-"""EGM's messages as the controller writes and reads them: field numbers, and bytes in both directions.
+"""EGM messages of the controller: field numbers, encoding and decoding.
 
-The definitions are compiled from the table below into a descriptor pool of our own: nothing is registered in the pool
-that a process shares, and no protoc is needed. Names and numbers: ABB, Application manual Externally Guided Motion,
+The definitions are compiled from the table below into a private descriptor pool, without protoc and without entries in
+the process-wide pool. Names and numbers: ABB, Application manual Externally Guided Motion,
 3HAC073318-001 rev K; EgmMeasuredForce of RobotWare 6.08 from ros-industrial/abb_libegm, egm.proto V1.1.
 """
 
@@ -18,9 +18,9 @@ from rtcp.virtual.irc5.geometry import FlangePose
 
 PACKAGE = "rtcp.virtual.egm"
 ROBOT_AXES = 6
-"""Values of `joints`; those of further axes are in `externalJoints`."""
+"""Number of values in `joints`; further axes are in `externalJoints`."""
 LARGEST_VALUE = 1e6
-"""Degrees or degrees/s: no joint goes there, and nothing overflows on the way."""
+"""Upper bound on values, degrees or degrees/s: beyond any joint, and safe from overflow."""
 
 _MESSAGES = {
     "EgmHeader": "1 seqno uint32, 2 tm uint32, 3 mtype MessageType",
@@ -47,7 +47,7 @@ _MESSAGES = {
     "11 moveIndex uint32, 12 CollisionInfo EgmCollisionInfo, 13 RAPIDfromRobot EgmRAPIDdata, 14 torqueRef EgmJoints",
     "EgmSensor": "1 header EgmHeader, 2 planned EgmPlanned, 3 speedRef EgmSpeedRef, 4 RAPIDtoRobot EgmRAPIDdata",
 }
-"""Message -> fields: number, name, label (optional where none is written), type."""
+"""Message -> fields: number, name, label (default: optional), type."""
 _OF_ROBOTWARE_6 = {"EgmMeasuredForce": "1 force repeated double"}
 _ENUMS = {
     "MessageType": ("EgmHeader", "MSGTYPE", "UNDEFINED COMMAND DATA CORRECTION PATH_CORRECTION"),
@@ -55,7 +55,7 @@ _ENUMS = {
     "MCIStateType": ("EgmMCIState", "MCI", "UNDEFINED ERROR STOPPED RUNNING"),
     "RapidCtrlExecStateType": ("EgmRapidCtrlExecState", "RAPID", "UNDEFINED STOPPED RUNNING"),
 }
-"""Enum -> the message that it stands in, prefix and names of its values, which count from 0."""
+"""Enum -> its message, prefix and names of its values, which count from 0."""
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _LABELS = {"optional": _FIELD.LABEL_OPTIONAL, "required": _FIELD.LABEL_REQUIRED, "repeated": _FIELD.LABEL_REPEATED}
 _SCALARS = {
@@ -75,16 +75,16 @@ class MciState(IntEnum):
 
 
 class GarbledDatagram(Exception):
-    """A datagram that is no EgmSensor, or holds values that are no numbers: a sentence."""
+    """A datagram that is not an EgmSensor or has invalid numbers; the message is a sentence."""
 
 
 class ForeignDatagram(Exception):
-    """An EgmSensor that does not correct the joints of this unit: a sentence."""
+    """An EgmSensor without joint corrections for this unit; the message is a sentence."""
 
 
 @dataclass(frozen=True)
 class UnitState:
-    """What a unit reports of one cycle; joints in degrees, the seventh last."""
+    """Feedback of a unit in a cycle; joints in degrees, the seventh last."""
 
     seqno: int
     clock_s: float
@@ -105,7 +105,7 @@ class UnitState:
 
 @dataclass(frozen=True)
 class Reference:
-    """What the PC asks for; joints in degrees and degrees/s, the seventh last. None: not in the datagram."""
+    """References from the PC; joints in degrees and degrees/s, the seventh last. None: not in the datagram."""
 
     seqno: int
     position: tuple[float, ...] | None
@@ -113,7 +113,7 @@ class Reference:
 
 
 class EgmCodec:
-    """Bytes of the messages of one RobotWare, 6 or 7."""
+    """Encodes and decodes the messages of a RobotWare version, 6 or 7."""
 
     def __init__(self, robotware: int) -> None:
         self._robotware = robotware
@@ -145,7 +145,7 @@ class EgmCodec:
         """Return the reference in a datagram for a unit with `axes` joints.
 
         Raises:
-            GarbledDatagram, ForeignDatagram: it holds none.
+            GarbledDatagram, ForeignDatagram: it has none.
         """
         sensor = self._sensor()
         try:
@@ -201,9 +201,9 @@ def _message_classes(robotware: int) -> tuple[Any, Any]:
                 entry.type, entry.type_name = _FIELD.TYPE_MESSAGE, f".{PACKAGE}.{type_name}"
         for enum, (owner, prefix, values) in _ENUMS.items():
             if owner == name:
-                made = kind.enum_type.add(name=enum)
+                enum_type = kind.enum_type.add(name=enum)
                 for value, text in enumerate(values.split()):
-                    made.value.add(name=f"{prefix}_{text}", number=value)
+                    enum_type.value.add(name=f"{prefix}_{text}", number=value)
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())
     robot, sensor = (pool.FindMessageTypeByName(f"{PACKAGE}.{name}") for name in ("EgmRobot", "EgmSensor"))

@@ -1,7 +1,7 @@
-"""RAPID's motion task of one unit, in simulated time: MoveAbsJ instructions run ahead of the motion. Degrees and s.
+"""RAPID's motion task of a unit, in simulated time: MoveAbsJ instructions run ahead of the motion. Degrees and s.
 
-The program puts moves into a queue and blocks when it is full; the planner joins them by corner zones. Along the path
-runs a time of its own: its rate is 1 at the programmed speed, and ramps to 0 at stop points and stops.
+The program queues moves and blocks while the queue is full; the planner joins them with corner zones. The rate of the
+path time is 1 at the programmed speed and ramps to 0 at stop points and stops.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from rtcp.virtual.irc5.mechanical_unit import HAND_SPEED, MechanicalUnit
 from rtcp.virtual.irc5.panel import STOPPING_TIME_S, Mode, Motors, Panel
 
 SHORTEST_MOVE_S = 0.01
-"""A shorter duration counts as this."""
+"""Lower bound on durations."""
 AT_START = 0.1
-"""A first point of a path within this distance of the arm is left out, degrees."""
+"""Distance from the arm within which the first point of a path is skipped, degrees."""
 
 
 class Move(NamedTuple):
@@ -27,44 +27,44 @@ class Move(NamedTuple):
     target: tuple[float, ...]
     duration: float
     fine: bool = False
-    """Whether it ends at rest, and RAPID waits for that; else in a zone."""
+    """True: it ends at rest, and RAPID waits for that; False: in a zone."""
 
 
 class _Planned(NamedTuple):
-    """A move from where the one before ends, at constant speed."""
+    """A move from the end of the previous one, at constant speed."""
 
     start: Sequence[float]
     velocity: tuple[float, ...]
     duration: float
-    """As programmed, or longer where a joint would be too fast."""
+    """Programmed duration, or longer if a joint would be too fast."""
     zone: float
-    """Time from its zone to its end, s: half the duration at most."""
+    """Time from its zone to its end, s: at most half the duration."""
     move: Move
 
 
 class MotionTask:
-    """`execute` gives moves to the program, `step` lets one period pass."""
+    """`execute` passes moves to the program, `step` advances by one period."""
 
     def __init__(self, unit: MechanicalUnit, panel: Panel, config: RapidConfig) -> None:
         self.unit = unit
         self.queue: deque[Move] = deque()
-        """Moves that the planner has and has not begun."""
+        """Moves known to the planner and not begun."""
         self.stopping = False
-        """StopMove: the queue is cleared when the arm stands."""
+        """True during StopMove: the queue is cleared at rest."""
         self.lost = False
-        """A fault: the arm stops, and its task takes part in nothing."""
+        """True: a fault stops the arm and its task."""
         self._panel = panel
         self._config = config
         self._program: deque[Move] = deque()
-        """Moves that the program has not reached, because the queue is full or a fine point is not."""
+        """Moves not reached by the program, because of a full queue or a pending fine point."""
         self._current: _Planned | None = None
         self._next: _Planned | None = None
-        """The move into which the current one passes by a corner of `_exit`."""
+        """The next move, joined to the current one by a corner of `_exit`."""
         self._stop_point = False
-        """Whether the current move ends at rest."""
+        """True: the current move ends at rest."""
         self._entry_velocity: tuple[float, ...] = ()
         self._entry = self._exit = 0.0
-        """Half the time that the corner at the beginning and at the end takes, s; 0: none."""
+        """Half the duration of the corner at the start and at the end, s; 0: none."""
         self._time = self._rate = self._look_ahead_s = 0.0
         longest = unit.config.dead_time_s + config.position_delay_s[1]
         self._history: deque[tuple[float, ...]] = deque(maxlen=math.ceil(longest / unit.config.period_s) + 2)
@@ -77,18 +77,18 @@ class MotionTask:
 
     @property
     def is_ready(self) -> bool:
-        """Whether the program waits for a point: the queue has room, and no fine point is ahead."""
+        """Whether the program waits for a point: the queue has room, and no fine point is pending."""
         fine = (self._current is not None and self._current.move.fine) or any(move.fine for move in self.queue)
         room = len(self.queue) < self._config.queue_moves
         return self.runs and room and not (self.stopping or self._program or fine)
 
     @property
     def moves_ahead(self) -> int:
-        """Moves that are accepted and not finished."""
+        """Number of accepted, unfinished moves."""
         return len(self._program) + len(self.queue) + (self._current is not None)
 
     def execute(self, moves: Sequence[Move]) -> None:
-        """Run these instructions; a target outside the joints' ranges stops this unit's RAPID."""
+        """Run these instructions; a target outside the joint ranges stops this unit's RAPID."""
         for move in moves:
             for i, (position, (low, high)) in enumerate(zip(move.target, self.unit.ranges, strict=True)):
                 if not low <= position <= high:
@@ -103,7 +103,7 @@ class MotionTask:
         self.stopping = True
 
     def step(self, dt: float) -> None:
-        """Let one period pass."""
+        """Advance by one period."""
         while self._program and len(self.queue) < self._config.queue_moves:
             self.queue.append(self._program.popleft())
         if self._current is None and self.queue and self.runs and not self.stopping:
@@ -121,7 +121,7 @@ class MotionTask:
         self._history.append(tuple(self.unit.planned))
 
     def reported(self, delay_s: float) -> list[float]:
-        """Return the joints as CJointT says them: the actual ones, older by `delay_s`."""
+        """Return the joints of CJointT: the actual ones `delay_s` ago."""
         back = min((self.unit.config.dead_time_s + delay_s) / self.unit.config.period_s, len(self._history) - 1.0)
         older, share = math.ceil(back), math.ceil(back) - back
         rows = self._history[-1 - older], self._history[-max(older, 1)]
@@ -143,12 +143,12 @@ class MotionTask:
             self._rate = min(1.0, self._rate + dt / ramp)
         else:
             self._rate = max(0.0, self._rate - dt / self._stopping_time())
-        left = current.duration - self._time
-        # A stop needs half the ramp of path time; so late the next move has to be there.
-        if self._next is None and not self._stop_point and left - self._rate * dt <= max(current.zone, ramp / 2.0):
+        remaining = current.duration - self._time
+        # A stop needs half the ramp in path time: the latest time for the next move to arrive.
+        if self._next is None and not self._stop_point and remaining - self._rate * dt <= max(current.zone, ramp / 2.0):
             self._end_of(current)
         if self._stop_point:
-            self._rate = min(self._rate, math.sqrt(2.0 * left / ramp))
+            self._rate = min(self._rate, math.sqrt(2.0 * remaining / ramp))
         if self._panel.mode is Mode.HAND:
             self._rate = min(self._rate, self._hand_rate(current, dt))
         self._time += self._rate * dt
@@ -164,7 +164,7 @@ class MotionTask:
             self.queue.popleft()
 
     def _end_of(self, current: _Planned) -> None:
-        """Decide how a move ends: in the corner to the next, or at rest because there is none."""
+        """Decide the end of a move: in the corner to the next one, or at rest without one."""
         if self.queue and not current.move.fine:
             self._next = self._plan(current.move.target, self.queue[0])
             self._exit = min(current.zone, self._next.zone)
@@ -194,15 +194,15 @@ class MotionTask:
     def _position(self, current: _Planned, time: float) -> list[float]:
         if time < self._entry:
             return _corner(current.start, self._entry_velocity, current.velocity, self._entry, time)
-        left = current.duration - time
-        if self._next is not None and left < self._exit:
-            return _corner(current.move.target, current.velocity, self._next.velocity, self._exit, -left)
+        remaining = current.duration - time
+        if self._next is not None and remaining < self._exit:
+            return _corner(current.move.target, current.velocity, self._next.velocity, self._exit, -remaining)
         return [start + speed * time for start, speed in zip(current.start, current.velocity, strict=True)]
 
 
 def _corner(
     point: Sequence[float], before: Sequence[float], after: Sequence[float], half: float, time: float
 ) -> list[float]:
-    """Position at `time`, -half to half around a point, at constant acceleration from one speed to the other."""
+    """Return the position at `time`, -half to half around a point, at constant acceleration between two speeds."""
     share = (time + half) ** 2 / (4.0 * half)
     return [p + v * time + (w - v) * share for p, v, w in zip(point, before, after, strict=True)]

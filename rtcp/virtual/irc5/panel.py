@@ -37,13 +37,13 @@ class Motors(Enum):
 
     OFF = "off"
     STOPPING = "stopping"
-    """On, during a stop of category 1 (IEC 60204-1, 9.2.2)."""
+    """Motors on, during a stop of category 1 (IEC 60204-1, 9.2.2)."""
     ON = "on"
 
 
 @dataclass(frozen=True)
 class StopRule:
-    """Where a stop is active, and its category (IEC 60204-1, 9.2.2)."""
+    """Modes in which a stop is active, and its category (IEC 60204-1, 9.2.2)."""
 
     modes: tuple[Mode, ...]
     category: int
@@ -56,17 +56,17 @@ STOPS = {
     Stop.GENERAL: StopRule(_ALWAYS, 1),
     Stop.SUPERIOR: StopRule(_ALWAYS, 1),
 }
-"""ABB, Product manual IRB 2600. The emergency stop's category can be configured."""
+"""From ABB, Product manual IRB 2600. The emergency stop's category is configurable."""
 STOPPING_TIME_S = {0: 0.15, 1: 0.4}
-"""Time from full speed to rest by category, s (assumed; of an IRB 120 with its load some tenths of a second)."""
+"""Time from full speed to rest by category, s (assumed; some tenths of a second for a loaded IRB 120)."""
 
 
 class PanelRefused(RequestRefused):
-    """The panel does not do this now: a sentence."""
+    """The panel refuses the action; the message is a sentence."""
 
 
 class Panel:
-    """Level inputs and edges of the safety chain. Every stop is latched: reset is a new edge."""
+    """Level inputs and edges of the safety chain. Every stop is latched until a reset edge."""
 
     def __init__(self, mode: Mode, emergency_category: int) -> None:
         self.mode = mode
@@ -75,37 +75,37 @@ class Panel:
         self.category = 1
         """Category of the last stop."""
         self.latched = False
-        """Whether a stop asks for Motors On."""
+        """True: a stop requires Motors On."""
         self.open: set[Stop] = set()
         self._categories = {stop: rule.category for stop, rule in STOPS.items()} | {Stop.EMERGENCY: emergency_category}
         self._stopping_s = 0.0
 
     def advance(self, dt: float) -> None:
-        """Let `dt` seconds pass: a stop of category 1 ends with motors off."""
+        """Advance by `dt` seconds: a stop of category 1 ends with motors off."""
         if self.motors is Motors.STOPPING:
             self._stopping_s += dt
             if self._stopping_s >= STOPPING_TIME_S[1]:
                 self.motors = Motors.OFF
 
     def open_circuit(self, stop: Stop) -> None:
-        """Open a stop's circuit: it acts where it is active in this mode."""
+        """Open a stop's circuit; it has an effect if active in this mode."""
         self.open.add(stop)
         if self.mode in STOPS[stop].modes:
             self.latched = True
             self._stop(self._categories[stop])
 
     def close_circuit(self, stop: Stop) -> None:
-        """Close a circuit, or release the button: nothing starts by that."""
+        """Close a circuit, or release the button; this starts nothing."""
         self.open.discard(stop)
 
     def select_mode(self, mode: Mode) -> None:
-        """Turn the key: motors go off, nothing starts by that."""
+        """Turn the key: motors go off; this starts nothing."""
         if mode is not self.mode:
             self.mode = mode
             self._stop(1)
 
     def hold_enabling(self, position: Enabling) -> None:
-        """Move the enabling device: in Hand motors are on while it is held; pressed through it must be released."""
+        """Move the enabling device: in Hand its middle position keeps motors on; after a full press, release it."""
         pressed = position is Enabling.MIDDLE and self.enabling is Enabling.RELEASED
         self.enabling = position
         if self.mode is not Mode.HAND:

@@ -1,4 +1,4 @@
-"""The controller's process: sockets for each unit or for RAPID streaming, and the operator's socket."""
+"""The controller's process: sockets of the units or of RAPID streaming, and the operator's socket."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from rtcp.virtual.request_socket import RequestSocket, control_socket
 from rtcp.virtual.server import StopRequest, request_prompt_scheduling
 
 DATAGRAM = 2048
-"""Longest datagram that is read, bytes; EgmSensor has about 130."""
+"""Upper bound on a received datagram, bytes; EgmSensor has about 130."""
 MOST_A_CYCLE = 64
-"""Datagrams that are taken from the socket in one cycle."""
+"""Upper bound on datagrams read per cycle."""
 PHASE_S = 0.0011
-"""From the first message of a unit to that of the next: units are not in step."""
+"""Offset between the first messages of two units: units are not in phase."""
 STALL_S = 0.1
-"""A unit that is further behind, because the process was stopped, goes on from now without catching up."""
+"""Delay (the process was stopped) above which a unit continues without catching up."""
 
 Ready = Callable[[Controller, "str | None"], None]
 
 
 class Cyclic(Protocol):
-    """Sockets with a period of their own."""
+    """Sockets with their own period."""
 
     period_s: float
 
     def cycle(self, clock_s: float) -> None:
-        """Read, let time pass, send."""
+        """Read, advance, send."""
 
     def close(self) -> None:
         """Close the sockets."""
 
 
 class UnitSocket:
-    """A unit's UdpUc device: speaks to the PC's port, and takes datagrams from there alone."""
+    """A unit's UdpUc device: sends to the PC's port and receives only from there."""
 
     def __init__(self, unit: Unit, config: UnitConfig) -> None:
         """Open the socket.
@@ -60,7 +60,7 @@ class UnitSocket:
             raise ConfigError([sentence]) from error
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
-        # The kernel takes the sender's address from the route; a datagram before the first message has nowhere to go.
+        # The kernel takes the sender's address from the route; before the first message no datagram can arrive.
         self.socket.bind(("", 0))
 
     def close(self) -> None:
@@ -95,32 +95,32 @@ class UnitSocket:
 def serve(
     controller: Controller, sockets: Sequence[Cyclic], operators: RequestSocket | None, stop: StopRequest
 ) -> None:
-    """Run in real time until `stop` came."""
+    """Run in real time until `stop` is requested."""
     last = time.monotonic()
     since_1970 = time.time() - last
     due = [last + PHASE_S * i for i in range(len(sockets))]
-    while not stop.came:
+    while not stop.requested:
         i = min(range(len(due)), key=due.__getitem__)
         if (wait := due[i] - time.monotonic()) > 0.0:
             time.sleep(wait)
         now = time.monotonic()
         controller.panel.advance(now - last)
         last = now
-        # The controller's own clock: exact periods, however late this process is.
+        # The controller's own clock has exact periods, even if this process is late.
         sockets[i].cycle(due[i] + since_1970)
         due[i] += sockets[i].period_s
         if now - due[i] > STALL_S:
             due[i] = now
         if operators is not None:
-            operators.look()
+            operators.poll()
 
 
 def run(config_path: Path, ready: Ready, control_path: Path | None = None, private: bool = False) -> None:
     """Run a virtual IRC5 until SIGTERM or SIGINT.
 
-    `ready` is called once, with the network interface of the units or None for those of the caller. At `control_path`
-    an operator works and faults can be asked for. With `private` a PC reaches the units by joining this process's
-    namespaces (/proc/PID/ns/user and /proc/PID/ns/net).
+    `ready` is called once, with the units' network interface, or None for the caller's. `control_path` accepts requests
+    of an operator and for faults. With `private` a PC reaches the units by joining this process's namespaces
+    (/proc/PID/ns/user and /proc/PID/ns/net).
 
     Raises:
         ConfigError, ValueError, NetworkError: with sentences for the user.
@@ -130,19 +130,19 @@ def run(config_path: Path, ready: Ready, control_path: Path | None = None, priva
     stop = StopRequest()
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    with ExitStack() as kept:
+    with ExitStack() as resources:
         operators = None
         if control_path is not None:
-            operators = RequestSocket(kept.enter_context(control_socket(control_path)), controller.request)
-            kept.callback(operators.close)
+            operators = RequestSocket(resources.enter_context(control_socket(control_path)), controller.request)
+            resources.callback(operators.close)
         interface = private_loopback() if private else None
         sockets: Sequence[Cyclic]
         if controller.streaming is None:
             sockets = [UnitSocket(controller.units[unit.name], unit) for unit in config.units]
         else:
             sockets = [StreamingServer(controller.streaming, config.units[0].period_s)]
-        for each in sockets:
-            kept.callback(each.close)
+        for server in sockets:
+            resources.callback(server.close)
         request_prompt_scheduling()
         ready(controller, interface)
         serve(controller, sockets, operators, stop)

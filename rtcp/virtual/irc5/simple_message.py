@@ -1,7 +1,7 @@
-"""Simple Message as RAPID reads and writes it (ROS-Industrial REP-I0004: numbers, REP-I0006: layouts).
+"""Simple Message of RAPID (ROS-Industrial REP-I0004: numbers, REP-I0006: layouts).
 
 A message is its length, msg_type, comm_type, reply_code (int32 each) and a body, little endian and packed; the length
-counts all but itself. A joint message has as many joints as its length says. Units: rad, s.
+excludes itself. The number of joints of a joint message follows from its length. Units: rad, s.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 LEAST_LENGTH, MOST_LENGTH = 12, 1023
 LEAST_JOINTS = 10
-"""Joints that REP-I0006 has room for; longer messages have more."""
+"""Number of joints in REP-I0006; longer messages have more."""
 _HEADER = struct.Struct("<4i")
 
 
@@ -43,7 +43,7 @@ class ReplyCode(IntEnum):
 
 
 class SpecialSequence(IntEnum):
-    """Sequence numbers that are no count."""
+    """Sequence numbers with a special meaning."""
 
     START_DOWNLOAD = -1
     END_TRAJECTORY = -3
@@ -51,11 +51,11 @@ class SpecialSequence(IntEnum):
 
 
 class NotAMessage(Exception):
-    """A length outside 12..1023: nothing after it can be read."""
+    """A length outside 12..1023: the rest of the stream is unreadable."""
 
 
 class Frame(NamedTuple):
-    """One message; its numbers may be unknown ones."""
+    """A message, possibly with unknown numbers."""
 
     msg_type: int
     comm_type: int
@@ -70,7 +70,7 @@ class JointPoint(NamedTuple):
     joints: tuple[float, ...]
     """rad."""
     duration: float
-    """Time from the point before, s."""
+    """Time from the previous point, s."""
 
 
 def pack(msg_type: int, comm_type: int, reply_code: int = 0, body: bytes = b"") -> bytes:
@@ -79,10 +79,10 @@ def pack(msg_type: int, comm_type: int, reply_code: int = 0, body: bytes = b"") 
 
 
 def take_frame(data: bytearray) -> Frame | None:
-    """Remove the first message from `data` and return it; None while it is not complete.
+    """Remove the first message from `data` and return it; None: incomplete.
 
     Raises:
-        NotAMessage: what is there begins with no length.
+        NotAMessage: the data do not begin with a valid length.
     """
     if len(data) < 4:
         return None
@@ -100,11 +100,11 @@ def take_frame(data: bytearray) -> Frame | None:
 def read_joint_point(frame: Frame, joints: int) -> JointPoint | None:
     """Return the point of a JOINT_TRAJ_PT with its first `joints` joints.
 
-    None: another message (only the type tells a JOINT_POSITION of 12 joints from a point of 10), fewer joints, or
-    numbers that are not finite.
+    None: another message (only the type distinguishes a JOINT_POSITION of 12 joints from a point of 10), fewer joints,
+    or numbers that are not finite.
     """
-    sent, rest = divmod(len(frame.body) - 12, 4)
-    if frame.msg_type != MessageType.JOINT_TRAJ_PT or rest or sent < joints:
+    sent, remainder = divmod(len(frame.body) - 12, 4)
+    if frame.msg_type != MessageType.JOINT_TRAJ_PT or remainder or sent < joints:
         return None
     sequence, *values = struct.unpack(f"<i{sent + 2}f", frame.body)
     if not all(map(isfinite, values)):
@@ -119,6 +119,6 @@ def joint_position(sequence: int, joints: Sequence[float]) -> bytes:
 
 
 def status(powered: bool, e_stopped: bool, failed: bool, in_motion: bool, automatic: bool, possible: bool) -> bytes:
-    """Return a STATUS as a topic; its error_code is 0 always, as in `abb/rapid`."""
+    """Return a STATUS as a topic; its error_code is always 0, as in `abb/rapid`."""
     fields = (powered, e_stopped, 0, failed, in_motion, 2 if automatic else 1, possible)
     return pack(MessageType.STATUS, CommType.TOPIC, body=struct.pack("<7i", *fields))

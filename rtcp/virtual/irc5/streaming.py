@@ -1,7 +1,7 @@
-"""RAPID streaming in simulated time: the motion server's task, the state server's task, and a motion task a unit.
+"""RAPID streaming in simulated time: the motion server's task, the state server's task, a motion task per unit.
 
-As `abb/rapid`: one message at a time; a point is offered to all motion tasks at once, and the reply follows its
-acceptance. Without acceptance within WaitSyncTask's timeout the reply is FAILURE.
+As in `abb/rapid`: one message at a time; a point goes to all motion tasks at once, and the reply follows its
+acceptance; after WaitSyncTask's timeout without acceptance the reply is FAILURE.
 """
 
 from __future__ import annotations
@@ -30,46 +30,46 @@ from rtcp.virtual.irc5.simple_message import (
 )
 
 MOST_POINTS = 200
-"""Of a downloaded path."""
+"""Upper bound on the points of a downloaded path."""
 STOPPING_SEQUENCES = (SpecialSequence.STOP_TRAJECTORY, SpecialSequence.START_DOWNLOAD)
 STREAMING_FAULTS = ("socket_cut", "half_message", "silent_state", "silent_motion")
-"""Faults of the connections; socket_cut is over when it has happened, the others last until they are cleared."""
+"""Faults of the connections; socket_cut is a single event, the others last until cleared."""
 
 
 class RapidStreaming:
-    """`receive` takes a message of the motion client, `step` lets a period pass and returns the reply that is due."""
+    """`receive` takes a message of the motion client; `step` advances by a period and returns the due reply."""
 
     def __init__(self, units: Mapping[str, MechanicalUnit], panel: Panel, config: RapidConfig) -> None:
         self.config = config
         self.tasks = {name: MotionTask(unit, panel, config) for name, unit in units.items()}
         self.counts: Counter[str] = Counter()
-        """Messages by what became of them."""
+        """Number of messages by result."""
         self.faults: set[str] = set()
-        """Those of `STREAMING_FAULTS` that last, and a socket_cut that has not happened yet."""
+        """Active `STREAMING_FAULTS`, including a pending socket_cut."""
         self.ports = {"motion_port": config.motion_port, "state_port": config.state_port}
-        """TCP ports; the server replaces 0 by those that it got."""
+        """TCP ports; the server replaces 0 by the assigned ones."""
         self._panel = panel
         self._frame: Frame | None = None
         self._point: JointPoint | None = None
-        """The message's point until the arms stand that it stops."""
+        """Point of the message, until the arms that it stops are at rest."""
         self._refused = False
         self._last: tuple[float, ...] = ()
-        """Where the arms are commanded, rad; empty: where they are."""
+        """Last commanded positions, rad; empty: the actual ones."""
         self._offered: list[JointPoint] = []
-        """Points that wait for acceptance."""
+        """Points awaiting acceptance."""
         self._download: list[JointPoint] | None = None
-        """Points of a path that is not complete; None: streaming."""
+        """Points of an incomplete path; None: streaming."""
         self._waited_s = 0.0
         self._random = Random(0)
         self._sequence = 0
 
     @property
     def is_busy(self) -> bool:
-        """Whether a message is being served: RAPID reads no other one then."""
+        """Whether a message is in progress; meanwhile RAPID reads no other one."""
         return self._frame is not None
 
     def receive(self, frame: Frame) -> None:
-        """Begin to serve a message."""
+        """Begin to process a message."""
         self._frame, self._waited_s, self._offered = frame, 0.0, []
         self._point = read_joint_point(frame, ROBOT_AXES * len(self.tasks))
         self._refused = self._point is None
@@ -77,19 +77,19 @@ class RapidStreaming:
             self.stop()
 
     def stop(self) -> None:
-        """Stop all arms and forget their queues: a stop message, or the client is gone."""
+        """Stop all arms and clear their queues, after a stop message or a disconnect."""
         self._download = None
         self._last = ()
         for task in self.tasks.values():
             task.stop()
 
     def disconnect(self) -> None:
-        """The motion client is gone."""
+        """Handle the disconnect of the motion client."""
         self._frame = None
         self.stop()
 
     def step(self, dt: float) -> bytes | None:
-        """Let one period pass; return the reply that is due in it."""
+        """Advance by one period; return the due reply."""
         for task in self.tasks.values():
             task.step(dt)
         frame, self._waited_s = self._frame, self._waited_s + dt
@@ -122,12 +122,12 @@ class RapidStreaming:
             task.lost = False
 
     def lose(self, name: str) -> None:
-        """Let a unit fail: it stops on its brakes, the others go on with what they have."""
+        """Fail a unit: it stops on its brakes; the others continue with their queues."""
         self.tasks[name].unit.fail("the arm is lost (a fault on command)")
         self.tasks[name].lost = True
 
     def status(self) -> dict[str, Any]:
-        """Return what the tasks do, as plain values."""
+        """Return the state of the tasks as plain values."""
         return {
             **self.ports,
             "moves_ahead": {name: task.moves_ahead for name, task in self.tasks.items()},
@@ -137,7 +137,7 @@ class RapidStreaming:
         }
 
     def _reply_code(self) -> ReplyCode | None:
-        """None while RAPID waits: for arms that slow down, or for room in the queues."""
+        """Return the reply code; None while RAPID waits for arms to stop or for room in the queues."""
         tasks = self.tasks.values()
         if any(task.stopping for task in tasks):
             return None
@@ -161,7 +161,7 @@ class RapidStreaming:
         return ReplyCode.SUCCESS
 
     def _take(self, point: JointPoint) -> None:
-        """Decide what a point is for: it is offered, collected, or refused."""
+        """Offer, collect or refuse a point."""
         if point.sequence == SpecialSequence.STOP_TRAJECTORY:
             return
         if point.sequence == SpecialSequence.START_DOWNLOAD:

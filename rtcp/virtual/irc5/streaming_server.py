@@ -1,4 +1,4 @@
-"""The TCP servers of RAPID streaming: one client each; another one waits until it is gone, as in RAPID."""
+"""The TCP servers of RAPID streaming: one client each; another one waits for its disconnect, as in RAPID."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _READ_BYTES = 4096
 
 
 class ClientSocket:
-    """A listening socket and its one client; nothing here waits."""
+    """A listening socket and its single client; never blocks."""
 
     def __init__(self, host: str, port: int) -> None:
         """Listen.
@@ -34,7 +34,7 @@ class ClientSocket:
         self._client: socket.socket | None = None
         self._received = bytearray()
         self._unsent: list[bytes] = []
-        """Parts that are not sent yet, one a cycle."""
+        """Unsent parts, one per cycle."""
 
     @property
     def is_connected(self) -> bool:
@@ -60,7 +60,7 @@ class ClientSocket:
         self._unsent.clear()
 
     def receive(self) -> bytearray:
-        """Take a client, read, and return what is there and not taken yet; the client may be gone afterwards."""
+        """Accept a client, read, and return the unprocessed data; the client may have disconnected afterwards."""
         try:
             if self._client is None:
                 self._client, _ = self._listener.accept()
@@ -78,12 +78,12 @@ class ClientSocket:
         return self._received
 
     def send(self, message: bytes, in_halves: bool) -> None:
-        """Send a message, or half of it in this cycle and half in the next."""
+        """Send a message, whole or as halves in two cycles."""
         half = len(message) // 2
         self._unsent += [message[:half], message[half:]] if in_halves else [message]
 
     def flush(self) -> None:
-        """Send the first part of what is not sent yet."""
+        """Send the first unsent part."""
         if self._client is None or not self._unsent:
             return
         try:
@@ -100,7 +100,7 @@ class ClientSocket:
 
 
 class StreamingServer:
-    """Serves a controller's RAPID streaming; `cycle` lets a period pass."""
+    """Serves a controller's RAPID streaming; `cycle` advances by a period."""
 
     def __init__(self, streaming: RapidStreaming, period_s: float) -> None:
         """Listen at both ports.
@@ -126,7 +126,7 @@ class StreamingServer:
         self._state.close()
 
     def cycle(self, clock_s: float) -> None:
-        """Read, let all units step, send."""
+        """Read, step all units, send."""
         streaming = self._streaming
         if "socket_cut" in streaming.faults:
             streaming.faults.discard("socket_cut")

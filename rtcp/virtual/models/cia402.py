@@ -1,4 +1,4 @@
-"""The power state machine of a CiA 402 drive, seen from the drive (CiA 402-2 and ETG.6010), as tables."""
+"""The power state machine of a CiA 402 drive as tables, from the drive's side (CiA 402-2 and ETG.6010)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class DriveState(IntEnum):
 
 
 class ControlCommand(IntEnum):
-    """What a controlword asks for; switch on and disable operation share one bit pattern (CiA 402-2, object 0x6040)."""
+    """Commands of the controlword; switch on and disable operation share a bit pattern (CiA 402-2, object 0x6040)."""
 
     NONE = 0
     SHUTDOWN = 1
@@ -32,7 +32,7 @@ class ControlCommand(IntEnum):
 
 
 class Status(IntFlag):
-    """Bits of the statusword outside the state (CiA 402-2, object 0x6041)."""
+    """Statusword bits besides the state (CiA 402-2, object 0x6041)."""
 
     VOLTAGE_ENABLED = 0x0010
     WARNING = 0x0080
@@ -64,12 +64,12 @@ _COMMANDS = (
     (0x82, 0x00, ControlCommand.DISABLE_VOLTAGE),
     (0x86, 0x02, ControlCommand.QUICK_STOP),
 )
-"""Mask and value of the controlword for each command (CiA 402-2, 0x6040); the fault reset is an edge, see below."""
+"""Mask and value of the controlword for each command (CiA 402-2, 0x6040), except the edge-triggered fault reset."""
 
 TRANSITIONS = MappingProxyType({
     (DriveState.SWITCH_ON_DISABLED, ControlCommand.SHUTDOWN): (2, DriveState.READY_TO_SWITCH_ON),
     (DriveState.READY_TO_SWITCH_ON, ControlCommand.SWITCH_ON): (3, DriveState.SWITCHED_ON),
-    # 0x0F in Ready To Switch On is transition 3 with an automatic transition 4 behind it.
+    # 0x0F in Ready To Switch On is transition 3 followed by an automatic transition 4.
     (DriveState.READY_TO_SWITCH_ON, ControlCommand.ENABLE_OPERATION): (3, DriveState.SWITCHED_ON),
     (DriveState.SWITCHED_ON, ControlCommand.ENABLE_OPERATION): (4, DriveState.OPERATION_ENABLED),
     (DriveState.OPERATION_ENABLED, ControlCommand.SWITCH_ON): (5, DriveState.SWITCHED_ON),
@@ -87,8 +87,8 @@ TRANSITIONS = MappingProxyType({
 })  # fmt: skip
 """(state, command) -> (number of the transition, next state) (CiA 402-2, power drive system).
 
-The drive itself makes 0 and 1 (start, self-test), 12 (end of a quick stop that disables), 13 and 14 (fault, end of the
-fault reaction)."""
+The drive itself executes 0 and 1 (start, self-test), 12 (end of a quick stop that disables), 13 and 14 (fault, end of
+the fault reaction)."""
 
 
 def _decode(low_byte: int) -> ControlCommand:
@@ -102,16 +102,16 @@ _DECODED = tuple(_decode(low_byte) for low_byte in range(256))
 
 
 class DriveStateMachine:
-    """Where the drive is, and what a controlword asks of it there."""
+    """State of the drive, and the transitions that a controlword requests."""
 
     def __init__(self) -> None:
         self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self._previous = 0
 
     def request(self, controlword: int) -> tuple[int, DriveState] | None:
-        """Return the transition (its number, the next state) that `controlword` asks for now; None where it asks none.
+        """Return the transition (its number, the next state) requested by `controlword`, or None.
 
-        To be called for every controlword: the fault reset is the rising edge of bit 7 (CiA 402-2, object 0x6040).
+        Call it for every controlword: the fault reset is the rising edge of bit 7 (CiA 402-2, object 0x6040).
         """
         rising = controlword & ~self._previous & 0x80
         self._previous = controlword

@@ -1,9 +1,9 @@
 """The behaviour `cia402`: a described servo drive of one or more axes with the units of the standard.
 
-Positions count 0x6092 a turn where the drive has it, else 0x608F times 0x6091; velocities in the unit of 0x60A9, else
-the same a second; accelerations in that of 0x60AA, else velocities a second; torques per mille of 0x6076. Revolutions
-and torques are the motor's, 0x6091 the gear behind it (CiA 402-2, ETG.6010). It works on whatever objects the drive
-has: what is 0 or missing gets a default.
+Position counts per revolution are in 0x6092 if the drive has it, else 0x608F times 0x6091; the unit of velocities is in
+0x60A9, else position counts per second; that of accelerations in 0x60AA, else velocity counts per second; torques are
+per mille of 0x6076. Revolutions and torques are those of the motor, 0x6091 is the gear (CiA 402-2, ETG.6010). Objects
+that are 0 or missing get a default.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from rtcp.virtual.models.cubemars import CONDITION_OPTIONS, SERVO_OPTIONS
 from rtcp.virtual.models.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, Hold, Motion
 from rtcp.virtual.models.mechanics import SIZES, ActuatorSize, Axis, Mechanics
 from rtcp.virtual.models.profile_modes import Homing, ProfilePosition, ProfileVelocity
-from rtcp.virtual.models.protection import Condition, ErrorLog, Feedback
+from rtcp.virtual.models.protection import BoundedFeedback, Condition, ErrorLog
 from rtcp.virtual.models.servo import ServoAxis
-from rtcp.virtual.models.units import AXIS_STRIDE, LIMITLESS, Absent, AxisObjects, Units, rate_unit
+from rtcp.virtual.models.units import AXIS_STRIDE, LIMITLESS, AxisObjects, Units, rate_unit
+from rtcp.virtual.objects import Number
 from rtcp.virtual.protocol import AlState
 
 MOST_AXES = 8
-"""Axes of a drive: their objects fill 0x6000 to 0x9FFF (ETG.6010)."""
+"""Upper bound on the axes of a drive: their objects fill 0x6000 to 0x9FFF (ETG.6010)."""
 _CONTROLWORD = 0x6040
 _COUNTS_PER_TURN = 65536
 _ACCELERATION = 20.0
-"""Of profiles, rad/s^2, where the description leaves it open."""
+"""Default acceleration of profiles, rad/s^2."""
 _QUICK_STOP = 50.0
 _MODEL = SIZES["orh60"]
-"""Its inertia and friction, in proportion to the rated torque, are those of a drive that says nothing of its own."""
+"""Default inertia and friction, scaled by the rated torque."""
 _POSITION_LIMIT = (1 << 31) - 1
 _SUPPORTED = {1: 0x607A, 3: 0x60FF, 6: 0x6098, 8: 0x607A, 9: 0x60FF, 10: 0x6071}
-"""Modes, and the object without which a drive has not got them."""
+"""Modes, and the object that each of them requires."""
 _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
     "rated_torque": Option(None, 0.001, 10_000.0, "Nm at the joint; left out: by 0x6076, else 28"),
     "peak_torque": Option(None, 0.001, 30_000.0, "Nm; left out: twice the rated torque"),
@@ -49,7 +50,7 @@ _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
 
 
 def _options() -> Mapping[str, Option]:
-    """Return the options: those of the axes for all of them, and with the number of one before them for it alone."""
+    """Return the options: those of all axes, and with an axis number as prefix those of one axis."""
     own = {
         f"axis{n}_{name}": Option(None, option.low, option.high, option.meaning, listed=False)
         for n in range(1, MOST_AXES + 1)
@@ -59,7 +60,7 @@ def _options() -> Mapping[str, Option]:
 
 
 class Cia402Drive(Behaviour):
-    """A servo drive; every 0x800 objects from 0x6040 on there is another axis."""
+    """A servo drive; each further axis is 0x800 after 0x6040."""
 
     options: ClassVar[Mapping[str, Option]] = _options()
     keeps_outputs = True
@@ -75,19 +76,19 @@ class Cia402Drive(Behaviour):
         device.servos = [axis.servo for axis in self.axes]
 
     def on_start(self) -> None:
-        """Power comes on."""
+        """Set up the axes at power-on."""
         for axis in self.axes:
             axis.read_units()
             axis.servo.power_on()
 
     def on_state(self, old: AlState, new: AlState) -> None:
-        """Take over what start-up commands have written, and whether outputs count."""
+        """Apply the start-up commands and the validity of the outputs."""
         if old < AlState.SAFE_OP <= new:
             for axis in self.axes:
                 axis.read_units()
 
     def on_outputs(self, dt: float) -> None:
-        """Let time pass for every axis."""
+        """Advance every axis."""
         valid = self.device.outputs_valid
         for axis in self.axes:
             servo = axis.servo
@@ -96,25 +97,8 @@ class Cia402Drive(Behaviour):
             servo.step(dt)
 
 
-class _BoundedFeedback(Feedback):
-    """Shows what is beyond an object's bits as the most that it holds."""
-
-    def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
-        super().__init__(objects, rated_torque)
-        indices = (0x6062, 0x6063, 0x6064, 0x606B, 0x606C, 0x6074, 0x6077, 0x6078, 0x60F4)
-        self._bounded = [(objects.number(n), *objects.bounds(n)) for n in indices if (n, 0) in objects]
-
-    def publish(self, status: int, axis: Axis, following: float) -> None:
-        """Write the statusword and what is measured."""
-        super().publish(status, axis, following)
-        for entry, low, high in self._bounded:
-            value = entry.value
-            if not low <= value <= high:
-                entry.value = low if value < low else high
-
-
 class _StandardAxis:
-    """One axis: its units and defaults, and the servo that turns it."""
+    """An axis: its units and defaults, and its servo."""
 
     def __init__(self, drive: Behaviour, number: int) -> None:
         self._drive = drive
@@ -122,9 +106,9 @@ class _StandardAxis:
         objects = self._objects = AxisObjects(drive.device.objects, Units(1.0, 1.0, 1.0, 1.0, 1.0), number)
         self._rated = objects.number(0x6076)
         stated = self._rated.value * 1e-3 * self._torque_ratio
-        given = self._option("rated_torque", 0.0) or stated or _MODEL.rated_torque
-        size = self._size = _size_of(given, self._option("peak_torque", 2.0 * given))
-        self._max_speed = Absent(0)
+        rated_torque = self._option("rated_torque", 0.0) or stated or _MODEL.rated_torque
+        size = self._size = _size_of(rated_torque, self._option("peak_torque", 2.0 * rated_torque))
+        self._max_speed = Number(0)
         mechanics = Mechanics(
             size.rotor_inertia + self._option("load_inertia", size.load_inertia),
             self._option("friction", size.coulomb),
@@ -135,7 +119,7 @@ class _StandardAxis:
             position=self._option("initial_position"),
         )
         self._read_units()
-        self._feedback = _BoundedFeedback(objects, size.rated_torque)
+        self._feedback = BoundedFeedback(objects, size.rated_torque)
         condition = Condition(size, drive.option("temperature"), drive.option("bus_voltage"))
         errors = ErrorLog(objects, drive.device.emergencies)
         self.servo = ServoAxis(
@@ -148,18 +132,18 @@ class _StandardAxis:
         return drive.option(f"axis{self._number + 1}_{name}", drive.option(name, otherwise))
 
     def read_units(self) -> None:
-        """Take over what the objects say of units now."""
+        """Read the units from the objects."""
         self._read_units()
         self._feedback.update_units()
 
     def _read_units(self) -> None:
         objects, units = self._objects, self._objects.units
-        turn = self._option("counts_per_turn", self._counts_per_turn())
-        units.position = 2 * pi / turn
+        counts_per_turn = self._option("counts_per_turn", self._counts_per_turn())
+        units.position = 2 * pi / counts_per_turn
         ratio = self._option("velocity_ratio", self._gear_ratio)
         units.velocity = rate_unit(objects.number(0x60A9).value, units.position, ratio) or units.position
         units.acceleration = rate_unit(objects.number(0x60AA).value, units.position, ratio) or units.velocity
-        units.increments = turn / (2 * pi)
+        units.increments = counts_per_turn / (2 * pi)
         rated = self._rated
         if not rated.value or self._option("rated_torque", 0.0):
             rated.value = round(self._size.rated_torque * 1000.0 / self._torque_ratio)
@@ -168,7 +152,7 @@ class _StandardAxis:
         objects.fill(self._defaults(units))
 
     def _counts_per_turn(self) -> float:
-        """Return the counts of a turn of the joint by the objects of the standard."""
+        """Return the position counts per joint revolution from the objects."""
         feed = self._ratio(0x6092)
         if feed:
             return feed
@@ -176,7 +160,7 @@ class _StandardAxis:
 
     @property
     def _gear_ratio(self) -> float:
-        """Turns of the motor for one of the joint."""
+        """Return the motor revolutions per joint revolution."""
         return self._ratio(0x6091) or 1.0
 
     @property
@@ -187,7 +171,7 @@ class _StandardAxis:
         objects = self._objects
         if (index, 1) not in objects:
             return 0.0
-        return objects.number(index, 1).value / (objects.number(index, 2).value or 1)
+        return float(objects.number(index, 1).value / (objects.number(index, 2).value or 1))
 
     def _defaults(self, units: Units) -> dict[tuple[int, int], int]:
         counts, speed = round(1.0 / units.position), round(1.0 / units.velocity)
@@ -223,12 +207,12 @@ class _StandardAxis:
         return {at: value for at, value in defaults.items() if at not in _OPTION_CODES or at not in self._objects}
 
     def _modes(self, axis: Axis, objects: AxisObjects) -> dict[int, Motion]:
-        unlimited = Absent(LIMITLESS)
+        unlimited = Number(LIMITLESS)
         modes: dict[int, Motion] = {
             1: ProfilePosition(axis, objects),
             3: ProfileVelocity(axis, objects),
             6: Homing(axis, objects, self._gear_ratio),
-            8: CyclicPosition(axis, objects, unlimited, unlimited, Absent(0), Absent(0)),
+            8: CyclicPosition(axis, objects, unlimited, unlimited, Number(0), Number(0)),
             9: CyclicVelocity(axis, objects),
             10: CyclicTorque(axis, objects),
         }
@@ -236,11 +220,11 @@ class _StandardAxis:
 
 
 _OPTION_CODES = frozenset({(0x605A, 0), (0x605C, 0), (0x605D, 0), (0x605E, 0)})
-"""Objects whose 0 has a meaning: it holds where the drive has them."""
+"""Objects for which 0 is a valid value."""
 
 
 def _size_of(rated: float, peak: float) -> ActuatorSize:
-    """Return an actuator of a rated torque, Nm."""
+    """Return an actuator of the given rated torque, Nm."""
     share = rated / _MODEL.rated_torque
     return ActuatorSize(
         "described", rated, peak, peak, rated, _MODEL.input_speed, _MODEL.rated_current, _MODEL.peak_current,

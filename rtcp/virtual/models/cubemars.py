@@ -1,4 +1,4 @@
-"""The Cubemars ORH drive: a CiA 402 servo drive with its motor, gear and load, as objects and time that passes."""
+"""The Cubemars ORH drive: a CiA 402 servo drive with motor, gear and load."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from math import pi
 from types import MappingProxyType
 from typing import ClassVar
 
-from rtcp.virtual.device import DeviceModel, Option, number
+from rtcp.virtual.device import DeviceModel, Option
 from rtcp.virtual.models.cia402 import DriveState
 from rtcp.virtual.models.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, Hold, Motion
 from rtcp.virtual.models.drive_objects import UNIT, define_objects
 from rtcp.virtual.models.mechanics import GEAR_RATIO, INCREMENTS_PER_RAD, SIZES, ActuatorSize, Axis, Mechanics
 from rtcp.virtual.models.profile_modes import Homing, ProfilePosition, ProfileVelocity
-from rtcp.virtual.models.protection import ENCODER_RANGE, Condition, ErrorLog, Feedback
+from rtcp.virtual.models.protection import ENCODER_RANGE, Condition, ErrorLog, FeedbackWithCondition
 from rtcp.virtual.models.servo import ServoAxis
 from rtcp.virtual.models.units import AxisObjects, Units
 from rtcp.virtual.objects import ObjectDictionary
@@ -37,7 +37,7 @@ CONDITION_OPTIONS = MappingProxyType({
 
 
 def modes_of(axis: Axis, objects: AxisObjects) -> dict[int, Motion]:
-    """Return the modes; in CSP 0x60FF limits the speed, 0 means no motion."""
+    """Return the modes; in CSP 0x60FF is the speed limit, 0 means no motion."""
     period, exponent = objects.number(0x60C2, 1), objects.number(0x60C2, 2)
     return {
         0: Hold(axis),
@@ -50,27 +50,10 @@ def modes_of(axis: Axis, objects: AxisObjects) -> dict[int, Motion]:
     }
 
 
-class _Feedback(Feedback):
-    """Shows the drive's condition in 0x2000 too."""
-
-    def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
-        super().__init__(objects, rated_torque)
-        self._temperature = objects.number(0x2000, 1)
-        self._bus_voltage = objects.number(0x2000, 2)
-        self._overload = objects.number(0x2000, 3)
-
-    def publish_condition(self, condition: Condition, torque: float) -> None:
-        """Write temperature, voltage, overload and current."""
-        super().publish_condition(condition, torque)
-        self._temperature.value = round(condition.temperature * 10.0)
-        self._bus_voltage.value = round(condition.bus_voltage * 100.0)
-        self._overload.value = min(0xFFFF, round(condition.overload * 1000.0))
-
-
 class CubemarsDrive(DeviceModel):
     """A Cubemars ORH drive; each size is a subclass."""
 
-    # The true numbers of the manufacturer are not known to this project; these are placeholders.
+    # Placeholders: the manufacturer's numbers are unknown to this project.
     vendor_id = 0x00000B5C
     product_code = 0x00040201
     device_type = 0x00020192  # servo drive, CiA 402
@@ -93,17 +76,17 @@ class CubemarsDrive(DeviceModel):
         )
         self.servo = ServoAxis(
             objects, size, mechanics, Condition(size, option("temperature"), option("bus_voltage")),
-            _Feedback(objects, size.rated_torque), ErrorLog(objects, self.emergencies), modes_of,
-            number(self.objects, 0x6080), ENCODER_RANGE,
+            FeedbackWithCondition(objects, size.rated_torque), ErrorLog(objects, self.emergencies), modes_of,
+            self.objects[0x6080, 0], ENCODER_RANGE,
         )  # fmt: skip
         self.servos = (self.servo,)
         self.mechanics, self.condition, self.axis = mechanics, self.servo.condition, self.servo.axis
-        # The segment steps the axis at once.
+        # Kept for fast access in a step.
         self.step = self.servo.step  # type: ignore[method-assign]
         self.power_on()
 
     def define(self, objects: ObjectDictionary) -> None:
-        """Add the objects of the drive and its PDOs, which the master may map anew."""
+        """Add the objects of the drive and its PDOs, which the master may remap."""
         define_objects(objects, self.size, int(self.option("sync_error_limit")))
         define_pdo_objects(objects, {0x1600: RX_PDO}, {0x1A00: TX_PDO}, [0x1600], [0x1A00], fixed=False)
 
@@ -118,16 +101,16 @@ class CubemarsDrive(DeviceModel):
         return self.servo.powered
 
     def inject_fault(self, code: int) -> None:
-        """Let the fault `code` happen now, as `ServoAxis.inject_fault`."""
+        """Trigger the fault `code`, see `ServoAxis.inject_fault`."""
         self.servo.inject_fault(code)
 
     def power_on(self) -> None:
-        """The supply comes back: all is as at power-on."""
+        """Power on: reset everything."""
         super().power_on()
         self.servo.power_on()
 
     def power_off(self) -> None:
-        """The supply goes: no torque, the brake closes."""
+        """Power off: no torque, the brake closes."""
         self.outputs_valid = False
         self.servo.power_off()
 
@@ -137,7 +120,7 @@ class CubemarsDrive(DeviceModel):
         self.servo.set_outputs_valid(valid)
 
     def step(self, dt: float) -> None:
-        """Let `dt` seconds pass: obey the RxPDO objects, move, write the TxPDO objects."""
+        """Advance by `dt` seconds: read the RxPDO objects, move, write the TxPDO objects."""
         self.servo.step(dt)
 
 

@@ -1,57 +1,57 @@
-"""The cyclic synchronous modes and the stop that may take over from any mode (CiA 402-2, ETG.6010).
+"""The cyclic synchronous modes, and the stop, which can interrupt any mode (CiA 402-2, ETG.6010).
 
-A mode is entered, then updated once a step: `count` sub-steps of `h` seconds each. `bits` are the bits of the
-statusword that the mode owns.
+After `enter`, `update` is called once a step: `count` sub-steps of `h` seconds each. `bits` are the mode's bits of the
+statusword.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Final
 
-from rtcp.virtual.device import Number
 from rtcp.virtual.models.cia402 import Status
 from rtcp.virtual.models.mechanics import Axis
 from rtcp.virtual.models.units import AxisObjects
+from rtcp.virtual.objects import Number
 
-# Plain ints: flag arithmetic is too slow for every step.
-REACHED = int(Status.TARGET_REACHED)
-LIMIT = int(Status.INTERNAL_LIMIT)
-SPECIFIC = int(Status.MODE_SPECIFIC)
-ERROR = int(Status.MODE_ERROR)
-_CATCHING_UP = 1.02
-_CREEP = 0.005
-"""What the position loop may add to the speed limit to make good what it lags behind: a factor, and rad/s."""
-_STANDSTILL = 0.005
-"""Speed, rad/s, below which a stopped joint counts as standing."""
-_STOP_PATIENCE = 0.5
-"""A joint that still moves so long (s) after its ramp has ended is moved by something else: the stop is over."""
+# Plain ints: enum arithmetic is too slow for every step.
+REACHED: Final = int(Status.TARGET_REACHED)
+LIMIT: Final = int(Status.INTERNAL_LIMIT)
+SPECIFIC: Final = int(Status.MODE_SPECIFIC)
+ERROR: Final = int(Status.MODE_ERROR)
+_CATCHING_UP: Final = 1.02
+_CREEP: Final = 0.005
+"""Excess over the speed limit that the position loop may use to catch up: a factor, and rad/s."""
+_STANDSTILL: Final = 0.005
+"""Speed below which a stopped joint counts as at rest, rad/s."""
+_STOP_PATIENCE: Final = 0.5
+"""Time after the end of the ramp at which a stop ends even if an external force still moves the joint, s."""
 
 
 class Motion:
-    """What moves the axis while the power stage is on. Base of the modes."""
+    """Base of the modes: moves the axis while the power stage is on."""
 
     closed: ClassVar[bool] = True
-    """Whether the position loop is closed: only then is the following error watched."""
+    """True: the position loop is closed and the following error is supervised."""
 
     def __init__(self, axis: Axis) -> None:
         self.bits = 0
         self._axis = axis
 
     def enter(self) -> None:
-        """Begin anew: nothing is left of an earlier target."""
+        """Start without any earlier target."""
         self.bits = 0
 
     def resume(self) -> None:
-        """Go on after a halt."""
+        """Continue after a halt."""
         self.enter()
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Let `count` times `h` seconds pass."""
+        """Advance by `count` times `h` seconds."""
         raise NotImplementedError
 
 
 class Profile:
-    """The objects that shape a profile, in SI units; 0x60C5 and 0x607F bound what the master asks for."""
+    """The objects of a profile in SI units; 0x60C5 and 0x607F bound the master's values."""
 
     def __init__(self, objects: AxisObjects) -> None:
         self._units = objects.units
@@ -66,22 +66,22 @@ class Profile:
     @property
     def velocity(self) -> float:
         """Profile velocity, rad/s."""
-        return min(self._velocity.value, self._top.value) * self._units.velocity
+        return float(min(self._velocity.value, self._top.value) * self._units.velocity)
 
     @property
     def top(self) -> float:
-        """Largest velocity of any profile, rad/s."""
-        return self._top.value * self._units.velocity
+        """Upper bound on the velocity of any profile, rad/s."""
+        return float(self._top.value * self._units.velocity)
 
     @property
     def acceleration(self) -> float:
         """Profile acceleration, rad/s^2, never zero."""
-        return max(1, min(self._acceleration.value, self._most.value)) * self._units.acceleration
+        return float(max(1, min(self._acceleration.value, self._most.value)) * self._units.acceleration)
 
     @property
     def deceleration(self) -> float:
         """Profile deceleration, rad/s^2, never zero."""
-        return max(1, min(self._deceleration.value, self._most.value)) * self._units.acceleration
+        return float(max(1, min(self._deceleration.value, self._most.value)) * self._units.acceleration)
 
     @property
     def range(self) -> tuple[float, float]:
@@ -91,23 +91,23 @@ class Profile:
 
 
 class Hold(Motion):
-    """No mode chosen yet (0x6061 = 0): the joint is held where it is."""
+    """No mode chosen yet (0x6061 = 0): holds the joint in place."""
 
     def enter(self) -> None:
-        """Hold here."""
+        """Hold the present position."""
         self._axis.synchronise()
         self._axis.reference_velocity = 0.0
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Stay."""
+        """Hold."""
         for _ in range(count):
             self._axis.follow(h)
 
 
 class CyclicPosition(Motion):
-    """CSP (8): interpolates from set-point to set-point, by `speed` and `top` fast at most.
+    """CSP (8): interpolates from set-point to set-point, at most at `speed` and `top`.
 
-    `period` and `exponent` (0x60C2) tell how long a set-point lasts; 0: as long as a step.
+    `period` and `exponent` (0x60C2) give the duration of a set-point; 0: one step.
     """
 
     def __init__(self, axis: Axis, objects: AxisObjects, speed: Number, top: Number, period: Number,
@@ -132,15 +132,17 @@ class CyclicPosition(Motion):
         self._clamped = self._held_back = False
 
     def enter(self) -> None:
-        """Start from where the joint is; after a halt, on to the set-point again."""
+        """Start from the joint's position; after a halt, continue to the set-point."""
         super().enter()
         self._set_point = None
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Move the demand along the line to the set-point, and the joint after it."""
+        """Move the demand linearly to the set-point; the joint follows."""
         axis = self._axis
-        counts = self._target.value + self._offset.value
-        limit = self._speed.value
+        target: int = self._target.value
+        offset: int = self._offset.value
+        limit: int = self._speed.value
+        counts = target + offset
         if counts != self._set_point or limit != self._limit:
             self._take(counts, limit, h * count)
         self._slope = axis.glide(self._goal, self._slope, self._fastest, h, count)
@@ -150,19 +152,21 @@ class CyclicPosition(Motion):
         self.bits = bits
 
     def _take(self, counts: int, limit: int, step: float) -> None:
-        # Every cycle in a motion: comparisons are quicker than min and max.
+        # Called every cycle of a motion: comparisons are faster than min and max.
         self._set_point, self._limit = counts, limit
-        high, low = self._high.value, self._low.value
+        high: int = self._high.value
+        low: int = self._low.value
         allowed = high if counts > high else counts
         if allowed < low:  # noqa: PLR1730
             allowed = low
         self._clamped = allowed != counts
         self._goal = allowed * self._units.position
-        value, exponent = self._period.value, self._exponent.value
+        value: int = self._period.value
+        exponent: int = self._exponent.value
         if value != self._period_told or exponent != self._exponent_told:
             self._period_told, self._exponent_told = value, exponent
             self._period_s = value * 10.0**exponent
-        highest = self._top.value
+        highest: int = self._top.value
         size = -limit if limit < 0 else limit
         top = (highest if highest < size else size) * self._units.velocity
         slope = (self._goal - self._axis.demand) / (self._period_s or step)
@@ -172,7 +176,7 @@ class CyclicPosition(Motion):
 
 
 class _WithoutPosition(Motion):
-    """What CSV and CST share: a target, an offset added to it, and the software position limits that stop the joint."""
+    """Common part of CSV and CST: target, offset, and software position limits that stop the joint."""
 
     closed = False
 
@@ -196,7 +200,7 @@ class CyclicVelocity(_WithoutPosition):
         super().__init__(axis, objects, 0x60FF, 0x60B1)
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Run at the velocity commanded."""
+        """Run at the commanded velocity."""
         axis = self._axis
         allowed = wanted = (self._target.value + self._offset.value) * self._units.velocity
         top = self._profile.top
@@ -217,7 +221,7 @@ class CyclicTorque(_WithoutPosition):
         super().__init__(axis, objects, 0x6071, 0x60B2)
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Apply the torque commanded."""
+        """Apply the commanded torque."""
         axis = self._axis
         wanted = (self._target.value + self._offset.value) * self._units.torque
         low, high, deceleration = self._limits()
@@ -229,9 +233,9 @@ class CyclicTorque(_WithoutPosition):
 
 
 class Stop(Motion):
-    """A ramp to rest, then the joint is held: halt, quick stop, disabling and fault reaction, in every mode alike.
+    """A ramp to rest, then hold: for halt, quick stop, disabling and fault reaction in all modes.
 
-    `deceleration` (rad/s^2) is set before `enter`; `done` tells that the joint stands.
+    Set `deceleration` (rad/s^2) before `enter`; `done` is True at rest.
     """
 
     def __init__(self, axis: Axis) -> None:
@@ -241,7 +245,7 @@ class Stop(Motion):
         self._waited = 0.0
 
     def enter(self) -> None:
-        """Begin to slow down from the joint's own position and velocity."""
+        """Start the ramp at the joint's position and velocity."""
         super().enter()
         self.done = False
         self._waited = 0.0

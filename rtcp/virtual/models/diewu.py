@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-from rtcp.virtual.device import DeviceModel, FreezableInputs, Option, number
+from rtcp.virtual.device import DeviceModel, FreezableInputs, Option
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary, Value
 from rtcp.virtual.pdo import define_pdo_objects
 
 CHANNELS = 16
 RELEASED = 0x033F
-"""Inputs with nothing pressed: joystick neutral (pull-ups, 63), toggle at the arm, emergency stop closed."""
+"""Inputs at rest: joystick neutral (pull-ups, 63), toggle at the arm, emergency stop closed."""
 _U16, _I32 = DataType.UNSIGNED16, DataType.INTEGER32
 
 
 class DiewuIoBox(DeviceModel, FreezableInputs):
     """The IO box.
 
-    The outside world sets `inputs` (or one of them with `set_input`) and turns the encoder. The master may force inputs
-    through 0x2000 (mask, levels, and for how long) and set the counter through 0x2001:1.
+    Tests set `inputs` (or one of them with `set_input`) and turn the encoder. The master can force inputs through
+    0x2000 (mask, levels, duration) and set the counter through 0x2001:1.
     """
 
-    # The true numbers of the manufacturer are not known to this project; these are placeholders.
+    # Placeholders: the manufacturer's numbers are unknown to this project.
     vendor_id = 0x00000D1E
     product_code = 0x00161602
     device_type = 0x00030191  # digital inputs and outputs, CiA 401
@@ -32,7 +32,7 @@ class DiewuIoBox(DeviceModel, FreezableInputs):
         "counter_rate": Option(0.0, -1e6, 1e6, "AB edges a second of the encoder"),
         "inputs": Option(RELEASED, 0, 0xFFFF, "levels at the inputs at power-on, bit 0 is input 1", whole=True),
     })  # fmt: skip
-    # Its clock, the first of the segment, is the reference of the others.
+    # Its clock, the first of the segment, is the reference clock.
     uses_sync0 = False
 
     def __init__(self, **options: object) -> None:
@@ -42,14 +42,14 @@ class DiewuIoBox(DeviceModel, FreezableInputs):
         self._inputs = int(self.option("inputs"))
         self._turned = 0.0
         self.broken: list[BrokenTerminals] = []
-        """Input terminals that do not show their level, also where it is forced."""
+        """Input terminals with a wrong level, even if forced."""
         self._held_s = 0.0
-        self._input_entry = number(objects, 0x6000, 1)
-        self._counter_entry = number(objects, 0x6010, 1)
-        self._output_entry = number(objects, 0x7000, 1)
-        self._mask_entry = number(objects, 0x2000, 1)
-        self._levels_entry = number(objects, 0x2000, 2)
-        self._terminal_entry = number(objects, 0x2002)
+        self._input_entry = objects[0x6000, 1]
+        self._counter_entry = objects[0x6010, 1]
+        self._output_entry = objects[0x7000, 1]
+        self._mask_entry = objects[0x2000, 1]
+        self._levels_entry = objects[0x2000, 2]
+        self._terminal_entry = objects[0x2002, 0]
 
     def define(self, objects: ObjectDictionary) -> None:
         """Add inputs, outputs and counter with their fixed PDOs."""
@@ -70,7 +70,7 @@ class DiewuIoBox(DeviceModel, FreezableInputs):
         define_pdo_objects(objects, rx_pdo, tx_pdo, [0x1600], [0x1A00], fixed=True)
 
     def power_on(self) -> None:
-        """The supply comes back: no input is forced."""
+        """Power on: no input is forced."""
         super().power_on()
         self._held_s = 0.0
 
@@ -86,7 +86,7 @@ class DiewuIoBox(DeviceModel, FreezableInputs):
         self._inputs = levels
 
     def set_input(self, channel: int, level: bool) -> None:
-        """Set the level at input `channel`, 0 to 15; raises ValueError for another one."""
+        """Set the level at input `channel`, 0 to 15; raises ValueError for any other."""
         if not 0 <= channel < CHANNELS:
             raise ValueError(f"the IO box has inputs 0 to {CHANNELS - 1}, not {channel}")
         bit = 1 << channel
@@ -98,21 +98,21 @@ class DiewuIoBox(DeviceModel, FreezableInputs):
         return self._output_entry.value if self.outputs_valid else 0
 
     def turn(self, edges: float) -> None:
-        """Turn the AB encoder by `edges`, negative for backwards; the next step counts whole ones."""
+        """Turn the AB encoder by `edges`, negative for backwards; the next step counts whole edges."""
         self._turned += edges
 
     def set_outputs_valid(self, valid: bool) -> None:
-        """Outputs become valid, or go to 0 (the safe state)."""
+        """Set whether the outputs are valid; invalid ones are 0 (safe state)."""
         super().set_outputs_valid(valid)
         self._terminal_entry.value = self.outputs
 
     def step(self, dt: float) -> None:
-        """Let `dt` seconds pass: drive the output terminals, read the inputs, count edges."""
+        """Advance by `dt` seconds: drive the output terminals, read the inputs, count edges."""
         self._terminal_entry.value = self._output_entry.value if self.outputs_valid else 0
         if self._held_s > 0.0:
             self._held_s -= dt
             if self._held_s <= 0.0:
-                # A client that died must not leave the joystick deflected for ever.
+                # Forcing expires, lest a dead client leave the joystick deflected for ever.
                 self._mask_entry.value = 0
         mask = self._mask_entry.value
         levels = self._inputs & ~mask | self._levels_entry.value & mask
@@ -135,7 +135,7 @@ class DiewuIoBox(DeviceModel, FreezableInputs):
 
 
 class BrokenTerminals:
-    """Input terminals, the bits of `mask`, that show `levels`; with a `half_period` (s) they toggle after each."""
+    """Input terminals `mask` stuck at `levels`; with a `half_period` (s) they toggle."""
 
     def __init__(self, mask: int, levels: int, half_period: float = 0.0) -> None:
         self._mask = mask
@@ -144,7 +144,7 @@ class BrokenTerminals:
         self._passed = 0.0
 
     def shown(self, levels: int, dt: float) -> int:
-        """Let `dt` seconds pass and return what the inputs show while `levels` are true."""
+        """Advance by `dt` seconds and return the visible levels for the true `levels`."""
         own = self._levels
         if self._half_period:
             self._passed += dt

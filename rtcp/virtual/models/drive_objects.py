@@ -1,7 +1,7 @@
 """The objects of a Cubemars ORH drive (CiA 402-2, ETG.6010), as tables.
 
-Every position, velocity, acceleration and torque counts 10000 to the rad, rad/s, rad/s^2 and Nm, where the standard
-would say increments and per mille of the rated torque: that is this maker's way, and so is a 32-bit actual torque.
+All positions, velocities, accelerations and torques have 10000 counts per rad, rad/s, rad/s^2 and Nm, unlike the
+standard's increments and per mille of the rated torque: vendor-specific, like the 32-bit actual torque.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ VOLTAGE_LOCK = 60.0
 HISTORY_LENGTH = 8
 
 HOMING_METHODS = (33, 34, 35, 37)
-"""Next index pulse in the negative, in the positive direction; where it stands (old and new number)."""
+"""Next index pulse in negative or positive direction; present position (old and new number)."""
 SUPPORTED_MODES = (1, 3, 6, 8, 9, 10)
 
 _I8, _I16, _I32 = DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32
@@ -102,7 +102,7 @@ _ALLOWED = {
     0x6086: (0,),
     0x6098: HOMING_METHODS,
 }
-"""The values that an SDO may write; others are answered with abort 0x06090030."""
+"""Allowed values of SDO writes; others get abort 0x06090030."""
 _BOUNDS = {
     0x6080: (0, round(VELOCITY_RANGE * COUNTS)),
     0x6083: (1, 0xFFFFFFFF),
@@ -114,12 +114,12 @@ _BOUNDS = {
 
 
 def define_objects(objects: ObjectDictionary, size: ActuatorSize, sync_error_limit: int) -> None:
-    """Add the objects of a drive of this size, identity and PDO objects (0x16xx, 0x1Axx, 0x1Cxx) left out."""
+    """Add the objects of a drive of this size, except identity and PDO objects (0x16xx, 0x1Axx, 0x1Cxx)."""
     for index, name, data_type, value, access in _STATE_AND_MODE + _POSITION + _VELOCITY + _TORQUE:
         low, high = _BOUNDS.get(index, (None, None))
         hook = _only(*_ALLOWED[index]) if index in _ALLOWED else None
         objects.variable(index, name, data_type, value, access, minimum=low, maximum=high, on_write=hook)
-    # A drive's error register may be mapped.
+    # The error register is mappable.
     objects[0x1001, 0].access = _TX
     _add_synchronisation(objects, sync_error_limit)
     _add_limits(objects, size)
@@ -127,12 +127,12 @@ def define_objects(objects: ObjectDictionary, size: ActuatorSize, sync_error_lim
 
 
 def _record(objects: ObjectDictionary, index: int, name: str, *entries: Entry) -> None:
-    made = objects.record(index, name, list(entries))
-    made.entries[0].value = made.highest_subindex
+    obj = objects.record(index, name, list(entries))
+    obj.entries[0].value = obj.highest_subindex
 
 
 def _add_synchronisation(objects: ObjectDictionary, limit: int) -> None:
-    """Add 0x10F1 and 0x1C32/0x1C33 (ETG.1020): the slave's application counts in them."""
+    """Add 0x10F1 and 0x1C32/0x1C33 (ETG.1020), which the slave's application updates."""
     _record(objects, 0x10F1, "Error settings",
             Entry(0x10F1, 1, "Local error reaction", _U32, 1, _RW),
             Entry(0x10F1, 2, "Sync error counter limit", _U16, limit, _RW))  # fmt: skip

@@ -1,23 +1,23 @@
-"""A joint: motor, gear, brake, load and gravity on the output side, and the loops that control it. SI units."""
+"""A joint: motor, gear, brake, load and gravity on the output side, and its control loops. SI units."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi, sin, sqrt
 from types import MappingProxyType
-from typing import ClassVar
+from typing import ClassVar, Final
 
-GRAVITY = 9.80665
+GRAVITY: Final = 9.80665
 GEAR_RATIO = 100
 ENCODER_INCREMENTS = 1 << 14
-"""Increments of a turn of either encoder; the motor's, behind the gear, gives the fine position."""
+"""Increments per revolution of each encoder; the motor's encoder gives the fine position."""
 INCREMENTS_PER_RAD = GEAR_RATIO * ENCODER_INCREMENTS / (2 * pi)
-"""Increments of the motor's encoder for one rad of the output."""
+"""Increments of the motor's encoder per rad of the output."""
 
 
 @dataclass(frozen=True)
 class ActuatorSize:
-    """An actuator: torques (Nm) and speed from the maker's table, output side; what the table leaves out is assumed."""
+    """An actuator, output side: torques (Nm) and speed from the maker's table, other values assumed."""
 
     name: str
     rated_torque: float
@@ -30,9 +30,9 @@ class ActuatorSize:
     rated_current: float
     peak_current: float
     rotor_inertia: float
-    """Rotor and wave generator as the output sees them, kg m^2 (assumed)."""
+    """Inertia of rotor and wave generator at the output, kg m^2 (assumed)."""
     load_inertia: float
-    """What a joint of this size usually carries, kg m^2 (assumed)."""
+    """Usual load inertia of a joint of this size, kg m^2 (assumed)."""
     coulomb: float
     """Coulomb friction of the gear, Nm (assumed)."""
     viscous: float
@@ -40,7 +40,7 @@ class ActuatorSize:
 
     @property
     def speed_limit(self) -> float:
-        """Largest speed of the output, rad/s, that the gear's input allows."""
+        """Speed limit of the output from the gear's input speed, rad/s."""
         return self.input_speed / 60 * 2 * pi / GEAR_RATIO
 
 
@@ -53,10 +53,10 @@ SIZES = MappingProxyType({
 
 
 class Mechanics:
-    """A joint that turns: `position` (rad, of the output encoder), `velocity` (rad/s), moved by `advance`.
+    """Mechanics of a joint: `position` (rad, of the output encoder) and `velocity` (rad/s), moved by `advance`.
 
     `load_mass_moment` (kg m) is the load's mass times the distance of its centre from the axis. `external_torque` (Nm)
-    is what the world adds: a hand, a collision, a payload. `braked` adds the holding torque to the friction.
+    is the sum of outside torques: a hand, a collision, a payload. `braked` adds the holding torque to the friction.
     """
 
     __slots__ = (
@@ -87,10 +87,10 @@ class Mechanics:
         self.velocity = 0.0
 
     def advance(self, torque: float, h: float) -> None:
-        """Let `h` seconds (at most about 1 ms) pass under `torque` (Nm) of the motor, as the output feels it.
+        """Advance by `h` seconds (at most about 1 ms) with the motor's `torque` (Nm) at the output.
 
-        Gravity adds `gravity_torque * sin(position + gravity_phase)`: with phase 0 the load stands upright at 0 and
-        wants to fall, with phase pi it hangs.
+        Gravity adds `gravity_torque * sin(position + gravity_phase)`: with phase 0 the load is upright (unstable) at 0,
+        with phase pi it hangs.
         """
         velocity = self.velocity
         net = torque + self.external_torque
@@ -106,17 +106,17 @@ class Mechanics:
             after = h * net / self.inertia
         else:
             opposed = net - friction if velocity > 0.0 else net + friction
-            # Viscous friction is taken implicitly: stable for any step.
+            # Implicit viscous friction: stable for any step.
             after = (velocity + h * opposed / self.inertia) / (1.0 + h * self.viscous / self.inertia)
             if after * velocity < 0.0 and -friction <= net <= friction:
-                # Friction stops a motion; it never turns it round.
+                # Friction stops a motion but never reverses it.
                 after = 0.0
         self.velocity = after
         self.position += 0.5 * (velocity + after) * h
 
 
 def ramp(velocity: float, target: float, acceleration: float, deceleration: float, h: float) -> float:
-    """Return the velocity after `h` seconds on the way to `target`, by `deceleration` when slowing."""
+    """Return the velocity after `h` seconds of a ramp to `target`, at `deceleration` when slowing."""
     slowing = abs(target) < abs(velocity) or target * velocity < 0.0
     change = (deceleration if slowing else acceleration) * h
     if velocity < target:
@@ -124,19 +124,18 @@ def ramp(velocity: float, target: float, acceleration: float, deceleration: floa
     return max(target, velocity - change)
 
 
-_POSITION_GAIN = 50.0
-_VELOCITY_BANDWIDTH = 300.0
-_VELOCITY_INTEGRAL = 40.0
-_TRACKER = 150.0
-"""Bandwidth (rad/s) of the tracker that smooths cyclic set-points: one count a cycle is 0.2 rad/s at 500 us."""
+_POSITION_GAIN: Final = 50.0
+_VELOCITY_BANDWIDTH: Final = 300.0
+_VELOCITY_INTEGRAL: Final = 40.0
+_TRACKER: Final = 150.0
+"""Bandwidth of the tracker that smooths cyclic set-points, rad/s: one count per cycle is 0.2 rad/s at 500 us."""
 
 
 class Axis:
-    """One controlled joint. Every method lets `h` seconds pass, at most `LONGEST_STEP` of them.
+    """A controlled joint. Every method advances by `h` seconds, at most `LONGEST_STEP`.
 
-    `demand` is the position that the drive is on its way through (0x6062); `reference` and `reference_velocity` are
-    what the position loop follows: the same, but smooth. The gains are set from the inertia that was there at
-    commissioning.
+    `demand` is the position demand value (0x6062); `reference` and `reference_velocity` are its smooth version for the
+    position loop. The gains are set from the inertia at commissioning.
     """
 
     LONGEST_STEP: ClassVar = 500e-6
@@ -149,11 +148,11 @@ class Axis:
     def __init__(self, mechanics: Mechanics) -> None:
         self.mechanics = mechanics
         self.offset = 0.0
-        """Position as the user counts it, minus the encoder's; homing sets it."""
+        """User position minus encoder position, rad; set by homing."""
         self.torque = 0.0
         self.torque_limit = 0.0
         self.saturated = False
-        """Whether the torque limit was met in the last step."""
+        """True: the last step reached the torque limit."""
         self._velocity_gain = _VELOCITY_BANDWIDTH * mechanics.inertia
         self._integral_gain = self._velocity_gain * _VELOCITY_INTEGRAL
         self._integral = 0.0
@@ -161,28 +160,28 @@ class Axis:
 
     @property
     def position(self) -> float:
-        """Position as the user counts it, rad."""
+        """User position, rad."""
         return self.mechanics.position + self.offset
 
     def synchronise(self) -> None:
-        """Set the demand to the joint's own position and velocity: no jump when something else takes over."""
+        """Set the demand to the joint's actual position and velocity, for a change of mode without a jump."""
         self.demand = self.reference = self.mechanics.position + self.offset
         self.reference_velocity = self.mechanics.velocity
 
     def shift(self, offset: float) -> None:
-        """Move the user's zero: every position reads `offset` rad more from now on."""
+        """Move the user's zero: all positions increase by `offset` rad."""
         self.offset += offset
         self.demand += offset
         self.reference += offset
 
     def release(self) -> None:
-        """Open the brake, power stage on: the loops start empty."""
+        """Power stage on, brake open; reset the loops."""
         self.mechanics.braked = False
         self._integral = 0.0
         self.synchronise()
 
     def rest(self, h: float) -> None:
-        """Power stage off, brake closed: friction alone stops the joint."""
+        """Power stage off, brake closed: only friction stops the joint."""
         self.torque = 0.0
         self.saturated = False
         self.mechanics.braked = True
@@ -190,10 +189,10 @@ class Axis:
         self.synchronise()
 
     def glide(self, goal: float, slope: float, fastest: float, h: float, count: int) -> float:
-        """Move `demand` on by `slope` (rad/s) until it is at `goal`, follow it; `count` times. Return the slope left.
+        """Move `demand` at `slope` (rad/s) to `goal` and follow it, `count` times; return the remaining slope.
 
-        It is followed, at most `fastest` (rad/s), through a tracker that has no lag at constant speed, of second order
-        and critically damped. What `run` and `Mechanics.advance` do is written out: a drive in CSP does nothing else.
+        A second-order, critically damped tracker without lag at constant speed follows, at most at `fastest` (rad/s).
+        `run` and `Mechanics.advance` are inlined: this is all that a drive in CSP does.
         """
         mechanics = self.mechanics
         demand, reference, along = self.demand, self.reference, self.reference_velocity
@@ -247,12 +246,12 @@ class Axis:
     def follow(self, h: float) -> None:
         """Close the position loop on `reference` and `reference_velocity`."""
         velocity = self.reference_velocity
-        # The reference is where the joint shall be after this step: compare what was before it.
+        # The reference is for the end of this step: compare with the value before it.
         error = self.reference - velocity * h - self.mechanics.position - self.offset
         self.run(velocity + _POSITION_GAIN * error, h)
 
     def ramp(self, velocity: float, acceleration: float, h: float) -> None:
-        """Move the demand at a speed that approaches `velocity` by `acceleration` (rad/s^2), and follow it."""
+        """Ramp the demand's speed to `velocity` at `acceleration` (rad/s^2), and follow it."""
         self.reference_velocity = ramp(self.reference_velocity, velocity, acceleration, acceleration, h)
         self.demand = self.reference = self.reference + self.reference_velocity * h
         self.follow(h)
@@ -275,18 +274,18 @@ class Axis:
         self.mechanics.advance(torque, h)
 
     def push(self, torque: float, slowest: float, fastest: float, h: float) -> None:
-        """Apply `torque` Nm as far as the torque limit and the range of velocities slowest..fastest allow."""
+        """Apply `torque` Nm within the torque limit and the velocity range slowest..fastest."""
         velocity = self.mechanics.velocity
         highest = min(self.torque_limit, self._velocity_gain * (fastest - velocity))
         lowest = max(-self.torque_limit, self._velocity_gain * (slowest - velocity))
         allowed = max(-self.torque_limit, min(self.torque_limit, max(lowest, min(highest, torque))))
         self.saturated = allowed != torque
-        # A velocity or position mode that takes over starts from this torque.
+        # A following velocity or position mode starts from this torque.
         self._integral = self.torque = allowed
         self.mechanics.advance(allowed, h)
 
     def velocity_range(self, low: float, high: float, deceleration: float) -> tuple[float, float]:
-        """Return the slowest and the fastest velocity from which `deceleration` (rad/s^2) still stops in low..high."""
+        """Return the range of velocities from which `deceleration` (rad/s^2) stops within low..high."""
         position = self.mechanics.position + self.offset
         below, above = position - low, high - position
         return (

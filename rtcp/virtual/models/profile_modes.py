@@ -1,4 +1,4 @@
-"""The modes in which the drive makes its own motion: profile position, profile velocity, homing (CiA 402-2)."""
+"""Modes with the drive's own profile: profile position, profile velocity, homing (CiA 402-2)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from rtcp.virtual.models.units import AxisObjects
 def approach(
     position: float, velocity: float, target: float, top: float, acceleration: float, deceleration: float, h: float
 ) -> tuple[float, float]:
-    """Return position and velocity after `h` seconds on the way to rest at `target`, at most `top` fast.
+    """Return position and velocity after `h` seconds of an approach to rest at `target`, at most at `top`.
 
-    SI units; `top`, `acceleration`, `deceleration` are positive. The target is met exactly, without overshoot unless
-    the velocity at the start forces one.
+    SI units; `top`, `acceleration`, `deceleration` are positive. It ends exactly at the target, without overshoot
+    unless the initial velocity forces one.
     """
     distance = target - position
     direction = 1.0 if distance >= 0.0 else -1.0
     distance *= direction
     along = velocity * direction
-    # The fastest speed from which whole steps of deceleration * h still stop at the target.
+    # Fastest speed from which whole steps of deceleration * h stop at the target.
     allowed = deceleration * (sqrt(0.25 * h * h + 2.0 * distance / deceleration) - 0.5 * h)
     wanted = min(top, allowed, distance / h)
     if along > wanted:
@@ -33,7 +33,7 @@ def approach(
         along = min(wanted, along + deceleration * h)
     else:
         along = min(wanted, along + acceleration * h)
-    # The last step is shorter than one of deceleration: it ends on the target, at rest.
+    # The last step is shorter than a deceleration step: it ends at rest on the target.
     if distance <= along * h * (1.0 + 1e-9) and along <= deceleration * h * (1.0 + 1e-9):
         return target, 0.0
     return position + direction * along * h, direction * along
@@ -47,7 +47,7 @@ _RELATIVE = 0x40
 
 @dataclass(frozen=True)
 class SetPoint:
-    """A target of profile position with the profile that was in force when it was accepted (SI units)."""
+    """A target of profile position with the profile at the time of its acceptance (SI units)."""
 
     position: float
     velocity: float
@@ -73,7 +73,7 @@ class ProfilePosition(Motion):
         self._inside = 0.0
 
     def enter(self) -> None:
-        """Forget every set-point; bit 4 must rise anew."""
+        """Discard all set-points; bit 4 must rise again."""
         self._active = self._queued = None
         self._last = self._axis.demand
         self._start = None
@@ -81,11 +81,11 @@ class ProfilePosition(Motion):
         self.bits = 0
 
     def resume(self) -> None:
-        """Go on to the active set-point."""
+        """Continue to the active set-point."""
         self._inside = 0.0
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Accept a set-point when one is offered; move towards the active one."""
+        """Accept an offered set-point; move towards the active one."""
         self._handshake(controlword)
         axis = self._axis
         for _ in range(count):
@@ -146,7 +146,7 @@ class ProfilePosition(Motion):
 
 
 class ProfileVelocity(Motion):
-    """Profile velocity (3): 0x60FF by ramps of 0x6083 and 0x6084, stopping at the software position limits."""
+    """Profile velocity (3): follows 0x60FF with ramps of 0x6083 and 0x6084; stops at the software position limits."""
 
     closed = False
 
@@ -162,12 +162,12 @@ class ProfileVelocity(Motion):
         self._inside = self._still = 0.0
 
     def enter(self) -> None:
-        """Ramp from the joint's own velocity."""
+        """Start at the joint's actual velocity."""
         self._inside = self._still = 0.0
         self.bits = 0
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Ramp towards the target velocity and keep it."""
+        """Ramp to the target velocity and hold it."""
         axis, profile = self._axis, self._profile
         wanted = self._target.value * self._units.velocity
         low, high = profile.range
@@ -194,7 +194,7 @@ class ProfileVelocity(Motion):
 
 
 class Phase(Enum):
-    """How far a homing procedure is (statusword bits 10, 12 and 13 of CiA 402-2)."""
+    """Phase of a homing procedure (statusword bits 10, 12 and 13 of CiA 402-2)."""
 
     IDLE = REACHED
     SEARCHING = 0
@@ -204,10 +204,10 @@ class Phase(Enum):
 
 
 class Homing(Motion):
-    """Homing (6) by methods 33, 34 (next index pulse), 35 and 37 (where it stands): home then reads 0x607C."""
+    """Homing (6) by methods 33, 34 (next index pulse), 35 and 37 (present position); home gets the value of 0x607C."""
 
     def __init__(self, axis: Axis, objects: AxisObjects, gear_ratio: float) -> None:
-        """The index pulse comes once a turn of the motor: `gear_ratio` times a turn of the output."""
+        """The index pulse occurs once per motor revolution: `gear_ratio` times per output revolution."""
         super().__init__(axis)
         self._units = objects.units
         self._pitch = 2 * pi / gear_ratio
@@ -221,16 +221,16 @@ class Homing(Motion):
         self._index = 0.0
 
     def enter(self) -> None:
-        """Wait for the start (controlword bit 4 rising)."""
+        """Wait for the start (rising edge of controlword bit 4)."""
         self._phase = Phase.IDLE
         self._start = None
         self.bits = 0
 
     def resume(self) -> None:
-        """Go on searching."""
+        """Continue the search."""
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Start or interrupt as bit 4 says; search; stop."""
+        """Start or interrupt by bit 4; search; stop."""
         start = controlword & _START
         if self._start is None:
             self._start = start
@@ -257,11 +257,11 @@ class Homing(Motion):
         elif method not in HOMING_METHODS or self._speed.value == 0:
             self._phase = Phase.FAILED
         else:
-            turn = floor(position / self._pitch)
+            revolution = floor(position / self._pitch)
             if method == 33:
-                self._index = (turn if turn * self._pitch < position else turn - 1) * self._pitch
+                self._index = (revolution if revolution * self._pitch < position else revolution - 1) * self._pitch
             else:
-                self._index = (turn + 1) * self._pitch
+                self._index = (revolution + 1) * self._pitch
             self._velocity = self._speed.value * self._units.velocity * (-1.0 if method == 33 else 1.0)
             self._phase = Phase.SEARCHING
 

@@ -1,4 +1,4 @@
-"""What a drive protects itself against and what it reports: faults, condition, actual values, errors."""
+"""Protection and reports of a drive: faults, condition, actual values, error log."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections import deque
 from enum import IntEnum
 from math import pi
 from types import MappingProxyType
+from typing import Final
 
 from rtcp.virtual.device import Emergency
 from rtcp.virtual.models.drive_objects import HISTORY_LENGTH, TEMPERATURE_LOCK, VOLTAGE_LOCK
@@ -23,12 +24,12 @@ class ErrorCode(IntEnum):
     UNDER_VOLTAGE = 0x3220
     OVER_TEMPERATURE = 0x4310
     ENCODER = 0x7305
-    """The position is unknown, no ramp can be kept."""
+    """The position is unknown, so no ramp is possible."""
     COMMUNICATION = 0x8130
     """Life guard: outputs became invalid while the drive was enabled.
 
-    EtherCAT has no life guarding of CANopen's; its watchdog is the sync manager's, and this code says the same: the
-    master's cyclic sign of life is missing. 0x7510 would be a fault of a serial interface inside the drive.
+    EtherCAT has the sync manager watchdog in place of CANopen's life guarding; the meaning is the same: the master's
+    cyclic sign of life is missing. 0x7510 would be a fault of a serial interface inside the drive.
     """
     OVER_SPEED = 0x8400
     FOLLOWING_ERROR = 0x8611
@@ -37,19 +38,19 @@ class ErrorCode(IntEnum):
 
 
 AT_ONCE = frozenset({ErrorCode.OVER_CURRENT, ErrorCode.OVER_VOLTAGE, ErrorCode.UNDER_VOLTAGE, ErrorCode.ENCODER})
-"""Faults in which torque must go at once."""
+"""Faults that remove the torque at once."""
 REGISTER_BITS = MappingProxyType({
     0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0xF: 0x81, 0x81: 0x11, 0x84: 0x21, 0x86: 0x21,
 })  # fmt: skip
-"""Bits of the error register 0x1001 by the class of an error code, its first digit or its first two (CiA 301)."""
+"""Bits of the error register 0x1001 by the class of an error code, its first one or two digits (CiA 301)."""
 ENCODER_RANGE = 4 * pi
-"""The multi-turn encoder counts two turns each way, rad; the firmware's position range of 12.5 rad ends just inside."""
+"""Range of the multi-turn encoder, two turns each way, rad; the firmware's range of 12.5 rad is just inside."""
 
-_UNDER_VOLTAGE_LOCK = 18.0
-_RATED_RISE = 40.0
-_THERMAL_TIME = 900.0
-_OVERLOAD_TIME = 2.0
-_INTERVAL = 0.005
+_UNDER_VOLTAGE_LOCK: Final = 18.0
+_RATED_RISE: Final = 40.0
+_THERMAL_TIME: Final = 900.0
+_OVERLOAD_TIME: Final = 2.0
+_INTERVAL: Final = 0.005
 
 
 class Condition:
@@ -67,9 +68,9 @@ class Condition:
         self._elapsed = 0.0
 
     def wear(self, torque: float, dt: float) -> bool:
-        """Count `torque` Nm for `dt` seconds; return True every 5 ms, when the quantities have been worked out anew.
+        """Accumulate `torque` Nm for `dt` seconds; return True every 5 ms, after an update of all quantities.
 
-        The overload integrator reaches 1 after 2 s of the start/stop torque and never below the average load torque.
+        The overload integrator reaches 1 after 2 s at the start/stop torque, and never at the average load torque.
         """
         self._heat += torque * torque * dt
         self._elapsed += dt
@@ -83,7 +84,7 @@ class Condition:
         return True
 
     def fault(self) -> int:
-        """Return the error code of what is wrong now, 0 for nothing."""
+        """Return the present error code; 0: none."""
         if self.bus_voltage > VOLTAGE_LOCK:
             return ErrorCode.OVER_VOLTAGE
         if self.bus_voltage < _UNDER_VOLTAGE_LOCK:
@@ -96,7 +97,7 @@ class Condition:
 
     @property
     def warning(self) -> bool:
-        """Whether a fault comes near: 10 K below the lock, 4 V below the lock, 80 % of the overload."""
+        """Whether a fault is near: 10 K or 4 V below the limit, or 80 % of the overload."""
         return (
             self.temperature >= TEMPERATURE_LOCK - 10.0
             or self.bus_voltage >= VOLTAGE_LOCK - 4.0
@@ -105,12 +106,12 @@ class Condition:
 
 
 def error_register(code: int) -> int:
-    """Return the bits of the error register that go with an error code, by its class."""
+    """Return the bits of the error register for the class of an error code."""
     return REGISTER_BITS.get(code >> 8) or REGISTER_BITS.get(code >> 12, 0x01)
 
 
 class Feedback:
-    """The actual and demand values of a drive: entries kept, nothing looked up in a step."""
+    """Actual and demand values of a drive; keeps the entries, to avoid look-ups in a step."""
 
     def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
         self._units = objects.units
@@ -128,14 +129,14 @@ class Feedback:
         self.update_units()
 
     def update_units(self) -> None:
-        """Take over the units, which have changed."""
+        """Apply changed units."""
         units = self._units
         self._increments_per_rad = units.increments
         self._positions, self._velocities = 1.0 / units.position, 1.0 / units.velocity
         self._torques = 1.0 / units.torque
 
     def publish(self, status: int, axis: Axis, following: float) -> None:
-        """Write the statusword and what is measured; `following` is the following error in rad."""
+        """Write the statusword and the measurements; `following`: following error, rad."""
         mechanics = axis.mechanics
         per_rad, positions, velocities = self._increments_per_rad, self._positions, self._velocities
         increments = round(mechanics.position * per_rad)
@@ -143,19 +144,53 @@ class Feedback:
         self._increments.value = increments
         self._position.value = round((increments / per_rad + axis.offset) * positions)
         self._velocity.value = round(mechanics.velocity * velocities)
-        # The current loop is ideal: the torque demanded is there.
+        # Ideal current loop: the actual torque equals the demand.
         self._torque.value = self._torque_demand.value = round(axis.torque * self._torques)
         self._position_demand.value = round(axis.demand * positions)
         self._velocity_demand.value = round(axis.reference_velocity * velocities)
         self._following.value = round(following * positions)
 
     def publish_condition(self, condition: Condition, torque: float) -> None:
-        """Write what changes slowly: the current that goes with `torque` Nm."""
+        """Write the slow quantities: the current for `torque` Nm."""
         self._current.value = round(1000.0 * torque / self._rated_torque)
 
 
+class FeedbackWithCondition(Feedback):
+    """Feedback with the drive's condition in 0x2000."""
+
+    def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
+        super().__init__(objects, rated_torque)
+        self._temperature = objects.number(0x2000, 1)
+        self._bus_voltage = objects.number(0x2000, 2)
+        self._overload = objects.number(0x2000, 3)
+
+    def publish_condition(self, condition: Condition, torque: float) -> None:
+        """Write temperature, voltage, overload and current."""
+        super().publish_condition(condition, torque)
+        self._temperature.value = round(condition.temperature * 10.0)
+        self._bus_voltage.value = round(condition.bus_voltage * 100.0)
+        self._overload.value = min(0xFFFF, round(condition.overload * 1000.0))
+
+
+class BoundedFeedback(Feedback):
+    """Feedback that saturates at the limits of an object's bits."""
+
+    def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
+        super().__init__(objects, rated_torque)
+        indices = (0x6062, 0x6063, 0x6064, 0x606B, 0x606C, 0x6074, 0x6077, 0x6078, 0x60F4)
+        self._bounded = [(objects.number(n), *objects.bounds(n)) for n in indices if (n, 0) in objects]
+
+    def publish(self, status: int, axis: Axis, following: float) -> None:
+        """Write the statusword and the measurements."""
+        super().publish(status, axis, following)
+        for entry, low, high in self._bounded:
+            value = entry.value
+            if not low <= value <= high:
+                entry.value = low if value < low else high
+
+
 class ErrorLog:
-    """The errors of a drive: 0x603F, 0x1001, 0x1003 and the emergency messages that wait to be sent."""
+    """The errors of a drive: 0x603F, 0x1001, 0x1003 and queued emergency messages."""
 
     def __init__(self, objects: AxisObjects, emergencies: deque[Emergency]) -> None:
         self.emergencies = emergencies
@@ -165,7 +200,7 @@ class ErrorLog:
         self._fields = [objects.number(0x1003, n) for n in range(1, HISTORY_LENGTH + 1) if (0x1003, n) in objects]
 
     def add(self, code: int) -> None:
-        """Report an error: the newest stands at 0x1003:1."""
+        """Report an error; the newest one is at 0x1003:1."""
         self._code.value = code
         self._register.value |= error_register(code)
         fields = self._fields
@@ -177,6 +212,6 @@ class ErrorLog:
         self.emergencies.append(Emergency(code, self._register.value))
 
     def reset(self) -> None:
-        """Report that no error is left (emergency message 0x0000); the history stays."""
+        """Report the absence of errors (emergency message 0x0000); the history stays."""
         self._code.value = self._register.value = 0
         self.emergencies.append(Emergency(0, 0))

@@ -1,40 +1,46 @@
 """One axis of a servo drive: power state machine, modes, protection and feedback (CiA 402-2, ETG.6010).
 
-It is the same for every drive; units, modes and which objects there are differ.
+It is common to all drives, which differ in units, modes and objects.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import ceil
+from typing import Final
 
-from rtcp.virtual.device import Number
 from rtcp.virtual.models.cia402 import STATE_BITS, DriveState, DriveStateMachine, Status
 from rtcp.virtual.models.cyclic_modes import ERROR, LIMIT, Motion, Profile, Stop
 from rtcp.virtual.models.mechanics import ActuatorSize, Axis, Mechanics
 from rtcp.virtual.models.protection import AT_ONCE, Condition, ErrorCode, ErrorLog, Feedback
 from rtcp.virtual.models.units import AxisObjects
+from rtcp.virtual.objects import Number
 
 SELF_TEST = 0.1
-"""How long (s) the drive stays in Not Ready To Switch On after power-on."""
-_HALT = 0x100
-_LONGEST = Axis.LONGEST_STEP * 1.000001
+"""Duration of Not Ready To Switch On after power-on, s."""
+_HALT: Final = 0x100
+# Plain ints: enum arithmetic is slow.
+_VOLTAGE_ENABLED: Final = int(Status.VOLTAGE_ENABLED)
+_WARNING: Final = int(Status.WARNING)
+_REMOTE: Final = int(Status.REMOTE)
+_LONGEST: Final = Axis.LONGEST_STEP * 1.000001
+"""Longest step, and what rounding adds, s."""
 
 Modes = Callable[[Axis, AxisObjects], dict[int, Motion]]
-"""Makes the modes of an axis, by their numbers in 0x6060; 0 holds it."""
+"""Creates the modes of an axis by their numbers in 0x6060; 0 holds the joint."""
 
 
 class ServoAxis:
     """An axis that turns a joint.
 
-    With the power stage off a brake holds the joint, which its gear alone would not do under the
-    weight of an arm. `mechanics` and `condition` may be changed from outside: a payload, a collision, heat.
+    With the power stage off a brake holds the joint, as the gear alone does not hold the weight of an arm. Tests may
+    change `mechanics` and `condition`: a payload, a collision, heat.
     """
 
     def __init__(self, objects: AxisObjects, size: ActuatorSize, mechanics: Mechanics, condition: Condition,
                  feedback: Feedback, errors: ErrorLog, modes: Modes, max_speed: Number,
                  encoder_range: float) -> None:  # fmt: skip
-        """Join the parts; `max_speed` in counts, `encoder_range` in rad each way. Call `power_on` then."""
+        """`max_speed` is in counts, `encoder_range` in rad each way. Call `power_on` afterwards."""
         self.objects = objects
         self.size = size
         self.mechanics = mechanics
@@ -42,13 +48,13 @@ class ServoAxis:
         self.axis = Axis(mechanics)
         self._units = objects.units
         self._lasting: list[int] = []
-        """Faults whose cause lasts, made from outside."""
+        """Injected faults with a lasting cause."""
         self._feedback = feedback
         self._errors = errors
         self._make_modes = modes
         self._max_speed = max_speed
         self._range = encoder_range
-        # `step` looks nothing up.
+        # Kept, to avoid look-ups in `step`.
         self._controlword = objects.number(0x6040)
         self._mode_wanted = objects.number(0x6060)
         self._mode_display = objects.number(0x6061)
@@ -73,7 +79,7 @@ class ServoAxis:
         return self._motion is not None
 
     def power_on(self) -> None:
-        """The supply comes back: all is as at power-on. The joint stands where it stands; its encoder is absolute."""
+        """Power on: reset everything but the position, as the encoder is absolute."""
         self.condition.overload = 0.0
         self.axis.offset = self.axis.torque_limit = 0.0
         self.axis.synchronise()
@@ -84,9 +90,9 @@ class ServoAxis:
         self._modes = self._make_modes(self.axis, self.objects)
         self._mode = 0
         self._motion: Motion | None = None
-        """What moves the axis; None while the power stage is off."""
+        """Active mode; None while the power stage is off."""
         self._pending = False
-        """Whether a ramp is under way that ends in transition 5 or 8."""
+        """True: a ramp is in progress that ends in transition 5 or 8."""
         self._busy = True
         self._last_controlword = 0
         self.outputs_valid = False
@@ -98,13 +104,13 @@ class ServoAxis:
         self._feedback.publish(self._bits, self.axis, 0.0)
 
     def power_off(self) -> None:
-        """The supply goes: no torque, the brake closes."""
+        """Power off: no torque, the brake closes."""
         self._supplied = False
         self.outputs_valid = False
         self._switch_off(DriveState.NOT_READY_TO_SWITCH_ON)
 
     def set_outputs_valid(self, valid: bool) -> None:
-        """Set whether process data outputs are valid (OP) or ignored; ignored, the controlword counts as 0.
+        """Set whether process data outputs are valid (OP) or ignored, which acts as controlword 0.
 
         Losing them with the power stage on is fault 0x8130.
         """
@@ -114,40 +120,42 @@ class ServoAxis:
         self._compose()
 
     def inject_fault(self, code: int) -> None:
-        """Let the fault `code` (0x603F) happen now; codes outside `AT_ONCE` react as 0x605E says.
+        """Trigger the fault `code` (0x603F); the reaction is by 0x605E unless the code is in `AT_ONCE`.
 
         Raises:
-            ValueError: `code` is no error code.
+            ValueError: `code` is not an error code.
         """
         if not 0x1000 <= code <= 0xFFFF:
             raise ValueError(f"error code 0x{code:X} is none: allowed are 0x1000 to 0xFFFF (CiA 402-2)")
         self._fail(code)
 
     def begin_fault(self, code: int) -> None:
-        """Let the fault `code` happen now, and its cause last until `end_fault`: no fault reset succeeds."""
+        """Trigger the fault `code` with a cause that lasts until `end_fault`: until then a fault reset fails."""
         self._lasting.append(code)
         if self._supplied and self._machine.state is not DriveState.NOT_READY_TO_SWITCH_ON:
             self._fail(code)
 
     def end_fault(self, code: int) -> None:
-        """Let the cause of a fault be gone: from now on a fault reset succeeds."""
+        """Remove the cause of a fault: a fault reset then succeeds."""
         self._lasting.remove(code)
 
     def step(self, dt: float) -> None:
-        """Let `dt` seconds pass: obey the RxPDO objects, move, write the TxPDO objects."""
+        """Advance by `dt` seconds: read the RxPDO objects, move, write the TxPDO objects."""
         if dt <= 0.0:
             return
         if not self._supplied:
             self._stand(dt)
             return
-        controlword = self._controlword.value if self.outputs_valid else 0
+        controlword: int = self._controlword.value if self.outputs_valid else 0
         if self._busy or controlword != self._last_controlword:
             self._last_controlword = controlword
             self._control(controlword, dt)
-        if self._mode_wanted.value != self._mode:
-            self._choose_mode(self._mode_wanted.value)
-        if self._max_torque.value != self._torque_counts:
-            self._torque_counts = self._max_torque.value
+        mode: int = self._mode_wanted.value
+        if mode != self._mode:
+            self._choose_mode(mode)
+        max_torque: int = self._max_torque.value
+        if max_torque != self._torque_counts:
+            self._torque_counts = max_torque
             self.axis.torque_limit = min(self._torque_counts * self._units.torque, self.size.start_stop_torque)
         if dt <= _LONGEST:
             count, h = 1, dt
@@ -168,7 +176,8 @@ class ServoAxis:
                 bits |= LIMIT
             if motion.closed:
                 following = axis.demand - axis.mechanics.position - axis.offset
-                window = self._window.value * self._units.position
+                counts: int = self._window.value
+                window = counts * self._units.position
                 if following > window or following < -window:
                     bits |= ERROR
                     self._following_time += dt
@@ -178,19 +187,20 @@ class ServoAxis:
                     self._following_time = 0.0
         self._protect(dt)
         if self._motion is not motion:
-            # A fault has ended the mode, and with it what its bits say.
+            # A fault ended the mode; its bits are void.
             bits = 0
         self._feedback.publish(self._bits | bits, axis, following)
 
     def _stand(self, dt: float) -> None:
-        """Without supply only the mechanics go on."""
+        """Advance only the mechanics, without supply."""
         count = ceil(dt / _LONGEST)
         for _ in range(count):
             self.axis.rest(dt / count)
 
     def _protect(self, dt: float) -> None:
         mechanics = self.mechanics
-        fastest = self._max_speed.value * self._units.velocity
+        counts: int = self._max_speed.value
+        fastest = counts * self._units.velocity
         if not -fastest <= mechanics.velocity <= fastest:
             self._fail(ErrorCode.OVER_SPEED)
         if not -self._range <= mechanics.position <= self._range:
@@ -202,29 +212,29 @@ class ServoAxis:
                 self._fail(code)
 
     def _report_condition(self) -> None:
-        """Refresh what changes slowly, and the warning bit."""
+        """Update the slow quantities and the warning bit."""
         self._feedback.publish_condition(self.condition, self.axis.torque)
         self._compose()
 
     def _compose(self) -> None:
-        """Work out the bits of the statusword that do not change from step to step."""
+        """Compute the bits of the statusword that are constant between events."""
         bits = STATE_BITS[self._machine.state]
         if self._machine.state is not DriveState.NOT_READY_TO_SWITCH_ON:
-            bits |= Status.VOLTAGE_ENABLED
+            bits |= _VOLTAGE_ENABLED
         if self.condition.warning:
-            bits |= Status.WARNING
+            bits |= _WARNING
         if self.outputs_valid:
-            bits |= Status.REMOTE
-        self._bits = int(bits)
+            bits |= _REMOTE
+        self._bits = bits
 
     def _enter(self, state: DriveState) -> None:
         self._machine.state = state
         self._compose()
 
     def _control(self, controlword: int, dt: float) -> None:
-        """Walk at most one transition of the state machine; start and end the stops that go with it."""
+        """Execute at most one transition of the state machine; start and end its stops."""
         before = self._machine.state
-        asked = self._machine.request(controlword)
+        transition = self._machine.request(controlword)
         if before is DriveState.NOT_READY_TO_SWITCH_ON:
             self._self_test -= dt
             if self._self_test <= 0.0:
@@ -235,11 +245,11 @@ class ServoAxis:
             if self._motion is None or self._stop.done:
                 self._switch_off(DriveState.FAULT)
         elif before is DriveState.QUICK_STOP_ACTIVE:
-            self._control_quick_stop(asked)
-        elif asked is not None:
-            self._follow_transition(*asked)
+            self._control_quick_stop(transition)
+        elif transition is not None:
+            self._follow_transition(*transition)
         elif self._pending and controlword & 0x8F == 0x0F:
-            # Enabled again before the ramp of transition 5 or 8 has ended.
+            # Enabled again before the end of the ramp of transition 5 or 8.
             self._start_mode()
         if self._machine.state is DriveState.OPERATION_ENABLED and not self._pending:
             self._control_halt(controlword)
@@ -270,12 +280,12 @@ class ServoAxis:
         else:
             self._switch_off(state)
 
-    def _control_quick_stop(self, asked: tuple[int, DriveState] | None) -> None:
+    def _control_quick_stop(self, transition: tuple[int, DriveState] | None) -> None:
         stays = self._quick_stop_option.value in (5, 6)
-        if asked is not None and asked[0] == 12:
-            self._switch_off(asked[1])
-        elif asked is not None and stays:
-            self._enter(asked[1])
+        if transition is not None and transition[0] == 12:
+            self._switch_off(transition[1])
+        elif transition is not None and stays:
+            self._enter(transition[1])
             self._start_mode()
         elif self._stop.done and not stays:
             self._switch_off(DriveState.SWITCH_ON_DISABLED)
@@ -319,7 +329,7 @@ class ServoAxis:
             self._modes[wanted].enter()
 
     def _fail(self, code: int) -> None:
-        """Transition 13: tell the fault and begin the reaction to it (0x605E)."""
+        """Transition 13: report the fault and begin the fault reaction (0x605E)."""
         state = self._machine.state
         at_once = code in AT_ONCE
         if state is DriveState.FAULT or (state is DriveState.FAULT_REACTION_ACTIVE and not at_once):
@@ -335,7 +345,7 @@ class ServoAxis:
         self._busy = True
 
     def _reset(self) -> None:
-        """Transition 15, refused for as long as what caused the fault lasts (CiA 402-2, transition 15)."""
+        """Transition 15, refused while the cause of the fault lasts (CiA 402-2, transition 15)."""
         mechanics = self.mechanics
         if self._lasting:
             self._errors.add(self._lasting[-1])

@@ -1,7 +1,7 @@
-"""The shape setter's two slaves: its control box, which holds the circuit and the rod, and the meter of u and i.
+"""The shape setter's two slaves: its control box, with circuit and rod, and the meter of u and i.
 
-Both are this project's own. The box comes before the meter on the cable, so that a sample belongs to the gate
-of the frame before.
+Both are this project's own designs. The box is before the meter on the cable, so that a sample belongs to the gate of
+the previous frame.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rtcp.virtual.device import DeviceModel, FreezableInputs, Option, number
+from rtcp.virtual.device import DeviceModel, FreezableInputs, Option
 from rtcp.virtual.heated_rod import Alloy, HeatedRod
 from rtcp.virtual.heater_circuit import Circuit, Sampling, SensePoint
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary, Value
@@ -23,7 +23,7 @@ INPUTS = (
     "Key in Auto", "Key in Manual", "Button, channel A", "Button, channel B", "Robot circuit, channel A",
     "Robot circuit, channel B",
 )  # fmt: skip
-"""Contacts that people and the robot's controller close, bit 0 first."""
+"""Contacts closed by people and by the robot's controller, from bit 0."""
 READY = 0x31
 """Key in Auto, both channels of the robot's circuit closed."""
 _BOOL, _U8, _U16, _U32, _I16, _I32 = (
@@ -31,7 +31,7 @@ _BOOL, _U8, _U16, _U32, _I16, _I32 = (
     DataType.INTEGER32,
 )  # fmt: skip
 _SHOWN_S = 0.05
-"""Interval at which what the rod is like is shown in its objects, s."""
+"""Update interval of the rod's objects, s."""
 _PROFILES = {
     0x2020: "Temperature, C",
     0x2021: "Share of the bend that is set",
@@ -47,8 +47,8 @@ _BEND = {0x2010: "Twist rate, 1/m", 0x2011: "First curvature, 1/m", 0x2012: "Sec
 class ShapeSetterBox(DeviceModel, FreezableInputs):
     """Gate, relay and lamps; key, button, robot's circuit, relay feedback, fuse, insulation and battery.
 
-    The master may force contacts through 0x2000 (mask, levels), bend the rod by 0x2010 to 0x2012 (one entry a cell) and
-    0x2013 (1: bend, 2: release, 3: another cold rod of the same kind), and read the rod from 0x2020 on.
+    The master can force contacts through 0x2000 (mask, levels), bend the rod through 0x2010 to 0x2012 (one entry per
+    cell) and 0x2013 (1: bend, 2: release, 3: new cold rod of the same kind), and read the rod from 0x2020.
     """
 
     vendor_id = 0x00000A55
@@ -75,15 +75,15 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
         super().__init__(**options)
         objects = self.objects
         self._contacts = int(self.option("inputs"))
-        self._outputs = [number(objects, 0x7000, n) for n in range(1, 5)]
-        self._inputs = [number(objects, 0x6000, n) for n in range(1, 9)]
-        self._chassis, self._battery = number(objects, 0x6010, 1), number(objects, 0x6010, 2)
-        self._alive = number(objects, 0x6010, 3)
-        self._mask, self._levels = number(objects, 0x2000, 1), number(objects, 0x2000, 2)
-        self._red = number(objects, 0x2001)
+        self._outputs = [objects[0x7000, n] for n in range(1, 5)]
+        self._inputs = [objects[0x6000, n] for n in range(1, 9)]
+        self._chassis, self._battery = objects[0x6010, 1], objects[0x6010, 2]
+        self._alive = objects[0x6010, 3]
+        self._mask, self._levels = objects[0x2000, 1], objects[0x2000, 2]
+        self._red = objects[0x2001, 0]
         self._shown_s = 0.0
         self.gate_was_on = False
-        """Whether the MOSFET conducted during the whole of the last step."""
+        """True: the MOSFET conducted during the whole last step."""
         self.circuit = Circuit(
             sense_point=SensePoint.ROD if self.option("four_wire") else SensePoint.LUG,
             sampling=Sampling.ALTERNATING if self.option("alternating") else Sampling.SIMULTANEOUS,
@@ -103,7 +103,7 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
         )  # fmt: skip
 
     def define(self, objects: ObjectDictionary) -> None:
-        """Add inputs and outputs with their fixed PDOs, and what a test bench needs."""
+        """Add inputs and outputs with their fixed PDOs, and the objects for tests."""
         tx, rx, rw = Access.RO | Access.TXPDO, Access.RW | Access.RXPDO, Access.RW
         inputs = (*INPUTS, "Relay closed", "Fuse intact")
         objects.record(0x6000, "Inputs", [Entry(0x6000, n, text, _BOOL, 0, tx) for n, text in enumerate(inputs, 1)])
@@ -122,7 +122,7 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
         for index, text in _BEND.items():
             cells = [Entry(index, n, f"Cell {n}", DataType.REAL32, 0.0, rw) for n in range(1, CELLS + 1)]
             objects.record(index, text, cells)
-        # The object is defined before the rod is there: the hook is looked up when it is written.
+        # The object exists before the rod: look up the hook at the write.
         act = Entry(0x2013, 1, "1 bend, 2 release, 3 another rod", _U8, 0, rw, on_write=self._act)
         objects.record(0x2013, "Rod", [act])
         for index, text in _PROFILES.items():
@@ -145,7 +145,7 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
 
     @property
     def contacts(self) -> int:
-        """Contacts that are closed, bit 0 is the key in Auto, before forcing."""
+        """Closed contacts before forcing; bit 0 is the key in Auto."""
         return self._contacts
 
     @contacts.setter
@@ -154,7 +154,7 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
 
     @property
     def gate(self) -> bool:
-        """Whether the gate is on: what the last valid outputs say."""
+        """Whether the gate is on in the last valid outputs."""
         return bool(self.outputs_valid and self._outputs[0].value)
 
     @property
@@ -174,7 +174,7 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
         }
 
     def step(self, dt: float) -> None:
-        """Let `dt` seconds pass in circuit and rod; read the contacts."""
+        """Advance circuit and rod by `dt` seconds; read the contacts."""
         circuit, rod, gate = self.circuit, self.rod, self.gate
         current = circuit.step(dt, gate, self.relay, rod.resistance)
         rod.step(dt, current)
@@ -204,7 +204,7 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
 
 
 class ShapeSetterMeter(DeviceModel, FreezableInputs):
-    """u at the rod and i of the shunt, 24 bit each, with the number of the sample and whether the gate was on."""
+    """u at the rod and i of the shunt, 24 bit each, with the sample number and the state of the gate."""
 
     vendor_id = 0x00000A55
     product_code = 0x00000011
@@ -217,8 +217,8 @@ class ShapeSetterMeter(DeviceModel, FreezableInputs):
     def __init__(self, **options: object) -> None:
         super().__init__(**options)
         self._box: ShapeSetterBox | None = None
-        self._voltage, self._current = (number(self.objects, 0x6020, n) for n in (1, 2))
-        self._sample, self._sense = (number(self.objects, 0x6020, n) for n in (3, 4))
+        self._voltage, self._current = (self.objects[0x6020, n] for n in (1, 2))
+        self._sample, self._sense = (self.objects[0x6020, n] for n in (3, 4))
 
     def define(self, objects: ObjectDictionary) -> None:
         """Add the channels with their fixed PDO."""
@@ -233,11 +233,11 @@ class ShapeSetterMeter(DeviceModel, FreezableInputs):
         define_pdo_objects(objects, {}, {0x1A00: mapped}, [], [0x1A00], fixed=True)
 
     def join(self, devices: Sequence[DeviceModel]) -> None:
-        """Find the box whose circuit it measures: the first one of the segment."""
+        """Find the box with the measured circuit: the first one of the segment."""
         self._box = next((device for device in devices if isinstance(device, ShapeSetterBox)), None)
 
     def step(self, dt: float) -> None:
-        """Show what the circuit's converter has."""
+        """Write the samples of the circuit's converter."""
         box = self._box
         if box is None or self.freezes:
             return

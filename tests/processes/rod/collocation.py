@@ -29,7 +29,7 @@ def solve_boundary_values(rod: Rod, end: Pose, start: Equilibrium, tolerance: fl
 
     def rates(s: Array, states: Array) -> Array:
         local = np.stack([np.interp(s, nodes, column) for column in shape.T], axis=1).tolist()
-        rows = [_rates(rod, one, u0, w) for one, u0 in zip(states.T.tolist(), local, strict=True)]
+        rows = [_rates(rod, state, u0, w) for state, u0 in zip(states.T.tolist(), local, strict=True)]
         return np.asarray(np.array(rows, dtype=np.float64).T)
 
     def residuals(first: Array, last: Array) -> Array:

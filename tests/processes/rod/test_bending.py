@@ -15,37 +15,26 @@ from rtcp.config.cell_file import load_cell
 from rtcp.config.find import default_config
 from rtcp.config.model import KeepOut
 from rtcp.ipc.errors import Invalid, Refused
-from rtcp.processes.rod import (
-    BendingPlan,
-    Chuck,
-    Form,
-    Rod,
-    bend,
-    follow_parameters,
-    plan_bending,
-    plan_motion,
-    pre_bend,
-    sample_equilibrium,
-)
+from rtcp.processes import rod
 from rtcp.processes.rod.bending import _check_between, _check_curves, _Holder, plan_approach
 
 CELL = load_cell(default_config().parent / "cell.yaml")
-ROD = Rod(0.3, 1e-3)
-CHUCK = Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.12, 0.0, -pi / 2, 0.0), 0.02)
+ROD = rod.Rod(0.3, 1e-3)
+CHUCK = rod.Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.12, 0.0, -pi / 2, 0.0), 0.02)
 CHUCKS = {"left": CHUCK, "right": CHUCK}
 HELD = Pose.from_xyzrpy(0.0, 0.0, 0.4, 0.0, 0.0, -pi / 2)
 NEAR = {"left": (0.0, 0.0, 0.8, 0.0, -0.77, 0.0), "right": (0.0, 0.0, 0.8, 0.0, -0.77, 0.0)}
 END = Pose((0.25, 0.05, 0.06), rotation_from_rpy(0.3, -0.3, 0.4))
-LONG = Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.25, 0.0, -pi / 2, 0.0), 0.02)
+LONG = rod.Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.25, 0.0, -pi / 2, 0.0), 0.02)
 SHORT_END = Pose((0.25 / 3.0, 0.05 / 3.0, 0.02), END.rotation)
 
 
-def planned(end: Pose = END, cell: CellConfig = CELL, held: Pose = HELD, chuck: Chuck = CHUCK) -> BendingPlan:
-    return plan_bending(cell, {"left": chuck, "right": chuck}, ROD, end, held, NEAR)
+def planned(end: Pose = END, cell: CellConfig = CELL, held: Pose = HELD, chuck: rod.Chuck = CHUCK) -> rod.BendingPlan:
+    return rod.plan_bending(cell, {"left": chuck, "right": chuck}, ROD, end, held, NEAR)
 
 
 @pytest.fixture(scope="module")
-def plan() -> BendingPlan:
+def plan() -> rod.BendingPlan:
     return planned()
 
 
@@ -55,16 +44,18 @@ def mouth(name: str, q: tuple[float, ...]) -> Pose:
     return Pose.from_xyzrpy(*member.base.position, *member.base.rpy) @ forward(member.config.arm, q) @ CHUCK.pose
 
 
-def test_it_begins_with_the_straight_rod_at_rest_and_ends_with_the_wanted_end_pose_at_rest(plan: BendingPlan) -> None:
+def test_it_begins_with_the_straight_rod_at_rest_and_ends_with_the_wanted_end_pose_at_rest(
+    plan: rod.BendingPlan,
+) -> None:
     for number, wanted in ((0, Pose((0.3, 0.0, 0.0), rotation_from_rpy(0.0, 0.0, 0.0))), (-1, END)):
         ends = {name: mouth(name, points[number].q) for name, points in plan.arms.items()}
         relative = ends["left"].inverse() @ ends["right"] @ Pose((0, 0, 0), rotation_from_rpy(0.0, 0.0, pi))
         assert relative.position == pytest.approx(wanted.position, abs=1e-8)
         assert relative.rotation == pytest.approx(wanted.rotation, abs=1e-8)
-        assert not any(one for points in plan.arms.values() for one in (*points[number].v, *points[number].a))  # type: ignore[misc]
+        assert not any(value for points in plan.arms.values() for value in (*points[number].v, *points[number].a))
 
 
-def test_the_chucks_hold_the_ends_of_the_curve_at_each_step(plan: BendingPlan) -> None:
+def test_the_chucks_hold_the_ends_of_the_curve_at_each_step(plan: rod.BendingPlan) -> None:
     times = {name: [point.t for point in points] for name, points in plan.arms.items()}
     for name, node in (("left", 0), ("right", -1)):
         joints = np.array([point.q for point in plan.arms[name]])
@@ -73,16 +64,16 @@ def test_the_chucks_hold_the_ends_of_the_curve_at_each_step(plan: BendingPlan) -
             assert np.linalg.norm(np.array(mouth(name, q).position) - curve[node]) < 1e-3
 
 
-def test_the_middle_of_the_rod_stays_where_it_is_held(plan: BendingPlan) -> None:
+def test_the_middle_of_the_rod_stays_where_it_is_held(plan: rod.BendingPlan) -> None:
     assert np.abs(plan.curves[:, 30] - HELD.position).max() < 1e-12
 
 
-def test_every_step_is_stable_and_the_rod_keeps_clear(plan: BendingPlan) -> None:
+def test_every_step_is_stable_and_the_rod_keeps_clear(plan: rod.BendingPlan) -> None:
     assert all(step.is_stable for step in plan.steps[1:])
     assert plan.clearance > CELL.clearance
 
 
-def test_both_arms_have_the_same_times(plan: BendingPlan) -> None:
+def test_both_arms_have_the_same_times(plan: rod.BendingPlan) -> None:
     left, right = ([point.t for point in plan.arms[name]] for name in ("left", "right"))
     assert left == right
     assert left[0] == 0.0
@@ -92,11 +83,11 @@ def test_both_arms_have_the_same_times(plan: BendingPlan) -> None:
 
 
 def test_a_drawn_shape_is_planned_by_its_parameters() -> None:
-    arcs = pre_bend(ROD, (1.0, 0.0))
-    wanted = sample_equilibrium(ROD, Form.ARC, np.random.default_rng(1))
-    steps = (*arcs, *follow_parameters(arcs[-1], wanted.a)[1:])
-    found = plan_motion(CELL, CHUCKS, steps, HELD, NEAR)
-    assert found.steps[-1].a == pytest.approx(wanted.a)
+    arcs = rod.pre_bend(ROD, (1.0, 0.0))
+    wanted = rod.sample_equilibrium(ROD, rod.Form.ARC, np.random.default_rng(1))
+    steps = (*arcs, *rod.follow_parameters(arcs[-1], wanted.a)[1:])
+    plan = rod.plan_motion(CELL, CHUCKS, steps, HELD, NEAR)
+    assert plan.steps[-1].a == pytest.approx(wanted.a)
 
 
 def test_an_end_pose_at_which_the_rod_snaps_is_refused() -> None:
@@ -113,7 +104,7 @@ def test_a_rod_held_out_of_reach_is_refused_by_the_name_of_the_arm() -> None:
 
 
 def test_a_rod_too_near_to_a_hand_is_refused() -> None:
-    short = Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.06, 0.0, -pi / 2, 0.0), 0.02)
+    short = rod.Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.06, 0.0, -pi / 2, 0.0), 0.02)
     with pytest.raises(Refused) as refused:
         planned(chuck=short)
     assert refused.value.reason == "rod_collision"
@@ -122,30 +113,32 @@ def test_a_rod_too_near_to_a_hand_is_refused() -> None:
 
 def test_chucks_that_would_come_nearer_than_the_clearance_are_refused() -> None:
     with pytest.raises(Refused, match="left and right") as refused:
-        plan_bending(replace(CELL, clearance=0.09), dict.fromkeys(NEAR, LONG), Rod(0.1, 0.5e-3), SHORT_END, HELD, NEAR)
+        rod.plan_bending(
+            replace(CELL, clearance=0.09), dict.fromkeys(NEAR, LONG), rod.Rod(0.1, 0.5e-3), SHORT_END, HELD, NEAR
+        )
     assert refused.value.reason == "arms_too_near"
 
 
 def test_a_step_at_which_an_arm_would_jump_is_refused() -> None:
-    steps = bend(ROD, END)
+    steps = rod.bend(ROD, END)
     with pytest.raises(Refused, match="jump") as refused:
-        plan_motion(CELL, CHUCKS, (steps[0], steps[-1]), HELD, NEAR)
+        rod.plan_motion(CELL, CHUCKS, (steps[0], steps[-1]), HELD, NEAR)
     assert refused.value.reason == "arm_out_of_reach"
 
 
 @pytest.mark.parametrize("number", [3, -1])
 def test_an_unstable_step_is_refused(number: int) -> None:
-    steps = list(bend(ROD, END))
+    steps = list(rod.bend(ROD, END))
     jacobian = steps[number].jacobian.copy()
     jacobian[40:, 0] *= -1.0
     steps[number] = replace(steps[number], jacobian=jacobian)
     with pytest.raises(Refused) as refused:
-        plan_motion(CELL, CHUCKS, steps, HELD, NEAR)
+        rod.plan_motion(CELL, CHUCKS, steps, HELD, NEAR)
     assert refused.value.reason == "rod_unstable"
 
 
-def test_arms_that_leave_the_rod_no_equilibrium_between_two_steps_are_refused(plan: BendingPlan) -> None:
-    holders = {one.name: _Holder(one, CHUCK, CELL.clearance) for one in CELL.arms}
+def test_arms_that_leave_the_rod_no_equilibrium_between_two_steps_are_refused(plan: rod.BendingPlan) -> None:
+    holders = {arm.name: _Holder(arm, CHUCK, CELL.clearance) for arm in CELL.arms}
     _check_between(holders, plan.arms, plan.steps, plan.times)
     pulled = [replace(point, q=(point.q[0], point.q[1] - 0.3, *point.q[2:])) for point in plan.arms["right"]]
     with pytest.raises(Refused) as refused:
@@ -153,11 +146,11 @@ def test_arms_that_leave_the_rod_no_equilibrium_between_two_steps_are_refused(pl
     assert refused.value.reason == "rod_no_equilibrium"
 
 
-def test_the_approach_is_a_straight_motion_of_all_joints_within_its_speed(plan: BendingPlan) -> None:
+def test_the_approach_is_a_straight_motion_of_all_joints_within_its_speed(plan: rod.BendingPlan) -> None:
     now = {name: tuple(q - 0.2 for q in begin) for name, begin in plan.begin.items()}
-    found = plan_approach(CELL, CHUCKS, now, plan.begin, 0.1)
-    assert found is not None
-    for name, points in found.items():
+    approach = plan_approach(CELL, CHUCKS, now, plan.begin, 0.1)
+    assert approach is not None
+    for name, points in approach.items():
         assert points[0]["q"] == pytest.approx(now[name])
         assert points[-1]["q"] == pytest.approx(plan.begin[name])
         assert all(np.ptp(np.array(point["q"]) - now[name]) < 1e-9 for point in points)
@@ -166,11 +159,11 @@ def test_the_approach_is_a_straight_motion_of_all_joints_within_its_speed(plan: 
 
 
 def test_an_approach_on_which_the_chucks_would_meet_is_refused_though_the_bare_arms_would_pass(
-    plan: BendingPlan,
+    plan: rod.BendingPlan,
 ) -> None:
     apart = {name: (q[0], q[1] - 0.3, *q[2:]) for name, q in plan.begin.items()}
     near = {name: (q[0], q[1] + 0.6, q[2] - 0.6, *q[3:]) for name, q in plan.begin.items()}
-    bare = Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.03, 0.0, -pi / 2, 0.0), 0.02)
+    bare = rod.Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.03, 0.0, -pi / 2, 0.0), 0.02)
     assert plan_approach(CELL, dict.fromkeys(CHUCKS, bare), apart, near, 0.3) is not None
     with pytest.raises(Refused, match="left and right") as refused:
         plan_approach(CELL, CHUCKS, apart, near, 0.3)
@@ -180,15 +173,15 @@ def test_an_approach_on_which_the_chucks_would_meet_is_refused_though_the_bare_a
 def with_box(low: tuple[float, float, float], high: tuple[float, float, float]) -> CellConfig:
     """Return the cell with a keep-out box at the left arm, in the frame of its base."""
     arms = tuple(
-        one
-        if one.name != "left"
+        arm
+        if arm.name != "left"
         else replace(
-            one,
+            arm,
             config=replace(
-                one.config, cartesian=replace(one.config.cartesian, keep_out=(KeepOut("bench", low, high),))
+                arm.config, cartesian=replace(arm.config.cartesian, keep_out=(KeepOut("bench", low, high),))
             ),
         )
-        for one in CELL.arms
+        for arm in CELL.arms
     )
     return replace(CELL, arms=arms)
 
@@ -196,7 +189,7 @@ def with_box(low: tuple[float, float, float], high: tuple[float, float, float]) 
 @pytest.mark.parametrize(
     ("height", "words"), [(0.0, "the rod, .* from the keep-out box bench of left"), (-0.1, "chuck of left")]
 )
-def test_a_keep_out_box_at_the_rod_or_at_a_chuck_is_refused(plan: BendingPlan, height: float, words: str) -> None:
+def test_a_keep_out_box_at_the_rod_or_at_a_chuck_is_refused(plan: rod.BendingPlan, height: float, words: str) -> None:
     left = CELL.member("left").base
     back = Pose.from_xyzrpy(*left.position, *left.rpy).inverse()
     place = tuple(plan.curves[-1][30 if height == 0.0 else 0].tolist())
@@ -208,22 +201,22 @@ def test_a_keep_out_box_at_the_rod_or_at_a_chuck_is_refused(plan: BendingPlan, h
 
 
 def test_a_rod_that_would_touch_itself_is_refused() -> None:
-    turn = np.linspace(0.0, 2.2 * pi, 61)
-    flat = np.stack([0.04 * np.cos(turn), 0.04 * np.sin(turn), np.zeros(61)], axis=1)
+    angle = np.linspace(0.0, 2.2 * pi, 61)
+    flat = np.stack([0.04 * np.cos(angle), 0.04 * np.sin(angle), np.zeros(61)], axis=1)
     with pytest.raises(Refused, match="touch itself") as refused:
         _check_curves(CELL, np.array([flat]), 1e-3)
     assert refused.value.reason == "rod_collision"
-    flat[:, 2] = 0.002 * turn
+    flat[:, 2] = 0.002 * angle
     _check_curves(CELL, np.array([flat]), 1e-3)
 
 
 def test_arms_that_the_cell_does_not_have_are_invalid() -> None:
     with pytest.raises(Invalid, match="left, right"):
-        plan_motion(CELL, {"left": CHUCK, "middle": CHUCK}, bend(ROD, END), HELD, NEAR)
+        rod.plan_motion(CELL, {"left": CHUCK, "middle": CHUCK}, rod.bend(ROD, END), HELD, NEAR)
     with pytest.raises(Invalid):
-        plan_motion(CELL, {"left": CHUCK}, bend(ROD, END), HELD, NEAR)
+        rod.plan_motion(CELL, {"left": CHUCK}, rod.bend(ROD, END), HELD, NEAR)
 
 
 def test_near_has_a_number_for_each_joint() -> None:
     with pytest.raises(Invalid, match="near of left: found 1 numbers, allowed are 6"):
-        plan_motion(CELL, CHUCKS, bend(ROD, END), HELD, {**NEAR, "left": (1.0,)})
+        rod.plan_motion(CELL, CHUCKS, rod.bend(ROD, END), HELD, {**NEAR, "left": (1.0,)})

@@ -1,4 +1,4 @@
-"""Ways of the rod through stable equilibria."""
+"""Paths of the rod through stable equilibria."""
 
 from __future__ import annotations
 

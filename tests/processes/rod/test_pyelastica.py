@@ -36,7 +36,7 @@ def test_a_clamped_rod_under_an_end_force_has_the_shape_that_pyelastica_comes_to
     simulator.finalize()
     ea.integrate(ea.PositionVerlet(), simulator, REST_S, round(REST_S / step), progress_bar=False)
 
-    # Its first element is the clamp, and bends from its middle on; the moment at our start follows from the shape.
+    # Its first element is the clamp and bends from its middle; the moment at our start follows from the shape.
     half = 0.5 * LENGTH / ELEMENTS
     free = replace(rod, length=LENGTH - half)
     scale, a = free.length / free.bending_stiffness, np.zeros(6)

@@ -19,7 +19,7 @@ def test_the_shipped_cell_runs_a_planned_bend() -> None:
             arms.enable()
             arms.move_joints(plan.begin, speed=0.2)
             arrivals = arms.run_trajectory(plan.trajectory)
-            assert {name: one.duration_s for name, one in arrivals.items()} == pytest.approx(
+            assert {name: arrival.duration_s for name, arrival in arrivals.items()} == pytest.approx(
                 dict.fromkeys(plan.arms, plan.duration_s)
             )
             for name, status in arms.status().items():

@@ -1,4 +1,4 @@
-"""What heat makes of a held rod, and what is left of it after its release."""
+"""The effect of heat on a held rod, and its shape after its release."""
 
 from __future__ import annotations
 

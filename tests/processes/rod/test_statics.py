@@ -1,4 +1,4 @@
-"""Equilibria of the rod against differences, Euler's load, collocation, and PyElastica."""
+"""Equilibria of the rod against finite differences, Euler's load, collocation, and PyElastica."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ def differences(rod: Rod, a: np.ndarray, steps: int, **loads: object) -> np.ndar
 
 
 def test_the_jacobian_is_that_of_differences() -> None:
-    found = integrate(ROD, A, steps=480)
-    assert np.abs(found.jacobian[-1] - differences(ROD, A, 480)).max() < 3.1e-10
+    bent = integrate(ROD, A, steps=480)
+    assert np.abs(bent.jacobian[-1] - differences(ROD, A, 480)).max() < 3.1e-10
 
 
 def test_the_jacobian_holds_on_the_plateau_with_weight_and_with_a_set_shape() -> None:
     shape = np.outer(np.linspace(0.0, 1.0, 481), [1.0, -3.0, 4.0])
     weight = (0.3, -0.2, -THICK.weight)
     a = np.array([0.5, 1.0, 4.0, -5.0, 3.0, 2.0])
-    found = integrate(THICK, a, shape, weight, 480)
-    assert not found.is_linear
-    assert np.abs(found.jacobian[-1] - differences(THICK, a, 480, set_shape=shape, weight=weight)).max() < 1e-6
+    bent = integrate(THICK, a, shape, weight, 480)
+    assert not bent.is_linear
+    assert np.abs(bent.jacobian[-1] - differences(THICK, a, 480, set_shape=shape, weight=weight)).max() < 1e-6
 
 
 def test_the_first_conjugate_point_of_a_compressed_straight_rod_is_where_its_load_is_that_of_euler() -> None:
     """Without the axial direction, in which the straight rod is singular, det J is zero at s = 2 pi / sqrt(F)."""
-    found = integrate(ROD, [0.0, 0.0, 0.0, -1.44 * EULER, 0.0, 0.0])
-    lateral = np.delete(np.delete(found.jacobian, 3, 1), 3, 2)
+    bent = integrate(ROD, [0.0, 0.0, 0.0, -1.44 * EULER, 0.0, 0.0])
+    lateral = np.delete(np.delete(bent.jacobian, 3, 1), 3, 2)
     bending = lateral[:, [2, 3], :][:, :, [2, 3]]
     signs = np.sign(np.linalg.det(bending)[5:])
-    assert found.s[5 + int(np.flatnonzero(signs[1:] != signs[:-1])[0])] == pytest.approx(0.3 / 1.2, abs=0.006)
+    assert bent.s[5 + int(np.flatnonzero(signs[1:] != signs[:-1])[0])] == pytest.approx(0.3 / 1.2, abs=0.006)
 
 
 @pytest.mark.parametrize(("share", "is_stable"), [(0.999, True), (1.001, False)])
@@ -57,8 +57,8 @@ def test_a_slightly_bent_rod_is_stable_up_to_the_load_of_euler(share: float, is_
 
 
 def test_the_conjugate_point_moves_to_the_length_at_which_the_load_is_that_of_euler() -> None:
-    found = integrate(ROD, [0.0, 0.0, 1e-3, -1.44 * EULER, 0.0, 0.0])
-    assert found.conjugate_point == pytest.approx(0.3 / 1.2, rel=2e-3)
+    bent = integrate(ROD, [0.0, 0.0, 1e-3, -1.44 * EULER, 0.0, 0.0])
+    assert bent.conjugate_point == pytest.approx(0.3 / 1.2, rel=2e-3)
 
 
 def test_the_straight_rod_is_singular() -> None:
@@ -66,10 +66,10 @@ def test_the_straight_rod_is_singular() -> None:
 
 
 def test_a_pure_moment_bends_an_arc() -> None:
-    found = integrate(ROD, [0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
-    assert found.end.position == pytest.approx((0.2 * np.sin(1.5), 0.2 * (1.0 - np.cos(1.5)), 0.0), abs=1e-8)
-    assert found.largest_strain == pytest.approx(0.5e-3 * 5.0)
-    assert found.is_stable
+    bent = integrate(ROD, [0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
+    assert bent.end.position == pytest.approx((0.2 * np.sin(1.5), 0.2 * (1.0 - np.cos(1.5)), 0.0), abs=1e-8)
+    assert bent.largest_strain == pytest.approx(0.5e-3 * 5.0)
+    assert bent.is_stable
 
 
 @pytest.mark.parametrize("rod", [ROD, THICK], ids=["linear", "on the plateau"])
@@ -78,10 +78,10 @@ def test_shooting_equals_collocation(rod: Rod) -> None:
     start = integrate(rod, a, steps=240)
     x, y, z = start.end.position
     end = Pose((x - 0.002, y + 0.004, z + 0.003), start.end.rotation)
-    found = shoot(rod, end, start)
-    assert found.is_linear is (rod is ROD)
-    assert np.abs(pose_error(found, end)).max() < 1e-10
-    assert solve_boundary_values(rod, end, start, 1e-9) == pytest.approx(found.a, abs=2e-6)
+    bent = shoot(rod, end, start)
+    assert bent.is_linear is (rod is ROD)
+    assert np.abs(pose_error(bent, end)).max() < 1e-10
+    assert solve_boundary_values(rod, end, start, 1e-9) == pytest.approx(bent.a, abs=2e-6)
 
 
 def test_shooting_and_collocation_agree_with_weight_and_a_set_shape() -> None:
@@ -94,33 +94,33 @@ def test_shooting_and_collocation_agree_with_weight_and_a_set_shape() -> None:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_of_random_stable_rods_moment_and_force_balance_along_the_rod(seed: int) -> None:
-    found = sample_equilibrium(ROD, list(Form)[seed % 3], np.random.default_rng(seed))
-    force = np.einsum("nij,nj->ni", found.rotations, found.f)
-    moment = np.einsum("nij,nj->ni", found.rotations, found.m) + np.cross(found.p, force)
+    drawn = sample_equilibrium(ROD, list(Form)[seed % 3], np.random.default_rng(seed))
+    force = np.einsum("nij,nj->ni", drawn.rotations, drawn.f)
+    moment = np.einsum("nij,nj->ni", drawn.rotations, drawn.m) + np.cross(drawn.p, force)
     scale = ROD.bending_stiffness / ROD.length
     assert np.abs(force - force[0]).max() < 1e-4 * scale / ROD.length
     assert np.abs(moment - moment[0]).max() < 1e-4 * scale
-    assert np.linalg.norm(np.diff(found.p, axis=0), axis=1).sum() == pytest.approx(ROD.length, rel=1e-3)
+    assert np.linalg.norm(np.diff(drawn.p, axis=0), axis=1).sum() == pytest.approx(ROD.length, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_of_random_stable_rods_the_other_end_sees_the_same_rod(seed: int) -> None:
-    found = sample_equilibrium(ROD, Form.OUT_OF_PLANE, np.random.default_rng(seed))
-    turn = np.diag([-1.0, -1.0, 1.0])
+    drawn = sample_equilibrium(ROD, Form.OUT_OF_PLANE, np.random.default_rng(seed))
+    half_turn = np.diag([-1.0, -1.0, 1.0])
     scale = ROD.length / ROD.bending_stiffness
-    mirrored = np.concatenate([turn @ found.m[-1] * -scale, turn @ found.f[-1] * -scale * ROD.length])
-    other = integrate(ROD, mirrored)
-    assert other.is_stable
-    assert np.linalg.norm(other.p[-1]) == pytest.approx(np.linalg.norm(found.p[-1]), abs=1e-6)
+    mirrored = np.concatenate([half_turn @ drawn.m[-1] * -scale, half_turn @ drawn.f[-1] * -scale * ROD.length])
+    reversed_rod = integrate(ROD, mirrored)
+    assert reversed_rod.is_stable
+    assert np.linalg.norm(reversed_rod.p[-1]) == pytest.approx(np.linalg.norm(drawn.p[-1]), abs=1e-6)
 
 
 def test_the_moment_law_is_linear_to_the_plateau_and_monotone_to_the_hard_limit() -> None:
     kappas = np.linspace(0.0, 2.0 * THICK.hard_strain / THICK.diameter, 400)
-    moments = np.array([THICK.moment(one) for one in kappas])
+    moments = np.array([THICK.moment(kappa) for kappa in kappas])
     linear = kappas * 0.5 * THICK.diameter <= 460.0 / 62_900.0
     assert moments[linear] == pytest.approx(THICK.bending_stiffness * kappas[linear])
     assert np.all(np.diff(moments) > 0.0)
-    assert [THICK.curvature(one)[0] for one in moments] == pytest.approx(kappas, rel=1e-10)
+    assert [THICK.curvature(moment)[0] for moment in moments] == pytest.approx(kappas, rel=1e-10)
 
 
 def test_the_moment_law_is_the_section_integral_of_the_stress() -> None:

@@ -12,29 +12,22 @@ from rtcp.ipc.refusals import Refusal
 from rtcp.ipc.states import State
 from rtcp.motion.step_group import Partner
 from rtcp.processes import ProcessSetup, Signal
+from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.interlocks import Mode
-from rtcp.processes.shape_setting.messages import (
-    ArmHeater,
-    HeaterState,
-    MeasureResistance,
-    RodPhase,
-    SetHeatProfile,
-    StartHeating,
-)
 from rtcp.processes.shape_setting.process import ShapeSetting
 
 PERIOD_S = 0.0005
 LATENCY = 2
 """Cycles from the gate's command to the conversion that shows it."""
 CONFIG = ShapeSettingConfig("shape_setting", "heater", arms=("left", "right"), relay_close_s=0.005, relay_open_s=0.005)
-PROFILE = SetHeatProfile(20.0, 20.0, 5000.0, 1.0, 5.0, 500.0, 200.0, 0.2, 400.0, 50.0, 1000.0)
-CONFIRMED = MeasureResistance(True, RodPhase.AUSTENITE)
+PROFILE = messages.SetHeatProfile(20.0, 20.0, 5000.0, 1.0, 5.0, 500.0, 200.0, 0.2, 400.0, 50.0, 1000.0)
+CONFIRMED = messages.MeasureResistance(True, messages.RodPhase.AUSTENITE)
 LEASE = 7
 
 
 class Context:
-    """What the heater asks of a `PartContext`, which nothing extends once it is compiled: it collects events."""
+    """A fake `PartContext` that collects events; the compiled class cannot be extended."""
 
     def __init__(self) -> None:
         self.period_s = PERIOD_S
@@ -51,7 +44,7 @@ class Context:
 
 
 class Rig:
-    """`cycle` lets one pass; `forced` are inputs that do not follow the hardware."""
+    """A heater and its simulated hardware; `forced` inputs do not follow the hardware."""
 
     def __init__(
         self, config: ShapeSettingConfig = CONFIG, resistance: float = 0.34, heat_capacity: float = 0.75
@@ -69,7 +62,7 @@ class Rig:
         self.arms_follow = True
         setup = ProcessSetup(PERIOD_S, {name: Signal(self.values, name) for name in names}, self.partners)
         self.heater = ShapeSetting(config, setup)
-        self.heater._since_heat_s = inf  # the rod is cold, however long the platform has to wait for that
+        self.heater._since_heat_s = inf  # the rod is cold, without the platform's waiting time
         self.set(battery_voltage=12.5, fuse_ok=1, chassis_voltage=5.0)
         for arm in self.partners.values():
             arm.state, arm.motion_allowed = State.HOLDING, True
@@ -94,7 +87,7 @@ class Rig:
         return self.initial * (1.0 + 2e-4 * (self.celsius - 20.0))
 
     def hardware(self) -> None:
-        """What the slaves send: the relay takes 3 ms, a conversion shows the gate of two cycles before."""
+        """The inputs from the slaves: the relay takes 3 ms, a conversion shows the gate of two cycles before."""
         closed = self.get("relay_closed") > 0.5
         self.relay_cycles = self.relay_cycles + 1 if closed is not self.relay else 0
         if self.relay_cycles > 6:
@@ -119,9 +112,9 @@ class Rig:
             if self.arms_follow:
                 for arm in self.partners.values():
                     arm.time_ns = self.context.now_ns
-            self.heater.update(self.context)
+            self.heater.update(self.context)  # type: ignore[arg-type]
 
-    def until(self, state: HeaterState, cycles: int = 20_000) -> None:
+    def until(self, state: messages.HeaterState, cycles: int = 20_000) -> None:
         for _ in range(cycles):
             if self.heater.state is state:
                 return
@@ -135,28 +128,30 @@ class Rig:
         self.set(key_manual=mode is Mode.MANUAL, key_auto=mode is Mode.AUTO)
 
     def permit(self, mode: Mode) -> None:
-        """Do what an operator does for a mode: key, and button or the robot's circuit."""
+        """Set key, and button or the robot's circuit, as an operator does for a mode."""
         self.key(mode)
-        held = mode is Mode.MANUAL
-        self.set(button_a=held, button_b=held, circuit_a=not held, circuit_b=not held)
+        is_manual = mode is Mode.MANUAL
+        self.set(button_a=is_manual, button_b=is_manual, circuit_a=not is_manual, circuit_b=not is_manual)
         self.cycle(2)
 
     def arm(self, mode: Mode = Mode.AUTO) -> None:
         self.permit(mode)
-        assert self.send(ArmHeater()) is None
+        assert self.send(messages.ArmHeater()) is None
         self.cycle(12)
-        assert self.heater.state is HeaterState.ARMED
+        assert self.heater.state is messages.HeaterState.ARMED
 
-    def heat(self, mode: Mode = Mode.AUTO, state: HeaterState = HeaterState.HEATING, **profile: Any) -> None:
+    def heat(
+        self, mode: Mode = Mode.AUTO, state: messages.HeaterState = messages.HeaterState.HEATING, **profile: Any
+    ) -> None:
         """Arm, measure, start; return in a state, with the gate on where it heats."""
         self.arm(mode)
         assert self.send(CONFIRMED) is None
-        self.until(HeaterState.ARMED)
+        self.until(messages.HeaterState.ARMED)
         assert self.send(replace(PROFILE, **profile)) is None
-        assert self.send(StartHeating()) is None
+        assert self.send(messages.StartHeating()) is None
         self.until(state)
         for _ in range(200):
-            if self.gate or state not in (HeaterState.HEATING, HeaterState.HOLDING):
+            if self.gate or state not in (messages.HeaterState.HEATING, messages.HeaterState.HOLDING):
                 return
             self.cycle()
         raise AssertionError("the gate never came on")

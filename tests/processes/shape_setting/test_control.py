@@ -16,66 +16,66 @@ def control(proportional: float = 100.0, integral: float = 0.0, derivative: floa
 
 
 def test_the_average_is_exponential_with_its_time_constant() -> None:
-    made = control()
+    pid = control()
     for _ in range(20):
-        made.measure(30.0)
-    assert made.average == pytest.approx(30.0 * (1.0 - exp(-1.0)))
+        pid.measure(30.0)
+    assert pid.average == pytest.approx(30.0 * (1.0 - exp(-1.0)))
 
 
 def test_the_gate_is_on_while_the_average_is_below_the_target() -> None:
-    made = control()
-    made.update(1.001, 1.0, 30.0, 100.0)
-    assert made.target == pytest.approx(3.0)
+    pid = control()
+    pid.update(1.001, 1.0, 30.0, 100.0)
+    assert pid.target == pytest.approx(3.0)
     on = 0
     for _ in range(4000):
-        made.measure(30.0 if made.gate else 0.0)
-        on += made.gate
+        pid.measure(30.0 if pid.gate else 0.0)
+        on += pid.gate
     # Each cycle of 30 A adds at most 1.5 A to the average.
     assert 3.0 <= 30.0 * on / 4000 <= 4.5
 
 
 def test_the_target_is_a_share_of_the_full_current() -> None:
-    made = control()
-    made.update(1.002, 1.0, 8.0, 100.0)
-    thin = made.target
-    made.update(1.002, 1.0, 114.0, 100.0)
-    assert made.target / thin == pytest.approx(114.0 / 8.0)
+    pid = control()
+    pid.update(1.002, 1.0, 8.0, 100.0)
+    thin = pid.target
+    pid.update(1.002, 1.0, 114.0, 100.0)
+    assert pid.target / thin == pytest.approx(114.0 / 8.0)
 
 
 @pytest.mark.parametrize(("setpoint", "target"), [(1.5, 5.0), (0.5, 0.0)])
 def test_limits_hold_the_target(setpoint: float, target: float) -> None:
-    made = control()
-    made.update(setpoint, 1.0, 30.0, 5.0)
-    assert made.target == target
-    assert made.is_limited
+    pid = control()
+    pid.update(setpoint, 1.0, 30.0, 5.0)
+    assert pid.target == target
+    assert pid.is_limited
 
 
 def test_the_integral_does_not_wind_up_in_a_limit() -> None:
-    made = control(integral=1000.0)
+    pid = control(integral=1000.0)
     for _ in range(1000):
-        made.update(1.1, 1.0, 30.0, 5.0)
-    made.update(1.1, 1.1, 30.0, 5.0)
-    assert made.target == pytest.approx(0.0, abs=1e-9)
+        pid.update(1.1, 1.0, 30.0, 5.0)
+    pid.update(1.1, 1.1, 30.0, 5.0)
+    assert pid.target == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_integral_stands_still_while_the_setpoint_moves() -> None:
-    made, setpoint = control(integral=10.0), 1.0
+    pid, setpoint = control(integral=10.0), 1.0
     for _ in range(100):
         setpoint += 1e-5
-        made.update(setpoint, setpoint - 1e-3, 30.0, 30.0)
-    assert made.target == pytest.approx(3.0)
+        pid.update(setpoint, setpoint - 1e-3, 30.0, 30.0)
+    assert pid.target == pytest.approx(3.0)
     for _ in range(100):
-        made.update(setpoint, setpoint - 1e-3, 30.0, 30.0)
-    assert made.target == pytest.approx(3.0 + 30.0 * 10.0 * 1e-3 * 100 * PERIOD_S)
+        pid.update(setpoint, setpoint - 1e-3, 30.0, 30.0)
+    assert pid.target == pytest.approx(3.0 + 30.0 * 10.0 * 1e-3 * 100 * PERIOD_S)
 
 
 def test_the_derivative_is_of_the_measured_ratio() -> None:
-    made = control(derivative=1.0)
+    pid = control(derivative=1.0)
     for _ in range(200):
-        made.update(1.005, 1.0, 30.0, 30.0)
-    before = made.target
-    made.update(1.015, 1.0098, 30.0, 30.0)
-    assert made.target - before == pytest.approx(30.0 * (100.0 * 0.0002 - 1.0 * 0.098))
+        pid.update(1.005, 1.0, 30.0, 30.0)
+    before = pid.target
+    pid.update(1.015, 1.0098, 30.0, 30.0)
+    assert pid.target - before == pytest.approx(30.0 * (100.0 * 0.0002 - 1.0 * 0.098))
 
 
 def test_a_ramp_rises_at_its_rate_and_ends_at_the_target() -> None:

@@ -1,4 +1,4 @@
-"""The table of the interlocks: every state of its rows in every mode, the latch, and nothing that restarts."""
+"""The table of the interlocks: every state of its rows in every mode, the latch, and no restart."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ FAULT_FREE = (
     1 << Row.KEY | 1 << Row.BUTTON | 1 << Row.ROBOT_CIRCUIT | 1 << Row.ARMS_PERMITTED | 1 << Row.ARMS_ENGAGED
     | 1 << Row.PLATFORM | 1 << Row.COMMANDER | 1 << Row.FUSE | 1 << Row.INSULATION
 )  # fmt: skip
-"""An operator who does all that is asked in both modes, and no fault."""
+"""Inputs that permit heat in both modes."""
 
 
 def permitted(mode: Mode, is_true: dict[str, npt.NDArray[np.bool_]]) -> npt.NDArray[np.bool_]:
-    """The rules in words of their own: when heat is permitted."""
+    """Whether heat is permitted, written independently of the table."""
     if mode is Mode.OFF:
         return np.zeros_like(is_true["key"])
     if mode is Mode.MANUAL:
@@ -53,7 +53,7 @@ def test_in_every_state_of_all_rows_heat_is_permitted_exactly_by_the_rules(mode:
     for start in range(0, 1 << len(names), chunk):
         holds = np.arange(start, start + chunk)
         is_true = {name: holds >> bit & 1 == 1 for bit, name in enumerate(names)}
-        assert ((violated(mode, holds) == 0) == permitted(mode, is_true)).all()  # type: ignore[arg-type]
+        assert np.array_equal(violated(mode, holds) == 0, permitted(mode, is_true))  # type: ignore[arg-type]
 
 
 def test_each_row_stands_once_in_the_table_in_the_order_of_its_bit() -> None:
@@ -62,10 +62,10 @@ def test_each_row_stands_once_in_the_table_in_the_order_of_its_bit() -> None:
 
 
 def closed(mode: Mode) -> Interlocks:
-    made = Interlocks()
-    made.update(mode, FAULT_FREE)
-    assert made.close(FAULT_FREE)
-    return made
+    interlocks = Interlocks()
+    interlocks.update(mode, FAULT_FREE)
+    assert interlocks.close(FAULT_FREE)
+    return interlocks
 
 
 @pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.AUTO])

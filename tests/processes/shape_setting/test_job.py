@@ -1,4 +1,4 @@
-"""Jobs in YAML: what `rtcp shape-set` reads, and a sentence with file and line for each mistake."""
+"""Jobs of `rtcp shape-set` in YAML, and the message with file and line for each mistake."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ from pathlib import Path
 import pytest
 
 from rtcp.api import RtcpError
-from rtcp.config.model import ConfigError
+from rtcp.config.findings import Finding
 from rtcp.processes.shape_setting.job import read_job
+from tests.findings import findings_of, summary
 
 FOLDER = Path(__file__).parents[3] / "config" / "shape_setting"
 
 
-def mistakes(tmp_path: Path, old: str, new: str, name: str = "arc.yaml") -> list[str]:
-    """Return the sentences for the example with `old` replaced, without the folder."""
+def mistakes(tmp_path: Path, old: str, new: str, name: str = "arc.yaml") -> list[Finding]:
+    """Mistakes in the example with `old` replaced."""
     folder = tmp_path / "jobs"
     shutil.copytree(FOLDER, folder)
     text = (folder / name).read_text()
     assert text.count(old) == 1
     (folder / name).write_text(text.replace(old, new))
-    with pytest.raises(ConfigError) as raised:
-        read_job(folder / "arc.yaml")
-    return [problem.removeprefix(f"{folder}/") for problem in raised.value.problems]
+    return findings_of(lambda: read_job(folder / "arc.yaml"))
 
 
 def test_the_example_is_a_job_with_its_profile() -> None:
@@ -39,38 +38,40 @@ ROD = "rod: {length: 0.3, diameter: 0.001}"
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "sentence"),
+    ("old", "new", "expected"),
     [
-        (ARC, "", "found neither of arc and end"),
-        (ARC, ARC + "\nend: {position: [0.25, 0.05, 0.06], rpy: [0.3, -0.3, 0.4]}", "found both of arc and end"),
-        (ARC, "arc: {angle: 0.9, side: [0, 0]}", "arc.yaml:8: arc.side: found 0, 0"),
-        (ARC, "arc: {angle: 4, side: [0, 1]}", "arc.yaml:8: arc.angle: found 4"),
-        (ARC, "arc: {angle: 0.9, side: [0, 1, 0]}", "arc.yaml:8: arc.side: found"),
-        (ARC, "arc: {side: [0, 1]}", "arc.yaml:8: arc: the key angle is missing"),
-        (ROD, "rod: {length: 0.8, diameter: 0.001}", "arc.yaml:4: rod.length: found 0.8"),
-        (ROD, "rod: {length: 0.3, diameter: 1}", "arc.yaml:4: rod.diameter: found 1"),
-        (ROD, "rod: {length: .nan, diameter: 0.001}", "arc.yaml:4: rod.length: found "),
-        (ROD, "rod: {length: 0.2, diameter: 0.001}", "arc.yaml:4: rod.length: found 0.2 m, the profile nitinol.yaml"),
-        (ROD, "rod: {length: 0.3, diameter: 0.001, colour: red}", "arc.yaml:4: rod.colour: "),
-        ("arm: right", "arm: left", 'arc.yaml:16: chucks[1].arm: found "left" twice'),
-        (LEFT, LEFT.replace("0.02", "1e300"), "arc.yaml:15: chucks[0].radius: found 1e+300"),
-        (LEFT, LEFT.replace("near: [0,", "near: [1e300,"), "arc.yaml:15: chucks[0].near[0]: found 1e+300"),
-        ("approach_speed: 0.3", "approach_speed: 3", "arc.yaml:18: approach_speed: found 3"),
-        ("approach_speed: 0.3", "approach_sped: 0.3", "arc.yaml:18: approach_sped: "),
-        ("heat: nitinol.yaml", "heat: other.yaml", "other.yaml"),
-        ("heat: nitinol.yaml", "heat: 3", "arc.yaml:3: heat: found 3"),
-        ("chucks:", "chucks: [", "arc.yaml:"),
+        (ARC, "", ": one_of_both found=neither of arc and end"),
+        (ARC, ARC + "\nend: {position: [0.25, 0.05, 0.06], rpy: [0.3, -0.3, 0.4]}",
+         ": one_of_both found=both of arc and end"),
+        (ARC, "arc: {angle: 0.9, side: [0, 0]}", "8 arc.side: no_direction"),
+        (ARC, "arc: {angle: 4, side: [0, 1]}", "8 arc.angle: range"),
+        (ARC, "arc: {angle: 0.9, side: [0, 1, 0]}", "8 arc.side: size"),
+        (ARC, "arc: {side: [0, 1]}", "8 arc: missing key=angle"),
+        (ROD, "rod: {length: 0.8, diameter: 0.001}", "4 rod.length: range"),
+        (ROD, "rod: {length: 0.3, diameter: 1}", "4 rod.diameter: range"),
+        (ROD, "rod: {length: .nan, diameter: 0.001}", "4 rod.length: range"),
+        (ROD, "rod: {length: 0.2, diameter: 0.001}", "4 rod.length: other_length"),
+        (ROD, "rod: {length: 0.3, diameter: 0.001, colour: red}", "4 rod.colour: unknown"),
+        ("arm: right", "arm: left", "16 chucks[1].arm: twice found=left"),
+        (LEFT, LEFT.replace("0.02", "1e300"), "15 chucks[0].radius: range"),
+        (LEFT, LEFT.replace("near: [0,", "near: [1e300,"), "15 chucks[0].near[0]: range"),
+        ("approach_speed: 0.3", "approach_speed: 3", "18 approach_speed: range"),
+        ("approach_speed: 0.3", "approach_sped: 0.3", "18 approach_sped: unknown"),
+        ("heat: nitinol.yaml", "heat: other.yaml", ": no_file"),
+        ("heat: nitinol.yaml", "heat: 3", "3 heat: type"),
+        ("chucks:", "chucks: [", ": not_yaml"),
     ],
 )  # fmt: skip
-def test_a_mistake_is_a_sentence_with_its_line(tmp_path: Path, old: str, new: str, sentence: str) -> None:
-    found = mistakes(tmp_path, old, new)
-    assert any(one.startswith(sentence) or sentence in one for one in found), found
-    assert all(one.split(":")[0].endswith(".yaml") or ".yaml" in one for one in found)
+def test_a_mistake_is_named_with_file_and_line(tmp_path: Path, old: str, new: str, expected: str) -> None:
+    problems = mistakes(tmp_path, old, new)
+    assert expected in [summary(finding, expected) for finding in problems]
+    assert all(finding.file and finding.file.suffix == ".yaml" for finding in problems)
 
 
 def test_a_mistake_of_the_profile_has_its_line_there(tmp_path: Path) -> None:
-    (sentence,) = mistakes(tmp_path, "target_c: 510", "target_c: hot", "nitinol.yaml")
-    assert sentence.startswith("nitinol.yaml:10: target_c: found ")
+    (finding,) = mistakes(tmp_path, "target_c: 510", "target_c: hot", "nitinol.yaml")
+    assert finding.file == tmp_path / "jobs" / "nitinol.yaml"
+    assert summary(finding, "10 ") == "10 target_c: type"
 
 
 def test_all_mistakes_come_at_once(tmp_path: Path) -> None:

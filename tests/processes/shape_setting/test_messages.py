@@ -1,4 +1,4 @@
-"""What the heater says: every message is made of its fields, and crosses shared memory unchanged."""
+"""Messages of the heater: each is made of its fields, and crosses shared memory unchanged."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KINDS: list[type[Message]] = [
 
 def example(kind: type[Message]) -> Message:
     values: list[Any] = [
-        next(iter(field)) if hasattr(field, "__members__") else field(1) for _, field in kind._fields
+        next(iter(field)) if hasattr(field, "__members__") else field(1) for field in kind.field_types.values()
     ]  # fmt: skip
     return kind(*values)
 

@@ -1,4 +1,4 @@
-"""The heater: heat is off in the cycle in which a cause is seen, and nothing turns it on but a command."""
+"""The heater: heat is off in the cycle of a cause, and only a command turns it on."""
 
 from __future__ import annotations
 
@@ -15,37 +15,8 @@ from rtcp.ipc.commands import Command
 from rtcp.ipc.refusals import Refusal
 from rtcp.ipc.states import State
 from rtcp.processes import ProcessSetup, Signal
+from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.interlocks import Mode, Row
-from rtcp.processes.shape_setting.messages import (
-    PROFILE_RANGES,
-    ArmedTooLong,
-    ArmHeater,
-    BatteryLow,
-    CauseRemains,
-    CoolingOutOfRange,
-    HeatEnded,
-    HeaterState,
-    HeaterTripped,
-    HeatForbidden,
-    HeatStopped,
-    MeasureResistance,
-    NoHeatProfile,
-    ProfileKey,
-    ProfileNumberOutOfRange,
-    ProfileOutOfRange,
-    ResetTrips,
-    ResistanceMeasured,
-    ResistanceNotMeasured,
-    RodNotConfirmed,
-    RodPhase,
-    RodStillHot,
-    ShapeSet,
-    StartHeating,
-    StopHeating,
-    TargetNotReached,
-    TripLatched,
-    WrongHeaterState,
-)
 from rtcp.processes.shape_setting.process import ShapeSetting
 from tests.processes.shape_setting.rig import CONFIG, CONFIRMED, PERIOD_S, PROFILE, Rig
 
@@ -64,11 +35,11 @@ def test_a_profile_heats_holds_cools_and_opens_the_relay(mode: Mode) -> None:
     rig = Rig()
     rig.heat(mode)
     hottest = 0.0
-    while rig.heater.state is not HeaterState.DONE and rig.context.cycle < 20_000:
+    while rig.heater.state is not messages.HeaterState.DONE and rig.context.cycle < 20_000:
         rig.cycle()
         hottest = max(hottest, rig.celsius)
     assert hottest == pytest.approx(500.0, abs=20.0)
-    assert isinstance(rig.context.events[-1], ShapeSet)
+    assert isinstance(rig.context.events[-1], messages.ShapeSet)
     assert not rig.relay
     assert not rig.gate
     assert rig.celsius == pytest.approx(400.0, abs=30.0)
@@ -76,9 +47,9 @@ def test_a_profile_heats_holds_cools_and_opens_the_relay(mode: Mode) -> None:
 
 def test_a_hold_and_its_energy_count_the_time_of_skipped_ticks() -> None:
     rig = Rig()
-    rig.heat(state=HeaterState.HOLDING, hold_s=1.0)
+    rig.heat(state=messages.HeaterState.HOLDING, hold_s=1.0)
     cycles, energy = 0, rig.heater.energy
-    while rig.heater.state is HeaterState.HOLDING:
+    while rig.heater.state is messages.HeaterState.HOLDING:
         rig.context.now_ns += 500_000
         rig.cycle()
         energy += rig.get("voltage") * rig.get("current") * 2 * PERIOD_S
@@ -90,7 +61,7 @@ def test_a_hold_and_its_energy_count_the_time_of_skipped_ticks() -> None:
 @pytest.mark.parametrize(("ohm", "joule_by_kelvin"), [(1.36, 0.19), (0.34, 0.75), (0.033, 7.8)])
 def test_one_setting_holds_rods_of_all_diameters(ohm: float, joule_by_kelvin: float) -> None:
     rig = Rig(resistance=ohm, heat_capacity=joule_by_kelvin)
-    rig.heat(state=HeaterState.HOLDING, hold_s=2.0, ramp_k_s=100.0, max_current=300.0)
+    rig.heat(state=messages.HeaterState.HOLDING, hold_s=2.0, ramp_k_s=100.0, max_current=300.0)
     rig.cycle(2000)
     for _ in range(10):
         rig.cycle(100)
@@ -101,9 +72,9 @@ def test_the_initial_resistance_is_a_mean_of_pulses_with_its_uncertainty() -> No
     rig = Rig()
     rig.arm()
     assert rig.send(CONFIRMED) is None
-    rig.until(HeaterState.ARMED)
-    (measured,) = events(rig, ResistanceMeasured)
-    assert isinstance(measured, ResistanceMeasured)
+    rig.until(messages.HeaterState.ARMED)
+    (measured,) = events(rig, messages.ResistanceMeasured)
+    assert isinstance(measured, messages.ResistanceMeasured)
     assert measured.pulses == CONFIG.pulses
     assert measured.resistance == pytest.approx(0.34, rel=1e-3)
     assert 0.0 < measured.uncertainty < 1e-3 * measured.resistance
@@ -132,11 +103,11 @@ def test_a_record_has_what_is_measured_beside_what_is_commanded() -> None:
     rig = Rig()
     rig.heat()
     rig.forced.update(relay_closed=1.0, gate_sense=1.0, current=30.0)
-    rig.send(StopHeating())
+    rig.send(messages.StopHeating())
     rig.cycle()
-    shown = record(rig)
-    assert (shown["gate"], shown["relay"]) == (0, 0)
-    assert (shown["relay_closed"], shown["gate_sense"], shown["current"], shown["inputs_alive"]) == (1, 1, 30.0, 1)
+    values = record(rig)
+    assert (values["gate"], values["relay"]) == (0, 0)
+    assert (values["relay_closed"], values["gate_sense"], values["current"], values["inputs_alive"]) == (1, 1, 30.0, 1)
     rig.context.good = False
     rig.cycle()
     assert not record(rig)["inputs_alive"]
@@ -146,14 +117,14 @@ def test_a_record_has_what_is_measured_beside_what_is_commanded() -> None:
 def test_a_rod_is_not_measured_before_its_time_to_cool_since_the_heat_is_over(cool_c: float) -> None:
     rig = Rig(replace(CONFIG, rod_cooling_s=10.0))
     rig.loss = 1.0
-    rig.heat(state=HeaterState.COOLING, target_c=350.0, cool_c=cool_c)
+    rig.heat(state=messages.HeaterState.COOLING, target_c=350.0, cool_c=cool_c)
     began = rig.context.cycle
-    rig.until(HeaterState.DONE)
+    rig.until(messages.HeaterState.DONE)
     cooled_s = (rig.context.cycle - began) * PERIOD_S
     assert record(rig)["rod_hot_s"] == pytest.approx(10.0 - cooled_s, abs=0.01)
     rig.cycle(20)
     rig.arm()
-    assert isinstance(rig.send(CONFIRMED), RodStillHot)
+    assert isinstance(rig.send(CONFIRMED), messages.RodStillHot)
     rig.cycle(round((10.0 - cooled_s) / PERIOD_S))
     assert rig.send(CONFIRMED) is None
 
@@ -162,7 +133,7 @@ def test_after_a_start_a_rod_is_not_measured_before_its_time_to_cool() -> None:
     rig = Rig(replace(CONFIG, rod_cooling_s=1.0))
     rig.heater._since_heat_s = 0.0
     rig.arm()
-    assert isinstance(rig.send(CONFIRMED), RodStillHot)
+    assert isinstance(rig.send(CONFIRMED), messages.RodStillHot)
     rig.cycle(2000)
     assert rig.send(CONFIRMED) is None
 
@@ -180,17 +151,17 @@ def test_a_current_that_nobody_commands_keeps_the_rod_hot() -> None:
 
 def test_a_contact_that_shows_a_rod_colder_than_the_room_does_not_end_the_cooling() -> None:
     rig = Rig()
-    rig.heat(state=HeaterState.COOLING)
+    rig.heat(state=messages.HeaterState.COOLING)
     rig.initial *= 0.86
     rig.cycle(400)
-    assert rig.heater.state is not HeaterState.DONE
+    assert rig.heater.state is not messages.HeaterState.DONE
 
 
 def test_a_hold_that_does_not_fit_beside_its_ramp_is_refused() -> None:
     rig = Rig(replace(CONFIG, longest_s=10.0))
     assert rig.send(replace(PROFILE, hold_s=7.0)) is None
     refusal = rig.send(replace(PROFILE, hold_s=7.7))
-    assert isinstance(refusal, ProfileNumberOutOfRange)
+    assert isinstance(refusal, messages.ProfileNumberOutOfRange)
     assert (refusal.value, refusal.greatest) == pytest.approx((7.7, 7.6))
 
 
@@ -208,8 +179,8 @@ def test_the_limits_of_current_and_power_hold_the_target() -> None:
 def test_a_rod_that_does_not_get_hot_ends_the_heating_after_its_longest_time() -> None:
     rig = Rig(replace(CONFIG, longest_s=3.0))
     rig.heat(max_power=10.0)
-    rig.until(HeaterState.READY)
-    assert events(rig, TargetNotReached)
+    rig.until(messages.HeaterState.READY)
+    assert events(rig, messages.TargetNotReached)
     assert not rig.gate
     assert not rig.relay
 
@@ -222,7 +193,7 @@ def test_an_armed_heater_that_nobody_uses_opens_its_relay() -> None:
     assert rig.relay
     rig.cycle(60)
     assert not rig.relay
-    assert events(rig, ArmedTooLong)
+    assert events(rig, messages.ArmedTooLong)
 
 
 def test_lamps_show_powered_and_armed() -> None:
@@ -250,35 +221,39 @@ def refused(rig: Rig, command: Command) -> Refusal:
 def test_heat_needs_its_steps_in_their_order() -> None:
     rig = Rig()
     rig.cycle()
-    assert refused(rig, ArmHeater()) == HeatForbidden(Row.KEY, Mode.OFF)
+    assert refused(rig, messages.ArmHeater()) == messages.HeatForbidden(Row.KEY, Mode.OFF)
     rig.permit(Mode.MANUAL)
-    assert refused(rig, StartHeating()) == WrongHeaterState(HeaterState.READY, HeaterState.ARMED)
+    assert refused(rig, messages.StartHeating()) == messages.WrongHeaterState(
+        messages.HeaterState.READY, messages.HeaterState.ARMED
+    )
     rig.arm(Mode.MANUAL)
-    assert refused(rig, ArmHeater()) == WrongHeaterState(HeaterState.ARMED, HeaterState.READY)
-    assert refused(rig, StartHeating()) == NoHeatProfile()
+    assert refused(rig, messages.ArmHeater()) == messages.WrongHeaterState(
+        messages.HeaterState.ARMED, messages.HeaterState.READY
+    )
+    assert refused(rig, messages.StartHeating()) == messages.NoHeatProfile()
     assert rig.send(PROFILE) is None
-    assert refused(rig, StartHeating()) == ResistanceNotMeasured()
+    assert refused(rig, messages.StartHeating()) == messages.ResistanceNotMeasured()
 
 
 @pytest.mark.parametrize(
     "command",
     [
-        MeasureResistance(False, RodPhase.AUSTENITE),
-        MeasureResistance(True, RodPhase.MARTENSITE),
-        MeasureResistance(True, RodPhase.UNKNOWN),
+        messages.MeasureResistance(False, messages.RodPhase.AUSTENITE),
+        messages.MeasureResistance(True, messages.RodPhase.MARTENSITE),
+        messages.MeasureResistance(True, messages.RodPhase.UNKNOWN),
     ],
 )
-def test_a_rod_that_is_bent_or_of_another_phase_is_not_measured(command: MeasureResistance) -> None:
+def test_a_rod_that_is_bent_or_of_another_phase_is_not_measured(command: messages.MeasureResistance) -> None:
     rig = Rig()
     rig.arm()
-    assert refused(rig, command) == RodNotConfirmed(command.phase)
+    assert refused(rig, command) == messages.RodNotConfirmed(command.phase)
 
 
 def test_pulses_wait_for_the_relay() -> None:
     rig = Rig()
     rig.permit(Mode.AUTO)
-    assert rig.send(ArmHeater()) is None
-    assert rig.send(CONFIRMED) == HeatForbidden(Row.RELAY_FEEDBACK, Mode.AUTO)
+    assert rig.send(messages.ArmHeater()) is None
+    assert rig.send(CONFIRMED) == messages.HeatForbidden(Row.RELAY_FEEDBACK, Mode.AUTO)
 
 
 @pytest.mark.parametrize(
@@ -293,34 +268,34 @@ def test_pulses_wait_for_the_relay() -> None:
 )  # fmt: skip
 def test_a_number_of_a_profile_out_of_range_is_refused_by_its_name(key: str, value: float) -> None:
     refusal = refused(Rig(), replace(PROFILE, **{key: value}))
-    assert isinstance(refusal, ProfileNumberOutOfRange)
+    assert isinstance(refusal, messages.ProfileNumberOutOfRange)
     assert refusal.quantity.name.lower() == key
     assert not refusal.least <= refusal.value <= refusal.greatest
 
 
 def test_a_heater_may_narrow_the_target() -> None:
     refusal = refused(Rig(replace(CONFIG, greatest_target_c=400.0)), PROFILE)
-    assert refusal == ProfileNumberOutOfRange(ProfileKey.TARGET_C, 500.0, 50.0, 400.0)
+    assert refusal == messages.ProfileNumberOutOfRange(messages.ProfileKey.TARGET_C, 500.0, 50.0, 400.0)
 
 
 @pytest.mark.parametrize("wrong", [{"cool_c": 20.0}, {"target_c": 400.0}, {"initial_c": 200.0, "cool_c": 100.0}])
 def test_a_profile_cools_to_between_its_initial_temperature_and_its_target(wrong: dict[str, float]) -> None:
-    assert isinstance(refused(Rig(), replace(PROFILE, **wrong)), CoolingOutOfRange)
+    assert isinstance(refused(Rig(), replace(PROFILE, **wrong)), messages.CoolingOutOfRange)
 
 
 def test_a_profile_beyond_the_plausible_ratio_is_refused() -> None:
-    assert isinstance(refused(Rig(), replace(PROFILE, kelvin_per_ratio=500.0)), ProfileOutOfRange)
+    assert isinstance(refused(Rig(), replace(PROFILE, kelvin_per_ratio=500.0)), messages.ProfileOutOfRange)
 
 
 def test_the_ranges_are_those_of_all_numbers_of_a_profile() -> None:
-    assert [key.name.lower() for key in PROFILE_RANGES] == [entry.name for entry in fields(PROFILE)]
+    assert [key.name.lower() for key in messages.PROFILE_RANGES] == [entry.name for entry in fields(PROFILE)]
 
 
 def test_a_weak_battery_is_refused() -> None:
     rig = Rig()
     rig.set(battery_voltage=11.0)
     rig.permit(Mode.AUTO)
-    assert refused(rig, ArmHeater()) == BatteryLow(11.0, CONFIG.least_battery_voltage)
+    assert refused(rig, messages.ArmHeater()) == messages.BatteryLow(11.0, CONFIG.least_battery_voltage)
     rig.cycle(5)
     assert not rig.relay
 
@@ -331,7 +306,7 @@ def test_the_key_at_off_forgets_the_initial_resistance() -> None:
     rig.key(Mode.OFF)
     rig.cycle(20)
     rig.arm()
-    assert refused(rig, StartHeating()) == ResistanceNotMeasured()
+    assert refused(rig, messages.StartHeating()) == messages.ResistanceNotMeasured()
 
 
 # -- heat off, for every row -------------------------------------------------------------------------------------------
@@ -436,7 +411,7 @@ def test_heat_is_off_in_the_cycle_of_the_cause_and_stays_off_when_it_is_gone(
     assert not rig.gate
     assert not rig.relay
     assert rig.heater.interlocks.cause is row
-    reported = events(rig, HeatEnded) + events(rig, HeaterTripped)
+    reported = events(rig, messages.HeatEnded) + events(rig, messages.HeaterTripped)
     assert [event.row for event in reported] == [row]  # type: ignore[attr-defined]
     rig.forced.clear()
     rig.context.good, rig.context.commander, rig.context.state = True, True, State.HOLDING
@@ -485,7 +460,7 @@ def test_channels_that_differ_forbid_heat_for_longer_than_the_discrepancy_time(
 
 def test_a_gate_that_stays_on_trips_within_its_cycles() -> None:
     rig = Rig()
-    rig.heat(state=HeaterState.COOLING, target_c=100.0, cool_c=60.0)
+    rig.heat(state=messages.HeaterState.COOLING, target_c=100.0, cool_c=60.0)
     rig.cycle(20)
     rig.forced.update(gate_sense=1.0, current=30.0, voltage=30.0 * rig.resistance)
     rig.cycle(CONFIG.gate_cycles + 1)
@@ -493,10 +468,10 @@ def test_a_gate_that_stays_on_trips_within_its_cycles() -> None:
     assert not rig.relay
 
 
-@pytest.mark.parametrize("state", [HeaterState.ARMED, HeaterState.COOLING])
-def test_a_current_with_the_gate_off_trips_as_the_gate_does(state: HeaterState) -> None:
+@pytest.mark.parametrize("state", [messages.HeaterState.ARMED, messages.HeaterState.COOLING])
+def test_a_current_with_the_gate_off_trips_as_the_gate_does(state: messages.HeaterState) -> None:
     rig = Rig()
-    if state is HeaterState.ARMED:
+    if state is messages.HeaterState.ARMED:
         rig.arm()
     else:
         rig.heat(state=state)
@@ -511,7 +486,7 @@ def test_a_current_with_the_gate_off_trips_as_the_gate_does(state: HeaterState) 
 
 def test_a_ratio_that_falls_in_a_pause_faster_than_a_rod_cools_is_too_steep() -> None:
     rig = Rig(replace(CONFIG, cooling_interval_s=0.5))
-    rig.heat(state=HeaterState.COOLING)
+    rig.heat(state=messages.HeaterState.COOLING)
     rig.cycle(1500)
     assert rig.relay
     rig.initial *= 0.88
@@ -535,7 +510,7 @@ def test_a_relay_that_does_not_close_trips_after_its_time() -> None:
     rig = Rig()
     rig.permit(Mode.AUTO)
     rig.forced["relay_closed"] = 0.0
-    assert rig.send(ArmHeater()) is None
+    assert rig.send(messages.ArmHeater()) is None
     rig.cycle(9)
     assert rig.relay
     rig.cycle(3)
@@ -547,17 +522,17 @@ def test_a_welded_relay_latches_after_the_heat_and_is_never_started_again_before
     rig = Rig()
     rig.heat()
     rig.forced["relay_closed"] = 1.0
-    assert rig.send(StopHeating()) is None
+    assert rig.send(messages.StopHeating()) is None
     rig.cycle(12)
-    assert rig.heater.state is HeaterState.TRIPPED
-    assert refused(rig, ArmHeater()) == TripLatched(Row.RELAY_FEEDBACK)
-    assert refused(rig, ResetTrips()) == CauseRemains(Row.RELAY_FEEDBACK)
+    assert rig.heater.state is messages.HeaterState.TRIPPED
+    assert refused(rig, messages.ArmHeater()) == messages.TripLatched(Row.RELAY_FEEDBACK)
+    assert refused(rig, messages.ResetTrips()) == messages.CauseRemains(Row.RELAY_FEEDBACK)
     rig.forced.clear()
     rig.cycle(10)
-    assert refused(rig, ArmHeater()) == TripLatched(Row.RELAY_FEEDBACK)
-    assert rig.send(ResetTrips()) is None
+    assert refused(rig, messages.ArmHeater()) == messages.TripLatched(Row.RELAY_FEEDBACK)
+    assert rig.send(messages.ResetTrips()) is None
     rig.cycle(20)
-    assert rig.heater.state is HeaterState.READY
+    assert rig.heater.state is messages.HeaterState.READY
     assert not rig.relay
     rig.arm()
 
@@ -568,24 +543,24 @@ def test_a_cause_that_was_there_before_the_inputs_went_missing_is_not_reset() ->
     rig.cycle()
     rig.context.good = False
     rig.cycle()
-    assert rig.send(ResetTrips()) == CauseRemains(Row.INSULATION)
+    assert rig.send(messages.ResetTrips()) == messages.CauseRemains(Row.INSULATION)
 
 
 def test_an_open_relay_is_needed_before_the_next_start() -> None:
     rig = Rig()
     rig.arm()
-    assert rig.send(StopHeating()) is None
+    assert rig.send(messages.StopHeating()) is None
     rig.cycle()
     assert rig.get("relay_closed")
-    assert refused(rig, ArmHeater()) == HeatForbidden(Row.RELAY_FEEDBACK, Mode.AUTO)
+    assert refused(rig, messages.ArmHeater()) == messages.HeatForbidden(Row.RELAY_FEEDBACK, Mode.AUTO)
     rig.cycle(10)
-    assert rig.send(ArmHeater()) is None
+    assert rig.send(messages.ArmHeater()) is None
 
 
 def test_the_gate_is_off_where_the_mirror_contact_opens_within_the_relays_time() -> None:
     rig = Rig()
     rig.permit(Mode.AUTO)
-    assert rig.send(ArmHeater()) is None
+    assert rig.send(messages.ArmHeater()) is None
     while not rig.get("relay_closed"):
         rig.cycle()
     assert rig.send(CONFIRMED) is None
@@ -611,7 +586,7 @@ def test_inputs_count_from_the_first_cycle_after_the_start() -> None:
     rig.set(key_auto=1, key_manual=1)
     rig.cycle(200)
     assert rig.heater.interlocks.latched == 0
-    assert refused(rig, ArmHeater()) == HeatForbidden(Row.KEY, Mode.OFF)
+    assert refused(rig, messages.ArmHeater()) == messages.HeatForbidden(Row.KEY, Mode.OFF)
 
 
 def test_a_key_at_both_positions_latches() -> None:
@@ -625,12 +600,12 @@ def test_a_key_at_both_positions_latches() -> None:
 def test_stop_turns_heat_off_at_once_and_needs_no_lease(mode: Mode) -> None:
     rig = Rig()
     rig.heat(mode)
-    assert not StopHeating.needs_lease
-    assert rig.send(StopHeating()) is None
+    assert not messages.StopHeating.needs_lease
+    assert rig.send(messages.StopHeating()) is None
     assert not rig.gate
     assert not rig.relay
     rig.cycle(30)
-    assert events(rig, HeatStopped)
+    assert events(rig, messages.HeatStopped)
     assert not rig.gate
     assert not rig.relay
 
@@ -644,7 +619,7 @@ def test_safe_turns_heat_off_at_once_until_the_next_start() -> None:
     rig.cycle(30)
     assert not rig.gate
     assert not rig.relay
-    assert rig.heater.state is HeaterState.READY
+    assert rig.heater.state is messages.HeaterState.READY
 
 
 def test_an_arm_that_the_cell_does_not_have_forbids_auto_and_not_manual() -> None:
@@ -652,7 +627,7 @@ def test_an_arm_that_the_cell_does_not_have_forbids_auto_and_not_manual() -> Non
     signals = {name: Signal(rig.values, name) for name in rig.values}
     rig.heater = ShapeSetting(CONFIG, ProcessSetup(PERIOD_S, signals, {}))
     rig.permit(Mode.AUTO)
-    assert isinstance(refused(rig, ArmHeater()), HeatForbidden)
+    assert isinstance(refused(rig, messages.ArmHeater()), messages.HeatForbidden)
     rig.arm(Mode.MANUAL)
 
 
@@ -663,7 +638,7 @@ OTHERS = ("permitted", "engaged", "recent", "good", "platform", "commander")
 
 
 def may_heat(mode: Mode, is_true: dict[str, bool]) -> bool:
-    """The rules for heat that is on, in words of their own."""
+    """The rules for heat that is on, written independently of the table."""
     always = ("relay_closed", "fuse_ok", "good", "platform", "commander")
     if not all(is_true[name] for name in always) or is_true["key_auto"] == is_true["key_manual"]:
         return False
@@ -689,7 +664,7 @@ def apply(rig: Rig, is_true: dict[str, bool]) -> None:
 def test_in_every_state_of_the_inputs_heat_goes_on_exactly_by_the_rules(mode: Mode) -> None:
     rig = Rig()
     rig.heat(mode)
-    # Nothing is left of one state for the next.
+    # Each state begins from a fresh heater.
     frozen = pickle.dumps((rig.heater, rig.context, rig.partners, rig.values, rig))
     permitted = 0
     for bits in product((False, True), repeat=len(LEVELS) + len(OTHERS)):
@@ -707,9 +682,9 @@ def test_in_every_state_of_the_inputs_heat_goes_on_exactly_by_the_rules(mode: Mo
 
 
 def run_random_sequences(count: int, seed: int) -> dict[str, int]:
-    """Let random inputs and commands act; check after each cycle that nothing is on that was not started."""
+    """Apply random inputs and commands; check after each cycle that nothing is on that was not started."""
     chance = random.Random(seed)
-    rig, seen = Rig(), dict.fromkeys(("heat", "ended", "tripped"), 0)
+    rig, counts = Rig(), dict.fromkeys(("heat", "ended", "tripped"), 0)
     started = armed = False
     for _ in range(count):
         mode = chance.choice(MODES)
@@ -717,24 +692,31 @@ def run_random_sequences(count: int, seed: int) -> dict[str, int]:
         is_true.update(key_auto=mode is Mode.AUTO, key_manual=mode is Mode.MANUAL)
         apply(rig, is_true)
         rig.cycle(12)
-        for command in (StopHeating(), ResetTrips(), ArmHeater()):
+        for command in (messages.StopHeating(), messages.ResetTrips(), messages.ArmHeater()):
             rig.send(command)
-            rig.cycle(1 if command != ArmHeater() else 12)
+            rig.cycle(1 if command != messages.ArmHeater() else 12)
         armed = started = rig.relay
         if chance.random() < 0.9:
             # An initial resistance as if it had been measured: pulses take longer than all the rest.
             rig.heater.initial.value = rig.resistance
             rig.send(PROFILE)
-            started = rig.send(chance.choice((StartHeating(), CONFIRMED))) is None or started
+            started = rig.send(chance.choice((messages.StartHeating(), CONFIRMED))) is None or started
         for _ in range(chance.randrange(1, 8)):
             for name in chance.sample(sorted(is_true), chance.choice((0, 0, 1, 2))):
                 is_true[name] = not is_true[name]
             apply(rig, is_true)
-            commands: list[Command] = [ArmHeater(), StartHeating(), CONFIRMED, ResetTrips(), StopHeating(), PROFILE]
-            command = chance.choice(commands) if chance.random() < 0.2 else None
-            if command is not None and rig.send(command) is None:
-                armed |= isinstance(command, ArmHeater)
-                started |= isinstance(command, (StartHeating, MeasureResistance))
+            commands: list[Command] = [
+                messages.ArmHeater(),
+                messages.StartHeating(),
+                CONFIRMED,
+                messages.ResetTrips(),
+                messages.StopHeating(),
+                PROFILE,
+            ]
+            sent = chance.choice(commands) if chance.random() < 0.2 else None
+            if sent is not None and rig.send(sent) is None:
+                armed |= isinstance(sent, messages.ArmHeater)
+                started |= isinstance(sent, (messages.StartHeating, messages.MeasureResistance))
             for _ in range(chance.choice((1, 1, 3, 12))):
                 before = len(rig.context.events)
                 rig.cycle()
@@ -747,20 +729,20 @@ def run_random_sequences(count: int, seed: int) -> dict[str, int]:
                 if rig.gate:
                     assert started
                     assert may_heat(rig.heater.inputs.mode, now)
-                    seen["heat"] += 1
+                    counts["heat"] += 1
                 if not rig.relay:
                     armed = started = False
                 for event in rig.context.events[before:]:
-                    seen["ended"] += isinstance(event, HeatEnded)
-                    seen["tripped"] += isinstance(event, HeaterTripped)
+                    counts["ended"] += isinstance(event, messages.HeatEnded)
+                    counts["tripped"] += isinstance(event, messages.HeaterTripped)
         rig.context.events.clear()
         rig.celsius = 20.0
-    return seen
+    return counts
 
 
 def test_random_sequences_of_inputs_and_commands_never_heat_outside_the_table() -> None:
-    seen = run_random_sequences(3_000, seed=33)
-    assert min(seen.values()) > 100, seen
+    counts = run_random_sequences(3_000, seed=33)
+    assert min(counts.values()) > 100, counts
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Profiles in YAML, their mistakes, and what goes to the loop."""
+"""Profiles in YAML, their mistakes, and the command to the loop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtcp.config.model import ConfigError
 from rtcp.processes.shape_setting.profile import (
     heat_command,
     read_profile,
@@ -19,20 +18,11 @@ from rtcp.processes.shape_setting.profile import (
     temperatures_along,
 )
 from rtcp.processes.shape_setting.temperature import Place
+from tests.findings import findings_of, summary
 from tests.processes.shape_setting.rig import Rig
 
 ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "config" / "shape_setting" / "nitinol.yaml"
-
-
-def mistakes(tmp_path: Path, old: str, new: str) -> list[str]:
-    text = EXAMPLE.read_text()
-    assert old in text
-    file = tmp_path / "rod.yaml"
-    file.write_text(text.replace(old, new))
-    with pytest.raises(ConfigError) as raised:
-        read_profile(file)
-    return [problem.removeprefix(f"{file}:") for problem in raised.value.problems]
 
 
 def test_the_example_is_a_profile_that_the_heater_takes() -> None:
@@ -46,20 +36,21 @@ def test_the_example_is_a_profile_that_the_heater_takes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "sentence"),
+    ("old", "new", "expected"),
     [
-        ("target_c: 510", "target_c: 5100", 10, "target_c: found 5100, allowed is a number from 50 to 600"),
-        ("cool_c: 80 ", "cool_c: 520", 13, "cool_c: found 520, allowed is a number from 20 to 400"),
-        ("cool_c: 80\n", "cool_c: 21\n", 13, "cool_c: found 21, allowed is more than initial_c, 22"),
-        ("alpha: 1.78e-10", "alpha: 2e-4", 4, "alloy.alpha: found 0.0002, allowed is a number from 1e-11 to 1e-08"),
-        ("hold_s: 120", "hold: 120", 11, "hold: this key does not exist; did you mean hold_s?"),
-        ("length: 0.3 ", "length: 300 ", 7, "ends.length: found 300, allowed is a number from 0.02 to 2"),
+        ("target_c: 510", "target_c: 5100", "10 target_c: range"),
+        ("cool_c: 80 ", "cool_c: 520", "13 cool_c: range"),
+        ("cool_c: 80\n", "cool_c: 21\n", "13 cool_c: too_low"),
+        ("alpha: 1.78e-10", "alpha: 2e-4", "4 alloy.alpha: range"),
+        ("hold_s: 120", "hold: 120", "11 hold: unknown"),
+        ("length: 0.3 ", "length: 300 ", "7 ends.length: range"),
     ],
 )
-def test_a_mistake_is_a_sentence_with_its_line(tmp_path: Path, old: str, new: str, line: int, sentence: str) -> None:
-    old = old if old in EXAMPLE.read_text() else old.rstrip()
-    problems = mistakes(tmp_path, old, new)
-    assert any(problem.startswith(f"{line}: {sentence}") for problem in problems), problems
+def test_a_mistake_is_named_with_its_line(tmp_path: Path, old: str, new: str, expected: str) -> None:
+    text = EXAMPLE.read_text()
+    file = tmp_path / "rod.yaml"
+    file.write_text(text.replace(old if old in text else old.rstrip(), new))
+    assert expected in [summary(finding, expected) for finding in findings_of(lambda: read_profile(file))]
 
 
 def test_the_temperatures_along_the_rod_have_chucks_middle_and_mean_of_the_scale() -> None:

@@ -11,9 +11,9 @@ from rtcp.processes.shape_setting.resistance import InitialResistance, Resistanc
 
 @pytest.fixture
 def meter() -> ResistanceMeter:
-    made = ResistanceMeter(0.0005, short=0.01, open_=5.0)
-    made.update(10.0, 20.0, 1.0, True)
-    return made
+    fresh = ResistanceMeter(0.0005, short=0.01, open_=5.0)
+    fresh.update(10.0, 20.0, 1.0, True)
+    return fresh
 
 
 def test_a_pair_with_the_gate_on_is_a_resistance(meter: ResistanceMeter) -> None:

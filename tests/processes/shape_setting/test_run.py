@@ -1,4 +1,4 @@
-"""The end of a run before its time: heat first, then motion, whatever does not answer."""
+"""The early end of a run: heat first, then motion, even if a part does not answer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rtcp.processes.shape_setting.run import Outcome, ShapeSettingRun
 
 
 class FakeRobot:
-    """The heater's platform over a connection of its own; it notes what it is asked."""
+    """The heater's platform over a connection of its own; it records its calls."""
 
     def __init__(self, done: list[str], answers: bool, **fields: float) -> None:
         self._done, self._answers, self.fields = done, answers, fields
@@ -142,14 +142,14 @@ def test_a_second_signal_keeps_nothing_from_stopping(number: signal.Signals) -> 
 
 
 def with_heater(run: ShapeSettingRun, *events: tuple[str, dict[str, float]], **fields: float) -> list[str]:
-    """Give a run a heater with fields and events; return where its commands will be."""
+    """Add a heater with fields and events to a run; return the list of its commands."""
     commands: list[str] = []
 
     def command(name: str, **_: float) -> None:
         commands.append(name)
 
-    shown = {**OFF, "latched": 0, "busy": 0, "rod_hot_s": 0.0, "mode": Mode.AUTO, **fields}
-    run._heater = SimpleNamespace(fields=shown, state="armed", command=command)  # type: ignore[assignment]
+    values = {**OFF, "latched": 0, "busy": 0, "rod_hot_s": 0.0, "mode": Mode.AUTO, **fields}
+    run._heater = SimpleNamespace(fields=values, state="armed", command=command)  # type: ignore[assignment]
     run._robot = SimpleNamespace(  # type: ignore[assignment]
         state=State.HOLDING, events=lambda since: [SimpleNamespace(name=name, fields=known) for name, known in events]
     )
@@ -202,7 +202,7 @@ def test_the_heater_has_to_supervise_both_arms(tmp_path: Path) -> None:
     run._member.config = SimpleNamespace(source="heater.yaml")  # type: ignore[misc, assignment]
     run._job = SimpleNamespace(holders={"left": None})  # type: ignore[assignment]
     run._check_arms()
-    run._job.holders["right"] = None  # type: ignore[assignment]
+    run._job.holders["right"] = None
     with pytest.raises(RtcpError, match=r"the arm right .* the heater supervises left: .* heater\.yaml"):
         run._check_arms()
 
@@ -247,14 +247,14 @@ def test_a_heating_to_another_profile_ends_the_run_with_an_error(
 
 
 @pytest.mark.parametrize(
-    ("middle_c", "said"),
+    ("middle_c", "text"),
     [(396.2, "its middle has 396 C: HOT, do not touch it"), (48.0, "its middle has 48 C"), (None, "is not known")],
 )
 def test_a_rod_that_is_released_is_said_to_be_as_hot_as_it_is(
-    tmp_path: Path, middle_c: float | None, said: str
+    tmp_path: Path, middle_c: float | None, text: str
 ) -> None:
     run = make_run(tmp_path)
     run.outcome.samples["middle_temperature"] = [] if middle_c is None else [510.0, middle_c, 0.0]
     assert run.middle_c == middle_c
-    assert said in module._warmth(run.middle_c)
+    assert text in module._warmth(run.middle_c)
     assert ("HOT" in module._warmth(run.middle_c)) is (middle_c == 396.2)

@@ -13,21 +13,14 @@ import pytest
 
 from rtcp.config import load
 from rtcp.control.processes import ProcessPart
-from rtcp.ipc.commands import Disable, Enable, Halt
+from rtcp.ipc.commands import Disable, Halt
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Simulation
+from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.interlocks import TABLE, Mode, Row, Rule
-from rtcp.processes.shape_setting.messages import (
-    ArmHeater,
-    HeaterState,
-    MeasureResistance,
-    RodPhase,
-    StartHeating,
-    StopHeating,
-)
 from rtcp.processes.shape_setting.process import ShapeSetting
 from rtcp.processes.shape_setting.profile import HeatProfile, heat_command, read_profile
+from rtcp.testing.simulation import Simulation
 from rtcp.virtual.heated_rod import HeatedRod
 from rtcp.virtual.heater_circuit import CircuitFault
 from rtcp.virtual.models.shape_setter import ShapeSetterBox, ShapeSetterMeter
@@ -52,7 +45,7 @@ class Platform(Simulation):
         config = load(ROOT / "config" / "heater.yaml")
         (heater,) = config.processes
         assert isinstance(heater, ShapeSettingConfig)
-        # With the tolerances of a robot: none for a busy host.
+        # With the tolerances of a real robot, not those of a busy host.
         process = ShapeSettingConfig(heater.kind, heater.name, arms=("left",), **({"rod_cooling_s": 0.0} | keys))
         super().__init__(replace(config, processes=(process,)))
         self.control = next(s.device for s in self.bus.slaves if isinstance(s.device, ShapeSetterBox))
@@ -73,50 +66,47 @@ class Platform(Simulation):
         assert record is not None
         return float(record[f"heater_{name}"][0])
 
-    def reaches(self, state: HeaterState, seconds: float) -> bool:
+    def reaches(self, state: messages.HeaterState, seconds: float) -> bool:
         return self.until(lambda: self.field("state") == state, seconds)
 
     def heat(self, mode: Mode = Mode.AUTO) -> None:
         self.control.contacts = AUTO if mode is Mode.AUTO else MANUAL
         for _ in range(4):
             self.cycle()
-        assert self.send(ArmHeater()).refusal is None
+        self.do(messages.ArmHeater())
         assert self.until(lambda: self.control.circuit.relay_closed, 0.1)
         for _ in range(4):
             self.cycle()
-        assert self.send(MeasureResistance(True, RodPhase.AUSTENITE)).refusal is None
-        assert self.reaches(HeaterState.ARMED, 2.0)
-        assert self.send(heat_command(short_profile())).refusal is None
-        assert self.send(StartHeating()).refusal is None
+        self.do(messages.MeasureResistance(True, messages.RodPhase.AUSTENITE))
+        assert self.reaches(messages.HeaterState.ARMED, 2.0)
+        self.do(heat_command(short_profile()))
+        self.do(messages.StartHeating())
         assert self.until(lambda: self.control.gate, 0.5)
 
 
 @contextlib.contextmanager
 def enabled(**keys: Any) -> Iterator[Platform]:
     with Platform(**keys) as made:
-        assert made.until(lambda: made.state is State.READY, 5.0)
-        made.acquire()
-        assert made.send(Enable()).refusal is None
-        assert made.until(lambda: made.state is State.HOLDING, 1.0)
+        made.hold()
         yield made
 
 
 @pytest.fixture
 def platform() -> Iterator[Platform]:
-    with enabled() as made:
-        yield made
+    with enabled() as platform:
+        yield platform
 
 
 def test_the_middle_of_the_virtual_rod_gets_its_temperature(platform: Platform) -> None:
     platform.heat()
-    assert platform.reaches(HeaterState.HOLDING, 5.0)
-    assert platform.reaches(HeaterState.COOLING, 2.0)
+    assert platform.reaches(messages.HeaterState.HOLDING, 5.0)
+    assert platform.reaches(messages.HeaterState.COOLING, 2.0)
     rod = platform.control.rod
     mean = float(np.average(rod.temperature, weights=rod.cell_lengths))
     assert platform.field("mean_temperature") == pytest.approx(mean, abs=3.0)
     # The cold ends have not reached the steady state of the fin by then.
     assert rod.middle_temperature == pytest.approx(510.0, abs=25.0)
-    assert platform.reaches(HeaterState.DONE, 20.0)
+    assert platform.reaches(messages.HeaterState.DONE, 20.0)
     for _ in range(2):
         platform.cycle()
     assert not platform.control.relay
@@ -211,7 +201,7 @@ ENDED_BEFORE = {
     # A platform in fault has called `safe` already.
     Row.PLATFORM: Row.NONE,
 }
-"""Rows that heat does not wait for: what has turned it off before they hold or latch."""
+"""Rows before which heat is already off, and what turned it off."""
 
 
 @pytest.mark.parametrize("rule", TABLE, ids=lambda rule: rule.row.name.lower())
@@ -245,12 +235,12 @@ def test_the_virtual_gate_is_off_two_cycles_after_the_cause_was_seen(row: Row, m
             assert not platform.control.relay
 
 
-@pytest.mark.parametrize("command", [StopHeating(), Halt(), Disable()], ids=lambda command: command.name)
+@pytest.mark.parametrize("command", [messages.StopHeating(), Halt(), Disable()], ids=lambda command: command.name)
 def test_stop_halt_and_disable_turn_the_virtual_gate_off_within_two_cycles(
-    platform: Platform, command: StopHeating | Halt | Disable
+    platform: Platform, command: messages.StopHeating | Halt | Disable
 ) -> None:
     platform.heat()
-    assert platform.send(command).refusal is None
+    platform.do(command)
     for _ in range(2):
         platform.cycle()
     assert not platform.control.gate
@@ -260,6 +250,6 @@ def test_stop_halt_and_disable_turn_the_virtual_gate_off_within_two_cycles(
 def test_a_gate_that_sticks_is_cut_off_by_the_relay(platform: Platform) -> None:
     platform.heat()
     platform.control.circuit.inject(CircuitFault.GATE_STUCK_ON)
-    assert platform.reaches(HeaterState.TRIPPED, 1.0)
+    assert platform.reaches(messages.HeaterState.TRIPPED, 1.0)
     assert platform.field("cause") in (Row.GATE_FEEDBACK, Row.STEEP_GRADIENT)
     assert platform.until(lambda: platform.control.circuit.current == 0.0, 0.05)

@@ -28,10 +28,10 @@ class Running(NamedTuple):
 
 
 class Traffic(NamedTuple):
-    """When frames were sent, and what came when; ns."""
+    """Instants of the frames sent, and the frames received with their instants; ns."""
 
     sent: list[int]
-    came: list[tuple[int, bytes]]
+    received: list[tuple[int, bytes]]
 
 
 Exchange = Callable[..., Traffic]
@@ -71,11 +71,10 @@ def begin_segment(three_slaves: Path) -> Iterator[BeginSegment]:
 
 @pytest.fixture(scope="module")
 def segment(three_slaves: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """One segment for all tests of a file; what one of them breaks it ends."""
+    """One segment for all tests of a file; each test clears its own faults."""
     control = tmp_path_factory.mktemp("control") / "segment.sock"
     process = start(three_slaves, "--control", str(control))
     try:
-        assert process.stdout is not None
         assert process.stdout.readline()
         yield Running(process, control)
         process.terminate()
@@ -87,21 +86,19 @@ def segment(three_slaves: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(scope="module")
 def exchange(segment: Running) -> Iterator[Exchange]:
-    """Send frames one after the other, wait for the `answers` (as many where left out) and `patience_s` more."""
+    """Send frames one after the other, wait for `answers` frames (default: one each) and `patience_s` longer."""
     with subprocess.Popen(
         [sys.executable, str(CHILD), str(segment.process.pid), "ecat0"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     ) as child:  # fmt: skip
-        assert child.stdin is not None
-        assert child.stdout is not None
 
         def send(frames: Sequence[bytes], answers: int | None = None, patience_s: float = 0.05) -> Traffic:
             expected = len(frames) if answers is None else answers
-            asked = {"frames": [f.hex() for f in frames], "gap_s": 0.001, "answers": expected, "patience_s": patience_s}
-            child.stdin.write(json.dumps(asked) + "\n")
+            query = {"frames": [f.hex() for f in frames], "gap_s": 0.001, "answers": expected, "patience_s": patience_s}
+            child.stdin.write(json.dumps(query) + "\n")
             child.stdin.flush()
-            told = json.loads(child.stdout.readline())
-            return Traffic(told["sent"], [(at, bytes.fromhex(frame)) for at, frame in told["came"]])
+            reply = json.loads(child.stdout.readline())
+            return Traffic(reply["sent"], [(at, bytes.fromhex(frame)) for at, frame in reply["received"]])
 
         yield send
         child.stdin.close()

@@ -1,10 +1,10 @@
-"""Sends frames to a segment as they are and tells what comes, in a process of its own.
+"""Sends frames to a segment unchanged and reports the frames received, in a process of its own.
 
     python raw_child.py PID INTERFACE
 
-joins the namespaces of process PID; answers each line of JSON,
-`{"frames": [hex], "gap_s": s, "answers": number, "patience_s": s}`, with one: `{"sent": [ns], "came": [[ns, hex]]}`
-(CLOCK_MONOTONIC). It waits for as many answers, however slow the host is, and then `patience_s` for more.
+joins the namespaces of process PID. A request is a line of JSON, `{"frames": [hex], "gap_s": s, "answers": number,
+"patience_s": s}`; its reply is `{"sent": [ns], "received": [[ns, hex]]}` (CLOCK_MONOTONIC). It waits until `answers`
+frames have arrived, then `patience_s` for more.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def join(pid: str) -> None:
                 raise OSError(ctypes.get_errno(), f"cannot join the {kind} namespace")
 
 
-def collect(raw: socket.socket, until: int, came: list[tuple[int, str]], enough: float = math.inf) -> None:
-    while len(came) < enough and (left := until - time.monotonic_ns()) > 0:
+def collect(raw: socket.socket, until: int, received: list[tuple[int, str]], enough: float = math.inf) -> None:
+    while len(received) < enough and (left := until - time.monotonic_ns()) > 0:
         if select.select([raw], [], [], left * 1e-9)[0]:
             frame, address = raw.recvfrom(2048)
             if address[2] != OUTGOING:
-                came.append((time.monotonic_ns(), frame.hex()))
+                received.append((time.monotonic_ns(), frame.hex()))
 
 
 def main() -> None:
@@ -46,16 +46,16 @@ def main() -> None:
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(EVERYTHING)) as raw:
         raw.bind((sys.argv[2], EVERYTHING))
         for line in sys.stdin:
-            asked = json.loads(line)
-            came: list[tuple[int, str]] = []
+            request = json.loads(line)
+            received: list[tuple[int, str]] = []
             sent = []
-            for frame in asked["frames"]:
+            for frame in request["frames"]:
                 sent.append(time.monotonic_ns())
                 raw.send(bytes.fromhex(frame))
-                collect(raw, time.monotonic_ns() + round(asked["gap_s"] * 1e9), came)
-            collect(raw, time.monotonic_ns() + LONGEST_WAIT_NS, came, asked["answers"])
-            collect(raw, time.monotonic_ns() + round(asked["patience_s"] * 1e9), came)
-            print(json.dumps({"sent": sent, "came": came}), flush=True)
+                collect(raw, time.monotonic_ns() + round(request["gap_s"] * 1e9), received)
+            collect(raw, time.monotonic_ns() + LONGEST_WAIT_NS, received, request["answers"])
+            collect(raw, time.monotonic_ns() + round(request["patience_s"] * 1e9), received)
+            print(json.dumps({"sent": sent, "received": received}), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A real master, pysoem unchanged, that meets faults: brings the segment to OP, lets them be made, tells what it saw.
+"""A real master, unmodified pysoem: brings the segment to OP, starts faults and prints their effects as JSON.
 
     python soem_recovery_child.py PID INTERFACE CONTROL
 
@@ -21,7 +21,7 @@ PERIOD = 0.002
 
 
 def cycle(master: pysoem.Master, seconds: float) -> list[int]:
-    """Exchange process data for so long; return the working counters."""
+    """Exchange process data for `seconds`; return the working counters."""
     counters = []
     for _ in range(round(seconds / PERIOD)):
         time.sleep(PERIOD)
@@ -40,7 +40,7 @@ def register(slave: pysoem.CdefSlave, address: int, size: int) -> int:
 
 
 def to_op(master: pysoem.Master) -> int:
-    """Ask all for OP while process data flow; return the state that all have."""
+    """Request OP of all slaves while process data flow; return the lowest state reached."""
     master.state = pysoem.OP_STATE
     master.write_state()
     for _ in range(20):
@@ -54,55 +54,55 @@ def main() -> None:
     join(sys.argv[1])
     master = pysoem.Master()
     without_blocking(master, sys.argv[2])
-    found: dict[str, object] = {"slaves": master.config_init()}
+    result: dict[str, object] = {"slaves": master.config_init()}
     master.config_map()
     master.state_check(pysoem.SAFEOP_STATE, 2_000_000)
-    found["op"] = to_op(master)
+    result["op"] = to_op(master)
     with SegmentClient(Path(sys.argv[3])) as segment:
         number = segment.fault({"fault": "cable", "after": 3})
-        found["broken"] = cycle(master, 0.3)
-        found["links"] = [register(slave, 0x0110, 2) >> 4 & 3 for slave in master.slaves[:3]]
-        found["watched"] = [each["reachable"] for each in segment.truth()["slaves"]]
+        result["broken"] = cycle(master, 0.3)
+        result["links"] = [register(slave, 0x0110, 2) >> 4 & 3 for slave in master.slaves[:3]]
+        result["watched"] = [each["reachable"] for each in segment.truth()["slaves"]]
         segment.clear(number)
-        found["lost_links"] = [register(slave, 0x0310, 2) for slave in master.slaves]
+        result["lost_links"] = [register(slave, 0x0310, 2) for slave in master.slaves]
         cycle(master, 0.02)
         master.read_state()
-        found["behind"] = [(slave.state, slave.al_status) for slave in master.slaves[2:5]]
+        result["behind"] = [(slave.state, slave.al_status) for slave in master.slaves[2:5]]
         for slave in master.slaves[3:]:
             slave.state = pysoem.SAFEOP_STATE + pysoem.STATE_ACK
             slave.write_state()
-        found["cleared"] = to_op(master), cycle(master, 0.02)[-5:]
+        result["cleared"] = to_op(master), cycle(master, 0.02)[-5:]
 
         number = segment.fault({"fault": "power", "slave": 7})
-        found["dark"] = cycle(master, 0.05)[-5:]
+        result["dark"] = cycle(master, 0.05)[-5:]
         segment.clear(number)
         last = master.slaves[6]
-        found["back"] = cycle(master, 0.05)[-5:]
-        found["recovered"] = last.recover()
-        found["reconfigured"] = last.reconfig()
-        found["again"] = to_op(master), cycle(master, 0.02)[-5:]
+        result["back"] = cycle(master, 0.05)[-5:]
+        result["recovered"] = last.recover()
+        result["reconfigured"] = last.reconfig()
+        result["again"] = to_op(master), cycle(master, 0.02)[-5:]
 
-        # Process data that this machine delays count as lost: only what answers came with is looked at.
+        # Frames that the host delays count as lost (-1): the test ignores them.
         number = segment.fault({"fault": "wkc", "slave": 3, "rate": 1.0})
-        found["not_counted"] = cycle(master, 0.02)[-5:]
+        result["not_counted"] = cycle(master, 0.02)[-5:]
         segment.clear(number)
         segment.fault({"fault": "corrupt", "after": 4, "burst": 5})
-        found["damaged"] = cycle(master, 0.02)
-        found["errors"] = [register(slave, 0x0300, 1) + 256 * register(slave, 0x0308, 1) for slave in master.slaves]
+        result["damaged"] = cycle(master, 0.02)
+        result["errors"] = [register(slave, 0x0300, 1) + 256 * register(slave, 0x0308, 1) for slave in master.slaves]
         segment.fault({"fault": "sdo_abort", "slave": 3, "code": 0x08000022})
         try:
             master.slaves[2].sdo_read(0x6041, 0)
         except pysoem.SdoError as error:
-            found["abort"] = error.abort_code
+            result["abort"] = error.abort_code
         segment.clear()
         segment.fault({"fault": "al_fall", "slave": 2, "code": 0x1234})
-        found["fallen"] = cycle(master, 0.02)[-5:]
+        result["fallen"] = cycle(master, 0.02)[-5:]
         master.read_state()
-        found["al"] = [(slave.state, slave.al_status) for slave in master.slaves[:3]]
+        result["al"] = [(slave.state, slave.al_status) for slave in master.slaves[:3]]
     master.state = pysoem.INIT_STATE
     master.write_state()
     master.close()
-    print(json.dumps(found))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -34,22 +34,22 @@ def connect(path: Path) -> socket.socket:
 
 @pytest.fixture(autouse=True)
 def whole(segment: Running) -> Iterator[None]:
-    """After each test nothing is broken."""
+    """Clear all faults after each test."""
     yield
     with segment.client() as client:
         client.clear()
 
 
-def indices(came: list[tuple[int, bytes]]) -> list[int]:
-    """The datagrams' numbers of the answers, in the order in which they came."""
-    return [next(parse(frame)).index for _, frame in came]
+def indices(received: list[tuple[int, bytes]]) -> list[int]:
+    """Datagram indices of the received frames, in order."""
+    return [next(parse(frame)).index for _, frame in received]
 
 
 # -- faults on real frames ------------------------------------------------------------------------------------------
 
 
 def test_without_a_fault_every_frame_comes_back_from_all_slaves(exchange: Exchange) -> None:
-    answers = [next(parse(frame)) for _, frame in exchange(BROADCASTS).came]
+    answers = [next(parse(frame)) for _, frame in exchange(BROADCASTS).received]
     assert [answer.index for answer in answers] == list(range(20))
     assert {answer.counter for answer in answers} == {3}
 
@@ -57,7 +57,7 @@ def test_without_a_fault_every_frame_comes_back_from_all_slaves(exchange: Exchan
 def test_a_burst_of_lost_frames_is_lost_and_the_next_one_comes(segment: Running, exchange: Exchange) -> None:
     with segment.client() as client:
         client.fault({"fault": "loss", "burst": 5})
-        assert indices(exchange(BROADCASTS, answers=15).came) == list(range(5, 20))
+        assert indices(exchange(BROADCASTS, answers=15).received) == list(range(5, 20))
         assert client.faults() == []
 
 
@@ -68,38 +68,38 @@ def test_slaves_see_what_is_lost_behind_them_and_not_what_is_lost_before(
     address = (0x2000 + seed).to_bytes(2, "little")
     with segment.client() as client:
         client.fault({"fault": "loss", "rate": 1.0, "seed": seed})
-        assert exchange([build(Datagram(DatagramCommand.APWR, 0, 0xFFFF, 0x0010, address))], answers=0).came == []
+        assert exchange([build(Datagram(DatagramCommand.APWR, 0, 0xFFFF, 0x0010, address))], answers=0).received == []
         while not (counts := client.faults()[0]["counts"])[lost]:
             time.sleep(0.01)
         assert counts[lost] == 1
         client.clear()
-    (_, answer), *_ = exchange([build(Datagram(DatagramCommand.FPRD, 0, 0x2000 + seed, 0, bytes(1)))]).came
+    (_, answer), *_ = exchange([build(Datagram(DatagramCommand.FPRD, 0, 0x2000 + seed, 0, bytes(1)))]).received
     assert next(parse(answer)).counter == written
 
 
 def test_answers_that_are_late_come_as_late_as_asked_for(segment: Running, exchange: Exchange) -> None:
     with segment.client() as client:
         client.fault({"fault": "delay", "ms": 300, "rate": 1.0})
-        sent, came = exchange(BROADCASTS)
-    assert indices(came) == list(range(20))
-    late = [at - begun for begun, (at, _) in zip(sent, came, strict=True)]
+        sent, received = exchange(BROADCASTS)
+    assert indices(received) == list(range(20))
+    late = [at - begun for begun, (at, _) in zip(sent, received, strict=True)]
     assert min(late) >= 300_000_000
-    assert came[0][0] > sent[1], "frames went on being sent and answered meanwhile"
+    assert received[0][0] > sent[1], "frames went on being sent and answered meanwhile"
 
 
 def test_answers_come_twice_or_after_the_next_one(segment: Running, exchange: Exchange) -> None:
     with segment.client() as client:
         client.fault({"fault": "duplicate", "burst": 2})
-        assert indices(exchange(BROADCASTS[:4], answers=6).came) == [0, 0, 1, 1, 2, 3]
+        assert indices(exchange(BROADCASTS[:4], answers=6).received) == [0, 0, 1, 1, 2, 3]
         client.fault({"fault": "reorder", "burst": 1})
-        assert indices(exchange(BROADCASTS[:4]).came) == [1, 0, 2, 3]
+        assert indices(exchange(BROADCASTS[:4]).received) == [1, 0, 2, 3]
 
 
 def test_a_garbled_answer_differs_in_as_many_bits_as_asked_for(segment: Running, exchange: Exchange) -> None:
-    ((_, whole),) = exchange(BROADCASTS[:1]).came
+    ((_, whole),) = exchange(BROADCASTS[:1]).received
     with segment.client() as client:
         client.fault({"fault": "garble", "bits": 3, "rate": 1.0})
-        ((_, garbled),) = exchange(BROADCASTS[:1]).came
+        ((_, garbled),) = exchange(BROADCASTS[:1]).received
     assert sum((a ^ b).bit_count() for a, b in zip(whole, garbled, strict=True)) == 3
 
 
@@ -108,19 +108,19 @@ def test_noise_comes_without_a_frame_of_the_masters_and_ends_with_its_time(
 ) -> None:
     with segment.client() as client:
         client.fault({"fault": "noise", "rate_hz": 500, "protocol": "arp", "lasts": 0.2})
-        came = exchange([], answers=1, patience_s=0.4).came
+        received = exchange([], answers=1, patience_s=0.4).received
         while client.faults():
             time.sleep(0.01)
-    assert 0 < len(came) <= 100
-    assert {frame[12:14] for _, frame in came} == {b"\x08\x06"}
-    assert exchange([], patience_s=0.1).came == []
+    assert 0 < len(received) <= 100
+    assert {frame[12:14] for _, frame in received} == {b"\x08\x06"}
+    assert exchange([], patience_s=0.1).received == []
 
 
 def test_a_cable_broken_by_command_is_seen_by_the_master_until_it_is_mended(
     segment: Running, exchange: Exchange
 ) -> None:
     def counter() -> int:
-        return next(parse(exchange(BROADCASTS[:1]).came[0][1])).counter
+        return next(parse(exchange(BROADCASTS[:1]).received[0][1])).counter
 
     with segment.client() as client:
         number = client.fault({"fault": "cable", "after": 1})
@@ -130,10 +130,10 @@ def test_a_cable_broken_by_command_is_seen_by_the_master_until_it_is_mended(
         assert counter() == 3
 
 
-# -- what is told ---------------------------------------------------------------------------------------------------
+# -- what is reported -----------------------------------------------------------------------------------------------
 
 
-def test_the_truth_is_told_slave_by_slave(segment: Running) -> None:
+def test_the_truth_is_reported_slave_by_slave(segment: Running) -> None:
     with segment.client() as client:
         before = time.monotonic_ns()
         truth = client.truth()
@@ -222,9 +222,8 @@ def test_clients_that_ask_without_end_stop_no_frame(segment: Running, exchange: 
         [sys.executable, "-c", FLOOD, str(segment.control)], stdout=subprocess.PIPE, text=True
     ) as flood:
         try:
-            assert flood.stdout is not None
             assert flood.stdout.readline() == "asking\n"
-            assert indices(exchange(BROADCASTS).came) == list(range(20))
+            assert indices(exchange(BROADCASTS).received) == list(range(20))
             with segment.client() as client:
                 assert client.faults() == [], "others are answered meanwhile"
             assert flood.poll() is None
@@ -269,9 +268,9 @@ def test_the_socket_is_its_owners_alone(segment: Running) -> None:
 
 def test_a_socket_in_use_is_refused_in_a_sentence_and_left_alone(begin_segment: BeginSegment, segment: Running) -> None:
     second = begin_segment("--control", str(segment.control))
-    _, said = second.communicate(timeout=20)
+    _, stderr = second.communicate(timeout=20)
     assert second.returncode == 2
-    assert said == (
+    assert stderr == (
         f"the control socket {segment.control} is in use by a process that runs: choose another path\n"
     )  # fmt: skip
     with segment.client() as client:
@@ -294,7 +293,6 @@ def test_a_killed_segments_socket_is_replaced_and_a_stopped_ones_removed(
     path = tmp_path / "segment.sock"
     for end in (signal.SIGKILL, signal.SIGTERM):
         running = begin_segment("--control", str(path))
-        assert running.stdout is not None
         assert running.stdout.readline()
         with Running(running, path).client() as client:
             assert client.faults() == []
@@ -308,7 +306,7 @@ def test_a_killed_segments_socket_is_replaced_and_a_stopped_ones_removed(
 def test_where_there_is_no_segment_the_client_says_where_it_looked(tmp_path: Path) -> None:
     path = tmp_path / "segment.sock"
     with pytest.raises(ServerAway, match=f"no segment answers at {path}"):
-        Running(None, path).client()  # type: ignore[arg-type]
+        Running(None, path).client()
 
 
 # -- scripts --------------------------------------------------------------------------------------------------------
@@ -323,7 +321,6 @@ def test_a_script_runs_by_itself_from_the_segments_start(begin_segment: BeginSeg
         "  - {at: 3600, fault: power, slave: 1}\n"
     )
     running = begin_segment("--control", str(path), "--faults", str(script))
-    assert running.stdout is not None
     assert running.stdout.readline()
     with Running(running, path).client() as client:
         while len(active := client.faults()) < 2:
@@ -338,7 +335,7 @@ def test_a_script_that_is_wrong_is_refused_with_its_lines_before_the_segment_sta
     script = tmp_path / "faults.yaml"
     script.write_text("faults:\n  - {at: 1, fault: cabel, after: 2}\n  - {fault: power, slave: 9}\n")
     refused = begin_segment("--faults", str(script))
-    said = refused.communicate(timeout=20)[1].splitlines()
+    stderr = refused.communicate(timeout=20)[1].splitlines()
     assert refused.returncode == 2
-    assert said[0].startswith(f"{script}:2: faults[0].fault: this fault does not exist; did you mean cable?")
-    assert said[1] == f"{script}:3: faults[1].slave: found 9, the segment has 3 slaves: allowed is at most 3"
+    assert stderr[0].startswith(f"{script}:2: faults[0].fault: this fault does not exist; did you mean cable?")
+    assert stderr[1] == f"{script}:3: faults[1].slave: found 9, the segment has 3 slaves: allowed is at most 3"

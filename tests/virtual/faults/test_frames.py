@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Literal
 
 import pytest
 
-from rtcp.virtual.faults.fault import FOR_EVER, Frames
+from rtcp.virtual.faults.fault import FOR_EVER, FrameFault, Frames
 from rtcp.virtual.faults.frames import MAKERS, Delay, Duplicate, Garble, Loss, Noise, Reorder
 from rtcp.virtual.faults.registry import ActiveFault, Planned
 from tests.virtual.line import MS, Line, TinyDevice
 
 
 class Cable:
-    """The way of frames, and what came out of it at the master's end."""
+    """A cable with faults, and the frames that the master received from it."""
 
     def __init__(self) -> None:
-        self.came: list[bytes] = []
-        self.frames = Frames(self.came.append)
+        self.received: list[bytes] = []
+        self.frames = Frames(self.received.append)
         self._segment = Line([TinyDevice()]).segment
 
-    def begin(self, fault: Any, t: int = 0) -> ActiveFault:
+    def begin(self, fault: FrameFault, t: int = 0) -> ActiveFault:
         return ActiveFault(Planned(fault), self._segment, self.frames, t)
 
     def send(self, *numbers: int, t: int = 0) -> list[int]:
@@ -33,9 +33,9 @@ class Cable:
         return reached
 
     def numbers(self) -> list[int]:
-        found = [frame[0] for frame in self.came]
-        self.came.clear()
-        return found
+        numbers = [frame[0] for frame in self.received]
+        self.received.clear()
+        return numbers
 
 
 @pytest.fixture
@@ -47,15 +47,15 @@ def differing_bits(frame: bytes, number: int) -> int:
     return sum((a ^ number).bit_count() for a in frame)
 
 
-def test_without_a_fault_frames_need_no_look(cable: Cable) -> None:
+def test_without_a_fault_frames_are_not_examined(cable: Cable) -> None:
     assert (cable.frames.active, cable.frames.due) == (False, FOR_EVER)
 
 
 def test_frames_are_lost_at_their_rate_half_of_them_before_the_segment(cable: Cable) -> None:
     undo = cable.begin(Loss(rate=0.25))
     reached = sum(len(cable.send(number % 256)) for number in range(2000))
-    assert 2000 - len(cable.came) == pytest.approx(500, rel=0.1)
-    assert undo.counts == {"lost_before": 2000 - reached, "lost_behind": reached - len(cable.came)}
+    assert 2000 - len(cable.received) == pytest.approx(500, rel=0.1)
+    assert undo.counts == {"lost_before": 2000 - reached, "lost_behind": reached - len(cable.received)}
     assert 2000 - reached == pytest.approx(250, rel=0.15)
 
 
@@ -106,7 +106,7 @@ def test_late_answers_come_when_they_are_due_and_several_are_under_way(cable: Ca
     assert (undo.counts, cable.frames.due, cable.frames.active) == ({"delayed": 2}, FOR_EVER, False)
 
 
-def test_answers_under_way_when_the_delay_is_mended_still_come(cable: Cable) -> None:
+def test_answers_under_way_when_the_delay_is_cleared_still_arrive(cable: Cable) -> None:
     cable.begin(Delay(ms=3, rate=1.0))(0)
     undo = cable.begin(Delay(ms=3, rate=1.0))
     cable.send(1)
@@ -143,7 +143,7 @@ def test_a_burst_of_one_is_not_over_before_the_answer_that_it_keeps_has_come(cab
 def test_as_many_bits_are_turned_over_as_asked_for_and_as_there_are(cable: Cable, bits: int, turned: int) -> None:
     cable.begin(Garble(bits=bits, rate=1.0))
     cable.send(7)
-    assert [differing_bits(frame, 7) for frame in cable.came] == [turned]
+    assert [differing_bits(frame, 7) for frame in cable.received] == [turned]
 
 
 def test_faults_of_several_kinds_meet_an_answer_in_the_order_of_the_cable(cable: Cable) -> None:
@@ -151,10 +151,10 @@ def test_faults_of_several_kinds_meet_an_answer_in_the_order_of_the_cable(cable:
     cable.begin(Duplicate(rate=1.0))
     cable.begin(Garble(rate=1.0))
     cable.send(7)
-    assert cable.came == []
+    assert cable.received == []
     cable.frames.tick(MS)
-    assert [differing_bits(frame, 7) for frame in cable.came] == [1, 1]
-    assert cable.came[0] == cable.came[1], "garbled first, then doubled, then late"
+    assert [differing_bits(frame, 7) for frame in cable.received] == [1, 1]
+    assert cable.received[0] == cable.received[1], "garbled first, then doubled, then late"
 
 
 def test_noise_comes_at_its_rate_whether_frames_pass_or_not(cable: Cable) -> None:
@@ -171,9 +171,9 @@ def test_noise_comes_at_its_rate_whether_frames_pass_or_not(cable: Cable) -> Non
 def test_noise_that_is_late_by_a_stop_of_the_process_is_left_out(cable: Cable) -> None:
     cable.begin(Noise(rate_hz=1000), t=0)
     cable.frames.tick(10_000 * MS)
-    assert len(cable.came) == 1
+    assert len(cable.received) == 1
     cable.frames.tick(10_010 * MS)
-    assert len(cable.came) == 11
+    assert len(cable.received) == 11
 
 
 @pytest.mark.parametrize(
@@ -182,30 +182,30 @@ def test_noise_that_is_late_by_a_stop_of_the_process_is_left_out(cable: Cable) -
      ("any", {0x0806, 0x0800, 0x88CC, 0x88A4})],
 )  # fmt: skip
 def test_noise_is_of_the_protocol_asked_for_and_fits_the_cable(
-    cable: Cable, protocol: Any, ethertypes: set[int]
+    cable: Cable, protocol: Literal["arp", "ip", "lldp", "ethercat"], ethertypes: set[int]
 ) -> None:
     cable.begin(Noise(rate_hz=1000, protocol=protocol), t=0)
     for _ in range(200):
         cable.frames.tick(cable.frames.due)
-    assert {int.from_bytes(frame[12:14], "big") for frame in cable.came} == ethertypes
-    assert all(60 <= len(frame) <= 1514 for frame in cable.came)
+    assert {int.from_bytes(frame[12:14], "big") for frame in cable.received} == ethertypes
+    assert all(60 <= len(frame) <= 1514 for frame in cable.received)
 
 
 def test_the_header_of_an_ip_packet_has_its_checksum(cable: Cable) -> None:
     cable.begin(Noise(rate_hz=1000, protocol="ip"), t=0)
     cable.frames.tick(cable.frames.due)
-    header = cable.came[0][14:34]
+    header = cable.received[0][14:34]
     total = sum(int.from_bytes(header[n : n + 2], "big") for n in range(0, 20, 2))
     assert (total & 0xFFFF) + (total >> 16) == 0xFFFF
 
 
 def test_the_same_seed_makes_the_same_noise() -> None:
-    def heard(seed: int) -> list[bytes]:
+    def noise(seed: int) -> list[bytes]:
         cable = Cable()
         cable.begin(Noise(rate_hz=1000, seed=seed), t=0)
         for _ in range(20):
             cable.frames.tick(cable.frames.due)
-        return cable.came
+        return cable.received
 
-    assert heard(1) == heard(1) != heard(2)
+    assert noise(1) == noise(1) != noise(2)
     assert set(MAKERS) == {"arp", "ip", "lldp", "ethercat"}

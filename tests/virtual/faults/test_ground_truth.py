@@ -1,4 +1,4 @@
-"""What the joints of a segment truly do: told when asked, watched from the first question on."""
+"""The true motion of a segment's joints: reported on request, watched from the first request on."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.virtual.faults.conftest import BeginSegment
 from tests.virtual.line import MS
 
 FALLING = "{load_mass_moment: 2.0, holding_torque: 0, initial_position: 0.5, viscous_friction: 6}"
-"""It sinks to the bottom within two seconds and stays there."""
+"""A load that sinks to the bottom within two seconds and stays there."""
 
 
 @pytest.fixture
@@ -49,9 +49,9 @@ def test_the_last_motion_and_the_largest_velocity_are_kept(config: Path) -> None
     assert truth.watching
     for now, velocity in ((2 * MS, 0.5), (3 * MS, -0.8), (4 * MS, 0.0021), (5 * MS, 0.0019), (6 * MS, 0.0)):
         drive.mechanics.velocity = velocity
-        truth.look(slave, now)
-    told = truth.answer(7 * MS)["slaves"][1]
-    assert (told["moved_ns"], told["peak_rad_s"], told["velocity_rad_s"]) == (4 * MS, 0.8, 0.0)
+        truth.update(slave, now)
+    joint = truth.answer(7 * MS)["slaves"][1]
+    assert (joint["moved_ns"], joint["peak_rad_s"], joint["velocity_rad_s"]) == (4 * MS, 0.8, 0.0)
 
 
 def test_the_largest_velocity_counts_from_when_it_was_cleared(config: Path) -> None:
@@ -64,16 +64,16 @@ def test_the_largest_velocity_counts_from_when_it_was_cleared(config: Path) -> N
     assert truth.answer(2 * MS)["slaves"][1]["peak_rad_s"] == 0.3
 
 
-def test_a_step_is_a_look_at_the_stepped_joint_alone(config: Path) -> None:
+def test_a_step_updates_the_stepped_joint_alone(config: Path) -> None:
     truth, segment = watched(config)
     io, stepped, other = segment.slaves
     truth.answer(MS)
     drive_of(stepped).mechanics.velocity = drive_of(other).mechanics.velocity = 0.5
-    truth.look(io, 2 * MS)
-    truth.look(stepped, 3 * MS)
+    truth.update(io, 2 * MS)
+    truth.update(stepped, 3 * MS)
     drive_of(stepped).mechanics.velocity = drive_of(other).mechanics.velocity = 0.0
-    told = truth.answer(4 * MS)["slaves"]
-    assert [(one["moved_ns"], one["peak_rad_s"]) for one in told[1:]] == [(3 * MS, 0.5), (0, 0.0)]
+    slaves = truth.answer(4 * MS)["slaves"]
+    assert [(slave["moved_ns"], slave["peak_rad_s"]) for slave in slaves[1:]] == [(3 * MS, 0.5), (0, 0.0)]
 
 
 def test_nothing_is_watched_any_more_when_nobody_has_asked_for_long_and_everything_from_the_next_request_on(
@@ -82,14 +82,14 @@ def test_nothing_is_watched_any_more_when_nobody_has_asked_for_long_and_everythi
     truth, segment = watched(config)
     slave = segment.slaves[1]
     truth.requested(0)
-    assert not truth.watching, "somebody asked, but never for the truth"
+    assert not truth.watching, "requests, but none for the truth"
     truth.answer(MS)
-    truth.look(slave, MS + PATIENCE)
+    truth.update(slave, MS + PATIENCE)
     assert truth.watching
     truth.requested(2 * MS)
-    truth.look(slave, 2 * MS + PATIENCE)
+    truth.update(slave, 2 * MS + PATIENCE)
     assert truth.watching
-    truth.look(slave, 2 * MS + PATIENCE + 1)
+    truth.update(slave, 2 * MS + PATIENCE + 1)
     assert not truth.watching
     truth.requested(3 * PATIENCE)
     assert truth.watching
@@ -105,26 +105,25 @@ def test_the_segment_says_which_slave_it_has_stepped(config: Path) -> None:
     assert segment.step_one() is None
 
 
-def test_a_real_segment_tells_of_a_load_that_falls_without_any_master(
+def test_a_real_segment_reports_a_falling_load_without_any_master(
     begin_segment: BeginSegment, config: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "segment.sock"
     process = begin_segment("--control", str(path), config=config)
-    assert process.stdout is not None
     assert process.stdout.readline()
     with SegmentClient(path) as client:
-        told = [client.truth()]
-        while told[-1]["slaves"][2]["velocity_rad_s"] or not told[-1]["slaves"][2]["moved_ns"]:
+        answers = [client.truth()]
+        while answers[-1]["slaves"][2]["velocity_rad_s"] or not answers[-1]["slaves"][2]["moved_ns"]:
             time.sleep(0.2)
-            told.append(client.truth())
-    _, resting, fallen = told[-1]["slaves"]
+            answers.append(client.truth())
+    _, resting, fallen = answers[-1]["slaves"]
     assert (resting["moved_ns"], resting["peak_rad_s"]) == (0, 0.0)
     assert fallen["position_rad"] == pytest.approx(3.14, abs=0.1)
     assert fallen["peak_rad_s"] > 1.0
-    asked = {each["time_ns"] for each in told}
-    speeds = {abs(each["slaves"][2]["velocity_rad_s"]) for each in told}
-    assert fallen["moved_ns"] not in asked or fallen["peak_rad_s"] not in speeds, "it is watched between the questions"
-    assert min(asked) < fallen["moved_ns"] < max(asked)
+    instants = {each["time_ns"] for each in answers}
+    speeds = {abs(each["slaves"][2]["velocity_rad_s"]) for each in answers}
+    assert fallen["moved_ns"] not in instants or fallen["peak_rad_s"] not in speeds, "it is watched between requests"
+    assert min(instants) < fallen["moved_ns"] < max(instants)
 
 
 def test_an_output_is_stamped_when_frames_change_it_with_the_clock_of_its_slave(config: Path) -> None:
@@ -132,13 +131,11 @@ def test_an_output_is_stamped_when_frames_change_it_with_the_clock_of_its_slave(
     box = segment.slaves[0]
     assert truth.edges(1, 10, MS) == []
     watch = box.application.outputs_watch
-    assert watch is not None
-    assert box.clock is not None
     for at, outputs in enumerate((b"\x00\x00", b"\x00\x02", b"\xff\x02", b"\x00\x00", b"\x00\x00", b"\x00\x02")):
         watch(memoryview(outputs), (2 + at) * MS)
     assert truth.edges(1, 10, 10 * MS) == [box.clock.local(at * MS) for at in (3, 5, 7)]
     assert truth.edges(1, 10, 10 * MS) == []
-    truth.look(box, 10 * MS + PATIENCE + 1)
+    truth.update(box, 10 * MS + PATIENCE + 1)
     assert box.application.outputs_watch is None
 
 

@@ -1,4 +1,4 @@
-"""The segment's process runs without a garbage collector: what faults leave behind is there for good."""
+"""The segment's process runs without a garbage collector: faults must leave no reference cycles."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ WRONG: list[bytes] = [
 
 
 class Bench:
-    """The shipped segment in OP, its registry, and a master's frames through both, as the server leads them."""
+    """The shipped segment in OP, its registry, and a master's frames through both, as in the server."""
 
     def __init__(self) -> None:
         self.line = Line()
@@ -99,16 +99,16 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def _bench() -> Iterator[Bench]:
-    made = Bench()
+    shared = Bench()
     gc.collect()
-    gc.freeze()  # what other tests keep need not be looked through each time
-    yield made
+    gc.freeze()  # the collections need not examine the objects of other tests
+    yield shared
     gc.unfreeze()
 
 
 @pytest.fixture
 def bench(_bench: Bench) -> Iterator[Bench]:
-    """The one of this file, its collector off as in the segment's process."""
+    """The file's bench, with the collector off as in the segment's process."""
     gc.disable()
     try:
         yield _bench
@@ -117,7 +117,7 @@ def bench(_bench: Bench) -> Iterator[Bench]:
 
 
 def left_by(play: Callable[[], object]) -> int:
-    """Return how many objects it leaves that only a collector would find."""
+    """Return the number of objects that only a collector would free."""
     play()
     gc.collect()
     for _ in range(ROUNDS):
@@ -131,7 +131,7 @@ def test_every_kind_of_fault_is_tried_here() -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_fault_that_is_mended_or_ends_at_its_time_leaves_nothing_to_collect(bench: Bench, name: str) -> None:
+def test_a_fault_that_is_cleared_or_ends_at_its_time_leaves_nothing_to_collect(bench: Bench, name: str) -> None:
     once = installed()[name].once
 
     def play() -> None:
@@ -164,7 +164,6 @@ def test_damage_on_either_way_leaves_nothing_to_collect(bench: Bench, way: str) 
 def test_a_burst_that_has_passed_leaves_nothing_to_collect(bench: Bench, name: str) -> None:
     keys = {key: value for key, value in KINDS[name].items() if key != "rate"}
     planned, _ = parse({"fault": name, **keys, "burst": 2})
-    assert planned is not None
 
     def play() -> None:
         bench.registry.begin(planned, bench.line.now)
@@ -183,7 +182,7 @@ def test_a_script_leaves_nothing_to_collect(bench: Bench, tmp_path: Path) -> Non
     def play() -> None:
         bench.registry = FaultRegistry(bench.line.segment, bench._send, bench.line.now, planned)
         bench.frames(3)
-        # All but what is over at once: the drive's single occurrence, the clock's jump.
+        # All but those that are over at once: the drive's single occurrence, the clock's jump.
         assert len(bench.registry.clear(None, bench.line.now)) == len(entries) - 2
 
     assert left_by(play) == 0
@@ -199,7 +198,7 @@ def test_what_is_refused_leaves_nothing_to_collect(bench: Bench, tmp_path: Path)
         control.close()
 
 
-def test_a_book_that_is_full_leaves_nothing_to_collect(bench: Bench) -> None:
+def test_a_full_registry_leaves_nothing_to_collect(bench: Bench) -> None:
     def play() -> None:
         refused = False
         while not refused:

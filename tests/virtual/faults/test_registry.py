@@ -14,20 +14,20 @@ S = 1000 * MS
 
 
 def planned(**mapping: Any) -> Planned:
-    found, findings = parse(mapping)
-    assert found is not None, findings
-    return found
+    fault, findings = parse(mapping)
+    assert fault is not None, findings
+    return fault
 
 
-class Kept:
-    """A registry with three slaves, what it sent and what it complained of."""
+class Bench:
+    """A registry with three slaves, the frames it sent and the messages it reported."""
 
     def __init__(self, *script: Planned) -> None:
         self.line = Line()
         self.t = self.line.now
         self.sent: list[bytes] = []
-        self.said: list[str] = []
-        self.registry = FaultRegistry(self.line.segment, self.sent.append, self.t, script, self.said.append)
+        self.reported: list[str] = []
+        self.registry = FaultRegistry(self.line.segment, self.sent.append, self.t, script, self.reported.append)
 
     def begin(self, **mapping: Any) -> int:
         return self.registry.begin(planned(**mapping), self.t)
@@ -44,110 +44,110 @@ class Kept:
         self.t = until
 
 
-def test_an_empty_book_waits_for_nothing() -> None:
-    kept = Kept()
-    assert (kept.registry.due, kept.active()) == (FOR_EVER, [])
+def test_an_empty_registry_waits_for_nothing() -> None:
+    bench = Bench()
+    assert (bench.registry.due, bench.active()) == (FOR_EVER, [])
 
 
-def test_a_fault_is_active_until_it_is_mended() -> None:
-    kept = Kept()
-    number = kept.begin(fault="loss", rate=0.5)
-    kept.pass_time(10 * S)
-    assert kept.registry.listing(kept.t) == [{
+def test_a_fault_is_active_until_it_is_cleared() -> None:
+    bench = Bench()
+    number = bench.begin(fault="loss", rate=0.5)
+    bench.pass_time(10 * S)
+    assert bench.registry.listing(bench.t) == [{
         "id": number, "fault": {"fault": "loss", "rate": 0.5, "seed": 0}, "since_s": 10.0, "left_s": None,
         "counts": {"lost_before": 0, "lost_behind": 0},
     }]  # fmt: skip
-    assert kept.registry.clear(number, kept.t) == [number]
-    assert (kept.active(), kept.registry.frames.active) == ([], False)
+    assert bench.registry.clear(number, bench.t) == [number]
+    assert (bench.active(), bench.registry.frames.active) == ([], False)
 
 
 def test_a_fault_that_lasts_ends_at_its_time() -> None:
-    kept = Kept()
-    kept.begin(fault="loss", rate=0.5, lasts=1.5)
-    kept.pass_time(S)
-    assert kept.registry.listing(kept.t)[0]["left_s"] == pytest.approx(0.5)
-    kept.pass_time(S // 2 - 1)
-    assert kept.registry.frames.active
-    kept.pass_time(1)
-    assert (kept.active(), kept.registry.frames.active, kept.registry.due) == ([], False, FOR_EVER)
+    bench = Bench()
+    bench.begin(fault="loss", rate=0.5, lasts=1.5)
+    bench.pass_time(S)
+    assert bench.registry.listing(bench.t)[0]["left_s"] == pytest.approx(0.5)
+    bench.pass_time(S // 2 - 1)
+    assert bench.registry.frames.active
+    bench.pass_time(1)
+    assert (bench.active(), bench.registry.frames.active, bench.registry.due) == ([], False, FOR_EVER)
 
 
-def test_all_are_mended_at_once_and_numbers_are_not_given_twice() -> None:
-    kept = Kept()
-    first = [kept.begin(fault="loss", rate=0.5), kept.begin(fault="cable", after=1)]
-    assert kept.registry.clear(None, kept.t) == first
-    assert kept.registry.clear(None, kept.t) == []
-    assert kept.begin(fault="garble", rate=0.5) > max(first)
+def test_all_are_cleared_at_once_and_numbers_are_not_given_twice() -> None:
+    bench = Bench()
+    first = [bench.begin(fault="loss", rate=0.5), bench.begin(fault="cable", after=1)]
+    assert bench.registry.clear(None, bench.t) == first
+    assert bench.registry.clear(None, bench.t) == []
+    assert bench.begin(fault="garble", rate=0.5) > max(first)
 
 
 def test_a_broken_cable_is_whole_again_when_its_time_is_over() -> None:
-    kept = Kept()
-    kept.begin(fault="cable", after=1, lasts=0.1)
-    assert len(kept.line.segment.topology.reached) == 1
-    kept.pass_time(100 * MS)
-    assert len(kept.line.segment.topology.reached) == 3
+    bench = Bench()
+    bench.begin(fault="cable", after=1, lasts=0.1)
+    assert len(bench.line.segment.topology.reached) == 1
+    bench.pass_time(100 * MS)
+    assert len(bench.line.segment.topology.reached) == 3
 
 
 def test_a_script_begins_and_ends_faults_at_its_times() -> None:
-    kept = Kept(planned(fault="loss", rate=1.0, at=1, lasts=2), planned(fault="cable", after=2, at=2))
-    assert kept.registry.due == kept.t + S
-    seen = []
+    bench = Bench(planned(fault="loss", rate=1.0, at=1, lasts=2), planned(fault="cable", after=2, at=2))
+    assert bench.registry.due == bench.t + S
+    active = []
     for _ in range(4):
-        seen.append([each["fault"]["fault"] for each in kept.registry.listing(kept.t)])
-        kept.pass_time(S)
-    assert seen == [[], ["loss"], ["loss", "cable"], ["cable"]]
+        active.append([each["fault"]["fault"] for each in bench.registry.listing(bench.t)])
+        bench.pass_time(S)
+    assert active == [[], ["loss"], ["loss", "cable"], ["cable"]]
 
 
-def test_what_the_segment_refuses_of_a_script_is_told_and_the_rest_goes_on() -> None:
-    kept = Kept(planned(fault="drive", slave=1, error="encoder", at=1), planned(fault="loss", rate=1.0, at=2))
-    kept.pass_time(3 * S)
-    assert len(kept.said) == 1
-    assert kept.said[0].startswith("the script's fault drive at 1 s is left out: ")
-    assert len(kept.active()) == 1
+def test_a_fault_of_a_script_that_the_segment_refuses_is_reported_and_the_others_begin() -> None:
+    bench = Bench(planned(fault="drive", slave=1, error="encoder", at=1), planned(fault="loss", rate=1.0, at=2))
+    bench.pass_time(3 * S)
+    assert len(bench.reported) == 1
+    assert bench.reported[0].startswith("the script's fault drive at 1 s is left out: ")
+    assert len(bench.active()) == 1
 
 
 def test_a_burst_that_has_passed_is_not_active_any_more() -> None:
-    kept = Kept()
-    number = kept.begin(fault="garble", burst=1)
-    kept.registry.answers(bytes(60), kept.t)
-    assert kept.active() == []
+    bench = Bench()
+    number = bench.begin(fault="garble", burst=1)
+    bench.registry.answers(bytes(60), bench.t)
+    assert bench.active() == []
     with pytest.raises(FaultRefused, match=f"fault {number} is not active any more"):
-        kept.registry.clear(number, kept.t)
+        bench.registry.clear(number, bench.t)
 
 
-def test_a_late_answer_is_what_the_book_waits_for_next() -> None:
-    kept = Kept()
-    kept.begin(fault="delay", ms=5, rate=1.0)
-    kept.registry.answers(b"late", kept.t)
-    assert kept.registry.due == kept.t + 5 * MS
-    kept.pass_time(5 * MS)
-    assert kept.sent == [b"late"]
+def test_a_late_answer_is_the_next_event_of_the_registry() -> None:
+    bench = Bench()
+    bench.begin(fault="delay", ms=5, rate=1.0)
+    bench.registry.answers(b"late", bench.t)
+    assert bench.registry.due == bench.t + 5 * MS
+    bench.pass_time(5 * MS)
+    assert bench.sent == [b"late"]
 
 
 def test_a_fault_that_happens_once_has_a_number_and_is_never_active() -> None:
-    kept = Kept()
-    assert kept.begin(fault="clock_jump", slave=1, us=50) > 0
-    assert kept.active() == []
+    bench = Bench()
+    assert bench.begin(fault="clock_jump", slave=1, us=50) > 0
+    assert bench.active() == []
 
 
-def test_mending_what_never_was_is_refused_with_what_is_active() -> None:
-    kept = Kept()
-    kept.begin(fault="loss", rate=0.5)
+def test_clearing_an_unknown_fault_is_refused_with_the_active_ones() -> None:
+    bench = Bench()
+    bench.begin(fault="loss", rate=0.5)
     with pytest.raises(FaultRefused, match="there was no fault 7; active now: 1"):
-        kept.registry.clear(7, kept.t)
-    assert kept.active() == [1]
+        bench.registry.clear(7, bench.t)
+    assert bench.active() == [1]
 
 
 def test_a_refused_fault_leaves_nothing_behind() -> None:
-    kept = Kept()
+    bench = Bench()
     with pytest.raises(FaultRefused):
-        kept.begin(fault="cable", after=9)
-    assert kept.active() == []
+        bench.begin(fault="cable", after=9)
+    assert bench.active() == []
 
 
 def test_there_is_an_end_to_the_number_of_faults() -> None:
-    kept = Kept()
+    bench = Bench()
     for _ in range(MOST_ACTIVE):
-        kept.begin(fault="loss", rate=0.5)
+        bench.begin(fault="loss", rate=0.5)
     with pytest.raises(FaultRefused, match=f"{MOST_ACTIVE} faults are active already"):
-        kept.begin(fault="loss", rate=0.5)
+        bench.begin(fault="loss", rate=0.5)

@@ -11,7 +11,8 @@ from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.registry import ActiveFault
 from rtcp.virtual.faults.slaves import CableFault, PowerFault
-from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
+from rtcp.virtual.models import DiewuIoBox
+from rtcp.virtual.models.cubemars import CubemarsOrh70
 from rtcp.virtual.objects import Value
 from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.frames import Datagram, build
@@ -33,12 +34,12 @@ def cut(line: Line, after: int) -> ActiveFault:
 
 
 def count(line: Line) -> int:
-    """How many slaves answer a broadcast."""
+    """Number of slaves that answer a broadcast."""
     return line.one(DatagramCommand.BRD, 0, 0x0000, bytes(1)).counter
 
 
 def exchange_for(line: Line, ns: int) -> list[int]:
-    """The working counters of one frame a millisecond."""
+    """Working counters of one frame a millisecond."""
     return [line.exchange(1, 2, 3, 4)[1] for _ in range(ns // MS)]
 
 
@@ -55,11 +56,11 @@ def test_frames_turn_round_at_a_broken_cable_and_only_the_slaves_before_it_count
     assert count(line) == 4
 
 
-def test_mended_at_once_the_slaves_behind_go_on_in_op_with_their_addresses() -> None:
+def test_after_a_quick_repair_the_slaves_behind_go_on_in_op_with_their_addresses() -> None:
     line = in_op()
     end = cut(line, 1)
     exchange_for(line, 20 * MS)
-    assert line.devices[1].out.value == 0
+    assert line.tiny[1].out.value == 0
     end(line.now)
     assert line.exchange(10, 20, 30, 40)[1] == 12
     assert line.exchange(10, 20, 30, 40) == ([11, 21, 31, 41], 12)
@@ -70,7 +71,7 @@ def test_the_watchdog_takes_the_slaves_behind_a_broken_cable_out_of_op_and_they_
     line = in_op()
     end = cut(line, 2)
     exchange_for(line, 150 * MS)
-    assert [device.valid for device in line.devices] == [[True], [True], [True, False], [True, False]]
+    assert [device.valid for device in line.tiny] == [[True], [True], [True, False], [True, False]]
     end(line.now)
     assert line.al(2) == line.al(3) == (SAFE_OP | ERROR, 0x001B)
     assert line.exchange()[1] == 8
@@ -125,7 +126,7 @@ def test_of_several_broken_cables_the_nearest_counts() -> None:
 def test_both_ends_of_a_broken_cable_show_no_link_and_count_its_loss() -> None:
     line = in_op()
     before = [line.number(n, DL_STATUS, 2) for n in range(4)]
-    assert [found & (LINK_0 | LINK_1 | CLOSED_0 | CLOSED_1) for found in before] == [
+    assert [status & (LINK_0 | LINK_1 | CLOSED_0 | CLOSED_1) for status in before] == [
         LINK_0 | LINK_1, LINK_0 | LINK_1, LINK_0 | LINK_1, LINK_0 | CLOSED_1,
     ]  # fmt: skip
     end = cut(line, 2)
@@ -188,10 +189,10 @@ def test_sync0_goes_on_behind_a_broken_cable() -> None:
 def test_frames_do_not_hurry_the_slaves_that_they_do_not_reach() -> None:
     line = in_op(2)
     cut(line, 1)
-    before = [device.steps for device in line.devices]
+    before = [device.steps for device in line.tiny]
     for _ in range(100):
         line.exchange(1, 2, after=MS // 10)
-    steps = [device.steps - begun for device, begun in zip(line.devices, before, strict=True)]
+    steps = [device.steps - begun for device, begun in zip(line.tiny, before, strict=True)]
     assert steps[0] >= 100
     assert steps[1] <= 11
 
@@ -211,8 +212,8 @@ def test_no_frame_passes_a_slave_without_supply_and_its_neighbours_lose_their_li
     assert exchange_for(line, 5 * MS) == [6] * 5
     assert line.read(1, LOST_LINKS, 2) == b"\0\1"
     assert line.slaves[3].esc.memory[LOST_LINKS : LOST_LINKS + 2] == b"\1\0"
-    assert line.devices[2].valid == [True, False]
-    assert line.devices[3].valid == [True]
+    assert line.tiny[2].valid == [True, False]
+    assert line.tiny[3].valid == [True]
 
 
 def test_with_its_supply_back_a_slave_is_in_init_with_the_registers_of_power_on() -> None:
@@ -260,7 +261,7 @@ def test_what_was_written_to_the_eeprom_outlives_the_supply() -> None:
     assert line.slaves[1].esc.eeprom.image is not image
 
 
-def test_without_supply_behind_a_broken_cable_both_must_be_mended() -> None:
+def test_without_supply_behind_a_broken_cable_both_must_be_cleared() -> None:
     line = in_op()
     whole, back = cut(line, 1), begin(line.segment, PowerFault(3), line.now)
     assert count(line) == 1
@@ -283,10 +284,9 @@ def test_a_slave_that_does_not_exist_has_no_supply_to_lose() -> None:
         begin(in_op().segment, PowerFault(5), 0)
 
 
-def enabled_drive() -> tuple[Line, CubemarsDrive]:
-    """A drive that moves at 1 rad/s, in OP by its own word: process data are not what is tested."""
-    drive = create("cubemars-orh70")
-    assert isinstance(drive, CubemarsDrive)
+def enabled_drive() -> tuple[Line, CubemarsOrh70]:
+    """A drive that moves at 1 rad/s, set valid directly: no process data are exchanged."""
+    drive = CubemarsOrh70()
     line = Line([drive, TinyDevice()])
     drive.set_outputs_valid(True)
     drive.objects[0x6085, 0].value = 12345
@@ -303,8 +303,8 @@ def enabled_drive() -> tuple[Line, CubemarsDrive]:
 
 
 def values_of(device: DeviceModel) -> dict[tuple[int, int], Value]:
-    """All objects, but for the temperature: the motor stays as warm as it is."""
-    entries = [entry for found in device.objects for entry in found.entries.values()]
+    """All objects except the temperature: the motor stays warm."""
+    entries = [entry for group in device.objects for entry in group.entries.values()]
     return {(e.index, e.subindex): e.value for e in entries if (e.index, e.subindex) != (0x2000, 1)}
 
 
@@ -325,7 +325,7 @@ def test_a_drive_without_supply_stands_by_its_brake_and_comes_back_as_at_power_o
     assert drive.state.name == "NOT_READY_TO_SWITCH_ON"
     line.pass_time(100 * MS)
     assert drive.state.name == "SWITCH_ON_DISABLED"
-    fresh = create("cubemars-orh70", initial_position=position)
+    fresh = CubemarsOrh70(initial_position=position)
     fresh.step(0.15)
     fresh.step(0.001)
     assert values_of(drive) == values_of(fresh)
@@ -335,8 +335,7 @@ def test_a_drive_without_supply_stands_by_its_brake_and_comes_back_as_at_power_o
 
 
 def test_without_supply_the_outputs_of_the_io_box_are_off_and_afterwards_nothing_is_forced() -> None:
-    box = create("diewu-io", inputs=0x1234)
-    assert isinstance(box, DiewuIoBox)
+    box = DiewuIoBox(inputs=0x1234)
     line = Line([box])
     box.set_outputs_valid(True)
     box.objects[0x7000, 1].value = 0xFFFF
@@ -357,8 +356,8 @@ def test_without_supply_the_outputs_of_the_io_box_are_off_and_afterwards_nothing
     assert box.objects[0x6000, 1].value == 0, "what is forced now has no end"
 
 
-def test_what_goes_and_comes_back_leaves_nothing_to_the_collector_of_garbage_which_is_off_in_a_segment() -> None:
-    line = Line([create("diewu-io"), create("cubemars-orh70"), TinyDevice()])
+def test_a_cleared_fault_leaves_nothing_to_the_garbage_collector_which_is_off_in_a_segment() -> None:
+    line = Line([DiewuIoBox(), CubemarsOrh70(), TinyDevice()])
     gc.collect()
     gc.disable()
     try:

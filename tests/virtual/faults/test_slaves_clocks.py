@@ -8,23 +8,7 @@ from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.slaves import ClockDrift, ClockJump, PowerFault, Sync0Lost
 from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.frames import Datagram
-from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, STATION, Line, TinyDevice, begin, start_sync0
-
-
-def by_sync0() -> Line:
-    """One slave in OP whose SYNC0 comes half a millisecond after each frame."""
-    line = Line([TinyDevice()])
-    line.to_pre_op()
-    line.configure_process_data()
-    start_sync0(line, 0, MS, first_in=50 * MS)
-    assert line.request(0, SAFE_OP) == (SAFE_OP, 0)
-    line.pass_time((line.slaves[0].esc.dc.sync0.due - line.now) % MS + MS // 2)
-    line.write(0, 0x0120, b"\x08\x00")
-    line.pass_time(MS - 100_000)
-    for _ in range(60):
-        line.exchange(1)
-    assert line.slaves[0].application.state == OP
-    return line
+from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, STATION, Line, TinyDevice, begin, by_sync0, start_sync0
 
 
 def local_times(line: Line) -> list[int]:
@@ -32,7 +16,7 @@ def local_times(line: Line) -> list[int]:
 
 
 def test_without_sync0_a_slave_leaves_op_and_with_it_again_it_goes_on_in_the_same_grid() -> None:
-    line = by_sync0()
+    line = by_sync0(TinyDevice())
     sync0 = line.slaves[0].esc.dc.sync0
     first, pulses = sync0.next, sync0.pulses
     end = begin(line.segment, Sync0Lost(1), line.now)
@@ -64,7 +48,7 @@ def test_sync0_that_is_activated_while_it_is_lost_begins_when_mended() -> None:
     assert sync0.pulses == 5
 
 
-def test_sync0_stays_lost_through_a_loss_of_supply_and_when_lost_twice_until_mended_twice() -> None:
+def test_sync0_stays_lost_through_a_loss_of_supply_and_when_lost_twice_until_cleared_twice() -> None:
     line = Line([TinyDevice()])
     ends = [begin(line.segment, Sync0Lost(1), line.now) for _ in range(2)]
     begin(line.segment, PowerFault(1), line.now)(line.now)
@@ -80,10 +64,10 @@ def test_sync0_stays_lost_through_a_loss_of_supply_and_when_lost_twice_until_men
 
 @pytest.mark.parametrize("us", [400.0, -400.0])
 def test_a_clock_jumps_once_and_its_sync0_with_it(us: float) -> None:
-    line = by_sync0()
+    line = by_sync0(TinyDevice())
     clock, sync0 = line.slaves[0].clock, line.slaves[0].esc.dc.sync0
     before, due = clock.local(line.now), sync0.due
-    line.segment.look_at(line.now)
+    line.segment.wake_at(line.now)
     line.segment.tick(line.now)
     undo = begin(line.segment, ClockJump(1, us), line.now)
     assert undo.over
@@ -96,7 +80,7 @@ def test_a_clock_jumps_once_and_its_sync0_with_it(us: float) -> None:
 
 
 def test_a_pulse_that_nobody_has_noticed_yet_comes_before_the_jump() -> None:
-    line = by_sync0()
+    line = by_sync0(TinyDevice())
     sync0 = line.slaves[0].esc.dc.sync0
     pulses = sync0.pulses
     line.now = sync0.due + 5_000
@@ -106,7 +90,7 @@ def test_a_pulse_that_nobody_has_noticed_yet_comes_before_the_jump() -> None:
 
 
 def test_a_clock_that_jumps_over_its_next_pulse_has_lost_sync0() -> None:
-    line = by_sync0()
+    line = by_sync0(TinyDevice())
     begin(line.segment, ClockJump(1, 5000.0), line.now)
     for _ in range(5):
         line.exchange(1)
@@ -120,15 +104,15 @@ def test_drift_compensation_takes_a_jump_back() -> None:
     line.write(1, 0x0920, (-start % 2**64).to_bytes(8, "little"))
     line.write(1, 0x0928, (820).to_bytes(4, "little"))
     begin(line.segment, ClockJump(2, 100.0), line.now)
-    found = []
+    differences = []
     for _ in range(2000):
         line.send(Datagram(DatagramCommand.FRMW, 0, STATION, 0x0910, bytes(8)), after=MS)
-        found.append(line.slaves[1].clock.difference)
-    assert abs(found[0]) > 90_000
-    assert max(map(abs, found[-10:])) < 1000
+        differences.append(line.slaves[1].clock.difference)
+    assert abs(differences[0]) > 90_000
+    assert max(map(abs, differences[-10:])) < 1000
 
 
-def test_a_clock_drifts_from_now_on_until_mended_and_what_it_has_gained_stays() -> None:
+def test_a_clock_drifts_from_now_on_until_cleared_and_its_gain_stays() -> None:
     line = Line([TinyDevice(), TinyDevice()], drifts=[0.0, 10.0])
     before = local_times(line)
     end = begin(line.segment, ClockDrift(2, 200.0), line.now)

@@ -8,14 +8,22 @@ from itertools import pairwise
 
 import pytest
 
-from rtcp.launch.inprocess import InProcessBus
+from rtcp.testing.bus import InProcessBus
 from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.faults.fault import DeviceFault, End, FaultRefused, Position
-from rtcp.virtual.faults.slaves import DriveErrorFault, InputsFrozen, JoystickCode, PowerFault, TerminalFault
-from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
+from rtcp.virtual.faults.slaves import (
+    DriveError,
+    DriveErrorFault,
+    InputsFrozen,
+    JoystickCode,
+    PowerFault,
+    TerminalFault,
+)
+from rtcp.virtual.models import DiewuIoBox
+from rtcp.virtual.models.cubemars import CubemarsOrh40, CubemarsOrh70
 from tests.virtual.line import MS, Line, begin
 
-CODES = {
+CODES: dict[DriveError, int] = {
     "over-current": 0x2310,
     "over-voltage": 0x3210,
     "under-voltage": 0x3220,
@@ -29,7 +37,7 @@ AT_ONCE = {"over-current", "over-voltage", "under-voltage", "encoder"}
 
 @dataclass(frozen=True)
 class Trusting(DeviceFault):
-    """A kind of a package outside, which leaves it to its base to look whether there is such a slave."""
+    """A fault of another package, whose base class checks the slave's position."""
 
     name = "trusting"
     slave: Position
@@ -40,19 +48,18 @@ class Trusting(DeviceFault):
 
 
 def test_a_slave_that_is_not_there_is_refused_for_a_kind_of_a_package_outside_too() -> None:
-    line = Line([create("diewu-io")])
+    line = Line([DiewuIoBox()])
     begin(line.segment, Trusting(1), 0)
     with pytest.raises(FaultRefused, match="there is no slave 2: the segment has slaves 1 to 1"):
         begin(line.segment, Trusting(2), 0)
 
 
 class Joint:
-    """A drive as slave 2 behind an IO box, that moves at 1 rad/s; its outputs are set as process data would."""
+    """A drive at 1 rad/s as slave 2 behind an IO box; tests set its outputs directly."""
 
     def __init__(self) -> None:
-        box, drive = create("diewu-io"), create("cubemars-orh70")
-        assert isinstance(drive, CubemarsDrive)
-        self.line = Line([box, drive])
+        drive = CubemarsOrh70()
+        self.line = Line([DiewuIoBox(), drive])
         self.drive = drive
         drive.set_outputs_valid(True)
         self.put(0x6060, 9)
@@ -84,13 +91,13 @@ class Joint:
         return self.drive.state.name
 
     def emergencies(self) -> list[int]:
-        found = [each.error_code for each in self.drive.emergencies]
+        codes = [each.error_code for each in self.drive.emergencies]
         self.drive.emergencies.clear()
-        return found
+        return codes
 
 
 @pytest.mark.parametrize("error", CODES)
-def test_a_drive_tells_its_error_stops_and_can_be_reset_when_the_cause_is_gone(error: str) -> None:
+def test_a_drive_reports_its_error_stops_and_can_be_reset_when_the_cause_is_gone(error: DriveError) -> None:
     joint = Joint()
     end = begin(joint.line.segment, DriveErrorFault(2, error), joint.line.now, lasts=2.0)
     assert not end.over
@@ -162,12 +169,10 @@ def test_who_is_no_drive_has_no_errors_of_a_drive() -> None:
 
 @pytest.fixture
 def box() -> DiewuIoBox:
-    made = create("diewu-io", inputs=0x003F)
-    assert isinstance(made, DiewuIoBox)
-    return made
+    return DiewuIoBox(inputs=0x003F)
 
 
-def seen(line: Line) -> int:
+def shown_inputs(line: Line) -> int:
     line.pass_time(MS)
     return int(line.devices[0].objects[0x6000, 1].value)
 
@@ -176,15 +181,15 @@ def test_an_input_stuck_high_or_low_wins_over_the_world_and_over_what_is_forced(
     line = Line([box])
     high = begin(line.segment, TerminalFault(16, "high"), line.now)
     low = begin(line.segment, TerminalFault(1, "low"), line.now)
-    assert seen(line) == 0x803E
+    assert shown_inputs(line) == 0x803E
     box.inputs = 0x7FFF
-    assert seen(line) == 0xFFFE
+    assert shown_inputs(line) == 0xFFFE
     box.objects[0x2000, 1].value = 0xFFFF
     box.objects[0x2000, 2].value = 0x0001
-    assert seen(line) == 0x8000
+    assert shown_inputs(line) == 0x8000
     high(line.now)
     low(line.now)
-    assert seen(line) == 0x0001
+    assert shown_inputs(line) == 0x0001
 
 
 @pytest.mark.parametrize("level", [0x0004, 0x0000])
@@ -194,54 +199,54 @@ def test_an_input_that_bounces_changes_with_each_half_period_and_begins_with_the
     box.inputs = level
     line = Line([box])
     end = begin(line.segment, TerminalFault(3, "bounce", 3.0), line.now)
-    shown = [seen(line) == level for _ in range(18)]
+    shown = [shown_inputs(line) == level for _ in range(18)]
     edges = [n for n in range(1, 18) if shown[n] != shown[n - 1]]
     assert shown[0] is False
     assert {after - before for before, after in pairwise(edges)} == {3}
     end(line.now)
-    assert [seen(line) for _ in range(9)] == [level] * 9
+    assert [shown_inputs(line) for _ in range(9)] == [level] * 9
 
 
 def test_the_joystick_s_lines_show_a_code_whatever_its_lever_does(box: DiewuIoBox) -> None:
     line = Line([box])
     end = begin(line.segment, JoystickCode(0b010101), line.now)
     box.inputs = 0xFFC0
-    assert seen(line) == 0xFFD5
+    assert shown_inputs(line) == 0xFFD5
     end(line.now)
-    assert seen(line) == 0xFFC0
+    assert shown_inputs(line) == 0xFFC0
 
 
 def test_frozen_inputs_keep_their_value_whatever_is_done_to_the_terminals(box: DiewuIoBox) -> None:
     line = Line([box])
     box.inputs = 0xFFFF
-    assert seen(line) == 0xFFFF
+    assert shown_inputs(line) == 0xFFFF
     ends = [begin(line.segment, InputsFrozen(1), line.now) for _ in range(2)]
     box.inputs = 0xFFC0
     pressed = begin(line.segment, TerminalFault(10, "low"), line.now)
-    assert seen(line) == 0xFFFF
+    assert shown_inputs(line) == 0xFFFF
     ends[0](line.now)
-    assert seen(line) == 0xFFFF
+    assert shown_inputs(line) == 0xFFFF
     ends[1](line.now)
-    assert seen(line) == 0xFDC0
+    assert shown_inputs(line) == 0xFDC0
     pressed(line.now)
-    assert seen(line) == 0xFFC0
+    assert shown_inputs(line) == 0xFFC0
 
 
 def test_only_an_io_box_has_inputs_to_freeze() -> None:
-    line = Line([create("cubemars-orh40")])
+    line = Line([CubemarsOrh40()])
     with pytest.raises(FaultRefused, match="is no IO box"):
         begin(line.segment, InputsFrozen(1), line.now)
 
 
 def test_without_an_io_box_no_input_can_be_broken() -> None:
-    line = Line([create("cubemars-orh40")])
+    line = Line([CubemarsOrh40()])
     for fault in (TerminalFault(1, "high"), JoystickCode(0)):
         with pytest.raises(FaultRefused, match="no IO box on the segment"):
             begin(line.segment, fault, line.now)
 
 
 def test_on_the_bus_inprocess_drives_and_inputs_fail_alike() -> None:
-    bus = InProcessBus([create("diewu-io"), create("cubemars-orh70")])
+    bus = InProcessBus([DiewuIoBox(), CubemarsOrh70()])
     models = [slave.device for slave in bus.slaves]
     undo = JoystickCode(0).begin(models)
     DriveErrorFault(2, "over-voltage").begin(models)

@@ -8,6 +8,7 @@ import pytest
 
 from rtcp.fieldbus.port_errors import ErrorCounters
 from rtcp.fieldbus.registers import Answer, RegisterPort
+from rtcp.ipc.events import CableEvent
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.slaves import CableFault, Corrupt, WorkingCounter
 from rtcp.virtual.protocol import DatagramCommand
@@ -18,7 +19,7 @@ COUNTERS = 0x0300
 
 
 class Direct(RegisterPort):
-    """The master's port, whose frames reach the slaves without a socket."""
+    """The master's register port, directly on the slaves, without a socket."""
 
     def __init__(self, line: Line) -> None:
         self._line = line
@@ -41,9 +42,9 @@ def lrw(*outputs: int) -> bytes:
 
 
 def errors(line: Line) -> list[tuple[int, int, int]]:
-    """Of each slave: invalid frames and receive errors at port 0, forwarded ones."""
-    found = [line.read(n, COUNTERS, 20) for n in range(len(line.slaves))]
-    return [(raw[0], raw[1], raw[8]) for raw in found]
+    """For each slave: invalid frames, receive errors and forwarded errors of port 0."""
+    counters = [line.read(n, COUNTERS, 20) for n in range(len(line.slaves))]
+    return [(raw[0], raw[1], raw[8]) for raw in counters]
 
 
 @pytest.mark.parametrize("after", [0, 1, 3])
@@ -56,7 +57,7 @@ def test_slaves_before_the_damage_do_their_work_the_next_counts_an_error_and_tho
     assert line.raw(lrw(1, 2, 3, 4)) is None
     assert undo.over
     assert undo.counts == {"corrupted": 1}
-    assert [device.out.value for device in line.devices] == [1, 2, 3, 4][:after] + [0] * (4 - after)
+    assert [device.out.value for device in line.tiny] == [1, 2, 3, 4][:after] + [0] * (4 - after)
     assert errors(line) == [(0, 0, 0)] * after + [(1, 1, 0)] + [(0, 0, 1)] * (3 - after)
     assert line.exchange(5, 6, 7, 8)[1] == 12
     assert line.exchange(5, 6, 7, 8) == ([6, 7, 8, 9], 12)
@@ -84,20 +85,20 @@ def test_damage_to_every_frame_ends_with_the_fault_and_the_counters_stop_at_255(
 
 
 def test_a_rate_damages_its_share_and_the_same_frames_with_the_same_seed() -> None:
-    def struck() -> list[bool]:
+    def damaged() -> list[bool]:
         line = in_op(2)
         begin(line.segment, Corrupt(1, rate=0.2, seed=7), line.now)
         return [line.raw(lrw(0, 0)) is None for _ in range(500)]
 
-    first = struck()
+    first = damaged()
     assert 60 < sum(first) < 140
-    assert struck() == first
+    assert damaged() == first
 
 
 def errors_behind(line: Line) -> list[tuple[int, int, int]]:
-    """Of each slave: invalid frames and receive errors at port 1, forwarded ones."""
-    found = [line.read(n, COUNTERS, 20) for n in range(len(line.slaves))]
-    return [(raw[2], raw[3], raw[9]) for raw in found]
+    """For each slave: invalid frames, receive errors and forwarded errors of port 1."""
+    counters = [line.read(n, COUNTERS, 20) for n in range(len(line.slaves))]
+    return [(raw[2], raw[3], raw[9]) for raw in counters]
 
 
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
@@ -110,7 +111,7 @@ def test_all_slaves_have_worked_when_a_frame_is_damaged_on_its_way_back_and_thos
     assert line.raw(lrw(1, 2, 3, 4)) is None
     assert undo.over
     assert undo.counts == {"corrupted": 1}
-    assert [device.out.value for device in line.devices] == [1, 2, 3, 4]
+    assert [device.out.value for device in line.tiny] == [1, 2, 3, 4]
     assert errors_behind(line) == ([(0, 0, 1)] * (after - 1) + [(1, 1, 0)] * bool(after) + [(0, 0, 0)] * (4 - after))
     assert errors(line) == [(0, 0, 0)] * 4
     assert line.exchange(5, 6, 7, 8)[1] == 12
@@ -148,8 +149,8 @@ def test_the_master_names_the_cable_over_which_damaged_frames_come_whichever_way
     after: int, way: Literal["out", "back"]
 ) -> None:
     line = in_op(3)
-    port, said = Direct(line), list[str]()
-    counters = ErrorCounters(port, ("a", "b", "c"), said.append)
+    events: list[CableEvent] = []
+    counters = ErrorCounters(Direct(line), 3, events.append)
     undo = begin(line.segment, Corrupt(after, way, burst=5), line.now)
     for _ in range(5):
         assert line.raw(lrw(0, 0, 0)) is None
@@ -157,13 +158,9 @@ def test_the_master_names_the_cable_over_which_damaged_frames_come_whichever_way
     for _ in range(3):
         counters.read_next()
     counters.report_due()
-    named = ("the master and slave 1 (a)", "slave 1 (a) and slave 2 (b)", "slave 2 (b) and slave 3 (c)")[after]
-    if (after, way) == (0, "back"):
-        # Nobody but the master's network card gets them.
-        assert said == []
-    else:
-        assert len(said) == 1
-        assert said[0].startswith(f"errors enter between {named}: 5 damaged frames since ")
+    # Only the master's network card receives frames that the first cable damages on their way back.
+    cables = [] if (after, way) == (0, "back") else [(after, after + 1, 5)]
+    assert [(event.near, event.far, event.count) for event in events] == cables
 
 
 @pytest.mark.parametrize("after", [2, 3])
@@ -204,7 +201,7 @@ def test_the_counter_lacks_the_share_of_a_slave_that_took_part(command: Datagram
     if command != DatagramCommand.LWR:
         assert answer.data[8:] == bytes.fromhex("0200 0300 0400 0500")
     line.pass_time(MS)
-    assert line.devices[1].out.value == (2 if command == DatagramCommand.LRD else 6)
+    assert line.tiny[1].out.value == (2 if command == DatagramCommand.LRD else 6)
     assert line.one(DatagramCommand.BRD, 0, 0, bytes(1)).counter == 4
     end(line.now)
     assert line.logical(command, 0, data).counter == full

@@ -32,33 +32,33 @@ class Master:
         return self.line.now
 
     def answer(self) -> bytes | None:
-        """What SM1 holds behind the mailbox header; None: nothing."""
-        found = self.line.one(DatagramCommand.FPRD, STATION, IN, bytes(SIZE))
-        return found.data[6 : 6 + found.data[0]] if found.counter else None
+        """Content of SM1 behind the mailbox header; None: empty."""
+        mailbox = self.line.one(DatagramCommand.FPRD, STATION, IN, bytes(SIZE))
+        return mailbox.data[6 : 6 + mailbox.data[0]] if mailbox.counter else None
 
     def wait(self, ms: int) -> tuple[bytes, int]:
         """Poll each 100 us; return the answer and the instant at which it was read."""
         for _ in range(10 * ms):
-            if (found := self.answer()) is not None:
-                return found, self.line.now
+            if (answer := self.answer()) is not None:
+                return answer, self.line.now
         raise AssertionError(f"no answer within {ms} ms")
 
     def abort_code(self, index: int, command: int = 0x40) -> int:
         self.ask(index, command=command)
-        found, _ = self.wait(5)
-        return int.from_bytes(found[6:10], "little") if found[2] == 0x80 else 0
+        answer, _ = self.wait(5)
+        return int.from_bytes(answer[6:10], "little") if answer[2] == 0x80 else 0
 
 
 def test_an_answer_comes_so_much_later_and_afterwards_at_once_again() -> None:
     master = Master()
     end = begin(master.line.segment, SdoLate(1, 20.0), master.line.now)
-    asked = master.ask(0x7000)
-    found, at = master.wait(50)
-    assert found[2:6] == bytes.fromhex("4b 00 70 01")
-    assert 20 * MS <= at - asked < 22 * MS
+    requested_at = master.ask(0x7000)
+    answer, at = master.wait(50)
+    assert answer[2:6] == bytes.fromhex("4b 00 70 01")
+    assert 20 * MS <= at - requested_at < 22 * MS
     end(master.line.now)
-    asked = master.ask(0x7000)
-    assert master.wait(5)[1] - asked < MS
+    requested_at = master.ask(0x7000)
+    assert master.wait(5)[1] - requested_at < MS
 
 
 def test_other_traffic_waits_behind_a_late_answer_in_order() -> None:
@@ -68,36 +68,36 @@ def test_other_traffic_waits_behind_a_late_answer_in_order() -> None:
     master.line.devices[0].emergencies.append(Emergency(0x1234, 0))
     master.line.pass_time(5 * MS)
     second = master.ask(0x6000)
-    found = [master.wait(50) for _ in range(3)]
-    assert [at - first >= 20 * MS for _, at in found] == [True] * 3
-    assert found[2][1] - second >= 20 * MS
-    assert found[0][0][2:4] == b"\x34\x12" or found[1][0][2:4] == b"\x34\x12"
-    indices = [answer[3:5] for answer, _ in found if answer[1] >> 4 == 3]
+    answers = [master.wait(50) for _ in range(3)]
+    assert [at - first >= 20 * MS for _, at in answers] == [True] * 3
+    assert answers[2][1] - second >= 20 * MS
+    assert answers[0][0][2:4] == b"\x34\x12" or answers[1][0][2:4] == b"\x34\x12"
+    indices = [answer[3:5] for answer, _ in answers if answer[1] >> 4 == 3]
     assert indices == [b"\x00\x70", b"\x00\x60"]
 
 
 def test_the_other_slaves_answer_at_once() -> None:
     master = Master()
     begin(master.line.segment, SdoLate(2, 20.0), master.line.now)
-    asked = master.ask(0x7000)
-    assert master.wait(5)[1] - asked < MS
+    requested_at = master.ask(0x7000)
+    assert master.wait(5)[1] - requested_at < MS
 
 
 def test_of_several_delays_the_longest_counts() -> None:
     master = Master()
     begin(master.line.segment, SdoLate(1, 30.0), master.line.now)
     begin(master.line.segment, SdoLate(1, 10.0), master.line.now)
-    asked = master.ask(0x7000)
-    assert 30 * MS <= master.wait(50)[1] - asked < 32 * MS
+    requested_at = master.ask(0x7000)
+    assert 30 * MS <= master.wait(50)[1] - requested_at < 32 * MS
 
 
 @pytest.mark.parametrize("command", [0x40, 0x2B], ids=["upload", "download"])
 def test_every_service_is_aborted_with_the_code_and_changes_nothing(command: int) -> None:
     master = Master()
     end = begin(master.line.segment, SdoAbort(1, 0x08000021), master.line.now)
-    before = master.line.devices[0].out.value
+    before = master.line.tiny[0].out.value
     assert master.abort_code(0x7000, command) == 0x08000021
-    assert master.line.devices[0].out.value == before
+    assert master.line.tiny[0].out.value == before
     assert master.abort_code(0x1018, 0x40) == 0x08000021
     end(master.line.now)
     assert master.abort_code(0x7000, command) == 0

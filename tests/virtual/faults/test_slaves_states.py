@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 
 from rtcp.virtual.faults.fault import FaultRefused
@@ -20,8 +22,8 @@ def in_op() -> Line:
 
 @pytest.mark.parametrize(("name", "state", "below"), [("OP", OP, SAFE_OP), ("SAFE-OP", SAFE_OP, PRE_OP),
                                                       ("PRE-OP", PRE_OP, INIT)])  # fmt: skip
-def test_a_refused_state_gives_the_code_until_mended_and_what_lies_below_is_free(
-    name: str, state: int, below: int
+def test_a_refused_state_gives_the_code_until_cleared_and_lower_states_are_free(
+    name: Literal["PRE-OP", "SAFE-OP", "OP"], state: int, below: int
 ) -> None:
     line = in_op()
     end = begin(line.segment, AlRefuse(2, name, REFUSED), line.now)
@@ -71,14 +73,14 @@ def test_a_slave_that_hangs_on_its_way_to_op_does_not_arrive_there() -> None:
 
 @pytest.mark.parametrize(("name", "state", "counter"), [("SAFE-OP", SAFE_OP, 4), ("PRE-OP", PRE_OP, 3)])
 def test_a_fall_is_a_state_with_error_and_code_a_working_counter_and_invalid_outputs(
-    name: str, state: int, counter: int
+    name: Literal["PRE-OP", "SAFE-OP"], state: int, counter: int
 ) -> None:
     line = in_op()
     undo = begin(line.segment, AlFall(2, name, REFUSED), line.now)
     assert undo.over
     assert line.al(1) == (state | ERROR, REFUSED)
     assert line.exchange(5, 5)[1] == counter
-    assert line.devices[1].valid == [True, False]
+    assert line.tiny[1].valid == [True, False]
     assert line.al(0) == (OP, 0)
     undo(line.now)
     assert line.request(1, state | ACK) == (state, 0)

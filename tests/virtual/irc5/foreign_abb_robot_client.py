@@ -23,9 +23,9 @@ def main() -> None:
         if not received:
             continue
         state = latest
-        wanted = np.array(state.joint_angles)
-        wanted[0] = target
-        answered += egm.send_to_robot(wanted)
+        reference = np.array(state.joint_angles)
+        reference[0] = target
+        answered += egm.send_to_robot(reference)
         if abs(state.joint_angles[0] - target) < 0.1:
             break
     print(json.dumps({

@@ -13,7 +13,7 @@ import numpy as np
 from ABBRobotEGM import EGM
 
 SPEED = 20.0
-"""degrees/s."""
+"""Speed of the ramp, degrees/s."""
 
 
 def main() -> None:
@@ -26,10 +26,10 @@ def main() -> None:
             if not received:
                 continue
             start = start or (time.monotonic(), state.joint_angles[0])
-            wanted, speed = np.array(state.joint_angles), np.zeros(6)
-            wanted[0] = min(target, start[1] + SPEED * (time.monotonic() - start[0]))
-            speed[0] = SPEED if wanted[0] < target else 0.0
-            answered += egm.send_to_robot(wanted, speed_ref=speed)
+            reference, speed = np.array(state.joint_angles), np.zeros(6)
+            reference[0] = min(target, start[1] + SPEED * (time.monotonic() - start[0]))
+            speed[0] = SPEED if reference[0] < target else 0.0
+            answered += egm.send_to_robot(reference, speed_ref=speed)
             if abs(state.joint_angles[0] - target) < 0.1 and not speed[0]:
                 break
         print(json.dumps({

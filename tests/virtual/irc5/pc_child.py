@@ -1,4 +1,4 @@
-"""Joins the namespaces of a controller and leads joint 1: `pc_child.py PID PORT DEGREES` prints where it came to."""
+"""Joins the namespaces of a controller and leads joint 1: `pc_child.py PID PORT DEGREES` prints where it ends."""
 
 from __future__ import annotations
 

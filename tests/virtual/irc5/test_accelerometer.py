@@ -13,7 +13,7 @@ from rtcp.virtual.irc5.geometry import Geometry
 
 PERIOD_S = 0.004032
 RADIUS_M = 0.374
-"""Of the flange about joint 1, all joints at zero."""
+"""Radius of the flange about joint 1, all joints at zero."""
 
 
 @pytest.fixture
@@ -28,8 +28,8 @@ def test_a_sine_of_joint_1_is_felt_along_y_at_its_instant(accelerometer: Acceler
         angle = amplitude * sin(rate * i * PERIOD_S)
         accelerometer.sample((degrees(angle), 0, 0, 0, 0, 0), 7.0 + i * PERIOD_S)
     for stamp, _, y, _ in accelerometer.take():
-        wanted = -RADIUS_M * amplitude * rate**2 * sin(rate * (stamp - 7.0))
-        assert y == pytest.approx(wanted, abs=1e-4)
+        expected = -RADIUS_M * amplitude * rate**2 * sin(rate * (stamp - 7.0))
+        assert y == pytest.approx(expected, abs=1e-4)
 
 
 def test_a_constant_speed_of_joint_1_is_felt_towards_the_axis(accelerometer: Accelerometer) -> None:

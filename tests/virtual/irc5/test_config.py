@@ -8,20 +8,19 @@ import pytest
 
 pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
 
-from rtcp.config.model import ConfigError
+from rtcp.config.findings import Finding
 from rtcp.virtual.irc5.config import load_irc5
 from rtcp.virtual.irc5.controller import Controller
 from rtcp.virtual.irc5.panel import Motors
+from tests.findings import findings_of, summary
 
 SHIPPED = Path(__file__).parents[3] / "config" / "irc5.yaml"
 
 
-def problems(tmp_path: Path, text: str) -> list[str]:
+def findings(tmp_path: Path, text: str) -> list[Finding]:
     path = tmp_path / "irc5.yaml"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError) as error:
-        Controller(load_irc5(path))
-    return [problem.removeprefix(f"{path}:") for problem in error.value.problems]
+    return findings_of(lambda: Controller(load_irc5(path)))
 
 
 def test_the_shipped_file_is_an_irb_120_that_waits_for_references() -> None:
@@ -32,48 +31,43 @@ def test_the_shipped_file_is_an_irb_120_that_waits_for_references() -> None:
 
 def test_names_and_ports_are_the_units_own(tmp_path: Path) -> None:
     text = "units:\n  - {name: A, port: 1}\n  - {name: A, port: 1}\n"
-    assert problems(tmp_path, text) == [
-        "3: units[1].name: found A, which units[0] has; each needs its own",
-        "3: units[1].port: found 1, which units[0] has; each needs its own",
-    ]
+    assert [summary(finding, "3 : of=") for finding in findings(tmp_path, text)] == [
+        "3 units[1].name: repeated of=units[0].name", "3 units[1].port: repeated of=units[0].port",
+    ]  # fmt: skip
 
 
 def test_there_are_four_units_at_most(tmp_path: Path) -> None:
     text = "units:\n" + "".join(f"  - {{name: A{i}, port: {i + 1}}}\n" for i in range(5))
-    assert problems(tmp_path, text) == ["1: units: found a list of 5, allowed is a list of 1 to 4 entries"]
+    (finding,) = findings(tmp_path, text)
+    assert summary(finding, "1 : found=") == "1 units: size found=5"
 
 
 def test_seven_joints_need_the_range_of_the_seventh(tmp_path: Path) -> None:
     text = "units:\n  - {name: A, port: 1, initial_position: [0, 0, 0, 0, 0, 0, 0]}\n"
-    assert problems(tmp_path, text) == ["2: units[0].initial_position: found 7 joints, allowed are the unit's 6"]
+    (finding,) = findings(tmp_path, text)
+    assert summary(finding, "2 : found=") == "2 units[0].initial_position: count found=7"
 
 
 def test_an_initial_position_outside_the_range_is_named(tmp_path: Path) -> None:
     text = "units:\n  - {name: A, port: 1, initial_position: [0, 120, 0, 0, 0, 0]}\n"
-    sentence = "initial_position of A: found 120 for joint 2, allowed is a number from -110 to 110"
-    assert problems(tmp_path, text) == [sentence]
+    (finding,) = findings(tmp_path, text)
+    assert str(finding) == "initial_position of A: found 120 for joint 2, allowed is a number from -110 to 110"
 
 
 def test_an_arm_that_is_not_there_is_named(tmp_path: Path) -> None:
-    assert "irb_9000" in problems(tmp_path, "units:\n  - {name: A, port: 1, arm: irb_9000}\n")[0]
+    assert "irb_9000" in str(findings(tmp_path, "units:\n  - {name: A, port: 1, arm: irb_9000}\n")[0])
 
 
 @pytest.mark.parametrize(
-    ("unit", "rapid", "sentence"),
+    ("unit", "rapid", "expected"),
     [
-        ("period_s: 0.008", "{}", "4: units[1].period_s: with rapid all units have the same"),
-        (
-            "external_joint: {min: 0, max: 1, velocity: 1}, initial_position: [0, 0, 0, 0, 0, 0, 0]",
-            "{}",
-            "4: units[1].external_joint: with rapid a unit has six joints",
-        ),
-        (
-            "robotware: 6",
-            "{position_delay_s: [0.02, 0.01]}",
-            "1: rapid.position_delay_s: found 0.02 before 0.01, allowed is the lower one first",
-        ),
+        ("period_s: 0.008", "{}", "4 units[1].period_s: unlike"),
+        ("external_joint: {min: 0, max: 1, velocity: 1}, initial_position: [0, 0, 0, 0, 0, 0, 0]", "{}",
+         "4 units[1].external_joint: seventh_joint"),
+        ("robotware: 6", "{position_delay_s: [0.02, 0.01]}", "1 rapid.position_delay_s: order"),
     ],
-)
-def test_what_rapid_streaming_cannot_do_is_named(tmp_path: Path, unit: str, rapid: str, sentence: str) -> None:
+)  # fmt: skip
+def test_what_rapid_streaming_cannot_do_is_named(tmp_path: Path, unit: str, rapid: str, expected: str) -> None:
     text = f"rapid: {rapid}\nunits:\n  - {{name: A, port: 1}}\n  - {{name: B, port: 2, {unit}}}\n"
-    assert problems(tmp_path, text) == [sentence]
+    (finding,) = findings(tmp_path, text)
+    assert summary(finding, expected) == expected

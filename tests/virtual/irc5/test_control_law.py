@@ -12,9 +12,9 @@ pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip in
 from tests.virtual.irc5.wire import PERIOD, pc
 
 DEAD_TIME = 4 * PERIOD
-"""14 ms, rounded up to whole periods."""
+"""14 ms, rounded up to whole periods, s."""
 SPEED = 20.0
-"""Of the ramps, degrees/s."""
+"""Speed of the ramps, degrees/s."""
 
 
 def ramp_lags(gain: float, with_speed: bool) -> tuple[float, float]:
@@ -22,9 +22,9 @@ def ramp_lags(gain: float, with_speed: bool) -> tuple[float, float]:
     robot = pc(egm={"position_gain": gain})
     speed = (SPEED, 0, 0, 0, 0, 0) if with_speed else None
     for cycle in range(700):
-        wanted = SPEED * cycle * PERIOD
-        state = robot.read((wanted, 0, 0, 0, 0, 0), speed)
-    return (wanted - state.planned[0]) / SPEED, (wanted - state.actual[0]) / SPEED
+        reference = SPEED * cycle * PERIOD
+        state = robot.read((reference, 0, 0, 0, 0, 0), speed)
+    return (reference - state.planned[0]) / SPEED, (reference - state.actual[0]) / SPEED
 
 
 @pytest.mark.parametrize("gain", [5.0, 20.0])
@@ -117,7 +117,7 @@ def sine_response(gain: float, with_speed: bool, period: float = 2.0) -> complex
 @pytest.mark.parametrize("gain", [5.0, 20.0])
 @pytest.mark.parametrize("with_speed", [False, True])
 def test_a_sine_comes_out_as_the_transfer_function_says(gain: float, with_speed: bool) -> None:
-    s = 1j * pi  # of a period of 2 s
+    s = 1j * pi  # a period of 2 s
     low_pass = 1.0 / (1.0 + s / (2.0 * pi * 20.0))
     closed_loop = (gain + (s if with_speed else 0.0)) * low_pass / (s + gain * low_pass)
     # Low pass and integrator each take a reference for the whole of its cycle: half a period early.

@@ -1,4 +1,4 @@
-"""Whatever comes to a unit's port: it is counted, dropped, and never moves a joint out of its limits."""
+"""Garbled datagrams are counted and dropped, and never move a joint out of its limits."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOT_USED = ("garbled", "foreign", "unused")
 
 @st.composite
 def damaged(draw: st.DrawFn) -> bytes:
-    """A good message of which some bytes are changed, cut or added."""
+    """A valid message with some bytes changed, cut or added."""
     datagram = bytearray(sensor(draw(st.integers(0, 1 << 31)), draw(NEAR), draw(NEAR)))
     for at, value in draw(st.lists(st.tuples(st.integers(0, len(datagram) - 1), st.integers(0, 255)), max_size=4)):
         datagram[at] = value

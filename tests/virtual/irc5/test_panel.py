@@ -16,7 +16,7 @@ from tests.virtual.irc5.wire import PERIOD, Pc, pc
 
 SPEED = (20.0, 0, 0, 0, 0, 0)
 TABLE = [
-    # circuit, mode, does it act, category
+    # circuit, mode, whether it acts, category
     ("emergency", "auto", True, 0),
     ("emergency", "hand", True, 0),
     ("automatic", "auto", True, 1),

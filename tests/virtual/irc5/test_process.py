@@ -25,7 +25,7 @@ pytestmark = pytest.mark.alone
 
 ROOT = Path(__file__).parents[3]
 PEERS = Path(os.environ.get("RTCP_EGM_PEERS", ROOT / ".venv-egm-peers")) / "bin" / "python"
-"""Of an environment with abb-robot-client 0.4.0 and ABBRobotEGM 1.0.7: their packages cannot be in one process."""
+"""Python of an environment with abb-robot-client 0.4.0 and ABBRobotEGM 1.0.7; one process cannot import both."""
 
 
 def free_port() -> int:
@@ -64,7 +64,6 @@ def started(
         group=user, extra_groups=None if user is None else [],
     )  # fmt: skip
     try:
-        assert process.stdout is not None
         line = process.stdout.readline()
         assert line, process.communicate()[1]
         ready = json.loads(line)
@@ -98,7 +97,7 @@ def listening() -> Iterator[socket.socket]:
 
 
 def drain(pc: socket.socket) -> tuple[bytes, Any]:
-    """The newest message, and its sender."""
+    """Return the newest message and its sender."""
     newest = pc.recvfrom(2048)
     pc.setblocking(False)
     try:
@@ -110,7 +109,7 @@ def drain(pc: socket.socket) -> tuple[bytes, Any]:
 
 
 def lead(pc: socket.socket, joint: float) -> Robot:
-    """Answer messages until joint 1 is there."""
+    """Answer messages until joint 1 reaches `joint`, degrees."""
     for seqno in range(3000):
         message, sender = drain(pc)
         robot = Robot(message)
@@ -133,10 +132,10 @@ def test_four_units_speak_each_to_its_port_with_a_period_of_its_own(tmp_path: Pa
 
 
 def test_units_move_each_by_their_own_references(tmp_path: Path) -> None:
-    with listening() as one, listening() as two:
-        units = unit("ROB_1", one.getsockname()[1]), unit("ROB_2", two.getsockname()[1])
+    with listening() as first, listening() as second:
+        units = unit("ROB_1", first.getsockname()[1]), unit("ROB_2", second.getsockname()[1])
         with irc5(tmp_path, *units) as operator:
-            lead(one, 5.0)
+            lead(first, 5.0)
             positions = {n: s["position_deg"][0] for n, s in ask(operator, do="status")["units"].items()}
     assert positions["ROB_1"] == pytest.approx(5.0, abs=0.2)
     assert positions["ROB_2"] == 0.0
@@ -207,7 +206,6 @@ def test_a_client_that_others_wrote_connects_and_moves_a_joint(client: str, robo
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     peer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
-        assert peer.stdout is not None
         assert peer.stdout.readline() == "ready\n"
         with irc5(tmp_path, unit("ROB_1", port, f"robotware: {robotware}")) as operator:
             report = json.loads(peer.communicate(timeout=40.0)[0])

@@ -13,8 +13,9 @@ import pytest
 pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
 
 from rtcp.virtual.irc5.config import Irc5Config, RapidConfig, UnitConfig
-from rtcp.virtual.irc5.controller import Controller, RequestRefused
+from rtcp.virtual.irc5.controller import Controller
 from rtcp.virtual.irc5.simple_message import Frame, NotAMessage, joint_position, read_joint_point, take_frame
+from rtcp.virtual.request_socket import RequestRefused
 
 PERIOD = 0.004
 RATE_S = 1 / 30
@@ -24,7 +25,7 @@ NO_DELAY = {"position_delay_s": (0.0, 0.0)}
 
 
 class Cell:
-    """A controller whose time is counted here, with the client's end of its motion server."""
+    """A controller in simulated time, and the client of its motion server."""
 
     def __init__(self, arms: int = 1, rapid: dict[str, Any] | None = None, **controller: Any) -> None:
         units = tuple(
@@ -32,7 +33,6 @@ class Cell:
         )
         config = Irc5Config(units, rapid=RapidConfig(**NO_DELAY | (rapid or {})), **controller)
         self.controller = Controller(config)
-        assert self.controller.streaming is not None
         self.streaming = self.controller.streaming
         self.unit = self.controller.units["ROB_1"].mechanical
         self.task = self.streaming.tasks["ROB_1"]
@@ -40,7 +40,7 @@ class Cell:
         self.clock = 0.0
 
     def step(self) -> int | None:
-        """One period; the code of the reply in it."""
+        """Advance by one period; return the code of its reply, None without a reply."""
         self.clock += PERIOD
         self.controller.panel.advance(PERIOD)
         reply = self.streaming.step(PERIOD)
@@ -51,14 +51,14 @@ class Cell:
             assert self.step() is None
 
     def send(self, sequence: int, degrees: Sequence[float], duration: float = RATE_S) -> None:
-        """A point of the first joint, or of all."""
+        """Send a point: degrees of the first joints, 0 for the others."""
         joints = [*degrees, *[0.0] * (max(10, 6 * self.arms) - len(degrees))]
         body = struct.pack(f"<i{len(joints) + 2}f", sequence, *map(math.radians, joints), 0.0, duration)
         assert not self.streaming.is_busy
         self.streaming.receive(Frame(11, 2, 0, body))
 
     def ask(self, sequence: int, degrees: Sequence[float] = (), duration: float = RATE_S) -> tuple[int, float]:
-        """Send a point and wait for its reply; the code, and how long it took."""
+        """Send a point; return the reply's code and the time until it, s."""
         self.send(sequence, degrees, duration)
         begun = self.clock
         while (code := self.step()) is None:
@@ -66,7 +66,7 @@ class Cell:
         return code, self.clock - begun
 
     def run_until_rest(self) -> float:
-        """The time until the arm has nothing more to do."""
+        """Run until the queue is empty; return the time, s."""
         begun = self.clock
         while self.task.moves_ahead:
             self.step()
@@ -83,8 +83,6 @@ def test_the_length_says_how_many_joints_a_point_has() -> None:
     data = bytearray(ten + twelve)
     first, second = take_frame(data), take_frame(data)
     assert (len(data), len(ten), len(twelve)) == (0, 4 + 64, 4 + 72)
-    assert first is not None
-    assert second is not None
     assert read_joint_point(first, 6) == (7, tuple(range(6)), 0.25)
     assert read_joint_point(first, 12) is None
     assert read_joint_point(second, 12) == (8, tuple(range(12)), 0.25)
@@ -94,7 +92,6 @@ def test_a_joint_position_of_12_joints_is_as_long_as_a_point_of_10_and_is_none()
     message = joint_position(0, [0.0] * 12)
     assert struct.unpack_from("<2i", message) == (64, 10)
     frame = take_frame(bytearray(message))
-    assert frame is not None
     assert read_joint_point(frame, 6) is None
 
 
@@ -151,9 +148,9 @@ def test_replies_follow_acceptance_and_wait_for_room_in_the_queue() -> None:
     answers = [cell.ask(i, [0.2 * i]) for i in range(20)]
     assert {code for code, _ in answers} == {SUCCESS}
     assert all(seconds == pytest.approx(PERIOD) for _, seconds in answers[:4])
-    for _, seconds in answers[7:]:  # the arm moves: a place is free once a move
+    for _, seconds in answers[7:]:  # the arm moves: each move frees a place
         assert seconds == pytest.approx(RATE_S, abs=1.1 * PERIOD)
-    assert cell.task.moves_ahead == 5  # four in the queue, and the one that moves
+    assert cell.task.moves_ahead == 5  # four in the queue and the current one
 
 
 def test_motion_begins_after_the_look_ahead() -> None:
@@ -194,7 +191,7 @@ def test_a_corner_is_cut_to_half_the_distance_and_does_not_stop() -> None:
         cell.step()
         path.append(tuple(cell.unit.planned[:2]))
     corner = min(math.dist(point, (2.0, 0.0)) for point in path)
-    assert corner == pytest.approx(math.hypot(0.25, 0.25), abs=0.02)  # of a parabola from middle to middle
+    assert corner == pytest.approx(math.hypot(0.25, 0.25), abs=0.02)  # a parabola from middle to middle
     assert [point for point in path if point[0] < 0.99 and point[1] > 0.0] == []
     inside = [point for point in path if point[0] > 0.6 and point[1] < 1.4]
     assert min(math.dist(a, b) for a, b in pairwise(inside)) > 0.02
@@ -227,14 +224,14 @@ def test_the_reported_position_is_late_by_the_set_delay() -> None:
     cell.wait(0.5)
     for delay in (-0.005, 0.0, 0.012):
         behind = cell.unit.planned[0] - cell.task.reported(delay)[0]
-        assert behind == pytest.approx(10.0 * (0.014 + delay), abs=1e-6)  # 14 ms from the planned to the actual one
+        assert behind == pytest.approx(10.0 * (0.014 + delay), abs=1e-6)  # 14 ms between planned and actual position
 
 
 # -- stops -------------------------------------------------------------------------------------------------------------
 
 
 def moving(**keys: Any) -> Cell:
-    """An arm within a long move, and one more in its queue."""
+    """An arm in a long move, with another move in its queue."""
     cell = Cell(rapid={"start_delay_s": 0.0}, **keys)
     cell.ask(0, [50.0], 1.0)
     cell.ask(1, [100.0], 1.0)
@@ -311,7 +308,7 @@ def test_a_client_that_is_gone_stops_the_arms() -> None:
 
 def test_a_target_outside_the_range_ends_rapid_with_an_error() -> None:
     cell = Cell()
-    assert cell.ask(0, [0.0, 120.0], 1.0)[0] == SUCCESS  # taken by the server, refused by the move
+    assert cell.ask(0, [0.0, 120.0], 1.0)[0] == SUCCESS  # the server accepts it, the move refuses it
     assert "50027 joint out of range: joint 2 to 120, allowed are -110 to 110" in cell.unit.events
     state = cell.streaming.state()
     assert struct.unpack_from("<7i", state, len(state) - 28) == (1, 0, 0, 1, 0, 2, 0)
@@ -327,7 +324,7 @@ def test_a_point_that_asks_for_too_high_a_speed_is_refused_from_where_the_arm_is
     assert cell.ask(0, [0.0, 4.9], 0.05)[0] == SUCCESS
     assert cell.ask(1, [0.0, 9.8], 0.05)[0] == SUCCESS
     assert cell.ask(2, [0.0, 4.7], 0.05)[0] == FAILURE
-    assert cell.ask(-4)[0] == SUCCESS  # before the motion began: the arm is at 0 again
+    assert cell.ask(-4)[0] == SUCCESS  # before the motion begins: the target is 0 again
     assert cell.ask(-1, [0.0, -4.9], 0.05)[0] == SUCCESS
     assert cell.ask(-3, [0.0, -10.0], 0.05)[0] == FAILURE
 

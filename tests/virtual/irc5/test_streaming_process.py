@@ -55,7 +55,6 @@ def irc5(folder: Path, arms: int = 1, rapid: str = "") -> Iterator[Irc5]:
     command = [sys.executable, "-m", "rtcp.virtual.irc5", "--config", str(config), "--control", str(control)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     try:
-        assert process.stdout is not None
         line = process.stdout.readline()
         assert line, process.communicate()[1]
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as operator:
@@ -71,13 +70,13 @@ def irc5(folder: Path, arms: int = 1, rapid: str = "") -> Iterator[Irc5]:
 
 
 def point(sequence: int, degrees: list[float], duration: float = 0.05) -> bytes:
-    """JOINT_TRAJ_PT as a request, with the joints given."""
+    """A JOINT_TRAJ_PT request."""
     joints = map(math.radians, degrees)
     return struct.pack(f"<5i{len(degrees) + 2}f", 24 + 4 * len(degrees), 11, 2, 0, sequence, *joints, 0.0, duration)
 
 
 def read(connection: socket.socket) -> tuple[int, int, int, bytes]:
-    """The next message: type, comm_type, reply_code, body."""
+    """Return type, comm_type, reply_code and body of the next message."""
     length = struct.unpack("<i", exactly(connection, 4))[0]
     message = exactly(connection, length)
     msg_type, comm_type, code = struct.unpack_from("<3i", message)
@@ -95,13 +94,13 @@ def exactly(connection: socket.socket, count: int) -> bytes:
 
 
 def read_on(connection: socket.socket) -> None:
-    """Read until there is nothing more: TimeoutError, or ConnectionError."""
+    """Read until TimeoutError or ConnectionError."""
     for _ in range(1000):
         read(connection)
 
 
 def until_joint(state: socket.socket, index: int, degrees: float) -> tuple[float, ...]:
-    """Read state until a joint is there; all joints, degrees."""
+    """Read state until a joint reaches `degrees`; return all joints, degrees."""
     while True:
         msg_type, _, _, body = read(state)
         if msg_type == 10:
@@ -213,26 +212,26 @@ def test_a_port_that_is_taken_is_a_sentence(tmp_path: Path) -> None:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("way", ["streaming", "downloading"])
-def test_our_simple_message_client_moves_two_arms_by_twelve_joints(tmp_path: Path, way: str) -> None:
+@pytest.mark.parametrize("mode", ["streaming", "downloading"])
+def test_our_simple_message_client_moves_two_arms_by_twelve_joints(tmp_path: Path, mode: str) -> None:
     goal = [0.02 * (axis + 1) for axis in range(12)]
     steps = 20
     points = [
         JointTrajPt(at, tuple(joint * at / steps for joint in goal), 1.0, 0.0333 if at else 0.0)
         for at in range(steps + 1)
     ]
-    if way == "downloading":
+    if mode == "downloading":
         points[0] = replace(points[0], sequence=SpecialSequence.START_TRAJECTORY_DOWNLOAD)
         points[-1] = replace(points[-1], sequence=SpecialSequence.END_TRAJECTORY)
-    seen: list[Message] = []
+    messages: list[Message] = []
 
     def is_there() -> bool:
-        positions = [message.positions for message in seen[-8:] if isinstance(message, JointPosition)]
+        positions = [message.positions for message in messages[-8:] if isinstance(message, JointPosition)]
         return bool(positions) and positions[-1] == pytest.approx(goal, abs=1e-3)
 
     async def move(robot: Irc5) -> None:
         motion = MotionClient("127.0.0.1", robot.ready["motion_port"], joints=12)
-        state = StateClient("127.0.0.1", seen.append, robot.ready["state_port"])
+        state = StateClient("127.0.0.1", messages.append, robot.ready["state_port"])
         running = [asyncio.create_task(client.run()) for client in (motion, state)]
         while not (motion.is_connected and state.is_connected):
             await asyncio.sleep(0.01)

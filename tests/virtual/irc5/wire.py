@@ -13,7 +13,7 @@ from rtcp.virtual.irc5.controller import Controller
 CORRECTION = 3
 PERIOD = 0.004032
 FREE = {"max_speed_deviation": 400.0, "cond_time_s": 1e6, "comm_timeout_s": 0.2}
-"""Neither the cap on speed nor convergence is in the way of a test of something else."""
+"""Settings without speed limit and convergence, for tests of other things."""
 
 
 def entry(number: int, value: bytes | float | int) -> bytes:
@@ -51,7 +51,7 @@ def sensor(
 
 def parse(message: bytes) -> dict[int, list[Any]]:
     """The fields of a message by number: doubles, integers, and bytes of messages."""
-    found: dict[int, list[Any]] = {}
+    fields: dict[int, list[Any]] = {}
     at = 0
     while at < len(message):
         tag, at = read_varint(message, at)
@@ -64,9 +64,9 @@ def parse(message: bytes) -> dict[int, list[Any]]:
             assert tag & 7 == 2
             size, at = read_varint(message, at)
             value, at = message[at : at + size], at + size
-        found.setdefault(tag >> 3, []).append(value)
+        fields.setdefault(tag >> 3, []).append(value)
     assert at == len(message)
-    return found
+    return fields
 
 
 def read_varint(message: bytes, at: int) -> tuple[int, int]:
@@ -79,7 +79,7 @@ def read_varint(message: bytes, at: int) -> tuple[int, int]:
 
 
 class Robot:
-    """An EgmRobot as read."""
+    """A parsed EgmRobot."""
 
     def __init__(self, message: bytes) -> None:
         self.fields = parse(message)
@@ -117,7 +117,7 @@ class Pc:
 
     def cycle(self, position: Sequence[float] | None = None, speed: Sequence[float] | None = None,
               *datagrams: bytes) -> Robot | None:  # fmt: skip
-        """Send a reference, or the datagrams, or nothing; return what the unit says, None where it is silent."""
+        """Send a reference, or the datagrams, or nothing; return the unit's message, None if it sends none."""
         if position is not None or speed is not None:
             self.seqno += 1
             datagrams += (sensor(self.seqno, position, speed),)
@@ -133,7 +133,7 @@ class Pc:
 
     def wait(self, seconds: float, position: Sequence[float] | None = None,
              speed: Sequence[float] | None = None) -> Robot:  # fmt: skip
-        """The same references, cycle by cycle."""
+        """Repeat the references in each cycle; return the last message."""
         for _ in range(round(seconds / PERIOD)):
             robot = self.read(position, speed)
         return robot
@@ -141,14 +141,8 @@ class Pc:
 
 def pc(*, egm: dict[str, float] | None = None, controller: dict[str, Any] | None = None, axes: int = 6,
        **unit: Any) -> Pc:  # fmt: skip
-    """A PC at a unit whose joints stand at 0, in EGMRunJoint."""
+    """A PC and a unit in EGMRunJoint with all joints at 0."""
     unit.setdefault("initial_position", (0.0,) * axes)
     external = ExternalJoint(-100.0, 100.0, 180.0) if axes == 7 else None
-    settings = UnitConfig(
-        "ROB_1",
-        6511,
-        external_joint=external,
-        egm=EgmConfig(**FREE | (egm or {})),
-        **unit,  # type: ignore[arg-type]
-    )
+    settings = UnitConfig("ROB_1", 6511, external_joint=external, egm=EgmConfig(**FREE | (egm or {})), **unit)
     return Pc(Controller(Irc5Config((settings,), **controller or {})))

@@ -1,4 +1,4 @@
-"""A bench for a virtual drive: no bus, no socket, only its objects and the time that passes."""
+"""A bench for a virtual drive: its objects in simulated time, without bus and socket."""
 
 from __future__ import annotations
 
@@ -126,7 +126,10 @@ class Bench:
         self.run(seconds + 0.3, stream)
 
 
+Maker = type[Bench]
+
+
 @pytest.fixture
-def drive() -> Callable[..., Bench]:
-    """Return what makes a drive on its bench: `drive("orh40", friction=1.0)`."""
+def drive() -> Maker:
+    """Return the class of the bench: `drive("orh40", friction=1.0)` makes one."""
     return Bench

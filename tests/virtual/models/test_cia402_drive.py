@@ -3,23 +3,11 @@
 from __future__ import annotations
 
 from math import pi
+from typing import Any
 
 import pytest
 
-from rtcp.esi.model import (
-    Coe,
-    Device,
-    DictionaryObject,
-    Identity,
-    Mailbox,
-    ObjectCode,
-    ObjectEntry,
-    Pdo,
-    PdoEntry,
-    Source,
-    SyncManager,
-    SyncManagerType,
-)
+from rtcp.esi import model
 from rtcp.virtual.described import DescribedDevice
 from rtcp.virtual.device import OptionError
 from rtcp.virtual.models.cia402 import DriveState
@@ -32,28 +20,29 @@ ENABLED = DriveState.OPERATION_ENABLED
 DT = 0.001
 
 
-def ratio(index: int, above: int, below: int) -> DictionaryObject:
-    entries = [ObjectEntry(0, "Count", "USINT", 8, default=b"\2")]
+def ratio(index: int, above: int, below: int) -> model.DictionaryObject:
+    entries = [model.ObjectEntry(0, "Count", "USINT", 8, default=b"\2")]
     entries += [
-        ObjectEntry(n, "", "UDINT", 32, default=value.to_bytes(4, "little")) for n, value in ((1, above), (2, below))
+        model.ObjectEntry(n, "", "UDINT", 32, default=value.to_bytes(4, "little"))
+        for n, value in ((1, above), (2, below))
     ]
-    return DictionaryObject(index, "", ObjectCode.RECORD, tuple(entries))
+    return model.DictionaryObject(index, "", model.ObjectCode.RECORD, tuple(entries))
 
 
-def variable(index: int, value: int) -> DictionaryObject:
-    entry = ObjectEntry(0, "", "UDINT", 32, default=value.to_bytes(4, "little"), writable=True)
-    return DictionaryObject(index, "", ObjectCode.VARIABLE, (entry,))
+def variable(index: int, value: int) -> model.DictionaryObject:
+    entry = model.ObjectEntry(0, "", "UDINT", 32, default=value.to_bytes(4, "little"), writable=True)
+    return model.DictionaryObject(index, "", model.ObjectCode.VARIABLE, (entry,))
 
 
-def rated(millinewtonmetres: int) -> DictionaryObject:
+def rated(millinewtonmetres: int) -> model.DictionaryObject:
     return variable(0x6076, millinewtonmetres)
 
 
-def pdos(first: int, entries: tuple[tuple[int, int], ...], manager: int, axes: int) -> tuple[Pdo, ...]:
+def pdos(first: int, entries: tuple[tuple[int, int], ...], manager: int, axes: int) -> tuple[model.Pdo, ...]:
     return tuple(
-        Pdo(
+        model.Pdo(
             first + 0x10 * n, "",
-            tuple(PdoEntry(index + 0x800 * n, 0, bits, "", TYPES[bits]) for index, bits in entries), manager,
+            tuple(model.PdoEntry(index + 0x800 * n, 0, bits, "", TYPES[bits]) for index, bits in entries), manager,
         )
         for n in range(axes)
     )  # fmt: skip
@@ -62,16 +51,16 @@ def pdos(first: int, entries: tuple[tuple[int, int], ...], manager: int, axes: i
 class Bench:
     """A drive in OP with its self-test behind it."""
 
-    def __init__(self, *objects: DictionaryObject, axes: int = 1, **options: object) -> None:
+    def __init__(self, *objects: model.DictionaryObject, axes: int = 1, **options: object) -> None:
         managers = (
-            SyncManager(0x1000, 128, 0x26, SyncManagerType.MAILBOX_RECEIVE),
-            SyncManager(0x1080, 128, 0x22, SyncManagerType.MAILBOX_SEND),
-            SyncManager(0x1100, 0, 0x64, SyncManagerType.OUTPUTS),
-            SyncManager(0x1600, 0, 0x20, SyncManagerType.INPUTS),
+            model.SyncManager(0x1000, 128, 0x26, model.SyncManagerType.MAILBOX_RECEIVE),
+            model.SyncManager(0x1080, 128, 0x22, model.SyncManagerType.MAILBOX_SEND),
+            model.SyncManager(0x1100, 0, 0x64, model.SyncManagerType.OUTPUTS),
+            model.SyncManager(0x1600, 0, 0x20, model.SyncManagerType.INPUTS),
         )
-        description = Device(
-            Identity(1, 2, 3), "Drive", Source.ESI, "here", sync_managers=managers, objects=objects,
-            rx_pdos=pdos(0x1600, RX, 2, axes), tx_pdos=pdos(0x1A00, TX, 3, axes), mailbox=Mailbox(Coe()),
+        description = model.Device(
+            model.Identity(1, 2, 3), "Drive", model.Source.ESI, "here", sync_managers=managers, objects=objects,
+            rx_pdos=pdos(0x1600, RX, 2, axes), tx_pdos=pdos(0x1A00, TX, 3, axes), mailbox=model.Mailbox(model.Coe()),
         )  # fmt: skip
         self.device = DescribedDevice(description, lambda alias: b"", Cia402Drive, **options)
         self.sentences: list[str] = []
@@ -110,7 +99,7 @@ class Bench:
     ids=["none", "encoder", "encoder and gear", "feed"],
 )
 def test_a_turn_of_the_joint_has_the_counts_that_the_drives_objects_say(
-    objects: tuple[DictionaryObject, ...], counts: int
+    objects: tuple[model.DictionaryObject, ...], counts: int
 ) -> None:
     bench = Bench(*objects, initial_position=pi)
     assert bench[0x6064] == counts // 2
@@ -144,7 +133,7 @@ def test_csp_follows_its_targets_at_any_speed_and_csv_keeps_counts_a_second() ->
     ids=["rpm", "mrpm", "mrpm of the joint", "counts a second", "millidegrees a second", "no rate"],
 )
 def test_velocities_count_in_the_unit_of_the_si_notation_and_accelerations_the_same_a_second(
-    unit: int, options: dict[str, float], counts: float
+    unit: int, options: dict[str, Any], counts: float
 ) -> None:
     bench = Bench(ratio(0x608F, 4096, 1), ratio(0x6091, 50, 1), variable(0x60A9, unit), variable(0x6083, 0), **options)
     bench.enable(9)
@@ -216,6 +205,6 @@ def test_what_a_description_leaves_open_gets_defaults_and_what_an_object_cannot_
 
 
 def test_a_device_without_a_controlword_is_no_drive() -> None:
-    description = Device(Identity(1, 2, 3), "Lamp", Source.ESI, "here")
+    description = model.Device(model.Identity(1, 2, 3), "Lamp", model.Source.ESI, "here")
     with pytest.raises(OptionError, match="cia402 moves a drive, and Lamp has no controlword"):
         DescribedDevice(description, lambda alias: b"", Cia402Drive)

@@ -1,16 +1,12 @@
 """The drive's state machine, its stops, its faults and its options."""
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 
 from rtcp.virtual.device import create, models
 from rtcp.virtual.models.cia402 import DriveState, DriveStateMachine
 from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.pdo import PdoImage
-
-Maker = Callable[..., Any]
+from tests.virtual.models.conftest import Maker
 
 TRANSITIONS = [
     (DriveState.SWITCH_ON_DISABLED, 0x06, 2, DriveState.READY_TO_SWITCH_ON),
@@ -85,7 +81,7 @@ def test_one_controlword_may_walk_switched_on_on_its_way_to_enabled(drive: Maker
     assert [bench.control(0x0F) for _ in range(2)] == ["switched on", "enabled"]
 
 
-def test_the_voltage_and_remote_bits_tell_the_supply_and_the_bus(drive: Maker) -> None:
+def test_the_voltage_and_remote_bits_show_the_supply_and_the_bus(drive: Maker) -> None:
     bench = drive()
     assert bench.bit(4)
     assert bench.bit(9)
@@ -157,9 +153,9 @@ def test_a_quick_stop_brings_every_mode_to_rest_and_holds(drive: Maker, mode: in
     bench.set_in_motion(mode)
     bench.control(bench[0x6040] & ~0x04)
     bench.run(0.6)
-    held = bench.position
+    position = bench.position
     bench.run(0.3)
-    assert abs(bench.position - held) < 3e-4
+    assert abs(bench.position - position) < 3e-4
     assert bench.drive.powered
 
 
@@ -169,15 +165,15 @@ def test_halt_stops_every_mode_and_its_release_goes_on(drive: Maker, mode: int) 
     bench.set_in_motion(mode)
     bench.control(bench[0x6040] | 0x100)
     bench.run(0.8)
-    held = bench.position
+    position = bench.position
     assert bench.state == "enabled"
     assert bench.bit(10)
     assert not bench.bit(12)
     bench.run(0.2)
-    assert abs(bench.position - held) < 3e-4
+    assert abs(bench.position - position) < 3e-4
     bench.control(bench[0x6040] & ~0x100)
     bench.run(0.3)
-    assert abs(bench.position - held) > 0.003
+    assert abs(bench.position - position) > 0.003
 
 
 @pytest.mark.parametrize(("controlword", "option"), [(0x07, 0x605C), (0x06, 0x605B)])

@@ -1,12 +1,11 @@
 """Every mode of the drive reaches its target, inside its limits, at any step size."""
 
-from collections.abc import Callable
 from math import pi
-from typing import Any
 
 import pytest
 
-Maker = Callable[..., Any]
+from tests.virtual.models.conftest import Bench, Maker
+
 INDEX_PITCH = 2 * pi / 100
 
 
@@ -101,7 +100,7 @@ def test_csp_interpolates_over_the_interpolation_time(drive: Maker) -> None:
 def test_csp_follows_the_line_between_set_points_within_a_cycle(drive: Maker) -> None:
     bench = drive(step=0.0005).enabled(8)
     speeds = []
-    # One count a cycle is the coarsest staircase: a drive that took it literally would see 0 and 0.4 rad/s in turn.
+    # One count a cycle is the coarsest staircase. Without interpolation the speed would alternate: 0 and 0.4 rad/s.
     for n in range(2000):
         bench[0x607A] = n // 2
         bench.run(0.0005)
@@ -109,7 +108,7 @@ def test_csp_follows_the_line_between_set_points_within_a_cycle(drive: Maker) ->
             speeds.append(bench.velocity)
     assert max(speeds) - min(speeds) < 0.02
     assert sum(speeds) / len(speeds) == pytest.approx(0.1, rel=0.01)
-    # A stream that ends at once swings back once, and no more.
+    # A stream that ends abruptly swings back only once.
     bench.run(0.3, lambda _: speeds.append(bench.velocity))
     assert min(speeds) > -0.05
 
@@ -190,7 +189,7 @@ def test_the_torque_limit_is_the_firmware_s_or_the_start_stop_torque(drive: Make
 # Profile position
 
 
-def _set_point(bench: Any, target: int, controlword: int = 0x1F) -> None:
+def _set_point(bench: Bench, target: int, controlword: int = 0x1F) -> None:
     bench[0x607A] = target
     bench.control(controlword)
     assert bench.bit(12)
@@ -294,7 +293,7 @@ def test_profiles_accelerate_no_faster_than_the_firmware_allows(drive: Maker) ->
 # Profile velocity and homing
 
 
-def test_profile_velocity_ramps_reaches_and_tells_standstill(drive: Maker) -> None:
+def test_profile_velocity_ramps_reaches_and_shows_standstill(drive: Maker) -> None:
     bench = drive().enabled(3)
     bench.run(0.05)
     assert bench.bit(12)
@@ -332,7 +331,7 @@ def test_homing_on_the_index_finds_the_next_pulse_in_its_direction(
     drive: Maker, method: int, turns: int, start: float
 ) -> None:
     bench = drive(initial_position=start * INDEX_PITCH).enabled(6)
-    # From on a pulse the next one counts.
+    # From a start on a pulse, the next pulse counts.
     turns += {(33, 4.0): -1, (34, 5.0): 1}.get((method, start), 0)
     bench[0x6098] = method
     bench[0x607C] = 1000

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from rtcp.config.buses import JOINT_INPUTS, JOINT_OUTPUTS, node
-from rtcp.config.model import ArmConfig, BusConfig, Name, SlaveConfig
+from rtcp.config.model import ArmConfig, BusConfig, SlaveConfig
+from rtcp.config.numbers import Name
 from rtcp.fieldbus.master import Master
 from rtcp.ipc.states import DriveState, Missing
 

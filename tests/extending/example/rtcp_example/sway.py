@@ -42,7 +42,7 @@ class SwayController(Controller):
         axis, a, frequency, limits = command.axis, command.amplitude, command.frequency, self.limits
         if not 0 <= axis < len(self._start):
             return UnknownAxis(axis, len(self._start) - 1)
-        sound = all(isfinite(one) and one > 0.0 for one in (a, frequency, command.duration_s))
+        sound = all(isfinite(x) and x > 0.0 for x in (a, frequency, command.duration_s))
         w, e = 2.0 * pi * frequency, pi / command.duration_s if sound else 0.0
         fastest, steepest = a * (w + e), a * (w * w + 2.0 * w * e + 2.0 * e * e)
         if continues or not sound or fastest > limits.velocity[axis] or steepest > limits.acceleration[axis]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rtcp.virtual.device import DeviceModel, Option, number
+from rtcp.virtual.device import DeviceModel, Option
 from rtcp.virtual.faults.fault import DeviceFault, FaultRefused, Position
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
@@ -21,7 +21,7 @@ class ThermometerModel(DeviceModel):
     def __init__(self, **options: object) -> None:
         super().__init__(**options)
         self.kelvin, self.breaks = [300.0, 300.0], 0
-        self._channels = [number(self.objects, 0x6000, channel) for channel in (1, 2)]
+        self._channels = [self.objects[0x6000, channel] for channel in (1, 2)]
 
     def define(self, objects: ObjectDictionary) -> None:
         access = Access.RO | Access.TXPDO

@@ -1,33 +1,20 @@
-"""What a random session does on either bus: commands that follow one another, and a hand on the joystick."""
+"""Random actions of a session on any bus: commands that follow one another, and a hand on the joystick."""
 
 from __future__ import annotations
 
 from math import inf, nan
 from random import Random
 
-from rtcp.ipc.commands import (
-    ApplyTorque,
-    Command,
-    Disable,
-    Enable,
-    Guide,
-    Halt,
-    Jog,
-    MoveAtVelocity,
-    MoveGripper,
-    Reset,
-    SetDriveMode,
-    SetOutput,
-    StreamPosition,
-)
+from rtcp.config.model import ControlModeName
+from rtcp.ipc import commands
 from rtcp.ipc.states import DriveMode, JogFrame
 
 NONSENSE = (nan, inf, -inf, 1e300, -1e300, 1e9, -1e9, 0.0)
-CONTROL_MODES = ("joint", "cartesian", "joystick", "velocity", "torque")
+CONTROL_MODES: tuple[ControlModeName, ...] = ("joint", "cartesian", "joystick", "velocity", "torque")
 SHARES = (3, 3, 2, 1, 1)
 """How often each of them is chosen."""
 JOYSTICK = (63, 62, 61, 59, 55, 47, 31)
-"""Codes of the joystick, the facts' table; the first is neutral."""
+"""Levels at the inputs of a joystick that is active low: forward is bit 0; the first is neutral."""
 
 
 class RandomActions:
@@ -35,6 +22,8 @@ class RandomActions:
 
     pauses: tuple[float, float] = (0.02, 0.15)
     """Seconds between two commands of a stream."""
+    joints = 6
+    """Number of joints."""
 
     def __init__(self, random: Random) -> None:
         self.random = random
@@ -47,7 +36,7 @@ class RandomActions:
         """The last targets, rad."""
         raise NotImplementedError
 
-    def send(self, command: Command) -> bool:
+    def send(self, command: commands.Command) -> bool:
         """Send a command; return whether it was accepted."""
         raise NotImplementedError
 
@@ -56,7 +45,7 @@ class RandomActions:
         raise NotImplementedError
 
     def show(self, code: int, seconds: float) -> None:
-        """Show a byte at the joystick's inputs for so long."""
+        """Show a byte at the joystick's inputs for a random time, at most `seconds`."""
         raise NotImplementedError
 
     def leave(self) -> None:
@@ -95,8 +84,10 @@ class RandomActions:
         self.send(
             random.choice(
                 (
-                    Enable(), Disable(), Reset(), Halt(), Halt(), SetDriveMode(random.choice(list(DriveMode))),
-                    SetOutput(random.randrange(0, 18), random.random() < 0.5), MoveGripper(random.random() < 0.5),
+                    commands.Enable(), commands.Disable(), commands.Reset(), commands.Halt(), commands.Halt(),
+                    commands.SetDriveMode(random.choice(list(DriveMode))),
+                    commands.SetOutput(random.randrange(0, 18), random.random() < 0.5),
+                    commands.MoveGripper(random.random() < 0.5),
                 )
             )
         )  # fmt: skip
@@ -110,26 +101,27 @@ class RandomActions:
         """Speeds of the tool or of joints, held for a while."""
         random = self.random
         frame = random.choice(list(JogFrame))
+        count = self.joints if frame is JogFrame.JOINTS else 6
         speeds = [
             random.choice((0.0, 0.0, 1.0, -1.0))
             * (random.choice((0.05, 0.1, 0.2, 0.4)) if frame is JogFrame.JOINTS or axis > 2 else 0.1)
-            for axis in range(6)
+            for axis in range(count)
         ]
         for _ in range(random.randrange(1, 10)):
             hold_s = self.or_nonsense(random.choice((0.1, 0.25)), 0.01)
-            if not self._goes_on(self.send(Jog(self.some(speeds), frame, hold_s))):
+            if not self._goes_on(self.send(commands.Jog(self.some(speeds), frame, hold_s))):
                 break
             if random.random() < 0.1:
-                speeds[random.randrange(6)] *= -1.0
+                speeds[random.randrange(count)] *= -1.0
         self.leave()
 
     def velocity(self) -> None:
         """Joint speeds."""
         random = self.random
         for _ in range(random.randrange(1, 6)):
-            speeds = [random.choice((0.0, random.uniform(-0.5, 0.5), 0.5)) for _ in range(6)]
+            speeds = [random.choice((0.0, random.uniform(-0.5, 0.5), 0.5)) for _ in range(self.joints)]
             hold_s = self.or_nonsense(random.choice((0.1, 0.5, 1.0)))
-            if not self._goes_on(self.send(MoveAtVelocity(self.some(speeds), hold_s))):
+            if not self._goes_on(self.send(commands.MoveAtVelocity(self.some(speeds), hold_s))):
                 break
             self.seconds(0.0, 0.3)
         self.leave()
@@ -138,16 +130,16 @@ class RandomActions:
         """Joint torques, with or without an impedance about where the arm was; or an arm that is guided by hand."""
         random = self.random
         if random.random() < 0.3:
-            if self._goes_on(self.send(Guide(self.or_nonsense(random.choice((0.0, 0.3, 1.0)))))):
+            if self._goes_on(self.send(commands.Guide(self.or_nonsense(random.choice((0.0, 0.3, 1.0)))))):
                 self.seconds(0.0, 1.0)
             self.leave()
             return
         for _ in range(random.randrange(1, 6)):
             size = random.choice((1.0, 5.0, 20.0))
-            torque = self.some([random.uniform(-size, size) for _ in range(6)])
+            torque = self.some([random.uniform(-size, size) for _ in range(self.joints)])
             stiffness, damping = random.choice((0.0, 0.5, 1.0)), random.choice((0.0, 1.0))
             hold_s = self.or_nonsense(random.choice((0.1, 0.5)))
-            if not self._goes_on(self.send(ApplyTorque(torque, stiffness, damping, hold_s))):
+            if not self._goes_on(self.send(commands.ApplyTorque(torque, stiffness, damping, hold_s))):
                 break
             self.seconds(0.0, 0.3)
         self.leave()
@@ -165,7 +157,7 @@ class RandomActions:
             target = [q + v * interval for q, v in zip(target, velocity, strict=True)]
             sent = self.near(0.5) if random.random() < 0.03 else target
             stamp = self.stamp - random.choice((0.0, 0.0, 0.0, 0.0, 0.5, interval))
-            accepted = self.send(StreamPosition(self.some(sent), self.or_nonsense(stamp, 0.01)))
+            accepted = self.send(commands.StreamPosition(self.some(sent), self.or_nonsense(stamp, 0.01)))
             self.seconds(0.5 * interval, 1.5 * interval)
             if not accepted and random.random() < 0.4:
                 break

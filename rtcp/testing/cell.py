@@ -11,38 +11,38 @@ from rtcp.control.partners import Partners
 from rtcp.ipc.commands import Command, Enable
 from rtcp.ipc.observer import Answer
 from rtcp.ipc.states import State
-from rtcp.launch.simulation import Simulation
+from rtcp.testing.simulation import Simulation
 
 
 class CellSimulation:
-    """The arms of a cell; `cycle` lets the cycle pass that is due first.
+    """The arms of a cell; `cycle` runs the cycle that is due next.
 
     Args:
-        cell: its arms are on EtherCAT.
-        seed: of what is left to chance on the buses.
-        positions: rad, where the joints of an arm stand at power-on, by its name.
+        cell: a cell whose arms are on EtherCAT.
+        seed: seed of the buses.
+        positions: name of an arm -> positions of its joints at power-on, rad.
     """
 
     def __init__(
         self, cell: CellConfig, seed: int = 0, *, positions: Mapping[str, Sequence[float]] | None = None
     ) -> None:
-        self.partners = {one.name: Partners(cell, one.name) for one in cell.members}
-        with contextlib.ExitStack() as made:
+        self.partners = {member.name: Partners(cell, member.name) for member in cell.members}
+        with contextlib.ExitStack() as stack:
             self.arms = {
-                one.name: made.enter_context(
+                member.name: stack.enter_context(
                     Simulation(
-                        one.config, seed + number, positions=(positions or {}).get(one.name),
-                        partners=self.partners[one.name],
+                        member.config, seed + number, positions=(positions or {}).get(member.name),
+                        partners=self.partners[member.name],
                     )
                 )
-                for number, one in enumerate(cell.members)
+                for number, member in enumerate(cell.members)
             }  # fmt: skip
-            self._opened = made.pop_all()
+            self._opened = stack.pop_all()
         for partners in self.partners.values():
-            partners.files = [self.arms[one.name].path for one in partners.members]
+            partners.files = [self.arms[member.name].path for member in partners.members]
             partners.open()
         self.silent: set[str] = set()
-        """Arms whose loop hangs: their cycles do not come."""
+        """Names of arms whose loop hangs, so that they have no cycles."""
 
     def __enter__(self) -> CellSimulation:
         return self
@@ -50,26 +50,28 @@ class CellSimulation:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:  # fmt: skip
+        for partners in self.partners.values():
+            partners.close()
         self._opened.close()
 
     @property
     def now_ns(self) -> int:
-        """Simulated time."""
+        """Simulated time, ns."""
         return max(arm.now_ns for arm in self.arms.values())
 
     def cycle(self) -> None:
-        """Let the cycle pass that is due first."""
+        """Run the cycle that is due next."""
         awake = [arm for name, arm in self.arms.items() if name not in self.silent]
         min(awake, key=lambda arm: arm.due_ns).cycle()
 
     def run(self, seconds: float) -> None:
-        """Let so much time pass."""
+        """Run the cycles of this time, s."""
         until = self.now_ns + round(seconds * 1e9)
         while self.now_ns < until:
             self.cycle()
 
     def until(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Let time pass until `condition`, at most `seconds`; return whether it came."""
+        """Run until `condition`, at most `seconds`; return whether it was met."""
         end = self.now_ns + round(seconds * 1e9)
         while not condition():
             if self.now_ns > end:
@@ -82,7 +84,7 @@ class CellSimulation:
         return all(arm.state in states for arm in self.arms.values())
 
     def enable(self) -> None:
-        """Bring all arms to hold, each under a lease."""
+        """Bring all arms to holding, each under a lease."""
         if not self.until(lambda: self.all_in(State.READY), 5.0):
             raise RuntimeError("not all arms became ready")
         for name, arm in self.arms.items():
@@ -93,7 +95,7 @@ class CellSimulation:
             raise RuntimeError("not all arms hold")
 
     def send(self, name: str, command: Command) -> Answer:
-        """Send a command to an arm and return its answer; time passes for all."""
+        """Send a command to an arm and return its answer; advances the time of all arms."""
         arm = self.arms[name]
         number = arm.observer.command(arm.lease, command)
         answer = None

@@ -1,9 +1,9 @@
-"""The bus `inprocess`: the virtual segment without sockets, in simulated time, the same in every run.
+"""The bus `inprocess`: the virtual segment without sockets, in simulated time, deterministic.
 
-It offers what `rtcp.fieldbus.bus` describes (Bus, ProcessData). A small master writes registers and objects of the
-slaves directly, sets them up with the code of the real bus, and passes one LRW frame a cycle through the segment:
-AL states, watchdogs, SYNC0 supervision and working counters are the segment's own. Left out: drift and delay of the
-clocks (all show the simulated time and one offset), and the time that services take.
+It implements `rtcp.fieldbus.bus` (Bus, ProcessData). A small master writes registers and objects of the slaves
+directly, sets them up with the code of the real bus, and passes one LRW frame a cycle through the segment: AL states,
+watchdogs, SYNC0 supervision and working counters are the segment's. Omitted: drift and delay of the clocks (all show
+the simulated time plus one offset), and the duration of services.
 """
 
 from __future__ import annotations
@@ -13,42 +13,33 @@ from random import Random
 from types import SimpleNamespace
 from typing import Any, cast
 
+from mypy_extensions import mypyc_attr
+
 from rtcp.config.model import SlaveConfig
-from rtcp.fieldbus.al_state import AlState, state_name
+from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import PortErrors, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import sync_cycles
-from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.mailbox import parse_emergency
 from rtcp.fieldbus.pdo import layout as image_of
 from rtcp.fieldbus.registers import Steps, finish
 from rtcp.fieldbus.slave_setup import configure_slave, identity_faults
-from rtcp.virtual import coe
+from rtcp.ipc.codes import state_name
+from rtcp.ipc.events import EmergencyMessage
+from rtcp.virtual import coe, protocol
 from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.objects import SdoAbort
-from rtcp.virtual.protocol import (
-    COUNTER,
-    DATAGRAM_HEADER,
-    ERROR_FLAG,
-    ETHERTYPE,
-    FIRST_DATAGRAM,
-    FMMU_SIZE,
-    HEADER,
-    SM_SIZE,
-    TYPE_DATAGRAMS,
-    DatagramCommand,
-    Register,
-)
 from rtcp.virtual.protocol import AlState as VirtualAlState
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import Slave
 
 _EPOCH_NS = 1_000_000_000
-"""The reference clock shows at least this at the start of time."""
+"""Least time of the reference clock at the begin, ns."""
 _MAILBOX_HEADER = 6
 
 
 class InProcessSlave:
-    """A slave of the segment as its master sees it; it is also its SDO client and its register port."""
+    """The master's view of a slave of the segment; also its SDO client and its register port."""
 
     def __init__(self, slave: Slave, bus: InProcessBus, position: int) -> None:
         self.virtual = slave
@@ -65,12 +56,12 @@ class InProcessSlave:
     @property
     def error(self) -> bool:
         """Error flag of the AL status."""
-        return bool(self.virtual.esc.get(Register.AL_STATUS, 2) & ERROR_FLAG)
+        return bool(self.virtual.esc.get(protocol.Register.AL_STATUS, 2) & protocol.ERROR_FLAG)
 
     @property
     def code(self) -> int:
         """AL status code."""
-        return self.virtual.esc.get(Register.AL_STATUS_CODE, 2)
+        return self.virtual.esc.get(protocol.Register.AL_STATUS_CODE, 2)
 
     @property
     def output_bytes(self) -> int:
@@ -83,20 +74,20 @@ class InProcessSlave:
         return sum(self.length(index) for index in self.device.roles.inputs)
 
     def length(self, index: int) -> int:
-        """Length of what a sync manager carries by its PDO assignment, bytes."""
+        """Length of a sync manager's data by its PDO assignment, bytes."""
         image = self.device.image(index)
         return 0 if image is None else image.byte_length
 
     def status(self) -> SlaveState:
-        """Return what its AL status says."""
+        """Return its AL status."""
         return SlaveState(
             self.position, station_of(self.position), self.name, self.state, self.error, self.code
         )  # fmt: skip
 
-    # -- registers and objects, as `configure_slave` uses them ----------------------------------------------------
+    # -- registers and objects, for `configure_slave` -------------------------------------------------------------
 
     def read(self, station: int, address: int, length: int) -> bytes | None:
-        """Read registers; `station` is not needed here."""
+        """Read registers; `station` is ignored."""
         return self.virtual.esc.read(address, length, self._bus.now_ns)
 
     def write(self, station: int, address: int, data: bytes) -> bool:
@@ -137,12 +128,12 @@ class InProcessSlave:
             raise BusError(f"{slave_label(self.position, self.name)} is in INIT, where it has no mailbox")
         return int(self.state)
 
-    def _aborted(self, what: str, index: int, subindex: int, abort: SdoAbort) -> SdoAborted:
+    def _aborted(self, verb: str, index: int, subindex: int, abort: SdoAbort) -> SdoAborted:
         where = slave_label(self.position, self.name)
-        text = f"{where} refused to {what} 0x{index:04X}:{subindex} with abort code 0x{abort.code:08X}"
+        text = f"{where} refused to {verb} 0x{index:04X}:{subindex} with abort code 0x{abort.code:08X}"
         return SdoAborted(text, abort.code)
 
-    def emergencies(self) -> Iterable[Emergency]:
+    def emergencies(self) -> Iterable[EmergencyMessage]:
         """Yield the emergency messages in its mailbox."""
         if self.device.roles.mailboxes is None:
             return
@@ -150,15 +141,16 @@ class InProcessSlave:
         while mailbox.enabled and mailbox.full:
             message = self.read(0, mailbox.start, mailbox.length) or b""
             self._bus.segment.settle(self._bus.now_ns)
-            found = parse(message[_MAILBOX_HEADER:], self.position, self.name)
-            if found is not None:
-                yield found
+            emergency = parse_emergency(message[_MAILBOX_HEADER:], self.position)
+            if emergency is not None:
+                yield emergency
 
 
+@mypyc_attr(native_class=False)  # tests replace its methods
 class InProcessData:
     """The process image (ProcessData): one LRW frame for all slaves. `InProcessBus.configure` makes it.
 
-    `lose` frames to test what follows; `heard` says whether the last `send` reached the slaves.
+    `lose` drops frames; `heard` tells whether the last `send` reached the slaves.
     """
 
     def __init__(self, bus: InProcessBus) -> None:
@@ -172,10 +164,10 @@ class InProcessData:
         self.stale = 0
         self.heard = False
         self.wkc = -1
-        """What the last `receive` returned."""
+        """Result of the last `receive`."""
         self.outputs = [bytes(length) for length in self._lengths]
-        """What the next `send` sends, slave by slave."""
-        self._data_at = FIRST_DATAGRAM + DATAGRAM_HEADER
+        """Outputs of each slave in the next `send`."""
+        self._data_at = protocol.FIRST_DATAGRAM + protocol.DATAGRAM_HEADER
         self._inputs_at = self._data_at + sum(self._lengths)
         self._places = []
         at = self._inputs_at
@@ -184,10 +176,12 @@ class InProcessData:
             at += length
         self._counter_at = at
         length = at - self._data_at
-        header = HEADER.pack(DatagramCommand.LRW, 0, 0, 0, length, 0)
-        frame_header = (length + DATAGRAM_HEADER + COUNTER | TYPE_DATAGRAMS << 12).to_bytes(2, "little")
-        ethernet = b"\xff" * 6 + b"\x01" * 6 + ETHERTYPE.to_bytes(2, "big")
-        self._empty = bytearray(ethernet + frame_header + header + bytes(length + COUNTER))
+        header = protocol.HEADER.pack(protocol.DatagramCommand.LRW, 0, 0, 0, length, 0)
+        frame_header = (length + protocol.DATAGRAM_HEADER + protocol.COUNTER | protocol.TYPE_DATAGRAMS << 12).to_bytes(
+            2, "little"
+        )
+        ethernet = b"\xff" * 6 + b"\x01" * 6 + protocol.ETHERTYPE.to_bytes(2, "big")
+        self._empty = bytearray(ethernet + frame_header + header + bytes(length + protocol.COUNTER))
         self._answer: bytearray | None = None
         self.inputs = [bytes(length) for length in inputs]
         """Inputs of each slave in the last answer."""
@@ -195,14 +189,16 @@ class InProcessData:
         self.dc_time = self._shown = bus.now_ns + bus.offset_ns
 
     def lose(self, cycles: int, heard: bool | None = None) -> None:
-        """Lose the next `cycles` frames: on the way back (`heard`) or out; None: chance decides."""
+        """Lose the next `cycles` frames: on the way back (`heard`) or out; None: at random. 0: lose no more."""
+        if not cycles:
+            self._lost_back = self._lost_out = 0
         if self._random.random() < 0.5 if heard is None else heard:
             self._lost_back = max(self._lost_back, cycles)
         else:
             self._lost_out = max(self._lost_out, cycles)
 
     def send(self) -> None:
-        """Send the outputs that were set."""
+        """Send the outputs."""
         self._answer = None
         self.heard = not self._lost_out
         if self._lost_out:
@@ -219,7 +215,7 @@ class InProcessData:
             self._answer = frame
 
     def receive(self) -> int:
-        """Return the working counter of the answer, -1 where none came; then inputs and `dc_time` stay."""
+        """Return the working counter of the answer, -1: none; inputs and `dc_time` then stay."""
         answer = self._answer
         if answer is None:
             self.missed += 1
@@ -235,18 +231,18 @@ class InProcessData:
         return self.inputs[index]
 
     def set_output(self, index: int, data: bytes) -> None:
-        """Set the outputs of slave `index` for the next `send`; data of another length is not taken."""
+        """Set the outputs of slave `index` for the next `send`; data of another length is ignored."""
         if len(data) == self._lengths[index]:
             self.outputs[index] = data
 
 
 class InProcessBus:
-    """A segment and its master in one object; its user moves the time by `advance_to` between two exchanges.
+    """A segment and its master in one object; its user advances the time by `advance_to` between two exchanges.
 
     Args:
         devices: the models in the order of the cable.
-        seed: of chance: the reference clock's offset, and the direction in which a frame is lost.
-        now_ns: the instant at which time begins.
+        seed: seed of the reference clock's offset and of the direction in which a frame is lost.
+        now_ns: initial time, ns.
     """
 
     def __init__(self, devices: Sequence[DeviceModel], seed: int = 0, now_ns: int = 0) -> None:
@@ -254,11 +250,11 @@ class InProcessBus:
         self.notes: list[str] = []
         self.now_ns = now_ns
         self.offset_ns = _EPOCH_NS + self.random.randrange(_EPOCH_NS)
-        """Reference clock less simulated time."""
-        shown = now_ns + self.offset_ns
+        """Reference clock minus simulated time, ns."""
+        clock_ns = now_ns + self.offset_ns
         for device in devices:
             device.join(devices)
-        virtual = [Slave(device, b"", 0.0, shown, 0, now_ns) for device in devices]
+        virtual = [Slave(device, b"", 0.0, clock_ns, 0, now_ns) for device in devices]
         self.segment = Segment(virtual, now_ns)
         self.slaves = [InProcessSlave(slave, self, position) for position, slave in enumerate(virtual, 1)]
         self._configs: Sequence[SlaveConfig] = ()
@@ -267,21 +263,21 @@ class InProcessBus:
     # -- Bus --------------------------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Nothing has to be opened."""
+        """Do nothing: there is no interface."""
 
     def scan(self) -> tuple[SlaveInfo, ...]:
-        """Bring the slaves to PRE-OP and return what is known of them."""
+        """Bring the slaves to PRE-OP and return their descriptions."""
         self.request_state(AlState.PREOP)
         return tuple(map(_info, self.slaves))
 
     def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> InProcessData:
-        """Compare the slaves with `slaves`, set them up, bring them to SAFE-OP with outputs of zero.
+        """Compare the segment with `slaves`, set the slaves up, bring them to SAFE-OP with all outputs 0.
 
         Raises:
-            BusError: what is on the bus differs from the configuration, or a slave refuses.
+            BusError: the bus differs from the configuration, or a slave refuses.
         """
-        found = [(slave.device.identity, slave) for slave in self.slaves]
-        pysoem_like = [SimpleNamespace(man=who.vendor_id, id=who.product_code, name=who.name) for who, _ in found]
+        identities = [(slave.device.identity, slave) for slave in self.slaves]
+        pysoem_like = [SimpleNamespace(man=who.vendor_id, id=who.product_code, name=who.name) for who, _ in identities]
         if faults := identity_faults(pysoem_like, slaves):
             raise BusError(*faults)
         self._configs, self._period_ns = slaves, period_ns
@@ -292,19 +288,19 @@ class InProcessBus:
         return InProcessData(self)
 
     def set_up(self, position: int) -> list[str]:
-        """Bring a slave to PRE-OP and configure it; return what was tolerated. Raises BusError where it refuses."""
+        """Bring a slave to PRE-OP and configure it; return tolerated deviations. Raises BusError where it refuses."""
         slave, config = self._slave(position), self._configs[position - 1]
         slave.name = config.name
         self.request_state(AlState.PREOP, [position])
         client = cast(Any, slave)
         notes = finish(configure_slave(client, client, 0, config, self._period_ns))
-        # As they will be mapped: slaves after this one may still have another mapping.
-        outputs = [image_of(other.device.rpdo).bytes for other in self._configs]
-        inputs = [image_of(other.device.tpdo).bytes for other in self._configs]
-        found, expected = (slave.output_bytes, slave.input_bytes), (outputs[position - 1], inputs[position - 1])
-        if found != expected:
+        # From the configuration: later slaves may still have another mapping.
+        outputs = [image_of(entry.device.rpdo).bytes for entry in self._configs]
+        inputs = [image_of(entry.device.tpdo).bytes for entry in self._configs]
+        actual, expected = (slave.output_bytes, slave.input_bytes), (outputs[position - 1], inputs[position - 1])
+        if actual != expected:
             raise BusError(
-                f"{slave_label(position, config.name)} has {found[0]} bytes of outputs and {found[1]} of inputs, its "
+                f"{slave_label(position, config.name)} has {actual[0]} bytes of outputs and {actual[1]} of inputs, its "
                 f"device file {expected[0]} and {expected[1]} (keys `rpdo` and `tpdo`)"
             )
         roles = slave.device.roles
@@ -314,18 +310,18 @@ class InProcessBus:
         clock = slave.virtual.clock
         if device.assign_activate and clock is not None:
             shift = round(device.sync0_shift_us * 1000)
-            shown = self.now_ns + self.offset_ns
-            offset = shown - clock.local(self.now_ns)
-            slave.write(0, Register.DC_OFFSET, offset.to_bytes(8, "little", signed=True))
+            clock_ns = self.now_ns + self.offset_ns
+            offset = clock_ns - clock.local(self.now_ns)
+            slave.write(0, protocol.Register.DC_OFFSET, offset.to_bytes(8, "little", signed=True))
             sync0, after = sync_cycles(device, self._period_ns)
-            start = shown + (shift - shown) % max(sync0, self._period_ns)
-            slave.write(0, Register.DC_START_TIME, start.to_bytes(8, "little"))
-            slave.write(0, Register.DC_SYNC0_CYCLE, sync0.to_bytes(4, "little") + after.to_bytes(4, "little"))
-            slave.write(0, Register.DC_ACTIVATION, bytes((device.assign_activate >> 8,)))
+            start = clock_ns + (shift - clock_ns) % max(sync0, self._period_ns)
+            slave.write(0, protocol.Register.DC_START_TIME, start.to_bytes(8, "little"))
+            slave.write(0, protocol.Register.DC_SYNC0_CYCLE, sync0.to_bytes(4, "little") + after.to_bytes(4, "little"))
+            slave.write(0, protocol.Register.DC_ACTIVATION, bytes((device.assign_activate >> 8,)))
         return notes
 
     def _map(self, slave: InProcessSlave, managers: Sequence[int], logical: int, first: int) -> None:
-        """Configure the sync managers of a direction, one after the other, and their FMMUs from number `first` on
+        """Configure the sync managers of a direction, in order, and their FMMUs from number `first` on
         (ETG.1000.4, 6.6 and 6.7)."""
         for fmmu, index in enumerate(managers, first):
             manager, length = slave.device.sync_managers[index], slave.length(index)
@@ -333,23 +329,29 @@ class InProcessBus:
                 continue
             start = manager.start.to_bytes(2, "little")
             head = start + length.to_bytes(2, "little")
-            slave.write(0, Register.SYNC_MANAGER + SM_SIZE * index, head + bytes((manager.control, 0, 1, 0)))
+            slave.write(
+                0, protocol.Register.SYNC_MANAGER + protocol.SM_SIZE * index, head + bytes((manager.control, 0, 1, 0))
+            )
             direction = 1 if index in slave.device.roles.inputs else 2
             setting = logical.to_bytes(4, "little") + length.to_bytes(2, "little") + b"\x00\x07"
-            slave.write(0, Register.FMMU + FMMU_SIZE * fmmu, setting + start + bytes((0, direction, 1, 0, 0, 0)))
+            slave.write(
+                0,
+                protocol.Register.FMMU + protocol.FMMU_SIZE * fmmu,
+                setting + start + bytes((0, direction, 1, 0, 0, 0)),
+            )
             logical += length
 
     def request_state(self, state: int, positions: Iterable[int] | None = None) -> None:
-        """Request `state` of the slaves at `positions`, None: of all; a way down acknowledges an error."""
+        """Request `state` of the slaves at `positions`, None: of all; a lower state acknowledges an error."""
         for slave in self._at(positions):
             if state >= AlState.PREOP and slave.state == AlState.INIT:
                 for number in slave.device.roles.mailboxes or ():
                     manager = slave.device.sync_managers[number]
                     head = manager.start.to_bytes(2, "little") + manager.length.to_bytes(2, "little")
                     settings = head + bytes((manager.control, 0, 1, 0))
-                    slave.write(0, Register.SYNC_MANAGER + SM_SIZE * number, settings)
-            acknowledge = ERROR_FLAG if slave.error and state < slave.state else 0
-            slave.write(0, Register.AL_CONTROL, (int(state) | acknowledge).to_bytes(2, "little"))
+                    slave.write(0, protocol.Register.SYNC_MANAGER + protocol.SM_SIZE * number, settings)
+            acknowledge = protocol.ERROR_FLAG if slave.error and state < slave.state else 0
+            slave.write(0, protocol.Register.AL_CONTROL, (int(state) | acknowledge).to_bytes(2, "little"))
         self.settle()
 
     def wait_for_state(self, state: int, timeout_s: float, positions: Iterable[int] | None = None) -> tuple[str, ...]:
@@ -362,17 +364,21 @@ class InProcessBus:
         )
 
     def acknowledge(self, position: int) -> None:
-        """Acknowledge a slave's error: it stays in the state that it is in, without the error indication."""
+        """Acknowledge a slave's error: clears the error indication, keeps the state."""
         slave = self._slave(position)
-        slave.write(0, Register.AL_CONTROL, (int(slave.state) | ERROR_FLAG).to_bytes(2, "little"))
+        slave.write(0, protocol.Register.AL_CONTROL, (int(slave.state) | protocol.ERROR_FLAG).to_bytes(2, "little"))
 
     def read_states(self) -> tuple[SlaveState, ...]:
-        """Return what every slave's AL status says."""
+        """Return the AL status of every slave."""
         return tuple(slave.status() for slave in self.slaves)
 
-    def emergencies(self) -> tuple[Emergency, ...]:
+    def emergencies(self) -> tuple[EmergencyMessage, ...]:
         """Return the emergency messages that came since the last call."""
-        return tuple(found for slave in self.slaves for found in slave.emergencies())
+        return tuple(emergency for slave in self.slaves for emergency in slave.emergencies())
+
+    def sdo(self, position: int) -> InProcessSlave:
+        """Return SDO access to a slave."""
+        return self._slave(position)
 
     def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
         """Return an object's value; raises SdoAborted, or BusError where there is no mailbox or no such slave."""
@@ -389,7 +395,7 @@ class InProcessBus:
     # -- time and faults --------------------------------------------------------------------------------------------
 
     def advance_to(self, now_ns: int) -> None:
-        """Let time pass up to `now_ns`, with every event of the segment at its instant."""
+        """Advance the time to `now_ns`, with every event of the segment at its instant."""
         segment = self.segment
         while segment.next_event <= now_ns:
             self.now_ns = max(self.now_ns, segment.next_event)
@@ -399,7 +405,7 @@ class InProcessBus:
         self.now_ns = max(now_ns, self.now_ns)
 
     def settle(self) -> None:
-        """Let the slaves act on what the master has written, and step their devices."""
+        """Let the slaves process the master's writes, and step their devices."""
         segment = self.segment
         segment.settle(self.now_ns)
         while segment.busy:

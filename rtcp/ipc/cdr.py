@@ -1,4 +1,4 @@
-"""Messages of ROS 2 by the hundred: CDR (OMG DDSI-RTPS, 10.5) whose strings stay; numpy fills in the numbers."""
+"""Batches of ROS 2 messages in CDR (OMG DDSI-RTPS, 10.5): strings are constant, numpy fills in the numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rtcp.ipc.recording import ENCAPSULATION
+from rtcp.ipc.schema import RecordSchema
+
+ENCAPSULATION = b"\x00\x01\x00\x00"
+"""CDR, little endian (OMG DDSI-RTPS, 10.5)."""
 
 
 class CdrTemplate:
@@ -38,7 +41,13 @@ class CdrTemplate:
         """Append a std_msgs/Header: its time is named sec and nanosec, with `suffix`."""
         return self.numbers(f"sec{suffix}", "<i4").numbers(f"nanosec{suffix}", "<u4").string(frame)
 
-    def fill(self, count: int, values: Mapping[str, npt.ArrayLike]) -> list[bytes]:
+    def record(self, schema: RecordSchema) -> CdrTemplate:
+        """Append the fields of a cycle record, by their names; its size is that of `rtcp.ipc.recording.cycle_type`."""
+        for field in schema.fields:
+            self.numbers(field.name, np.dtype(field.type).newbyteorder("<").str, *field.shape)
+        return self._align(8)
+
+    def fill(self, count: int, values: Mapping[str, npt.ArrayLike] | npt.NDArray[np.void]) -> list[bytes]:
         """Return `count` messages; each value has `count` as its first dimension."""
         blank = np.frombuffer(ENCAPSULATION + bytes(self._fixed), np.uint8)
         rows = np.tile(blank, (count, 1))

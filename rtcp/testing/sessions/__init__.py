@@ -1,0 +1,5 @@
+"""Random sessions of a simulated arm, each from a seed, checked by what goes over its bus."""
+
+from rtcp.testing.sessions.session import Result, run_session
+
+__all__ = ["Result", "run_session"]

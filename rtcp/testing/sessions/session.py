@@ -1,0 +1,473 @@
+"""A random session from a seed: where it begins, what is done in it, and its result."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import isfinite, sqrt
+from random import Random
+from typing import Any, Literal
+
+import rtcp
+from kinematics import forward
+from rtcp.config.model import MODE_CHANNELS, MOST_AXES, ArmConfig, ControlModeName, DriveModeName
+from rtcp.config.segment import SegmentConfig
+from rtcp.ipc import commands
+from rtcp.ipc.message import PAYLOAD_SIZE
+from rtcp.ipc.states import ControlMode, State
+from rtcp.motion.limits import Values
+from rtcp.motion.planning.interpolation import quaternion
+from rtcp.motion.planning.plan import COLUMNS, CUBIC, KIND, LINE, POSITIONS, QUINTIC, VELOCITIES
+from rtcp.testing.sessions.actions import CONTROL_MODES, NONSENSE, SHARES, RandomActions
+from rtcp.testing.sessions.checker import Bounds, Reading, Violation, reading_of
+from rtcp.testing.sessions.commander import FAULTS, KINDS, ODD_INTEGERS, Commander, random_command
+
+LONGEST_WAIT_S = 0.3
+MOVABLE = (State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING, State.CLOSING)
+_CLOSE_S = 2.5
+_PLACES = 1000
+"""Start positions that are tried before one that touches something is taken."""
+
+Outcome = Literal["passed", "violation", "error", "worker_died"]
+
+
+@dataclass(frozen=True)
+class Result:
+    """The result of one session; but for its costs, `cpu_s` and `wall_s`, the same wherever it runs."""
+
+    seed: int
+    outcome: Outcome
+    version: str = rtcp.__version__
+    simulated_s: float = 0.0
+    cycles: int = 0
+    commands: int = 0
+    faults: int = 0
+    """Faults and actions of people."""
+    largest_step: float = 0.0
+    """Largest step of a target, as a fraction of what the speed limit allows."""
+    largest_acceleration: float = 0.0
+    """The same of the acceleration limit."""
+    largest_speed: float = 0.0
+    """Largest speed of a target, rad/s."""
+    violation: str = ""
+    """The first violation (fields of `rtcp.testing.sessions.checker.Violation`) or the error, as JSON."""
+    cpu_s: float = 0.0
+    wall_s: float = 0.0
+
+
+class Session(RandomActions):
+    """A session on the in-process bus. Everything follows from `random`.
+
+    Args:
+        random: source of randomness.
+        config: the arm.
+        reading: how its frames are read; None: by the configuration.
+        segment: the slaves; None: the configured segment.
+        periods_us: cycles to choose from, us; empty: the configured one.
+    """
+
+    def __init__(
+        self,
+        random: Random,
+        config: ArmConfig,
+        reading: Reading | None = None,
+        segment: SegmentConfig | None = None,
+        periods_us: Sequence[float] = (),
+    ) -> None:
+        super().__init__(random)
+        self.reading = reading = reading_of(config) if reading is None else reading
+        self.bounds = Bounds.configured(config)
+        self.joints = len(config.joints)
+        modes: list[tuple[ControlModeName, int]] = [*zip(CONTROL_MODES, SHARES, strict=True)]
+        if config.arm is None:
+            modes = [(mode, share) for mode, share in modes if mode not in ("cartesian", "joystick")]
+        (mode,) = random.choices([name for name, _ in modes], [share for _, share in modes])
+        cycle = replace(config.cycle, period_us=random.choice(periods_us)) if periods_us else config.cycle
+        drive_mode = random.choice(drive_modes(config))
+        chosen = replace(config, cycle=cycle, drive_mode=drive_mode, control_mode=mode)
+        positions = self._place(random.random() < 0.9)
+        self.commander = commander = Commander(chosen, random.randrange(1 << 30), positions, reading, segment)
+        self.period_s = chosen.cycle.period_us * 1e-6
+        self.mode = ControlMode[mode.upper()]
+        self.actions: list[tuple[int, Callable[[], object]]] = [
+            (4, self.enable),
+            (24, self._begin_motion),
+            (12, self.command),
+            (4, self._change_mode),
+            (2, lambda: self.send(commands.SetOutput(self.or_odd(random.randrange(0, 18)), random.random() < 0.5))),
+            (1, lambda: commander.send(random_command(random, self.joints))),
+            (1, lambda: commander.send_raw(self._kind(), [self._number() for _ in range(PAYLOAD_SIZE // 8)])),
+            (1, lambda: commander.send(self._random_move(), lease=random.randrange(3))),
+            (1, lambda: commander.fault(random.randrange(self.joints), random.choice(FAULTS))),
+            (2, lambda: commander.lose(random.choice((1, 1, 2, 5, 20, 60)), random.random() < 0.5)),
+            (1, lambda: commander.drop(random.randrange(1, len(config.slaves) + 1))),
+            (3, self._silence),
+            (2, self._halt),
+            (2, self._push),
+            (2, self.joystick),
+            (1, self.toggle),
+            (1, self.emergency),
+            (6, self.limits),
+        ]
+        if more := len(config.models[1:]):
+            self.actions.append((4, lambda: self.send(commands.SetTool(self.or_odd(random.randint(0, more))))))
+
+    @property
+    def commanded(self) -> list[float]:
+        """The last targets on the bus, rad."""
+        return self.commander.commanded
+
+    def send(self, command: commands.Command) -> bool:
+        """Send a command."""
+        return self.commander.send(command)
+
+    def seconds(self, least: float, most: float) -> None:
+        """Let time pass."""
+        self.commander.wait(max(1, int(self.random.uniform(least, most) / self.period_s)))
+
+    def show(self, code: int, seconds: float) -> None:
+        """Show a byte at the joystick's inputs for a random time, at most `seconds`."""
+        self.commander.joystick(~code & 0x3F)
+        self.seconds(0.0, seconds)
+
+    def or_odd(self, number: int) -> int:
+        """Return the integer, or now and then one that nobody should send."""
+        return self.random.choice(ODD_INTEGERS) if self.random.random() < 0.03 else number
+
+    def is_free(self, bounds: Bounds, q: Sequence[float], clearance: float = 0.0, tool: int = 0) -> bool:
+        """Whether the arm keeps clear of boxes and of itself, by `clearance` m more than it must."""
+        workspace = self.reading.workspaces[tool]
+        return workspace is None or workspace.deepest(bounds, q) < -clearance
+
+    def _place(self, free: bool) -> list[float]:
+        bounds, random = self.bounds, self.random
+        for _ in range(_PLACES):
+            place = [random.uniform(low, high) for low, high in zip(bounds.low, bounds.high, strict=True)]
+            if random.random() < 0.1:
+                axis = random.randrange(self.joints)
+                place[axis] = random.choice((bounds.low[axis] - 0.01, bounds.high[axis] + 0.01))
+            if not free or self.is_free(bounds, place, 0.01):
+                break
+        return place
+
+    def _kind(self) -> int:
+        return self.random.choice((self.random.randrange(1 << 32), self.random.choice(KINDS).number))
+
+    def _number(self) -> float:
+        return self.or_nonsense(self.random.uniform(-3.0, 3.0))
+
+    def _begin_motion(self) -> None:
+        """Mostly one that the control mode takes, now and then another."""
+        mode = self.random.choice(list(ControlMode)) if self.random.random() < 0.1 else self.mode
+        special = {ControlMode.VELOCITY: self.velocity, ControlMode.TORQUE: self.torque,
+                   ControlMode.JOYSTICK: self.joystick}  # fmt: skip
+        usual = (self._move, self._move, self.trajectory, self.invade, self.line, self.stream, self.jog,
+                 self.setpoints, self.open_trajectory)  # fmt: skip
+        (special[mode] if mode in special else self.random.choice(usual))()
+
+    def _change_mode(self) -> None:
+        (wanted,) = self.random.choices(list(ControlMode), SHARES)
+        if self.send(commands.SetControlMode(wanted)):
+            self.mode = wanted
+
+    def enable(self) -> None:
+        """Enable the arm, mostly after what its state needs."""
+        if self.random.random() < 0.9:
+            self.commander.enable()
+        else:
+            self.send(commands.Enable())
+
+    def _random_move(self) -> commands.MoveJoints:
+        random, bounds = self.random, self.bounds
+        span = random.choice((1.0, 1.0, 0.2, 0.02))
+        here = self.commanded
+        target = []
+        for q, low, high in zip(here, bounds.low, bounds.high, strict=True):
+            far = random.uniform(low, high)
+            wanted = q + span * (far - q)
+            if random.random() < 0.05:
+                wanted = random.choice((low, high, low - 1e-3, high + 1e-3))
+            target.append(self.or_nonsense(wanted) if random.random() < 0.1 else wanted)
+        if random.random() < 0.2:
+            kept = random.randrange(self.joints)
+            target = [q if axis != kept else wanted for axis, (q, wanted) in enumerate(zip(here, target, strict=True))]
+        speed = random.choice((0.5, 0.5, 0.2, random.uniform(0.0, 0.6)))
+        return commands.MoveJoints(tuple(target), self.or_nonsense(speed), random.random() < 0.5)
+
+    def _move(self) -> None:
+        self.send(self._random_move())
+
+    def _silence(self) -> None:
+        self._begin_long_motion()
+        self.commander.fall_silent()
+        self.seconds(*self.random.choice(((0.0, 0.8), (1.3, 2.0))))
+        self.commander.acquire()
+
+    def _halt(self) -> None:
+        self._begin_long_motion()
+        self.seconds(0.0, 0.4)
+        self.send(commands.Halt())
+        self.seconds(*self.random.choice(((0.0, 0.2), (0.8, 1.5))))
+
+    def _begin_long_motion(self) -> None:
+        """Mostly begin one that only a stop ends soon."""
+        if self.random.random() < 0.7:
+            bounds = self.bounds
+            there = [max(a, min(b, q)) for q, a, b in zip(self.near(0.5), bounds.low, bounds.high, strict=True)]
+            self.send(commands.MoveJoints(tuple(there), 0.1, True))
+
+    def _push(self) -> None:
+        axis = self.random.randrange(self.joints)
+        self.commander.push(axis, self.random.uniform(-15.0, 15.0))
+        self.seconds(0.0, 0.2)
+        self.commander.push(axis, 0.0)
+
+    def trajectory(self) -> None:
+        """A trajectory that nobody has planned: its pieces may be far too quick, or none at all."""
+        random = self.random
+        kind = random.choice((CUBIC, QUINTIC))
+        rows = [_waypoint(0.0, self.commanded, kind)] if random.random() < 0.5 else []
+        for t, q in self.waypoints((0.1, 0.3, 0.3, 1.0), 8):
+            speed = [random.uniform(-0.3, 0.3) if random.random() < 0.5 else 0.0 for _ in q]
+            rows.append(_waypoint(t, q, kind, speed))
+        rows[-1][VELOCITIES : VELOCITIES + self.joints] = [0.0] * self.joints
+        self._run(commands.RunTrajectory, rows)
+
+    def open_trajectory(self) -> None:
+        """A trajectory to which rows are appended that nobody has planned; in time, too late, or never."""
+        random, observer = self.random, self.commander.simulation.observer
+        kind = random.choice((CUBIC, QUINTIC))
+        rows = [
+            _waypoint(t, q, kind, [random.choice((0.0, random.uniform(-0.3, 0.3))) for _ in q])
+            for t, q in self.waypoints((0.1, 0.3, 0.3, 1.0), 12)
+        ]
+        known = random.randrange(1, len(rows) + 1)
+        slot = observer.write_plan(rows[:known])
+        going = self.send(commands.RunTrajectory(slot, known, open=True))
+        while going and known < len(rows):
+            self.seconds(0.0, 0.6)
+            more = random.randrange(1, len(rows) - known + 1)
+            observer.extend_plan(slot, known, rows[known : known + more])
+            known += more
+            going = self.send(commands.ExtendTrajectory(self.or_odd(known), random.random() < 0.3))
+
+    def setpoints(self) -> None:
+        """A stream through shared memory, with and without velocities, and with what nobody should send."""
+        random, simulation = self.random, self.commander.simulation
+        stream = self.or_odd(simulation.now_ns)
+        interval, pace = random.choice((0.0005, 0.002, 0.01, 0.05)), random.choice((0.1, 0.3, 0.6))
+        here = self.commanded
+        velocity = [random.uniform(-pace, pace) for _ in here]
+        if not self.send(commands.OpenStream(stream)):
+            return
+        for _ in range(random.randrange(3, 40)):
+            self.stamp += interval
+            if random.random() < 0.1:
+                velocity = [random.uniform(-pace, pace) for _ in here]
+            here = [q + v * interval for q, v in zip(here, velocity, strict=True)]
+            rest = [0.0] * (MOST_AXES - len(here))
+            sent = self.near(0.5) if random.random() < 0.02 else here
+            speeds = velocity if random.random() < 0.9 else [random.uniform(-9.0, 9.0) for _ in here]
+            rates = [random.uniform(-5.0, 5.0) for _ in here]
+            numbers = [*self.some(sent), *rest, *self.some(speeds), *rest, *self.some(rates), *rest]
+            bits = random.choice((0, 1, 1, 3)) if random.random() < 0.97 else random.randrange(256)
+            stamp = self.or_nonsense(self.stamp - random.choice((0.0, 0.0, 0.0, 0.0, 0.0, 0.5, interval)), 0.01)
+            if not simulation.observer.setpoint(stream, bits, stamp, numbers):
+                break
+            if random.random() < 0.7:
+                self.seconds(0.5 * interval, 1.5 * interval)
+
+    def _run(self, kind: type[commands.RunTrajectory] | type[commands.RunLines], rows: list[list[float]]) -> None:
+        random = self.random
+        if random.random() < 0.1:
+            rows[random.randrange(len(rows))][random.randrange(COLUMNS)] = random.choice(NONSENSE)
+        slot = self.commander.simulation.observer.write_plan(rows)
+        self.send(kind(self.or_odd(slot), self.or_odd(len(rows))))
+
+    def invade(self) -> None:
+        """A smooth trajectory to where a point of the arm would be in a keep-out box, or the tool outside its box."""
+        bounds, here = self.commander.bounds, self.commanded
+        for _ in range(60):
+            near = self.near(0.8)
+            there = [max(a, min(b, q)) for q, a, b in zip(near, bounds.low, bounds.high, strict=True)]
+            if not self.is_free(bounds, there, tool=self.commander.checker.tool):
+                break
+        else:
+            return
+        took = 0.1 + max(abs(b - a) for a, b in zip(here, there, strict=True)) / self.random.choice((0.1, 0.25))
+        rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, here), (took, there))]
+        slot = self.commander.simulation.observer.write_plan(rows)
+        if self.send(commands.RunTrajectory(slot, len(rows))):
+            self.seconds(0.5 * took, took)
+
+    def line(self) -> None:
+        """Straight pieces from where the tool is, planned by nobody: out of reach, too quick, through a singularity."""
+        random = self.random
+        arm = self.commander.simulation.config.arm
+        if arm is None:
+            return
+        pose = forward(arm, self.commanded[:6])
+        orientation = quaternion(pose.rotation)
+        rows, at = [], list(pose.position)
+        for _ in range(random.randrange(1, 4)):
+            far = random.choice((0.02, 0.1, 0.3))
+            to = [x + random.uniform(-far, far) for x in at]
+            length = sqrt(sum((b - a) ** 2 for a, b in zip(at, to, strict=True)))
+            speed = random.choice((0.05, 0.1, 0.25, 0.5)) / max(length, 1e-3)
+            took = 2.0 / speed
+            piece = [*at, *orientation, *to, *orientation, speed, 4 * speed, 40 * speed, length, took]
+            rows.append([*piece, *[0.0] * (KIND - len(piece)), LINE])
+            at = to
+        self._run(commands.RunLines, rows)
+
+    # -- limits -----------------------------------------------------------------------------------------------------
+
+    def limits(self) -> None:
+        """Narrower ones, now and then too narrow for the arm, too wide, or none at all; or those of the start again."""
+        random, commander = self.random, self.commander
+        old = commander.limits
+        widest = Values.configured(commander.simulation.config)
+        if random.random() < 0.2:
+            commander.set_limits(widest)
+            return
+        here = self.commanded
+        share = random.choice((0.2, 0.6, 0.6, 0.9, 0.9, 1.1))
+        changes: dict[str, Any] = {}
+        if random.random() < 0.5:
+            low = [self.or_nonsense(q + share * (a - q), 0.005) for q, a in zip(here, widest.low, strict=True)]
+            high = [self.or_nonsense(q + share * (b - q), 0.005) for q, b in zip(here, widest.high, strict=True)]
+            changes |= {"low": tuple(low), "high": tuple(high)}
+        for name in ("velocity", "acceleration", "jerk", "torque"):
+            if random.random() < 0.5:
+                scale = random.choice((0.3, 0.3, 0.5, 0.5, 0.7, 0.7, 1.0, 1.1))
+                changes[name] = tuple(self.or_nonsense(scale * x, 0.005) for x in getattr(widest, name))
+        if random.random() < 0.3 and widest.box is not None:
+            by = random.choice((0.05, 0.2, -0.1))
+            changes["box"] = tuple(x + (by if at < 3 else -by) for at, x in enumerate(widest.box))
+        if random.random() < 0.3:
+            by = random.choice((0.02, 0.1, -0.1))
+            changes["keep_out"] = tuple(
+                tuple(x - by if at < 3 else x + by for at, x in enumerate(box)) for box in widest.keep_out
+            )
+        commander.set_limits(replace(old, **changes))
+
+    def toggle(self) -> None:
+        """Give the joystick to the chair for a while."""
+        self.commander.toggle(False)
+        self.seconds(0.0, 0.3)
+        self.commander.toggle(True)
+
+    def emergency(self) -> None:
+        """Press the emergency stop, and mostly reset it later."""
+        self.commander.press(True)
+        self.seconds(*self.random.choice(((0.05, 0.6), (0.05, 0.6), (0.8, 1.5))))
+        self.commander.press(False)
+        self.seconds(0.0, 0.1)
+        if self.random.random() < 0.8:
+            self.send(commands.Reset())
+            self.commander.simulation.until(lambda: self.commander.state is not State.RESETTING, 0.5)
+
+    def run(self, seconds: float) -> None:
+        """Run for this simulated time, s, or to the first violation."""
+        commander, random = self.commander, self.random
+        weights = [weight for weight, _ in self.actions]
+        while commander.seconds < seconds and not (commander.simulation.done or commander.checker.violations):
+            if commander.state not in MOVABLE and random.random() < 0.7:
+                commander.enable()
+            else:
+                random.choices(self.actions, weights)[0][1]()
+            commander.wait(int(random.expovariate(8.0 / LONGEST_WAIT_S) / self.period_s) + 1)
+            if random.random() < 0.3:
+                commander.wait(int(random.uniform(0.0, LONGEST_WAIT_S) / self.period_s))
+        if random.random() < 0.15:
+            commander.send(commands.Shutdown())
+            commander.wait(int(_CLOSE_S / self.period_s))
+
+    def result(self, seed: int, error: Exception | None = None) -> Result:
+        """Return the result of the session as it is now."""
+        commander, checker = self.commander, self.commander.checker
+        first = checker.violations[0] if checker.violations else None
+        return Result(
+            seed,
+            "error" if error is not None else "passed" if first is None else "violation",
+            simulated_s=commander.seconds,
+            cycles=checker.frames,
+            commands=commander.taken.total() + commander.refused.total(),
+            faults=commander.faults.total(),
+            largest_step=checker.largest_step,
+            largest_acceleration=checker.largest_acceleration,
+            largest_speed=checker.largest_speed,
+            violation=error_json(error) if error is not None else "" if first is None else violation_json(first),
+        )
+
+
+Inspect = Callable[[Session, Exception | None], None]
+
+
+def run_session(
+    seed: int,
+    config: ArmConfig,
+    seconds: float,
+    segment: SegmentConfig | None = None,
+    inspect: Inspect | None = None,
+) -> Result:
+    """Run the session of a seed; an error of the session is its result.
+
+    Args:
+        seed: of everything in it.
+        config: the arm.
+        seconds: simulated time, s.
+        segment: the slaves; None: the configured segment.
+        inspect: called with the session before it is closed, and with its error.
+    """
+    began = time.thread_time(), time.perf_counter()
+    session: Session | None = None
+    failure: Exception | None = None
+    try:
+        session = Session(Random(seed), config, segment=segment)
+        session.run(seconds)
+    except Exception as error:
+        failure = error
+    try:
+        if session is None:
+            return Result(seed, "error", violation=error_json(failure))
+        if inspect is not None:
+            inspect(session, failure)
+        cpu_s, wall_s = time.thread_time() - began[0], time.perf_counter() - began[1]
+        return replace(session.result(seed, failure), cpu_s=cpu_s, wall_s=wall_s)
+    finally:
+        if session is not None:
+            session.commander.close()
+
+
+def drive_modes(config: ArmConfig) -> list[DriveModeName]:
+    """Return the drive modes that the process data of all joints have; CSP, the usual one, twice."""
+    devices = {slave.name: slave.device for slave in config.slaves}
+    modes: list[DriveModeName] = ["csp"]
+    for mode, needed in MODE_CHANNELS.items():
+        images = [devices[joint.slave].of_axis(joint.axis) for joint in config.joints]
+        mapped = [({c.name for c in image.outputs}, {c.name for c in image.inputs}) for image in images]
+        if all(outputs.issuperset(needed[0]) and inputs.issuperset(needed[1]) for outputs, inputs in mapped):
+            modes.append(mode)
+    return modes
+
+
+def violation_json(violation: Violation) -> str:
+    """Return the fields of a violation as JSON; infinite ends are left out."""
+    fields = asdict(violation)
+    return json.dumps({n: v for n, v in fields.items() if not isinstance(v, float) or isfinite(v)})
+
+
+def error_json(error: BaseException | None) -> str:
+    """Return an exception as JSON."""
+    return json.dumps({"error": type(error).__name__, "message": str(error)})
+
+
+def _waypoint(t: float, q: list[float], kind: float, speed: Sequence[float] = ()) -> list[float]:
+    row = [0.0] * COLUMNS
+    row[0], row[KIND] = t, kind
+    row[POSITIONS : POSITIONS + len(q)] = q
+    row[VELOCITIES : VELOCITIES + len(speed)] = speed
+    return row
