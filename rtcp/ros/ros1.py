@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Collection, Coroutine, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -59,6 +59,8 @@ _MASTER_S = 1.0
 _MASTER_TIMEOUT_S = 2.0
 _CLOSE_S = 2.0
 """Longest wait for the end of the connection; the end of the process ends it too."""
+_END_S = 5.0
+"""Longest wait from the signal to the end of the process, s."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ def run(options: NodeOptions) -> None:
     ends = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: ends.set())
+    threading.Thread(target=_end_late, args=(ends,), daemon=True).start()
     master = Master()
     while not (identity := master.identity()):
         if ends.wait(_MASTER_S):
@@ -107,6 +110,15 @@ def run(options: NodeOptions) -> None:
         # rospy registers its topics only with the master of its start: for another one the process restarts.
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     rospy.signal_shutdown("the node ends")
+
+
+def _end_late(ends: threading.Event) -> None:
+    """End the process some time after the signal: without a master a registration never returns, and rospy's own end
+    waits for its lock.
+    """
+    ends.wait()
+    time.sleep(_END_S)
+    os._exit(0)
 
 
 class Master:
@@ -154,7 +166,8 @@ class Publications:
         self._speed_override = rospy.Publisher("speed_override_state", Float64, queue_size=10)
         self._diagnostics = rospy.Publisher("/diagnostics", DiagnosticArray, queue_size=10)
         self._tf = rospy.Publisher("/tf", TFMessage, queue_size=100, tcp_nodelay=True)
-        self._channels: dict[tuple[str, str], rospy.Publisher] = {}
+        self._channels: dict[tuple[str, str], rospy.Publisher | None] = {}
+        """None: not yet registered."""
 
     def connected(self, config: ArmConfig) -> None:
         """Set robot_description, where the geometry is known and it is not yet set."""
@@ -222,14 +235,22 @@ class Publications:
 
     def channels(self, sample: ChannelSample) -> None:
         """Publish each channel on a separate topic, and subscribe to commands of settable ones."""
-        for slave, values in sample.values.items():
-            for name, value in values.items():
-                if (slave, name) not in self._channels:
-                    topic = "/".join(("gpio", *(re.sub(r"\W", "_", part, flags=re.ASCII) for part in (slave, name))))
-                    self._channels[slave, name] = rospy.Publisher(topic, Float64, queue_size=10)
-                    if (slave, name) in sample.settable:
-                        self._commands.take_output(f"{topic}/command", slave, name)
-                self._channels[slave, name].publish(value)
+        values = {(slave, name): value for slave, named in sample.values.items() for name, value in named.items()}
+        if new := [channel for channel in values if channel not in self._channels]:
+            self._channels |= dict.fromkeys(new)
+            # A registration waits for the master, without which the other topics go on.
+            threading.Thread(target=self._register, args=(new, sample.settable), daemon=True).start()
+        for channel, value in values.items():
+            if publisher := self._channels[channel]:
+                publisher.publish(value)
+
+    def _register(self, channels: Sequence[tuple[str, str]], settable: Collection[tuple[str, str]]) -> None:
+        """Register the topics of channels (slave, name)."""
+        for slave, name in channels:
+            topic = "/".join(("gpio", *(re.sub(r"\W", "_", part, flags=re.ASCII) for part in (slave, name))))
+            self._channels[slave, name] = rospy.Publisher(topic, Float64, queue_size=10)
+            if (slave, name) in settable:
+                self._commands.take_output(f"{topic}/command", slave, name)
 
 
 class Commands:

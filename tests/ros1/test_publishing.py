@@ -215,10 +215,12 @@ def test_after_the_return_of_a_killed_roscore_everything_is_there_again(
 ) -> None:
     listener.until("joint_states", lambda message: True)
     ros.kill_core()
-    # Connections continue without a master.
-    before = len(listener.heard("joint_states"))
-    until(lambda: len(listener.heard("joint_states")) > before + 10, "joint states without a master")
-    ros.start_core()
+    try:
+        # Connections continue without a master.
+        before = len(listener.heard("joint_states"))
+        until(lambda: len(listener.heard("joint_states")) > before + 10, "joint states without a master")
+    finally:
+        ros.start_core()
     topics = {"/joint_states", "/feedback_states", "/robot_status", "/diagnostics", "/tf", "/joint_command"}
     until(lambda: topics <= set(ros.run("/usr/bin/rostopic", "list").stdout.split()), "the topics")
     assert "/rtcp" in ros.run("/usr/bin/rosnode", "list").stdout.split()
@@ -248,18 +250,28 @@ def test_a_node_that_was_killed_is_replaced_by_the_next_one(
 def test_a_node_that_is_ended_leaves_the_master_without_its_name(ros: Ros, node: subprocess.Popen[str]) -> None:
     until(lambda: "/rtcp" in ros.run("/usr/bin/rosnode", "list").stdout.split(), "the node")
     node.send_signal(signal.SIGTERM)
-    assert node.wait() == 0
+    assert node.wait(PATIENCE_S) == 0
     assert "/rtcp" not in ros.run("/usr/bin/rosnode", "list").stdout.split()
 
 
-def test_a_node_ends_without_a_master_too(ros: Ros, node: subprocess.Popen[str], listener: Listener) -> None:
-    listener.until("joint_states", lambda message: True)
-    ros.kill_core()
+def test_without_a_master_a_node_publishes_a_platform_that_comes_and_ends(ros: Ros, platform: Platform) -> None:
+    platform.rtcp("stop", check=None)
+    node = begin_node(ros, platform)
+    listener = Listener(ros)
     try:
-        node.send_signal(signal.SIGTERM)
-        assert node.wait() == 0
+        listener.until("robot_status", lambda message: message["in_motion"] == -1)
+        ros.kill_core()
+        try:
+            # The topics of the platform's channels cannot be registered before there is a master.
+            platform.rtcp("start", "--detach")
+            until(lambda: len(listener.heard("joint_states")) > 100, "joint states")
+            node.send_signal(signal.SIGTERM)
+            assert node.wait(PATIENCE_S) == 0
+        finally:
+            ros.start_core()
     finally:
-        ros.start_core()
+        ros.stop(listener.process)
+        ros.stop(node)
 
 
 def test_a_word_that_is_no_remapping_is_refused(ros_on_the_path: None, platform: Platform) -> None:
