@@ -24,6 +24,8 @@ from rtcp.processes.shape_setting import interlocks  # noqa: E402
 from rtcp.processes.shape_setting.config import ShapeSettingConfig  # noqa: E402
 
 _PART = re.compile(r"(<!-- generated: ([^\n]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_REQUIREMENT = re.compile(r'    "(?!rtcp)([\w.-]+)(.*)",(?:  # (.+))?')
+"""A dependency in pyproject.toml: name, versions and marker, reason."""
 _FILES: dict[str, tuple[type, str]] = {
     "arm": (model.ArmFile, ""),
     "device": (model.DeviceDescription, ""),
@@ -143,6 +145,18 @@ def methods(part: str) -> str:
     )
 
 
+def dependencies(section: str) -> str:
+    """Return the table of the dependencies in this list of pyproject.toml."""
+    project = (FOLDER.parent / "pyproject.toml").read_text()
+    lines = re.search(rf"^{section} = \[\n(.*?)^\]", project, re.DOTALL | re.MULTILINE)
+    assert lines is not None
+    matches = [match for match in map(_REQUIREMENT.fullmatch, lines[1].splitlines()) if match]
+    return table(
+        ["package", "versions", "reason"],
+        [[name, f"`{limits}`", why] for name, limits, why in map(re.Match.groups, matches)],
+    )
+
+
 def _parameters(kind: type) -> Iterator[tuple[str, str, object]]:
     hints = get_type_hints(kind, include_extras=True)
     for entry in fields(kind):
@@ -159,6 +173,7 @@ def _line(text: str | None) -> str:
 
 
 PARTS: dict[str, Callable[..., str]] = {
+    "dependencies": dependencies,
     "keys": keys,
     "machine": machine,
     "methods": methods,
