@@ -342,7 +342,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="rtcp.gateway.server")
     parser.add_argument("--directory", type=Path, required=True)
     parser.add_argument("--ready-fd", type=int, required=True)
+    parser.add_argument("--wait", action="store_true", help="begin with a byte from standard input")
     arguments = parser.parse_args()
+    if arguments.wait and not sys.stdin.buffer.read(1):
+        return 1  # the launcher has ended
     to_stderr = logging.StreamHandler(sys.stderr)
     to_stderr.setFormatter(log_format())
     logging.basicConfig(level=logging.INFO, handlers=[to_stderr])

@@ -1,4 +1,7 @@
-"""Start and stop the platform of the runtime directory: segment, loop, gateway, in this order, and back."""
+"""Start and stop the platform of the runtime directory: segment, loop, gateway, in this order, and back.
+
+Their modules, most of the time of a start, are loaded side by side.
+"""
 
 from __future__ import annotations
 
@@ -265,6 +268,8 @@ def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_
     for log in directory.glob("*.log"):
         log.replace(log.with_name(f"{log.name}.1"))  # kept until the next start
     try:
+        # Each process loads its modules while the one before it starts.
+        loop = platform.load_loop()
         if interface == VIRTUAL and config.bus.VIRTUAL_PROCESS:
             facts = platform.start_segment(segment_path(config), options.poll)
             interface, segment = str(facts["interface"]), int(facts["pid"])
@@ -274,8 +279,9 @@ def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_
         Session(
             config, bus, interface, segment, began_ns, state, platform.segment_control, cell and _placed(cell), name
         ).write(directory)  # fmt: skip
-        platform.start_loop(report)
-        platform.await_gateway(platform.begin_gateway())
+        ready = platform.begin_gateway(waits=True)
+        platform.start_loop(loop, report)
+        platform.await_gateway(ready)
     except BaseException:
         with defer_signals():
             platform.stop()

@@ -47,14 +47,19 @@ Report = Callable[[str], None]
 
 
 def spawn(
-    module: str, *arguments: str, stdout: int | BinaryIO, stderr: int | BinaryIO, env: dict[str, str] | None = None
+    module: str,
+    *arguments: str,
+    stdout: int | BinaryIO,
+    stderr: int | BinaryIO,
+    stdin: int = subprocess.DEVNULL,
+    env: dict[str, str] | None = None,
 ) -> tuple[subprocess.Popen[bytes], int]:
     """Start a module as a process in a session of its own; return also the pipe on which it reports, as JSON lines."""
     reading, writing = os.pipe()
     try:
         child = subprocess.Popen(
             [sys.executable, "-m", module, *arguments, "--ready-fd", str(writing)],
-            stdin=subprocess.DEVNULL,
+            stdin=stdin,
             stdout=stdout,
             stderr=stderr,
             env=env,
@@ -77,6 +82,13 @@ def read_lines(reading: int, timeout_s: float) -> Iterator[dict[str, Any]]:
             *lines, pending = (pending + read).split(b"\n")
             for line in lines:
                 yield json.loads(line)
+
+
+def _release(child: subprocess.Popen[bytes]) -> None:
+    """Have a process go on that waits for its turn."""
+    if child.stdin is not None:
+        with contextlib.suppress(BrokenPipeError), child.stdin:  # it has ended
+            child.stdin.write(b"\n")
 
 
 class Platform:
@@ -105,11 +117,17 @@ class Platform:
 
     # -- starting -----------------------------------------------------------------------------------------------
 
-    def _spawn(self, name: str, module: str, *arguments: str) -> tuple[subprocess.Popen[bytes], int]:
-        """Start a process and write down its id; where the disk refuses that, kill it."""
+    def _spawn(
+        self, name: str, module: str, *arguments: str, waits: bool = False
+    ) -> tuple[subprocess.Popen[bytes], int]:
+        """Start a process and write down its id; where the disk refuses that, kill it.
+
+        `waits`: it loads its modules, and does nothing before `_release`.
+        """
         # A signal between start and registration would leave a process that nobody knows of.
         with open_log(self.directory / f"{name}.log") as log, defer_signals():
-            child, reading = spawn(module, *arguments, stdout=log, stderr=log, env=self._environment)
+            arguments, stdin = ((*arguments, "--wait"), subprocess.PIPE) if waits else (arguments, subprocess.DEVNULL)
+            child, reading = spawn(module, *arguments, stdin=stdin, stdout=log, stderr=log, env=self._environment)
             before = getattr(self.processes, name)
             self._children.append(child)
             setattr(self.processes, name, session.identify(child.pid))
@@ -121,11 +139,16 @@ class Platform:
                 child.kill()
                 child.wait()
                 raise
-        others = set(available_cpus()) - {choose_cpu(self._config.cycle.cpu)}
-        if name != "loop" and others:
-            with contextlib.suppress(OSError):
-                os.sched_setaffinity(child.pid, others)  # off the cycle's CPU
+        if name != "loop" and not waits:
+            self._move_off_the_cycle(child)
         return child, reading
+
+    def _move_off_the_cycle(self, child: subprocess.Popen[bytes]) -> None:
+        """Keep a process off the cycle's CPU."""
+        if others := set(available_cpus()) - {choose_cpu(self._config.cycle.cpu)}:
+            with contextlib.suppress(OSError):
+                for thread in os.listdir(f"/proc/{child.pid}/task"):
+                    os.sched_setaffinity(int(thread), others)
 
     def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
         """Start the segment; return its ready line: pid, interface, slaves."""
@@ -139,9 +162,14 @@ class Platform:
                 return line
         raise self._not_ready("segment", child)
 
-    def start_loop(self, report: Report) -> None:
+    def load_loop(self) -> tuple[subprocess.Popen[bytes], int]:
+        """Start the loop's process, which loads its modules and waits; return what `start_loop` takes."""
+        return self._spawn("loop", "rtcp.control.process", "--directory", str(self.directory), waits=True)
+
+    def start_loop(self, loaded: tuple[subprocess.Popen[bytes], int], report: Report) -> None:
         """Start the loop; return when all slaves are in OP."""
-        child, reading = self._spawn("loop", "rtcp.control.process", "--directory", str(self.directory))
+        child, reading = loaded
+        _release(child)
         for line in read_lines(reading, _READY_TIMEOUT_S):
             if line["event"] == "phase":
                 report(line["text"])
@@ -153,14 +181,19 @@ class Platform:
                 return
         raise self._not_ready("loop", child)
 
-    def begin_gateway(self) -> int:
-        """Start the gateway; return the pipe on which it reports that the control socket listens."""
-        _, reading = self._spawn("gateway", "rtcp.gateway.server", "--directory", str(self.directory))
+    def begin_gateway(self, waits: bool = False) -> int:
+        """Start the gateway; return the pipe on which it reports that the control socket listens.
+
+        `waits`: it only loads its modules before `await_gateway`.
+        """
+        _, reading = self._spawn("gateway", "rtcp.gateway.server", "--directory", str(self.directory), waits=waits)
         return reading
 
     def await_gateway(self, reading: int) -> None:
         """Wait until the gateway that was started last listens at the control socket."""
         child = self._children[-1]
+        self._move_off_the_cycle(child)
+        _release(child)
         for _ in read_lines(reading, _READY_TIMEOUT_S):
             return
         raise self._not_ready("gateway", child)

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 import yaml
 
-from rtcp.config.find import default_config
+from rtcp.config import default_config, load
 from rtcp.ipc.errors import Refused
 from rtcp.ipc.jsonrpc import INTERNAL_ERROR
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, segment_control
+from rtcp.realtime.scheduling import choose_cpu
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import CUBEMARS, FULL_CIA402, PERIOD_US, SLAVES, Platform
 from tests.e2e.wire import COUNTS_PER_RAD, outputs
@@ -45,6 +46,13 @@ def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> Non
     shared.until(lambda status: status["wkc"]["actual"] == 3 * SLAVES, "a frame with the full working counter")
     assert status["dc"]["locked"]
     assert status["cycle_ns"] == PERIOD_US * 1000
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one CPU runs all")
+def test_no_thread_of_gateway_and_segment_runs_on_the_cpu_of_the_cycle(shared: Platform) -> None:
+    pids, cpu = shared.pids(), choose_cpu(load(default_config()).cycle.cpu)
+    tasks = [task for name in ("gateway", "segment") for task in os.listdir(f"/proc/{pids[name]}/task")]
+    assert not [task for task in tasks if cpu in os.sched_getaffinity(int(task))]
 
 
 def test_the_status_has_every_promised_field(shared: Platform) -> None:

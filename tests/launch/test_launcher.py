@@ -216,6 +216,18 @@ def test_a_gateway_whose_pipe_closes_before_it_exits_is_reported_with_its_exit_c
         running.await_gateway(reading)
 
 
+@pytest.mark.parametrize("module", ["rtcp.control.process", "rtcp.gateway.server"])
+def test_a_process_that_waits_for_its_turn_ends_with_its_launcher(module: str, directory: Path) -> None:
+    child, reading = platform.spawn(
+        module, "--directory", str(directory), "--wait",
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    # As the end of the launcher would, it closes the pipe; without a turn the session, which is missing, is not read.
+    said, _ = child.communicate()
+    assert (child.returncode, said) == (1, b"")
+    assert not list(platform.read_lines(reading, 60.0))
+
+
 def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmConfig) -> None:
     (directory / "loop.log").write_text("what went wrong")
     (directory / "gateway.log").write_text("who asked")
