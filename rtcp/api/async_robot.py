@@ -8,7 +8,6 @@ import itertools
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 from rtcp.api.results import Pose, Positions, Progress, result
@@ -60,9 +59,7 @@ class AsyncRobot(Methods):
         self._receiving = asyncio.create_task(self._receive(reader))
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def close(self) -> None:

@@ -9,12 +9,12 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rtcp.api.results import Arrival, Status, result
 from rtcp.api.robot import Robot
 from rtcp.config.cell import CellConfig, Member
+from rtcp.ipc.closing import Closing
 from rtcp.ipc.errors import NotRunning, RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
 from rtcp.ipc.session import SessionError, read_session
@@ -132,7 +132,7 @@ def cell_of_this_arm() -> tuple[CellConfig, Member] | None:
     return None
 
 
-class CellStream:
+class CellStream(Closing):
     """Setpoints of several arms in step: the end of one stream ends all of them.
 
     Args:
@@ -141,14 +141,6 @@ class CellStream:
 
     def __init__(self, streams: Mapping[str, Stream]) -> None:
         self.streams = dict(streams)
-
-    def __enter__(self) -> CellStream:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def is_open(self) -> bool:
@@ -187,7 +179,7 @@ class CellStream:
             stream.close()
 
 
-class Cell:
+class Cell(Closing):
     """The arms of a running cell. Closing it stops its motions.
 
     Args:
@@ -215,14 +207,6 @@ class Cell:
         except RtcpError:
             self.close()
             raise
-
-    def __enter__(self) -> Cell:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close all connections; a second time is harmless."""

@@ -13,7 +13,6 @@ from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
 
 from rtcp.api.results import (
@@ -36,6 +35,7 @@ from rtcp.api.results import (
     result,
 )
 from rtcp.ipc.client import ControlClient
+from rtcp.ipc.closing import Closing
 from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
@@ -796,7 +796,7 @@ class Methods:
         return Call(name, fields, _as_is, progress)
 
 
-class Robot(Methods):
+class Robot(Methods, Closing):
     """A connection to the running platform; one call at a time, from one thread.
 
     Closing it stops its motions: its lease ends, and the arm comes to a controlled stop.
@@ -814,14 +814,6 @@ class Robot(Methods):
         self._client = ControlClient(name, path)
         self.directory = runtime_directory() if path is None else path.parent
         """Runtime directory of its platform."""
-
-    def __enter__(self) -> Robot:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the connection; a second time is harmless."""

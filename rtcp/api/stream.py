@@ -9,10 +9,10 @@ import struct
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rtcp.config.model import MOST_AXES
+from rtcp.ipc.closing import Closing
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.events import Event, LeaseExpired, MotionEnded, PermissionWithdrawn, Stopped
 from rtcp.ipc.layout import SETPOINT_ENDS, SETPOINT_HAS_ACCELERATION, SETPOINT_HAS_VELOCITY
@@ -25,7 +25,7 @@ _ENDS = (MotionEnded, LeaseExpired, PermissionWithdrawn)
 _NOTHING = (0.0,) * (3 * MOST_AXES)
 
 
-class Stream:
+class Stream(Closing):
     """Setpoints for the joints at any rate, each the newest: `with robot.open_stream() as stream: stream.send(q)`.
 
     The joints follow smoothly under their limits and come to rest where the stream pauses; without a setpoint for 0.2 s
@@ -59,14 +59,6 @@ class Stream:
     def from_json(cls, answer: Mapping[str, Any]) -> Stream:
         """Read the answer of the method `open_stream`."""
         return cls(Path(answer["directory"]), answer["stream"], answer["lease"], answer["since"])
-
-    def __enter__(self) -> Stream:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def is_open(self) -> bool:

@@ -13,7 +13,6 @@ import termios
 import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
 from typing import Annotated
 
 import typer
@@ -83,9 +82,7 @@ class Keyboard:
         tty.setcbreak(self._descriptor)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._settings)
 
     def read(self, timeout_s: float) -> str:

@@ -9,10 +9,10 @@ import struct
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rtcp.ipc import jsonrpc
+from rtcp.ipc.closing import Closing
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
 from rtcp.ipc.session import is_running, read_processes
@@ -29,7 +29,7 @@ _PEER = struct.Struct("3i")
 """Process, user and group at the other end (unix(7), SO_PEERCRED)."""
 
 
-class ControlClient:
+class ControlClient(Closing):
     """A connection to the running platform.
 
     Closing it while a move is under way ends the lease of this client: the arm comes to a controlled stop.
@@ -52,14 +52,6 @@ class ControlClient:
         self._request = 0
         self._received = bytearray()
         self._socket = _connect(self._path)
-
-    def __enter__(self) -> ControlClient:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the connection; a second time is harmless."""

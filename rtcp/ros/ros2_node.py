@@ -13,7 +13,6 @@ import signal
 import threading
 from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Protocol
 
 from kinematics.forward import frames
@@ -154,9 +153,7 @@ class Commands:
     def __enter__(self) -> Commands:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with contextlib.suppress(concurrent.futures.TimeoutError, RtcpError):
             self.submit(self.commander.close()).result(_CLOSE_S)
         self.loop.call_soon_threadsafe(self.loop.stop)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
 
 from rtcp.config.cell import CellConfig
 from rtcp.control.partners import Partners
@@ -47,9 +46,7 @@ class CellSimulation:
     def __enter__(self) -> CellSimulation:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:  # fmt: skip
+    def __exit__(self, *_: object) -> None:
         for partners in self.partners.values():
             partners.close()
         self._opened.close()

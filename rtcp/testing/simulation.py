@@ -12,8 +12,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
@@ -25,6 +24,7 @@ from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.master import Master
 from rtcp.fieldbus.supervision import SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.closing import Closing
 from rtcp.ipc.commands import Command, Enable
 from rtcp.ipc.events import SlavesLeftOp
 from rtcp.ipc.layout import LEASE_DURATION_AT, LEASE_ID_AT, LEASE_RENEWED_AT
@@ -59,10 +59,7 @@ class Frame(NamedTuple):
     """Inputs of each slave in the last received answer."""
 
 
-_Simulation = TypeVar("_Simulation", bound="Simulation")
-
-
-class Simulation:
+class Simulation(Closing):
     """An arm, its loop and a commander in one process; `cycle` runs one cycle.
 
     Args:
@@ -122,14 +119,6 @@ class Simulation:
         """Lease of the commands; 0: none."""
         self.on_frame: Callable[[Frame], None] | None = None
         """Called after each cycle."""
-
-    def __enter__(self: _Simulation) -> _Simulation:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:  # fmt: skip
-        self.close()
 
     def close(self) -> None:
         """Close the blackboard and remove its file; may be called again."""

@@ -14,7 +14,6 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from types import TracebackType
 
 from rtcp import __version__
 from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder, FrameError
@@ -239,9 +238,7 @@ class SimpleMessageServer:
         self._publishing = asyncio.create_task(self._publish())
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close every connection; where a client has moved the arm it stops, and its drives are disabled."""
         self._close_servers()
         self._publishing.cancel()
