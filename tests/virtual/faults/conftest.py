@@ -12,6 +12,8 @@ from typing import NamedTuple
 import pytest
 
 from rtcp.virtual.faults.control import SegmentClient
+from rtcp.virtual.protocol import DatagramCommand
+from tests.virtual.frames import Datagram, build
 
 ROOT = Path(__file__).parents[3]
 CHILD = Path(__file__).with_name("raw_child.py")
@@ -100,5 +102,9 @@ def exchange(segment: Running) -> Iterator[Exchange]:
             reply = json.loads(child.stdout.readline())
             return Traffic(reply["sent"], [(at, bytes.fromhex(frame)) for at, frame in reply["received"]])
 
+        # A segment that has just started can lose the CPU for longer than an answer is worth sending.
+        request = build(Datagram(DatagramCommand.BRD, 0, 0, 0, bytes(2)))
+        while not send([request], answers=0).received:
+            pass
         yield send
         child.stdin.close()
