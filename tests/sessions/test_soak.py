@@ -5,10 +5,15 @@ Workers are real processes.
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import json
 import os
 import signal
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -200,6 +205,39 @@ def test_a_black_box_is_never_overwritten(tmp_path: Path) -> None:
 def other_version(wanted: SessionPlan, seeds: Sequence[int]) -> Batch:
     batch = run_batch(wanted, seeds)
     return batch if 1 in seeds else batch._replace(results=[replace(r, version="0.0.1") for r in batch.results])
+
+
+@contextlib.contextmanager
+def scheduler(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """A scheduler and a worker as another machine has them, and the scheduler's address."""
+    file = folder / "scheduler.json"
+    common = ("--scheduler-file", str(file), "--host", "127.0.0.1", "--no-dashboard")
+    with contextlib.ExitStack() as opened:
+        processes = [
+            opened.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-m", f"distributed.cli.dask_{name}", *common, *options],
+                    stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=folder,
+                    env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+                )
+            )
+            for name, options in (("scheduler", ["--port", "0"]), ("worker", ["--nthreads", "1", "--no-nanny"]))
+        ]  # fmt: skip
+        for process in processes:
+            opened.callback(process.kill)
+        while not file.exists() or not (text := file.read_text()):
+            time.sleep(0.05)
+        yield processes[0], json.loads(text)["address"]
+
+
+def test_a_scheduler_that_ends_is_said_and_what_is_known_is_kept(tmp_path: Path) -> None:
+    with scheduler(tmp_path) as (process, address), cluster(address) as client:
+        assert soaked(client, plan(4), tmp_path / "whole").outcomes == {"passed": 4}
+        with pytest.raises(SoakError) as raised:
+            soaked(client, plan(60), tmp_path / "part", progress=lambda summary: process.kill())
+    known = rows_of(tmp_path / "part")
+    assert 0 < len(known) < 60
+    assert (raised.value.reason, raised.value.fields["sessions"]) == ("lost", len(known))
 
 
 def test_a_worker_of_another_version_is_refused_by_its_name(client: Client, tmp_path: Path) -> None:
