@@ -12,6 +12,7 @@ import rtcp
 from rtcp.api import State
 from rtcp.api.cell import Cell
 from rtcp.config.find import default_config
+from rtcp.ipc.errors import Refused
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.virtual.request_socket import RequestClient
@@ -66,14 +67,22 @@ def put_in_order(operator: RequestClient) -> None:
 
 def restore(cell: Cell) -> None:
     """Reset and enable what needs it, and go home."""
-    until = time.monotonic() + 10.0
+    until = time.monotonic() + 30.0
     while any(status.state in (State.STOPPING, State.DISABLING, State.STARTING) for status in cell.status().values()):
         assert time.monotonic() < until
         time.sleep(0.05)
     cell.reset()
     for name, status in cell.status().items():
-        if status.state is State.READY:
-            cell.arms[name].enable()
+        while status.state is State.READY:
+            assert time.monotonic() < until
+            try:
+                cell.arms[name].enable()
+                break
+            except Refused as error:
+                # The joints still run out after a fault.
+                if error.reason != "not_at_standstill":
+                    raise
+                time.sleep(0.05)
     cell.move_joints(dict.fromkeys(cell.arms, ABB_HOME))
 
 
@@ -95,7 +104,7 @@ class Records:
 
     def await_speed(self, least: float) -> None:
         """Wait until every arm is faster than `least`, rad/s."""
-        until = time.monotonic() + 10.0
+        until = time.monotonic() + 30.0
         while time.monotonic() < until:
             newest = [observer.latest() for observer in self._observers.values()]
             if all(record is not None and np.abs(record["commanded_velocity"]).max() > least for record in newest):
