@@ -1,4 +1,6 @@
-"""How long the host kept the CPU from a process that wanted it: the one reason to repeat a test in real time.
+"""How long the host kept the CPU from a process that wanted it: the reason to repeat a test in real time.
+
+Without the right to SCHED_FIFO every process of a test can lose the CPU like that, and the watcher does not see it.
 
 As a program it wakes up every 2 ms and writes into a file the longest delay of a wake-up, s, since the number there was
 last set to 0.
@@ -8,6 +10,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import resource
 import struct
 import subprocess
 import sys
@@ -22,6 +25,11 @@ _INTERVAL_S = 0.002
 _NICENESS = 5
 """Of a watcher that may not be of real time: more important, it would see no delay that a test suffers."""
 _DELAY = struct.Struct("d")
+
+
+def may_run_in_real_time() -> bool:
+    """Whether this user has the right to SCHED_FIFO."""
+    return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] > 0
 
 
 class Stalls:
