@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import TypeVar
 
 _T = TypeVar("_T", bound="Closing")
 
 
-class Closing:
+class Closing(ABC):
     """Base of what is closed: `with made: ...` closes it."""
 
     def __enter__(self: _T) -> _T:
@@ -16,6 +17,6 @@ class Closing:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @abstractmethod
     def close(self) -> None:
         """Close it; a second time is harmless."""
-        raise NotImplementedError

@@ -122,7 +122,7 @@ class Platform:
     ) -> tuple[subprocess.Popen[bytes], int]:
         """Start a process and write down its id; where the disk refuses that, kill it.
 
-        `waits`: it loads its modules, and does nothing before `_release`.
+        `waits`: it loads its modules, on any CPU since nothing moves yet, and does nothing before `_release`.
         """
         # A signal between start and registration would leave a process that nobody knows of.
         with open_log(self.directory / f"{name}.log") as log, defer_signals():
