@@ -10,7 +10,7 @@ from typing import Any
 from rtcp.config.model import DeviceDescription, SlaveConfig
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.registers import Register, RegisterPort, Steps
+from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
 
 _DC_SPEED_DEFAULT = b"\x00\x10"
 _SYNC_DELAY_NS = 100_000_000
@@ -19,10 +19,15 @@ _SETTLED_NS = 2_000
 _SETTLE_S = 1.5
 _UNTIL_2000_NS = 946_684_800 * 1_000_000_000
 _SYNC_ATTEMPTS = 4
+_SAME_DELAY_NS = 100
+"""More than two measurements of one delay differ by, less than the delay of a slave's neighbour does."""
+_NOT_MEASURED = 0x7FFF_FFFF
+"""Content of a delay's register until SOEM has written it: that frame may get lost too."""
+_MEASUREMENTS = 20
 
 
 def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig], period_ns: int) -> None:
-    """Measure the delays, set the offsets and start SYNC0 where the device's file says so (`assign_activate`).
+    """Set the clocks and start SYNC0 where the device's file says so (`assign_activate`).
 
     Args:
         master: pysoem's master, its slaves in PRE-OP and mapped.
@@ -33,15 +38,77 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
     Raises:
         BusError: no clock, SYNC0 in the past, or an activation that reads back differently.
     """
-    clocks = master.config_dc()
-    for position, config in enumerate(slaves, 1):
+    labels = [slave_label(position, config.name) for position, config in enumerate(slaves, 1)]
+    clocks = set_clocks(master, port, labels)
+    for position, (label, config) in enumerate(zip(labels, slaves, strict=True), 1):
         word = config.device.assign_activate
         if not word:
             continue
-        label = slave_label(position, config.name)
         if not clocks:
             raise BusError(f"{label}: `assign_activate` is 0x{word:04X} but no slave has a distributed clock")
         start_sync(port, station_of(position), label, config.device, period_ns)
+
+
+def set_clocks(master: Any, port: RegisterPort, labels: Sequence[str]) -> bool:
+    """Measure the propagation delays and set all clocks by the first; return whether there is one.
+
+    SOEM measures, and does not notice a frame that was lost: the slave then gets the times of the one before it. So a
+    delay counts once it was found twice; delays and offsets are then written with frames that are checked.
+
+    Args:
+        master: pysoem's master, its slaves in PRE-OP.
+        port: the port for registers.
+        labels: the slaves in messages, in the order of the cable.
+
+    Raises:
+        BusError: a slave stopped answering, or its delay was another one each time.
+    """
+    clocks = [
+        position
+        for position, label in enumerate(labels, 1)
+        if _read(port, position, Register.FEATURES, 2, label) & FEATURE_DC
+    ]
+    if not clocks:
+        return False
+    reference, *others = clocks
+    measured: dict[int, list[int]] = {position: [] for position in others}
+    delays: dict[int, int] = {}
+    for _ in range(_MEASUREMENTS):
+        missing = [position for position in others if position not in delays]
+        for position in missing:
+            marker = _NOT_MEASURED.to_bytes(4, "little")
+            port.put(station_of(position), Register.DC_DELAY, marker, labels[position - 1])
+        # Once at least: with it SOEM adds the reference's time to the cycle's frame.
+        master.config_dc()
+        for position in missing:
+            delay = _read(port, position, Register.DC_DELAY, 4, labels[position - 1])
+            if delay == _NOT_MEASURED:
+                continue
+            if any(abs(delay - before) <= _SAME_DELAY_NS for before in measured[position]):
+                delays[position] = delay
+            measured[position].append(delay)
+        if len(delays) == len(others):
+            break
+    else:
+        position = missing[0]
+        found = ", ".join(map(str, measured[position])) or "nothing"
+        raise BusError(
+            f"{labels[position - 1]}: {_MEASUREMENTS} measurements of its propagation delay (register 0x0928) do not "
+            f"agree, two have to be within {_SAME_DELAY_NS} ns; found, in ns: {found}"
+        )
+    # SOEM leaves the reference's alone; a slave that has moved along the cable still has its delay from before.
+    port.put(station_of(reference), Register.DC_DELAY, bytes(4), labels[reference - 1])
+    for position in others:
+        delay_register = delays[position].to_bytes(4, "little")
+        take_over_time(port, station_of(position), labels[position - 1], delay_register, [reference], always=True)
+    return True
+
+
+def _read(port: RegisterPort, position: int, register: Register, length: int, label: str) -> int:
+    content = port.read(station_of(position), register, length)
+    if content is None:
+        raise BusError(f"{label} stopped answering while the clocks were set")
+    return int.from_bytes(content, "little")
 
 
 def take_over_time(

@@ -19,7 +19,7 @@ from rtcp.esi.sii import read_sii
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, PdoInfo, SlaveInfo, SlaveState, slave_label, station_of
-from rtcp.fieldbus.clocks import start_clocks
+from rtcp.fieldbus.clocks import set_clocks, start_clocks
 from rtcp.fieldbus.describe import describe_device, pdos_of_eeprom
 from rtcp.fieldbus.eeprom import (
     BOOTSTRAP_WORD,
@@ -150,11 +150,11 @@ class SoemBus:
         """Find the slaves, bring them to PRE-OP, measure delays; return their descriptions.
 
         Raises:
-            BusError: no slave answers.
+            BusError: no slave answers, or the measurements of a delay do not agree.
         """
         self._discover()
         self._to_preop()
-        self._master.config_dc()
+        set_clocks(self._master, self.port, [slave_label(i, name) for i, name in enumerate(self._names, 1)])
         slaves = self._describe()
         tree = Topology.of([info.ports for info in slaves])
         return tuple(

@@ -200,7 +200,7 @@ def refused(bus: SoemBus, count: int, how: str) -> Any:
 
 
 def up(bus: SoemBus, count: int, complete_access: bool = True) -> Any:
-    """Configure the slaves up to SAFE-OP, as the loop's process does."""
+    """Configure the slaves up to SAFE-OP, as the loop's process does; latch what their clocks show."""
     bus.scan()
     make, attempts = bus._map, []
 
@@ -210,7 +210,17 @@ def up(bus: SoemBus, count: int, complete_access: bool = True) -> Any:
 
     bus._map = count_attempt  # type: ignore[method-assign]
     data = bus.configure([with_device(config, complete_access=complete_access) for config in arm(count)], 1_000_000)
-    return {"expected_wkc": data.expected_wkc, "tries": bus.port.tries, "attempts": len(attempts)}
+    tries = bus.port.tries
+    bus.port.tries = 25
+    bus.port.write_all(0x0900, bytes(4))
+    read = bus.port.read
+    delays = [int.from_bytes(read(station_of(i), 0x0928, 4) or b"", "little") for i in range(1, count + 1)]
+    times = [
+        sum(int.from_bytes(read(station_of(i), at, 8) or b"", "little") for at in (0x0918, 0x0920)) - delay
+        for i, delay in enumerate(delays, 1)
+    ]
+    return {"expected_wkc": data.expected_wkc, "tries": tries, "attempts": len(attempts), "delays": delays,
+            "apart_ns": max(times) - min(times)}  # fmt: skip
 
 
 def misread(bus: SoemBus, count: int, times: int) -> Any:

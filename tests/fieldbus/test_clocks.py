@@ -9,7 +9,7 @@ import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import clocks
-from rtcp.fieldbus.clocks import settle_clock, start_sync, take_over_time
+from rtcp.fieldbus.clocks import set_clocks, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import DatagramCommand, finish
 from rtcp.virtual.segment import make_segment
@@ -52,6 +52,39 @@ def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Dire
     with pytest.raises(BusError, match=r"slave 3 \(drive2\): the local times could not be latched"):
         take_over_time(port, STATION, LABEL, bytes(4), (1, 2), always=True)
     assert port.read(STATION, 0x0920, 8) == before
+
+
+class Measuring:
+    """In place of SOEM, whose socket this port has not: measures delays of the three slaves, one tuple a call."""
+
+    def __init__(self, port: Direct, *delays: tuple[int | None, int | None]) -> None:
+        self._port = port
+        self._delays = iter(delays)
+
+    def config_dc(self) -> bool:
+        for station, delay in zip((0x1002, 0x1003), next(self._delays), strict=True):
+            if delay is not None:
+                self._port.put(station, 0x0928, delay.to_bytes(4, "little"), "SOEM")
+        return True
+
+
+def test_a_delay_counts_once_it_was_found_twice(port: Direct) -> None:
+    # Found by a master before, when the box was no reference.
+    port.put(0x1001, 0x0928, (5000).to_bytes(4, "little"), LABEL)
+    master = Measuring(port, (820, 834_300_572), (None, None), (None, 1650), (830, 1_668_595_264), (820, 1660))
+    assert set_clocks(master, port, ["io", "drive1", LABEL])
+    delays = [int.from_bytes(port.read(station, 0x0928, 4) or b"", "little") for station in (0x1001, 0x1002, 0x1003)]
+    assert delays == [0, 830, 1660]
+    port.write_all(0x0900, bytes(4))
+    times = [port.read(station, at, 8) for station in (0x1001, 0x1002, 0x1003) for at in (0x0918, 0x0920)]
+    first, *rest = (sum(int.from_bytes(time or b"", "little") for time in times[i : i + 2]) for i in (0, 2, 4))
+    assert [(time - first) % (1 << 64) for time in rest] == pytest.approx([830, 1660], abs=200)
+
+
+def test_delays_that_never_agree_are_refused_with_what_was_found(port: Direct) -> None:
+    master = Measuring(port, *((820, None if n % 2 else 1000 * n) for n in range(20)))
+    with pytest.raises(BusError, match=r"slave 3 .*: 20 measurements .* 0x0928\) do not agree.* ns: 0, 2000, 4000, "):
+        set_clocks(master, port, ["io", "drive1", LABEL])
 
 
 @pytest.mark.parametrize("register", [0x0980, 0x0990, 0x09A0])
