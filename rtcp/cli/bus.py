@@ -251,12 +251,16 @@ def scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[Renderabl
             str(slave["state"]),
             str(slave["output_bits"]),
             str(slave["input_bits"]),
-            str(slave["delay_ns"]) if slave["dc"] else "no DC",
+            _delay(slave) if slave["dc"] else "no DC",
             str(sum(slave["port_errors"]["rx"]) + sum(slave["port_errors"]["links"])),
         )
         parts += [Text(""), Text(f"{slave['position']}  {slave['name']}", "bold")]
         parts += [Padding(facts, (0, 0, 0, 3)) for facts in (_slave_facts(slave), _pdo_map(slave)) if facts.row_count]
     return parts
+
+
+def _delay(slave: Mapping[str, Any]) -> str:
+    return "unknown" if slave["delay_ns"] is None else str(slave["delay_ns"])
 
 
 def _branches(slaves: Sequence[Mapping[str, Any]]) -> list[int]:
@@ -300,7 +304,7 @@ def _slave_facts(slave: Mapping[str, Any]) -> Table:
     if managers:
         rows.add_row("sync", "\n".join(managers))
     rows.add_row("FMMUs", str(slave["fmmus"]))
-    rows.add_row("clock", f"yes, {slave['delay_ns']} ns from the reference" if slave["dc"] else "none")
+    rows.add_row("clock", f"yes, {_delay(slave)} ns from the reference" if slave["dc"] else "none")
     ports = ", ".join(_port(slave, port) for port in range(len(slave["ports"])))
     behind = f"slave {slave['parent']}, port {slave['parent_port']}" if slave["parent"] else "the master"
     rows.add_row("ports", f"{ports or '-'}; behind {behind}")

@@ -118,8 +118,8 @@ class SlaveInfo:
     """Number of FMMUs of its ESC."""
     dc: bool
     """Whether it has a distributed clock."""
-    delay_ns: int
-    """Propagation delay from the reference clock, as measured."""
+    delay_ns: int | None
+    """Propagation delay from the reference clock, as measured; None: it has no clock, or its measurements differ."""
     ports: tuple[PortState, ...]
     """Ports 0 to 3."""
     parent: int

@@ -20,9 +20,7 @@ _SETTLE_S = 1.5
 _UNTIL_2000_NS = 946_684_800 * 1_000_000_000
 _SYNC_ATTEMPTS = 4
 _SAME_DELAY_NS = 100
-"""More than two measurements of one delay differ by, less than the delay of a slave's neighbour does."""
-_NOT_MEASURED = 0x7FFF_FFFF
-"""Content of a delay's register until SOEM has written it: that frame may get lost too."""
+"""Largest difference between two measurements of one delay, ns; less than the delay of one slave."""
 _MEASUREMENTS = 20
 
 
@@ -36,72 +34,89 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
         period_ns: the cycle of SYNC0.
 
     Raises:
-        BusError: no clock, SYNC0 in the past, or an activation that reads back differently.
+        BusError: no clock, a clock that cannot be set (`measure_delays`, `_set_clocks`), SYNC0 in the past, or an
+            activation that reads back differently.
     """
-    labels = [slave_label(position, config.name) for position, config in enumerate(slaves, 1)]
-    clocks = set_clocks(master, port, labels)
-    for position, (label, config) in enumerate(zip(labels, slaves, strict=True), 1):
-        word = config.device.assign_activate
-        if not word:
-            continue
-        if not clocks:
-            raise BusError(f"{label}: `assign_activate` is 0x{word:04X} but no slave has a distributed clock")
-        start_sync(port, station_of(position), label, config.device, period_ns)
+    labels = {position: slave_label(position, config.name) for position, config in enumerate(slaves, 1)}
+    clocks = clocks_of(port, labels)
+    for position, config in enumerate(slaves, 1):
+        if config.device.assign_activate and position not in clocks:
+            raise BusError(
+                f"{labels[position]}: `assign_activate` is 0x{config.device.assign_activate:04X} but it has no "
+                "distributed clock that can be set (registers 0x0008 and 0x0928)"
+            )
+    _set_clocks(port, clocks, measure_delays(master, port, clocks))
+    for position, config in enumerate(slaves, 1):
+        if config.device.assign_activate:
+            start_sync(port, station_of(position), labels[position], config.device, period_ns)
 
 
-def set_clocks(master: Any, port: RegisterPort, labels: Sequence[str]) -> bool:
-    """Measure the propagation delays and set all clocks by the first; return whether there is one.
+def clocks_of(port: RegisterPort, labels: dict[int, str]) -> dict[int, str]:
+    """Return those of the slaves (position: label) whose clock can be set; others at most measure delays."""
+    clocks = {}
+    for position, label in labels.items():
+        features = port.read(station_of(position), Register.FEATURES, 2)
+        delay = port.read(station_of(position), Register.DC_DELAY, 4)
+        if features is not None and features[0] & FEATURE_DC and delay is not None:
+            clocks[position] = label
+    return clocks
 
-    SOEM measures, and does not notice a frame that was lost: the slave then gets the times of the one before it. So a
-    delay counts once it was found twice; delays and offsets are then written with frames that are checked.
+
+def measure_delays(master: Any, port: RegisterPort, clocks: dict[int, str]) -> dict[int, int]:
+    """Measure the propagation delays from the reference clock and write them; return them by position, ns.
+
+    SOEM measures, and does not notice a frame that was lost: the slave then gets times of the one before it, and a
+    delay of up to seconds. So a delay counts once it was found twice.
 
     Args:
         master: pysoem's master, its slaves in PRE-OP.
         port: the port for registers.
-        labels: the slaves in messages, in the order of the cable.
+        clocks: what `clocks_of` returned.
 
     Raises:
         BusError: a slave stopped answering, or its delay was another one each time.
     """
-    clocks = [
-        position
-        for position, label in enumerate(labels, 1)
-        if _read(port, position, Register.FEATURES, 2, label) & FEATURE_DC
-    ]
-    if not clocks:
-        return False
-    reference, *others = clocks
-    measured: dict[int, list[int]] = {position: [] for position in others}
+    measured: dict[int, list[int]] = {position: [] for position in clocks}
     delays: dict[int, int] = {}
     for _ in range(_MEASUREMENTS):
-        missing = [position for position in others if position not in delays]
-        for position in missing:
-            marker = _NOT_MEASURED.to_bytes(4, "little")
-            port.put(station_of(position), Register.DC_DELAY, marker, labels[position - 1])
-        # Once at least: with it SOEM adds the reference's time to the cycle's frame.
+        # SOEM leaves alone the first clock, and those behind no other; that register may be from another place.
+        for position, label in clocks.items():
+            port.put(station_of(position), Register.DC_DELAY, bytes(4), label)
+        # Even without a clock: SOEM then knows that there is none.
         master.config_dc()
-        for position in missing:
-            delay = _read(port, position, Register.DC_DELAY, 4, labels[position - 1])
-            if delay == _NOT_MEASURED:
-                continue
+        for position in clocks.keys() - delays.keys():
+            delay = _read(port, position, Register.DC_DELAY, 4, clocks[position])
             if any(abs(delay - before) <= _SAME_DELAY_NS for before in measured[position]):
                 delays[position] = delay
             measured[position].append(delay)
-        if len(delays) == len(others):
+        if len(delays) == len(clocks):
             break
     else:
-        position = missing[0]
-        found = ", ".join(map(str, measured[position])) or "nothing"
+        position = min(clocks.keys() - delays.keys())
+        text = ", ".join(map(str, measured[position]))
         raise BusError(
-            f"{labels[position - 1]}: {_MEASUREMENTS} measurements of its propagation delay (register 0x0928) do not "
-            f"agree, two have to be within {_SAME_DELAY_NS} ns; found, in ns: {found}"
+            f"{clocks[position]}: {_MEASUREMENTS} measurements of its propagation delay (register 0x0928) do not "
+            f"agree: two have to be within {_SAME_DELAY_NS} ns of each other; found, in ns: {text}"
         )
-    # SOEM leaves the reference's alone; a slave that has moved along the cable still has its delay from before.
-    port.put(station_of(reference), Register.DC_DELAY, bytes(4), labels[reference - 1])
-    for position in others:
-        delay_register = delays[position].to_bytes(4, "little")
-        take_over_time(port, station_of(position), labels[position - 1], delay_register, [reference], always=True)
-    return True
+    for position, delay in delays.items():
+        port.put(station_of(position), Register.DC_DELAY, delay.to_bytes(4, "little"), clocks[position])
+    return delays
+
+
+def _set_clocks(port: RegisterPort, clocks: dict[int, str], delays: dict[int, int]) -> None:
+    """Set all clocks to the host's time since 2000: one broadcast latches their local times (ETG.1000.4, 6.8).
+
+    SOEM has done so already, in frames that nobody checks. Raises BusError: a slave stopped answering.
+    """
+    if not clocks:
+        return
+    if port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4)) < 1:
+        raise BusError("no slave latched its local time while the clocks were set")
+    latched = time.time_ns() - _UNTIL_2000_NS
+    for position, label in clocks.items():
+        own = _read(port, position, Register.DC_RECEIVE_TIME, 8, label)
+        offset = latched + delays[position] - own & (1 << 64) - 1
+        port.put(station_of(position), Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
 
 
 def _read(port: RegisterPort, position: int, register: Register, length: int, label: str) -> int:

@@ -171,7 +171,7 @@ def describe(
         sync_managers=_sync_managers(port, station),
         fmmus=register(Register.FMMU_COUNT, 1),
         dc=dc,
-        delay_ns=register(Register.DC_DELAY, 4) if dc else 0,
+        delay_ns=None,
         ports=port_states(register(Register.DL_STATUS, 2)),
         parent=0,
         parent_port=0,

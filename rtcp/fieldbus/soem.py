@@ -19,7 +19,7 @@ from rtcp.esi.sii import read_sii
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, PdoInfo, SlaveInfo, SlaveState, slave_label, station_of
-from rtcp.fieldbus.clocks import set_clocks, start_clocks
+from rtcp.fieldbus.clocks import clocks_of, measure_delays, start_clocks
 from rtcp.fieldbus.describe import describe_device, pdos_of_eeprom
 from rtcp.fieldbus.eeprom import (
     BOOTSTRAP_WORD,
@@ -150,16 +150,22 @@ class SoemBus:
         """Find the slaves, bring them to PRE-OP, measure delays; return their descriptions.
 
         Raises:
-            BusError: no slave answers, or the measurements of a delay do not agree.
+            BusError: no slave answers.
         """
         self._discover()
         self._to_preop()
-        set_clocks(self._master, self.port, [slave_label(i, name) for i, name in enumerate(self._names, 1)])
+        clocks = clocks_of(self.port, {i: slave_label(i, name) for i, name in enumerate(self._names, 1)})
+        try:
+            delays: dict[int, int] = measure_delays(self._master, self.port, clocks)
+        except BusError:
+            # A scan is for a bus that is not in order, too.
+            delays = {}
         slaves = self._describe()
         tree = Topology.of([info.ports for info in slaves])
         return tuple(
             replace(
                 info,
+                delay_ns=delays.get(info.position),
                 parent=tree.parent(info.position),
                 parent_port=tree.port(info.position),
                 watchdog_off=watchdog_off(self.port, station_of(info.position)),

@@ -57,6 +57,16 @@ def test_registers_that_a_virtual_sync_manager_stands_for_are_process_data(start
     assert [received[1] for _, received in result["patterns"]] == [sent[1] for sent, _ in result["patterns"]]
 
 
+@pytest.mark.parametrize(
+    ("root", "delays"), [("clock", [0, 840, 1680, 4200, 5040]), ("coupler", [None, 0, 840, 0, 840])]
+)
+def test_delays_count_from_the_first_clock_of_a_branch(
+    start_segment: StartSegment, root: str, delays: list[int | None]
+) -> None:
+    segment = start_segment((root, "clock, after: 1, port: 3", "clock", "clock, after: 1, port: 1", "clock"))
+    assert [slave["delay_ns"] for slave in segment.master("scan")["result"]] == pytest.approx(delays, abs=20)
+
+
 def test_a_slave_on_one_branch_is_set_up_again_while_another_branch_is_lost(start_segment: StartSegment) -> None:
     kinds = ("coupler", "bits4", "bits2", "areas", "output")
     segment = start_segment((kinds[0], "bits4, after: 1, port: 3", "bits2", "areas, after: 1, port: 1", "output"))

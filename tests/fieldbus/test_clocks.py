@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import clocks
-from rtcp.fieldbus.clocks import set_clocks, settle_clock, start_sync, take_over_time
+from rtcp.fieldbus.clocks import clocks_of, measure_delays, settle_clock, start_clocks, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.registers import DatagramCommand, finish
+from rtcp.fieldbus.registers import Answer, DatagramCommand, finish
 from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm, with_device
 
 LABEL, STATION = "slave 3 (drive2)", 0x1003
 PERIOD = 1_000_000
+LABELS = {1: "slave 1 (io)", 2: "slave 2 (drive1)", 3: LABEL}
 
 
 @pytest.fixture
@@ -55,7 +57,7 @@ def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Dire
 
 
 class Measuring:
-    """In place of SOEM, whose socket this port has not: measures delays of the three slaves, one tuple a call."""
+    """In place of SOEM, whose socket this port has not: writes the delays of drives 1 and 2, one tuple a call."""
 
     def __init__(self, port: Direct, *delays: tuple[int | None, int | None]) -> None:
         self._port = port
@@ -68,23 +70,62 @@ class Measuring:
         return True
 
 
+def delays_of(port: Direct) -> list[int]:
+    return [int.from_bytes(port.read(0x1000 + position, 0x0928, 4) or b"", "little") for position in (1, 2, 3)]
+
+
 def test_a_delay_counts_once_it_was_found_twice(port: Direct) -> None:
-    # Found by a master before, when the box was no reference.
+    # Of another place on the cable, and another master.
     port.put(0x1001, 0x0928, (5000).to_bytes(4, "little"), LABEL)
-    master = Measuring(port, (820, 834_300_572), (None, None), (None, 1650), (830, 1_668_595_264), (820, 1660))
-    assert set_clocks(master, port, ["io", "drive1", LABEL])
-    delays = [int.from_bytes(port.read(station, 0x0928, 4) or b"", "little") for station in (0x1001, 0x1002, 0x1003)]
-    assert delays == [0, 830, 1660]
-    port.write_all(0x0900, bytes(4))
-    times = [port.read(station, at, 8) for station in (0x1001, 0x1002, 0x1003) for at in (0x0918, 0x0920)]
-    first, *rest = (sum(int.from_bytes(time or b"", "little") for time in times[i : i + 2]) for i in (0, 2, 4))
-    assert [(time - first) % (1 << 64) for time in rest] == pytest.approx([830, 1660], abs=200)
+    master = Measuring(port, (820, 834_300_572), (None, 1650), (830, 1_668_595_264), (820, 1660), (820, 7))
+    clocks = clocks_of(port, LABELS)
+    assert measure_delays(master, port, clocks) == {1: 0, 2: 830, 3: 1660}
+    assert delays_of(port) == [0, 830, 1660]
 
 
 def test_delays_that_never_agree_are_refused_with_what_was_found(port: Direct) -> None:
-    master = Measuring(port, *((820, None if n % 2 else 1000 * n) for n in range(20)))
-    with pytest.raises(BusError, match=r"slave 3 .*: 20 measurements .* 0x0928\) do not agree.* ns: 0, 2000, 4000, "):
-        set_clocks(master, port, ["io", "drive1", LABEL])
+    master = Measuring(port, *((820, 1000 * (n + 1)) for n in range(20)))
+    with pytest.raises(
+        BusError, match=r"slave 3 .*: 20 measurements .* 0x0928\) do not agree.* ns: 1000, 2000, 3000, "
+    ):
+        measure_delays(master, port, clocks_of(port, LABELS))
+
+
+def test_a_slave_that_only_measures_delays_gets_no_clock(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
+    # As the EL2828 of tests/virtual/captures_of_devices: 0x0008 is 0x01FC, 0x0918, 0x0920 and 0x0928 do not answer.
+    exchange = port.exchange
+
+    def without_offset(command: DatagramCommand, station: int, address: int, data: bytes, **keys: Any) -> Answer:
+        absent = station == 0x1002 and 0x0910 <= address < 0x0980
+        return Answer(data, 0) if absent else exchange(command, station, address, data, **keys)
+
+    monkeypatch.setattr(port, "exchange", without_offset)
+    clocks = clocks_of(port, LABELS)
+    assert measure_delays(Measuring(port, (None, 1660), (None, 1660)), port, clocks) == {1: 0, 3: 1660}
+    config = arm(3)
+    with pytest.raises(
+        BusError, match=r"slave 2 \(drive1\): `assign_activate` is 0x0300 but it has no distributed clock"
+    ):
+        start_clocks(Measuring(port), port, config, PERIOD)
+    without_sync = [config[0], with_device(config[1], assign_activate=0), config[2]]
+    start_clocks(Measuring(port, (None, 1660), (None, 1660)), port, without_sync, PERIOD)
+    assert port.read(0x1003, 0x0981, 1) == b"\x03"
+
+
+@pytest.mark.parametrize("lost", ["latch", "receive time", "offset"])
+def test_clocks_are_set_together_or_not_at_all(port: Direct, monkeypatch: pytest.MonkeyPatch, lost: str) -> None:
+    start_clocks(Measuring(port, (820, 1660), (820, 1660)), port, arm(3), PERIOD)
+    port.write_all(0x0900, bytes(4))
+    times = [sum(int.from_bytes(port.read(station, at, 8) or b"", "little") for at in (0x0918, 0x0920))
+             for station in (0x1001, 0x1002, 0x1003)]  # fmt: skip
+    assert [(time - times[0]) % (1 << 64) for time in times] == pytest.approx([0, 820, 1660], abs=200)
+    port.lost = {{
+        "latch": (DatagramCommand.BWR, 0x0900),
+        "receive time": (DatagramCommand.FPRD, 0x0918),
+        "offset": (DatagramCommand.FPWR, 0x0920),
+    }[lost]}  # fmt: skip
+    with pytest.raises(BusError):
+        start_clocks(Measuring(port, (820, 1660), (820, 1660)), port, arm(3), PERIOD)
 
 
 @pytest.mark.parametrize("register", [0x0980, 0x0990, 0x09A0])
