@@ -5,7 +5,6 @@ It reports on a pipe, one JSON object a line: `phase` sentences, then `ready` wi
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import math
@@ -35,7 +34,7 @@ from rtcp.fieldbus.master import Master, master_of
 from rtcp.ipc.blackboard import Blackboard, BlackboardTooLarge
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import SchemaError
-from rtcp.ipc.session import EXIT_INCOMPLETE, Session, SessionError, read_session, write_exit_report
+from rtcp.ipc.session import EXIT_INCOMPLETE, Session, SessionError, launch_arguments, read_session, write_exit_report
 from rtcp.ipc.stop_reactions import quick_stop_s
 from rtcp.realtime import scheduling
 
@@ -74,16 +73,10 @@ def main() -> int:
     Return 0 after an orderly end, `EXIT_INCOMPLETE` where slaves did not reach INIT at the end, 2 where the start
     failed, 1 after a defect of this program.
     """
-    parser = argparse.ArgumentParser(prog="rtcp.control.process")
-    parser.add_argument("--directory", type=Path, required=True)
-    parser.add_argument("--ready-fd", type=int, required=True)
-    parser.add_argument("--wait", action="store_true", help="begin with a byte from standard input")
-    arguments = parser.parse_args()
-    if arguments.wait and not sys.stdin.buffer.read(1):
-        return 1  # the launcher has ended
-    report = Report(arguments.ready_fd)
+    directory, ready_fd = launch_arguments("rtcp.control.process")
+    report = Report(ready_fd)
     try:
-        session = read_session(arguments.directory)
+        session = read_session(directory)
     except SessionError as error:
         report.tell("error", sentences=[str(error)])
         sys.stderr.write(f"{error}\n")
@@ -96,7 +89,7 @@ def main() -> int:
     try:
         config = session.config
         master = master_of(config.bus)(config, session.interface, session.segment_pid)
-        _work(master, session, arguments.directory, report)
+        _work(master, session, directory, report)
     except (BusError, DeviceError, ConfigError, SchemaError, BlackboardTooLarge) as error:
         sentences = list(error.sentences) if isinstance(error, BusError) else str(error).splitlines()
         report.tell("error", sentences=sentences)
@@ -107,7 +100,7 @@ def main() -> int:
             before = len(master.notes)
             master.close()
             left += master.notes[before:]
-        write_exit_report(arguments.directory, os.getpid(), left)
+        write_exit_report(directory, os.getpid(), left)
         sys.stderr.write("".join(f"{sentence}\n" for sentence in left))
     return EXIT_INCOMPLETE if left else 0
 

@@ -5,7 +5,6 @@ It may die and be started again while the loop holds the arm: a motion on its be
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import json
@@ -33,6 +32,7 @@ from rtcp.ipc.session import (
     SessionError,
     exit_problems,
     is_running,
+    launch_arguments,
     processes_file,
     read_json,
     read_processes,
@@ -339,24 +339,18 @@ class Gateway:
 
 def main() -> int:
     """Run the gateway's process."""
-    parser = argparse.ArgumentParser(prog="rtcp.gateway.server")
-    parser.add_argument("--directory", type=Path, required=True)
-    parser.add_argument("--ready-fd", type=int, required=True)
-    parser.add_argument("--wait", action="store_true", help="begin with a byte from standard input")
-    arguments = parser.parse_args()
-    if arguments.wait and not sys.stdin.buffer.read(1):
-        return 1  # the launcher has ended
+    directory, ready_fd = launch_arguments("rtcp.gateway.server")
     to_stderr = logging.StreamHandler(sys.stderr)
     to_stderr.setFormatter(log_format())
     logging.basicConfig(level=logging.INFO, handlers=[to_stderr])
 
     def ready() -> None:
         with contextlib.suppress(OSError):
-            os.write(arguments.ready_fd, json.dumps({"event": "ready", "pid": os.getpid()}).encode() + b"\n")
-            os.close(arguments.ready_fd)
+            os.write(ready_fd, json.dumps({"event": "ready", "pid": os.getpid()}).encode() + b"\n")
+            os.close(ready_fd)
 
     try:
-        asyncio.run(_run(arguments.directory, ready))
+        asyncio.run(_run(directory, ready))
     except (BlackboardError, SessionError, OSError, TypeError) as error:
         sys.stderr.write(f"gateway: {error}\n")
         return 1

@@ -36,6 +36,26 @@ class SessionError(Exception):
     """A file of the runtime directory is missing, damaged or writable by others; the message names it."""
 
 
+# -- beginning --------------------------------------------------------------------------------------------------
+
+
+def launch_arguments(program: str) -> tuple[Path, int]:
+    """Return the runtime directory and the pipe for reports from the command line of loop or gateway.
+
+    With `--wait`: once the launcher has written a byte to standard input; where it has ended, exit with 1.
+    """
+    import argparse  # here: clients read sessions too
+
+    parser = argparse.ArgumentParser(prog=program)
+    parser.add_argument("--directory", type=Path, required=True)
+    parser.add_argument("--ready-fd", type=int, required=True)
+    parser.add_argument("--wait", action="store_true", help="begin with a byte from standard input")
+    arguments = parser.parse_args()
+    if arguments.wait and not sys.stdin.buffer.read(1):
+        raise SystemExit(1)
+    return arguments.directory, arguments.ready_fd
+
+
 # -- processes --------------------------------------------------------------------------------------------------
 
 

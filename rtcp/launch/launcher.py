@@ -46,6 +46,7 @@ from rtcp.ipc.session import (
     read_processes,
     read_session,
     remove_exit_report,
+    session_file,
 )
 from rtcp.launch.platform import Platform, Report, clear, defer_signals, end_platform
 
@@ -265,6 +266,7 @@ def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_
     state = state_directory().absolute()
     platform = Platform(directory, config, Processes(), state)
     remove_exit_report(directory)
+    session_file(directory).unlink(missing_ok=True)  # of the run before; the new loop counts as running from here on
     for log in directory.glob("*.log"):
         log.replace(log.with_name(f"{log.name}.1"))  # kept until the next start
     try:
@@ -279,7 +281,7 @@ def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_
         Session(
             config, bus, interface, segment, began_ns, state, platform.segment_control, cell and _placed(cell), name
         ).write(directory)  # fmt: skip
-        ready = platform.begin_gateway(waits=True)
+        ready = platform.load_gateway()
         platform.start_loop(loop, report)
         platform.await_gateway(ready)
     except BaseException:

@@ -85,8 +85,8 @@ def read_lines(reading: int, timeout_s: float) -> Iterator[dict[str, Any]]:
 
 
 def _release(child: subprocess.Popen[bytes]) -> None:
-    """Have a process go on that waits for its turn."""
-    if child.stdin is not None:
+    """Let a process that was loaded begin; once is enough."""
+    if child.stdin is not None and not child.stdin.closed:
         with contextlib.suppress(BrokenPipeError), child.stdin:  # it has ended
             child.stdin.write(b"\n")
 
@@ -118,15 +118,11 @@ class Platform:
     # -- starting -----------------------------------------------------------------------------------------------
 
     def _spawn(
-        self, name: str, module: str, *arguments: str, waits: bool = False
+        self, name: str, module: str, *arguments: str, stdin: int = subprocess.DEVNULL
     ) -> tuple[subprocess.Popen[bytes], int]:
-        """Start a process and write down its id; where the disk refuses that, kill it.
-
-        `waits`: it loads its modules, on any CPU since nothing moves yet, and does nothing before `_release`.
-        """
+        """Start a process and write down its id; where the disk refuses that, kill it."""
         # A signal between start and registration would leave a process that nobody knows of.
         with open_log(self.directory / f"{name}.log") as log, defer_signals():
-            arguments, stdin = ((*arguments, "--wait"), subprocess.PIPE) if waits else (arguments, subprocess.DEVNULL)
             child, reading = spawn(module, *arguments, stdin=stdin, stdout=log, stderr=log, env=self._environment)
             before = getattr(self.processes, name)
             self._children.append(child)
@@ -137,18 +133,17 @@ class Platform:
                 setattr(self.processes, name, before)
                 os.close(reading)
                 child.kill()
-                child.wait()
+                child.communicate()  # closes the pipe to it, too
                 raise
-        if name != "loop" and not waits:
-            self._move_off_the_cycle(child)
+        others = set(available_cpus()) - {choose_cpu(self._config.cycle.cpu)}
+        if name != "loop" and others:
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(child.pid, others)  # off the cycle's CPU
         return child, reading
 
-    def _move_off_the_cycle(self, child: subprocess.Popen[bytes]) -> None:
-        """Keep a process off the cycle's CPU."""
-        if others := set(available_cpus()) - {choose_cpu(self._config.cycle.cpu)}:
-            with contextlib.suppress(OSError):
-                for thread in os.listdir(f"/proc/{child.pid}/task"):
-                    os.sched_setaffinity(int(thread), others)
+    def _load(self, name: str, module: str) -> tuple[subprocess.Popen[bytes], int]:
+        """Start a process that loads its modules and does nothing before `_release`."""
+        return self._spawn(name, module, "--directory", str(self.directory), "--wait", stdin=subprocess.PIPE)
 
     def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
         """Start the segment; return its ready line: pid, interface, slaves."""
@@ -164,7 +159,7 @@ class Platform:
 
     def load_loop(self) -> tuple[subprocess.Popen[bytes], int]:
         """Start the loop's process, which loads its modules and waits; return what `start_loop` takes."""
-        return self._spawn("loop", "rtcp.control.process", "--directory", str(self.directory), waits=True)
+        return self._load("loop", "rtcp.control.process")
 
     def start_loop(self, loaded: tuple[subprocess.Popen[bytes], int], report: Report) -> None:
         """Start the loop; return when all slaves are in OP."""
@@ -181,18 +176,19 @@ class Platform:
                 return
         raise self._not_ready("loop", child)
 
-    def begin_gateway(self, waits: bool = False) -> int:
-        """Start the gateway; return the pipe on which it reports that the control socket listens.
+    def load_gateway(self) -> int:
+        """Start the gateway's process, which loads its modules and waits; return what `await_gateway` takes."""
+        return self._load("gateway", "rtcp.gateway.server")[1]
 
-        `waits`: it only loads its modules before `await_gateway`.
-        """
-        _, reading = self._spawn("gateway", "rtcp.gateway.server", "--directory", str(self.directory), waits=waits)
+    def begin_gateway(self) -> int:
+        """Start the gateway; return the pipe on which it reports that the control socket listens."""
+        child, reading = self._load("gateway", "rtcp.gateway.server")
+        _release(child)
         return reading
 
     def await_gateway(self, reading: int) -> None:
         """Wait until the gateway that was started last listens at the control socket."""
         child = self._children[-1]
-        self._move_off_the_cycle(child)
         _release(child)
         for _ in read_lines(reading, _READY_TIMEOUT_S):
             return
