@@ -153,7 +153,7 @@ def dependencies(section: str) -> str:
     matches = [match for match in map(_REQUIREMENT.fullmatch, lines[1].splitlines()) if match]
     return table(
         ["package", "versions", "reason"],
-        [[name, f"`{limits}`", why] for name, limits, why in map(re.Match.groups, matches)],
+        [[name, f"`{limits}`" if limits else "any", why] for name, limits, why in map(re.Match.groups, matches)],
     )
 
 

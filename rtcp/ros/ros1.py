@@ -118,6 +118,7 @@ def _end_late(ends: threading.Event) -> None:
     """
     ends.wait()
     time.sleep(_END_S)
+    print(f"ended {_END_S:g} s after the signal, without the ROS master's answer", file=sys.stderr, flush=True)
     os._exit(0)
 
 
@@ -248,9 +249,12 @@ class Publications:
         """Register the topics of channels (slave, name)."""
         for slave, name in channels:
             topic = "/".join(("gpio", *(re.sub(r"\W", "_", part, flags=re.ASCII) for part in (slave, name))))
-            self._channels[slave, name] = rospy.Publisher(topic, Float64, queue_size=10)
-            if (slave, name) in settable:
-                self._commands.take_output(f"{topic}/command", slave, name)
+            try:
+                self._channels[slave, name] = rospy.Publisher(topic, Float64, queue_size=10)
+                if (slave, name) in settable:
+                    self._commands.take_output(f"{topic}/command", slave, name)
+            except (rospy.ROSException, OSError) as error:
+                rospy.logerr("topic %s is not published: %s", topic, error)
 
 
 class Commands:
