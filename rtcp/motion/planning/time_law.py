@@ -111,4 +111,5 @@ def _passes(rate: Array, acceleration: Array, pitch: float) -> Array:
         energy[k + 1] = min(energy[k + 1], energy[k] + most)
     for k in range(len(room) - 1, -1, -1):
         energy[k] = min(energy[k], energy[k + 1] + room[k])
-    return np.sqrt(2.0 * np.array(energy))
+    speeds: Array = np.sqrt(2.0 * np.array(energy))
+    return speeds

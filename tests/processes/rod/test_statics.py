@@ -6,6 +6,7 @@ from math import pi
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from kinematics.pose import IDENTITY, Pose, rotation_from_rpy
 from rtcp.ipc.errors import Refused
@@ -130,7 +131,7 @@ def test_the_moment_law_is_the_section_integral_of_the_stress() -> None:
     stresses[3] = 500e6 + 27.8e9 * (strains[3] - strains[2])
     integrand = 4.0 * y * np.interp(kappa * y, strains, stresses) * np.sqrt(radius**2 - y * y)
     assert kappa * radius > strains[2]
-    assert THICK.moment(kappa) == pytest.approx(float(np.trapezoid(integrand, y)), rel=1e-5)
+    assert THICK.moment(kappa) == pytest.approx(float(trapezoid(integrand, y)), rel=1e-5)
 
 
 def test_the_rod_of_a_millimetre_sags_by_its_weight_as_a_clamped_beam() -> None:

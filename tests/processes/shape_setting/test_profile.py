@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from rtcp.processes.shape_setting.profile import (
     heat_command,
@@ -60,7 +61,7 @@ def test_the_temperatures_along_the_rod_have_chucks_middle_and_mean_of_the_scale
     assert grid.shape == (3001, 2)
     assert grid[:, 0] == pytest.approx(profile.chuck_c)
     assert (grid[0, 1], grid[1500, 1], grid[-1, 1]) == pytest.approx((profile.chuck_c, 510.0, profile.chuck_c))
-    share = (np.trapezoid(grid[:, 1], s) / profile.ends.length - profile.chuck_c) / (510.0 - profile.chuck_c)
+    share = (trapezoid(grid[:, 1], s) / profile.ends.length - profile.chuck_c) / (510.0 - profile.chuck_c)
     assert share == pytest.approx(profile.ends.mean_by_middle(), rel=1e-4)
     thin = replace(profile, ends=replace(profile.ends, end_length=1e-5))
     assert temperatures_along(thin, s, [510.0])[1, 0] == pytest.approx(510.0, abs=0.1)
