@@ -521,7 +521,7 @@ def _rows(path: _Path, law: TimeLaw, begin_s: float) -> list[Point]:
         return (
             path.at(x, 0),
             first * rate[:, None],
-            second * (rate * rate)[:, None] + first * change[:, None],
+            second * np.square(rate)[:, None] + first * change[:, None],
         )
 
     while True:
