@@ -85,7 +85,8 @@ def measure_delays(master: Any, port: RegisterPort, clocks: dict[int, str]) -> d
         # Even without a clock: SOEM then knows that there is none.
         master.config_dc()
         for position in clocks.keys() - delays.keys():
-            delay = _read(port, position, Register.DC_DELAY, 4, clocks[position])
+            # SOEM's may be negative, behind a junction without a clock.
+            delay = _read(port, position, Register.DC_DELAY, 4, clocks[position], signed=True)
             if any(abs(delay - before) <= _SAME_DELAY_NS for before in measured[position]):
                 delays[position] = delay
             measured[position].append(delay)
@@ -99,7 +100,7 @@ def measure_delays(master: Any, port: RegisterPort, clocks: dict[int, str]) -> d
             f"agree: two have to be within {_SAME_DELAY_NS} ns of each other; found, in ns: {text}"
         )
     for position, delay in delays.items():
-        port.put(station_of(position), Register.DC_DELAY, delay.to_bytes(4, "little"), clocks[position])
+        port.put(station_of(position), Register.DC_DELAY, delay.to_bytes(4, "little", signed=True), clocks[position])
     return delays
 
 
@@ -119,11 +120,13 @@ def _set_clocks(port: RegisterPort, clocks: dict[int, str], delays: dict[int, in
         port.put(station_of(position), Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
 
 
-def _read(port: RegisterPort, position: int, register: Register, length: int, label: str) -> int:
+def _read(
+    port: RegisterPort, position: int, register: Register, length: int, label: str, *, signed: bool = False
+) -> int:
     content = port.read(station_of(position), register, length)
     if content is None:
         raise BusError(f"{label} stopped answering while the clocks were set")
-    return int.from_bytes(content, "little")
+    return int.from_bytes(content, "little", signed=signed)
 
 
 def take_over_time(
@@ -159,7 +162,8 @@ def take_over_time(
         their_delay = port.read(station_of(neighbour), Register.DC_DELAY, 4)
         if None not in theirs and their_delay is not None:
             time_then = sum(int.from_bytes(part or b"", "little") for part in theirs)
-            time_then += int.from_bytes(delay, "little") - int.from_bytes(their_delay, "little")
+            time_then += int.from_bytes(delay, "little", signed=True)
+            time_then -= int.from_bytes(their_delay, "little", signed=True)
             break
     offset = time_then - int.from_bytes(own, "little") & (1 << 64) - 1
     port.put(station, Register.DC_DELAY, delay, label)

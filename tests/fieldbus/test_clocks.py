@@ -66,7 +66,7 @@ class Measuring:
     def config_dc(self) -> bool:
         for station, delay in zip((0x1002, 0x1003), next(self._delays), strict=True):
             if delay is not None:
-                self._port.put(station, 0x0928, delay.to_bytes(4, "little"), "SOEM")
+                self._port.put(station, 0x0928, delay.to_bytes(4, "little", signed=True), "SOEM")
         return True
 
 
@@ -112,13 +112,18 @@ def test_a_slave_that_only_measures_delays_gets_no_clock(port: Direct, monkeypat
     assert port.read(0x1003, 0x0981, 1) == b"\x03"
 
 
-@pytest.mark.parametrize("lost", ["latch", "receive time", "offset"])
-def test_clocks_are_set_together_or_not_at_all(port: Direct, monkeypatch: pytest.MonkeyPatch, lost: str) -> None:
-    start_clocks(Measuring(port, (820, 1660), (820, 1660)), port, arm(3), PERIOD)
+@pytest.mark.parametrize("delays", [(820, 1660), (2520, -2520)])
+def test_clocks_are_set_together(port: Direct, delays: tuple[int, int]) -> None:
+    start_clocks(Measuring(port, delays, delays), port, arm(3), PERIOD)
     port.write_all(0x0900, bytes(4))
     times = [sum(int.from_bytes(port.read(station, at, 8) or b"", "little") for at in (0x0918, 0x0920))
              for station in (0x1001, 0x1002, 0x1003)]  # fmt: skip
-    assert [(time - times[0]) % (1 << 64) for time in times] == pytest.approx([0, 820, 1660], abs=200)
+    apart = [(time - times[0] + (1 << 63)) % (1 << 64) - (1 << 63) for time in times]
+    assert apart == pytest.approx([0, *delays], abs=200)
+
+
+@pytest.mark.parametrize("lost", ["latch", "receive time", "offset"])
+def test_clocks_that_cannot_be_set_end_the_start(port: Direct, lost: str) -> None:
     port.lost = {{
         "latch": (DatagramCommand.BWR, 0x0900),
         "receive time": (DatagramCommand.FPRD, 0x0918),
