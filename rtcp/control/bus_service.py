@@ -81,6 +81,8 @@ class BusService(threading.Thread):
         self._watch_s = watch_s
         self._publish_polls = max(round(_PUBLISH_S / watch_s), 1)
         self._op_wanted = False
+        self._began_s = math.inf
+        """When the thread began, CLOCK_MONOTONIC; a poll takes long where no slave answers."""
         self._is_reported = False
         self._nodes = len(master.config.slaves)
         self._asked = 0
@@ -153,6 +155,7 @@ class BusService(threading.Thread):
 
     def _run_polls(self) -> None:
         thread_beside(self._cycle_cpu, self._cycle_priority - 1)
+        self._began_s = time.monotonic()
         poll = 0
         while not self._end.wait(self._watch_s):
             poll += 1
@@ -225,7 +228,7 @@ class BusService(threading.Thread):
         if (missing := self._master.waiting_for()) != self._waiting_for:
             self._waiting_for = missing
             self._blackboard.event(WaitingForRobot(missing) if missing else RobotReady())
-        if not self._is_reported and (self.all_op or poll * self._watch_s > _SPEAKS_S):
+        if not self._is_reported and (self.all_op or time.monotonic() - self._began_s > _SPEAKS_S):
             self._is_reported = True
             for position in range(1, self._nodes + 1):
                 self._blackboard.slave(position, AlState.OP, 0)
@@ -247,7 +250,7 @@ class BusService(threading.Thread):
                 self._watcher = bus.watcher(self._blackboard.event)
                 self.all_op = True
                 self.on_op()
-        elif poll * self._watch_s > _LOCK_S:
+        elif time.monotonic() - self._began_s > _LOCK_S:
             self.refused = (
                 f"the cycle did not lock onto the reference clock within {_LOCK_S:g} s: the frames come too unevenly "
                 f"or do not come back (see `rtcp status`, bus.send_phase){cpu_hint(self._cycle_cpu)}",

@@ -39,16 +39,23 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
     """
     labels = {position: slave_label(position, config.name) for position, config in enumerate(slaves, 1)}
     clocks = clocks_of(port, labels)
-    for position, config in enumerate(slaves, 1):
-        if config.device.assign_activate and position not in clocks:
+    synchronous = {
+        position: config.device for position, config in enumerate(slaves, 1) if config.device.assign_activate
+    }
+    for position, device in synchronous.items():
+        if position not in clocks:
             raise BusError(
-                f"{labels[position]}: `assign_activate` is 0x{config.device.assign_activate:04X} but it has no "
-                "distributed clock that can be set (registers 0x0008 and 0x0928)"
+                f"{labels[position]}: `assign_activate` is 0x{device.assign_activate:04X} but it has no distributed "
+                "clock that can be set (registers 0x0008 and 0x0928)"
             )
+    if synchronous and (measuring := _measuring_only(port, min(clocks))):
+        raise BusError(
+            f"{labels[measuring]}: its clock only measures delays, and SOEM takes the first slave with a clock as the "
+            f"reference: put it behind {labels[min(clocks)]} on the cable"
+        )
     _set_clocks(port, clocks, measure_delays(master, port, clocks))
-    for position, config in enumerate(slaves, 1):
-        if config.device.assign_activate:
-            start_sync(port, station_of(position), labels[position], config.device, period_ns)
+    for position, device in synchronous.items():
+        start_sync(port, station_of(position), labels[position], device, period_ns)
 
 
 def clocks_of(port: RegisterPort, labels: dict[int, str]) -> dict[int, str]:
@@ -60,6 +67,15 @@ def clocks_of(port: RegisterPort, labels: dict[int, str]) -> dict[int, str]:
         if features is not None and features[0] & FEATURE_DC and delay is not None:
             clocks[position] = label
     return clocks
+
+
+def _measuring_only(port: RegisterPort, reference: int) -> int:
+    """Return the first slave before `reference` with a clock, which then cannot be set; 0: none."""
+    for position in range(1, reference):
+        features = port.read(station_of(position), Register.FEATURES, 2)
+        if features is not None and features[0] & FEATURE_DC:
+            return position
+    return 0
 
 
 def measure_delays(master: Any, port: RegisterPort, clocks: dict[int, str]) -> dict[int, int]:

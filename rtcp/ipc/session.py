@@ -11,7 +11,7 @@ import os
 import stat
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -162,8 +162,18 @@ def read_processes(directory: Path) -> Processes:
 
 def _replace(path: Path, content: object) -> None:
     fresh = path.with_suffix(".new")
-    fresh.write_text(json.dumps(content))
+    with _naming(fresh):
+        fresh.write_text(json.dumps(content))
     fresh.replace(path)
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Name the file in an error of the disk, which a write does not."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 # -- the session ------------------------------------------------------------------------------------------------
@@ -199,7 +209,7 @@ class Session:
         path = session_file(directory)
         path.unlink(missing_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        with open(descriptor, "w") as file:
+        with _naming(path), open(descriptor, "w") as file:
             json.dump({"version": rtcp.__version__, "session": to_json(self)}, file)
 
 

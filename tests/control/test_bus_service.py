@@ -119,6 +119,25 @@ def test_a_cycle_that_does_not_lock_under_fifo_names_the_cpu_that_it_keeps(
     assert ("the cycle keeps CPU 1 under SCHED_FIFO while it waits" in sentence) is named
 
 
+def test_the_time_to_lock_passes_also_while_polls_take_long(
+    bus: Bus, board: Blackboard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bus_service, "_LOCK_S", 0.1)
+    waiting = BusService(rig.master(bus), board, [(2, 1), (3, 1)], 5.0, 1, 80, watch_s=0.001)
+    polls: list[float] = []
+    refused = threading.Event()
+
+    def look_around() -> None:
+        polls.append(time.monotonic())
+        time.sleep(0.02)  # as every frame that no slave answers
+
+    waiting.look_around, waiting.on_refused = look_around, refused.set
+    waiting.start()
+    refused.wait()
+    waiting.finish()
+    assert len(polls) < 20
+
+
 @pytest.fixture
 def bus() -> Bus:
     return Bus()

@@ -112,6 +112,17 @@ def test_a_slave_that_only_measures_delays_gets_no_clock(port: Direct, monkeypat
     assert port.read(0x1003, 0x0981, 1) == b"\x03"
 
 
+def test_a_first_slave_that_only_measures_delays_is_no_reference(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = port.read
+    monkeypatch.setattr(
+        port, "read", lambda station, at, n: None if (station, at) == (0x1001, 0x0928) else read(station, at, n)
+    )
+    with pytest.raises(
+        BusError, match=r"^slave 1 \(io\): its clock only measures .* put it behind slave 2 \(drive1\) on"
+    ):
+        start_clocks(Measuring(port), port, arm(3), PERIOD)
+
+
 @pytest.mark.parametrize("delays", [(820, 1660), (2520, -2520)])
 def test_clocks_are_set_together(port: Direct, delays: tuple[int, int]) -> None:
     start_clocks(Measuring(port, delays, delays), port, arm(3), PERIOD)

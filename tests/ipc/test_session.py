@@ -54,6 +54,13 @@ def test_a_process_is_known_by_its_identity_in_every_other_process(
     assert read_processes(tmp_path).loop.identity == written.loop.identity
 
 
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path: Path) -> None:
+    full = tmp_path / "processes.new"
+    full.symlink_to("/dev/full")
+    with pytest.raises(OSError, match=f"No space left on device: '{full}'"):
+        Processes().write(tmp_path)
+
+
 def test_a_later_process_with_the_same_id_is_not_running_and_not_signalled(child: subprocess.Popen[bytes]) -> None:
     earlier = Pid(child.pid, identify(child.pid).identity + 1)
     assert not is_running(earlier)
