@@ -188,15 +188,17 @@ def test_a_gateway_that_stands_still_ends_the_motion_by_its_lease(running: Platf
     observer, since = observe(running), running.last_event()
     gateway = running.pids()["gateway"]
     os.kill(gateway, signal.SIGSTOP)
-    end = time.monotonic() + 20
-    while True:
-        latest = observer.latest()
-        assert latest is not None
-        if int(latest[0]["state"]) == 4:
-            break
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    os.kill(gateway, signal.SIGCONT)
+    try:
+        end = time.monotonic() + 20
+        while True:
+            latest = observer.latest()
+            assert latest is not None
+            if int(latest[0]["state"]) == 4:
+                break
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    finally:
+        os.kill(gateway, signal.SIGCONT)
     observer.close()
     assert moving.wait() == 5
     assert "lease_expired" in running.events(since)
@@ -255,21 +257,23 @@ def test_a_gateway_that_hangs_stops_the_motion_is_named_and_can_be_killed_and_re
     observer = observe(running)
     before = running.pids()
     os.kill(before["gateway"], signal.SIGSTOP)
-    end = time.monotonic() + 20
-    while True:
-        latest = observer.latest()
-        assert latest is not None
-        if int(latest[0]["state"]) == 4 and abs(float(latest[0]["actual_velocity"][0])) < 1e-3:
-            break
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    observer.close()
-    with (
-        ControlClient(path=control_socket(running.directory)) as client,
-        pytest.raises(RtcpError, match=rf"its gateway \(process {before['gateway']}\) hangs"),
-    ):
-        client.call("status", timeout_s=0.5)
-    kill(before["gateway"])
+    try:
+        end = time.monotonic() + 20
+        while True:
+            latest = observer.latest()
+            assert latest is not None
+            if int(latest[0]["state"]) == 4 and abs(float(latest[0]["actual_velocity"][0])) < 1e-3:
+                break
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        observer.close()
+        with (
+            ControlClient(path=control_socket(running.directory)) as client,
+            pytest.raises(RtcpError, match=rf"its gateway \(process {before['gateway']}\) hangs"),
+        ):
+            client.call("status", timeout_s=0.5)
+    finally:
+        kill(before["gateway"])
     assert moving.wait() in (4, 5)
     running.rtcp("start", "--detach")
     status = running.status()
