@@ -189,7 +189,7 @@ class BusService(threading.Thread):
 
     def _watch(self, poll: int) -> None:
         if self._bus is None:
-            self._watch_controller(poll)
+            self._watch_controller()
             return
         watcher = self._watcher
         if watcher is None:
@@ -222,7 +222,7 @@ class BusService(threading.Thread):
         if poll % self._publish_polls == 0 or not (was_well and watcher.all_op):
             self._publish_health(watcher)
 
-    def _watch_controller(self, poll: int) -> None:
+    def _watch_controller(self) -> None:
         """Watch a bus without slaves: it is usable once it is connected; an event says what a person has to do."""
         self.all_op = self._master.connected
         if (missing := self._master.waiting_for()) != self._waiting_for:

@@ -48,11 +48,12 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
                 f"{labels[position]}: `assign_activate` is 0x{device.assign_activate:04X} but it has no distributed "
                 "clock that can be set (registers 0x0008 and 0x0928)"
             )
-    if synchronous and (measuring := _measuring_only(port, min(clocks))):
-        raise BusError(
-            f"{labels[measuring]}: its clock only measures delays, and SOEM takes the first slave with a clock as the "
-            f"reference: put it behind {labels[min(clocks)]} on the cable"
-        )
+    for position in range(1, min(clocks)) if synchronous else ():
+        if _measures(port, position):
+            raise BusError(
+                f"{labels[position]}: its clock only measures delays, and SOEM takes the first slave with a clock as "
+                f"the reference: put it behind {labels[min(clocks)]} on the cable"
+            )
     _set_clocks(port, clocks, measure_delays(master, port, clocks))
     for position, device in synchronous.items():
         start_sync(port, station_of(position), labels[position], device, period_ns)
@@ -60,22 +61,17 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
 
 def clocks_of(port: RegisterPort, labels: dict[int, str]) -> dict[int, str]:
     """Return those of the slaves (position: label) whose clock can be set; others at most measure delays."""
-    clocks = {}
-    for position, label in labels.items():
-        features = port.read(station_of(position), Register.FEATURES, 2)
-        delay = port.read(station_of(position), Register.DC_DELAY, 4)
-        if features is not None and features[0] & FEATURE_DC and delay is not None:
-            clocks[position] = label
-    return clocks
+    return {
+        position: label
+        for position, label in labels.items()
+        if _measures(port, position) and port.read(station_of(position), Register.DC_DELAY, 4) is not None
+    }
 
 
-def _measuring_only(port: RegisterPort, reference: int) -> int:
-    """Return the first slave before `reference` with a clock, which then cannot be set; 0: none."""
-    for position in range(1, reference):
-        features = port.read(station_of(position), Register.FEATURES, 2)
-        if features is not None and features[0] & FEATURE_DC:
-            return position
-    return 0
+def _measures(port: RegisterPort, position: int) -> bool:
+    """Whether a slave has a clock, or at least measures delays."""
+    features = port.read(station_of(position), Register.FEATURES, 2)
+    return features is not None and bool(features[0] & FEATURE_DC)
 
 
 def measure_delays(master: Any, port: RegisterPort, clocks: dict[int, str]) -> dict[int, int]:

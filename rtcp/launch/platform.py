@@ -182,8 +182,8 @@ class Platform:
 
     def begin_gateway(self) -> int:
         """Start the gateway; return the pipe on which it reports that the control socket listens."""
-        child, reading = self._load("gateway", "rtcp.gateway.server")
-        _release(child)
+        reading = self.load_gateway()
+        _release(self._children[-1])
         return reading
 
     def await_gateway(self, reading: int) -> None:
