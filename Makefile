@@ -3,6 +3,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# make test SEED=1234 repeats the order of an earlier run.
+PYTEST = $(BIN)/python -m pytest $(if $(SEED),--randomly-seed=$(SEED))
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -24,27 +26,20 @@ run: setup ## run the demonstration: virtual segment, master, a move, the figure
 panel: setup ## run the virtual arm with the panel: http://127.0.0.1:8080 in a browser
 	@$(BIN)/rtcp start --panel
 
-check: lint ## check style, format and types, and run the short tests that need no real time: before each commit
-	@$(BIN)/python -m pytest -m 'not alone and not slow' --longest 0.7 --numprocesses auto
+check: lint ## check style, format and types, and run the tests that need no platform: before each commit
+	@$(PYTEST) -m 'not platform and not long' --numprocesses auto
 
-test: setup ## run the tests, but those that take long, in a browser, and on ROS 1
-	@status=0; \
-	$(BIN)/python -m pytest -m 'not alone and not slow' --longest 1 --numprocesses auto || status=1; \
-	$(BIN)/python -m pytest -m 'alone and not slow and not browser' --longest 1.5 --ignore=tests/ros1 --numprocesses 2 --dist loadfile || status=1; \
-	exit $$status
+test: setup ## run all tests but those marked long
+	@$(PYTEST) -m 'not long' --numprocesses 4 --dist loadfile
 
-test-all: oracles ## run all tests: those that take long, every sample, systemd as PID 1, in a browser
-	@status=0; \
-	RTCP_SLOW=1 $(BIN)/python -m pytest -m 'not alone' --numprocesses auto || status=1; \
-	RTCP_SLOW=1 $(BIN)/python -m pytest -m 'alone and not browser' --numprocesses 2 --dist loadfile || status=1; \
-	RTCP_SLOW=1 $(BIN)/python -m pytest -m browser || status=1; \
-	exit $$status
+test-all: oracles ## run all tests, with every sample
+	@RTCP_THOROUGH=1 $(PYTEST) --numprocesses 4 --dist loadfile
 
 test-arms: setup ## run the end-to-end tests of the arm with the drives of each other arm (tests/drive_esi.py)
 	@status=0; \
 	for arm in two-axis myactuator synapticon; do \
 		echo "== $$arm"; \
-		RTCP_TEST_ARM=$$arm $(BIN)/python -m pytest tests/e2e -m 'alone and not slow' \
+		RTCP_TEST_ARM=$$arm $(BIN)/python -m pytest tests/e2e -m 'platform and not long' \
 			-k 'not test_abb and not test_cell and not test_heater and not test_shape and not test_systemd' || status=1; \
 	done; \
 	exit $$status

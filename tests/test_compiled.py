@@ -14,7 +14,7 @@ import pytest
 
 import hatch_build
 from kinematics.compiled import ABI, BUILD, MANIFEST, PURE, sources_digest, use
-from tests.samples import SLOW
+from tests.samples import THOROUGH
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -132,7 +132,7 @@ def test_solving_a_quadratic_leaves_no_ring_of_references_where_the_collector_is
 
 @pytest.mark.skipif(not BUILD.is_used, reason="nothing is compiled, or it is not used")
 def test_compiled_functions_return_what_the_source_does_to_the_bit() -> None:
-    samples = str(20_000 if SLOW else 1000)
+    samples = str(20_000 if THOROUGH else 1000)
     runs = [
         subprocess.Popen(
             [sys.executable, "-m", "tests.compiled_results", samples],

@@ -136,7 +136,7 @@ def test_the_demo_of_an_installed_wheel_runs(installed: Path, tmp_path: Path) ->
     assert "start to OP" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(0)
 def test_a_wheel_that_was_compiled_runs_compiled_wherever_it_is_installed(tmp_path: Path) -> None:
     wheel = built(tmp_path, pure=False)

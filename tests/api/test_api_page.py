@@ -13,7 +13,7 @@ import pytest
 
 from tests.e2e.conftest import Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -13,7 +13,7 @@ import pytest
 
 from rtcp.cli.jog import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey, RenewalCheck
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 ARROW_UP, ARROW_LEFT = b"\x1b[A", b"\x1b[D"
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 def test_a_scan_of_the_virtual_bus_starts_a_segment_and_ends_it(

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
-SLOW = ("--cycle-us", "2000")
+THOROUGH = ("--cycle-us", "2000")
 """A cycle that a loaded machine keeps: what is tested here is how the commands start and end it."""
 
 FIELDS = {
@@ -38,7 +38,7 @@ def nothing_is_left(
 def test_a_detached_start_returns_when_the_platform_answers_and_stop_ends_it(
     rtcp: Callable[..., Any], arm: Path
 ) -> None:
-    started = rtcp("start", "--detach", "--config", str(arm), "--mode", "csv", *SLOW)
+    started = rtcp("start", "--detach", "--config", str(arm), "--mode", "csv", *THOROUGH)
     assert (started.code, started.err) == (0, "")
     status = json.loads(rtcp("status", "--json").out)
     assert {name: type(status[name]) for name in FIELDS} == FIELDS
@@ -52,7 +52,7 @@ def test_a_detached_start_returns_when_the_platform_answers_and_stop_ends_it(
 def test_stop_ends_a_start_in_the_foreground_with_exit_code_0(
     rtcp: Callable[..., Any], rtcp_process: Callable[..., Any], arm: Path
 ) -> None:
-    running = rtcp_process("start", "--config", str(arm), *SLOW)
+    running = rtcp_process("start", "--config", str(arm), *THOROUGH)
     assert any(line.startswith("ready") for line in running.stdout)
     assert rtcp("stop").code == 0
     assert [*running.stdout] == ["stopped\n"]
@@ -64,7 +64,7 @@ def test_stop_ends_a_start_in_the_foreground_with_exit_code_0(
 def test_a_signal_during_the_start_leaves_nothing(
     rtcp_process: Callable[..., Any], arm: Path, number: signal.Signals
 ) -> None:
-    starting = rtcp_process("start", "--config", str(arm), *SLOW)
+    starting = rtcp_process("start", "--config", str(arm), *THOROUGH)
     assert starting.stdout.readline().startswith("segment")
     starting.send_signal(number)
     _, trouble = starting.communicate()
@@ -87,9 +87,9 @@ def test_a_start_right_after_a_stop_is_not_ended_by_the_former_launcher(
     processes_of: Callable[[Path], list[int]],
     wait_until: Callable[[Callable[[], bool]], None],
 ) -> None:
-    assert rtcp("start", "--detach", "--config", str(arm), *SLOW).code == 0
+    assert rtcp("start", "--detach", "--config", str(arm), *THOROUGH).code == 0
     assert rtcp("stop").code == 0
-    assert rtcp("start", "--detach", "--config", str(arm), *SLOW).code == 0
+    assert rtcp("start", "--detach", "--config", str(arm), *THOROUGH).code == 0
     wait_until(lambda: len(processes_of(arm)) <= 1)  # the former launcher has gone
     assert json.loads(rtcp("status", "--json").out)["state"] == "ready"
     assert rtcp("stop").code == 0

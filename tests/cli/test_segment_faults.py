@@ -15,7 +15,7 @@ import pytest
 from rtcp.cli.segment import kinds
 from rtcp.virtual.faults.registry import installed, load_script
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
 Rtcp = Callable[..., Any]

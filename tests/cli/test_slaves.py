@@ -20,7 +20,7 @@ from rtcp.fieldbus.eeprom import is_sound, with_alias
 from rtcp.launch import offline
 from tests.fieldbus.terminals import DEVICES, write_segment
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 Rtcp = Callable[..., Any]
 FILES, BITS4 = "slave 1 (Terminal 40, serial 140)", "slave 2 (Terminal 14, serial 114)"

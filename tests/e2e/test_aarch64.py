@@ -31,8 +31,8 @@ NOT_EMULATED = (
 """qemu passes neither the request of ethtool on nor those that create interfaces."""
 
 pytestmark = [
-    pytest.mark.alone,
-    pytest.mark.slow,
+    pytest.mark.platform,
+    pytest.mark.long,
     pytest.mark.timeout(4 * 3600),
     pytest.mark.skipif(os.geteuid() != 0, reason="debootstrap needs root"),
     pytest.mark.skipif(shutil.which("debootstrap") is None, reason="`apt-get install debootstrap`"),
@@ -89,5 +89,5 @@ def test_an_arm64_debian_installs_it_and_passes_the_unit_tests(debian: Path) -> 
     installed = run_in(debian, "make setup")
     assert installed.returncode == 0, installed.stdout + installed.stderr
     left_out = " ".join(f"--deselect {name}" for name in NOT_EMULATED)
-    tests = run_in(debian, f".venv/bin/python -m pytest -q -m 'not alone and not slow' {left_out} {' '.join(TESTS)}")
+    tests = run_in(debian, f".venv/bin/python -m pytest -q -m 'not platform and not long' {left_out} {' '.join(TESTS)}")
     assert tests.returncode == 0, tests.stdout[-8000:] + tests.stderr[-2000:]

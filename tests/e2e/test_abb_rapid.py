@@ -18,7 +18,7 @@ from rtcp.virtual.request_socket import RequestClient
 
 from .conftest import Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 HOME = [0.0, 0.0, 0.0, 0.0, 0.5, 0.0]
 SLOW_RAD_S = 0.2
 

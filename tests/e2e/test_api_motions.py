@@ -19,7 +19,7 @@ from rtcp.ipc.runtime_directory import control_socket, segment_control
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import Platform, kill
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 HOME = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
 

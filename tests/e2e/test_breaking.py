@@ -20,7 +20,7 @@ from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import CUBEMARS, FULL_CIA402, SLAVES, Platform, gone, kill, lives
 from tests.e2e.wire import outputs
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 PERIOD_US = 1000
 """A cycle that a loaded host keeps."""
@@ -125,7 +125,7 @@ def test_a_segment_that_stands_still_for_longer_than_allowed_is_a_fault_and_can_
 
 
 @CUBEMARS
-@pytest.mark.parametrize("mode", ["csp", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("csv", "cst"))])
+@pytest.mark.parametrize("mode", ["csp", *(pytest.param(mode, marks=pytest.mark.long) for mode in ("csv", "cst"))])
 def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform, mode: str) -> None:
     running.call("mode", name=mode)
     running.call("enable")

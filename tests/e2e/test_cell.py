@@ -32,7 +32,7 @@ from tests.cell.running import (
 )
 from tests.e2e.conftest import Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from tests.cell.running import ABB_HOME, CONFIG, Records, RunningCell, instants
 from tests.ros2.node import point, until
 from tests.ros2.zenoh_client import JOINT_STATES, Router, call
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 NAMES = [f"{arm}_joint_{number}" for arm in ("left", "right") for number in range(1, 7)]
 HOME = [*ABB_HOME, *ABB_HOME]
 THERE = [0.3, 0.1, 0.0, 0.1, 0.5, 0.1, -0.3, 0.1, 0.0, 0.0, 0.5, 0.2]

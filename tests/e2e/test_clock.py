@@ -8,7 +8,7 @@ from rtcp.fieldbus.bus import station_of
 from rtcp.ipc.errors import Faulted
 from tests.e2e.conftest import SLAVES, Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 OP = 0x08
 

@@ -17,7 +17,7 @@ from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import CUBEMARS, SEVEN_SLAVES, SLAVES, Platform, gone, kill, lives
 from tests.e2e.wire import inputs, outputs
 
-pytestmark = [pytest.mark.alone, pytest.mark.slow]
+pytestmark = [pytest.mark.platform, pytest.mark.long]
 
 ZERO = [0.0] * 6
 

@@ -11,7 +11,7 @@ from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import CUBEMARS, Platform
 from tests.e2e.wire import BOX_OUT, COUNTS_PER_RAD, DRIVE, DRIVES, images
 
-pytestmark = [pytest.mark.alone, CUBEMARS]
+pytestmark = [pytest.mark.platform, CUBEMARS]
 
 LOW, HIGH, OPEN, CLOSED = 0.0, 1.5, 1.4, 0.05
 ENABLE_OPERATION = 0x0F

@@ -26,7 +26,7 @@ from rtcp.telemetry.experiments.experiment import Row, Setup, carry_out, read_re
 
 from .conftest import SLAVES, Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_a_step_of_1_35_rad_settles_at_0_2_rad_s_without_overshoot(platform: Pla
     assert "Step of 1.35 rad" in (tmp_path / "step" / "report.html").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_square_is_driven_in_both_planes_within_1_mm_commanded_and_3_mm_actual(
     platform: Platform, tmp_path: Path
 ) -> None:
@@ -89,14 +89,14 @@ def test_the_cycle_is_the_same_from_inside_and_at_an_output_of_the_io_box(setup:
     assert inside == pytest.approx(2000.0, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_item_is_picked_by_the_joystick_of_the_virtual_arm(setup: Setup) -> None:
     rows = carried_out(PicksExperiment(("shelf",)), setup)
     assert rows["shelf: distance to the item"].met
     assert rows["highest item above ground"].here == pytest.approx(0.8, abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_streamed_sine_is_followed_with_a_latency_far_below_the_sources(setup: Setup) -> None:
     rows = carried_out(LatencyExperiment((30.0,), 3), setup)
     for sender in ("Python API", "socket"):
@@ -106,7 +106,7 @@ def test_a_streamed_sine_is_followed_with_a_latency_far_below_the_sources(setup:
     assert any("other limits" in note for note in read_result(setup.folder).notes)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_by_rapid_the_sine_is_nearly_half_a_second_behind_and_reported_some_ms_late(setup: Setup) -> None:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     by_rapid = replace(setup, config=default_config().with_name("abb_irb120_rapid.yaml"))
@@ -117,14 +117,14 @@ def test_by_rapid_the_sine_is_nearly_half_a_second_behind_and_reported_some_ms_l
     assert abs(rows["Python API, 30 Hz: reported behind the accelerometer"].here) < 30.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_inertia_and_friction_of_a_joint_come_back_within_5_percent(setup: Setup) -> None:
     rows = carried_out(TrackingExperiment((0,), (0.5, 1.0)), setup)
     assert [rows[f"joint1: {key}"].met for key in ("inertia", "coulomb", "viscous")] == [True] * 3
     assert rows["joint1, 0.5 Hz: gain"].here == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_process_has_its_share_of_a_core_and_its_memory(setup: Setup) -> None:
     rows = carried_out(ResourcesExperiment(3.0), setup)
     for activity in ("holding", "moving", "jogging", "recording"):

@@ -15,7 +15,7 @@ from rtcp.telemetry.reading import read
 
 from .conftest import FULL_CIA402, Platform
 
-pytestmark = [pytest.mark.alone, FULL_CIA402]
+pytestmark = [pytest.mark.platform, FULL_CIA402]
 BENT = [0.0, -0.5, 1.8, 0.0, 1.2, 0.0]
 ARM = load(default_config())
 

@@ -17,7 +17,7 @@ from rtcp.processes.shape_setting.profile import heat_command, read_profile
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 CONFIG = default_config().parent
 AUTO, MANUAL, RELEASED = 0x31, 0x0E, 0x02

@@ -15,7 +15,7 @@ from tests.viewer import Viewer
 
 from .conftest import Platform, kill
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 def begun(platform: Platform, *arguments: str) -> tuple[subprocess.Popen[str], str]:

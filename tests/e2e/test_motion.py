@@ -19,7 +19,7 @@ from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from tests.e2e.conftest import FULL_CIA402, Platform, kill
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 PERIOD_US = 1000
 """A cycle that a loaded host keeps."""

@@ -26,7 +26,7 @@ from tests.e2e.conftest import CUBEMARS, FULL_CIA402, PERIOD_US, SLAVES, Platfor
 from tests.e2e.wire import COUNTS_PER_RAD, outputs
 from tests.fieldbus.test_capture import OUTBOUND, PACKET, blocks
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 ZERO = [0.0] * 6
 Q = [0.3, -0.2, 0.4, -0.1, 0.25, -0.35]

@@ -20,7 +20,7 @@ from tests.telemetry.test_recorder import messages
 from .conftest import CUBEMARS, Platform
 from .wire import COUNTS_PER_RAD, inputs, outputs
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 def recordings(platform: Platform) -> list[dict[str, Any]]:

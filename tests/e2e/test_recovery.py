@@ -17,7 +17,7 @@ from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import CUBEMARS, PERIOD_US, SEVEN_SLAVES, SLAVES, Platform
 from tests.e2e.wire import outputs
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 ENABLE_OPERATION = 0x000F
 ENABLED = 0x27

@@ -11,7 +11,7 @@ from rtcp.telemetry.reading import Recorded, read
 
 from .conftest import Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 def record(platform: Platform, name: str, *command: str, check: int = 0) -> Recorded:

@@ -15,7 +15,7 @@ import pytest
 
 from tests.e2e.conftest import Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 class Manager:

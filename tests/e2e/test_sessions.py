@@ -10,7 +10,7 @@ from tests.e2e.wire import BOX_OUT, DRIVE, HEAD, LEAVES, LRW, datagrams, frames
 from tests.sessions.session import Outcome
 from tests.sessions.wire_session import check, run_on_the_wire
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 PERIOD_US = 2000
 SECONDS = 6.0

@@ -33,7 +33,7 @@ from rtcp.virtual.request_socket import RequestClient, RequestRefused
 from tests.cell.running import put_in_order
 from tests.e2e.conftest import Platform, kill, lives
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 CONFIG = default_config().parent
 AWAY = (0.2, 0.0, 0.7, 0.0, -0.6, 0.0)
@@ -288,7 +288,7 @@ def test_a_rod_gets_its_shape_and_the_report_says_what_was_measured(cell: Heater
 @pytest.mark.parametrize(
     ("number", "phase"),
     [
-        pytest.param(number, phase, id=f"{number.name}-{phase}", marks=[] if phase == "heating" else [pytest.mark.slow])
+        pytest.param(number, phase, id=f"{number.name}-{phase}", marks=[] if phase == "heating" else [pytest.mark.long])
         for number in (signal.SIGINT, signal.SIGKILL)
         for phase in BEGINS
     ],
@@ -343,7 +343,7 @@ CAUSES: dict[str, tuple[Callable[[HeaterCell], None], str]] = {
 
 
 @pytest.mark.parametrize(
-    "cause", [pytest.param(cause, marks=[] if cause == "cell halt" else [pytest.mark.slow]) for cause in CAUSES]
+    "cause", [pytest.param(cause, marks=[] if cause == "cell halt" else [pytest.mark.long]) for cause in CAUSES]
 )
 def test_heat_ends_by_itself_and_the_message_says_why(cell: HeaterCell, cause: str) -> None:
     act, words = CAUSES[cause]
@@ -371,7 +371,7 @@ def test_a_halt_of_one_arm_that_bends_the_rod_ends_all(cell: HeaterCell) -> None
     assert "stop" in errors
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_after_all_that_is_complete(cell: HeaterCell) -> None:
     folder = cell.directory / "last"
     cell.platform.rtcp("shape-set", str(cell.job), "--yes", "--out", str(folder))

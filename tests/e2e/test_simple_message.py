@@ -20,7 +20,7 @@ from rtcp.fieldbus.simple_message.messages import JointPosition, JointTrajPt, Pi
 from rtcp.ros.simple_message.client import MotionClient
 from tests.e2e.conftest import Platform, gone, kill
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 TOLERANCE_RAD = 0.01
 STEPS = 30
 

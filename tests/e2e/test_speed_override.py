@@ -15,7 +15,7 @@ from rtcp.api import Robot, State
 from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 HERE = [0.0, -0.2, 2.0, 0.0, 1.0, 0.0]
 THERE = [0.9, *HERE[1:]]

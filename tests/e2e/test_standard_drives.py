@@ -16,7 +16,7 @@ from tests.e2e.arms import replace_drives
 from tests.e2e.conftest import CUBEMARS, Platform
 from tests.fieldbus.terminals import ESI_FILES
 
-pytestmark = [pytest.mark.alone, CUBEMARS]
+pytestmark = [pytest.mark.platform, CUBEMARS]
 
 VALVES = """
 name: Valve terminal

@@ -26,8 +26,8 @@ CGROUPS = next((path for path in map(Path, ("/sys/fs/cgroup", "/sys/fs/cgroup/un
                 if (path / "cgroup.procs").exists() and (path / "cgroup.controllers").exists()), None)  # fmt: skip
 
 pytestmark = [
-    pytest.mark.alone,
-    pytest.mark.slow,
+    pytest.mark.platform,
+    pytest.mark.long,
     pytest.mark.timeout(600),
     pytest.mark.skipif(os.geteuid() != 0, reason="systemd as PID 1 needs root: run `make test-all` as root"),
     pytest.mark.skipif(not SYSTEMD.exists(), reason="systemd is not installed: `apt-get install systemd`"),

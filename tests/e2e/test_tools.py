@@ -15,7 +15,7 @@ from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import Platform
 from tests.two_tools import add_tools
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 HERE = [0.0, -0.2, 2.0, 0.0, 1.0, 0.0]
 PROGRAM = """

@@ -18,7 +18,7 @@ def test_hundreds_of_mutated_files_and_images_raise_no_other_error(tmp_path: Pat
     assert mutate.failing(0, 600, tmp_path) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(7200)
 def test_a_hundred_thousand_mutated_files_and_images_raise_no_other_error_and_take_bounded_memory() -> None:
     command = [sys.executable, "-m", "tests.esi.mutate", "1000", "100000"]

@@ -60,7 +60,7 @@ def joystick() -> Iterator[Joystick]:
 
 
 @pytest.mark.parametrize(
-    "where", ["shelf", *(pytest.param(where, marks=pytest.mark.slow) for where in ("table", "ground"))]
+    "where", ["shelf", *(pytest.param(where, marks=pytest.mark.long) for where in ("table", "ground"))]
 )
 def test_an_item_is_picked_by_joystick_bytes_alone(joystick: Joystick, where: str) -> None:
     item = ITEMS[where]

@@ -21,7 +21,7 @@ from tests.panel.conftest import begun
 
 from .conftest import add_thermometer
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from tests.faults.cases import HOLDING, MOVING
 from tests.faults.egm import CASES, LIMITS, START, Trials, run_case
 from tests.virtual.irc5.wire import sensor
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 PART = (
     ("controller: stopped for 2 s", MOVING),

@@ -11,7 +11,7 @@ from tests.e2e.conftest import Platform
 from tests.faults.cases import CASES, HOLDING, JOGGING, JOYSTICK, MOVING, Case
 from tests.faults.run import HOLD_MS, harness_of, run_case
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 PART = (
     ("cable: slave 3 to 4", MOVING),

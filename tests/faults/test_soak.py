@@ -18,7 +18,7 @@ from rtcp.virtual.faults.registry import installed, parse
 from tests.e2e.conftest import Platform
 from tests.faults.run import HOLD_MS
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 DRIVES = (2, 3, 4, 5, 6, 7)
 HELD = Resources(rss=60 << 20, threads=2, files=10)

@@ -15,7 +15,7 @@ from rtcp.virtual.faults.control import SegmentClient
 from tests.fieldbus.conftest import WATCHER, StartSegment
 from tests.fieldbus.terminals import DEVICES, ESI_FILES, OUT
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 DIRECT = ("coupler", "bits2", "emulated", "output", "bits4", "bits7", "bits6", "input", "bits1", "bits6")
 

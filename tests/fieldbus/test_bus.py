@@ -13,7 +13,7 @@ import pytest
 from rtcp.virtual.faults.control import SegmentClient
 from tests.fieldbus.conftest import Segment, StartSegment
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 OP_MAPPING = ["05", "10004060", "20007a60", "2000ff60", "20007160", "08006060"]
 INIT, NO_SYNC = "01", "00"
@@ -123,7 +123,7 @@ def test_what_differs_from_the_configuration_is_refused_in_sentences(
     assert answer["after"]["al_status"] == INIT
 
 
-@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 3))])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 3))])
 @pytest.mark.parametrize("fault", [{"fault": "loss", "rate": 0.02}, {"fault": "delay", "rate": 0.02, "ms": 30}])
 def test_frames_that_get_lost_or_come_late_keep_no_segment_from_being_configured(
     start_segment: StartSegment, fault: dict[str, Any], seed: int
@@ -140,7 +140,7 @@ def test_frames_that_get_lost_or_come_late_keep_no_segment_from_being_configured
     assert result["apart_ns"] < 1_000_000
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3, 4))])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3, 4))])
 def test_a_segment_that_is_off_its_cpu_now_and_then_is_configured_all_the_same(
     start_segment: StartSegment, seed: int
 ) -> None:

@@ -10,7 +10,7 @@ from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.recovery import Action, action_for
 from tests.fieldbus.conftest import WATCHER, Segment
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 OP = ["OP"] * 3
 

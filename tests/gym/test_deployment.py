@@ -29,7 +29,7 @@ from rtcp.ipc.runtime_directory import control_socket
 from rtcp.ipc.states import ControlMode, State
 from tests.e2e.conftest import Platform
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
 GOAL = np.array([0.1, 0.35, 1.5, 0.05, 0.55, -0.1])

@@ -40,7 +40,7 @@ def test_its_task_is_done_by_whoever_goes_straight_to_the_target(reach: ModuleTy
     assert reach.evaluate(lambda observation: np.zeros(3), 5) == 0.0
 
 
-@pytest.mark.alone
+@pytest.mark.platform
 def test_its_task_is_done_on_a_platform_too(
     reach: ModuleType, enabled: Platform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -49,7 +49,7 @@ def test_its_task_is_done_on_a_platform_too(
     assert reach.on_the_robot(straight, 2) == 1.0
 
 
-@pytest.mark.alone
+@pytest.mark.platform
 @pytest.mark.skipif(
     importlib.util.find_spec("stable_baselines3") is None,
     reason="stable-baselines3 is not installed, which brings torch",

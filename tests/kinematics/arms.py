@@ -1,6 +1,6 @@
 """Arms from their data sheets, random arms, forward kinematics as 4x4 matrices, and how much the tests try.
 
-Nothing here uses the code under test except the model and the pose. `RTCP_SLOW=1` runs the full counts.
+Nothing here uses the code under test except the model and the pose. `RTCP_THOROUGH=1` runs the full counts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from kinematics.model import ArmModel, DhRow, JointLimit
 from kinematics.pose import Pose
-from tests.samples import SLOW
+from tests.samples import THOROUGH
 
 Change = Callable[[ArmModel], ArmModel]
 
@@ -23,7 +23,7 @@ TOOL = Pose.from_xyzrpy(0.03, -0.02, 0.11, 0.4, -1.2, 2.1)
 
 def count(quick: int, slow: int) -> int:
     """How many cases to try."""
-    return slow if SLOW else quick
+    return slow if THOROUGH else quick
 
 
 def assistive() -> ArmModel:

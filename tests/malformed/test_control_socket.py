@@ -15,7 +15,7 @@ import pytest
 from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import Platform, lives
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 LINES = 800
 A_CONNECTION = 60

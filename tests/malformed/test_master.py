@@ -15,7 +15,7 @@ from tests.malformed import mutated_answers
 from tests.malformed.cable import answerer, master, report_of
 from tests.malformed.line import Line
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 def test_process_data_are_exchanged_on_through_mutated_answers_and_are_right_again_after_them() -> None:

@@ -21,10 +21,10 @@ from rtcp.motion.controllers import Controller, ControllerSetup, JogController
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
-from tests.samples import SLOW
+from tests.samples import THOROUGH
 
 PERIOD = 0.0005
-JOG_PERIOD = 0.0005 if SLOW else 0.002
+JOG_PERIOD = 0.0005 if THOROUGH else 0.002
 SAMPLED = round(0.01 / JOG_PERIOD)
 Rows = Callable[..., "tuple[memoryview[float], int]"]
 """Plans points; returns the rows and their count."""

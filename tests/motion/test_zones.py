@@ -23,7 +23,7 @@ from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.guards.zones import ITSELF, TOOL, Zones, inside
 from rtcp.motion.limits import Limits, corners
 from tests.arm_geometry import CLEARANCE, RADIUS, Point, box_gaps, depth, own_gap, points
-from tests.samples import SLOW, examples
+from tests.samples import THOROUGH, examples
 
 from .guard_checker import ARM, MODEL, GuardChecker, with_boxes
 
@@ -396,7 +396,7 @@ def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
     # A plate of 2 mm beside the tool, at many distances: at full speed a cycle's step is longer.
     q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
     tool = points(q)[0]
-    for gap, sign in product([0.004 * n for n in range(1, 20, 1 if SLOW else 3)], [1.0, -1.0]):
+    for gap, sign in product([0.004 * n for n in range(1, 20, 1 if THOROUGH else 3)], [1.0, -1.0]):
         y = tool[1] + sign * (BODY + gap + 0.001)
         box = [tool[0] - 0.3, y - 0.001, tool[2] - 0.3, tool[0] + 0.3, y + 0.001, tool[2] + 0.3]
         checker = GuardChecker(with_boxes(WIDE, box), q, 0.01)

@@ -53,7 +53,7 @@ def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 @needs_c
 def test_all_solutions_are_those_of_kinematics(arm: tuple[ArmModel, CSolver]) -> None:
-    """Order, branch, limits and singularities are compared too; a million poses with RTCP_SLOW=1."""
+    """Order, branch, limits and singularities are compared too; a million poses with RTCP_THOROUGH=1."""
     compared = compare(*arm, count(3_000, 1_000_000 // len(ARMS)))
     assert compared.different == 0, compared.first
     assert compared.worst < 1e-4  # at an edge of the workspace an angle has half the digits of the pose

@@ -26,7 +26,7 @@ from rtcp.virtual.request_socket import RequestClient
 from tests.cell.running import ABB_HOME, CONFIG, RunningCell, put_in_order, restore
 from tests.panel.conftest import barriers, begun, show, until, visitor
 
-pytestmark = [pytest.mark.alone, pytest.mark.browser]
+pytestmark = [pytest.mark.platform, pytest.mark.browser]
 SLACK_S = 0.6
 """Allowance for braking, 0.22 s along a common path, and a shared host, s."""
 FAR = {"left": "0.9, 0.2, 0.1, 0, 0.5, 0.3", "right": "-0.9, 0.1, -0.1, 0.1, 0.6, 0"}

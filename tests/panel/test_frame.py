@@ -20,7 +20,7 @@ from rtcp.panel.trends import KEPT_S, SAMPLE_S, Trends
 from tests.e2e.conftest import Platform
 from tests.panel.conftest import BENT, begun, show, until, visitor
 
-pytestmark = [pytest.mark.alone, pytest.mark.browser]
+pytestmark = [pytest.mark.platform, pytest.mark.browser]
 PHONE: ViewportSize = {"width": 400, "height": 844}
 
 

@@ -40,7 +40,7 @@ from tests.panel.conftest import (
     visitor,
 )
 
-pytestmark = [pytest.mark.alone, pytest.mark.browser]
+pytestmark = [pytest.mark.platform, pytest.mark.browser]
 NAMESPACE = f"rtcp-net-{os.getpid()}"
 GRIPPER = 1 << 3
 """Mask of the gripper's output, number 4."""

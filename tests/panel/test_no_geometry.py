@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 from tests.e2e.conftest import Platform
 from tests.panel.conftest import begun, show, until, visitor
 
-pytestmark = [pytest.mark.alone, pytest.mark.browser]
+pytestmark = [pytest.mark.platform, pytest.mark.browser]
 
 
 @pytest.fixture(scope="module", params=[4, 7])

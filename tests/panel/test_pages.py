@@ -21,7 +21,7 @@ from rtcp.virtual.faults.registry import installed
 from tests.e2e.conftest import Platform
 from tests.panel.conftest import BENT, barriers, begun, show, until, visitor
 
-pytestmark = [pytest.mark.alone, pytest.mark.browser]
+pytestmark = [pytest.mark.platform, pytest.mark.browser]
 REPOSITORY = Path(__file__).parents[2]
 DRIVE_IDENTITY = re.compile(r"vendor_id: (\w+)[\s\S]*product_id: (\w+)")
 

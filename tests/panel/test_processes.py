@@ -13,7 +13,7 @@ from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from tests.e2e.conftest import Platform
 from tests.panel.conftest import barriers, begun, show
 
-pytestmark = [pytest.mark.alone, pytest.mark.browser]
+pytestmark = [pytest.mark.platform, pytest.mark.browser]
 HEATER = Path(__file__).parents[2] / "config/heater.yaml"
 
 

@@ -12,7 +12,7 @@ from rtcp.config.motion_file import read_motion
 from tests.e2e.conftest import Platform
 from tests.panel.conftest import BENT, barriers, show, until
 
-pytestmark = [pytest.mark.alone, pytest.mark.browser]
+pytestmark = [pytest.mark.platform, pytest.mark.browser]
 
 
 def file_of(platform: Platform, name: str) -> Path:

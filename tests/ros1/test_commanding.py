@@ -14,7 +14,7 @@ from tests.e2e.conftest import Platform
 
 from .conftest import Ros, begin_node, command, is_at, until
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 THERE = [0.2, -0.1, 0.1, 0.0, 0.1, 0.3]
 SUCCEEDED, PREEMPTED, ABORTED, REJECTED = 3, 2, 4, 5
 """actionlib_msgs/GoalStatus."""

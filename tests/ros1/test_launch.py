@@ -14,7 +14,7 @@ from tests.e2e.conftest import Platform
 
 from .conftest import PATIENCE_S, Ros
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 LAUNCH = Path(__file__).parents[2] / "config/ros"
 
 

@@ -12,7 +12,7 @@ from tests.e2e.conftest import Platform
 from .conftest import Ros, begin_node, command, is_at, until
 from .test_commanding import path
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 
 @pytest.mark.parametrize("kind", ["path", "stream"])

@@ -22,7 +22,7 @@ from tests.e2e.conftest import Platform, kill
 
 from .conftest import PATIENCE_S, Ros, begin_node, until
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 LISTENER = Path(__file__).parent / "listener.py"
 
 

@@ -19,7 +19,7 @@ from tests.e2e.wire import COUNTS_PER_RAD, outputs
 
 from .conftest import Ros, begin_node, command, is_at, until
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 RADIUS_RAD, PERIOD_S = 0.1, 4.0
 
 

@@ -23,7 +23,7 @@ from tests.e2e.test_standard_drives import add_valves
 from .node import free_port, outputs, point, until
 from .zenoh_client import GID, JOINT_STATES, Router, call
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 THERE = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1]
 
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from rtcp.ipc.commands import Halt, SetControlMode
 from rtcp.ipc.states import ControlMode, State
 from rtcp.testing.sessions.commander import KINDS
-from tests.samples import SLOW
+from tests.samples import THOROUGH
 from tests.sessions.session import Outcome, run_session, session_of
 
-SESSIONS, BATCH = (100, 20) if SLOW else (4, 2)
+SESSIONS, BATCH = (100, 20) if THOROUGH else (4, 2)
 
 
 @pytest.mark.timeout(900)
@@ -22,7 +22,7 @@ def test_no_frame_of_a_random_session_breaks_a_limit(first: int) -> None:
     assert failures == []
 
 
-@pytest.mark.skipif(not SLOW, reason="30 sessions: with RTCP_SLOW=1")
+@pytest.mark.skipif(not THOROUGH, reason="30 sessions: with RTCP_THOROUGH=1")
 @pytest.mark.timeout(900)
 def test_the_sessions_visit_every_state_and_send_every_command() -> None:
     total = Outcome()
@@ -57,7 +57,7 @@ ACTIONS = len(session_of(1).actions)
 
 
 # Hypothesis shortens a session that breaks a limit.
-@settings(max_examples=60 if SLOW else 3, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60 if THOROUGH else 3, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 1000),
     steps=st.lists(st.tuples(st.integers(0, ACTIONS - 1), st.integers(0, 10_000)), min_size=1, max_size=20),

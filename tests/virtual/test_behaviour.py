@@ -30,7 +30,7 @@ from tests.virtual.test_described import DRIVE, OP, OUTPUTS, TWO, device
 PRE_OP, BOOT = 2, 3
 
 
-@pytest.mark.alone
+@pytest.mark.platform
 @pytest.mark.parametrize(
     ("behaviour", "part", "message"),
     [
@@ -62,7 +62,7 @@ def config_of(folder: Path, behaviour: str) -> Path:
     return config
 
 
-@pytest.mark.alone
+@pytest.mark.platform
 @pytest.mark.parametrize(
     ("behaviour", "code", "message"),
     [
@@ -96,7 +96,7 @@ UNUSABLE = {
 }
 
 
-@pytest.mark.alone
+@pytest.mark.platform
 @pytest.mark.parametrize("name", UNUSABLE)
 def test_a_behaviour_that_cannot_be_made_is_a_sentence_of_the_segments_file(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
@@ -273,7 +273,7 @@ def test_packets_out_of_order_and_messages_that_fit_nothing_are_errors() -> None
     assert client.ask(ACKNOWLEDGE, 7)[:2] == (ERROR, 0x8005)
 
 
-@pytest.mark.alone
+@pytest.mark.platform
 def test_a_real_master_writes_firmware_in_boot_and_reads_it(tmp_path: Path) -> None:
     from tests.virtual.conftest import segment
 

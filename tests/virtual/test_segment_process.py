@@ -18,7 +18,7 @@ import pytest
 
 from rtcp.virtual.server import SO_TIMESTAMPNS, TIMESPEC, arrival
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 ROOT = Path(__file__).parents[2]
 CHILD = Path(__file__).with_name("soem_child.py")
@@ -283,7 +283,7 @@ def test_under_sched_fifo_the_segment_leaves_the_kernel_its_share_of_the_cpu(
     assert result["counters"] == [7]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("options", "frames", "period_us"), [((), 100_000, 0), (("--poll",), 20_000, 1000)])
 def test_no_frame_is_lost_back_to_back_nor_while_polling(
     config: Path, options: tuple[str, ...], frames: int, period_us: int

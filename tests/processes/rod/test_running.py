@@ -8,8 +8,8 @@ from tests.cell.running import CONFIG, RunningCell
 from tests.processes.rod.test_bending import planned
 
 
-@pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.long
+@pytest.mark.platform
 def test_the_shipped_cell_runs_a_planned_bend() -> None:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     plan = planned()

@@ -20,7 +20,7 @@ from rtcp.virtual.request_socket import LONGEST_REQUEST, MOST_CLIENTS, RequestRe
 from tests.virtual.faults.conftest import BeginSegment, Exchange, Running
 from tests.virtual.frames import Datagram, build, parse
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 BROADCASTS = [build(Datagram(DatagramCommand.BRD, number, 0, 0, bytes(2))) for number in range(20)]
 

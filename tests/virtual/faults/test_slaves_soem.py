@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 ROOT = Path(__file__).parents[3]
 CHILD = Path(__file__).with_name("soem_recovery_child.py")

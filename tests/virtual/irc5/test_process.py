@@ -21,7 +21,7 @@ pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip in
 from tests.virtual.irc5.wire import Robot, sensor
 from tests.virtual.test_segment_process import NOBODY, needs_nobody
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.platform
 
 ROOT = Path(__file__).parents[3]
 PEERS = Path(os.environ.get("RTCP_EGM_PEERS", ROOT / ".venv-egm-peers")) / "bin" / "python"
