@@ -8,7 +8,7 @@ PYTEST = $(BIN)/python -m pytest $(if $(SEED),--randomly-seed=$(SEED))
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup oracles run panel check test test-all test-arms test-ros fast faults lint format clean
+.PHONY: help setup oracles run panel check test test-all test-flaky test-arms test-ros fast faults lint format clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -18,7 +18,7 @@ setup: ## make .venv with the package and what it needs
 	@sh .ci/setup "$(PYTHON)"
 
 oracles: setup ## add what the kinematics is compared with (Pinocchio, EAIK); without it those tests are skipped
-	@$(BIN)/python -m pip install --quiet --editable '.[dev,oracles]'
+	@sh .ci/install .venv --editable '.[dev,oracles]'
 
 run: setup ## run the demonstration: virtual segment, master, a move, the figures
 	@$(BIN)/rtcp demo --square xy
@@ -34,6 +34,9 @@ test: setup ## run all tests but those marked long
 
 test-all: oracles ## run all tests, with every sample
 	@RTCP_THOROUGH=1 $(PYTEST) --numprocesses 4 --dist loadfile
+
+test-flaky: setup ## run all tests but the long ones five times on a busy host: no verdict may change
+	@$(BIN)/python -m tests.flaky $(if $(SEED),--seed $(SEED)) -- -m 'not long' --numprocesses 4 --dist loadfile
 
 test-arms: setup ## run the end-to-end tests of the arm with the drives of each other arm (tests/drive_esi.py)
 	@status=0; \
