@@ -9,7 +9,9 @@ from __future__ import annotations
 import re
 import stat
 from collections.abc import Iterable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +87,13 @@ def parse(text: str, path: Path) -> Document:
     Raises:
         ConfigError: it is no YAML, empty, no mapping, larger than any configuration, or repeats keys.
     """
+    known = _parsed(text, path)
+    return Document(path, deepcopy(known.data), dict(known.lines))
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str, path: Path) -> Document:
+    """As `parse`. Remembered because a simulation reads the same files again for every arm that it makes."""
     document = Document(path)
     builder = _Builder(text, document.lines)
     try:
