@@ -104,10 +104,9 @@ def test_a_record_of_the_far_future_is_not_taken(beside: Beside) -> None:
 
 def test_every_field_of_a_record_is_taken(beside: Beside) -> None:
     vectors = [[0.1 * n + part for n in range(6)] for part in (1.0, -2.0, 3.0)]
-    names = ("commanded_position", "commanded_velocity", "acceleration_limit")
     beside.reads(
         state=State.MOVING, step_motion=7, step_phase=StepPhase.BRAKING, step_brake_ns=9, step_path_s=0.5,
-        **dict(zip(names, vectors, strict=True)),
+        commanded_position=vectors[0], commanded_velocity=vectors[1], acceleration_limit=vectors[2],
     )  # fmt: skip
     record = beside.record
     assert [record.position, record.velocity, record.acceleration] == vectors
@@ -121,6 +120,8 @@ def test_the_guard_brakes_a_partner_by_its_acceleration_in_force_and_after_its_s
     guard = beside.partners.watch(ArmState(6), limits, 0.001)
     assert guard is not None
     assert guard._own.acceleration is limits.acceleration
-    assert [body.acceleration for body in guard._partners if body is not None] == [beside.record.acceleration]
+    (partner,) = guard._partners
+    assert partner is not None
+    assert partner.acceleration is beside.record.acceleration
     assert (guard._period_s, guard._delay_s) == (0.001, CELL.longest_silence_s + CELL.slowest_s)
     assert guard._clearance == CELL.clearance

@@ -46,7 +46,7 @@ def during_a_stop(q: Sequence[float], velocity: Sequence[float], delay: float, t
     return [a + turned(v, rate, delay, time) for a, v, rate in zip(q, velocity, ACCELERATION, strict=True)]
 
 
-def ends(arm: Body, q: Sequence[float]) -> list[Sequence[float]]:
+def ends(arm: Body, q: Sequence[float]) -> list[tuple[float, ...]]:
     """Both ends of each body's axis, m."""
     arm.place(q)
     axes = arm.placed.axes
