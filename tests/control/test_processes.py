@@ -13,12 +13,17 @@ from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, InputsConfig, OutputsConfig
 from rtcp.control.part import PartContext
 from rtcp.ipc.commands import AT_REST, Command, Disable, MoveJoints, Reset
+from rtcp.ipc.events import ProcessFailed
 from rtcp.ipc.refusals import Refusal
 from rtcp.ipc.schema import Field
 from rtcp.ipc.states import State
 from rtcp.processes import InputChannel, OutputChannel, Process, ProcessConfig, ProcessSetup
 from rtcp.testing.simulation import Simulation
 from rtcp.virtual.models.diewu import RELEASED
+
+SAFE = 0x0300
+"""Safe value of the outputs, other than zero."""
+RAISES = 7
 
 
 class Blink(Command):
@@ -58,6 +63,8 @@ class Lamp(Process):
         assert isinstance(command, Blink)
         if not command.pattern:
             return Dark()
+        if command.pattern == RAISES:
+            raise RuntimeError("no such pattern")
         self.pattern = command.pattern
         return None
 
@@ -77,7 +84,9 @@ class Lamp(Process):
 def config(tmp_path: Path) -> ArmConfig:
     (tmp_path / "segment.yaml").write_text("slaves: [{model: diewu-io}]\n")
     box = load(default_config())
-    slave = replace(box.slaves[0], device=replace(box.slaves[0].device, kind="generic"))
+    device = replace(box.slaves[0].device, kind="generic")
+    pdos = tuple(replace(pdo, channels=tuple(replace(c, safe=SAFE) for c in pdo.channels)) for pdo in device.rpdo)
+    slave = replace(box.slaves[0], device=replace(device, rpdo=pdos))
     platform = replace(box, joints=(), slaves=(slave,), arm=None, source=tmp_path / "lamp.yaml", gripper=None)
     return replace(platform, inputs=InputsConfig(), outputs=OutputsConfig(), processes=(LampConfig("lamp", "lamp"),))
 
@@ -136,7 +145,7 @@ def test_a_fault_makes_it_safe_until_it_is_commanded_again(running: Simulation) 
     running.send(Blink(5))
     running.data.lose(running.config.bus.lost_cycles + 5)
     running.bring_to(State.FAULT, 1.0)
-    assert shown(running) == 0
+    assert shown(running) == SAFE
     running.send(Reset())
     running.bring_to(State.READY)
     assert shown(running) == 0
@@ -144,16 +153,29 @@ def test_a_fault_makes_it_safe_until_it_is_commanded_again(running: Simulation) 
     assert shown(running) == 6
 
 
-def test_one_that_raises_is_a_fault_with_outputs_of_zero(running: Simulation) -> None:
-    running.send(Blink(5))
-    lamp(running).raises = True
+def test_one_that_raises_is_a_fault_with_safe_outputs_each_time(running: Simulation) -> None:
+    for pattern in (5, 6):
+        running.send(Blink(pattern))
+        assert shown(running) == pattern
+        lamp(running).raises = True
+        running.bring_to(State.FAULT, 0.1)
+        running.run(0.1)
+        assert shown(running) == SAFE
+        assert running.send(Blink(pattern)).refusal is not None
+        record = running.observer.latest()
+        assert record is not None
+        assert int(record["lamp_pattern"][0]) == 0
+        lamp(running).raises = False
+        running.run(0.1)
+        assert shown(running) == SAFE
+        running.send(Reset())
+        running.bring_to(State.READY)
+        assert shown(running) == 0
+        assert lamp(running).pattern == 0
+    assert sum(isinstance(record.event, ProcessFailed) for record in running.events) == 2
+
+
+def test_one_that_raises_in_a_command_is_a_fault_too(running: Simulation) -> None:
+    running.send(Blink(RAISES))
     running.bring_to(State.FAULT, 0.1)
-    assert shown(running) == 0
-    refusal = running.send(Blink(6)).refusal
-    assert refusal is not None
-    lamp(running).raises = False
-    running.send(Reset())
-    running.bring_to(State.READY)
-    assert shown(running) == 0
-    running.send(Blink(6))
-    assert shown(running) == 6
+    assert shown(running) == SAFE
