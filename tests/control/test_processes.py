@@ -12,9 +12,9 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, InputsConfig, OutputsConfig
 from rtcp.control.part import PartContext
-from rtcp.ipc.commands import AT_REST, Command, Disable, MoveJoints, Reset
+from rtcp.ipc.commands import Command, Disable, MoveJoints, Reset
 from rtcp.ipc.events import ProcessFailed
-from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.refusals import ProcessRaised, Refusal
 from rtcp.ipc.schema import Field
 from rtcp.ipc.states import State
 from rtcp.processes import InputChannel, OutputChannel, Process, ProcessConfig, ProcessSetup
@@ -29,7 +29,7 @@ RAISES = 7
 class Blink(Command):
     """Show `pattern` at the outputs."""
 
-    states = AT_REST
+    states = frozenset(State)
     pattern: int
 
 
@@ -55,6 +55,7 @@ class Lamp(Process):
         self._inputs, self._outputs = setup.signals[config.inputs], setup.signals[config.outputs]
         self.pattern = 0
         self.raises = False
+        self.updates = 0
 
     def fields(self) -> Sequence[Field]:
         return (Field("pattern", "uint16", "", "What it shows."),)
@@ -69,6 +70,7 @@ class Lamp(Process):
         return None
 
     def update(self, context: PartContext) -> None:
+        self.updates += 1
         if self.raises:
             raise RuntimeError("the lamp is gone")
         self._outputs.value = self.pattern if self._inputs.value == RELEASED else 0
@@ -157,11 +159,14 @@ def test_one_that_raises_is_a_fault_with_safe_outputs_each_time(running: Simulat
     for pattern in (5, 6):
         running.send(Blink(pattern))
         assert shown(running) == pattern
-        lamp(running).raises = True
-        running.bring_to(State.FAULT, 0.1)
-        running.run(0.1)
-        assert shown(running) == SAFE
-        assert running.send(Blink(pattern)).refusal is not None
+        lamp(running).raises, before = True, lamp(running).updates
+        outputs = set()
+        for _ in range(20):
+            running.cycle()
+            outputs.add(running.box.outputs)  # type: ignore[union-attr]
+        assert outputs == {pattern, SAFE}
+        assert (running.state, lamp(running).updates) == (State.FAULT, before + 1)
+        assert isinstance(running.send(Blink(pattern)).refusal, ProcessRaised)
         record = running.observer.latest()
         assert record is not None
         assert int(record["lamp_pattern"][0]) == 0

@@ -249,6 +249,8 @@ def test_a_homing_can_follow_another(homing: Homing, drive: Cia402Drive, wire: W
     assert show(homing, wire, ENABLED, position=750, mode=8) is P.ENTERING
     assert homing.position == pytest.approx(0.07)
     assert show(homing, wire, REST) is P.SEARCHING
+    show(homing, wire, UNDER_WAY, position=800)
+    assert homing.position == pytest.approx(0.08)
     show(homing, wire, FAILED, LATE + 1)
     show(homing, wire, FAILED, 20)
     assert show(homing, wire, ENABLED, 2, mode=8) is P.FAILED

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rtcp.config.model import Joint, Range
@@ -200,6 +200,8 @@ def test_a_target_is_led_back_no_faster_than_gently_or_than_its_joint_may_and_un
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50))
+@example([0.01] * 20 + [0.0] * 3)
+@example([-0.01] * 20 + [0.0] * 3)
 def test_a_target_velocity_changes_by_no_more_than_acceleration_x_cycle(wanted: list[float]) -> None:
     guard, drive = OutputLimiter(Limits(CONFIG), PERIOD), Drive()
     before = 0.0

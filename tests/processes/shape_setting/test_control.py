@@ -87,7 +87,7 @@ def test_after_a_reset_the_next_heating_is_the_first_one_again(limit: float) -> 
     assert (second.target, second.is_limited) == (0.0, False)
     for n in range(300):
         for pid in (first, second):
-            pid.update(1.02 if n else 1.01, 1.012 + 1e-5 * (n // 5), 30.0, 30.0)
+            pid.update(1.02, 1.012 + 1e-5 * (n // 5), 30.0, 30.0)
         assert (first.target, first.is_limited) == (second.target, second.is_limited)
 
 
