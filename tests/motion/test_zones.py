@@ -321,7 +321,7 @@ def test_room_from_before_a_change_is_not_used(tmp_path: Path, change: str, sign
     cartesian = replace(config.cartesian, box=None, keep_out=())
     limits = Limits(replace(config, cartesian=cartesian))
     guard, state, dt = TrajectoryGuard(config, limits, 0.002), ArmState(6), 0.002
-    q = [0.0, 0.6, 1.2, 0.0, 0.0, 0.0]
+    q = [0.0, 1.2, 0.0, 0.0, 0.0, 0.0]
     # Joint 1 moves the tool along y, towards a wall just beside the arm that is to be stopped there.
     tool = config.models[change == "tool"]
     x, y, z = forward(tool, q).position
@@ -344,6 +344,7 @@ def test_room_from_before_a_change_is_not_used(tmp_path: Path, change: str, sign
     guard.latch(state)
     drive(5, 1e-3 * side)
     drive(20, 0.0)
+    assert guard.poses == frames(config.models[0], state.commanded)
     if change == "tool":
         guard.use_tool(1)
     elif change == "keep-out box":
