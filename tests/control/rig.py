@@ -290,16 +290,21 @@ class LoopRig(Simulation):
         self.wait(lambda: not self.machine.changing_mode)
         return self
 
-    def set_in_motion(self, mode: int = CSP) -> LoopRig:
-        """Move both joints at full speed, far from their targets."""
+    def set_in_motion(self, mode: int = CSP, direction: int = 1) -> LoopRig:
+        """Move both joints at full speed in a direction, 1 or -1, far from their targets."""
         self.hold(mode)
-        self.move(1.8, 1.8)
+        self.move(direction * 1.8, direction * 1.8)
         self.run(0.6)
-        assert all(drive.velocity > 0.9 * SPEED for drive in self.arm.drives)
+        assert all(direction * drive.velocity > 0.9 * SPEED for drive in self.arm.drives)
         return self
 
-    def lead_to(self, state: State) -> LoopRig:
-        """Bring the machine from its start into `state`, by the commands and faults that lead there."""
+    def lead_to(self, state: State, direction: int = 1) -> LoopRig:
+        """Bring the machine from its start into `state`, by the commands and faults that lead there.
+
+        Args:
+            state: the state.
+            direction: 1 or -1, of a motion on the way.
+        """
         if state is State.STARTING:
             self.cycle()
         elif state is State.READY:
@@ -309,11 +314,11 @@ class LoopRig(Simulation):
         elif state is State.HOLDING:
             self.hold()
         elif state is State.MOVING:
-            self.set_in_motion()
+            self.set_in_motion(direction=direction)
         elif state is State.STOPPING:
-            self.set_in_motion().do(Halt())
+            self.set_in_motion(direction=direction).do(Halt())
         elif state is State.DISABLING:
-            self.set_in_motion().do(Disable())
+            self.set_in_motion(direction=direction).do(Disable())
         elif state is State.FAULT:
             self.hold()
             self.service.lost_slave = 3
@@ -322,8 +327,9 @@ class LoopRig(Simulation):
             self.hold().press()
         elif state is State.STOPPED_BY_LIMIT:
             # The limits close in on a move that was planned under wider ones.
-            self.set_in_motion()
-            self.arm.limits.high[0] = self.arm.state.commanded[0] + 0.3
+            self.set_in_motion(direction=direction)
+            ends = self.arm.limits.high if direction > 0 else self.arm.limits.low
+            ends[0] = self.arm.state.commanded[0] + direction * 0.3
             self.bring_to(State.STOPPED_BY_LIMIT)
         elif state is State.HOMING:
             self.hold()
@@ -336,7 +342,7 @@ class LoopRig(Simulation):
             self.slaves_come_back = False
             self.do(Reset())
         else:
-            self.set_in_motion().do(Shutdown())
+            self.set_in_motion(direction=direction).do(Shutdown())
         assert self.state is state
         return self
 
@@ -381,6 +387,10 @@ def let_go(rig: LoopRig) -> None:
     for axis in range(2):
         turn(rig, axis, 1.0, 0.0, 0.0)
 
+
+DIRECTIONS = pytest.mark.parametrize("direction", [1, -1])
+MOTIONS = pytest.mark.parametrize(("mode", "direction"), [(CSP, 1), (CSP, -1), (CSV, -1), (CST, 1), (CST, -1)])
+"""Drive modes and directions of a motion."""
 
 Step = Callable[[LoopRig], object]
 CAUSES: dict[str, tuple[Step, Step]] = {

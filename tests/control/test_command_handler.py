@@ -255,6 +255,10 @@ def test_the_edge_of_a_range_is_inside_it(rig: LoopRig) -> None:
 # -- enabling -------------------------------------------------------------------------------------------------------
 
 
+def standstill(axis: int, velocity: float) -> refusals.Refusal:
+    return refusals.NotAtStandstill(axis, about(velocity, rel=0.01))
+
+
 @pytest.mark.parametrize(
     ("prevent", "refusal"),
     [
@@ -262,9 +266,19 @@ def test_the_edge_of_a_range_is_inside_it(rig: LoopRig) -> None:
         (lambda rig: setattr(rig.discipline, "locked", False), refusals.ClockNotLocked()),
         (lambda rig: setattr(rig.models[1].mechanics, "position", 2.1), refusals.JointOutsideRange(1, 2.1)),
         (lambda rig: setattr(rig.models[1].mechanics, "position", -2.1), refusals.JointOutsideRange(1, -2.1)),
-        (lambda rig: turn(rig, 1, 1e5, 0.05, 10.0), refusals.NotAtStandstill(1, about(0.05, rel=0.01))),
+        *(
+            (lambda rig, a=axis, v=velocity: turn(rig, a, 1e5, v, 200.0 * v), standstill(axis, velocity))
+            for axis in range(2)
+            for velocity in (0.05, -0.05)
+        ),
     ],
-    ids=["a slave is not in OP", "the clock is not locked", "above the range", "below the range", "a joint turns"],
+    ids=[
+        "a slave is not in OP",
+        "the clock is not locked",
+        "above the range",
+        "below the range",
+        *(f"joint {axis + 1} turns {way}" for axis in range(2) for way in ("up", "down")),
+    ],
 )
 def test_nothing_is_enabled_while(rig: LoopRig, prevent: Step, refusal: refusals.Refusal) -> None:
     prevent(rig.start())

@@ -16,6 +16,7 @@ from .rig import (
     CAUSES,
     CONFIG,
     COUNTS,
+    DIRECTIONS,
     EMERGENCY_STOP_INPUT,
     LONGEST_STEP,
     PERIOD_S,
@@ -35,20 +36,27 @@ PRESSED_SAYS = (
 # -- the button -----------------------------------------------------------------------------------------------------
 
 
-def test_in_motion_the_drives_ramp_down_before_the_torque_goes_and_the_slaves_are_parked_last(rig: LoopRig) -> None:
+@DIRECTIONS
+def test_each_time_the_drives_ramp_down_before_the_torque_goes_and_the_slaves_are_parked_last(
+    rig: LoopRig, direction: int
+) -> None:
     parked: list[int] = []
-    rig.set_in_motion()
+    rig.set_in_motion(direction=direction)
     rig.service.park = lambda: parked.append(rig.context.cycle)  # type: ignore[method-assign]
-    begun = len(rig.log)
-    rig.press()
-    rig.wait(lambda: bool(parked))
-    seen = rig.log[begun:]
-    moving = [n for n, cycle in enumerate(seen) if any(abs(drive.velocity) > 200 for drive in cycle.drives)]
-    torque = [n for n, cycle in enumerate(seen) if any(drive.has_torque for drive in cycle.drives)]
-    assert moving
-    assert max(moving) < max(torque) < len(seen)
-    assert parked == [rig.context.cycle]
-    assert rig.kinds[-2:] == [events.EmergencyStopActivated, events.SlavesParked]
+    for times in (1, 2, 3):
+        begun = len(rig.log)
+        rig.press()
+        rig.wait(lambda: len(parked) == times)  # noqa: B023
+        seen = rig.log[begun:]
+        moving = [n for n, cycle in enumerate(seen) if any(abs(drive.velocity) > 200 for drive in cycle.drives)]
+        torque = [n for n, cycle in enumerate(seen) if any(drive.has_torque for drive in cycle.drives)]
+        assert moving
+        assert max(moving) < max(torque) < len(seen)
+        assert parked[-1] == rig.context.cycle
+        assert rig.kinds[-2:] == [events.EmergencyStopActivated, events.SlavesParked]
+        rig.press(False)
+        rig.recover().move(direction * 1.8, direction * 1.8)
+        rig.run(0.6)
 
 
 def test_while_it_is_pressed_neither_reset_nor_enable_is_taken(rig: LoopRig) -> None:
@@ -150,10 +158,11 @@ def test_a_torque_beyond_its_limit_counts_after_five_cycles_in_a_row(rig: LoopRi
 # -- stopped by a limit ---------------------------------------------------------------------------------------------
 
 
-def test_a_move_that_meets_a_limit_is_stopped_before_it_and_says_which(rig: LoopRig) -> None:
-    rig.lead_to(State.STOPPED_BY_LIMIT)
-    limit = rig.arm.limits.high[0]
-    assert max(cycle.drives[0].target for cycle in rig.log) <= limit * COUNTS
+@DIRECTIONS
+def test_a_move_that_meets_a_limit_is_stopped_before_it_and_says_which(rig: LoopRig, direction: int) -> None:
+    rig.lead_to(State.STOPPED_BY_LIMIT, direction)
+    limit = rig.arm.limits.high[0] if direction > 0 else -rig.arm.limits.low[0]
+    assert max(direction * cycle.drives[0].target for cycle in rig.log) <= limit * COUNTS
     assert rig.kinds[-2:] == [events.JointLimitReached, events.StoppedByLimit]
     assert rig.last_of(events.JointLimitReached).axis == 0
     assert "`rtcp reset`" in rig.messages[-2]
@@ -180,18 +189,18 @@ def test_stopped_by_a_limit_the_arm_holds_and_moves_again_only_after_reset(rig: 
 
 
 @pytest.mark.parametrize("beyond", [-0.05, 0.015, 0.019])
-@pytest.mark.parametrize("speed", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize(("speed", "side"), [(0.1, 1), (0.3, -1), (0.5, 1), (0.5, -1)])
 def test_a_move_right_after_a_homing_beyond_the_range_begins_as_any_other(
-    rig: LoopRig, beyond: float, speed: float
+    rig: LoopRig, beyond: float, speed: float, side: int
 ) -> None:
     rig.hold()
-    high = rig.arm.limits.high[0]
+    edge = rig.arm.limits.high[0] if side > 0 else rig.arm.limits.low[0]
     rig.models[0].objects[0x6098, 0].value = 37
-    rig.models[0].objects[0x607C, 0].value = round((high + beyond) * COUNTS)
+    rig.models[0].objects[0x607C, 0].value = round((edge + side * beyond) * COUNTS)
     rig.do(Home(0))
     rig.bring_to(State.HOLDING)
     begun = len(rig.log) - 1
-    rig.move(high - 0.8, rig.arm.drives[1].position, speed=speed)
+    rig.move(edge - side * 0.8, rig.arm.drives[1].position, speed=speed)
     rig.run(1.2)
     targets = [cycle.drives[0].target for cycle in rig.log[begun:]]
     speeds = [(after - before) / COUNTS / PERIOD_S for before, after in pairwise(targets)]

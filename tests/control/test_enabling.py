@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 
-from rtcp.ipc.commands import Disable, Enable
+from rtcp.ipc.commands import Disable, Enable, Reset
 from rtcp.ipc.events import DriveLeftEnabled, Enabled, OverSpeed, PositionJumped, ReturningToRange
 from rtcp.ipc.refusals import WrongState
 from rtcp.ipc.states import State
@@ -16,11 +17,13 @@ from .rig import (
     CONFIG,
     CONTROLWORD,
     COUNTS,
+    DIRECTIONS,
     ENABLE_OPERATION,
     LONGEST_STEP,
     PERIOD_S,
     QUICK_STOP,
     SWITCH_ON,
+    UNDER_VOLTAGE,
     LoopRig,
     about,
     move_to,
@@ -140,44 +143,47 @@ def test_a_drive_that_leaves_operation_enabled_while_others_are_on_their_way_is_
     rig.recover()
 
 
-def enable_beyond(rig: LoopRig, beyond: float = 0.018) -> LoopRig:
-    """Enable with the second joint `beyond` rad outside its range, until all drives are enabled."""
-    rig.models[1].mechanics.position = CONFIG.joints[1].position.max + beyond
+def enable_beyond(rig: LoopRig, beyond: float = 0.018, side: int = 1) -> LoopRig:
+    """Enable with the second joint `beyond` rad outside its range of -2 to 2 rad, until all drives are enabled."""
+    rig.models[1].mechanics.position = side * (CONFIG.joints[1].position.max + beyond)
     rig.start().do(Enable())
     rig.wait(lambda: all(drive.statusword & 0x6F == 0x27 for drive in rig.log[-1].drives))
     return rig
 
 
+@DIRECTIONS
 @pytest.mark.parametrize(("velocity", "speed"), [(0.5, 0.05), (0.02, 0.02)])
 def test_a_joint_that_is_brought_back_into_its_range_is_reported_with_how_far_and_how_fast(
-    rig: LoopRig, velocity: float, speed: float
+    rig: LoopRig, velocity: float, speed: float, direction: int
 ) -> None:
     limits = rig.arm.limits
     limits.velocity[1] = velocity
     rig.arm.output_limiter.take(limits)
-    enable_beyond(rig).bring_to(State.HOLDING)
+    enable_beyond(rig, side=direction).bring_to(State.HOLDING)
     assert rig.kinds[-2:] == [ReturningToRange, Enabled]
     assert rig.events[-2].event == ReturningToRange(1, about(0.018, abs=1e-4), speed)
 
 
-def test_what_a_joint_at_the_edge_sags_is_made_good_without_a_word(rig: LoopRig) -> None:
-    enable_beyond(rig, 0.0005).bring_to(State.HOLDING)
+@DIRECTIONS
+def test_what_a_joint_at_the_edge_sags_is_made_good_without_a_word(rig: LoopRig, direction: int) -> None:
+    enable_beyond(rig, 0.0005, direction).bring_to(State.HOLDING)
     assert ReturningToRange not in rig.kinds
-    assert rig.log[-1].drives[1].target == 20000
+    assert rig.log[-1].drives[1].target == direction * 20000
 
 
-def test_no_motion_begins_before_a_joint_beyond_its_range_is_back(rig: LoopRig) -> None:
-    enable_beyond(rig)
+@DIRECTIONS
+def test_no_motion_begins_before_a_joint_beyond_its_range_is_back(rig: LoopRig, direction: int) -> None:
+    enable_beyond(rig, side=direction)
     began = len(rig.log)
     while rig.state is State.ENABLING:
-        answer = rig.send(move_to(0.0, 1.0))
+        answer = rig.send(move_to(0.0, direction * 1.0))
     # The last command came in the cycle that ended enabling.
     assert (len(rig.log) - began) * PERIOD_S == pytest.approx(0.018 / 0.05, abs=0.04)
     assert isinstance(answer.refusal, WrongState)
-    assert rig.log[-1].drives[1].target == 20000
-    rig.move(0.0, 1.0)
+    assert rig.log[-1].drives[1].target == direction * 20000
+    rig.move(0.0, direction * 1.0)
     rig.bring_to(State.HOLDING)
-    assert rig.log[-1].drives[1].target == 10000
+    assert rig.log[-1].drives[1].target == direction * 10000
 
 
 def test_a_joint_that_is_brought_back_stands_when_it_is_disabled_and_begins_anew_where_it_is(rig: LoopRig) -> None:
@@ -216,6 +222,27 @@ def test_a_false_position_is_judged_by_where_a_joint_beyond_its_range_is_and_not
     rig.bring_to(State.FAULT, 2 * CONFIG.supervision.cycles * PERIOD_S)
     assert rig.kinds[-1] is PositionJumped
     assert rig.last == PositionJumped(1, about(1.98), about(2.015))
+
+
+def test_each_time_enabling_disabling_and_a_reset_take_as_long_as_the_first(rig: LoopRig) -> None:
+    rig.start()
+    lengths: list[tuple[int, ...]] = []
+    for _ in range(3):
+        at = [len(rig.log)]
+        for command, state in ((Enable(), State.HOLDING), (Disable(), State.READY), (Enable(), State.HOLDING)):
+            rig.do(command)
+            rig.bring_to(state)
+            at.append(len(rig.log))
+        rig.models[1].inject_fault(UNDER_VOLTAGE)
+        rig.bring_to(State.FAULT)
+        rig.run(0.1)
+        at.append(len(rig.log))
+        rig.do(Reset())
+        rig.bring_to(State.READY)
+        at.append(len(rig.log))
+        rig.run(0.1)
+        lengths.append(tuple(after - before for before, after in pairwise(at)))
+    assert lengths == [lengths[0]] * 3
 
 
 def test_one_garbled_statusword_stops_a_holding_joint_with_its_torque(rig: LoopRig) -> None:

@@ -13,7 +13,7 @@ from rtcp.ipc.commands import Disable, Reset, Shutdown
 from rtcp.ipc.events import EmergencyStopActivated, EstopUnobservable, OverSpeed, TorqueRemoved
 from rtcp.ipc.states import State
 
-from .rig import CONFIG, COUNTS, CSP, CST, CSV, QUICK_STOP, UNDER_VOLTAGE, VOLTAGE_OFF, LoopRig
+from .rig import CONFIG, COUNTS, DIRECTIONS, MOTIONS, QUICK_STOP, UNDER_VOLTAGE, VOLTAGE_OFF, LoopRig
 
 BOX = 1
 QUICK_STOP_RAMP = 0x6085
@@ -27,10 +27,12 @@ def lose_box(rig: LoopRig, state: int) -> None:
     rig.service.lost_slave = BOX
 
 
-@pytest.mark.parametrize("mode", [CSP, CSV, CST])
+@MOTIONS
 @pytest.mark.parametrize("kind", ["drive", "slave", "frames"])
-def test_a_fault_while_disabling_ramps_down_and_then_takes_the_torque(rig: LoopRig, mode: int, kind: str) -> None:
-    rig.set_in_motion(mode).do(Disable())
+def test_a_fault_while_disabling_ramps_down_and_then_takes_the_torque(
+    rig: LoopRig, mode: int, direction: int, kind: str
+) -> None:
+    rig.set_in_motion(mode, direction).do(Disable())
     rig.run(0.02)
     assert rig.state is State.DISABLING
     if kind == "drive":
@@ -74,6 +76,18 @@ def test_a_box_that_comes_back_in_time_lets_the_arm_hold(rig: LoopRig) -> None:
         rig.board.slave(BOX, AlState.OP, 0)
         rig.run(0.05)
     assert rig.powered == [True, True]
+    assert EstopUnobservable not in rig.kinds
+
+
+def test_in_each_fault_the_box_has_the_whole_time_to_come_back(rig: LoopRig) -> None:
+    rig.hold()
+    for _ in range(3):
+        lose_box(rig, AlState.PREOP)
+        rig.run(0.9 * UNOBSERVABLE_S)
+        assert rig.powered == [True, True]
+        rig.away.clear()
+        rig.board.slave(BOX, AlState.OP, 0)
+        rig.recover()
     assert EstopUnobservable not in rig.kinds
 
 
@@ -122,14 +136,23 @@ def test_a_reset_that_fails_out_of_the_emergency_stop_leaves_no_torque(rig: Loop
     assert EstopUnobservable not in rig.kinds
 
 
-def test_a_reset_before_the_emergency_stop_has_ramped_down_does_not_drop_a_joint_that_turns(rig: LoopRig) -> None:
-    # The removal of torque in an earlier fault ends with its reset.
-    rig.set_in_motion().do(Disable())
-    rig.service.lost_slave = 3
+@DIRECTIONS
+@pytest.mark.parametrize("frames", [True, False])
+def test_a_reset_before_the_emergency_stop_has_ramped_down_does_not_drop_a_joint_that_turns(
+    rig: LoopRig, frames: bool, direction: int
+) -> None:
+    # The removal of torque in an earlier fault, by silence or after a slave was lost, ends with its reset.
+    rig.set_in_motion(direction=direction).do(Disable())
+    if frames:
+        rig.service.lost_slave = 3
+    else:
+        rig.lose_frames()
     rig.bring_to(State.FAULT)
     rig.run(1.0)
     rig.service.lost_slave = 0
-    rig.recover().move(1.8, 1.8)
+    rig.lose_frames(False)
+    rig.run(0.1)
+    rig.recover().move(direction * 1.8, direction * 1.8)
     rig.run(0.6)
     rig.machine.change(OverSpeed(0, 1.0, 0.5))
     rig.run(0.012)
@@ -158,10 +181,12 @@ def slow(config: ArmConfig) -> ArmConfig:
     return replace(config, slaves=tuple(slaves))
 
 
-@pytest.mark.parametrize("stop", ["disable", "press"])
+@pytest.mark.parametrize(("stop", "direction"), [("disable", 1), ("disable", -1), ("press", -1)])
 @pytest.mark.parametrize("away", [False, True])
-def test_the_torque_waits_for_the_drives_own_ramp(new_rig: Callable[..., LoopRig], stop: str, away: bool) -> None:
-    rig = new_rig(slow(CONFIG)).set_in_motion()
+def test_the_torque_waits_for_the_drives_own_ramp(
+    new_rig: Callable[..., LoopRig], stop: str, direction: int, away: bool
+) -> None:
+    rig = new_rig(slow(CONFIG)).set_in_motion(direction=direction)
     if stop == "disable":
         rig.do(Disable())
         rig.service.lost_slave = 3

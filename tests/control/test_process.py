@@ -15,7 +15,7 @@ from rtcp.devices.drive import Drive
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.pdo import layout
 
-from .rig import CONFIG, CSP, CST, CSV, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
+from .rig import CONFIG, CSP, MOTIONS, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
 
 DISABLE_OPERATION_OPTION = 0x605C
 STILL_RAD_S = 0.01
@@ -51,12 +51,12 @@ class Watched:
         return wkc
 
 
-def set_in_motion(rig: LoopRig, mode: int = CSP) -> Watched:
+def set_in_motion(rig: LoopRig, mode: int = CSP, direction: int = 1) -> Watched:
     """Both joints at full speed, with drives whose torque goes at once on `disable operation`."""
     for model in rig.models:
         model.objects[DISABLE_OPERATION_OPTION, 0].value = 0
         model.objects[0x6085, 0].value = 100_000
-    rig.set_in_motion(mode)
+    rig.set_in_motion(mode, direction)
     return Watched(rig)
 
 
@@ -67,9 +67,11 @@ def ramps_down_under_torque(watched: Watched) -> bool:
     return len(moving) > 10 and all(moving) and at_rest
 
 
-@pytest.mark.parametrize("mode", [CSP, CSV, CST])
-def test_after_a_defect_joints_ramp_down_and_none_loses_its_torque_while_it_moves(rig: LoopRig, mode: int) -> None:
-    watched = set_in_motion(rig, mode)
+@MOTIONS
+def test_after_a_defect_joints_ramp_down_and_none_loses_its_torque_while_it_moves(
+    rig: LoopRig, mode: int, direction: int
+) -> None:
+    watched = set_in_motion(rig, mode, direction)
     stop_blindly(rig.data, CONFIG, rig.joints.pairs)
     assert ramps_down_under_torque(watched)
 

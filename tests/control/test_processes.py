@@ -12,19 +12,24 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, InputsConfig, OutputsConfig
 from rtcp.control.part import PartContext
-from rtcp.ipc.commands import AT_REST, Command, Disable, MoveJoints, Reset
-from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.commands import Command, Disable, MoveJoints, Reset
+from rtcp.ipc.events import ProcessFailed
+from rtcp.ipc.refusals import ProcessRaised, Refusal
 from rtcp.ipc.schema import Field
 from rtcp.ipc.states import State
 from rtcp.processes import InputChannel, OutputChannel, Process, ProcessConfig, ProcessSetup
 from rtcp.testing.simulation import Simulation
 from rtcp.virtual.models.diewu import RELEASED
 
+SAFE = 0x0300
+"""Safe value of the outputs, other than zero."""
+RAISES = 7
+
 
 class Blink(Command):
     """Show `pattern` at the outputs."""
 
-    states = AT_REST
+    states = frozenset(State)
     pattern: int
 
 
@@ -50,6 +55,7 @@ class Lamp(Process):
         self._inputs, self._outputs = setup.signals[config.inputs], setup.signals[config.outputs]
         self.pattern = 0
         self.raises = False
+        self.updates = 0
 
     def fields(self) -> Sequence[Field]:
         return (Field("pattern", "uint16", "", "What it shows."),)
@@ -58,10 +64,13 @@ class Lamp(Process):
         assert isinstance(command, Blink)
         if not command.pattern:
             return Dark()
+        if command.pattern == RAISES:
+            raise RuntimeError("no such pattern")
         self.pattern = command.pattern
         return None
 
     def update(self, context: PartContext) -> None:
+        self.updates += 1
         if self.raises:
             raise RuntimeError("the lamp is gone")
         self._outputs.value = self.pattern if self._inputs.value == RELEASED else 0
@@ -77,7 +86,9 @@ class Lamp(Process):
 def config(tmp_path: Path) -> ArmConfig:
     (tmp_path / "segment.yaml").write_text("slaves: [{model: diewu-io}]\n")
     box = load(default_config())
-    slave = replace(box.slaves[0], device=replace(box.slaves[0].device, kind="generic"))
+    device = replace(box.slaves[0].device, kind="generic")
+    pdos = tuple(replace(pdo, channels=tuple(replace(c, safe=SAFE) for c in pdo.channels)) for pdo in device.rpdo)
+    slave = replace(box.slaves[0], device=replace(device, rpdo=pdos))
     platform = replace(box, joints=(), slaves=(slave,), arm=None, source=tmp_path / "lamp.yaml", gripper=None)
     return replace(platform, inputs=InputsConfig(), outputs=OutputsConfig(), processes=(LampConfig("lamp", "lamp"),))
 
@@ -136,7 +147,7 @@ def test_a_fault_makes_it_safe_until_it_is_commanded_again(running: Simulation) 
     running.send(Blink(5))
     running.data.lose(running.config.bus.lost_cycles + 5)
     running.bring_to(State.FAULT, 1.0)
-    assert shown(running) == 0
+    assert shown(running) == SAFE
     running.send(Reset())
     running.bring_to(State.READY)
     assert shown(running) == 0
@@ -144,16 +155,32 @@ def test_a_fault_makes_it_safe_until_it_is_commanded_again(running: Simulation) 
     assert shown(running) == 6
 
 
-def test_one_that_raises_is_a_fault_with_outputs_of_zero(running: Simulation) -> None:
-    running.send(Blink(5))
-    lamp(running).raises = True
+def test_one_that_raises_is_a_fault_with_safe_outputs_each_time(running: Simulation) -> None:
+    for pattern in (5, 6):
+        running.send(Blink(pattern))
+        assert shown(running) == pattern
+        lamp(running).raises, before = True, lamp(running).updates
+        outputs = set()
+        for _ in range(20):
+            running.cycle()
+            outputs.add(running.box.outputs)  # type: ignore[union-attr]
+        assert outputs == {pattern, SAFE}
+        assert (running.state, lamp(running).updates) == (State.FAULT, before + 1)
+        assert isinstance(running.send(Blink(pattern)).refusal, ProcessRaised)
+        record = running.observer.latest()
+        assert record is not None
+        assert int(record["lamp_pattern"][0]) == 0
+        lamp(running).raises = False
+        running.run(0.1)
+        assert shown(running) == SAFE
+        running.send(Reset())
+        running.bring_to(State.READY)
+        assert shown(running) == 0
+        assert lamp(running).pattern == 0
+    assert sum(isinstance(record.event, ProcessFailed) for record in running.events) == 2
+
+
+def test_one_that_raises_in_a_command_is_a_fault_too(running: Simulation) -> None:
+    running.send(Blink(RAISES))
     running.bring_to(State.FAULT, 0.1)
-    assert shown(running) == 0
-    refusal = running.send(Blink(6)).refusal
-    assert refusal is not None
-    lamp(running).raises = False
-    running.send(Reset())
-    running.bring_to(State.READY)
-    assert shown(running) == 0
-    running.send(Blink(6))
-    assert shown(running) == 6
+    assert shown(running) == SAFE

@@ -26,11 +26,13 @@ from .rig import (
     CSP,
     CST,
     CSV,
+    DIRECTIONS,
     EMERGENCY_STOP_INPUT,
     ENABLE_OPERATION,
     ENABLE_TIMEOUT_S,
     LONGEST_STEP,
     LOST_CYCLES,
+    MOTIONS,
     PERIOD_S,
     QUICK_STOP,
     SWITCH_ON,
@@ -202,12 +204,13 @@ def test_drives_that_still_hear_are_commanded_to_stop_for_as_long_as_no_frame_co
 # -- faults in motion -----------------------------------------------------------------------------------------------
 
 
+@DIRECTIONS
 @pytest.mark.parametrize("key", ["drive_fault", "slave_lost"])
-def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(rig: LoopRig, key: str) -> None:
-    rig.set_in_motion()
-    rig.models[0].mechanics.external_torque = -100.0
+def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(rig: LoopRig, key: str, direction: int) -> None:
+    rig.set_in_motion(direction=direction)
+    rig.models[0].mechanics.external_torque = -direction * 100.0
     rig.run(0.04)
-    lag = rig.log[-1].drives[0].target - rig.log[-1].drives[0].position
+    lag = direction * (rig.log[-1].drives[0].target - rig.log[-1].drives[0].position)
     assert lag > 20 * LONGEST_STEP
     CAUSES[key][0](rig)
     rig.bring_to(State.FAULT)
@@ -218,9 +221,11 @@ def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(rig: LoopRig, 
     assert rig.longest_step(0) <= LONGEST_STEP
 
 
-@pytest.mark.parametrize("mode", [CSP, CSV, CST])
-def test_a_fault_of_one_drive_brings_the_others_to_rest_under_torque_in_every_mode(rig: LoopRig, mode: int) -> None:
-    rig.set_in_motion(mode)
+@MOTIONS
+def test_a_fault_of_one_drive_brings_the_others_to_rest_under_torque_in_every_mode(
+    rig: LoopRig, mode: int, direction: int
+) -> None:
+    rig.set_in_motion(mode, direction)
     rig.models[1].inject_fault(UNDER_VOLTAGE)
     rig.bring_to(State.FAULT)
     rig.run(0.5)
@@ -267,9 +272,10 @@ def slow_quick_stop(rig: LoopRig) -> None:
         model.objects[0x6085, 0].value = 2000
 
 
-def test_a_reset_lets_come_to_rest_what_still_moves_before_it_takes_its_torque(rig: LoopRig) -> None:
+@DIRECTIONS
+def test_a_reset_lets_come_to_rest_what_still_moves_before_it_takes_its_torque(rig: LoopRig, direction: int) -> None:
     slow_quick_stop(rig)
-    rig.set_in_motion()
+    rig.set_in_motion(direction=direction)
     rig.service.lost_slave = 3
     rig.cycle()
     rig.do(Reset())
@@ -318,12 +324,13 @@ def test_set_points_that_jump_reach_the_drives_in_steps_inside_the_speed_limit(r
     assert min(cycle.drives[1].target for cycle in rig.log) >= -2.0 * COUNTS
 
 
-def test_a_stop_comes_to_rest_far_before_the_target_and_holds(rig: LoopRig) -> None:
-    rig.lead_to(State.STOPPING)
+@DIRECTIONS
+def test_a_stop_comes_to_rest_far_before_the_target_and_holds(rig: LoopRig, direction: int) -> None:
+    rig.lead_to(State.STOPPING, direction)
     rig.bring_to(State.HOLDING)
     rig.run(0.1)
     assert rig.kinds[-1] is events.Stopped
-    assert rig.arm.drives[0].position < 0.3
+    assert 0.0 < direction * rig.arm.drives[0].position < 0.3
     assert rig.joints.first_moving() == -1
 
 
@@ -334,9 +341,12 @@ def test_a_lease_of_another_commander_ends_the_move_too(rig: LoopRig) -> None:
     assert (rig.state, rig.kinds[-1]) == (State.STOPPING, events.LeaseExpired)
 
 
+@DIRECTIONS
 @pytest.mark.parametrize("state", [State.DISABLING, State.CLOSING], ids=lambda state: state.name.lower())
-def test_disabling_and_closing_in_motion_take_the_torque_only_at_standstill(rig: LoopRig, state: State) -> None:
-    rig.lead_to(state)
+def test_disabling_and_closing_in_motion_take_the_torque_only_at_standstill(
+    rig: LoopRig, state: State, direction: int
+) -> None:
+    rig.lead_to(state, direction)
     rig.wait(lambda: rig.done or rig.state is State.READY)
     assert (events.Disabled in rig.kinds) is (state is State.DISABLING)
     sent = [drive for cycle in rig.log for drive in cycle.drives if drive.has_torque and drive.controlword == SWITCH_ON]
@@ -356,9 +366,12 @@ def test_disabling_while_enabling_is_done_only_when_no_drive_has_torque(rig: Loo
 # -- the end --------------------------------------------------------------------------------------------------------
 
 
-def test_closing_in_a_fault_lets_come_to_rest_what_ramps_down_before_it_takes_the_torque(rig: LoopRig) -> None:
+@DIRECTIONS
+def test_closing_in_a_fault_lets_come_to_rest_what_ramps_down_before_it_takes_the_torque(
+    rig: LoopRig, direction: int
+) -> None:
     slow_quick_stop(rig)
-    rig.set_in_motion()
+    rig.set_in_motion(direction=direction)
     rig.service.lost_slave = 3
     rig.run(0.01)
     rig.do(Shutdown())
@@ -382,11 +395,13 @@ def test_closing_without_frames_commands_a_quick_stop_for_as_long_as_one_takes(
     assert longest_s <= len(stops) * period_us * 1e-6 <= longest_s + 0.02
 
 
-@pytest.mark.parametrize("mode", [CSP, CSV, CST])
-def test_closing_without_one_of_the_slaves_ends_when_the_joints_of_the_others_stand(rig: LoopRig, mode: int) -> None:
+@MOTIONS
+def test_closing_without_one_of_the_slaves_ends_when_the_joints_of_the_others_stand(
+    rig: LoopRig, mode: int, direction: int
+) -> None:
     for model in rig.models:
         model.objects[0x6085, 0].value = 100_000  # as the start-up SDOs of the drive's description set it
-    rig.set_in_motion(mode)
+    rig.set_in_motion(mode, direction)
     receive = rig.data.receive
     rig.data.receive = lambda: receive() - 3  # type: ignore[method-assign]
     rig.do(Shutdown())

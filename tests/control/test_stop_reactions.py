@@ -18,6 +18,7 @@ from .rig import (
     CSP,
     CST,
     CSV,
+    DIRECTIONS,
     ENABLE_OPERATION,
     LONGEST_STEP,
     LOST_CYCLES,
@@ -167,9 +168,10 @@ def test_what_is_worse_ends_the_controlled_stop_for_a_lost_clock(switch_rig: Mak
 # -- closing --------------------------------------------------------------------------------------------------------
 
 
+@DIRECTIONS
 @pytest.mark.parametrize("reaction", HARD)
-def test_a_press_while_the_loop_is_ending_takes_its_reaction(switch_rig: Make, reaction: str) -> None:
-    rig = switch_rig(emergency_stop=reaction).set_in_motion()
+def test_a_press_while_the_loop_is_ending_takes_its_reaction(switch_rig: Make, reaction: str, direction: int) -> None:
+    rig = switch_rig(emergency_stop=reaction).set_in_motion(direction=direction)
     rig.do(Shutdown())
     at = cause(rig, "emergency_stop")
     assert {drive.controlword for drive in rig.log[at].drives} == {HARD[reaction]}

@@ -9,7 +9,7 @@ import pytest
 
 from rtcp.config import load
 from rtcp.ipc.commands import MoveGripper, MoveJoints, SetControlMode, SetOutput
-from rtcp.ipc.events import EmergencyStopActivated, PermissionWithdrawn
+from rtcp.ipc.events import EmergencyStopActivated, GripperOpens, PermissionWithdrawn
 from rtcp.ipc.refusals import ReservedOutput, UnknownBox
 from rtcp.ipc.states import ControlMode, State
 from rtcp.testing.simulation import Simulation
@@ -18,8 +18,8 @@ from tests.two_boxes import SWITCH, two_boxes
 
 STATE_LAMP, MOTION_LAMP, HEARTBEAT, GRIPPER = (1 << bit for bit in range(4))
 """Outputs of `desk`."""
-FORWARD, STOP = 0, 9
-"""Channels of `io`, from 0: a direction of the joystick, active low; the emergency stop, closed."""
+FORWARD, MODE_DOWN, STOP = 0, 5, 9
+"""Channels of `io`, from 0: a direction and a paddle of the joystick, active low; the emergency stop, closed."""
 SOMEWHERE = (0.0, -0.5, 1.8, 0.0, 1.2, 0.0)
 
 
@@ -105,6 +105,37 @@ def test_the_joystick_at_the_first_box_jogs_the_arm(arm: Simulation) -> None:
     arm.bring_to(State.MOVING, 0.5)
     io(arm).set_input(FORWARD, True)
     arm.bring_to(State.HOLDING, 2.0)
+
+
+@pytest.mark.parametrize("modes_down", [0, 1], ids=["tool", "gripper"])
+def test_without_the_enabling_switch_the_joystick_neither_moves_the_arm_nor_grips_and_begins_with_neutral(
+    arm: Simulation, modes_down: int
+) -> None:
+    arm.do(SetControlMode(ControlMode.JOYSTICK))
+    for _ in range(modes_down):
+        for level in (False, True):
+            io(arm).set_input(MODE_DOWN, level)
+            arm.run(0.05)
+    q, events = list(arm.loop.arm.state.commanded), len(arm.events)
+    states: set[State] = set()
+    arm.on_frame = lambda frame: states.add(arm.state)
+
+    def shown(pressed: bool, level: bool) -> None:
+        desk(arm).set_input(SWITCH - 1, pressed)
+        arm.run(0.05)
+        io(arm).set_input(FORWARD, level)
+        arm.run(0.05)
+
+    shown(pressed=False, level=True)
+    shown(pressed=False, level=False)
+    shown(pressed=True, level=False)
+    assert states == {State.HOLDING}
+    assert (list(arm.loop.arm.state.commanded), len(arm.events)) == (q, events)
+    shown(pressed=True, level=True)
+    shown(pressed=True, level=False)
+    kinds = {type(record.event) for record in arm.events[events:]}
+    assert kinds == ({GripperOpens} if modes_down else set())
+    assert (State.MOVING in states) is not modes_down
 
 
 def test_an_emergency_stop_pressed_while_the_other_box_is_lost_still_stops_the_arm(arm: Simulation) -> None:

@@ -30,11 +30,20 @@ def test_the_statusword_tells_the_state(drive: Cia402Drive, wire: Wire, word: in
     assert drive.state is state
 
 
-def test_every_state_has_a_controlword_for_every_goal(drive: Cia402Drive, wire: Wire) -> None:
+def test_no_goal_but_enabling_gives_torque_and_no_state_leaves_a_drive_without_a_controlword(
+    drive: Cia402Drive, wire: Wire
+) -> None:
     for word in range(0x80):
         for goal in T:
             wire.receive(word)
             drive.advance(goal)
+            sent = wire.sent()[0]
+            # 0x0F: enable operation; 0x02: quick stop; 0x80: fault reset.
+            assert sent in (0x00, 0x02, 0x06, 0x07, 0x0F, 0x80)
+            assert goal is T.ENABLED or sent != 0x0F
+            assert (sent == 0x02) is (goal is T.QUICK_STOPPED)
+            assert goal is not T.TORQUE_OFF or sent == 0x00
+            assert sent != 0x80 or (goal is T.RESET and drive.state is S.FAULT)
 
 
 @pytest.mark.parametrize(

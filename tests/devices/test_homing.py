@@ -21,6 +21,7 @@ LATE = 10
 """Cycles after the start whose statusword does not answer it yet."""
 INDEX_PITCH = 2 * math.pi / 100
 P = HomingPhase
+VELOCITIES = pytest.mark.parametrize("velocity", [500, -500])
 
 
 # -- the words ---------------------------------------------------------------------------------------------------------
@@ -134,25 +135,45 @@ def test_the_set_point_is_where_the_drive_is(homing: Homing, wire: Wire) -> None
         assert homing.position == pytest.approx(position * 1e-4)
 
 
+@VELOCITIES
 @pytest.mark.parametrize("word", [FAILED, FAILING, 0x3237, 0x3637])
-def test_a_homing_error_takes_the_start_bit_away_and_ends_in_csp(homing: Homing, wire: Wire, word: int) -> None:
+def test_a_homing_error_takes_the_start_bit_away_and_ends_in_csp(
+    homing: Homing, wire: Wire, word: int, velocity: int
+) -> None:
     show(homing, wire, UNDER_WAY, 20)
-    assert show(homing, wire, word, velocity=500) is P.STOPPING
+    assert show(homing, wire, word, velocity=velocity) is P.STOPPING
     for _ in range(200):
-        assert show(homing, wire, FAILING, velocity=500) is P.STOPPING
+        assert show(homing, wire, FAILING, velocity=velocity) is P.STOPPING
         assert (wire.sent()[0], wire.sent()[4]) == (0x0F, 6)
     assert show(homing, wire, FAILED) is P.LEAVING
     assert show(homing, wire, ENABLED, 2, mode=8) is P.FAILED
     assert homing.shown == word
 
 
-def test_a_stop_takes_the_start_bit_away_and_waits_for_rest(homing: Homing, wire: Wire) -> None:
-    show(homing, wire, UNDER_WAY, 20, velocity=500)
+@VELOCITIES
+def test_a_stop_takes_the_start_bit_away_and_waits_for_rest(homing: Homing, wire: Wire, velocity: int) -> None:
+    show(homing, wire, UNDER_WAY, 20, velocity=velocity)
     homing.stop()
-    assert show(homing, wire, UNDER_WAY, 100, velocity=500) is P.STOPPING
+    assert show(homing, wire, UNDER_WAY, 100, velocity=velocity) is P.STOPPING
     assert (wire.sent()[0], wire.sent()[4]) == (0x0F, 6)
     assert show(homing, wire, REST) is P.LEAVING
     assert show(homing, wire, ENABLED, 2, mode=8) is P.STOPPED
+
+
+@VELOCITIES
+def test_a_drive_that_does_not_come_to_rest_runs_on_and_keeps_mode_6(homing: Homing, wire: Wire, velocity: int) -> None:
+    show(homing, wire, UNDER_WAY, 20, velocity=velocity)
+    homing.stop()
+    assert show(homing, wire, UNDER_WAY, 6000, velocity=velocity) is P.STOPPING
+    assert show(homing, wire, UNDER_WAY, velocity=velocity) is P.RUNNING
+    assert wire.sent()[4] == 6
+
+
+def test_rest_counts_only_when_the_drive_has_had_time_to_answer_the_stop(homing: Homing, wire: Wire) -> None:
+    show(homing, wire, UNDER_WAY, 20)
+    homing.stop()
+    assert show(homing, wire, UNDER_WAY, LATE) is P.STOPPING
+    assert show(homing, wire, UNDER_WAY) is P.LEAVING
 
 
 def test_after_a_stop_the_target_is_where_the_drive_came_to_rest(homing: Homing, wire: Wire) -> None:
@@ -228,9 +249,16 @@ def test_a_homing_can_follow_another(homing: Homing, drive: Cia402Drive, wire: W
     assert show(homing, wire, ENABLED, position=750, mode=8) is P.ENTERING
     assert homing.position == pytest.approx(0.07)
     assert show(homing, wire, REST) is P.SEARCHING
+    show(homing, wire, UNDER_WAY, position=800)
+    assert homing.position == pytest.approx(0.08)
     show(homing, wire, FAILED, LATE + 1)
     show(homing, wire, FAILED, 20)
     assert show(homing, wire, ENABLED, 2, mode=8) is P.FAILED
+    homing.start(drive)
+    assert (homing.shown, homing.shown_mode) == (0, HOMING)
+    homing.stop()
+    show(homing, wire, ENABLED, LATE + 1, mode=8)
+    assert show(homing, wire, ENABLED, 2, mode=8) is P.STOPPED
 
 
 def test_nothing_happens_before_the_start() -> None:

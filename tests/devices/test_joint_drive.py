@@ -20,6 +20,7 @@ JOINT = CONFIG.joints[0]
 PERIOD_S = CONFIG.cycle.period_us * 1e-6
 LIMIT = JOINT.velocity
 ENABLED = DriveState.OPERATION_ENABLED
+SIGNS = pytest.mark.parametrize("sign", [1.0, -1.0])
 
 
 def made(zero: float = 0.0) -> JointDrive:
@@ -62,10 +63,11 @@ def test_what_keeps_a_drive_from_following_is_shown(state: DriveState) -> None:
     assert not drive.advance(TargetState.ENABLED)
 
 
-def test_with_a_position_goes_the_speed_that_leads_to_it_and_0_where_it_stands() -> None:
+@SIGNS
+def test_with_a_position_goes_the_speed_that_leads_to_it_and_0_where_it_stands(sign: float) -> None:
     drive = enabled()
-    drive.target_position = 0.5 + 0.5 * LIMIT * PERIOD_S
-    assert sent(drive) == (drive.target_position, pytest.approx(0.5 * LIMIT), FOLLOW)
+    drive.target_position = 0.5 + sign * 0.5 * LIMIT * PERIOD_S
+    assert sent(drive) == (drive.target_position, pytest.approx(sign * 0.5 * LIMIT), FOLLOW)
     read(drive, 0.5)
     assert sent(drive) == (drive.target_position, 0.0, FOLLOW)
 
@@ -95,19 +97,21 @@ def test_a_target_that_is_no_number_leaves_the_last(target: float) -> None:
     assert sent(drive) == (0.5, 0.0, FOLLOW)
 
 
-def test_a_quick_stop_is_a_ramp_at_the_joints_acceleration() -> None:
+@SIGNS
+def test_a_quick_stop_is_a_ramp_at_the_joints_acceleration(sign: float) -> None:
     drive = enabled()
-    drive.target_position = 0.5 + 0.5 * PERIOD_S
-    _, before, _ = sent(drive)
-    speeds = []
+    drive.target_position = 0.5 + sign * 0.5 * PERIOD_S
+    positions, speeds = [drive.target_position], [sent(drive)[1]]
     for _ in range(round(0.5 / JOINT.acceleration / PERIOD_S) + 2):
         read(drive, 0.5)
         drive.advance(TargetState.QUICK_STOPPED)
-        speeds.append(sent(drive)[1])
+        position, speed, _ = sent(drive)
+        positions.append(position)
+        speeds.append(speed)
     assert drive.state is DriveState.QUICK_STOP_ACTIVE
-    assert before == pytest.approx(0.5)
-    assert speeds[0] == pytest.approx(0.5 - JOINT.acceleration * PERIOD_S)
-    assert all(a - b <= JOINT.acceleration * PERIOD_S + 1e-12 for a, b in pairwise(speeds))
+    assert speeds[:2] == pytest.approx([sign * 0.5, sign * (0.5 - JOINT.acceleration * PERIOD_S)])
+    assert all(0.0 <= sign * (a - b) <= JOINT.acceleration * PERIOD_S + 1e-12 for a, b in pairwise(speeds))
+    assert [b - a for a, b in pairwise(positions)] == pytest.approx([speed * PERIOD_S for speed in speeds[1:]])
     assert speeds[-1] == 0.0
     assert drive.advance(TargetState.DISABLED) is False
     read(drive, 0.5)
@@ -115,17 +119,21 @@ def test_a_quick_stop_is_a_ramp_at_the_joints_acceleration() -> None:
     assert sent(drive)[2] == STAND
 
 
-def test_the_ramp_ends_at_the_end_of_the_range() -> None:
-    end = JOINT.position.max
-    drive = enabled(end - 0.001)
-    drive.target_position = end - 0.001 + LIMIT * PERIOD_S / 5
+@SIGNS
+def test_the_ramp_ends_at_the_end_of_the_range_with_a_speed_of_0(sign: float) -> None:
+    end = JOINT.position.max if sign > 0.0 else JOINT.position.min
+    drive = enabled(end - sign * 0.001)
+    drive.target_position = end + sign * (LIMIT * PERIOD_S / 5 - 0.001)
     sent(drive)
+    references = []
     for _ in range(200):
-        read(drive, end - 0.001)
+        read(drive, end - sign * 0.001)
         drive.advance(TargetState.QUICK_STOPPED)
-        position, _, command = sent(drive)
-        assert position <= end
-        assert command == STOP
+        references.append(sent(drive))
+    assert {command for *_, command in references} == {STOP}
+    assert all(sign * position <= sign * end for position, *_ in references)
+    assert {speed for position, speed, _ in references if position == end} == {0.0}
+    assert references[-1][0] == end
 
 
 def test_a_drive_that_does_not_follow_yet_is_enabled_where_the_joint_is_then() -> None:
@@ -139,6 +147,24 @@ def test_a_drive_that_does_not_follow_yet_is_enabled_where_the_joint_is_then() -
     read(drive, 0.8)
     assert drive.advance(TargetState.ENABLED)
     assert sent(drive) == (0.8, 0.0, FOLLOW)
+
+
+def test_a_stop_after_a_stop_is_a_whole_ramp_again() -> None:
+    drive = enabled()
+    for target in (0.5 + 0.5 * PERIOD_S, 0.5 - 0.5 * PERIOD_S):
+        read(drive, 0.5)
+        assert drive.advance(TargetState.ENABLED)
+        drive.target_position = target
+        sent(drive)
+        for _ in range(100):
+            read(drive, 0.5)
+            drive.advance(TargetState.QUICK_STOPPED)
+            if sent(drive)[1] == 0.0:
+                break
+        assert drive.state is DriveState.QUICK_STOP_ACTIVE
+        read(drive, 0.5)
+        drive.advance(TargetState.ENABLED)  # from where the joint is, at rest
+        assert sent(drive) == (0.5, 0.0, FOLLOW)
 
 
 def test_after_a_session_that_began_anew_the_ramp_does_not_go_on() -> None:
@@ -165,23 +191,26 @@ def test_what_was_not_sent_in_lost_cycles_is_no_standstill() -> None:
     assert [sent(drive) for _ in range(3)] == [last] * 3
 
 
-def test_a_quick_stop_after_lost_cycles_begins_where_the_controller_has_gone_on_to() -> None:
-    drive = moving()
-    for _ in range(10):
+@SIGNS
+@pytest.mark.parametrize("lost", [0, 10])
+def test_a_quick_stop_after_lost_cycles_begins_where_the_controller_has_gone_on_to(lost: int, sign: float) -> None:
+    drive = moving(sign * 0.5)
+    for _ in range(lost):
         sent(drive)
     drive.advance(TargetState.QUICK_STOPPED)
     position, speed, command = sent(drive)
     slower = 0.5 - JOINT.acceleration * PERIOD_S
-    assert (speed, command) == (pytest.approx(slower), STOP)
-    assert position == pytest.approx(0.5 + (0.5 * 11 + slower) * PERIOD_S)
+    assert (speed, command) == (pytest.approx(sign * slower), STOP)
+    assert position == pytest.approx(0.5 + sign * (0.5 * (lost + 1) + slower) * PERIOD_S)
 
 
+@SIGNS
 @pytest.mark.parametrize("goal", [TargetState.DISABLED, TargetState.TORQUE_OFF, TargetState.RESET])
-def test_a_joint_that_moves_comes_to_rest_by_its_ramp_before_anything_else(goal: TargetState) -> None:
-    drive = moving()
+def test_a_joint_that_moves_comes_to_rest_by_its_ramp_before_anything_else(goal: TargetState, sign: float) -> None:
+    drive = moving(sign * 0.5)
     read(drive, 0.5)
     assert not drive.advance(goal)
-    assert 0.0 < sent(drive)[1] < 0.5
+    assert 0.0 < sign * sent(drive)[1] < 0.5
     for _ in range(100):
         read(drive, 0.5)
         drive.advance(goal)
@@ -191,11 +220,12 @@ def test_a_joint_that_moves_comes_to_rest_by_its_ramp_before_anything_else(goal:
     assert sent(drive)[1:] == (0.0, STAND)
 
 
-def test_a_quick_stop_outside_the_range_does_not_jump_to_its_end() -> None:
-    drive = enabled(JOINT.position.max + 0.01)
-    read(drive, JOINT.position.max + 0.01)
+@pytest.mark.parametrize("outside", [JOINT.position.max + 0.01, JOINT.position.min - 0.01])
+def test_a_quick_stop_outside_the_range_does_not_jump_to_its_end(outside: float) -> None:
+    drive = enabled(outside)
+    read(drive, outside)
     drive.advance(TargetState.QUICK_STOPPED)
-    assert sent(drive) == (pytest.approx(JOINT.position.max + 0.01), 0.0, STOP)
+    assert sent(drive) == (pytest.approx(outside), 0.0, STOP)
 
 
 def test_positions_count_from_the_zero() -> None:

@@ -197,19 +197,22 @@ def test_a_lease_that_is_being_renewed_never_looks_free_to_another_process(board
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
-        observer = Observer(path)
-        lease = observer.acquire("renewer", 60.0)
-        os.write(writing, b"!")
-        for _ in range(50_000):
-            observer.renew(lease)
-        os._exit(0)
+        renewed_all = False
+        try:
+            observer = Observer(path)
+            lease = observer.acquire("renewer", 60.0)
+            os.write(writing, b"!")
+            renewed_all = all(observer.renew(lease) for _ in range(50_000))
+        finally:
+            os._exit(0 if renewed_all else 1)
     os.read(reading, 1)
     seen = set()
-    while os.waitpid(child, os.WNOHANG)[0] == 0:
+    while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
         for _ in range(2000):
             lease, renewed, duration = board.lease()
             seen.add((lease, duration))
             assert renewed >= lease
+    assert os.waitstatus_to_exitcode(ended[1]) == 0
     assert len(seen) == 1
     os.close(reading)
     os.close(writing)

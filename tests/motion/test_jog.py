@@ -141,11 +141,17 @@ def test_a_command_that_is_no_number_stops(number: float) -> None:
     assert drive.still
 
 
-def test_started_while_the_arm_moves_it_goes_on_without_a_jump() -> None:
-    drive = Driven(BENT).deflect(twist_of("+x"), 0.5)
+@pytest.mark.parametrize("direction", ["+x", "-x", "-z", "+ry"])
+def test_started_while_the_arm_moves_it_goes_on_without_a_jump(direction: str) -> None:
+    drive = Driven(BENT).deflect(twist_of(direction), 0.5)
+    before = list(drive.state.commanded_velocity)
     drive.jog.start()
-    drive.deflect(twist_of("+x"), 0.5)
-    drive.release()
+    drive.deflect(twist_of(direction), JOG_PERIOD)
+    after = drive.state.commanded_velocity
+    assert max(map(abs, before)) > 0.05
+    assert after == pytest.approx(before, abs=2e-3)
+    drive.deflect(twist_of(direction), 0.5)
+    assert drive.cuts == 0
 
 
 def test_the_inverse_and_the_distances_are_those_of_the_kinematics() -> None:

@@ -7,9 +7,12 @@ import random
 
 import pytest
 
-from kinematics.forward import forward
+from kinematics.forward import forward, frames
 from kinematics.jacobian import jacobian
 from rtcp.config import default_config, load
+from rtcp.motion.controllers.jog_bounds import JogBounds
+from rtcp.motion.controllers.jog_inverse import JogInverse
+from rtcp.motion.guards.zones import ITSELF
 from rtcp.motion.state import Phase
 from tests.samples import some
 
@@ -192,6 +195,30 @@ def test_a_nearly_stretched_elbow_comes_in_again(bend: float) -> None:
     out = [w - s for w, s in zip(wrist, (0.0, 0.0, 0.17), strict=True)]
     drive.deflect([-0.1 * component for component in out] + [0.0] * 3, 2.0)
     assert drive.singularities[1] > 0.3
+
+
+@pytest.mark.parametrize("change", ["position", "box", "keep-out box"])
+def test_boundaries_are_looked_for_at_once_after_another_motion_and_when_a_box_has_changed(change: str) -> None:
+    drive, _ = before_wall(1, 1)
+    near, poses = drive.state.commanded, drive.guard.poses
+    far = [*near]
+    far[0] -= math.pi if near[0] > 0.0 else -math.pi
+    inverse = JogInverse(MODEL)
+    assert inverse.at(poses)
+    bounds = JogBounds(drive.limits, drive.guard.zones, inverse, 0.5, NEAREST, 0.002)
+    x, y, z = drive.tool
+    wall = (-9.0, -9.0, -9.0, 9.0, y + 0.02, 9.0)
+    plate = (x - 0.1, y + 0.05, z - 0.1, x + 0.1, y + 0.06, z + 0.1)
+    drive.limits.box, drive.limits.keep_out = None, (plate,) if change == "position" else ()
+    begun = frames(MODEL, far) if change == "position" else poses
+    bounds.update(begun, far if change == "position" else near, jumped=True)
+    assert not [clearance for clearance in bounds.near if clearance.zone < ITSELF]
+    if change == "box":
+        drive.limits.box = wall
+    elif change == "keep-out box":
+        drive.limits.keep_out = (plate,)
+    bounds.update(poses, near, jumped=change == "position")
+    assert [clearance.zone for clearance in bounds.near if clearance.zone < ITSELF]
 
 
 def stick(chance: random.Random) -> list[float]:

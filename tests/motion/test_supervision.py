@@ -72,12 +72,14 @@ def test_after_a_reset_the_count_begins_anew(kind: Kind) -> None:
     assert [event is not None for event in events] == [False] * (CYCLES - 1) + [True]
 
 
-def test_the_limits_that_are_in_force_are_those_that_count() -> None:
-    arm = Supervised()
-    assert arm.check(OverSpeed, *[1.0] * CYCLES)[-1] is None
-    arm.limits.velocity[1] = 0.5
+@pytest.mark.parametrize("kind", [OverSpeed, OverTorque])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_limits_that_are_in_force_are_those_that_count(kind: Kind, sign: float) -> None:
+    arm, value = Supervised(), sign * 0.9 * BOUNDS[kind]
+    assert arm.check(kind, *[value] * CYCLES)[-1] is None
+    (arm.limits.velocity if kind is OverSpeed else arm.limits.torque)[1] *= 0.5
     arm.supervision.take(arm.limits)
-    assert arm.check(OverSpeed, *[1.0] * CYCLES)[-1] == OverSpeed(1, 1.0, 0.75)
+    assert arm.check(kind, *[value] * CYCLES)[-1] == kind(1, near(value), near(0.5 * BOUNDS[kind]))
 
 
 PART = st.sampled_from([0.0, 1.0, -1.0, 1.01, -1.01, inf, -inf, nan])

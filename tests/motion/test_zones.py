@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from math import hypot, inf, nan
+from pathlib import Path
 from random import Random
 from unittest.mock import Mock
 
@@ -14,16 +15,19 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from kinematics.capsules import outside
-from kinematics.forward import frames
+from kinematics.forward import forward, frames
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
+from rtcp.config import load
 from rtcp.ipc.events import BoxReached, CollisionAhead, NotLeavingBox
 from rtcp.motion.guards.braking import touched
-from rtcp.motion.guards.trajectory_guard import GuardResult
+from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.guards.zones import ITSELF, TOOL, Zones, inside
 from rtcp.motion.limits import Limits, corners
+from rtcp.motion.state import ArmState, Setpoint
 from tests.arm_geometry import CLEARANCE, RADIUS, Point, box_gaps, depth, own_gap, points
 from tests.samples import THOROUGH, examples
+from tests.two_tools import two_tools
 
 from .guard_checker import ARM, MODEL, GuardChecker, with_boxes
 
@@ -305,6 +309,58 @@ def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytes
     driven(checker, [0.5] * 6, 200)
     assert counted.call_count <= 3
     assert checker.guard.poses == frames(MODEL, checker.state.commanded)
+
+
+# -- what is remembered of earlier cycles ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("change", ["tool", "keep-out box", "box", "position"])
+def test_room_from_before_a_change_is_not_used(tmp_path: Path, change: str, sign: float) -> None:
+    config = load(two_tools(tmp_path))
+    cartesian = replace(config.cartesian, box=None, keep_out=())
+    limits = Limits(replace(config, cartesian=cartesian))
+    guard, state, dt = TrajectoryGuard(config, limits, 0.002), ArmState(6), 0.002
+    q = [0.0, 1.2, 0.0, 0.0, 0.0, 0.0]
+    # Joint 1 moves the tool along y, towards a wall just beside the arm that is to be stopped there.
+    tool = config.models[change == "tool"]
+    x, y, z = forward(tool, q).position
+    side = sign if x > 0.0 else -sign
+    wall = y + sign * (BODY + 0.02)
+    low, high = [x - 0.02, min(wall, wall + sign), z - 0.02], [x + 0.02, max(wall, wall + sign), z + 0.02]
+    keep_out = corners(low, high)
+    if change in ("tool", "position"):
+        limits.keep_out = (keep_out,)
+
+    def drive(cycles: int, speed: float) -> GuardResult:
+        target = Setpoint(6)
+        for _ in range(cycles):
+            target.position = [state.commanded[0] + speed * dt, *state.commanded[1:]]
+            target.velocity = [speed, *[0.0] * 5]
+            result = guard.apply(state, target, tolerates_saturation=True)
+        return result
+
+    state.commanded = [q[0] + (2.0 if change == "position" else 0.0), *q[1:]]
+    guard.latch(state)
+    drive(5, 1e-3 * side)
+    drive(20, 0.0)
+    assert guard.poses == frames(config.models[0], state.commanded)
+    if change == "tool":
+        guard.use_tool(1)
+    elif change == "keep-out box":
+        limits.keep_out = (keep_out,)
+    elif change == "box":
+        limits.box = (-9.0, -9.0, -9.0, 9.0, y + 0.03, 9.0) if sign > 0.0 else (-9.0, y - 0.03, -9.0, 9.0, 9.0, 9.0)
+    else:
+        state.commanded = list(q)
+        guard.latch(state)
+    assert guard.poses == frames(tool, state.commanded)
+    for _ in range(400):
+        if drive(1, 0.5 * side) is GuardResult.STOPPED:
+            break
+    assert isinstance(guard.ended, BoxReached)
+    assert guard.zones is not None
+    assert 0.0 <= guard.zones.distance(frames(tool, state.commanded))[0] < 0.03
 
 
 # -- exactly at a face, and thin plates ---------------------------------------------------------------------------

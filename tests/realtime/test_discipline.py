@@ -47,9 +47,9 @@ def run(discipline: Discipline, reference: Reference, cycles: int, *, lost: int 
     return wakeups
 
 
-@pytest.mark.parametrize("drift_ppm", [-20.0, -3.0, 0.0, 7.5, 20.0])
-def test_the_cycle_locks_within_two_seconds_and_stays_at_its_phase(drift_ppm: float) -> None:
-    reference = Reference(drift_ppm, seed=1)
+@pytest.mark.parametrize(("drift_ppm", "seed"), [(-20.0, 1), (-3.0, 2), (0.0, 3), (7.5, 4), (20.0, 5)])
+def test_the_cycle_locks_within_two_seconds_and_stays_at_its_phase(drift_ppm: float, seed: int) -> None:
+    reference = Reference(drift_ppm, seed)
     discipline = Discipline(PERIOD, PHASE)
     run(discipline, reference, 4000)
     assert discipline.locked
@@ -68,8 +68,9 @@ def test_stalls_of_milliseconds_do_not_move_the_followed_clock() -> None:
     assert max(min(step, PERIOD - step) for step in steps) < 500
 
 
-def test_lost_frames_are_bridged_by_the_rate() -> None:
-    reference = Reference(20.0, seed=3)
+@pytest.mark.parametrize("drift_ppm", [20.0, -20.0])
+def test_lost_frames_are_bridged_by_the_rate(drift_ppm: float) -> None:
+    reference = Reference(drift_ppm, seed=3)
     discipline = Discipline(PERIOD, PHASE)
     run(discipline, reference, 6000, lost=3)
     assert discipline.locked
@@ -121,17 +122,30 @@ def test_frames_that_a_loaded_host_delays_do_not_keep_the_cycle_from_locking() -
     assert abs(discipline.filtered_ns) < 5_000
 
 
-def test_a_reference_clock_that_jumps_for_good_is_not_taken_for_late_frames() -> None:
+@pytest.mark.parametrize("by_ns", [150_000, -150_000, 7 * PERIOD + 150_000, -7 * PERIOD - 150_000])
+def test_a_reference_clock_that_jumps_for_good_is_not_taken_for_late_frames(by_ns: int) -> None:
     reference = Reference(0.0, seed=10)
     discipline = Discipline(PERIOD, PHASE)
     planned = 10**12
     for cycle in range(6000):
-        jump = 150_000 if cycle >= 2000 else 0
+        jump = by_ns if cycle >= 2000 else 0
         discipline.observe(planned, reference.seen_by_frame(planned) + jump)
-        planned = discipline.next_wakeup(planned)
+        before, planned = planned, discipline.next_wakeup(planned)
+        assert cycle < 2000 or abs(planned - before - PERIOD) < 700  # followed little by little
         if cycle == 2200:
             assert not discipline.locked
     assert discipline.locked
+    assert abs((planned + 8_000 + EPOCH + by_ns - PHASE + PERIOD // 2) % PERIOD - PERIOD // 2) < 10_000
+
+
+@pytest.mark.parametrize("periods", [3, -3])
+def test_a_reference_that_is_set_by_whole_periods_stays_locked(periods: int) -> None:
+    line = Line()
+    assert line.frames([0] * 2000)[-1]
+    plain = line.reference.at
+    line.reference.at = lambda instant_ns: plain(instant_ns) + periods * PERIOD  # type: ignore[method-assign]
+    assert all(line.frames([0] * 500))
+    assert abs(line.discipline.filtered_ns) < 5_000
 
 
 class Line:

@@ -78,6 +78,31 @@ def test_the_derivative_is_of_the_measured_ratio() -> None:
     assert pid.target - before == pytest.approx(30.0 * (100.0 * 0.0002 - 1.0 * 0.098))
 
 
+@pytest.mark.parametrize("limit", [2.0, 30.0])
+def test_after_a_reset_the_next_heating_is_the_first_one_again(limit: float) -> None:
+    first, second = control(10.0, 100.0, 0.1), control(10.0, 100.0, 0.1)
+    for n in range(300):
+        second.update(1.02, 1.0 + 1e-5 * (n // 7), 30.0, limit)
+    second.reset()
+    assert (second.target, second.is_limited) == (0.0, False)
+    for n in range(300):
+        for pid in (first, second):
+            pid.update(1.02, 1.012 + 1e-5 * (n // 5), 30.0, 30.0)
+        assert (first.target, first.is_limited) == (second.target, second.is_limited)
+
+
+def test_below_zero_the_integral_learns_what_leads_back() -> None:
+    pid = control(integral=100.0)
+    for _ in range(100):
+        pid.update(1.0, 1.01, 30.0, 30.0)
+    pid.update(1.01, 1.01, 30.0, 30.0)
+    assert pid.target == 0.0
+    for _ in range(50):
+        pid.update(1.01, 1.009, 30.0, 30.0)
+    # The error of 0.001, and 50 steps of the integral, which stood still below zero.
+    assert pid.target == pytest.approx(30.0 * (100.0 * 0.001 + 100.0 * 0.001 * 50 * PERIOD_S), rel=0.05)
+
+
 def test_a_ramp_rises_at_its_rate_and_ends_at_the_target() -> None:
     ramp = Ramp()
     ramp.begin(20.0, 120.0, 50.0)
