@@ -26,6 +26,7 @@ from rtcp.ipc.session import read_processes
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.arms import replace_drives, slaves_of
 from tests.leftovers import Leftovers
+from tests.two_tools import add_tools
 from tests.waiting import HANG_S, until
 
 HERE = Path(__file__).parent
@@ -194,6 +195,11 @@ class Platform:
             "motion",
         )
 
+    def pass_cycles(self, count: int) -> None:
+        """Wait until the loop has run so many cycles."""
+        end = self.status()["cycles"] + count
+        self.until(lambda status: status["cycles"] >= end, f"{count} cycles")
+
     def wire(self, *arguments: str) -> str:
         """Run `tests.e2e.wire` in the segment's namespace."""
         segment = self.pids()["segment"]
@@ -234,8 +240,7 @@ class Platform:
         for pid in self.pids().values():
             _signal(pid, signal.SIGCONT)
         if all(lives(pid) for pid in self.pids().values()):
-            before = self.status()["cycles"]
-            self.until(lambda status: status["cycles"] > before + 250, "the cycles in which the loop notices the pause")
+            self.pass_cycles(250)  # in which the loop notices the pause
 
     def pids(self) -> dict[str, int]:
         """Return the process ids that the platform wrote down."""
@@ -293,10 +298,11 @@ def platform() -> Iterator[Platform]:
 
 @pytest.fixture(scope="session")
 def kept(leftovers: Leftovers) -> Iterator[Platform]:
-    """The started platform of this worker; its cycle is `PERIOD_US`."""
+    """The started platform of this worker; its cycle is `PERIOD_US`, and its arm has two tools."""
     made = Platform()
     leftovers.shared.add(str(made.directory))
     made.be_patient(2000)
+    add_tools(made.directory / "config")
     made.rtcp("start", "--detach")
     yield made
     made.thaw()
