@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -28,9 +27,7 @@ def test_an_interrupt_ends_though_an_arm_and_its_halt_do_not_answer(monkeypatch:
     main = threading.main_thread().ident
     assert main is not None
     threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT)).start()
-    began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         cell._all(lambda name, robot: robot.status())
-    assert time.monotonic() - began < 2.0
     assert halted.is_set()
     frozen.set()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,21 +14,27 @@ from rtcp.api import RtcpError
 from rtcp.config.find import default_config
 from rtcp.ipc.runtime_directory import irc5_control
 from rtcp.virtual.request_socket import RequestClient
+from tests.leftovers import Leftovers
+from tests.waiting import until
 
 from .conftest import Platform
 
 pytestmark = pytest.mark.platform
 HOME = [0.0, 0.0, 0.0, 0.0, 0.5, 0.0]
 SLOW_RAD_S = 0.2
+CYCLE_LOST = pytest.mark.long("test_a_cycle_is_lost_when_either_positions_or_status_are_missing")
+STATE_BY_STATUS = pytest.mark.long("test_the_state_of_a_drive_is_what_the_status_says")
 
 
 @pytest.fixture(scope="module")
-def platform() -> Iterator[Platform]:
+def platform(leftovers: Leftovers) -> Iterator[Platform]:
     made = Platform()
+    leftovers.shared.add(str(made.directory))
     made.environment["RTCP_CONFIG"] = str(default_config().parent / "abb_irb120_rapid.yaml")
     made.rtcp("start", "--detach")
     yield made
     made.end()
+    leftovers.shared.discard(str(made.directory))
 
 
 @pytest.fixture
@@ -75,8 +80,7 @@ def units(platform: Platform) -> dict[str, list[float]]:
 
 def rest(platform: Platform) -> float:
     """Wait until the first joint rests; return its position, degrees."""
-    while any(units(platform)["velocity_deg_s"]):
-        time.sleep(0.1)
+    until(lambda: not any(units(platform)["velocity_deg_s"]), "rest")
     return units(platform)["position_deg"][0]
 
 
@@ -84,15 +88,15 @@ def test_it_is_moved_from_the_command_line_halted_and_disabled(platform: Platfor
     shown = json.loads(platform.rtcp("status", "--json").stdout)
     assert (shown["bus_kind"], shown["slaves"], shown["dc"]) == ("rapid", [], None)
     assert shown["devices"]["robot"]["mode"]["value"] == 2
-    platform.rtcp("enable")
-    assert "arrived" in platform.rtcp("move", "0.2", "0.1", "0", "0", "0.6", "0").stdout
+    platform.call("enable")
+    assert "arrived" in platform.rtcp("move", "0.1", "0.1", "0", "0", "0.6", "0").stdout
     rest(platform)
-    assert units(platform)["position_deg"][:2] == pytest.approx([11.459, 5.730], abs=0.01)
+    assert units(platform)["position_deg"][:2] == pytest.approx([5.730, 5.730], abs=0.01)
     platform.background("move", "--speed", f"{SLOW_RAD_S}", "1.5", "0", "0", "0", "0.5", "0")
-    platform.until_moving(0.25)
-    platform.rtcp("halt")
-    assert 0.25 < rest(platform) * 0.01745 < 1.4
-    platform.rtcp("disable")
+    platform.until_moving(0.15)
+    platform.call("halt")
+    assert 0.15 < rest(platform) * 0.01745 < 1.4
+    platform.call("disable")
     assert set(platform.status()["drive_states"]) == {"switched on"}
 
 
@@ -100,8 +104,8 @@ def test_it_is_moved_from_the_command_line_halted_and_disabled(platform: Platfor
     ("verb", "keys", "state", "missing"),
     [
         ("stop_rapid", {}, "ready to switch on", "program"),
-        ("motors_off", {}, "switch on disabled", "motors"),
-        ("stop", {"circuit": "emergency"}, "switch on disabled", "motors"),
+        pytest.param("motors_off", {}, "switch on disabled", "motors", marks=STATE_BY_STATUS),
+        pytest.param("stop", {"circuit": "emergency"}, "switch on disabled", "motors", marks=STATE_BY_STATUS),
     ],
 )
 def test_what_the_operator_stops_is_said_and_starts_by_the_operator_alone(
@@ -125,7 +129,16 @@ def test_what_the_operator_stops_is_said_and_starts_by_the_operator_alone(
     assert rest(moving) == pytest.approx(here, abs=0.01)
 
 
-@pytest.mark.parametrize("fault", ["socket_cut", "silent_motion", "silent_state"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "socket_cut",
+        pytest.param("silent_motion", marks=pytest.mark.long("test_a_motion_server_that_does_not_answer_is_lost")),
+        pytest.param(
+            "silent_state", marks=pytest.mark.long("test_a_cycle_is_lost_when_either_positions_or_status_are_missing")
+        ),
+    ],
+)
 def test_a_lost_connection_is_a_fault_and_nothing_moves_when_it_is_back(moving: Platform, fault: str) -> None:
     operate(moving, "fault", fault=fault)
     status = moving.until(lambda status: status["state"] == "fault", "the fault")

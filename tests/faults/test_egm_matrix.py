@@ -1,4 +1,4 @@
-"""A fixed part of the fault matrix of an arm behind a controller that speaks EGM; `make faults` runs all of it."""
+"""A part of the fault matrix of an arm behind a controller that speaks EGM; `make faults` runs all of it."""
 
 from __future__ import annotations
 
@@ -10,53 +10,48 @@ import pytest
 
 pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
 
-from rtcp.api import RtcpError
 from rtcp.virtual.irc5.controller import _FAULTS
 from tests.faults import egm_wire
 from tests.faults.cases import HOLDING, MOVING
-from tests.faults.egm import CASES, LIMITS, START, Trials, run_case
+from tests.faults.egm import CASES, LIMITS, Trials, run_case
+from tests.leftovers import Leftovers
 from tests.virtual.irc5.wire import sensor
 
-pytestmark = pytest.mark.platform
-
 PART = (
-    ("controller: stopped for 2 s", MOVING),
     ("messages to the PC: none", MOVING),
+    ("Hand: enabling device released", MOVING),
+    ("loop: killed", MOVING),
+)
+MORE = (
+    ("controller: stopped for 2 s", MOVING),
     ("messages to the PC: 1 in 5 an old one", MOVING),
     ("replies: none", MOVING),
     ("replies: all twice", MOVING),
     ("emergency stop", MOVING),
-    ("Hand: enabling device released", MOVING),
     ("RAPID stopped", HOLDING),
     ("collision", MOVING),
     ("session begins anew", MOVING),
-    ("loop: killed", MOVING),
 )
+LONG = pytest.mark.long("test_a_fault_has_the_reaction_of_the_matrix_and_the_arm_recovers")
+"""Of `MORE`: tests/fieldbus/test_egm.py has what the loop is shown after each, without a platform."""
 
 
 @pytest.fixture(scope="module")
-def trials() -> Iterator[Trials]:
+def trials(leftovers: Leftovers) -> Iterator[Trials]:
     """One platform for all cases: each must leave the arm usable for the next."""
     made = Trials()
+    leftovers.shared.add(str(made.platform.directory))
     yield made
     made.close()
+    leftovers.shared.discard(str(made.platform.directory))
 
 
-@pytest.mark.parametrize(("name", "workload"), PART)
+@pytest.mark.platform
+@pytest.mark.parametrize(("name", "workload"), [*PART, *(pytest.param(*case, marks=LONG) for case in MORE)])
 def test_a_fault_has_the_reaction_of_the_matrix_and_the_arm_recovers(trials: Trials, name: str, workload: str) -> None:
     case = next(case for case in CASES if case.name == name and workload in case.workloads)
     result, wrong = run_case(trials, case, workload)
     assert not wrong, f"{wrong}\n{result}"
-
-
-def test_what_the_controller_does_not_offer_is_refused_with_the_reason(trials: Trials) -> None:
-    trials.put_in_order()
-    assert trials.harness.move(START) == ""
-    done = trials.platform.rtcp("sdo", "read", "1", "0x6041", check=3)
-    assert "no SDO on a bus of kind egm: a robot controller has no SDO" in done.stderr
-    with pytest.raises(RtcpError, match="joint_1 has no homing here"):
-        trials.harness.robot.home("joint_1")
-    assert trials.harness.state().name == "HOLDING"
 
 
 def test_every_fault_of_the_virtual_controller_is_in_the_matrix() -> None:

@@ -1,11 +1,11 @@
-"""The recorder as a process beside a real blackboard, which the test writes; its files are read by public readers."""
+"""The recorder beside a real blackboard, which the test writes: in this process, or as a process of its own where the
+test kills the process, or takes its rights or its disk. Public readers read its files."""
 
 from __future__ import annotations
 
 import csv
 import ctypes
 import json
-import os
 import resource
 import shutil
 import signal
@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -31,14 +31,18 @@ from rtcp.config import default_config, load
 from rtcp.config.model import RecordingConfig
 from rtcp.config.serialization import to_json
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.events import ErrorReported, ResetDone
-from rtcp.ipc.layout import EVENTS
+from rtcp.ipc.layout import EVENTS, RECORDS
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import DriveState
 from rtcp.ipc.tool_motion import POSE, VELOCITY
+from rtcp.telemetry import recorder as module
+from rtcp.telemetry.recorder import FLUSH_S, Recorder, RecorderStatus
 from tests.records import numbers
+from tests.waiting import until
 
 CONFIG = load(default_config())
 PERIOD_NS = 2_000_000
@@ -70,7 +74,8 @@ class Loop:
             }
             joints |= {"drive_state": DriveState.OPERATION_ENABLED, "statusword": 0x1237}
             scalars = {"cycle": self.cycles, "time_ns": time.monotonic_ns(), "io_inputs": inputs}
-            self.board.publish(numbers(SCHEMA, **scalars, **joints))
+            self.last = numbers(SCHEMA, **scalars, **joints)
+            self.board.publish(self.last)
 
 
 @pytest.fixture
@@ -81,9 +86,7 @@ def loop(tmp_path: Path) -> Iterator[Loop]:
     blackboard_file(tmp_path).unlink()
 
 
-def record(
-    loop: Loop, limit: int | None = None, environment: Mapping[str, str] = MappingProxyType({}), **given: Any
-) -> subprocess.Popen[str]:
+def record(loop: Loop, limit: int | None = None, **given: Any) -> subprocess.Popen[str]:
     """Start a recorder. `limit`: of its files' size, as on a full disk. Rights of files bind it also as root."""
     options = to_json(RecordingConfig(**{"out": str(loop.directory)} | given))
 
@@ -97,7 +100,7 @@ def record(
     return subprocess.Popen(
         [sys.executable, "-m", "rtcp.telemetry.recorder", "--directory", str(loop.directory),
          "--options", json.dumps(options)],
-        stdout=subprocess.PIPE, text=True, env={**os.environ, **environment}, preexec_fn=narrow,  # noqa: PLW1509
+        stdout=subprocess.PIPE, text=True, preexec_fn=narrow,  # noqa: PLW1509
     )  # fmt: skip
 
 
@@ -111,8 +114,62 @@ def ended(recorder: subprocess.Popen[str], loop: Loop) -> dict[str, Any]:
     """End a recorder; return its report."""
     recorder.terminate()
     recorder.wait()
+    return status(recorder, loop)
+
+
+def status(recorder: subprocess.Popen[str], loop: Loop) -> dict[str, Any]:
+    """Return the last report of a recorder."""
     state: dict[str, Any] = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
     return state
+
+
+class Clock:
+    """The module `time` of the recorder, with an hour of the test's own."""
+
+    def __init__(self) -> None:
+        self.now, self.set_ns = 1000.0, 0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def monotonic_ns(self) -> int:
+        return time.monotonic_ns()
+
+    def time_ns(self) -> int:
+        return time.time_ns() + self.set_ns
+
+    def strftime(self, form: str) -> str:
+        return time.strftime(form)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(module, "time", made)
+    return made
+
+
+class Here:
+    """A recorder in this process, which reads when the test says so."""
+
+    def __init__(self, loop: Loop, clock: Clock, **given: Any) -> None:
+        self.recorder = Recorder(loop.directory, RecordingConfig(**{"out": str(loop.directory)} | given))
+        self.files = list(map(Path, self.recorder.status.files))
+        self._clock = clock
+
+    def take(self) -> RecorderStatus:
+        """Write what is new, and flush it."""
+        self._clock.now += FLUSH_S
+        self.recorder._write_new()
+        return self.recorder.status
+
+    def finish(self) -> RecorderStatus:
+        """Write the rest and end."""
+        self._clock.now += FLUSH_S
+        self.recorder.end()
+        self.recorder.run()
+        self.recorder._feed.close()
+        return self.recorder.status
 
 
 def messages(path: Path, topic: str) -> list[Any]:
@@ -121,35 +178,40 @@ def messages(path: Path, topic: str) -> list[Any]:
         return [decoded.decoded_message for decoded in reader.iter_decoded_messages(topics=[topic])]
 
 
+def numbers_in(path: Path) -> list[int]:
+    """The numbers of the cycles in a whole file."""
+    with open(path, "rb") as file:
+        found = make_reader(file).iter_messages(topics=["/cycle"])
+        return [int.from_bytes(message.data[4:12], "little") for _, _, message in found]
+
+
 def test_every_cycle_is_in_both_files_with_the_values_of_its_record(loop: Loop) -> None:
     recorder = record(loop, formats=("mcap", "csv"))
     mcap_file, csv_file = map(Path, begun(recorder)["recording"]["files"])
-    for _ in range(20):
-        loop.publish(100)
-        time.sleep(0.03)
+    loop.publish(300)
     said = ended(recorder, loop)
-    assert (said["records"], said["missing"], said["problem"], said["ended"]) == (2000, 0, "", True)
+    assert (said["records"], said["missing"], said["problem"], said["ended"]) == (300, 0, "", True)
     cycles = messages(mcap_file, "/cycle")
-    assert [cycle.number for cycle in cycles] == list(range(1, 2001))
+    assert [cycle.number for cycle in cycles] == list(range(1, 301))
     states = messages(mcap_file, "/joint_states")
     assert (states[0].name, states[6].position) == ([joint.name for joint in CONFIG.joints], cycles[6].actual_position)
     assert cycles[6].actual_position == pytest.approx([7e-4 + 0.1 * axis for axis in range(6)], abs=1e-12)
     assert messages(mcap_file, "/joint_targets")[6].effort == cycles[6].sent_torque
     rows = list(csv.reader(csv_file.open()))
     assert rows[0] == ["Time", *(f"J{axis}_{what}" for what in ("pos", "vel", "tor", "tpos") for axis in range(1, 7))]
-    assert len(rows) == 2001
+    assert len(rows) == 301
     for row, cycle in zip(rows[1:], cycles, strict=True):
         wanted = [*cycle.actual_position, *cycle.actual_velocity, *cycle.actual_torque, *cycle.sent_position]
         assert [float(value) for value in row] == pytest.approx([(cycle.time_ns - cycles[0].time_ns) * 1e-9, *wanted])
 
 
-def test_the_file_explains_itself(loop: Loop) -> None:
-    recorder = record(loop)
-    (path,) = begun(recorder)["recording"]["files"]
+def test_the_file_explains_itself(loop: Loop, clock: Clock) -> None:
+    here = Here(loop, clock)
+    (path,) = here.files
     loop.publish(3)
     loop.board.event(ResetDone())
     loop.board.event(ErrorReported("drive 3 (slave 4): its lamp is lit"))
-    ended(recorder, loop)
+    here.finish()
     with open(path, "rb") as file:
         reader = make_reader(file)
         attached = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
@@ -165,11 +227,11 @@ def test_the_file_explains_itself(loop: Loop) -> None:
     assert words["inputs"]["forward"] is True
 
 
-def test_the_frames_lead_from_the_base_to_the_tool(loop: Loop) -> None:
-    recorder = record(loop)
-    (path,) = map(Path, begun(recorder)["recording"]["files"])
+def test_the_frames_lead_from_the_base_to_the_tool(loop: Loop, clock: Clock) -> None:
+    here = Here(loop, clock)
+    (path,) = here.files
     loop.publish()
-    ended(recorder, loop)
+    here.finish()
     (tf,) = messages(path, "/tf")
     q = messages(path, "/cycle")[0].actual_position
     place, rotation = np.zeros(3), np.eye(3)
@@ -191,17 +253,18 @@ def test_the_frames_lead_from_the_base_to_the_tool(loop: Loop) -> None:
     assert rotation.ravel() == pytest.approx(tool.rotation, abs=1e-9)
 
 
-def test_a_killed_recorder_leaves_all_but_the_last_second(loop: Loop) -> None:
+def test_a_killed_recorder_leaves_all_but_what_it_got_since_its_last_report(loop: Loop) -> None:
     recorder = record(loop)
     (path,) = begun(recorder)["recording"]["files"]
-    for _ in range(30):
-        loop.publish(50)
-        time.sleep(0.05)
+    loop.publish(600)
+    reported = until(lambda: status(recorder, loop)["records"], "a report")
+    loop.publish(50)
     recorder.kill()
     recorder.wait()
     numbers = whole_cycles(path)
     assert numbers == list(range(1, len(numbers) + 1))
-    assert len(numbers) > 600
+    assert 0 < reported <= len(numbers)
+    assert FLUSH_S <= 1.0
 
 
 def whole_cycles(path: str) -> list[int]:
@@ -224,44 +287,40 @@ def test_a_full_disk_ends_the_recording_with_a_message(loop: Loop) -> None:
         loop.publish(40)
         time.sleep(0.02)
     assert recorder.returncode == 1
-    said = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
+    said = status(recorder, loop)
     assert said["problem"] == f"the recording has ended: {path} cannot be written: File too large"
     assert len(whole_cycles(path)) > 50
 
 
 @pytest.mark.parametrize("what", ["file", "directory"])
-def test_a_file_or_directory_that_is_removed_ends_the_recording(loop: Loop, what: str) -> None:
+def test_a_file_or_directory_that_is_removed_ends_the_recording(loop: Loop, clock: Clock, what: str) -> None:
     directory = loop.directory / "gone"
     directory.mkdir()
-    recorder = record(loop, out=str(directory))
-    (path,) = map(Path, begun(recorder)["recording"]["files"])
+    here = Here(loop, clock, out=str(directory))
+    (path,) = here.files
     path.unlink() if what == "file" else shutil.rmtree(directory)
-    while recorder.poll() is None:
-        loop.publish(10)
-        time.sleep(0.02)
-    state = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
-    assert state["problem"] == f"the recording has ended: {path} cannot be written: it has been removed"
-
-
-def test_what_was_not_read_in_time_is_a_gap_that_is_reported(loop: Loop) -> None:
-    recorder = record(loop)
-    (path,) = map(Path, begun(recorder)["recording"]["files"])
     loop.publish(10)
-    time.sleep(0.5)
-    recorder.send_signal(signal.SIGSTOP)
-    loop.publish(40_000)
+    assert here.finish().problem == f"the recording has ended: {path} cannot be written: it has been removed"
+
+
+def test_what_was_not_read_in_time_is_a_gap_that_is_reported(loop: Loop, clock: Clock) -> None:
+    here = Here(loop, clock)
+    (path,) = here.files
+    loop.publish(10)
+    here.take()
+    for _ in range(RECORDS + 100):
+        loop.board.publish(loop.last)
     for _ in range(EVENTS + 10):
         loop.board.event(ResetDone())
-    recorder.send_signal(signal.SIGCONT)
-    said = ended(recorder, loop)
-    numbers = [message.number for message in messages(path, "/cycle")]
-    assert said["missing"] > 0
-    assert len(numbers) + said["missing"] == loop.cycles == numbers[-1]
+    said = here.finish()
+    numbers, last = numbers_in(path), RECORDS + 110
+    assert said.missing > 0
+    assert len(numbers) + said.missing == last == numbers[-1]
     logged = [
         message["message"].removesuffix(" are missing: they were not read in time")
         for message in json_messages(path, "/log")
     ]
-    assert logged[0] == f"{said['missing']} of the cycles from 11 to 40010"
+    assert logged[0] == f"{said.missing} of the cycles from 11 to {last}"
     assert logged[1] == "10 of the events from 1 to 10"
     assert len(logged) == 2 + EVENTS
 
@@ -271,11 +330,11 @@ def json_messages(path: Path, topic: str) -> list[Any]:
         return [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics=[topic])]
 
 
-def test_chosen_signals_of_each_tenth_cycle(loop: Loop) -> None:
-    recorder = record(loop, formats=("mcap", "csv"), signals=("*_position", "time_ns"), every=10)
-    mcap_file, csv_file = map(Path, begun(recorder)["recording"]["files"])
+def test_chosen_signals_of_each_tenth_cycle(loop: Loop, clock: Clock) -> None:
+    here = Here(loop, clock, formats=("mcap", "csv"), signals=("*_position", "time_ns"), every=10)
+    mcap_file, csv_file = here.files
     loop.publish(100)
-    ended(recorder, loop)
+    here.finish()
     first = messages(mcap_file, "/cycle")[0]
     assert first.number == 10
     assert hasattr(first, "sent_position")
@@ -287,31 +346,29 @@ def test_chosen_signals_of_each_tenth_cycle(loop: Loop) -> None:
     assert int(rows[1][rows[0].index("time_ns")]) == first.time_ns
 
 
-def test_changes_between_the_chosen_cycles_are_recorded(loop: Loop) -> None:
-    recorder = record(loop, every=10)
-    (path,) = map(Path, begun(recorder)["recording"]["files"])
+def test_changes_between_the_chosen_cycles_are_recorded(loop: Loop, clock: Clock) -> None:
+    here = Here(loop, clock, every=10)
+    (path,) = here.files
     for inputs in (0x3F, 0x3E, 0x3F):
         loop.publish(3, inputs)
     loop.publish(11)
-    ended(recorder, loop)
+    here.finish()
     assert [message["inputs"]["forward"] for message in json_messages(path, "/machine")] == [True, False, True]
     assert [message.number for message in messages(path, "/cycle")] == [10, 20]
 
 
 @pytest.mark.parametrize("limit", [{"max_file_mb": 1}, {"max_file_seconds": 1.0}], ids=["size", "age"])
-def test_files_rotate_without_a_lost_or_doubled_cycle(loop: Loop, limit: dict[str, Any]) -> None:
-    recorder = record(loop, formats=("mcap", "csv"), **limit)
-    begun(recorder)
-    while status(loop, recorder)["rotations"] < 2:
-        loop.publish(30)
-        time.sleep(0.02)
-    said = ended(recorder, loop)
+def test_files_rotate_without_a_lost_or_doubled_cycle(loop: Loop, clock: Clock, limit: dict[str, Any]) -> None:
+    here = Here(loop, clock, formats=("mcap", "csv"), **limit)
+    while here.take().rotations < 2:
+        loop.publish(100)
+    loop.publish(5)
+    said = here.finish()
     parts = sorted(loop.directory.glob("recording-*.mcap"))
-    assert str(parts[-1]) == said["files"][0]
-    numbers = [message.number for part in parts for message in messages(part, "/cycle")]
-    assert numbers == list(range(1, loop.cycles + 1))
-    assert said["records"] == loop.cycles
-    assert said["bytes"] == sum(part.stat().st_size for part in loop.directory.glob("recording-*"))
+    assert str(parts[-1]) == said.files[0]
+    assert [number for part in parts for number in numbers_in(part)] == list(range(1, loop.cycles + 1))
+    assert said.records == loop.cycles
+    assert said.bytes == sum(part.stat().st_size for part in loop.directory.glob("recording-*"))
     rows = [row for part in sorted(loop.directory.glob("recording-*.csv")) for row in csv.reader(part.open())]
     instants = [float(row[0]) for row in rows if row[0] != "Time"]
     assert len(instants) == loop.cycles
@@ -326,40 +383,28 @@ def explains_itself(path: Path) -> None:
         assert {attachment.name for attachment in reader.iter_attachments()} == {"configuration.json", "arm.urdf"}
         assert [entry.name for entry in reader.iter_metadata()] == ["rtcp/about"]
         topics = [channel.topic for _, channel, _ in reader.iter_messages(topics=["/robot_description", "/machine"])]
-    assert sorted(topics) == ["/machine", "/robot_description"][0 if messages(path, "/cycle") else 1 :]
+    assert sorted(topics) == ["/machine", "/robot_description"][0 if numbers_in(path) else 1 :]
 
 
-def test_only_the_newest_files_are_kept(loop: Loop) -> None:
-    recorder = record(loop, out=str(loop.directory / "arm.mcap"), max_file_seconds=1.0, keep=2)
-    begun(recorder)
-    while status(loop, recorder)["rotations"] < 3:
+def test_only_the_newest_files_are_kept(loop: Loop, clock: Clock) -> None:
+    here = Here(loop, clock, out=str(loop.directory / "arm.mcap"), max_file_seconds=1.0, keep=2)
+    while here.take().rotations < 3:
         loop.publish(10)
-        time.sleep(0.02)
-    said = ended(recorder, loop)
-    names = [f"arm-{said['rotations'] - away:06d}.mcap" for away in (1, 0)]
+    said = here.finish()
+    names = [f"arm-{said.rotations - away:06d}.mcap" for away in (1, 0)]
     assert sorted(path.name for path in loop.directory.glob("*.mcap")) == names
 
 
-def status(loop: Loop, recorder: subprocess.Popen[str]) -> dict[str, Any]:
-    assert recorder.poll() is None
-    state: dict[str, Any] = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
-    return state
-
-
-def test_a_recording_ends_before_the_disk_is_full(loop: Loop) -> None:
-    reserve_mb = shutil.disk_usage(loop.directory).free // 10**6 - 1000
-    recorder = record(loop, reserve_mb=reserve_mb)
-    (path,) = map(Path, begun(recorder)["recording"]["files"])
+def test_a_recording_ends_before_the_disk_is_full(loop: Loop, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = [2_001e6]
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=free[0]))
+    here = Here(loop, clock, reserve_mb=2000)
     loop.publish(100)
-    filler = loop.directory / "filler"
-    with filler.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, 2 * 10**9)
-    recorder.wait()
-    filler.unlink()
-    said = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
-    assert said["problem"].startswith(f"the recording has ended: {loop.directory}: ")
-    assert f"less than the reserve of {reserve_mb} MB" in said["problem"]
-    assert len(messages(path, "/cycle")) == 100
+    free[0] = 1_999e6
+    said = here.finish()
+    assert said.problem.startswith(f"the recording has ended: {loop.directory}: ")
+    assert "less than the reserve of 2000 MB" in said.problem
+    assert len(numbers_in(here.files[0])) == 100
 
 
 @pytest.mark.parametrize(
@@ -381,9 +426,19 @@ def test_a_recording_ends_before_the_disk_is_full(loop: Loop) -> None:
     ids=lambda case: case if isinstance(case, str) else "",
 )
 def test_what_cannot_be_recorded_is_refused(
-    loop: Loop, given: dict[str, Any], reason: str, fields: dict[str, Any]
+    loop: Loop,
+    given: dict[str, Any],
+    reason: str,
+    fields: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    refused_with(record(loop, **given), reason, fields)
+    monkeypatch.setattr(signal, "signal", lambda number, action: None)
+    options = json.dumps(to_json(RecordingConfig(**{"out": str(loop.directory)} | given)))
+    assert module.main(["--directory", str(loop.directory), "--options", options]) == 1
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["reason"] == reason
+    assert {name: answer["fields"][name] for name in fields} == fields
 
 
 def refused_with(recorder: subprocess.Popen[str], reason: str, fields: Mapping[str, Any]) -> None:
@@ -393,51 +448,42 @@ def refused_with(recorder: subprocess.Popen[str], reason: str, fields: Mapping[s
     assert {name: answer["fields"][name] for name in fields} == fields
 
 
-@pytest.mark.parametrize("mode", [0o555, 0o000])
-def test_a_directory_without_rights_is_refused(loop: Loop, mode: int) -> None:
+def test_a_directory_without_rights_is_refused(loop: Loop) -> None:
     closed = loop.directory / "closed"
-    closed.mkdir(mode=mode)
+    closed.mkdir(mode=0o555)
     recorder = record(loop, out=str(closed / "one.mcap"))
     refused_with(recorder, "not_writable", {"file": str(closed / "one.mcap"), "error": "Permission denied"})
 
 
-@pytest.mark.parametrize("given", [{"limit": 2000}, {"reserve_mb": 10**9}], ids=["full disk", "reserve"])
-def test_a_failed_start_leaves_no_file(loop: Loop, given: dict[str, Any]) -> None:
-    recorder = record(loop, formats=("csv", "mcap"), **given)
-    refused_with(recorder, "disk_reserve" if "reserve_mb" in given else "not_writable", {})
+def test_a_failed_start_leaves_no_file(loop: Loop) -> None:
+    refused_with(record(loop, formats=("csv", "mcap"), limit=2000), "not_writable", {})
+    with pytest.raises(RtcpError) as refused:
+        Recorder(loop.directory, RecordingConfig(out=str(loop.directory), formats=("csv", "mcap"), reserve_mb=10**9))
+    assert refused.value.reason == "disk_reserve"
     assert not list(loop.directory.glob("recording-*"))
 
 
 def test_a_failed_start_leaves_the_file_that_is_in_its_way(loop: Loop) -> None:
     mine = loop.directory / "mine.csv"
     mine.write_text("mine")
-    refused_with(record(loop, out=str(mine)), "not_writable", {"file": str(mine), "error": "File exists"})
+    with pytest.raises(RtcpError) as refused:
+        Recorder(loop.directory, RecordingConfig(out=str(mine)))
+    assert refused.value.reason == "not_writable"
+    assert refused.value.fields == {"file": str(mine), "error": "File exists"}
     assert mine.read_text() == "mine"
 
 
-def test_a_clock_that_is_set_while_recording_does_not_tear_the_file(
-    loop: Loop, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # No test may set the host's clock: while the file exists each process sees a changed clock.
-    is_set = loop.directory / "set"
-    (loop.directory / "sitecustomize.py").write_text(
-        "import os, time\n"
-        "_time_ns = time.time_ns\n"
-        f"time.time_ns = lambda: _time_ns() + {HOUR_NS} * os.path.exists({str(is_set)!r})\n"
-    )
-    real = time.time_ns
-    monkeypatch.setattr(time, "time_ns", lambda: real() + HOUR_NS * is_set.exists())
-    recorder = record(loop, environment={"PYTHONPATH": str(loop.directory)})
-    (path,) = map(Path, begun(recorder)["recording"]["files"])
-    recorder.send_signal(signal.SIGSTOP)
+def test_a_clock_that_is_set_while_recording_does_not_tear_the_file(loop: Loop, clock: Clock) -> None:
+    here = Here(loop, clock)
+    (path,) = here.files
     loop.publish(2)
     loop.board.event(ErrorReported("before"))
-    is_set.touch()
+    clock.set_ns = HOUR_NS
     loop.publish(2)
-    recorder.send_signal(signal.SIGCONT)
+    here.take()
     loop.board.event(ErrorReported("after"))
     loop.publish()
-    ended(recorder, loop)
+    here.finish()
     with open(path, "rb") as file:
         messages = [
             (message.log_time, channel.topic, message.data) for _, channel, message in make_reader(file).iter_messages()
