@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,13 +25,13 @@ from rtcp.ipc.runtime_directory import control_socket, segment_control
 from rtcp.ipc.session import read_processes
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.arms import replace_drives, slaves_of
+from tests.leftovers import Leftovers
+from tests.waiting import HANG_S, until
 
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
-PERIOD_US = 2000
-"""Cycle of a platform under test, us: the shortest that a shared host keeps beside the tests."""
-
-
+PERIOD_US = 4000
+"""Cycle of a platform under test, us: the platforms of four tests side by side keep it."""
 OTHER_ARM = os.environ.get("RTCP_TEST_ARM", "")
 """Arm of `tests.drive_esi.ARMS` that the tests run with in place of the shipped one."""
 SLAVES = slaves_of(OTHER_ARM) if OTHER_ARM else 7
@@ -171,15 +170,19 @@ class Platform:
             self.call("move_joints", q=[0.0] * 6)
         self.call("disable")
 
-    def until(self, met: Callable[[dict[str, Any]], bool], what: str, patience_s: float = 20.0) -> dict[str, Any]:
-        """Ask for the status until `met`; the patience only keeps a broken platform from hanging the tests."""
-        end = time.monotonic() + patience_s
-        while True:
-            status = self.status()
-            if met(status):
-                return status
-            assert time.monotonic() < end, f"{what} did not come: {status}\n{self.logs()}"
-            time.sleep(0.05)
+    def until(self, met: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
+        """Ask for the status until `met`, and return that status."""
+        last: dict[str, Any] = {}
+
+        def is_met() -> bool:
+            last.update(self.status())
+            return met(last)
+
+        try:
+            until(is_met, what, interval_s=0.05)
+        except AssertionError as never:
+            raise AssertionError(f"{never}: {last}\n{self.logs()}") from None
+        return last
 
     def until_moving(self, far_rad: float = 0.05) -> dict[str, Any]:
         """Wait until the first joint moves and is more than `far_rad` from 0.
@@ -220,6 +223,20 @@ class Platform:
         """Return the AL status of every slave, read with frames of the tests' own."""
         return [int(word) for word in json.loads(self.wire("al"))]
 
+    def freeze(self) -> None:
+        """Stop the processes of the platform, so that a platform which waits for its next tests takes no time."""
+        self.end_commands()
+        for pid in self.pids().values():
+            _signal(pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """Continue the processes of the platform; `restore` clears the fault that a long pause has been."""
+        for pid in self.pids().values():
+            _signal(pid, signal.SIGCONT)
+        if all(lives(pid) for pid in self.pids().values()):
+            before = self.status()["cycles"]
+            self.until(lambda status: status["cycles"] > before + 250, "the cycles in which the loop notices the pause")
+
     def pids(self) -> dict[str, int]:
         """Return the process ids that the platform wrote down."""
         return {name: int(pid) for name, pid in vars(read_processes(self.directory)).items()}
@@ -250,7 +267,7 @@ def gone(pid: int) -> None:
     except ProcessLookupError:
         return
     try:
-        assert select.select([process], [], [], 20.0)[0], f"process {pid} does not end"
+        assert select.select([process], [], [], HANG_S)[0], f"process {pid} does not end"
     finally:
         os.close(process)
 
@@ -261,6 +278,11 @@ def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> None:
     gone(pid)
 
 
+def _signal(pid: int, number: signal.Signals) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, number)
+
+
 @pytest.fixture
 def platform() -> Iterator[Platform]:
     """A platform that is not started."""
@@ -269,21 +291,34 @@ def platform() -> Iterator[Platform]:
     made.end()
 
 
-@pytest.fixture
-def running(shared: Platform) -> Platform:
-    """The platform of the module, started again where the test before broke it, the arm disabled at 0."""
-    shared.restore()
-    return shared
+@pytest.fixture(scope="session")
+def kept(leftovers: Leftovers) -> Iterator[Platform]:
+    """The started platform of this worker; its cycle is `PERIOD_US`."""
+    made = Platform()
+    leftovers.shared.add(str(made.directory))
+    made.be_patient(2000)
+    made.rtcp("start", "--detach")
+    yield made
+    made.thaw()
+    made.end()
+    leftovers.shared.discard(str(made.directory))
 
 
 @pytest.fixture(scope="module")
-def shared(request: pytest.FixtureRequest) -> Iterator[Platform]:
-    """A started platform for tests of a module that restore it; its cycle is `PERIOD_US`."""
-    made = Platform()
-    made.be_patient(2000, getattr(request.module, "PERIOD_US", PERIOD_US))
-    made.rtcp("start", "--detach")
-    yield made
-    made.end()
+def shared(kept: Platform) -> Iterator[Platform]:
+    """The started platform of this worker for the tests of a module, which restore it."""
+    kept.thaw()
+    kept.restore()
+    yield kept
+    kept.freeze()
+
+
+@pytest.fixture
+def running(shared: Platform) -> Iterator[Platform]:
+    """The shared platform, started again where the test before broke it, the arm disabled at 0."""
+    shared.restore()
+    yield shared
+    shared.end_commands()
 
 
 @pytest.fixture
@@ -291,11 +326,11 @@ def enabled(shared: Platform, request: pytest.FixtureRequest) -> Iterator[Platfo
     """The shared platform, in CSP, enabled; disabled afterwards. A test that is repeated begins at 0, as at first."""
     if getattr(request.node, "execution_count", 1) > 1:
         shared.restore()
-    shared.end_commands()
     if shared.status()["state"] in ("fault", "emergency_stop"):
         shared.call("reset")
     shared.call("mode", name="csp")
     shared.call("enable")
     yield shared
+    shared.end_commands()
     with contextlib.suppress(RtcpError):
         shared.call("disable")

@@ -212,7 +212,7 @@ def test_a_mover_that_is_suspended_loses_its_lease_and_the_arm_stops(running: Pl
     os.kill(moving.pid, signal.SIGSTOP)
     try:
         # Before it would have arrived, 30 s later.
-        running.until(lambda status: status["state"] == "holding", "rest", 15.0)
+        running.until(lambda status: status["state"] == "holding", "rest")
         assert running.status()["lease"]["holder"] in ("", None)
         assert "lease_expired" in running.events(since)
         running.call("move_joints", q=[0.0] * 6)

@@ -9,9 +9,9 @@ import pytest
 
 from rtcp.config import default_config, load, with_period
 from rtcp.config.model import ArmConfig
-from tests.e2e.conftest import Platform, enabled, shared
+from tests.e2e.conftest import Platform, enabled, kept, shared
 
-__all__ = ["Platform", "enabled", "shared"]
+__all__ = ["Platform", "enabled", "kept", "shared"]
 
 Make = Callable[..., Any]
 

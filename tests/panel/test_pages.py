@@ -441,7 +441,7 @@ def test_faults_of_the_segment_are_made_and_objects_read(page: Page, holding: Pl
     expect(page.get_by_text(re.compile(r"^fault \d+: power, for"))).to_be_visible(timeout=20_000)
     page.get_by_role("button", name="Clear all").click()
     expect(page.locator("[data-live=state]")).to_have_text("fault")
-    holding.until(lambda status: all(slave["state"] == "OP" for slave in status["slaves"]), "OP again", 40.0)
+    holding.until(lambda status: all(slave["state"] == "OP" for slave in status["slaves"]), "OP again")
     expect(page.locator("td", has_text=re.compile("^OP$"))).to_have_count(7)
 
 
