@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
+import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from time import monotonic, monotonic_ns, sleep
 from typing import Any, Generic, TypeVar
 
 from rtcp.config.model import ArmConfig
@@ -59,7 +59,7 @@ class _Waiter(Generic[T]):
     ) -> None:
         self.interval_s = interval_s
         self._poll = poll
-        self._left_s, self._before = timeout_s, monotonic()
+        self._left_s, self._before = timeout_s, time.monotonic()
         self._timed_out = timed_out
         self._pace = pace
         self.outcome: asyncio.Future[T] = asyncio.get_running_loop().create_future()
@@ -70,7 +70,7 @@ class _Waiter(Generic[T]):
             return
         try:
             result = self._poll()
-            now = monotonic()
+            now = time.monotonic()
             self._left_s -= self._pace() * (now - self._before)
             self._before = now
             if result is None and self._left_s < 0.0:
@@ -319,7 +319,7 @@ class CommandChannel:
                 waiter.update()
             interval_s = min((waiter.interval_s for waiter in self._waiters), default=_POLL_S)
             # Not `asyncio.sleep`: epoll's resolution of 1 ms would delay each answer by two cycles.
-            await asyncio.get_running_loop().run_in_executor(self._sleeper, sleep, interval_s)
+            await asyncio.get_running_loop().run_in_executor(self._sleeper, time.sleep, interval_s)
             if not self._waiters:
                 self._has_waiters.clear()
 
@@ -414,7 +414,7 @@ class StreamingCommands:
     async def open(self, caller: Caller, motion: int = 0, partners: int = 0) -> Json:
         """Begin a stream of the client; return its number and lease, which the client renews, and the last event."""
         lease, since = self._lease(caller)
-        stream = monotonic_ns()
+        stream = time.monotonic_ns()
         self._head = await self._channel.accept(lease, OpenStream(stream, motion, partners))
         return {"stream": stream, "lease": lease, "since": since}
 

@@ -17,7 +17,7 @@ from rtcp.config import default_config, load
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
-from tests.gateway.fake_loop import FakeLoop
+from tests.gateway.fake_loop import FakeLoop, RunningLoop
 from tests.gateway.fake_platform import FakePlatform, fake_platform
 
 
@@ -35,7 +35,7 @@ def served_loop(directory: Path) -> Iterator[FakeLoop]:
     config = load(default_config())
     Session(config, "virtual", "ecat0", 0, time.monotonic_ns()).write(directory)
     (directory / "started.json").write_text("{}")
-    made = FakeLoop(blackboard_file(directory))
+    made = RunningLoop(blackboard_file(directory))
     reading, writing = os.pipe()
     gateway = subprocess.Popen(
         [sys.executable, "-m", "rtcp.gateway.server", "--directory", str(directory), "--ready-fd", str(writing)],

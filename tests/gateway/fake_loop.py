@@ -26,12 +26,12 @@ _FOR_EVER = 1_000_000_000
 
 
 class FakeLoop:
-    """Publishes a record a millisecond, answers commands and requests for the service thread.
+    """Publishes a record a turn, answers commands and requests for the service thread.
 
     What came: `commands`, `plans`, `requests`. What a test may set: `state`, `control_mode`, `q`, `inputs`; by kind
     of command `refusals`, `ends` (where it leads) and `reports` (events that it leads to at once);
     `event_at_the_end` of a motion that ends by itself, `ends_in`, the state then, and `moves_for`, its duration in
-    turns of about a millisecond.
+    turns.
     """
 
     def __init__(self, path: Path, q: Sequence[float] = (0.0,) * JOINTS, state: State = State.READY) -> None:
@@ -40,11 +40,8 @@ class FakeLoop:
         self.plans: list[list[list[float]]] = []
         self.requests: list[dict[str, Any]] = []
         self._lease = 0
-        self._ended = threading.Event()
         self._set_up(q, state)
         self._publish()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
 
     def _set_up(self, q: Sequence[float], state: State) -> None:
         self.refusals: dict[type[Command], Refusal] = {}
@@ -67,8 +64,6 @@ class FakeLoop:
         self._set_up((0.0,) * JOINTS, State.READY)
 
     def end(self) -> None:
-        self._ended.set()
-        self._thread.join()
         self.board.close()
 
     def received(self, kind: type[C]) -> list[C]:
@@ -85,13 +80,13 @@ class FakeLoop:
         writes = [request for request in self.requests if request["do"] == "sdo_write"]
         return [(write["index"], write["subindex"], write["hex"]) for write in writes]
 
-    def _run(self) -> None:
-        while not self._ended.wait(0.001):
-            if self.board.command_waits():
-                self._handle()
-            self._serve()
-            self._move()
-            self._publish()
+    def turn(self) -> None:
+        """Answer what waits and publish a record; called once a millisecond."""
+        if self.board.command_waits():
+            self._handle()
+        self._serve()
+        self._move()
+        self._publish()
 
     def _move(self) -> None:
         if not self._left:
@@ -150,3 +145,22 @@ class FakeLoop:
         memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(answer)] = answer
         words[SERVICE_LENGTH_AT] = len(answer)
         words[SERVICE_STATE_AT] = 2
+
+
+class RunningLoop(FakeLoop):
+    """The same in a thread, for a gateway in another process: a turn takes about a millisecond."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def end(self) -> None:
+        self._ended.set()
+        self._thread.join()
+        super().end()
+
+    def _run(self) -> None:
+        while not self._ended.wait(0.001):
+            self.turn()

@@ -1,4 +1,4 @@
-"""The methods of the gateway, in this process, in front of a fake loop."""
+"""The methods of the gateway in front of a fake loop, in this process and in simulated time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import limits_file
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import ControlMode, State
+from tests import simulated_time
 from tests.gateway.fake_loop import FakeLoop
+from tests.simulated_time import Clock
 
 T = TypeVar("T")
 
@@ -39,6 +41,7 @@ class FakePlatform:
     ) -> None:
         self.config = dataclasses.replace(config or load(default_config()), lease_s=lease_s)
         self.directory = directory
+        self.clock = Clock()
         self.loop = FakeLoop(directory / "board", q, State.HOLDING)
         self.observer = Observer(directory / "board")
         self.session = Session(self.config, bus, "ecat0", 0, time.monotonic_ns())
@@ -53,12 +56,11 @@ class FakePlatform:
         self.show(state=State.HOLDING)
 
     def show(self, *, control_mode: ControlMode | None = None, state: State | None = None) -> None:
-        """Set mode or state of the loop; return when its records have them."""
+        """Set mode or state of the loop and of its latest record."""
         self.loop.control_mode = self.loop.control_mode if control_mode is None else control_mode
         self.loop.state = self.loop.state if state is None else state
-        seen = self.observer.head
-        while self.observer.head < seen + 2:
-            time.sleep(0.001)
+        self.loop.turn()
+        self.snapshot.follow()
 
     async def call(self, method: str, params: dict[str, Any], client: str = "one", connection: int = 1) -> Any:
         """Call a method as a client's request does."""
@@ -77,7 +79,7 @@ class FakePlatform:
         raise AssertionError(f"{method} did not fail: {answer}")
 
     def run(self, work: Callable[[], Awaitable[T]]) -> T:
-        """Run a coroutine in an event loop while the gateway's tasks read the blackboard."""
+        """Run a coroutine while the loop publishes and the gateway's tasks read the blackboard."""
 
         async def end_platform() -> list[str]:
             return []
@@ -94,12 +96,14 @@ class FakePlatform:
                 for task in following:
                     task.cancel()
 
-        return asyncio.run(whole())
+        return simulated_time.run(whole(), self.clock)
 
     async def _follow(self) -> None:
         while True:
+            for _ in range(5):
+                self.loop.turn()
+                await asyncio.sleep(0.001)
             self.snapshot.follow()
-            await asyncio.sleep(0.005)
 
     def end(self) -> None:
         self.observer.close()

@@ -21,7 +21,7 @@ from rtcp.ipc.events import ErrorReported, ProcessDataLost
 from rtcp.ipc.recording import About, listed
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
-from tests.gateway.fake_loop import FakeLoop
+from tests.gateway.fake_loop import RunningLoop
 
 LOST = ProcessDataLost(3, 5)
 
@@ -33,7 +33,7 @@ class Gateways:
         self.directory = directory
         Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(directory)
         (directory / "started.json").write_text("{}")
-        self.loop = FakeLoop(blackboard_file(directory))
+        self.loop = RunningLoop(blackboard_file(directory))
         self._started: list[subprocess.Popen[bytes]] = []
 
     def start(self) -> subprocess.Popen[bytes]:

@@ -10,7 +10,6 @@ import pytest
 
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range
 from rtcp.fieldbus.al_state import AlState
-from rtcp.gateway import command_channel
 from rtcp.gateway.command_channel import Caller, CommandChannel
 from rtcp.gateway.machine_actions import MachineActions
 from rtcp.gateway.status_snapshot import StatusSnapshot
@@ -18,19 +17,13 @@ from rtcp.ipc.errors import Faulted
 from rtcp.ipc.events import SlavesParked
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import State
+from tests import simulated_time
 from tests.control.conftest import new_rig, rig
 from tests.control.rig import CONFIG, CONTROLWORD, LOST_CYCLES, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
 
 __all__ = ["new_rig", "rig"]
 
 FINGER = Joint("finger", "drive2", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
-
-
-@pytest.fixture(autouse=True)
-def simulated_time(rig: LoopRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cycles that the gateway waits on any host."""
-    monkeypatch.setattr(command_channel, "monotonic", lambda: rig.observer.head * PERIOD_S)
-    monkeypatch.setattr(command_channel, "_POLL_S", 0.0)
 
 
 def disable(rig: LoopRig, config: ArmConfig = CONFIG) -> dict[str, Any]:
@@ -43,11 +36,11 @@ def disable(rig: LoopRig, config: ArmConfig = CONFIG) -> dict[str, Any]:
         asked = asyncio.ensure_future(MachineActions(channel).disable(Caller("a test", 1)))
         while not asked.done():
             rig.cycle()
-            await asyncio.sleep(0)
+            await asyncio.sleep(PERIOD_S)
         following.cancel()
         return await asked
 
-    return asyncio.run(both())
+    return simulated_time.run(both())
 
 
 def failure(rig: LoopRig) -> str:

@@ -21,6 +21,7 @@ from rtcp.ipc.refusals import Malformed, PositionOutOfRange
 from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
 from rtcp.ipc.states import DriveMode, DriveState
 from tests.records import numbers
+from tests.simulated_time import Clock
 
 JOINTS = 6
 SCHEMA = arm_schema(JOINTS)
@@ -183,14 +184,18 @@ def test_a_second_commander_is_refused_with_the_holders_name(observer: Observer,
 
 
 def test_a_lease_that_is_not_renewed_is_free_again(observer: Observer) -> None:
-    lease = observer.acquire("first", 0.05)
-    assert observer.renew(lease)
-    time.sleep(0.06)
-    assert not observer.renew(lease)
-    assert observer.holder() == ""
-    observer.acquire("second", 10.0)
-    observer.release(lease)
-    assert observer.holder() == "second"
+    with Clock().shown() as clock:
+        lease = observer.acquire("first", 0.05)
+        clock.advance(0.05)
+        assert observer.renew(lease)
+        clock.advance(0.05)
+        assert observer.holder() == "first"
+        clock.advance(1e-9)
+        assert not observer.renew(lease)
+        assert observer.holder() == ""
+        observer.acquire("second", 10.0)
+        observer.release(lease)
+        assert observer.holder() == "second"
 
 
 def test_a_lease_that_is_being_renewed_never_looks_free_to_another_process(board: Blackboard, path: Path) -> None:

@@ -13,6 +13,7 @@ from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder
 from rtcp.ros.simple_message import client as client_module
 from rtcp.ros.simple_message.client import MotionClient, StateClient
 from rtcp.ros.simple_message.server import ServerOptions, SimpleMessageServer
+from tests import simulated_time
 from tests.ros.fake_arm import HOME, FakeArm
 
 OK = messages.ReplyCode.SUCCESS
@@ -32,7 +33,7 @@ def run(test: Awaitable[None]) -> None:
     async def whole() -> None:
         await test
 
-    asyncio.run(whole())
+    simulated_time.run(whole())
 
 
 def test_it_is_tried_again_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:

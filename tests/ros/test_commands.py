@@ -28,6 +28,7 @@ from rtcp.ros.commands import (
     TrajectoryPoint,
     points_of,
 )
+from tests import simulated_time
 
 NAMES = ("a", "b", "c")
 HERE = (0.1, 0.2, 0.3)
@@ -167,7 +168,7 @@ def carry_out(arm: FakeArm, test: Callable[[Commander], Coroutine[Any, Any, None
         await test(commander)
         await asyncio.sleep(0)
 
-    asyncio.run(run())
+    simulated_time.run(run())
     return logged
 
 
@@ -285,11 +286,10 @@ def test_an_empty_trajectory_stops_the_motion(arm: FakeArm) -> None:
 
 
 def test_a_trajectory_begins_at_its_stamp(arm: FakeArm) -> None:
-    begin = time.time() + 0.2
-
     async def test(commander: Commander) -> None:
+        begin = time.time() + 0.2
         await commander.begin_trajectory(Trajectory(NAMES, PATH.points, begin))
-        assert time.time() >= begin
+        assert time.time() == pytest.approx(begin, abs=0.03)
         arm.end()
 
     carry_out(arm, test)

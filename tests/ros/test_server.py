@@ -36,6 +36,7 @@ from rtcp.ros import held_up
 from rtcp.ros.simple_message.arm import Point
 from rtcp.ros.simple_message.sequence import BUFFER_POINTS
 from rtcp.ros.simple_message.server import ServerOptions, SimpleMessageServer
+from tests import simulated_time
 from tests.ros.fake_arm import HOME, READY, FakeArm, FakeTrajectory
 
 START, END, STOP = -1, -3, -4
@@ -132,7 +133,7 @@ def run(test: Callable[[Rig], Awaitable[None]], **options: Any) -> FakeArm:
             await test(rig)
         return rig.arm
 
-    return asyncio.run(whole())
+    return simulated_time.run(whole())
 
 
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
