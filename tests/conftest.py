@@ -25,7 +25,7 @@ from tests.samples import THOROUGH
 from tests.verdicts import Verdicts
 
 _UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True)
-settings.register_profile("same", parent=_UNHURRIED, derandomize=True, max_examples=100 if THOROUGH else 20)
+settings.register_profile("same", parent=_UNHURRIED, derandomize=True, max_examples=100 if THOROUGH else 10)
 settings.register_profile("search", parent=_UNHURRIED)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 

@@ -13,7 +13,7 @@ THOROUGH = "RTCP_THOROUGH" in os.environ
 
 def examples(full: int) -> int:
     """Return the number of examples of a property."""
-    return full if THOROUGH else max(full // 6, 5)
+    return full if THOROUGH else min(full, max(full // 10, 3))
 
 
 def some(cases: Iterable[Case], every: int = 3) -> list[Case]:

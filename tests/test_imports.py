@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
@@ -102,9 +103,10 @@ def modules_named(statement: ast.Import | ast.ImportFrom, package: str) -> list[
     return [module, *(f"{module}.{name}" for name in behind)]
 
 
-def statements(path: Path) -> Iterator[ast.Import | ast.ImportFrom]:
+@cache
+def statements(path: Path) -> list[ast.Import | ast.ImportFrom]:
     nodes = ast.walk(ast.parse(path.read_text(), str(path)))
-    return (node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom))
+    return [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
 def imports_of(root: Path) -> Iterator[Import]:
@@ -132,7 +134,9 @@ def breaks_the_order(statement: Import) -> bool:
     return rank[statement.imported] >= rank[statement.importer]
 
 
-IMPORTS = list(imports_of(ROOT))
+@cache
+def all_imports() -> list[Import]:
+    return list(imports_of(ROOT))
 
 
 def sentences(breaches: list[Import]) -> list[str]:
@@ -155,14 +159,14 @@ def test_every_module_but_the_packages_own_lies_in_a_folder() -> None:
 def test_a_folder_imports_only_folders_above_it() -> None:
     breaches = [
         imported
-        for imported in IMPORTS
+        for imported in all_imports()
         if is_ours(imported) and breaks_the_order(imported) and (imported.file, imported.module) not in EXCEPTIONS
     ]
     assert sentences(breaches) == []
 
 
 def test_no_file_imports_itself_by_way_of_others() -> None:
-    paths = {path for imported in IMPORTS if (path := ROOT / imported.file).name != "__init__.py"}
+    paths = {path for imported in all_imports() if (path := ROOT / imported.file).name != "__init__.py"}
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in paths}
     graph: dict[Path, set[Path]] = {}
     for path in paths:
@@ -176,13 +180,15 @@ def test_no_file_imports_itself_by_way_of_others() -> None:
 
 def test_every_exception_is_still_needed() -> None:
     breaches = {
-        (imported.file, imported.module) for imported in IMPORTS if is_ours(imported) and breaks_the_order(imported)
+        (imported.file, imported.module)
+        for imported in all_imports()
+        if is_ours(imported) and breaks_the_order(imported)
     }
     assert set(EXCEPTIONS) <= breaches
 
 
 def test_the_package_itself_names_the_api_and_loads_no_more_than_kinematics() -> None:
-    named = {imported.module for imported in IMPORTS if imported.file == "rtcp/__init__.py" and is_ours(imported)}
+    named = {imported.module for imported in all_imports() if imported.file == "rtcp/__init__.py" and is_ours(imported)}
     assert named == {"rtcp.api", "kinematics.compiled"}
     program = "import sys, rtcp; print([name for name in sys.modules if name.startswith('rtcp.')])"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -190,7 +196,7 @@ def test_the_package_itself_names_the_api_and_loads_no_more_than_kinematics() ->
 
 
 def test_nothing_imports_cli() -> None:
-    assert sentences([each for each in IMPORTS if each.imported == "cli" and each.importer != "cli"]) == []
+    assert sentences([each for each in all_imports() if each.imported == "cli" and each.importer != "cli"]) == []
 
 
 @pytest.mark.parametrize(
@@ -198,32 +204,35 @@ def test_nothing_imports_cli() -> None:
     [("virtual", "fieldbus"), ("virtual", "devices"), ("fieldbus", "virtual"), ("devices", "virtual")],
 )
 def test_the_two_sides_of_the_wire_share_no_code(importer: str, imported: str) -> None:
-    assert sentences([each for each in IMPORTS if (each.importer, each.imported) == (importer, imported)]) == []
+    assert sentences([each for each in all_imports() if (each.importer, each.imported) == (importer, imported)]) == []
 
 
 def test_virtual_imports_nothing_of_ours_but_config_esi_and_kinematics() -> None:
     allowed = {"rtcp", "virtual", "config", "esi", "kinematics"}
-    imported = [each for each in IMPORTS if each.importer == "virtual" and is_ours(each)]
+    imported = [each for each in all_imports() if each.importer == "virtual" and is_ours(each)]
     assert sentences([each for each in imported if each.imported not in allowed]) == []
 
 
 def test_the_loops_side_does_not_import_virtual() -> None:
     sides = ("fieldbus", "devices", "ipc", "motion", "realtime", "control", "gateway")
-    assert sentences([each for each in IMPORTS if each.imported == "virtual" and each.importer in sides]) == []
+    assert sentences([each for each in all_imports() if each.imported == "virtual" and each.importer in sides]) == []
 
 
 def test_devices_and_kinematics_know_nothing_of_motion() -> None:
-    assert sentences([f for f in IMPORTS if f.imported == "motion" and f.importer in ("devices", "kinematics")]) == []
+    assert (
+        sentences([f for f in all_imports() if f.imported == "motion" and f.importer in ("devices", "kinematics")])
+        == []
+    )
 
 
 def test_motion_knows_nothing_of_bytes() -> None:
     forbidden = ("fieldbus", "devices", "virtual", "struct")
-    assert sentences([each for each in IMPORTS if each.importer == "motion" and each.imported in forbidden]) == []
+    assert sentences([each for each in all_imports() if each.importer == "motion" and each.imported in forbidden]) == []
 
 
 def test_kinematics_imports_only_the_standard_library_numpy_and_itself() -> None:
     allowed = {*sys.stdlib_module_names, "numpy", "kinematics"}
-    imported = [each for each in IMPORTS if each.importer == "kinematics"]
+    imported = [each for each in all_imports() if each.importer == "kinematics"]
     assert sentences([each for each in imported if each.module.partition(".")[0] not in allowed]) == []
 
 
@@ -238,7 +247,7 @@ def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
     # typing_extensions is imported for the type checker alone.
     ours = {"rtcp", "kinematics", "typing_extensions", *sys.stdlib_module_names}
     optional = ABB | CLUSTER | GYM | ROS_2 | dict.fromkeys(ROS_FILES, ROS)
-    imports = [each for each in IMPORTS if each.module.partition(".")[0] not in optional.get(each.file, ())]
+    imports = [each for each in all_imports() if each.module.partition(".")[0] not in optional.get(each.file, ())]
     outside = [(each.importer, each.module.partition(".")[0]) for each in imports]
     names = {(importer == "panel", PACKAGES.get(name, name)) for importer, name in outside if name not in ours}
     assert {name for of_panel, name in names if not of_panel} - declared("dependencies") == set()
@@ -250,7 +259,7 @@ def test_ros_is_a_client_of_the_api() -> None:
 
     The messages of Simple Message are the bus's, which speaks it to controllers.
     """
-    imported = {each.module for each in IMPORTS if each.importer == "ros" and is_ours(each)} - {"rtcp"}
+    imported = {each.module for each in all_imports() if each.importer == "ros" and is_ours(each)} - {"rtcp"}
     messages = "rtcp.fieldbus.simple_message"
     allowed = ("rtcp.ros", "rtcp.api", "rtcp.config", "kinematics", "rtcp.ipc.runtime_directory", messages)
     others = {module for module in imported if not module.startswith(allowed)}
@@ -259,7 +268,7 @@ def test_ros_is_a_client_of_the_api() -> None:
 
 def test_the_panel_is_a_client_of_the_api() -> None:
     """What it reads besides are files: configuration and geometry."""
-    imported = {each.imported for each in IMPORTS if each.importer == "panel" and is_ours(each)}
+    imported = {each.imported for each in all_imports() if each.importer == "panel" and is_ours(each)}
     assert imported == {"panel", "api", "config", "kinematics"}
 
 

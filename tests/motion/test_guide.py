@@ -25,7 +25,7 @@ from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState
 from rtcp.testing.simulation import Frame, Simulation
-from tests.samples import examples
+from tests.samples import examples, some
 
 from .conftest import ARM, MODEL, no_plan
 
@@ -39,6 +39,8 @@ class Guided(Simulation):
     """An arm on the bus in control mode torque, tracked in every cycle."""
 
     def __init__(self, q: Sequence[float], config: ArmConfig = ARM) -> None:
+        # A cycle of 1 ms: half the work of the shipped one.
+        config = replace(config, cycle=replace(config.cycle, period_us=1000))
         super().__init__(config, follow_clock=False, positions=q)
         self.largest_step = 0.0
         self.fastest_tool = self.fastest_joint = 0.0
@@ -117,7 +119,7 @@ def guided() -> Iterator[Callable[..., Guided]]:
         yield lambda *given: made.enter_context(Guided(*given))
 
 
-@pytest.mark.parametrize("q", POSTURES)
+@pytest.mark.parametrize("q", some(POSTURES))
 def test_without_a_push_the_arm_stays_where_it_is(guided: Callable[..., Guided], q: tuple[float, ...]) -> None:
     arm = guided(q)
     before = arm.tool
@@ -127,7 +129,7 @@ def test_without_a_push_the_arm_stays_where_it_is(guided: Callable[..., Guided],
     assert math.dist(arm.tool, before) < 2e-3
 
 
-@pytest.mark.parametrize("force", [(0.0, 20.0, 0.0), (0.0, -20.0, 0.0), (0.0, 0.0, 20.0), (0.0, 0.0, -20.0)])
+@pytest.mark.parametrize("force", some([(0.0, 20.0, 0.0), (0.0, -20.0, 0.0), (0.0, 0.0, 20.0), (0.0, 0.0, -20.0)]))
 def test_the_tool_follows_the_force_and_rests_where_it_is_let_go(
     guided: Callable[..., Guided], force: tuple[float, float, float]
 ) -> None:

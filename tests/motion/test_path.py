@@ -21,6 +21,7 @@ from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import derivative, quintic, value
 from rtcp.motion.planning.path import plan_path
 from rtcp.motion.planning.plan import ACCELERATIONS, POSITIONS, VELOCITIES, Plan, PlanRefused
+from tests.samples import examples
 
 Array = npt.NDArray[np.float64]
 CONFIG = load(default_config())
@@ -257,7 +258,7 @@ def stops(draw: st.DrawFn) -> Stop:
     return at(x, y, z, **keys)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.lists(stops(), min_size=1, max_size=6))
 def test_random_paths_keep_every_limit_or_are_refused(program: list[Stop]) -> None:
     try:

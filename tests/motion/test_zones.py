@@ -26,7 +26,7 @@ from rtcp.motion.guards.zones import ITSELF, TOOL, Zones, inside
 from rtcp.motion.limits import Limits, corners
 from rtcp.motion.state import ArmState, Setpoint
 from tests.arm_geometry import CLEARANCE, RADIUS, Point, box_gaps, depth, own_gap, points
-from tests.samples import THOROUGH, examples
+from tests.samples import THOROUGH, examples, some
 from tests.two_tools import two_tools
 
 from .guard_checker import ARM, MODEL, GuardChecker, with_boxes
@@ -204,9 +204,8 @@ def test_bodies_that_overlap_may_only_come_apart() -> None:
     raise AssertionError("they do not come apart")
 
 
-@pytest.mark.parametrize("dt", [0.002, 0.01])
 @pytest.mark.parametrize("gap", [-0.03, -1e-3, 0.0, 1e-3])
-@pytest.mark.parametrize("part", [1.0, 0.1])
+@pytest.mark.parametrize(("dt", "part"), some([(0.01, 1.0), (0.01, 0.1), (0.002, 1.0), (0.002, 0.1)], 4))
 def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, part: float) -> None:
     q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
     tool = points(q)[0]
@@ -235,7 +234,7 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
 
     monkeypatch.setattr("rtcp.motion.guards.braking.frames", counted)
     chance, most, dt = Random(1), 0, 0.0005
-    for _ in range(3000):
+    for _ in range(3000 if THOROUGH else 300):
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
         tool, axis = points(q)[0], chance.randrange(3)
         low, high = [at - 0.5 for at in tool], [at + 0.5 for at in tool]
@@ -258,7 +257,7 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
 
 def test_a_stop_outside_a_box_is_never_reported_with_a_distance_inside() -> None:
     chance, stops = Random(5), 0
-    for _ in range(60):
+    while stops < (11 if THOROUGH else 2):
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
         tool, axis = points(q)[0], chance.randrange(3)
         low, high = [at - 0.5 for at in tool], [at + 0.5 for at in tool]
@@ -276,7 +275,6 @@ def test_a_stop_outside_a_box_is_never_reported_with_a_distance_inside() -> None
             stops += 1
             assert checker.guard.nearest_box(checker.state.commanded)[0] >= 0.0
             assert checker.guard.ended.distance >= 0.0
-    assert stops > 10
 
 
 def test_a_stop_before_the_tools_own_box_names_it() -> None:
@@ -452,12 +450,12 @@ def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
     # A plate of 2 mm beside the tool, at many distances: at full speed a cycle's step is longer.
     q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
     tool = points(q)[0]
-    for gap, sign in product([0.004 * n for n in range(1, 20, 1 if THOROUGH else 3)], [1.0, -1.0]):
+    for gap, sign in product([0.004 * n for n in range(1, 20, 1 if THOROUGH else 6)], [1.0, -1.0]):
         y = tool[1] + sign * (BODY + gap + 0.001)
         box = [tool[0] - 0.3, y - 0.001, tool[2] - 0.3, tool[0] + 0.3, y + 0.001, tool[2] + 0.3]
         checker = GuardChecker(with_boxes(WIDE, box), q, 0.01)
         side = -sign if tool[0] > 0 else sign
-        driven(checker, [side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
-        driven(checker, [-side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
+        driven(checker, [side, 0.0, 0.0, 0.0, 0.0, 0.0], 80)
+        driven(checker, [-side, 0.0, 0.0, 0.0, 0.0, 0.0], 80)
         here = points(checker.state.commanded)[0][1]
         assert sign * here < sign * y, (gap, sign)
