@@ -1,4 +1,4 @@
-"""What bounds a motion of a page in time: its tokens, its presence, STOP, a take-over; in simulated time, on a fake arm."""
+"""A page's motion is bounded in time by tokens, presence, STOP and take-over. The arm is fake, the time simulated."""
 
 from __future__ import annotations
 
