@@ -47,7 +47,7 @@ def run(suite: Path, test: str, *options: str, stall_s: float = 0.0) -> tuple[in
     (suite / "test_it.py").write_text(f"import subprocess, sys\nfrom pathlib import Path\nimport pytest\n{test}")
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--rootdir", str(suite), str(suite), *options]
     done = subprocess.run(command, text=True, capture_output=True, check=False)
-    return done.returncode, done.stdout
+    return done.returncode, done.stdout + done.stderr
 
 
 _TIMED = "@pytest.mark.timing\ndef test_time(): assert False\n"
@@ -60,7 +60,7 @@ def test_luck():
     assert ran
 """
 _NOT_SELECTED = """
-@pytest.mark.long
+@pytest.mark.long("test_short")
 def test_long(): pass
 @pytest.mark.platform
 def test_other(): pass
@@ -104,6 +104,19 @@ def test_the_last_line_counts_what_was_not_selected_and_why(suite: Path, options
     assert printed.splitlines()[-1] == (
         "not selected: 1 long, `make test-all` runs them; 1 on a real platform, `make test` runs them"
     )
+
+
+@pytest.mark.parametrize(
+    ("test", "found"),
+    [
+        ("@pytest.mark.long\ndef test_alone(): pass", "needs the name of its short sibling"),
+        ("@pytest.mark.platform\n@pytest.mark.parametrize('n', range(151))\ndef test_many(n): pass", "151 tests run"),
+    ],
+)
+def test_a_suite_that_breaks_its_rules_is_refused(suite: Path, test: str, found: str) -> None:
+    status, printed = run(suite, test)
+    assert status != 0
+    assert found in printed
 
 
 def test_a_process_that_a_test_leaves_fails_that_test_and_is_ended(suite: Path) -> None:

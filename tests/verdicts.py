@@ -24,6 +24,8 @@ _REASONS = {
 }
 """Why tests with a marker are not selected. The first marker that a test has counts."""
 _OTHER_REASON = "by the options of this run"
+MAX_PLATFORM_TESTS = 150
+"""At most this many tests run on a real platform: the others are faster and see more in simulated time."""
 
 
 class Verdicts:
@@ -43,8 +45,21 @@ class Verdicts:
             markers = (reason for name, reason in _REASONS.items() if item.get_closest_marker(name))
             self._not_selected[next(markers, _OTHER_REASON)] += 1
 
+    @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Repeat a failed test on a real platform once."""
+        """Refuse a suite that breaks its rules. Repeat a failed test on a real platform once.
+
+        Raises:
+            pytest.UsageError: a long test has no short sibling, or too many tests run on a real platform.
+        """
+        names = {item.name.partition("[")[0] for item in items}
+        is_whole = self._config.args_source is pytest.Config.ArgsSource.TESTPATHS
+        for item in items:
+            marker = item.get_closest_marker("long")
+            if marker is not None and (not marker.args or (is_whole and marker.args[0] not in names)):
+                raise pytest.UsageError(f"{item.nodeid} is long and needs the name of its short sibling: {marker.args}")
+        if (count := sum(item.get_closest_marker("platform") is not None for item in items)) > MAX_PLATFORM_TESTS:
+            raise pytest.UsageError(f"{count} tests run on a real platform, allowed are {MAX_PLATFORM_TESTS}")
         for item in items:
             if item.get_closest_marker("platform") and not item.get_closest_marker("timing"):
                 item.add_marker(pytest.mark.flaky(reruns=1))
