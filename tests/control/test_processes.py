@@ -163,7 +163,7 @@ def test_one_that_raises_is_a_fault_with_safe_outputs_each_time(running: Simulat
         outputs = set()
         for _ in range(20):
             running.cycle()
-            outputs.add(running.box.outputs)  # type: ignore[union-attr]
+            outputs.add(running.box.outputs)
         assert outputs == {pattern, SAFE}
         assert (running.state, lamp(running).updates) == (State.FAULT, before + 1)
         assert isinstance(running.send(Blink(pattern)).refusal, ProcessRaised)

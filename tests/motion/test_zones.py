@@ -328,7 +328,7 @@ def test_room_from_before_a_change_is_not_used(tmp_path: Path, change: str, sign
     side = sign if x > 0.0 else -sign
     wall = y + sign * (BODY + 0.02)
     low, high = [x - 0.02, min(wall, wall + sign), z - 0.02], [x + 0.02, max(wall, wall + sign), z + 0.02]
-    keep_out = corners(low, high)
+    keep_out = corners(tuple(low), tuple(high))
     if change in ("tool", "position"):
         limits.keep_out = (keep_out,)
 
