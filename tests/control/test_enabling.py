@@ -174,6 +174,7 @@ def test_what_a_joint_at_the_edge_sags_is_made_good_without_a_word(rig: LoopRig,
 @DIRECTIONS
 def test_no_motion_begins_before_a_joint_beyond_its_range_is_back(rig: LoopRig, direction: int) -> None:
     enable_beyond(rig, side=direction)
+    assert rig.arm.state.commanded[1] == direction * 2.0
     began = len(rig.log)
     while rig.state is State.ENABLING:
         answer = rig.send(move_to(0.0, direction * 1.0))

@@ -18,8 +18,8 @@ from tests.two_boxes import SWITCH, two_boxes
 
 STATE_LAMP, MOTION_LAMP, HEARTBEAT, GRIPPER = (1 << bit for bit in range(4))
 """Outputs of `desk`."""
-FORWARD, MODE_DOWN, STOP = 0, 5, 9
-"""Channels of `io`, from 0: a direction and a paddle of the joystick, active low; the emergency stop, closed."""
+FORWARD, MODE_DOWN, TOGGLE, STOP = 0, 5, 8, 9
+"""Channels of `io`, from 0: a direction and a paddle of the joystick, active low; toggle; emergency stop, closed."""
 SOMEWHERE = (0.0, -0.5, 1.8, 0.0, 1.2, 0.0)
 
 
@@ -107,21 +107,23 @@ def test_the_joystick_at_the_first_box_jogs_the_arm(arm: Simulation) -> None:
     arm.bring_to(State.HOLDING, 2.0)
 
 
+@pytest.mark.parametrize("without", ["enabling switch", "toggle"])
 @pytest.mark.parametrize("modes_down", [0, 1], ids=["tool", "gripper"])
-def test_without_the_enabling_switch_the_joystick_neither_moves_the_arm_nor_grips_and_begins_with_neutral(
-    arm: Simulation, modes_down: int
+def test_without_enabling_switch_or_toggle_the_joystick_neither_moves_the_arm_nor_grips_and_begins_with_neutral(
+    arm: Simulation, modes_down: int, without: str
 ) -> None:
     arm.do(SetControlMode(ControlMode.JOYSTICK))
     for _ in range(modes_down):
         for level in (False, True):
             io(arm).set_input(MODE_DOWN, level)
             arm.run(0.05)
-    q, events = list(arm.loop.arm.state.commanded), len(arm.events)
+    q, begun = list(arm.loop.arm.state.commanded), len(arm.events)
+    box, channel = (desk(arm), SWITCH - 1) if without == "enabling switch" else (io(arm), TOGGLE)
     states: set[State] = set()
     arm.on_frame = lambda frame: states.add(arm.state)
 
     def shown(pressed: bool, level: bool) -> None:
-        desk(arm).set_input(SWITCH - 1, pressed)
+        box.set_input(channel, pressed)
         arm.run(0.05)
         io(arm).set_input(FORWARD, level)
         arm.run(0.05)
@@ -130,12 +132,12 @@ def test_without_the_enabling_switch_the_joystick_neither_moves_the_arm_nor_grip
     shown(pressed=False, level=False)
     shown(pressed=True, level=False)
     assert states == {State.HOLDING}
-    assert (list(arm.loop.arm.state.commanded), len(arm.events)) == (q, events)
+    assert list(arm.loop.arm.state.commanded) == q
+    assert GripperOpens() not in [record.event for record in arm.events[begun:]]
     shown(pressed=True, level=True)
     shown(pressed=True, level=False)
-    kinds = {type(record.event) for record in arm.events[events:]}
-    assert kinds == ({GripperOpens} if modes_down else set())
-    assert (State.MOVING in states) is not modes_down
+    assert [record.event for record in arm.events[begun:]].count(GripperOpens()) == modes_down
+    assert (State.MOVING in states) is (modes_down == 0)
 
 
 def test_an_emergency_stop_pressed_while_the_other_box_is_lost_still_stops_the_arm(arm: Simulation) -> None:
