@@ -284,7 +284,7 @@ def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> None:
 
 
 def _signal(pid: int, number: signal.Signals) -> None:
-    with contextlib.suppress(ProcessLookupError):
+    if lives(pid):  # 0 where the platform has ended: that would be the group of this process
         os.kill(pid, number)
 
 

@@ -89,7 +89,7 @@ def test_a_command_gives_a_detached_loop_its_gateway_back_which_records_what_hap
     with contextlib.closing(Observer(blackboard_file(running.directory))) as observer:
         os.kill(before["segment"], signal.SIGSTOP)
         try:
-            until(lambda: State(int(observer.latest()[0]["state"])) is State.FAULT, "the fault")  # type: ignore[index]
+            until(lambda: State(int(observer.latest()[0]["state"])) is State.FAULT, "the fault")
         finally:
             os.kill(before["segment"], signal.SIGCONT)
     # The state directory of that shell does not matter: the recording is stored beside the others.
