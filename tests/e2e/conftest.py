@@ -159,8 +159,9 @@ class Platform:
             lambda status: (
                 all(slave["state"] == "OP" for slave in status["slaves"])
                 and status["state"] not in ("moving", "stopping")
+                and status["dc"]["locked"]
             ),
-            "OP and rest",
+            "OP, rest and a followed clock",
         )
         if found["state"] in ("fault", "stopped_by_limit"):
             self.call("reset")

@@ -121,7 +121,7 @@ def test_an_arm_built_from_the_file_of_its_drives_maker_moves_and_stops_and_its_
     platform.call("reset")
     platform.rtcp("sdo", "write", "valves", "0x7000:1", "5000", "--type", "int16", check=None)
     assert "has set its `objects`" in platform.rtcp("segment", "get", "5", check=3).stderr
-    assert "Statusword" in platform.rtcp("segment", "get", "2").stdout
+    assert "statusword" in platform.rtcp("segment", "get", "2").stdout
 
 
 @pytest.mark.long("test_an_arm_built_from_the_file_of_its_drives_maker_moves_and_stops_and_its_channels_work")
