@@ -159,8 +159,9 @@ class Platform:
             lambda status: (
                 all(slave["state"] == "OP" for slave in status["slaves"])
                 and status["state"] not in ("moving", "stopping")
+                and status["dc"]["locked"]
             ),
-            "OP and rest",
+            "OP, rest and a followed clock",
         )
         if found["state"] in ("fault", "stopped_by_limit"):
             self.call("reset")
@@ -284,7 +285,7 @@ def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> None:
 
 
 def _signal(pid: int, number: signal.Signals) -> None:
-    with contextlib.suppress(ProcessLookupError):
+    if lives(pid):  # 0 where the platform has ended: that would be the group of this process
         os.kill(pid, number)
 
 

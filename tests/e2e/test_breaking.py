@@ -190,8 +190,8 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdog_and_its_stream_moves_
             with pytest.raises(Faulted, match="has ended"):
                 stream.send([0.5] * 6)
             other.send(ZERO)
-            running.pass_cycles(5)
         stream.close()
+        running.pass_cycles(25)
         assert (stream.sent, other.sent) == (1, 20)
         assert robot.status().commanded_positions == pytest.approx(ZERO, abs=1e-6)
 

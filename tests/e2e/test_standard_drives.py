@@ -63,7 +63,7 @@ def add_valves(folder: Path) -> None:
 
 
 def move_and_stop(platform: Platform) -> None:
-    """Enable, move by the joints and on a line, press the virtual emergency stop, end the platform."""
+    """Enable, move by the joints and on a line, press the virtual emergency stop."""
     goal = [0.2, 0.3, 0.4, -0.2, 0.4, 0.3]
     with rtcp.connect("a test", control_socket(platform.directory)) as robot:
         robot.enable()
@@ -77,7 +77,6 @@ def move_and_stop(platform: Platform) -> None:
     platform.until(
         lambda status: status["state"] == "emergency_stop" and not status["robot"]["drives_powered"], "emergency stop"
     )
-    platform.rtcp("stop")
 
 
 def test_an_arm_built_from_the_file_of_its_drives_maker_moves_and_stops_and_its_channels_work(
@@ -118,6 +117,11 @@ def test_an_arm_built_from_the_file_of_its_drives_maker_moves_and_stops_and_its_
     platform.call("reset")
     assert "4000" in platform.rtcp("segment", "get", "5", "0x7000:1").stdout
     move_and_stop(platform)
+    # A device that cannot work leaves OP; the other slaves and the segment's socket continue.
+    platform.call("reset")
+    platform.rtcp("sdo", "write", "valves", "0x7000:1", "5000", "--type", "int16", check=None)
+    assert "has set its `objects`" in platform.rtcp("segment", "get", "5", check=3).stderr
+    assert "statusword" in platform.rtcp("segment", "get", "2").stdout
 
 
 @pytest.mark.long("test_an_arm_built_from_the_file_of_its_drives_maker_moves_and_stops_and_its_channels_work")

@@ -1,9 +1,8 @@
-"""Two tools on a real socket between real processes: lines, programs and status are those of the tool in use."""
+"""Two tools on a real socket between real processes: lines and status are those of the tool in use."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,19 +16,6 @@ from tests.e2e.conftest import Platform
 pytestmark = pytest.mark.platform
 
 HERE = [0.0, -0.2, 2.0, 0.0, 1.0, 0.0]
-PROGRAM = """
-speed: 0.1
-poses:
-  - {name: here, q: [0, -0.2, 2, 0, 1, 0]}
-  - {name: beside, pose: [X, 0.1, Z, RX, RY, RZ]}
-program:
-  - {tool: flange}
-  - {move: here}
-  - {tool: probe}
-  - {line: beside}
-  - {line: here}
-  - {tool: flange}
-"""
 
 
 @pytest.fixture
@@ -66,28 +52,6 @@ def test_a_line_of_the_chosen_tool_is_a_line_of_its_point(shared: Platform, robo
     assert moved["tool"].tolist() == [1] * len(moved)
     tip = [moved[name] for name in ("tool_x", "tool_y", "tool_z")]
     assert np.abs(np.column_stack(tip) - forward_batch(probe, moved["actual_position"])[0]).max() < 1e-9
-
-
-def test_a_program_changes_the_tool_and_is_planned_with_each(shared: Platform, robot: Robot, tmp_path: Path) -> None:
-    feed = rtcp.Feed(shared.directory)
-    probe = forward(feed.config.models[1], HERE)
-    feed.close()
-    text = PROGRAM
-    for name, number in zip(
-        ("RX", "RY", "RZ", "X", "Z"), (*probe.rpy, probe.position[0], probe.position[2]), strict=True
-    ):
-        text = text.replace(name, f"{number:.6f}")
-    file = tmp_path / "tools.yaml"
-    file.write_text(text)
-    program = rtcp.Program(file)
-    planned = program.check(robot)
-    assert planned[-2].plan.length_m == pytest.approx(0.1, abs=1e-4)
-    robot.set_payload(0.3)
-    said: list[str] = []
-    program.run(robot, lambda step: said.append(step.text))
-    assert [what for what in said if "tool" in what] == ["tool: flange", "tool: probe", "tool: flange"]
-    assert (robot.status().tool, robot.status().payload.mass) == ("flange", 0.0)
-    assert robot.positions == pytest.approx(HERE, abs=2e-3)
 
 
 def test_the_command_line_lists_and_chooses_tools_and_says_what_is_held(enabled: Platform, robot: Robot) -> None:
