@@ -119,6 +119,7 @@ def test_an_installed_wheel_exports_the_package_for_moveit(installed: Path, tmp_
     assert (tmp_path / "abb_irb120_moveit_config" / "src" / "kinematics_plugin.cpp").is_file()
 
 
+@pytest.mark.platform
 def test_the_demo_of_an_installed_wheel_runs(installed: Path, tmp_path: Path) -> None:
     directory = tempfile.mkdtemp(prefix="rtcp-wheel-", dir="/tmp")
     environment = {name: value for name, value in os.environ.items() if name not in ("RTCP_CONFIG", "PYTHONPATH")}
@@ -136,7 +137,7 @@ def test_the_demo_of_an_installed_wheel_runs(installed: Path, tmp_path: Path) ->
     assert "start to OP" in done.stdout
 
 
-@pytest.mark.long
+@pytest.mark.long("test_the_default_configuration_loads_from_an_installed_wheel")
 @pytest.mark.timeout(0)
 def test_a_wheel_that_was_compiled_runs_compiled_wherever_it_is_installed(tmp_path: Path) -> None:
     wheel = built(tmp_path, pure=False)

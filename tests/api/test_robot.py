@@ -23,6 +23,7 @@ from rtcp.ipc.commands import Halt, Jog, MoveGripper, MoveJoints, SetOutput, Str
 from rtcp.ipc.events import SlaveLost
 from rtcp.ipc.runtime_directory import control_socket
 from tests.gateway.fake_loop import JOINTS, FakeLoop
+from tests.waiting import HANG_S, until
 
 Q = [0.1] * JOINTS
 LONG = 1_000_000
@@ -315,7 +316,7 @@ def test_inputs_and_outputs_are_mappings_by_name_and_by_place(robot: Robot, loop
 
 def test_a_wait_for_an_input_of_another_thread_ends_with_it(robot: Robot, loop: FakeLoop) -> None:
     threading.Timer(0.1, lambda: setattr(loop, "inputs", 1 << 11)).start()
-    robot.io.wait("io.12", True, timeout_s=5.0)
+    robot.io.wait("io.12", True, timeout_s=HANG_S)
     with pytest.raises(rtcp.TimedOut) as late:
         robot.io.wait("io.12", False, timeout_s=0.1)
     assert (late.value.reason, late.value.fields["name"]) == ("level_not_reached", "io.12")
@@ -323,8 +324,7 @@ def test_a_wait_for_an_input_of_another_thread_ends_with_it(robot: Robot, loop: 
 
 def test_pose_fk_and_ik_are_the_same_in_both_robots(directory: Path, robot: Robot, loop: FakeLoop) -> None:
     loop.q = [0.1, 0.3, 1.5, 0.2, 0.5, 0.4]
-    time.sleep(0.05)
-    assert robot.positions == pytest.approx(loop.q)
+    until(lambda: robot.positions == pytest.approx(loop.q), "the positions")
     pose = robot.fk(loop.q)
     assert robot.pose == pytest.approx(pose, abs=1e-6)
     assert robot.status().tool_velocity == (0.0,) * 6

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import time
+import contextlib
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,8 @@ from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.virtual.request_socket import RequestClient
 from tests.e2e.conftest import Platform
+from tests.leftovers import Leftovers
+from tests.waiting import until
 
 CONFIG = default_config().parent
 ABB_HOME = (0.0, 0.0, 0.0, 0.0, 0.5, 0.0)
@@ -30,11 +34,21 @@ silence_s: 0.2
 MIXED = PAIR.replace("{name: left, config: assistive_arm.yaml", "{name: left, config: abb_irb120.yaml")
 
 
+@contextlib.contextmanager
+def leftovers_of(leftovers: Leftovers, *names: str) -> Iterator[Platform]:
+    """A platform whose parts, by their names, may outlive a test meanwhile."""
+    platform = Platform()
+    directories = {str(platform.directory), *(str(platform.directory / name) for name in names)}
+    leftovers.shared |= directories
+    yield platform
+    leftovers.shared -= directories
+
+
 class RunningCell:
     """A cell of a file, its directories, and the commands of a user."""
 
-    def __init__(self, file: Path | str) -> None:
-        self.platform = platform = Platform()
+    def __init__(self, file: Path | str, platform: Platform | None = None) -> None:
+        self.platform = platform = platform or Platform()
         self.directory = platform.directory
         if isinstance(file, str):
             platform.be_patient(500)
@@ -67,22 +81,26 @@ def put_in_order(operator: RequestClient) -> None:
 
 def restore(cell: Cell) -> None:
     """Reset and enable what needs it, and go home."""
-    until = time.monotonic() + 30.0
-    while any(status.state in (State.STOPPING, State.DISABLING, State.STARTING) for status in cell.status().values()):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+
+    def rests() -> bool:
+        states = (status.state for status in cell.status().values())
+        return not {State.STOPPING, State.DISABLING, State.STARTING} & set(states)
+
+    def is_enabled(name: str) -> bool:
+        try:
+            cell.arms[name].enable()
+            return True
+        except Refused as error:
+            # The joints still run out after a fault.
+            if error.reason != "not_at_standstill":
+                raise
+            return False
+
+    until(rests, "rest")
     cell.reset()
     for name, status in cell.status().items():
-        while status.state is State.READY:
-            assert time.monotonic() < until
-            try:
-                cell.arms[name].enable()
-                break
-            except Refused as error:
-                # The joints still run out after a fault.
-                if error.reason != "not_at_standstill":
-                    raise
-                time.sleep(0.05)
+        if status.state is State.READY:
+            until(partial(is_enabled, name), f"{name} enabled")
     cell.move_joints(dict.fromkeys(cell.arms, ABB_HOME))
 
 
@@ -104,13 +122,12 @@ class Records:
 
     def await_speed(self, least: float) -> None:
         """Wait until every arm is faster than `least`, rad/s."""
-        until = time.monotonic() + 30.0
-        while time.monotonic() < until:
+
+        def is_reached() -> bool:
             newest = [observer.latest() for observer in self._observers.values()]
-            if all(record is not None and np.abs(record["commanded_velocity"]).max() > least for record in newest):
-                return
-            time.sleep(0.002)
-        raise AssertionError("the arms do not move")
+            return all(record is not None and np.abs(record["commanded_velocity"]).max() > least for record in newest)
+
+        until(is_reached, "motion of all arms", interval_s=0.002)
 
     def newest(self) -> dict[str, Any]:
         """Return the newest record of each arm, shape (1,)."""
@@ -121,10 +138,10 @@ class Records:
         return {name: float(record["step_path_s"][0]) for name, record in self.newest().items()}
 
 
-def instants(records: dict[str, Any]) -> dict[str, tuple[int, int]]:
-    """Return when each arm began to move and came to rest, CLOCK_MONOTONIC."""
-    spans = {}
+def starts(records: dict[str, Any]) -> dict[str, int]:
+    """Return when each arm's path began, CLOCK_MONOTONIC: the median over the motion, whichever cycles came late."""
+    begun = {}
     for name, rows in records.items():
-        moves = np.flatnonzero(np.abs(rows["commanded_velocity"]).max(axis=1) > 0.0)
-        spans[name] = int(rows["time_ns"][moves[0]]), int(rows["time_ns"][moves[-1]])
-    return spans
+        moves = rows[np.abs(rows["commanded_velocity"]).max(axis=1) > 0.0]
+        begun[name] = int(np.median(moves["time_ns"] - moves["step_path_s"] * 1e9))
+    return begun

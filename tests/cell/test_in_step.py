@@ -18,9 +18,9 @@ SLOWEST_NS = 2_000_000
 
 
 def test_random_motions_begin_and_end_together() -> None:
-    outcome = run_motions(seed=1, count=6)
+    outcome = run_motions(seed=1, count=2)
     assert outcome.problems == []
-    assert outcome.motions == 6
+    assert outcome.motions == 2
     assert outcome.off_goal < 1e-9
     # Each begins in its own first cycle after the instant, and ends in its own.
     assert outcome.begin_apart_ns <= SLOWEST_NS
@@ -30,7 +30,7 @@ def test_random_motions_begin_and_end_together() -> None:
 
 @pytest.mark.parametrize("kind", ["halt", "halt at both", "disable", "lease ends"])
 def test_both_brake_on_one_time_scale(kind: str) -> None:
-    outcome = run_mishaps(2, 3, [kind])
+    outcome = run_mishaps(2, 1, [kind])
     assert outcome.problems == []
     assert outcome.off_path < 1e-7
     assert outcome.rest_apart_s < 1e-5
@@ -38,7 +38,7 @@ def test_both_brake_on_one_time_scale(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["drive fault", "emergency stop", "frames lost", "loop hangs"])
 def test_the_other_brakes_along_its_path(kind: str) -> None:
-    outcome = run_mishaps(3, 3, [kind])
+    outcome = run_mishaps(3, 1, [kind])
     assert outcome.problems == []
     assert outcome.off_path < 1e-7
     # The other arm reacts within two cycles of the slower arm; to silence after its time limit,
@@ -49,7 +49,7 @@ def test_the_other_brakes_along_its_path(kind: str) -> None:
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_arms_that_know_nothing_of_each_others_targets_keep_apart(seed: int) -> None:
-    nearness = run_near(seed, count=6)
+    nearness = run_near(seed, count=4)
     assert nearness.problems == []
     assert nearness.stops > 0
     assert nearness.arrivals > 0

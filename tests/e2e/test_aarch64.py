@@ -32,7 +32,7 @@ NOT_EMULATED = (
 
 pytestmark = [
     pytest.mark.platform,
-    pytest.mark.long,
+    pytest.mark.long("test_the_default_configuration_loads_from_an_installed_wheel"),
     pytest.mark.timeout(4 * 3600),
     pytest.mark.skipif(os.geteuid() != 0, reason="debootstrap needs root"),
     pytest.mark.skipif(shutil.which("debootstrap") is None, reason="`apt-get install debootstrap`"),

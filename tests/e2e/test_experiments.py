@@ -6,14 +6,17 @@ What a shared host takes away shows in figures of time: of those a test asks onl
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rtcp.cli.__main__ import main
 from rtcp.cli.platform import running_platform
 from rtcp.config.find import default_config
+from rtcp.ipc.session import Processes, identify
 from rtcp.telemetry.experiments import (
     CycleExperiment,
     Experiment,
@@ -25,8 +28,6 @@ from rtcp.telemetry.experiments import (
 from rtcp.telemetry.experiments.experiment import Row, Setup, carry_out, read_result
 
 from .conftest import SLAVES, Platform
-
-pytestmark = pytest.mark.platform
 
 
 @pytest.fixture
@@ -57,6 +58,8 @@ def ran(platform: Platform, name: str, tmp_path: Path) -> tuple[dict[str, Any], 
     return {row["figure"]: row for row in result["rows"]}, done.stdout
 
 
+@pytest.mark.platform
+@pytest.mark.long("test_a_step_settles_without_overshoot")
 def test_a_step_of_1_35_rad_settles_at_0_2_rad_s_without_overshoot(platform: Platform, tmp_path: Path) -> None:
     rows, printed = ran(platform, "step", tmp_path)
     assert all(row["met"] for row in rows.values())
@@ -67,7 +70,8 @@ def test_a_step_of_1_35_rad_settles_at_0_2_rad_s_without_overshoot(platform: Pla
     assert "Step of 1.35 rad" in (tmp_path / "step" / "report.html").read_text()
 
 
-@pytest.mark.long
+@pytest.mark.platform
+@pytest.mark.long("test_what_is_beside_the_square_is_measured_and_drawn")
 def test_the_square_is_driven_in_both_planes_within_1_mm_commanded_and_3_mm_actual(
     platform: Platform, tmp_path: Path
 ) -> None:
@@ -76,12 +80,16 @@ def test_the_square_is_driven_in_both_planes_within_1_mm_commanded_and_3_mm_actu
     assert (tmp_path / "square" / "recording-yz.mcap").stat().st_size > 0
 
 
+@pytest.mark.platform
 def test_the_delays_are_those_of_the_source(platform: Platform, tmp_path: Path) -> None:
     rows, _ = ran(platform, "delays", tmp_path)
     assert [row["source"] for row in rows.values()] == [0, 820, 1660, 2500, 3320, 4160, 5020][:SLAVES]
     assert all(row["met"] for row in rows.values())
 
 
+@pytest.mark.platform
+@pytest.mark.timing
+@pytest.mark.long("test_the_delays_are_those_of_the_source")
 def test_the_cycle_is_the_same_from_inside_and_at_an_output_of_the_io_box(setup: Setup) -> None:
     rows = carried_out(CycleExperiment((2000.0,), 2.0), setup)
     inside, outside = (rows[f"2000 us, {side}: mean"].here for side in ("inside", "outside"))
@@ -89,14 +97,16 @@ def test_the_cycle_is_the_same_from_inside_and_at_an_output_of_the_io_box(setup:
     assert inside == pytest.approx(2000.0, rel=0.05)
 
 
-@pytest.mark.long
+@pytest.mark.platform
+@pytest.mark.long("test_an_item_is_picked_by_joystick_bytes_alone")
 def test_an_item_is_picked_by_the_joystick_of_the_virtual_arm(setup: Setup) -> None:
     rows = carried_out(PicksExperiment(("shelf",)), setup)
     assert rows["shelf: distance to the item"].met
     assert rows["highest item above ground"].here == pytest.approx(0.8, abs=0.01)
 
 
-@pytest.mark.long
+@pytest.mark.platform
+@pytest.mark.long("test_the_sine_fit_finds_the_latency_at_30_hz_within_0_2_ms")
 def test_a_streamed_sine_is_followed_with_a_latency_far_below_the_sources(setup: Setup) -> None:
     rows = carried_out(LatencyExperiment((30.0,), 3), setup)
     for sender in ("Python API", "socket"):
@@ -106,7 +116,8 @@ def test_a_streamed_sine_is_followed_with_a_latency_far_below_the_sources(setup:
     assert any("other limits" in note for note in read_result(setup.folder).notes)
 
 
-@pytest.mark.long
+@pytest.mark.platform
+@pytest.mark.long("test_a_sine_at_30_hz_is_late_by_what_was_measured_on_the_real_one")
 def test_by_rapid_the_sine_is_nearly_half_a_second_behind_and_reported_some_ms_late(setup: Setup) -> None:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     by_rapid = replace(setup, config=default_config().with_name("abb_irb120_rapid.yaml"))
@@ -117,14 +128,16 @@ def test_by_rapid_the_sine_is_nearly_half_a_second_behind_and_reported_some_ms_l
     assert abs(rows["Python API, 30 Hz: reported behind the accelerometer"].here) < 30.0
 
 
-@pytest.mark.long
+@pytest.mark.platform
+@pytest.mark.long("test_inertia_and_friction_come_back_from_the_torque_that_they_take")
 def test_inertia_and_friction_of_a_joint_come_back_within_5_percent(setup: Setup) -> None:
     rows = carried_out(TrackingExperiment((0,), (0.5, 1.0)), setup)
     assert [rows[f"joint1: {key}"].met for key in ("inertia", "coulomb", "viscous")] == [True] * 3
     assert rows["joint1, 0.5 Hz: gain"].here == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.long
+@pytest.mark.platform
+@pytest.mark.long("test_resources_are_those_of_the_process")
 def test_each_process_has_its_share_of_a_core_and_its_memory(setup: Setup) -> None:
     rows = carried_out(ResourcesExperiment(3.0), setup)
     for activity in ("holding", "moving", "jogging", "recording"):
@@ -142,15 +155,21 @@ def test_each_process_has_its_share_of_a_core_and_its_memory(setup: Setup) -> No
     ],
 )
 def test_what_cannot_be_carried_out_or_reported_is_one_message(
-    platform: Platform, arguments: list[str], code: int, said: str
+    arguments: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    done = platform.rtcp(*arguments, check=code)
-    assert said in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    assert main(arguments) == code
+    assert said in (complaint := capsys.readouterr().err)
+    assert len(complaint.splitlines()) == 1
 
 
-def test_an_experiment_is_refused_while_a_platform_runs(shared: Platform, tmp_path: Path) -> None:
-    assert "a platform runs already" in shared.rtcp("experiment", "step", "--out", str(tmp_path / "x"), check=3).stderr
+def test_an_experiment_is_refused_while_a_platform_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(tmp_path))
+    tmp_path.chmod(0o700)
+    Processes(loop=identify(os.getpid())).write(tmp_path)
+    assert main(["experiment", "step", "--out", str(tmp_path / "x")]) == 3
+    assert "a platform runs already" in capsys.readouterr().err
 
 
 def test_a_real_arm_keeps_its_limits(setup: Setup) -> None:

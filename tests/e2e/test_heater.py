@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,11 +12,14 @@ from typing import Any
 import pytest
 
 from rtcp.api import Robot, RtcpError
+from rtcp.cli.__main__ import main
 from rtcp.config.find import default_config
 from rtcp.ipc.runtime_directory import control_socket, segment_control
 from rtcp.processes.shape_setting.profile import heat_command, read_profile
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import Platform
+from tests.leftovers import Leftovers
+from tests.waiting import until
 
 pytestmark = pytest.mark.platform
 
@@ -29,13 +33,15 @@ PROFILE = replace(
 class Heater:
     """The heater's platform, and people at its box."""
 
-    def __init__(self) -> None:
-        self.platform = platform = Platform()
+    def __init__(self, platform: Platform) -> None:
+        self.platform = platform
         platform.be_patient(500)
         file = platform.directory / "config" / "heater.yaml"
-        file.write_text(file.read_text().replace("period_us: 500 ", "period_us: 2000 "))
+        file.write_text(file.read_text().replace("period_us: 500 ", "period_us: 4000 "))
+        box = file.with_name("devices") / "shape-setter-box.yaml"
+        box.write_text(box.read_text().replace("watchdog_ms: 5", "watchdog_ms: 20"))
         platform.rtcp("start", "--detach", "--config", str(file))
-        platform.rtcp("enable")
+        platform.call("enable")
 
     def connect(self) -> Robot:
         return Robot("the tests", control_socket(self.platform.directory))
@@ -44,7 +50,8 @@ class Heater:
         with SegmentClient(segment_control(self.platform.directory)) as segment:
             # Without a clear between them, which would put the key at Auto for an instant.
             segment.fault({"fault": "contacts", "slave": 1, "closed": closed})
-        time.sleep(0.1)
+        before = self.platform.status()["cycles"]
+        self.platform.until(lambda status: status["cycles"] > before + 20, "the debounce of the contacts")
 
     def truth(self) -> dict[str, Any]:
         with SegmentClient(segment_control(self.platform.directory)) as segment:
@@ -52,14 +59,11 @@ class Heater:
         return box
 
     def until(self, met: Callable[[dict[str, Any]], bool], what: str) -> None:
-        end = time.monotonic() + 20.0
-        while not met(truth := self.truth()):
-            assert time.monotonic() < end, f"{what}: {truth}"
-            time.sleep(0.01)
+        until(lambda: met(self.truth()), what)
 
     def assert_off(self) -> None:
         self.until(lambda truth: not (truth["gate"] or truth["relay"]), "heat off")
-        for _ in range(50):
+        for _ in range(20):
             truth = self.truth()
             assert not truth["gate"]
             assert not truth["relay"]
@@ -67,10 +71,12 @@ class Heater:
 
 
 @pytest.fixture(scope="module")
-def started() -> Iterator[Heater]:
-    made = Heater()
-    yield made
-    made.platform.end()
+def started(leftovers: Leftovers) -> Iterator[Heater]:
+    platform = Platform()
+    leftovers.shared.add(str(platform.directory))
+    yield Heater(platform)
+    platform.end()
+    leftovers.shared.discard(str(platform.directory))
 
 
 @pytest.fixture
@@ -86,15 +92,20 @@ def heater(started: Heater) -> Heater:
 
 def prepare(heater: Heater, robot: Robot) -> None:
     """Arm, measure, and send the profile to the loop."""
-    robot.command("arm_heater")
-    heater.until(lambda truth: truth["relay_closed"], "relay closed")
-    time.sleep(0.1)
+    arm(heater, robot)
     robot.command("measure_resistance", straight_and_unloaded=True, phase="austenite")
     robot.command("set_heat_profile", **asdict(heat_command(PROFILE)))
 
 
-def heating(heater: Heater, robot: Robot) -> tuple[threading.Thread, list[RtcpError]]:
-    """Begin to heat; return the command's thread when the rod gets hot, and the list for its error."""
+def arm(heater: Heater, robot: Robot) -> None:
+    """Arm; return when the loop has seen that the relay is closed."""
+    robot.command("arm_heater")
+    until(lambda: robot.processes["heater"].fields["relay_closed"], "relay closed")
+
+
+@contextlib.contextmanager
+def heating(heater: Heater, robot: Robot) -> Iterator[list[RtcpError]]:
+    """Begin to heat; yield the list for the error of the command when the rod gets hot; wait for its end."""
     prepare(heater, robot)
     errors: list[RtcpError] = []
 
@@ -105,68 +116,61 @@ def heating(heater: Heater, robot: Robot) -> tuple[threading.Thread, list[RtcpEr
             errors.append(error)
 
     thread = threading.Thread(target=heat)
-    thread.start()
     start = heater.truth()["middle_temperature"]
+    thread.start()
     heater.until(lambda truth: truth["middle_temperature"] > start + 5.0, "heat")
-    return thread, errors
+    yield errors
+    heater.assert_off()
+    thread.join()
 
 
-def test_by_hand_in_manual_without_arms_a_released_button_ends_the_heat(heater: Heater) -> None:
+def test_a_released_button_another_client_and_the_end_of_the_connection_end_the_heat(heater: Heater) -> None:
     with heater.connect() as robot:
-        thread, errors = heating(heater, robot)
-        heater.set_contacts(RELEASED)
-        heater.assert_off()
-        thread.join()
+        with heating(heater, robot) as errors:
+            heater.set_contacts(RELEASED)
         assert [error.fields["row"] for error in errors] == ["button"]
         heater.set_contacts(MANUAL)
         heater.assert_off()
         assert robot.processes["heater"].state == "ready"
-
-
-def test_the_command_line_shows_a_process_and_sends_it_any_of_its_commands(heater: Heater) -> None:
-    rtcp = heater.platform.rtcp
-    assert "shape_setting" in rtcp("process").stdout
-    shown = rtcp("process", "heater").stdout
-    assert "phase: unknown | austenite | martensite" in " ".join(shown.split())
-    rtcp("process", "heater", "arm_heater")
-    heater.until(lambda truth: truth["relay_closed"], "relay closed")
-    time.sleep(0.1)
-    rtcp("process", "heater", "measure_resistance", "straight_and_unloaded=true", "phase=austenite")
-    with heater.connect() as robot:
-        assert robot.processes["heater"].fields["initial_resistance"] > 0.0
-    assert "heater is ready" in rtcp("process", "heater", "stop_heating").stdout
-    rtcp("process", "heater", "measure_resistance", "straight_and_unloaded=yes", "phase=austenite", check=2)
-    rtcp("process", "heater", "melt", check=2)
-    rtcp("process", "heater", "reset_trips", "now", check=2)
-    rtcp("process", "pump", "reset_trips", check=3)
-    rtcp("process", "pump", check=3)
-
-
-def test_a_connection_that_closes_ends_the_heat(heater: Heater) -> None:
-    with heater.connect() as robot:
-        thread, _ = heating(heater, robot)
-        robot._client._socket.shutdown(2)
-        heater.assert_off()
-        thread.join()
+        with heater.connect() as other:
+            with heating(heater, robot) as errors:
+                with pytest.raises(RtcpError) as refused:
+                    other.command("start_heating")
+                assert refused.value.reason == "lease_held"
+                other.command("stop_heating")
+            assert len(errors) == 1
+        with heating(heater, robot):
+            robot._client._socket.shutdown(2)
     with heater.connect() as robot:
         assert robot.processes["heater"].fields["cause"] == 6
 
 
-def test_auto_without_the_arms_of_the_cell_is_refused(heater: Heater) -> None:
+def test_the_command_line_shows_a_process_and_sends_it_any_of_its_commands_which_the_process_may_refuse(
+    heater: Heater, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, value in heater.platform.environment.items():
+        monkeypatch.setenv(name, value)
+
+    def rtcp(*arguments: str, code: int = 0) -> str:
+        assert main(("process", *arguments)) == code
+        return capsys.readouterr().out
+
+    assert "shape_setting" in rtcp()
+    assert "phase: unknown | austenite | martensite" in " ".join(rtcp("heater").split())
+    with heater.connect() as robot:
+        rtcp("heater", "arm_heater")
+        until(lambda: robot.processes["heater"].fields["relay_closed"], "relay closed")
+        rtcp("heater", "measure_resistance", "straight_and_unloaded=true", "phase=austenite")
+        assert robot.processes["heater"].fields["initial_resistance"] > 0.0
+    assert "heater is ready" in rtcp("heater", "stop_heating")
+    rtcp("heater", "measure_resistance", "straight_and_unloaded=yes", "phase=austenite", code=2)
+    rtcp("heater", "melt", code=2)
+    rtcp("heater", "reset_trips", "now", code=2)
+    rtcp("pump", "reset_trips", code=3)
+    rtcp("pump", code=3)
+    # In Auto the heater needs the arms of its cell.
     heater.set_contacts(AUTO)
-    with heater.connect() as robot, pytest.raises(RtcpError, match="interlock") as refused:
+    with heater.connect() as robot, pytest.raises(RtcpError, match="interlock") as no_arms:
         robot.command("arm_heater")
-    assert refused.value.kind == "refused"
+    assert no_arms.value.kind == "refused"
     assert not heater.truth()["relay"]
-
-
-def test_another_client_may_stop_the_heat_and_may_not_begin_any(heater: Heater) -> None:
-    with heater.connect() as robot, heater.connect() as other:
-        thread, errors = heating(heater, robot)
-        with pytest.raises(RtcpError) as refused:
-            other.command("start_heating")
-        assert refused.value.reason == "lease_held"
-        other.command("stop_heating")
-        heater.assert_off()
-        thread.join()
-        assert len(errors) == 1

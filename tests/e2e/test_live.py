@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from rtcp.cli.__main__ import main
 from rtcp.ipc.session import read_processes
 from tests.viewer import Viewer
 
@@ -25,34 +26,34 @@ def begun(platform: Platform, *arguments: str) -> tuple[subprocess.Popen[str], s
     return view, view.stdout.readline().partition(": ")[0]
 
 
-def test_two_views_show_a_move_as_the_platform_reports_it(enabled: Platform) -> None:
-    goal = [0.1, -0.1, 0.1, 0.0, 0.0, 0.1]
-    views = [begun(enabled, "--every", every) for every in ("1", "5")]
-    for (view, url), every in zip(views, (1, 5), strict=True):
-        with Viewer(url) as viewer:
-            assert "assistive-arm" in viewer.info["name"]
-            last: dict[str, Any] = {}
-            numbers, states = [], [viewer.first("/machine")["state"]]
-            enabled.call("move_joints", q=goal if every == 1 else [0.0] * 6)
-            arrived, arrived_ns = enabled.status(), time.monotonic_ns()
-            while {"/cycle", "/joint_targets", "/tf"} - last.keys() or last["/cycle"].time_ns < arrived_ns:
-                topic, message = viewer.read()
-                last[topic] = message
-                if topic == "/cycle":
-                    numbers.append(message.number)
-                elif topic == "/machine" and message["state"] != states[-1]:
-                    states.append(message["state"])
-        assert numbers == list(range(numbers[0], numbers[-1] + 1, every))
-        assert states == ["holding", "moving", "holding"]
-        assert last["/joint_states"].position == pytest.approx(arrived["joints"]["actual_position"], abs=1e-4)
-        assert last["/joint_targets"].name == last["/joint_states"].name
-        # Also for one who comes when all has been said.
-        with Viewer(url, ["/robot_description", "/machine"]) as late:
-            assert "<robot" in late.first("/robot_description").data
-            assert late.first("/machine")["state"] == "holding"
-        assert [frame.child_frame_id for frame in last["/tf"].transforms][-1] == "tool0"
-        view.send_signal(signal.SIGINT)
-        assert view.wait() == 0
+def test_a_view_shows_a_move_as_the_platform_reports_it_and_says_that_others_can_watch(enabled: Platform) -> None:
+    view, url = begun(enabled, "--every", "2", "--host", "0.0.0.0")
+    assert view.stdout is not None
+    assert view.stdout.readline() == "whoever reaches 0.0.0.0 can watch: nobody is asked for a name\n"
+    with Viewer(url) as viewer:
+        assert "assistive-arm" in viewer.info["name"]
+        last: dict[str, Any] = {}
+        numbers, states = [], [viewer.first("/machine")["state"]]
+        enabled.call("move_joints", q=[0.1, -0.1, 0.1, 0.0, 0.0, 0.1])
+        arrived, arrived_ns = enabled.status(), time.monotonic_ns()
+        while {"/cycle", "/joint_targets", "/tf"} - last.keys() or last["/cycle"].time_ns < arrived_ns:
+            topic, message = viewer.read()
+            last[topic] = message
+            if topic == "/cycle":
+                numbers.append(message.number)
+            elif topic == "/machine" and message["state"] != states[-1]:
+                states.append(message["state"])
+    assert numbers == list(range(numbers[0], numbers[-1] + 1, 2))
+    assert states == ["holding", "moving", "holding"]
+    assert last["/joint_states"].position == pytest.approx(arrived["joints"]["actual_position"], abs=1e-4)
+    assert last["/joint_targets"].name == last["/joint_states"].name
+    assert [frame.child_frame_id for frame in last["/tf"].transforms][-1] == "tool0"
+    # Also for one who comes when all has been said.
+    with Viewer(url, ["/robot_description", "/machine"]) as late:
+        assert "<robot" in late.first("/robot_description").data
+        assert late.first("/machine")["state"] == "holding"
+    view.send_signal(signal.SIGINT)
+    assert view.wait() == 0
 
 
 def test_the_view_ends_with_the_loop(running: Platform) -> None:
@@ -64,20 +65,19 @@ def test_the_view_ends_with_the_loop(running: Platform) -> None:
     assert (view.returncode, said) == (4, "rtcp: the platform has ended\n")
 
 
-def test_what_cannot_be_served_ends_in_one_message(running: Platform) -> None:
+def test_what_cannot_be_served_ends_in_one_message(
+    running: Platform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said(code: int, *arguments: str) -> str:
+        assert main(("live", *arguments)) == code
+        return capsys.readouterr().err
+
+    assert "start one with `rtcp start`" in said(4)
+    for name, value in running.environment.items():
+        monkeypatch.setenv(name, value)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = str(server.getsockname()[1])
-        said = running.rtcp("live", "--port", port, check=3).stderr
-    assert said.startswith(f"rtcp: 127.0.0.1 port {port} cannot be listened at: Address already in use")
-    assert "nowhere.invalid port 8765 cannot be" in running.rtcp("live", "--host", "nowhere.invalid", check=3).stderr
-    assert "--port" in running.rtcp("live", "--port", "70000", check=2).stderr
-
-
-def test_without_a_platform_there_is_nothing_to_show(platform: Platform) -> None:
-    assert "start one with `rtcp start`" in platform.rtcp("live", check=4).stderr
-
-
-def test_a_view_for_others_says_that_it_is_one(running: Platform) -> None:
-    view, _ = begun(running, "--host", "0.0.0.0")
-    assert view.stdout is not None
-    assert view.stdout.readline() == "whoever reaches 0.0.0.0 can watch: nobody is asked for a name\n"
+        told = said(3, "--port", port)
+    assert told.startswith(f"rtcp: 127.0.0.1 port {port} cannot be listened at: Address already in use")
+    assert "nowhere.invalid port 8765 cannot be" in said(3, "--host", "nowhere.invalid")
+    assert "--port" in said(2, "--port", "70000")

@@ -27,7 +27,7 @@ CGROUPS = next((path for path in map(Path, ("/sys/fs/cgroup", "/sys/fs/cgroup/un
 
 pytestmark = [
     pytest.mark.platform,
-    pytest.mark.long,
+    pytest.mark.long("test_it_is_ready_after_op_and_pings_only_while_the_cycle_goes_on"),
     pytest.mark.timeout(600),
     pytest.mark.skipif(os.geteuid() != 0, reason="systemd as PID 1 needs root: run `make test-all` as root"),
     pytest.mark.skipif(not SYSTEMD.exists(), reason="systemd is not installed: `apt-get install systemd`"),

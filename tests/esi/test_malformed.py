@@ -15,10 +15,10 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_hundreds_of_mutated_files_and_images_raise_no_other_error(tmp_path: Path) -> None:
-    assert mutate.failing(0, 600, tmp_path) == []
+    assert mutate.failing(0, 300, tmp_path) == []
 
 
-@pytest.mark.long
+@pytest.mark.long("test_hundreds_of_mutated_files_and_images_raise_no_other_error")
 @pytest.mark.timeout(7200)
 def test_a_hundred_thousand_mutated_files_and_images_raise_no_other_error_and_take_bounded_memory() -> None:
     command = [sys.executable, "-m", "tests.esi.mutate", "1000", "100000"]

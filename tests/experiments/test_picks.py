@@ -59,9 +59,10 @@ def joystick() -> Iterator[Joystick]:
         yield Joystick(simulation)
 
 
-@pytest.mark.parametrize(
-    "where", ["shelf", *(pytest.param(where, marks=pytest.mark.long) for where in ("table", "ground"))]
-)
+LONG = pytest.mark.long("test_an_item_is_picked_by_joystick_bytes_alone")
+
+
+@pytest.mark.parametrize("where", ["shelf", *(pytest.param(where, marks=LONG) for where in ("table", "ground"))])
 def test_an_item_is_picked_by_joystick_bytes_alone(joystick: Joystick, where: str) -> None:
     item = ITEMS[where]
     assert dist(Person(joystick).pick(item), item) < 0.02

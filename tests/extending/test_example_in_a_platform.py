@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from urllib.request import urlopen
+from typing import cast
 
 import pytest
 
@@ -14,10 +13,12 @@ from rtcp.api import Robot, RtcpError
 from rtcp.api.feed import Feed
 from rtcp.ipc import recording
 from rtcp.ipc.runtime_directory import control_socket
+from rtcp.panel.live import Live
+from rtcp.panel.metrics import exposition
 from rtcp.panel.scope import signals_of
 from rtcp.telemetry.reading import Reader, read
 from tests.e2e.conftest import Platform
-from tests.panel.conftest import begun
+from tests.leftovers import Leftovers
 
 from .conftest import add_thermometer
 
@@ -25,9 +26,10 @@ pytestmark = pytest.mark.platform
 
 
 @pytest.fixture(scope="module")
-def seen(installed: Path) -> Iterator[SimpleNamespace]:
+def seen(installed: Path, leftovers: Leftovers) -> Iterator[SimpleNamespace]:
     """Outputs of a platform with a thermometer, until the thermometer was too warm and stopped the arm."""
     platform, seen = Platform(), SimpleNamespace()
+    leftovers.shared.add(str(platform.directory))
     try:
         platform.be_patient(lost_ms=2000)
         add_thermometer(platform.directory / "config")
@@ -35,16 +37,14 @@ def seen(installed: Path) -> Iterator[SimpleNamespace]:
         platform.rtcp("start", "--detach")
         platform.call("enable")
         kept = platform.directory / "kept"
-        signals = ("--signals", "thermometer_*")
-        platform.rtcp("record", "start", "--format", "mcap,csv", *signals, "--out", str(kept))
-        seen.status = json.loads(platform.rtcp("status", "--json").stdout)
+        platform.call("record_start", formats=["mcap", "csv"], signals=["thermometer_*"], out=str(kept))
+        seen.status = platform.status()
         feed = Feed(platform.directory)
         seen.scope = signals_of(feed.config, feed.schema)
         feed.close()
-        with begun(platform) as (_, url):
-            platform.until(lambda _: b"rtcp_up 1" in urlopen(f"{url}/metrics").read(), "the state at the panel")
-            seen.metrics = urlopen(f"{url}/metrics").read().decode()
         with Robot("a test", control_socket(platform.directory)) as robot:
+            shown = robot.status()
+            seen.metrics = exposition(cast(Live, SimpleNamespace(status=shown, pages={}))).decode()
             with pytest.raises(RtcpError) as refused:
                 robot.command("set_alarm", kelvin=200.0)
             seen.refused = refused.value
@@ -52,21 +52,21 @@ def seen(installed: Path) -> Iterator[SimpleNamespace]:
             robot.command("set_alarm", kelvin=seen.alarm)
         platform.until(lambda shown: shown["state"] == "fault", "the fault")
         platform.until(lambda _: any(platform.directory.glob("state/faults/*.mcap")), "the recording of the fault")
-        platform.rtcp("record", "stop")
+        platform.call("record_stop")
         (seen.mcap,), (seen.csv,) = kept.glob("*.mcap"), kept.glob("*.csv")
         (seen.black_box,) = platform.directory.glob("state/faults/*.mcap")
         yield seen
     finally:
         platform.end()
+        leftovers.shared.discard(str(platform.directory))
 
 
-def test_its_values_are_in_the_status_with_their_unit(seen: SimpleNamespace) -> None:
+def test_its_values_are_shown_recorded_and_measured_with_their_unit(seen: SimpleNamespace) -> None:
     device = seen.status["devices"]["thermometer"]
     assert device["first"] == {"value": pytest.approx(300.0), "unit": "K"}
     assert device["second"]["value"] > 300.0
-
-
-def test_its_values_are_recorded_with_unit_and_meaning(seen: SimpleNamespace) -> None:
+    assert seen.scope["thermometer_second"] == "thermometer second"
+    assert 'rtcp_device_value{device="thermometer",field="first",unit="K"} 300.0' in seen.metrics
     recording, reader = read(seen.mcap), Reader(seen.mcap)
     list(reader)
     assert recording.records.dtype.names == ("number", "time_ns", "thermometer_first", "thermometer_second")
@@ -75,34 +75,19 @@ def test_its_values_are_recorded_with_unit_and_meaning(seen: SimpleNamespace) ->
     assert recording.records["thermometer_first"] == pytest.approx(300.0)
     # 10 K a second.
     assert recording.records["thermometer_second"][-1] > seen.alarm + 10.0
-
-
-def test_chosen_they_are_columns_of_a_csv(seen: SimpleNamespace) -> None:
     header, first, *_ = seen.csv.read_text().splitlines()
     row = dict(zip(header.split(","), first.split(","), strict=True))
     assert row["thermometer_first"] == "300"
 
 
-def test_they_are_signals_of_the_scope(seen: SimpleNamespace) -> None:
-    assert seen.scope["thermometer_second"] == "thermometer second"
-
-
-def test_they_are_metrics(seen: SimpleNamespace) -> None:
-    assert 'rtcp_device_value{device="thermometer",field="first",unit="K"} 300.0' in seen.metrics
-
-
-def test_its_command_is_refused_over_the_control_socket_in_its_own_words(seen: SimpleNamespace) -> None:
+def test_its_command_is_refused_in_its_own_words_or_leads_to_its_event_and_its_fault_in_the_black_box(
+    seen: SimpleNamespace,
+) -> None:
     assert seen.refused.kind == "refused"
     assert str(seen.refused).startswith("an alarm at 200 K would be active at once: the second channel has")
-
-
-def test_its_command_leads_to_its_event_and_its_fault_in_the_recordings_log(seen: SimpleNamespace) -> None:
     log = [line.message for line in read(seen.mcap).log]
     assert any(message.startswith("the second channel has") and message.endswith(" K") for message in log)
     assert any(message.endswith("more than 10 K above the alarm") for message in log)
-
-
-def test_its_values_are_in_the_black_box_around_its_fault(seen: SimpleNamespace) -> None:
     fault = recording.read(seen.black_box)
     assert fault.about.what.endswith("more than 10 K above the alarm")
     assert fault.records["thermometer_second"][fault.about.at] > seen.alarm + 9.9

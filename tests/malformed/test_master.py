@@ -15,40 +15,38 @@ from tests.malformed import mutated_answers
 from tests.malformed.cable import answerer, master, report_of
 from tests.malformed.line import Line
 
-pytestmark = pytest.mark.platform
-
 
 def test_process_data_are_exchanged_on_through_mutated_answers_and_are_right_again_after_them() -> None:
     with answerer(1) as pid:
-        report = report_of(master(pid, "exchange", 5000))
-    assert report["mutated"] > 2000
-    assert sum(report["counters"].values()) == 5000
+        report = report_of(master(pid, "exchange", 1500))
+    assert report["mutated"] > 600
+    assert sum(report["counters"].values()) == 1500
     # Lost, judged by the working counter, or good: all three come.
-    assert min(report["counters"].values()) > 50
+    assert min(report["counters"].values()) > 5
     assert report["recovered"]
 
 
 def test_services_beside_the_cycle_end_in_an_answer_or_a_sentence() -> None:
     with answerer(1) as pid:
-        report = report_of(master(pid, "services", 150))
-    assert report["mutated"] > 100
+        report = report_of(master(pid, "services", 70))
+    assert report["mutated"] > 30
     assert bytes.fromhex(report["name"]).startswith(b"Cubemars")
 
 
 def test_scans_and_configurations_on_mutated_answers_end_in_a_sentence_and_a_sane_scan_follows() -> None:
     with answerer(3) as pid:
-        report = report_of(master(pid, "scans", 3))
-    assert sum(report["ends"].values()) == 3
+        report = report_of(master(pid, "scans", 1))
+    assert sum(report["ends"].values()) == 1
     assert report["slaves"] == 7
 
 
 def test_the_masters_own_parsers_end_in_an_answer_or_a_sentence_and_work_on() -> None:
-    outcome = mutated_answers.run(2000, 1)
+    outcome = mutated_answers.run(800, 1)
     assert outcome.failures == []
-    assert outcome.frames >= 2000
-    assert outcome.kinds["done"] > 100
-    assert outcome.kinds["refused"] > 100
-    assert outcome.kinds["emergencies"] > 5
+    assert outcome.frames >= 800
+    assert outcome.kinds["done"] > 40
+    assert outcome.kinds["refused"] > 40
+    assert outcome.kinds["emergencies"] > 1
     assert outcome.objects < 20_000
 
 

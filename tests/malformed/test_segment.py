@@ -15,7 +15,7 @@ from tests.malformed.mutate import MUTATIONS, mutated, shape
 from tests.malformed.mutated_frames import run
 from tests.virtual.frames import Datagram, build, parse
 
-SHARE = 20_000
+SHARE = 6_000
 """Frames, of the million of `benchmarks/mutations.py`."""
 MOST_OBJECTS = 20_000
 

@@ -15,8 +15,8 @@ pytestmark = pytest.mark.platform
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("seed", range(1, 6) if THOROUGH else [1])
 def test_no_reference_of_a_random_session_breaks_a_limit(seed: int) -> None:
-    outcome = run_on_egm(seed, 60.0 if THOROUGH else 15.0)
+    outcome = run_on_egm(seed, 60.0 if THOROUGH else 5.0)
     assert outcome.failures == []
-    assert outcome.replies > 1000
+    assert outcome.replies > 300
     assert outcome.taken
     assert outcome.requests

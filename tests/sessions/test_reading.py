@@ -80,7 +80,7 @@ def frames() -> list[Frame]:
 def test_it_reads_frames_and_places_the_bodies_as_the_facts_have_them(frames: list[Frame]) -> None:
     ours, facts = reading_of(configuration()), reading()
     places = set()
-    for frame in frames[::10]:
+    for frame in frames[::40]:
         q = []
         for one, other in zip(ours.joints, facts.joints, strict=True):
             assert one.slot == other.slot
@@ -90,7 +90,7 @@ def test_it_reads_frames_and_places_the_bodies_as_the_facts_have_them(frames: li
         bounds = Bounds.configured(configuration())
         assert ours.workspaces[0].deepest(bounds, q) == pytest.approx(deepest(bounds, q), abs=1e-4)
         places.add(tuple(q))
-    assert len(places) > 50
+    assert len(places) > 10
 
 
 def test_the_bodies_of_the_tool_that_the_arm_has_are_checked(tmp_path: Path) -> None:

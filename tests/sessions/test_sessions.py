@@ -12,7 +12,7 @@ from rtcp.testing.sessions.commander import KINDS
 from tests.samples import THOROUGH
 from tests.sessions.session import Outcome, run_session, session_of
 
-SESSIONS, BATCH = (100, 20) if THOROUGH else (4, 2)
+SESSIONS, BATCH = (100, 20) if THOROUGH else (2, 1)
 
 
 @pytest.mark.timeout(900)
@@ -22,7 +22,7 @@ def test_no_frame_of_a_random_session_breaks_a_limit(first: int) -> None:
     assert failures == []
 
 
-@pytest.mark.skipif(not THOROUGH, reason="30 sessions: with RTCP_THOROUGH=1")
+@pytest.mark.long("test_no_frame_of_a_random_session_breaks_a_limit")
 @pytest.mark.timeout(900)
 def test_the_sessions_visit_every_state_and_send_every_command() -> None:
     total = Outcome()

@@ -15,7 +15,7 @@ LENGTH, DIAMETER, ELEMENTS, REST_S = 1.0, 0.05, 40, 16.0
 MODULUS, RATIO, DENSITY = 1e6, 0.33, 1000.0
 
 
-@pytest.mark.long
+@pytest.mark.long("test_shooting_equals_collocation")
 def test_a_clamped_rod_under_an_end_force_has_the_shape_that_pyelastica_comes_to_rest_in() -> None:
     rod = Rod(LENGTH, DIAMETER, MODULUS, RATIO, DENSITY, plateau_stress=MODULUS, plateau_end_stress=1.1 * MODULUS)
     force = np.array([0.0, 1.5, 1.0]) * rod.bending_stiffness / LENGTH**2

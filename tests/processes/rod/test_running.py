@@ -8,7 +8,7 @@ from tests.cell.running import CONFIG, RunningCell
 from tests.processes.rod.test_bending import planned
 
 
-@pytest.mark.long
+@pytest.mark.long("test_other_cells")
 @pytest.mark.platform
 def test_the_shipped_cell_runs_a_planned_bend() -> None:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")

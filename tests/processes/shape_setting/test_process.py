@@ -745,7 +745,7 @@ def test_random_sequences_of_inputs_and_commands_never_heat_outside_the_table() 
     assert min(counts.values()) > 100, counts
 
 
-@pytest.mark.long
+@pytest.mark.long("test_random_sequences_of_inputs_and_commands_never_heat_outside_the_table")
 def test_100_000_random_sequences_never_heat_outside_the_table() -> None:
     seen = run_random_sequences(100_000, seed=4)
     assert min(seen.values()) > 10_000, seen

@@ -1,0 +1,5 @@
+"""The shared platform."""
+
+from tests.e2e.conftest import kept, running, shared
+
+__all__ = ["kept", "running", "shared"]
