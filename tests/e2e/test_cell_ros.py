@@ -18,8 +18,9 @@ pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip in
 from rtcp.ros.ros2_types import decode, encode, make
 from rtcp.ros.ros2_zenoh import key_of, open_session
 from tests.cell.running import ABB_HOME, CONFIG, Records, RunningCell, instants
-from tests.ros2.node import point, until
+from tests.ros2.node import point
 from tests.ros2.zenoh_client import JOINT_STATES, Router, call
+from tests.waiting import until
 
 pytestmark = pytest.mark.platform
 NAMES = [f"{arm}_joint_{number}" for arm in ("left", "right") for number in range(1, 7)]

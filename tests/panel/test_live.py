@@ -1,4 +1,4 @@
-"""What bounds a motion of a page in time: its tokens, its presence, STOP, a take-over; in simulated time, on a fake arm."""
+"""What bounds a motion of a page in time: tokens, presence, STOP, a take-over; in simulated time, on a fake arm."""
 
 from __future__ import annotations
 
