@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
+import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserType, Error, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserType, Dialog, Error, Page, expect, sync_playwright
 
 from rtcp.api import RtcpError
 from tests.e2e.conftest import Platform
+from tests.leftovers import Leftovers
+from tests.waiting import HANG_S
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = [
@@ -29,6 +32,9 @@ FLAGS = [
     "--enable-unsafe-swiftshader",
 ]
 PASSWORD, VIEWERS_PASSWORD = "correct horse", "battery staple"
+PERIOD_US = 8000
+"""Cycle of the platform, us: what a person does takes no shorter one, and the browser needs the time."""
+HOSTILE = "<img src=x onerror=alert(1)>"
 
 
 @contextlib.contextmanager
@@ -45,43 +51,65 @@ def begun(platform: Platform, *arguments: str) -> Iterator[tuple[subprocess.Pope
     finally:
         if panel.poll() is None:
             panel.terminate()
-        _, complaints = panel.communicate(timeout=20)
+        _, complaints = panel.communicate(timeout=HANG_S)
         assert "most recent call last" not in complaints, complaints
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def chromium() -> Iterator[BrowserType]:
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed (Debian: apt install chromium)")
+    expect.set_options(timeout=HANG_S * 1000)
     with sync_playwright() as playwright:
         yield playwright.chromium
 
 
-@pytest.fixture(scope="module")
-def browser(chromium: BrowserType) -> Iterator[Browser]:
+@pytest.fixture(scope="session")
+def browser(leftovers: Leftovers, chromium: BrowserType) -> Iterator[Browser]:
     chrome = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
     yield chrome
     chrome.close()
 
 
-@pytest.fixture(scope="module")
-def platform() -> Iterator[Platform]:
-    """A platform that does not run yet."""
-    started = Platform()
-    started.be_patient(lost_ms=2000)
+@pytest.fixture(scope="session")
+def kept(leftovers: Leftovers) -> Iterator[tuple[Platform, subprocess.Popen[str], str]]:
+    """A started platform, a panel beside it and its address, for the tests of this worker.
+
+    The sixth joint and its drive have names that are scripts; the drives have their temperature in the process data.
+    """
+    made = Platform()
+    leftovers.shared.add(str(made.directory))
+    made.be_patient(lost_ms=2000, period_us=PERIOD_US)
+    arm, drive = made.directory / "config/assistive_arm.yaml", made.directory / "config/devices/cubemars-orh.yaml"
+    arm.write_text(re.sub(r"\b(drive6|joint6)\b", rf'"\g<1> {HOSTILE}"', arm.read_text()))
+    temperature = "- {index: 0x2000, sub_index: 1, type: int16, name: temperature, factor: 0.1}"
+    drive.write_text(re.sub(r"( *)- \{index: 0x6061.*", rf"\g<0>\n\1{temperature}", drive.read_text()))
     try:
-        yield started
+        made.rtcp("start", "--detach")
+        with begun(made) as (process, url):
+            yield made, process, url
+            process.send_signal(signal.SIGCONT)
+        made.thaw()
     finally:
-        started.end_commands()
-        started.rtcp("stop", check=None)
-        shutil.rmtree(started.directory, ignore_errors=True)
+        made.end()
+        leftovers.shared.discard(str(made.directory))
 
 
 @pytest.fixture(scope="module")
-def panel(platform: Platform) -> Iterator[str]:
-    """Its address."""
-    with begun(platform) as (_, url):
-        yield url
+def platform(kept: tuple[Platform, subprocess.Popen[str], str]) -> Iterator[Platform]:
+    """The started platform of this worker, which takes no time between two modules."""
+    made, process, _ = kept
+    process.send_signal(signal.SIGCONT)
+    made.thaw()
+    yield made
+    made.freeze()
+    process.send_signal(signal.SIGSTOP)
+
+
+@pytest.fixture(scope="module")
+def panel(platform: Platform, kept: tuple[Platform, subprocess.Popen[str], str]) -> str:
+    """The address of the panel."""
+    return kept[2]
 
 
 @pytest.fixture
@@ -90,14 +118,40 @@ def page(browser: Browser, panel: str) -> Iterator[Page]:
         yield opened
 
 
+@pytest.fixture
+def drawing(browser: Browser, panel: str) -> Iterator[Page]:
+    """A page that draws the arm."""
+    with visitor(browser, panel, draws=True) as opened:
+        yield opened
+
+
 @contextlib.contextmanager
-def visitor(browser: Browser, url: str, **options: Any) -> Iterator[Page]:
-    """A browser window of its own; an error of the panel's scripts fails the test."""
+def visitor(browser: Browser, url: str, draws: bool = False, **options: Any) -> Iterator[Page]:
+    """A browser window of its own; an error of the panel's scripts, or a name that runs as one, fails the test.
+
+    Args:
+        browser: where.
+        url: the panel.
+        draws: whether the arm is drawn; without a GPU that takes as long as everything else.
+        options: of the window.
+    """
     complaints: list[str] = []
+
+    def dismiss(dialog: Dialog) -> None:
+        complaints.append(f"a name ran as a script: {dialog.message}")
+        dialog.dismiss()
+
     context = browser.new_context(base_url=url, viewport={"width": 1200, "height": 700}, **options)
     page = context.new_page()
+    if not draws:
+        page.add_init_script(
+            "HTMLCanvasElement.prototype.getContext = ((get) => function (kind, ...options) {"
+            " return kind.startsWith('webgl') ? null : get.call(this, kind, ...options);"
+            "})(HTMLCanvasElement.prototype.getContext)"
+        )
     page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.set_default_timeout(15_000)
+    page.on("dialog", dismiss)
+    page.set_default_timeout(HANG_S * 1000)
     try:
         yield page
     finally:
@@ -111,6 +165,12 @@ def show(page: Page, path: str) -> Page:
     page.goto(path)
     page.wait_for_selector("[data-live=state][data-state]:not([data-state='no connection'])")
     return page
+
+
+def show_targets(page: Page) -> None:
+    """Open the tab Targets and wait until its fields have the position of the arm; the last two are filled last."""
+    show(page, "/targets")
+    expect(page.get_by_label("joint5, rad")).to_have_value(re.compile(r"^0\.[45]"))
 
 
 def log_in(page: Page, password: str = PASSWORD) -> None:
@@ -129,16 +189,6 @@ def barriers(page: Page) -> dict[str, list[str]]:
         for rule in Axe().run(page).response["violations"]
         if rule["impact"] in ("serious", "critical")
     }
-
-
-def until(met: Callable[[], Any], goal: str, patience_s: float = 20.0) -> Any:
-    """Wait until `met` returns a true value; return it."""
-    end = time.monotonic() + patience_s
-    while time.monotonic() < end:
-        if result := met():
-            return result
-        time.sleep(0.05)
-    raise AssertionError(f"not within {patience_s:g} s: {goal}")
 
 
 BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]

@@ -1,4 +1,4 @@
-"""Access to the panel: over real HTTP and WebSockets, with requests that no browser would send."""
+"""Access to the panel, with requests that no browser would send: over real HTTP and WebSockets, and in process."""
 
 from __future__ import annotations
 
@@ -17,18 +17,22 @@ import stat
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import urlencode, urlsplit
 
 import pytest
+from starlette.responses import PlainTextResponse
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from rtcp.api import Invalid
 from rtcp.panel import access
 from tests.e2e.conftest import Platform
-from tests.panel.conftest import begun, until
+from tests.panel.conftest import begun
+from tests.simulated_time import Clock
+from tests.waiting import HANG_S, until
 
 PAGE = {"Accept": "text/html"}
 PASSWORDS = {"operator": "correct horse", "viewer": "battery staple"}
@@ -36,33 +40,69 @@ PASSWORDS = {"operator": "correct horse", "viewer": "battery staple"}
 
 @pytest.fixture(scope="module")
 def open_panel() -> Iterator[tuple[Platform, str]]:
-    """A panel without passwords, without a platform."""
+    """A panel without passwords and without a platform, which a web browser is told to open."""
     platform = Platform()
+    browser, opened = platform.directory / "browser", platform.directory / "opened"
+    browser.write_text(f'#!/bin/sh\necho "$1" $$ >{opened}\nexec sleep 60 >/dev/null 2>&1\n')
+    browser.chmod(0o700)
+    platform.environment["BROWSER"] = f"{browser} %s"  # Python waits for one that is named so
     try:
-        with begun(platform) as (_, url):
+        with begun(platform, "--open") as (_, url):
             yield platform, url
     finally:
+        # After the panel, which would try the next browser.
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(int(opened.read_text().split()[1]), signal.SIGKILL)
         platform.end()
 
 
-@pytest.fixture(scope="module")
-def closed_panel() -> Iterator[str]:
-    """A panel with passwords."""
-    platform = Platform()
-    try:
+@dataclass
+class Answer:
+    """The answer of the middleware to a request."""
+
+    status: int
+    headers: dict[str, str]
+    text: str
+
+    @property
+    def cookie(self) -> str:
+        return self.headers.get("set-cookie", "").partition(";")[0]
+
+
+class Guarded:
+    """The middleware before pages that are open to whoever reaches them, with passwords."""
+
+    def __init__(self, file: Path) -> None:
         for role, password in PASSWORDS.items():
-            platform_password(platform, role, password)
-        with begun(platform) as (_, url):
-            yield url
-    finally:
-        platform.end()
+            access.set_password(file, cast(access.Role, role), password)
+        self._access = access.Access(PlainTextResponse("a page"), access.Sessions(file), "127.0.0.1", False)
+
+    def ask(self, method: str, path: str, headers: dict[str, str] | None = None, body: str = "") -> Answer:
+        """Send one request from this machine."""
+        sent: list[Any] = []
+        fields = {"host": "localhost", **{name.lower(): value for name, value in (headers or {}).items()}}
+
+        async def receive() -> Any:
+            return {"type": "http.request", "body": body.encode(), "more_body": False}
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+
+        raw = [(name.encode(), value.encode("latin-1")) for name, value in fields.items()]
+        scope = {"type": "http", "method": method, "path": path, "headers": raw, "client": ("127.0.0.1", 1)}
+        asyncio.run(self._access(scope, receive, send))
+        begin, *parts = sent
+        heads = {name.decode(): value.decode() for name, value in begin["headers"]}
+        return Answer(begin["status"], heads, b"".join(part.get("body", b"") for part in parts).decode())
+
+    def log_in(self, password: str, origin: str = "http://localhost") -> Answer:
+        body = urlencode({"name": "Ada", "password": password})
+        return self.ask("POST", "/login", {"Origin": origin, "Content-Length": str(len(body))}, body)
 
 
-def platform_password(platform: Platform, role: str, password: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rtcp.cli", "panel", "password", "--role", role]
-    return subprocess.run(
-        command, input=f"{password}\n", env=platform.environment, text=True, capture_output=True, check=False
-    )
+@pytest.fixture
+def guarded(tmp_path: Path) -> Guarded:
+    return Guarded(tmp_path / "panel.json")
 
 
 def ask(
@@ -76,9 +116,9 @@ def ask(
     """Send one request; return the response, read."""
     place = urlsplit(url).netloc
     connection = (
-        http.client.HTTPConnection(place, timeout=20)
+        http.client.HTTPConnection(place, timeout=HANG_S)
         if context is None
-        else http.client.HTTPSConnection(place, timeout=20, context=context)
+        else http.client.HTTPSConnection(place, timeout=HANG_S, context=context)
     )
     connection.request(method, path, body, headers or {})
     response = connection.getresponse()
@@ -89,12 +129,6 @@ def ask(
 
 def cookie_of(response: Any) -> str:
     return str(response.getheader("set-cookie") or "").partition(";")[0]
-
-
-def log_in(url: str, password: str, **headers: str) -> Any:
-    body = urlencode({"name": "Ada", "password": password})
-    fields = {"Origin": url, "Content-Type": "application/x-www-form-urlencoded", **headers}
-    return ask(url, "POST", "/login", fields, body)
 
 
 def status_of_socket(url: str, path: str, **headers: str) -> int:
@@ -116,12 +150,11 @@ def test_a_visitor_gets_a_cookie_that_no_script_and_no_other_site_can_use(open_p
     assert not re.search(r"""(src|href)=["']https?:""", page.text)
 
 
-@pytest.mark.parametrize(
-    "path", ["/", "/live", "/metrics", "/static/panel.js", "/recordings/x.mcap", "/_nicegui_ws/socket.io/"]
-)
-def test_nothing_is_served_without_a_session(closed_panel: str, path: str) -> None:
+@pytest.mark.parametrize("path", ["/", "/live", "/metrics", "/static/panel.js", "/recordings/x.mcap"])
+def test_nothing_is_served_without_a_session(guarded: Guarded, path: str) -> None:
     for cookie in ("", "rtcp_panel=" + "A" * 43, "rtcp_panel=../../etc", "rtcp_panel=" + "x" * 9000):
-        assert ask(closed_panel, "GET", path, {"Cookie": cookie}).status in (400, 401, 431)
+        assert guarded.ask("GET", path, {"Cookie": cookie}).status == 401
+    assert guarded.ask("GET", path, {"Cookie": guarded.log_in("battery staple").cookie}).text == "a page"
 
 
 def test_prometheus_needs_no_cookie_where_nobody_is_asked(open_panel: tuple[Platform, str]) -> None:
@@ -176,16 +209,16 @@ def test_no_file_outside_the_recordings_is_served(open_panel: tuple[Platform, st
         assert ask(url, "GET", f"/recordings/{path}", cookie).status in (400, 401, 404)
 
 
-def test_passwords_open_the_panel_and_are_kept_as_hashes(closed_panel: str) -> None:
-    assert ask(closed_panel, "GET", "/", PAGE).getheader("location") == "/login"
-    assert log_in(closed_panel, "wrong").status == 401
-    assert log_in(closed_panel, "correct horse", Origin="http://evil.example").status == 403
-    response = log_in(closed_panel, "correct horse")
-    assert (response.status, response.getheader("location")) == (303, "/")
-    assert ask(closed_panel, "GET", "/", {**PAGE, "Cookie": cookie_of(response)}).status == 200
-    ended = ask(closed_panel, "POST", "/logout", {"Cookie": cookie_of(response), "Origin": closed_panel})
+def test_passwords_open_the_panel(guarded: Guarded) -> None:
+    assert guarded.ask("GET", "/", PAGE).headers["location"] == "/login"
+    assert guarded.log_in("wrong").status == 401
+    assert guarded.log_in("correct horse", "http://evil.example").status == 403
+    response = guarded.log_in("correct horse")
+    assert (response.status, response.headers["location"]) == (303, "/")
+    assert guarded.ask("GET", "/", {**PAGE, "Cookie": response.cookie}).status == 200
+    ended = guarded.ask("POST", "/logout", {"Cookie": response.cookie, "Origin": "http://localhost"})
     assert ended.status == 303
-    assert ask(closed_panel, "GET", "/metrics", {"Cookie": cookie_of(response)}).status == 401
+    assert guarded.ask("GET", "/metrics", {"Cookie": response.cookie}).status == 401
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
@@ -221,15 +254,12 @@ def test_with_a_certificate_everything_is_encrypted(tmp_path: Path) -> None:
         platform.end()
 
 
-def test_tries_are_limited(tmp_path: Path) -> None:
-    platform = Platform()
-    try:
-        platform_password(platform, "operator", "correct horse")
-        with begun(platform) as (_, url):
-            assert [log_in(url, "wrong").status for _ in range(6)] == [401] * 5 + [429]
-            assert log_in(url, "correct horse").status == 429
-    finally:
-        platform.end()
+def test_tries_are_limited(guarded: Guarded) -> None:
+    with Clock().shown() as clock:
+        assert [guarded.log_in("wrong").status for _ in range(6)] == [401] * 5 + [429]
+        assert guarded.log_in("correct horse").status == 429
+        clock.advance(60.0)
+        assert guarded.log_in("correct horse").status == 303
 
 
 def test_tries_from_many_addresses_lock_nobody_out_who_was_there_before(
@@ -247,21 +277,20 @@ def test_tries_from_many_addresses_lock_nobody_out_who_was_there_before(
     assert not sessions.too_many_tries("127.0.0.1")
 
 
-def test_many_requests_are_refused_and_others_are_still_served(closed_panel: str) -> None:
-    cookie = cookie_of(log_in(closed_panel, "battery staple"))
-    place = urlsplit(closed_panel)
-    # All at once over one connection: the first message beyond the limit closes it.
-    with socket.create_connection((place.hostname, place.port), 20.0) as flood:
-        flood.sendall(f"GET /metrics HTTP/1.1\r\nHost: {place.netloc}\r\n\r\n".encode() * 1000)
-        answered = b""
-        with contextlib.suppress(ConnectionResetError):
-            while part := flood.recv(1 << 16):
-                answered += part
-    assert answered.count(b"HTTP/1.1 429") == 1
-    assert 0 < answered.count(b"HTTP/1.1 401") < 600
-    assert ask(closed_panel, "GET", "/metrics", {"Cookie": cookie}).status == 200
+def test_many_requests_are_refused_and_others_are_still_served(guarded: Guarded) -> None:
+    with Clock().shown() as clock:
+        cookie = {"Cookie": guarded.log_in("battery staple").cookie}
+        answers = [guarded.ask("GET", "/metrics") for _ in range(500)]
+        served = sum(answer.status == 401 for answer in answers)
+        assert served == pytest.approx(399, abs=1)
+        assert [answer.status for answer in answers] == [401] * served + [429] * (500 - served)
+        assert answers[-1].headers["connection"] == "close"
+        assert guarded.ask("GET", "/metrics", cookie).status == 200
+        clock.advance(0.5)
+        assert [guarded.ask("GET", "/metrics").status for _ in range(60)].count(401) == pytest.approx(50, abs=1)
 
 
+@pytest.mark.platform
 def test_a_platform_is_started_with_its_panel_and_both_end_together() -> None:
     platform = Platform()
     platform.be_patient(lost_ms=2000)
@@ -274,7 +303,7 @@ def test_a_platform_is_started_with_its_panel_and_both_end_together() -> None:
         assert hint == "Ctrl-C ends the panel\n"
         until(lambda: "rtcp_up 1.0" in ask(url, "GET", "/metrics").text, "the platform")
         running.send_signal(signal.SIGINT)
-        _, complaints = running.communicate(timeout=30)
+        _, complaints = running.communicate(timeout=HANG_S)
         assert (running.returncode, "Traceback" in complaints) == (0, False), complaints
         with pytest.raises(ConnectionRefusedError):
             ask(url, "GET", "/", PAGE)
@@ -297,30 +326,18 @@ def test_a_busy_port_of_the_panel_refuses_the_start_before_the_platform() -> Non
         platform.end()
 
 
-def test_open_shows_the_panel_in_a_browser_and_does_not_wait_for_it(tmp_path: Path) -> None:
-    browser, opened = tmp_path / "browser", tmp_path / "shown"
-    browser.write_text(f'#!/bin/sh\necho "$1" $$ >{opened}\nexec sleep 60 >/dev/null 2>&1\n')
-    browser.chmod(0o700)
-    platform = Platform()
-    platform.environment["BROWSER"] = f"{browser} %s"  # Python waits for one that is named so
-    try:
-        with begun(platform, "--open") as (_, url):
-            address = until(lambda: opened.exists() and opened.read_text(), "the browser").split()[0]
-            assert address.rstrip("/") == url
-            assert ask(url, "GET", "/", PAGE).status == 303
-    finally:
-        # After the panel, which would try the next browser.
-        os.kill(int(opened.read_text().split()[1]), signal.SIGKILL)
-        platform.end()
+def test_open_shows_the_panel_in_a_browser_and_does_not_wait_for_it(open_panel: tuple[Platform, str]) -> None:
+    platform, url = open_panel
+    opened = platform.directory / "opened"
+    until(lambda: opened.exists() and opened.read_text(), "the browser")
+    assert opened.read_text().split()[0].rstrip("/") == url
+    assert ask(url, "GET", "/", PAGE).status == 303
 
 
-def test_another_address_wants_a_password() -> None:
-    platform = Platform()
-    try:
-        refused = platform.rtcp("panel", "--host", "0.0.0.0", "--port", "0", check=2)
-        assert "rtcp panel password" in refused.stderr
-    finally:
-        platform.end()
+def test_another_address_wants_a_password(tmp_path: Path) -> None:
+    with pytest.raises(Invalid, match="rtcp panel password"):
+        access.passwords_for("0.0.0.0", tmp_path / "panel.json")
+    assert access.passwords_for("127.0.0.1", tmp_path / "panel.json") is None
 
 
 def test_the_file_is_readable_by_its_owner_alone_and_a_damaged_one_is_said(tmp_path: Path) -> None:

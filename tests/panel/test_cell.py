@@ -7,9 +7,9 @@ import json
 import os
 import re
 import signal
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,28 +21,30 @@ from rtcp.api import Feed, Robot, State
 from rtcp.api.cell import Cell
 from rtcp.ipc.runtime_directory import control_socket, irc5_control
 from rtcp.ipc.session import read_processes, read_session
-from rtcp.panel.live import JOG_S, PRESENCE_S
 from rtcp.virtual.request_socket import RequestClient
 from tests.cell.running import ABB_HOME, CONFIG, RunningCell, put_in_order, restore
-from tests.panel.conftest import barriers, begun, show, until, visitor
+from tests.leftovers import Leftovers
+from tests.panel.conftest import barriers, begun, show, visitor
+from tests.waiting import until
 
 pytestmark = [pytest.mark.platform, pytest.mark.browser]
-SLACK_S = 0.6
-"""Allowance for braking, 0.22 s along a common path, and a shared host, s."""
 FAR = {"left": "0.9, 0.2, 0.1, 0, 0.5, 0.3", "right": "-0.9, 0.1, -0.1, 0.1, 0.6, 0"}
 """Seconds away at 0.15 rad/s."""
 
 
 @pytest.fixture(scope="module")
-def running() -> Iterator[RunningCell]:
+def running(leftovers: Leftovers) -> Iterator[RunningCell]:
     """Two virtual IRB 120; their loops may be later than shipped, as a browser draws beside them."""
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     file, count = re.subn(r"^silence_s: \S+", "silence_s: 0.2", (CONFIG / "cell.yaml").read_text(), flags=re.MULTILINE)
     assert count == 1
     cell = RunningCell(file)
     cell.platform.environment["RTCP_NAME"] = "left"
+    directories = {str(directory) for directory in (cell.directory, cell.of("left"), cell.of("right"))}
+    leftovers.shared |= directories
     yield cell
     cell.end()
+    leftovers.shared -= directories
 
 
 @pytest.fixture(scope="module")
@@ -81,25 +83,29 @@ def drawn(page: Page) -> dict[str, list[float]]:
     return positions
 
 
-def stood_after(feed: Feed, since_ns: int) -> float:
-    """Return the time from an instant to the last cycle in motion, s."""
-    time.sleep(PRESENCE_S + SLACK_S + 0.5)
-    records, _ = feed.records()
-    moving = records[np.abs(records["commanded_velocity"]).max(axis=1) > 0.0]
-    return float(moving["time_ns"][-1] - since_ns) * 1e-9
+def stopped(cell: Cell, running: RunningCell, state: State = State.HOLDING) -> None:
+    """Wait until all arms are in a state; no arm has reached its goal, and none moves in the records after it."""
+    until(lambda: states(cell) == dict.fromkeys(cell.arms, state), f"state {state.words} of all arms")
+    for name, status in cell.status().items():
+        assert abs(status.positions[0]) < 0.85
+        with contextlib.closing(Feed(running.of(name))) as feed:
+            rest: list[Any] = []
+            while len(rest) < 50:
+                feed.ended(0.05)
+                rest += list(feed.records()[0]["commanded_position"])
+            assert np.ptp(rest, axis=0).max() < 1e-9
 
 
-def begin(page: Page, running: RunningCell) -> dict[str, Feed]:
-    """Begin a motion in step on the page Cell; return the feeds of both arms when both move."""
+def begin(page: Page, running: RunningCell) -> None:
+    """Begin a motion in step on the page Cell; return when both arms move."""
     show(page, "/cell")
     for name, q in FAR.items():
         page.get_by_label(f"Joints of {name}, rad").fill(q)
     page.get_by_label("Speed (empty: the limit), rad/s").fill("0.15")
     page.get_by_role("button", name="Move in step").click()
-    feeds = {name: Feed(running.of(name)) for name in FAR}
-    for feed in feeds.values():
-        until(partial(moves, feed), "motion")
-    return feeds
+    for name in FAR:
+        with contextlib.closing(Feed(running.of(name))) as feed:
+            until(partial(moves, feed), "motion")
 
 
 def speed(feed: Feed) -> float:
@@ -111,11 +117,15 @@ def moves(feed: Feed) -> bool:
     return speed(feed) > 0.05
 
 
+def stands(feed: Feed) -> bool:
+    return speed(feed) == 0.0
+
+
 # -- one space --------------------------------------------------------------------------------------------------------
 
 
-def test_partners_are_drawn_where_they_stand_live_and_only_while_they_run(
-    page: Page, running: RunningCell, cell: Cell
+def test_partners_are_drawn_live_while_they_run_and_a_missing_one_is_named(
+    drawing: Page, running: RunningCell, cell: Cell
 ) -> None:
     def expected() -> tuple[float, ...]:
         own, partner = (Pose.from_xyzrpy(*arm.base.position, *arm.base.rpy) for arm in cell.config.arms)
@@ -123,87 +133,73 @@ def test_partners_are_drawn_where_they_stand_live_and_only_while_they_run(
         assert arm is not None
         return (own.inverse() @ partner @ forward(arm, cell.arms["right"].status().positions)).position
 
-    show(page, "/arm")
-    expect(page.get_by_role("link", name="Cell")).to_be_visible()
-    until(lambda: drawn(page), "the partner is drawn")
-    assert drawn(page)["right"] == pytest.approx(expected(), abs=2e-3)
+    show(drawing, "/arm")
+    expect(drawing.get_by_role("link", name="Cell")).to_be_visible()
+    until(lambda: drawn(drawing), "the partner is drawn")
+    assert drawn(drawing)["right"] == pytest.approx(expected(), abs=2e-3)
     before = expected()
     cell.arms["right"].move_joints([0.5, *ABB_HOME[1:]])
     assert np.abs(np.subtract(expected(), before)).max() > 0.1
-    until(lambda: drawn(page)["right"] == pytest.approx(expected(), abs=2e-3), "the partner is drawn anew")
+    until(lambda: drawn(drawing)["right"] == pytest.approx(expected(), abs=2e-3), "the partner is drawn anew")
     running.platform.rtcp("--name", "right", "stop")
-    until(lambda: not drawn(page), "the partner is gone")
-    assert page.evaluate("rtcp.state.partners.right.state") == "off"
-    running.platform.rtcp("--name", "right", "start", "--detach", "--cell", file_of(running))
-    until(lambda: "right" in drawn(page), "the partner is back")
-
-
-# -- STOP -------------------------------------------------------------------------------------------------------------
-
-
-def test_stop_ends_what_anybody_moves_at_any_arm(page: Page, running: RunningCell, cell: Cell) -> None:
-    show(page, "/health")
-    feeds = {name: Feed(running.of(name)) for name in cell.arms}
-    for name in cell.arms:
-        running.platform.background("--name", name, "move", "1.2", "0", "0", "0", "0.5", "0", "--speed", "0.15")
-    for feed in feeds.values():
-        until(partial(moves, feed), "motion")
-    now = time.monotonic_ns()
-    page.get_by_role("button", name="STOP not the emergency stop").click()
-    assert max(stood_after(feed, now) for feed in feeds.values()) < JOG_S + SLACK_S
-    assert states(cell) == {"left": State.HOLDING, "right": State.HOLDING}
-
-
-@pytest.mark.parametrize("hanging", ["left", "right"])
-def test_stop_reaches_an_arm_while_the_platform_of_another_hangs(
-    page: Page, running: RunningCell, cell: Cell, hanging: str
-) -> None:
-    show(page, "/health")
-    moving = "right" if hanging == "left" else "left"
-    feed = Feed(running.of(moving))
-    gateway = read_processes(running.of(hanging)).gateway
-    os.kill(gateway, signal.SIGSTOP)
-    try:
-        for target in ("1.2", "0"):  # the first STOP still waits for the arm that hangs when the second comes
-            running.platform.background("--name", moving, "move", target, "0", "0", "0", "0.5", "0", "--speed", "0.15")
-            until(lambda: speed(feed) > 0.05, "motion")
-            time.sleep(1.5)
-            now = time.monotonic_ns()
-            page.get_by_role("button", name="STOP not the emergency stop").click()
-            assert stood_after(feed, now) < JOG_S + SLACK_S
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(gateway, signal.SIGCONT)
-
-
-def test_an_arm_that_does_not_run_is_named_and_keeps_nothing_from_the_others(
-    page: Page, running: RunningCell, cell: Cell
-) -> None:
-    show(page, "/cell")
+    until(lambda: not drawn(drawing), "the partner is gone")
+    assert drawing.evaluate("rtcp.state.partners.right.state") == "off"
+    drawing.get_by_role("link", name="Cell").click()
     cell.arms["left"].disable()
-    running.platform.rtcp("--name", "right", "stop")
-    expect(page.locator("[data-arm=right] [data-live$=state]")).to_have_text("off")
-    answer = page.request.post("/stop", headers={"Origin": page.url.rpartition("/")[0]})
+    expect(drawing.locator("[data-arm=right] [data-live$=state]")).to_have_text("off")
+    answer = drawing.request.post("/stop", headers={"Origin": drawing.url.rpartition("/")[0]})
     assert answer.status == 503
     assert answer.text().startswith("right: no platform is running")
-    page.get_by_role("button", name="Enable all").click()
-    expect(page.get_by_text(re.compile("^right: .*rtcp --name right start"))).to_be_visible()
+    drawing.get_by_role("button", name="Enable all").click()
+    expect(drawing.get_by_text(re.compile("^right: .*rtcp --name right start"))).to_be_visible()
     with Robot("the tests", control_socket(running.of("left"))) as left:
         until(lambda: left.state is State.READY, "left is without torque again")
+    running.platform.rtcp("--name", "right", "start", "--detach", "--cell", file_of(running))
+    until(lambda: "right" in drawn(drawing), "the partner is back")
 
 
 def test_the_page_start_starts_the_arm_in_its_cell_again(page: Page, running: RunningCell, cell: Cell) -> None:
     show(page, "/")
     page.get_by_role("button", name="Stop the platform").click()
     state = page.locator("header [data-live=state]")
-    expect(state).to_have_text("off", timeout=30_000)
+    expect(state).to_have_text("off")
     page.get_by_role("button", name="Start", exact=True).click()
-    expect(state).to_have_text("ready", timeout=30_000)
+    expect(state).to_have_text("ready")
     expect(page.get_by_role("link", name="Cell")).to_be_visible()
     assert read_session(running.of("left")).partners == ("right",)
 
 
-# -- the page Cell ----------------------------------------------------------------------------------------------------
+def test_stop_ends_what_anybody_moves_at_any_arm_also_while_the_platform_of_another_hangs(
+    page: Page, running: RunningCell, cell: Cell
+) -> None:
+    show(page, "/health")
+    stop = page.get_by_role("button", name="STOP not the emergency stop")
+
+    def move(name: str, target: str) -> None:
+        running.platform.background("--name", name, "move", target, "0", "0", "0", "0.5", "0", "--speed", "0.15")
+
+    for name in cell.arms:
+        move(name, "1.2")
+    with contextlib.ExitStack() as feeds:
+        opened = {name: feeds.enter_context(contextlib.closing(Feed(running.of(name)))) for name in cell.arms}
+        for feed in opened.values():
+            until(partial(moves, feed), "motion")
+        stop.click()
+        stopped(cell, running)
+        running.platform.end_commands()
+        for hanging, moving in (("left", "right"), ("right", "left")):
+            gateway = read_processes(running.of(hanging)).gateway
+            os.kill(gateway, signal.SIGSTOP)
+            try:
+                for target in ("1.2", "-1"):  # the first STOP still waits for the arm that hangs when the second comes
+                    move(moving, target)
+                    until(partial(moves, opened[moving]), "motion")
+                    stop.click()
+                    until(partial(stands, opened[moving]), "standstill")
+                    running.platform.end_commands()
+            finally:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(gateway, signal.SIGCONT)
 
 
 def test_all_arms_are_enabled_moved_in_step_and_disabled(page: Page, running: RunningCell, cell: Cell) -> None:
@@ -247,34 +243,21 @@ def test_all_arms_are_enabled_moved_in_step_and_disabled(page: Page, running: Ru
     until(lambda: states(cell) == dict.fromkeys(cell.arms, State.READY), "no arm has torque")
 
 
-@pytest.mark.parametrize("how", ["overloaded", "closed", "stop", "disable"])
-def test_a_motion_in_step_ends_with_its_page(
-    browser: Browser, panel: str, running: RunningCell, cell: Cell, how: str
-) -> None:
-    with visitor(browser, panel) as page:
-        feeds = begin(page, running)
-        now = time.monotonic_ns()
-        end: dict[str, Callable[[], object]] = {
-            "overloaded": lambda: page.evaluate(
-                "setTimeout(() => { const end = Date.now() + 3000; while (Date.now() < end) ; }, 0)"
-            ),
-            "closed": page.close,
-            "stop": page.get_by_role("button", name="STOP not the emergency stop").click,
-            "disable": page.get_by_role("button", name="Disable all").click,
-        }
-        end[how]()
-        longest = (PRESENCE_S if how == "overloaded" else JOG_S) + SLACK_S
-        assert max(stood_after(feed, now) for feed in feeds.values()) < longest
-    state = State.READY if how == "disable" else State.HOLDING
-    assert states(cell) == dict.fromkeys(cell.arms, state)
-
-
-def test_another_page_commands_nothing_while_one_operates(
+def test_a_motion_in_step_ends_with_its_page_by_stop_and_by_disabling_and_no_other_page_begins_one(
     browser: Browser, panel: str, running: RunningCell, cell: Cell
 ) -> None:
-    with visitor(browser, panel) as page, visitor(browser, panel) as second:
-        show(page, "/cell").get_by_role("button", name="Disable all").click()
-        until(lambda: states(cell) == dict.fromkeys(cell.arms, State.READY), "no arm has torque")
-        show(second, "/cell").get_by_role("button", name="Enable all").click()
-        expect(second.get_by_role("button", name="Ask to take over")).to_be_visible()
-        assert states(cell) == dict.fromkeys(cell.arms, State.READY)
+    with visitor(browser, panel) as second:
+        with visitor(browser, panel) as page:
+            begin(page, running)
+            page.get_by_role("button", name="Disable all").click()
+            stopped(cell, running, State.READY)
+            show(second, "/cell").get_by_role("button", name="Enable all").click()
+            expect(second.get_by_role("button", name="Ask to take over")).to_be_visible()
+            assert states(cell) == dict.fromkeys(cell.arms, State.READY)
+            page.get_by_role("button", name="Enable all").click()
+            until(lambda: states(cell) == dict.fromkeys(cell.arms, State.HOLDING), "all arms hold")
+            begin(page, running)
+            second.get_by_role("button", name="STOP not the emergency stop").click()
+            stopped(cell, running)
+            begin(page, running)
+        stopped(cell, running)

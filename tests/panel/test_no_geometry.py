@@ -1,33 +1,35 @@
-"""Arms without `kinematics`, of 4 and of 7 joints: the panel says so, and offers what such an arm supports."""
+"""An arm of 7 joints without `kinematics`: the panel says so, and offers what such an arm supports."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, expect
 from ruamel.yaml import YAML
 
 from tests.e2e.conftest import Platform
-from tests.panel.conftest import begun, show, until, visitor
+from tests.leftovers import Leftovers
+from tests.panel.conftest import PERIOD_US, begun, show, visitor
+from tests.waiting import until
 
 pytestmark = [pytest.mark.platform, pytest.mark.browser]
 
 
-@pytest.fixture(scope="module", params=[4, 7])
-def platform(request: pytest.FixtureRequest) -> Iterator[Platform]:
-    """An enabled platform with the given number of joints."""
+@pytest.fixture(scope="module")
+def platform(leftovers: Leftovers) -> Iterator[Platform]:
+    """An enabled platform with seven joints."""
     started = Platform()
+    leftovers.shared.add(str(started.directory))
     try:
-        started.be_patient(lost_ms=2000)
-        without_geometry(started, request.param)
+        started.be_patient(lost_ms=2000, period_us=PERIOD_US)
+        without_geometry(started, 7)
         started.rtcp("start", "--detach")
         started.call("enable")
         yield started
     finally:
-        started.rtcp("stop", check=None)
-        shutil.rmtree(started.directory, ignore_errors=True)
+        started.end()
+        leftovers.shared.discard(str(started.directory))
 
 
 def without_geometry(platform: Platform, joints: int) -> None:
@@ -47,36 +49,26 @@ def without_geometry(platform: Platform, joints: int) -> None:
             yaml.dump(data, written)
 
 
-@pytest.fixture
-def page(browser: Browser, platform: Platform) -> Iterator[Page]:
-    with begun(platform) as (_, url), visitor(browser, url) as opened:
-        yield opened
-
-
-def test_pages_say_that_there_is_no_geometry_and_offer_joints_alone(page: Page, platform: Platform) -> None:
-    joints = len(platform.status()["joint_names"])
-    for path in ("/arm", "/targets", "/jog"):
-        show(page, path)
-        expect(page.locator("#space")).to_contain_text("The arm has no geometry (the key kinematics is missing)")
-        expect(page.get_by_text("No platform runs")).to_have_count(0)
-        expect(page.locator("[data-live^='tool.'], [data-live^='singular.']")).to_have_count(0)
-    expect(page.get_by_label("Frame").locator("option")).to_have_text(["Joints"])
-    expect(page.get_by_role("button", name="Up, +Z")).to_have_count(0)
-    expect(page.get_by_label("Speed, m/s")).to_be_hidden()
-    page.get_by_role("button", name=f"joint{joints} +").hover()
-    page.mouse.down()
-    until(lambda: abs(platform.status()["joints"]["actual_position"][-1]) > 0.01, "the jog")
-    page.mouse.up()
-    platform.until(lambda status: status["state"] == "holding", "rest")
-
-
-def test_targets_of_the_joints_are_planned_and_sent(page: Page, platform: Platform) -> None:
-    joints = len(platform.status()["joint_names"])
-    show(page, "/targets")
-    expect(page.get_by_label("Target", exact=True).locator("option")).to_have_text(["Joint positions"])
-    expect(page.get_by_role("button", name="Solutions")).to_have_count(0)
-    page.get_by_label(f"joint{joints}, rad", exact=True).fill("0.2")
-    page.get_by_role("button", name="Plan", exact=True).click()
-    page.get_by_role("button", name="Send").click()
-    expect(page.get_by_text("There; largest error")).to_be_visible()
-    assert platform.status()["joints"]["actual_position"][-1] == pytest.approx(0.2, abs=1e-3)
+def test_pages_say_that_there_is_no_geometry_and_offer_joints_alone(browser: Browser, platform: Platform) -> None:
+    with begun(platform) as (_, url), visitor(browser, url) as page:
+        for path in ("/arm", "/jog"):
+            show(page, path)
+            expect(page.locator("#space")).to_contain_text("The arm has no geometry (the key kinematics is missing)")
+            expect(page.get_by_text("No platform runs")).to_have_count(0)
+            expect(page.locator("[data-live^='tool.'], [data-live^='singular.']")).to_have_count(0)
+        expect(page.get_by_label("Frame").locator("option")).to_have_text(["Joints"])
+        expect(page.get_by_role("button", name="Up, +Z")).to_have_count(0)
+        expect(page.get_by_label("Speed, m/s")).to_be_hidden()
+        page.get_by_role("button", name="joint7 +").hover()
+        page.mouse.down()
+        until(lambda: abs(platform.status()["joints"]["actual_position"][-1]) > 1e-3, "the jog")
+        page.mouse.up()
+        platform.until(lambda status: status["state"] == "holding", "rest")
+        show(page, "/targets")
+        expect(page.get_by_label("Target", exact=True).locator("option")).to_have_text(["Joint positions"])
+        expect(page.get_by_role("button", name="Solutions")).to_have_count(0)
+        page.get_by_label("joint7, rad", exact=True).fill("0.2")
+        page.get_by_role("button", name="Plan", exact=True).click()
+        page.get_by_role("button", name="Send").click()
+        expect(page.get_by_text("There; largest error")).to_be_visible()
+        assert platform.status()["joints"]["actual_position"][-1] == pytest.approx(0.2, abs=1e-3)

@@ -10,7 +10,8 @@ from playwright.sync_api import Page, expect
 
 from rtcp.config.motion_file import read_motion
 from tests.e2e.conftest import Platform
-from tests.panel.conftest import BENT, barriers, show, until
+from tests.panel.conftest import BENT, barriers, show
+from tests.waiting import until
 
 pytestmark = [pytest.mark.platform, pytest.mark.browser]
 
@@ -35,13 +36,13 @@ def opened(page: Page, platform: Platform, name: str) -> None:
 
 def expect_notice(page: Page, text: str) -> None:
     """Wait until the page has the text, possibly after a motion."""
-    expect(page.get_by_text(text, exact=True)).to_be_visible(timeout=40_000)
+    expect(page.get_by_text(text, exact=True)).to_be_visible()
 
 
 def kind(page: Page, name: str, its_field: str) -> None:
     """Choose the kind of the new step; its fields follow."""
     page.get_by_label("Kind").select_option(name)
-    expect(page.get_by_label(its_field)).to_be_visible(timeout=20_000)
+    expect(page.get_by_label(its_field)).to_be_visible()
 
 
 def keep(page: Page, name: str, kind: str = "q") -> None:
@@ -51,7 +52,7 @@ def keep(page: Page, name: str, kind: str = "q") -> None:
     expect(page.get_by_role("row", name=re.compile(f"^{name} "))).to_be_visible()
 
 
-def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_command_line(
+def test_a_program_taught_by_clicks_is_checked_stepped_paused_run_stepped_back_and_stopped(
     page: Page, holding: Platform
 ) -> None:
     there = [0.5, *BENT[1:]]
@@ -66,7 +67,7 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     kind(page, "wait_s", "Time, s")
     page.get_by_label("Time, s").fill("0.2")
     click(page, "Add the step")
-    expect(page.get_by_role("row", name=re.compile("wait 0.2 s"))).to_be_visible(timeout=20_000)
+    expect(page.get_by_role("row", name=re.compile("wait 0.2 s"))).to_be_visible()
     page.get_by_label("Pose", exact=True).select_option("there")
     page.get_by_label(re.compile("^Speed .*, rad/s$")).fill("0.2")
     page.get_by_label("Where").select_option("before step 2")
@@ -89,7 +90,7 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     ]
 
     click(page, "Check")
-    expect(page.get_by_text(re.compile(r"^It can be run: 2 motions"))).to_be_visible(timeout=40_000)
+    expect(page.get_by_text(re.compile(r"^It can be run: 2 motions"))).to_be_visible()
     for number in (1, 2):
         click(page, "Step")
         expect_notice(page, f"Step {number} is done")
@@ -103,40 +104,25 @@ def test_a_program_taught_by_clicks_runs_steps_and_pauses_and_runs_from_the_comm
     assert holding.status()["speed_override"] == 0.0
     # Another tab keeps the run.
     page.get_by_role("link", name="Jog", exact=True).click()
-    expect(page.get_by_label("Movement")).to_be_visible(timeout=20_000)
+    expect(page.get_by_label("Movement")).to_be_visible()
     page.get_by_role("link", name="Program", exact=True).click()
-    expect(page.get_by_label("Movement")).to_have_count(0, timeout=20_000)
+    expect(page.get_by_label("Movement")).to_have_count(0)
     click(page, "Go on")
     expect_notice(page, "Step 3 is done")
     assert holding.status()["joints"]["actual_position"] == pytest.approx(there, abs=2e-3)
+    click(page, "Step back")
+    expect_notice(page, "Step 3 is next")
+    assert holding.status()["joints"]["actual_position"] == pytest.approx(BENT, abs=2e-3)
     click(page, "Run from step 1")
     expect_notice(page, "Done")
-    click(page, "Run from step 3")
-    expect_notice(page, "Done")
-    holding.call("move_joints", q=BENT)
-    holding.rtcp("run", str(file_of(holding, "clicks")))
     assert holding.status()["joints"]["actual_position"] == pytest.approx(there, abs=2e-3)
-
-
-def test_a_step_back_returns_and_a_stop_ends_the_program(page: Page, holding: Platform) -> None:
-    opened(page, holding, "stepped")
-    keep(page, "here")
-    holding.call("move_joints", q=[0.4, *BENT[1:]])
-    keep(page, "there", "pose")
-    page.get_by_label("Pose", exact=True).select_option("here")
-    click(page, "Add the step")
-    expect(page.get_by_role("row", name=re.compile("move to here"))).to_be_visible(timeout=20_000)
+    keep(page, "pose", "pose")
     kind(page, "line", "Speed (empty: the program's), m/s")
+    page.get_by_label("Pose", exact=True).select_option("pose")
+    page.get_by_label("Where").select_option("")
     click(page, "Add the step")
-    expect(page.get_by_role("row", name=re.compile("line to there"))).to_be_visible(timeout=20_000)
-    click(page, "Step")
-    expect_notice(page, "Step 1 is done")
-    click(page, "Step")
-    expect_notice(page, "Step 2 is done")
-    click(page, "Step back")
-    expect_notice(page, "Step 2 is next")
-    assert holding.status()["joints"]["actual_position"] == pytest.approx(BENT, abs=2e-3)
-    click(page, "Step")
+    expect(page.get_by_role("row", name=re.compile("line to pose"))).to_be_visible()
+    click(page, "Run from step 1")
     holding.until_moving()
     page.get_by_role("button", name="STOP").click()
     expect_notice(page, "It has ended early")

@@ -1,8 +1,8 @@
-"""One command from a client on rospy: `client.py KIND JSON` prints the result as JSON.
+"""A client on rospy that carries out commands: lines of JSON, [kind, arguments], each answered by a line.
 
 `path` and `point` publish once, `stream` publishes points of a sine at `rate_hz` on `topic`; `service`, `stop_motion`,
-`robot_enable`, `robot_disable` call; `follow` sends a goal of the action, and with `cancel_s` cancels it after so many
-seconds.
+`robot_enable`, `robot_disable` call; `follow` sends a goal of the action, and with `cancels` cancels it once the arm
+has moved.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from industrial_msgs.srv import CmdJointTrajectory, StopMotion  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
+_publishers: dict[str, Any] = {}
+
 
 def point_of(given: dict[str, Any]) -> Any:
     return JointTrajectoryPoint(positions=given["q"], time_from_start=rospy.Duration(given["t"]))
@@ -34,22 +36,20 @@ def trajectory_of(given: dict[str, Any]) -> Any:
     return JointTrajectory(joint_names=given["names"], points=points * given.get("times", 1))
 
 
-def publish(topic: str, message: Any) -> None:
-    publisher = rospy.Publisher(topic, type(message), queue_size=1)
-    while publisher.get_num_connections() == 0:
+def publisher(topic: str, kind: Any) -> Any:
+    """Return a publisher that the node has connected to."""
+    if topic not in _publishers:
+        _publishers[topic] = rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
+    while _publishers[topic].get_num_connections() == 0:
         time.sleep(0.05)
-    publisher.publish(message)
-    time.sleep(0.5)  # rospy sends from a thread
+    return _publishers[topic]
 
 
 def stream(given: dict[str, Any]) -> dict[str, Any]:
     """Publish `count` points of (1 - cos) with its velocity; only the first joint moves."""
     topic, rate_hz = given["topic"], given["rate_hz"]
     is_point = topic != "joint_trajectory"
-    kind = JointTrajectoryPoint if is_point else JointTrajectory
-    publisher = rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
-    while publisher.get_num_connections() == 0:
-        time.sleep(0.05)
+    sends = publisher(topic, JointTrajectoryPoint if is_point else JointTrajectory)
     w = 2 * math.pi / given["period_s"]
     rest, begin = [0.0] * 5, time.monotonic()
     for number in range(1, given["count"] + 1):
@@ -64,8 +64,7 @@ def stream(given: dict[str, Any]) -> dict[str, Any]:
             point.time_from_start = rospy.Duration(1 / rate_hz)  # as MoveIt Servo has it
             message = JointTrajectory(joint_names=given["names"], points=[point])
             message.header.stamp = rospy.Time.now()
-        publisher.publish(message)
-    time.sleep(0.5)
+        sends.publish(message)
     return {"last": list(point.positions)}
 
 
@@ -86,36 +85,44 @@ def follow(given: dict[str, Any]) -> dict[str, Any]:
     goal = FollowJointTrajectoryGoal(trajectory=trajectory_of(given))
     goal.path_tolerance = [JointTolerance(**tolerance) for tolerance in given.get("path_tolerance", ())]
     goal.goal_tolerance = [JointTolerance(**tolerance) for tolerance in given.get("goal_tolerance", ())]
-    client.send_goal(goal)
-    if "cancel_s" in given:
-        while client.get_state() == actionlib.GoalStatus.PENDING:
+    moved: list[Any] = []
+
+    def on_feedback(feedback: Any) -> None:
+        if abs(feedback.actual.positions[0]) > 0.01:
+            moved.append(feedback)
+
+    client.send_goal(goal, feedback_cb=on_feedback)
+    if given.get("cancels"):
+        while not moved:
             time.sleep(0.02)
-        time.sleep(given["cancel_s"])
         client.cancel_goal()
     client.wait_for_result()
     result = client.get_result()
     return {"state": client.get_state(), "code": result.error_code, "text": result.error_string}
 
 
-def main() -> None:
-    kind, given = sys.argv[1], json.loads(sys.argv[2])
-    rospy.init_node("client", anonymous=True)
-    answer: dict[str, Any] = {}
+def carry_out(kind: str, given: dict[str, Any]) -> dict[str, Any]:
     if kind == "path":
-        publish(given.get("topic", "joint_path_command"), trajectory_of(given))
+        publisher(given.get("topic", "joint_path_command"), JointTrajectory).publish(trajectory_of(given))
     elif kind == "point":
-        publish("joint_command", point_of(given))
+        publisher("joint_command", JointTrajectoryPoint).publish(point_of(given))
     elif kind == "stream":
-        answer = stream(given)
+        return stream(given)
     elif kind == "service":
-        answer = call("joint_path_command", CmdJointTrajectory, trajectory_of(given))
+        return call("joint_path_command", CmdJointTrajectory, trajectory_of(given))
     elif kind == "stop_motion":
-        answer = call(kind, StopMotion)
+        return call(kind, StopMotion)
     elif kind == "follow":
-        answer = follow(given)
+        return follow(given)
     else:
-        answer = call(kind, Trigger)
-    print("answer", json.dumps(answer))
+        return call(kind, Trigger)
+    return {}
+
+
+def main() -> None:
+    rospy.init_node("client", anonymous=True)
+    for line in sys.stdin:
+        print("answer", json.dumps(carry_out(*json.loads(line))), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""ROS 1 of Debian in a network namespace of its own: a roscore, which every ROS process of these tests shares.
+"""ROS 1 of Debian in a network namespace of its own: one roscore, which every ROS process of these tests shares.
 
 No test here sees another ROS on this host, nor is seen by it. Without Debian's packages they are skipped with one
 sentence; `make test-ros` installs them.
@@ -6,15 +6,16 @@ sentence; `make test-ros` installs them.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import select
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +23,10 @@ import pytest
 
 from rtcp.ros import ros1_messages
 from tests.e2e.conftest import Platform
+from tests.leftovers import Leftovers
+from tests.waiting import HANG_S, until
 
 CLIENT = Path(__file__).parent / "client.py"
-PATIENCE_S = 120.0
-"""Time limit, s, that only keeps a broken node from hanging the tests."""
-
-
-def until(met: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
-    """Wait until `met` returns a true value; return it."""
-    end = time.monotonic() + patience_s
-    while not (answer := met()):
-        assert time.monotonic() < end, f"{what} did not come within {patience_s:g} s"
-        time.sleep(0.05)
-    return answer
 
 
 class Ros:
@@ -57,6 +49,7 @@ class Ros:
             pytest.skip(f"no network namespace can be made here: {self._holder.stderr.read().strip()}")
         self.environment = {
             **os.environ,
+            "RTCP_RUNTIME_DIR": str(self.directory),
             "ROS_MASTER_URI": "http://127.0.0.1:11311",
             "ROS_IP": "127.0.0.1",
             "ROS_HOME": str(self.directory),
@@ -64,6 +57,7 @@ class Ros:
             "ROS_PACKAGE_PATH": "",
         }
         self._begun: list[subprocess.Popen[str]] = []
+        self._numbers = itertools.count()
         self.core: subprocess.Popen[str] | None = None
 
     def enter(self, *command: str | Path) -> list[str]:
@@ -73,7 +67,7 @@ class Ros:
 
     def background(self, *command: str | Path, **environment: str) -> subprocess.Popen[str]:
         """Start a command in the namespace; `end` ends it."""
-        log = (self.directory / f"{len(self._begun)}.log").open("w")
+        log = (self.directory / f"{next(self._numbers)}.log").open("w")
         begun = subprocess.Popen(
             self.enter(*command), env=self.environment | environment, stdout=log, stderr=subprocess.STDOUT, text=True
         )
@@ -92,13 +86,6 @@ class Ros:
     def logs(self) -> str:
         """Return what the commands in the background have written."""
         return "".join(path.read_text() for path in sorted(self.directory.glob("*.log")))
-
-    def begin_client(self, kind: str, **given: Any) -> subprocess.Popen[str]:
-        """Start a client on rospy (`client.py`), whose output is a pipe."""
-        return subprocess.Popen(
-            self.enter(sys.executable, CLIENT, kind, json.dumps(given)),
-            env=self.environment, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
 
     def start_core(self) -> None:
         """Start a roscore and wait until it answers."""
@@ -121,7 +108,7 @@ class Ros:
         if begun.poll() is None:
             begun.send_signal(number)
             try:
-                begun.wait(30)
+                begun.wait(HANG_S)
             except subprocess.TimeoutExpired:
                 begun.kill()
                 begun.wait()
@@ -143,12 +130,44 @@ def begin_node(ros: Ros, platform: Platform, *arguments: str) -> subprocess.Pope
     return ros.background(sys.executable, "-m", "rtcp.cli", "ros", *arguments, **environment)
 
 
-def command(ros: Ros, kind: str, **given: Any) -> dict[str, Any]:
-    """Run a command of a client on rospy; return its result."""
-    said = ros.run(sys.executable, CLIENT, kind, json.dumps(given)).stdout
-    (line,) = (line for line in said.splitlines() if line.startswith("answer "))
-    answer: dict[str, Any] = json.loads(line.removeprefix("answer "))
-    return answer
+class Client:
+    """A client on rospy (`client.py`), which carries out one command after another."""
+
+    def __init__(self, ros: Ros) -> None:
+        self._process = subprocess.Popen(
+            ros.enter(sys.executable, CLIENT),
+            env=ros.environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def begin(self, kind: str, **given: Any) -> None:
+        """Begin a command."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps([kind, given]) + "\n")
+        self._process.stdin.flush()
+
+    def result(self) -> dict[str, Any]:
+        """Wait for the end of the command; return its result."""
+        assert self._process.stdout is not None
+        line = next((line for line in self._process.stdout if line.startswith("answer ")), "answer null")
+        answer: dict[str, Any] = json.loads(line.removeprefix("answer "))
+        return answer
+
+    def command(self, kind: str, **given: Any) -> dict[str, Any]:
+        """Carry out a command; return its result."""
+        self.begin(kind, **given)
+        return self.result()
+
+    def has_answered(self) -> bool:
+        """Whether a result waits."""
+        return bool(select.select([self._process.stdout], [], [], 0.0)[0])
+
+    def end(self) -> None:
+        """Kill it."""
+        self._process.kill()
+        self._process.communicate()
 
 
 def is_at(arm: Platform, goal: list[float]) -> bool:
@@ -165,22 +184,44 @@ def ros_on_the_path() -> None:
     ros1_messages.make_importable()
 
 
-@pytest.fixture(scope="module")
-def ros(ros_on_the_path: None) -> Iterator[Ros]:
-    """A namespace with a roscore for the tests of a module."""
+@pytest.fixture(scope="session")
+def ros(ros_on_the_path: None, leftovers: Leftovers) -> Iterator[Ros]:
+    """A namespace with a roscore."""
     made = Ros()
+    leftovers.shared.add(str(made.directory))
     try:
         made.start_core()
         yield made
     finally:
         made.end()
+        leftovers.shared.discard(str(made.directory))
 
 
-@pytest.fixture(scope="module")
-def platform() -> Iterator[Platform]:
-    """A started platform on its virtual segment, with the tolerances of a shared host."""
+@pytest.fixture
+def client(ros: Ros) -> Iterator[Client]:
+    """A client."""
+    made = Client(ros)
+    yield made
+    made.end()
+
+
+@pytest.fixture(scope="session")
+def kept(leftovers: Leftovers) -> Iterator[Platform]:
+    """A started platform for the tests of this worker."""
     made = Platform()
+    leftovers.shared.add(str(made.directory))
     made.be_patient(2000)
     made.rtcp("start", "--detach")
     yield made
+    made.thaw()
     made.end()
+    leftovers.shared.discard(str(made.directory))
+
+
+@pytest.fixture(scope="module")
+def platform(kept: Platform) -> Iterator[Platform]:
+    """The started platform of this worker, which takes no time between two modules."""
+    kept.thaw()
+    kept.restore()
+    yield kept
+    kept.freeze()

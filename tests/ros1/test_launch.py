@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.conftest import Platform
+from tests.waiting import HANG_S
 
-from .conftest import PATIENCE_S, Ros
+from .conftest import Ros
 
-pytestmark = pytest.mark.platform
 LAUNCH = Path(__file__).parents[2] / "config/ros"
 
 
+@pytest.mark.platform
 def test_the_launch_file_starts_the_node_and_the_transforms_of_the_whole_arm(ros: Ros, platform: Platform) -> None:
     environment = {name: value for name, value in platform.environment.items() if name.startswith("RTCP_")}
     environment["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
@@ -26,7 +27,7 @@ def test_the_launch_file_starts_the_node_and_the_transforms_of_the_whole_arm(ros
     try:
         # The joints' transforms come only where the joint states of the node reach the publisher of the URDF's links.
         echo = ["/usr/bin/rostopic", "echo", "-n", "1", "--filter", "len(m.transforms) == 6", "/tf"]
-        transforms = ros.run("timeout", str(PATIENCE_S), *echo).stdout
+        transforms = ros.run("timeout", str(HANG_S), *echo).stdout
         description = ros.run("/usr/bin/rosparam", "get", "/robot_description").stdout
     finally:
         ros.stop(launch)

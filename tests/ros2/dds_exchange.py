@@ -12,7 +12,8 @@ from rtcp.ros.ros2_dds import DdsWire
 from rtcp.ros.ros2_node import Commands, Publications
 from rtcp.ros.ros2_types import encode
 from tests.ros.test_commands import FakeArm
-from tests.ros2.node import CONFIG, OPTIONS, SAMPLE, commanded, point, trajectory, until
+from tests.ros2.node import CONFIG, OPTIONS, SAMPLE, commanded, point, trajectory
+from tests.waiting import until
 
 
 class FastDds:

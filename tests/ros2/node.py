@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import socket
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from rtcp.config.find import default_config
@@ -18,17 +17,6 @@ from tests.ros.test_commands import HERE, NAMES, FakeArm
 CONFIG = load(default_config())
 SAMPLE = JointSample(1_700_000_000_250_000_000, (0.1,) * 6, (0.2,) * 6, (0.3,) * 6, (0.15,) * 6)
 OPTIONS = Ros2Options("arm", commands=CommandOptions())
-PATIENCE_S = 120.0
-"""Time limit, s, that only keeps a broken node from hanging the tests."""
-
-
-def until(met: Callable[[], Any], what: str) -> Any:
-    """Wait until `met` returns a true value; return it."""
-    end = time.monotonic() + PATIENCE_S
-    while not (answer := met()):
-        assert time.monotonic() < end, f"{what} did not come within {PATIENCE_S:g} s"
-        time.sleep(0.01)
-    return answer
 
 
 def free_port() -> int:

@@ -17,8 +17,9 @@ from rtcp.ros.ros2_node import ACTION_TOPICS, OUT, Commands, Publications
 from rtcp.ros.ros2_types import CANCEL, FOLLOW, encode, make
 from rtcp.ros.state import ChannelSample, Diagnostics, RobotStatus
 from tests.ros.test_commands import FakeArm
+from tests.waiting import until
 
-from .node import CONFIG, SAMPLE, arrive, trajectory, until
+from .node import CONFIG, SAMPLE, arrive, trajectory
 
 JOINTS = tuple("abcdef")
 

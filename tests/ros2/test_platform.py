@@ -19,39 +19,52 @@ from rtcp.ros.ros2_types import GROUP_VALUES, decode, encode, make, type_hash
 from rtcp.ros.ros2_zenoh import open_session
 from tests.e2e.conftest import Platform
 from tests.e2e.test_standard_drives import add_valves
+from tests.leftovers import Leftovers
+from tests.waiting import until
 
-from .node import free_port, outputs, point, until
+from .node import free_port, outputs, point
 from .zenoh_client import GID, JOINT_STATES, Router, call
 
-pytestmark = pytest.mark.platform
 THERE = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1]
+LONG = pytest.mark.long("test_the_latency_of_each_wire_is_measured_in_the_frames[simple-message]")
 
 
-@pytest.fixture
-def prepared() -> Iterator[Platform]:
-    """A platform with the tolerances of a shared host, not yet started."""
+@pytest.fixture(scope="module")
+def platform(leftovers: Leftovers) -> Iterator[Platform]:
+    """A started platform whose last slave is a terminal with valves."""
     made = Platform()
+    leftovers.shared.add(str(made.directory))
     made.be_patient(2000)
+    add_valves(made.directory / "config")
+    made.rtcp("start", "--detach")
     yield made
     made.end()
+    leftovers.shared.discard(str(made.directory))
 
 
-@pytest.fixture
-def platform(prepared: Platform) -> Platform:
-    """A started platform."""
-    prepared.rtcp("start", "--detach")
-    return prepared
-
-
-def test_the_arm_is_enabled_moved_and_seen_over_zenoh(platform: Platform) -> None:
+@pytest.fixture(scope="module")
+def node(platform: Platform) -> Iterator[tuple[subprocess.Popen[str], Router]]:
+    """The node over Zenoh, and its router."""
     router = Router()
-    node = platform.background("ros", "--zenoh", "--router", router.address, "--name", "arm")
+    made = platform.background("ros", "--zenoh", "--router", router.address, "--name", "arm")
+    yield made, router
+    made.send_signal(signal.SIGINT)
+    _, log = made.communicate()
+    assert made.returncode == 0, log
+    router.close()
+
+
+@pytest.mark.platform
+def test_the_arm_is_enabled_moved_and_seen_over_zenoh(
+    platform: Platform, node: tuple[subprocess.Popen[str], Router]
+) -> None:
+    router = node[1]
     received: list[Any] = []
     with open_session(router.address) as session:
         subscriber = session.declare_subscriber(JOINT_STATES, received.append)
         assert call(session, "robot_enable", "std_srvs/srv/Trigger").success
         names = platform.status()["joint_names"]
-        points = [point(0.0, [0.0] * 6), point(2.0, THERE)]
+        points = [point(0.0, [0.0] * 6), point(1.0, THERE)]
         trajectory = make("trajectory_msgs/msg/JointTrajectory", joint_names=names, points=points)
         answer = call(session, "joint_path_command", "industrial_msgs/srv/CmdJointTrajectory", trajectory=trajectory)
         assert answer.code.val == 1
@@ -64,17 +77,13 @@ def test_the_arm_is_enabled_moved_and_seen_over_zenoh(platform: Platform) -> Non
         stamp = decode("sensor_msgs/msg/JointState", received[-1].payload.to_bytes()).header.stamp
         assert 0.0 <= time.time() - stamp.sec - 1e-9 * stamp.nanosec < 3600.0
         subscriber.undeclare()
-    node.send_signal(signal.SIGINT)
-    _, log = node.communicate()
-    assert node.returncode == 0, log
-    router.close()
 
 
-def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_everywhere(prepared: Platform) -> None:
-    platform, router = prepared, Router()
-    add_valves(platform.directory / "config")
-    platform.rtcp("start", "--detach")
-    node = platform.background("ros", "--zenoh", "--router", router.address, "--name", "arm")
+@pytest.mark.platform
+def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_everywhere(
+    platform: Platform, node: tuple[subprocess.Popen[str], Router]
+) -> None:
+    process, router = node
     kind = f"control_msgs::msg::dds_::DynamicInterfaceGroupValues_/{type_hash(GROUP_VALUES)}"
     received: list[Any] = []
 
@@ -101,27 +110,25 @@ def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_every
         until(lambda: latest()["valves"]["current"] == 12.5, "the output")
         assert "12500" in platform.rtcp("segment", "get", "8", "0x7000:1").stdout
         set_current(21.0)
-        assert node.stderr is not None
-        log = iter(node.stderr.readline, "")
+        assert process.stderr is not None
+        log = iter(process.stderr.readline, "")
         refused = next((line for line in log if "cannot be set" in line), "")
         assert "gpio_controller/commands: valves.current: 21 cannot be set: allowed is 4 to 20" in refused
         assert latest()["valves"]["current"] == 12.5
         subscriber.undeclare()
-    node.send_signal(signal.SIGINT)
-    node.communicate()
-    router.close()
 
 
-def test_without_a_router_the_node_waits_and_ends_when_it_is_asked_to(platform: Platform) -> None:
-    node = platform.background("ros", "--zenoh", "--router", f"tcp/127.0.0.1:{free_port()}")
-    assert node.stderr is not None
-    assert "waiting for the router" in until(node.stderr.readline, "a line of the log")
-    node.send_signal(signal.SIGTERM)
-    node.communicate()
+def test_without_a_router_the_node_waits_and_ends_when_it_is_asked_to() -> None:
+    command = [sys.executable, "-m", "rtcp.cli", "ros", "--zenoh", "--router", f"tcp/127.0.0.1:{free_port()}"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as node:
+        assert node.stderr is not None
+        assert "waiting for the router" in until(node.stderr.readline, "a line of the log")
+        node.send_signal(signal.SIGTERM)
     assert node.returncode == 0
 
 
-@pytest.mark.parametrize("wire", ["dds", "zenoh", "simple-message"])
+@pytest.mark.platform
+@pytest.mark.parametrize("wire", ["simple-message", *(pytest.param(wire, marks=LONG) for wire in ("dds", "zenoh"))])
 def test_the_latency_of_each_wire_is_measured_in_the_frames(platform: Platform, wire: str) -> None:
     if wire == "dds":
         pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: pip install 'rtcp[dds]' (x86_64)")

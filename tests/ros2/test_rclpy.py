@@ -17,9 +17,10 @@ from rtcp.ros.ros2_node import IN, OUT, Commands, Publications
 from rtcp.ros.ros2_types import FOLLOW
 from rtcp.ros.state import ChannelSample, Diagnostics, RobotStatus
 from tests.ros.test_commands import HERE, NAMES, FakeArm
+from tests.waiting import until
 
 from . import rclpy_stand_in
-from .node import CONFIG, OPTIONS, SAMPLE, arrive, commanded, outputs, until
+from .node import CONFIG, OPTIONS, SAMPLE, arrive, commanded, outputs
 
 TIMEOUT_S = 100.0
 

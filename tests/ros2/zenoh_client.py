@@ -12,8 +12,9 @@ import zenoh
 from rtcp.ros.ros2_types import FOLLOW, decode, encode, make, type_hash
 from rtcp.ros.ros2_zenoh import open_session
 from tests.ros.test_commands import NAMES
+from tests.waiting import until
 
-from .node import free_port, trajectory, until
+from .node import free_port, trajectory
 
 JOINT_STATES = (
     "0/joint_states/sensor_msgs::msg::dds_::JointState_/"
