@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,18 +10,17 @@ from typing import Any
 import pytest
 
 from tests.fieldbus.terminals import write_segment
+from tests.forked import Forked, answer_of
 
-CHILD = Path(__file__).with_name("master_child.py")
-WATCHER = Path(__file__).with_name("watcher_child.py")
+CHILD = "tests.fieldbus.master_child"
+WATCHER = "tests.fieldbus.watcher_child"
 MODELS = ("diewu-io", *("cubemars-orh70",) * 3, "cubemars-orh60", "cubemars-orh50", "cubemars-orh40")
 
 
 class Segment:
     """A virtual segment in a process of its own, and masters that are started against it."""
 
-    def __init__(
-        self, file: Path, slaves: int | Sequence[str], program: Sequence[str] = ("-m", "rtcp.virtual")
-    ) -> None:  # fmt: skip
+    def __init__(self, file: Path, slaves: int | Sequence[str], program: str = "rtcp.virtual") -> None:
         """Start it with the first `slaves` of the arm, or with these of `terminals`."""
         if isinstance(slaves, int):
             file.write_text("slaves:\n" + "".join(f"  - model: {model}\n" for model in MODELS[:slaves]))
@@ -34,12 +31,8 @@ class Segment:
         # Short: a Unix socket's path has 107 bytes at most.
         self.directory = Path(tempfile.mkdtemp(prefix="rtcp-segment-", dir="/tmp"))
         self.control = self.directory / "segment.sock"
-        self.process = subprocess.Popen(
-            [sys.executable, *program, "--config", str(file), "--control", str(self.control)],
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
+        self.process = Forked(program, "--config", str(file), "--control", str(self.control))
+        line = self.process.line()
         assert line, "the segment did not start"
         self.pid = json.loads(line)["pid"]
 
@@ -49,26 +42,16 @@ class Segment:
         *,
         receive_fraction: float = 0.3,
         promiscuous: bool = False,
-        child: Path = CHILD,
+        child: str = CHILD,
         **arguments: object,
     ) -> dict[str, Any]:
         """Run a scenario of `child`; return its answer, empty where it was killed."""
         question = {"scenario": scenario, "pid": self.pid, "count": self.count, "arguments": arguments,
                     "receive_fraction": receive_fraction, "promiscuous": promiscuous}  # fmt: skip
-        done = subprocess.run(
-            [sys.executable, str(child), json.dumps(question)],
-            stdout=subprocess.PIPE,
-            text=True,
-            check=False,
-            timeout=240,
-        )
-        return json.loads(done.stdout) if done.stdout else {}
+        return answer_of(child, json.dumps(question)) or {}
 
     def end(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+        self.process.end()
         shutil.rmtree(self.directory, ignore_errors=True)
 
 
@@ -80,7 +63,7 @@ StartSegment = Callable[..., Segment]
 def start_segment(tmp_path: Path) -> Iterator[StartSegment]:
     running: list[Segment] = []
 
-    def start(slaves: int | Sequence[str], **program: Sequence[str]) -> Segment:
+    def start(slaves: int | Sequence[str], **program: str) -> Segment:
         running.append(Segment(tmp_path / f"segment{len(running)}.yaml", slaves, **program))
         return running[-1]
 

@@ -13,18 +13,18 @@ import pytest
 from rtcp.virtual.faults.control import SegmentClient
 from tests.fieldbus.conftest import Segment, StartSegment
 
-pytestmark = pytest.mark.platform
-
 OP_MAPPING = ["05", "10004060", "20007a60", "2000ff60", "20007160", "08006060"]
 INIT, NO_SYNC = "01", "00"
 DELAYS = [0, 820, 1660, 2500, 3320, 4160, 5020]
 """Propagation delays of the arm's slaves, ns."""
+LOST = "test_frames_that_get_lost_or_come_late_keep_no_segment_from_being_configured"
+STALLED = "test_a_segment_that_is_off_its_cpu_now_and_then_is_configured_all_the_same"
 PROMISCUOUS = 0x100
 """IFF_PROMISC, netdevice(7)."""
 
 
 def test_seven_slaves_go_from_init_to_op_with_clocks_and_a_mapping_that_reads_back(start_segment: StartSegment) -> None:
-    answer = start_segment(7).master("op", receive_fraction=0.5, period_ns=1_000_000)
+    answer = start_segment(7).master("op", receive_fraction=0.5, period_ns=4_000_000)
     result = answer["result"]
     assert result["safe_op"] == ["SAFE-OP"] * 7
     assert result["states"] == ["OP"] * 7
@@ -34,21 +34,22 @@ def test_seven_slaves_go_from_init_to_op_with_clocks_and_a_mapping_that_reads_ba
     assert result["mapping"] == OP_MAPPING
     assert result["assigned"] == ["01", "0016"]
     assert result["following_window"] == 2000
-    assert result["watchdog"] == 200
-    assert result["sync0_cycle_ns"] == 1_000_000
+    assert result["watchdog"] == 50_000  # units of 0.1 ms
+    assert result["sync0_cycle_ns"] == 4_000_000
     # The reference clock is the first slave's: it drifts by ppm, not by per cent.
-    assert abs(result["dc_passed_ns"] - result["host_passed_ns"]) < 0.1 * result["host_passed_ns"] + 20_000_000
+    least, most = result["host_passed_ns"]
+    assert 0.9 * least < result["dc_passed_ns"] < 1.1 * most
 
 
 def test_close_leaves_the_slaves_in_init_without_sync(segment: Segment) -> None:
-    answer = segment.master("op", receive_fraction=0.5, period_ns=1_000_000)
+    answer = segment.master("op", receive_fraction=0.5, period_ns=4_000_000)
     assert answer["left"] == []
     assert answer["after"] == {"al_status": INIT, "sync": NO_SYNC}
 
 
 @pytest.mark.parametrize(
     ("scenario", "arguments"),
-    [("scan", {}), ("up", {}), ("op", {"period_ns": 1_000_000}), ("refused", {"how": "absent objects"})],
+    [("up", {}), ("op", {"period_ns": 4_000_000}), ("refused", {"how": "absent objects"})],
 )
 def test_no_start_and_no_end_makes_a_slave_report_an_al_error(
     segment: Segment, scenario: str, arguments: dict[str, Any]
@@ -82,7 +83,7 @@ def test_an_error_in_the_cycle_leaves_the_slaves_in_init_too(segment: Segment) -
 
 def test_slaves_left_in_op_with_sync_by_a_killed_master_start_again(segment: Segment) -> None:
     assert segment.master("abandoned") == {}
-    assert segment.master("op", receive_fraction=0.5, period_ns=1_000_000)["result"]["states"] == ["OP"] * 3
+    assert segment.master("op", receive_fraction=0.5, period_ns=4_000_000)["result"]["states"] == ["OP"] * 3
 
 
 def test_a_scan_tells_identity_states_map_clocks_and_delays(start_segment: StartSegment) -> None:
@@ -123,7 +124,7 @@ def test_what_differs_from_the_configuration_is_refused_in_sentences(
     assert answer["after"]["al_status"] == INIT
 
 
-@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 3))])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.long(LOST)) for seed in (1, 3))])
 @pytest.mark.parametrize("fault", [{"fault": "loss", "rate": 0.02}, {"fault": "delay", "rate": 0.02, "ms": 30}])
 def test_frames_that_get_lost_or_come_late_keep_no_segment_from_being_configured(
     start_segment: StartSegment, fault: dict[str, Any], seed: int
@@ -140,7 +141,7 @@ def test_frames_that_get_lost_or_come_late_keep_no_segment_from_being_configured
     assert result["apart_ns"] < 1_000_000
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3, 4))])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long(STALLED)) for seed in (2, 3, 4))])
 def test_a_segment_that_is_off_its_cpu_now_and_then_is_configured_all_the_same(
     start_segment: StartSegment, seed: int
 ) -> None:
@@ -167,7 +168,7 @@ def test_a_segment_that_is_off_its_cpu_now_and_then_is_configured_all_the_same(
 def test_slaves_that_answer_complete_access_wrongly_are_mapped_by_single_subindices(
     start_segment: StartSegment, complete_access: bool
 ) -> None:
-    segment = start_segment(3, program=["-m", "tests.fieldbus.wrong_complete_access"])
+    segment = start_segment(3, program="tests.fieldbus.wrong_complete_access")
     result = segment.master("up", complete_access=complete_access)["result"]
     assert result["expected_wkc"] == 9
     assert result["attempts"] == (2 if complete_access else 1)
@@ -189,9 +190,7 @@ def test_a_map_that_soem_misreads_each_time_is_told(segment: Segment) -> None:
 def test_a_slave_that_is_silent_while_it_is_configured_is_told(segment: Segment) -> None:
     with SegmentClient(segment.control) as client:
         client.fault({"fault": "sdo_late", "slave": 2, "ms": 60000})
-    began_s = time.monotonic()
     (sentence,) = segment.master("refused", how="as it is")["error"]
-    assert time.monotonic() - began_s < 20
     assert sentence.startswith("slave 2 (drive1), ")
     assert sentence.endswith(": no answer in time")
 
@@ -242,20 +241,19 @@ def test_a_drive_that_loses_its_outputs_is_told_by_emergency_and_watchdog(segmen
 
 def test_no_answer_from_before_a_silence_is_taken_for_a_new_one(start_segment: StartSegment) -> None:
     segment = start_segment(7)
-    period = 500_000
+    period = 2_000_000
     result = segment.master("stopped", pid=segment.pid, period_ns=period)["result"]
     rows, stop, go = result["rows"], result["stop"], result["go"]
     taken = [(n, lag) for n, (wkc, lag, _, _) in enumerate(rows) if wkc >= 0]
-    lags = sorted(lag for n, lag in taken if n < stop)
-    usual = lags[len(lags) // 2]
-    # SOEM alone takes answers that are a multiple of 16 cycles old, 8 ms here, with a perfect working counter.
-    assert min(lag for _, lag in taken) > usual - 4_000_000
+    # SOEM alone takes answers that are a multiple of 16 cycles old, with a perfect working counter.
+    assert min(lag for _, lag in taken) > min(lag for n, lag in taken if n < stop) - 8 * period
     assert all(wkc == -1 for wkc, *_ in rows[stop + 1 : go])
     assert any(n > go for n, _ in taken)
     # The counter depends on whether the drives' watchdogs expired; this test does not.
     assert any(wkc > 0 for wkc, *_ in rows[go:])
 
 
+@pytest.mark.timing
 def test_nothing_is_taken_in_while_the_segment_is_silent(start_segment: StartSegment) -> None:
     segment = start_segment(3)
     result = segment.master("stopped", pid=segment.pid, period_ns=500_000)["result"]

@@ -17,8 +17,6 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.launch.capturing import Capture
 from tests.fieldbus.conftest import Segment
 
-pytestmark = pytest.mark.platform
-
 SECTION, INTERFACE, PACKET = 0x0A0D0D0A, 1, 6
 OUTBOUND = 2
 

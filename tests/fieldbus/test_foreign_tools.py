@@ -22,8 +22,6 @@ from rtcp.launch.capturing import Capture
 from tests.fieldbus.conftest import MODELS, StartSegment
 from tests.virtual.conftest import ROOT, described, segment
 
-pytestmark = pytest.mark.platform
-
 TOOLS = Path(os.environ.get("RTCP_FOREIGN_TOOLS", "none"), "bin")
 KICKCAT = Path(__file__).with_name("kickcat_child.py")
 JOINED = (

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 import pytest
 
 from rtcp.virtual.objects import SdoAbort
+from tests.forked import Forked, answer_of
 
 ROOT = Path(__file__).parents[2]
 VENDOR = Path(__file__).with_name("vendor.xml")
@@ -28,9 +27,7 @@ def master(tmp_path: Path) -> Master:
         config = tmp_path / "segment.yaml"
         config.write_text("slaves:\n" + "".join(f"- {{{entry}}}\n" for entry in entries), encoding="utf-8")
         with segment(config) as pid:
-            command = [sys.executable, "-m", "tests.virtual.any_child", str(pid), "ecat0", *outputs]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT)
-        result: dict[str, Any] = json.loads(done.stdout)
+            result: dict[str, Any] = answer_of("tests.virtual.any_child", str(pid), "ecat0", *outputs)
         return result
 
     return run
@@ -46,13 +43,11 @@ def abort_of(call: Callable[..., object], *arguments: object) -> int:
 @contextmanager
 def segment(config: Path, *options: str) -> Iterator[int]:
     """Run a segment's process."""
-    command = [sys.executable, "-m", "rtcp.virtual", "--config", str(config), *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    process = Forked("rtcp.virtual", "--config", str(config), *options)
     try:
-        yield int(json.loads(process.stdout.readline())["pid"])
+        yield int(json.loads(process.line())["pid"])
     finally:
-        process.kill()
-        process.communicate()
+        process.end()
 
 
 def described(product: int, more: str = "") -> str:
