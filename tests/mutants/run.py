@@ -1,15 +1,14 @@
 """`make mutants`: put small mistakes into a copy of this tree, one at a time, and see whether the tests notice them.
 
-A first run of the tests records which of them execute which statement; `.mutants` keeps the record until a file
-changes. For each mistake the tests of its statement run, the fastest first, until one fails. They run in a fork of a
-process that has loaded the libraries, so that a mistake takes about two seconds more than its tests.
+A first run of the tests records which of them execute which statement; `.mutants` keeps it, and a changed file of
+tests is recorded again. For each mistake the tests of its statement run, the fastest first, until one fails. They run
+in a fork of a process that has loaded the libraries, so that a mistake takes about two seconds more than its tests.
 """
 
 from __future__ import annotations
 
 import argparse
 import difflib
-import hashlib
 import os
 import random
 import resource
@@ -30,7 +29,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from tests.mutants.kinds import Mutant, mutants_of
-from tests.mutants.recording import Recorder, Recording
+from tests.mutants.recording import Recorder, Recording, record_of, statement_at
 
 ROOT = Path(__file__).resolve().parents[2]
 TARGETS = (
@@ -41,10 +40,10 @@ TESTS = "not alone and not slow"
 """Marker expression of the tests, as in `make check`."""
 LONGEST_S = 0.7
 """Longer tests are left out, as in `make check`."""
-FOLDERS = ("cell", "config", "control", "devices", "faults", "fieldbus", "motion", "processes", "realtime", "sessions")
+FOLDERS = ("devices", "realtime", "processes", "fieldbus", "motion", "control", "cell", "sessions", "config", "faults")
 TESTS_S = 40.0
-"""The tests of one mistake take this long at most. The longest ones are left out, and the report says so."""
-TEST_LIMIT_S = 20
+"""The tests of one mistake take this CPU time at most. The longest ones are left out, and the report says so."""
+TEST_LIMIT_S = 30
 """A test that takes longer has noticed the mistake."""
 LEAST_KILLED = 85.0
 MEMORY_BYTES = 8 << 30
@@ -99,13 +98,31 @@ def _files(target: str) -> list[str]:
     return [str(file.relative_to(ROOT)) for file in ([path] if path.is_file() else sorted(path.rglob("*.py")))]
 
 
-def _record(kept: Path) -> int:
-    """Run all tests and record which statements each of them executes. In the child process, in the copy."""
-    recorder = Recorder(file for target in TARGETS for file in _files(target))
+def _record(files: list[str], folder: Path) -> int:
+    """Run these files of tests and record which statements each test executes. In the child process, in the copy."""
+    recorder = Recorder((file for target in TARGETS for file in _files(target)), files, folder)
     arguments = ["-q", "-p", "no:cacheprovider", "-m", TESTS, "--longest", str(LONGEST_S)]
-    pytest.main([*arguments, *(f"tests/{folder}" for folder in FOLDERS)], plugins=[recorder])
-    recorder.save(kept)
-    return 0
+    return int(pytest.main([*arguments, *files], plugins=[recorder]))
+
+
+def _recorded(log: Path) -> Recording:
+    """Return the record, after the files of tests that changed have been recorded again."""
+    folder = ROOT / ".mutants"
+    folder.mkdir(exist_ok=True)
+    recording = Recording(folder)
+    recording.read(file for name in FOLDERS for file in sorted(Path("tests", name).rglob("test_*.py")))
+    if recording.missing:
+        print(f"recording what the tests of {len(recording.missing)} files execute", flush=True)
+        files = [Path(file) for file in recording.missing]
+        for file in recording.missing:
+            record_of(folder, file).unlink(missing_ok=True)
+        if _forked(partial(_record, recording.missing, folder), log, 7200.0) not in (0, 1, 5):
+            sys.exit(log.read_text())
+        recording.missing = []
+        recording.read(files)
+    if recording.failed:
+        print(f"{len(recording.failed)} tests fail without a mistake and are left out: {recording.failed[:5]}")
+    return recording
 
 
 def _change(before: str, after: str) -> tuple[str, str]:
@@ -163,12 +180,6 @@ def _copy(into: Path) -> None:
     (into / ".venv").symlink_to((ROOT / ".venv").resolve())
 
 
-def _digest(folders: Iterable[str]) -> str:
-    """Return a digest of what decides which test executes which line."""
-    files = sorted(file for folder in folders for file in Path(folder).rglob("*.py") if "mutants" not in file.parts)
-    return hashlib.sha256(b"".join(str(file).encode() + file.read_bytes() for file in files)).hexdigest()[:16]
-
-
 def _load() -> None:
     """Load the libraries of the tests, and nothing of this tree."""
     for name in ("hypothesis", "numpy", "pydantic", "ruckig", "scipy.optimize", "typer"):
@@ -184,8 +195,6 @@ def main() -> int:
     count = options.count or (60 if options.file else 150)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    kept = ROOT / ".mutants"
-    kept.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="rtcp-mutants-") as folder:
         copy, log = Path(folder) / "tree", Path(folder) / "log"
         copy.mkdir()
@@ -194,16 +203,7 @@ def main() -> int:
         sys.path[0] = os.environ["PYTHONPATH"] = str(copy)
         sys.path_importer_cache.clear()
         _load()
-        record = kept / f"{_digest(('rtcp', 'kinematics', 'tests'))}.json"
-        if not record.exists():
-            print("recording which tests execute which statement; this takes some minutes", flush=True)
-            if _forked(lambda: _record(record), log, 3600.0) != 0 or not record.exists():
-                sys.exit(log.read_text())
-            for older in set(kept.glob("*.json")) - {record}:
-                older.unlink()
-        recording = Recording(record)
-        if recording.failed:
-            print(f"{len(recording.failed)} tests fail without a mistake and are left out: {recording.failed[:5]}")
+        recording = _recorded(log)
         # Python takes two texts of one length and one second for the same, and would run the compiled form of another.
         os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
         sys.dont_write_bytecode = True
@@ -223,7 +223,7 @@ def _judge(
         begun = time.monotonic()
         correct, wrong = _change(before, after)
         described = f"{mutant.path}:{mutant.line}\n    correct: {correct}\n    mutant:  {wrong}"
-        tests, seconds, every = recording.tests(mutant.path, before, mutant.line, TESTS_S)
+        tests, seconds, every = recording.tests(mutant.path, before, statement_at(before, mutant.line), TESTS_S)
         reason = accepted.get((mutant.path, correct, wrong))
         if reason is not None:
             verdict = "accepted"
@@ -233,7 +233,7 @@ def _judge(
         else:
             path = Path(mutant.path)
             path.write_text(after)
-            status = _forked(partial(_run, tests), log, 60.0 + 5.0 * seconds)
+            status = _forked(partial(_run, tests), log, 120.0 + 10.0 * seconds)
             path.write_text(before)
             verdict = _verdict(status, log.read_text(errors="replace"))
             described += f"\n    tests:   {len(tests)} of {every} that execute the statement"

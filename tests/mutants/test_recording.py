@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from tests.mutants.recording import first_line, marked
+from tests.mutants.recording import marked, statement_at
 
 _SOURCE = '''"""What it is."""
 
@@ -30,20 +30,27 @@ def speed(x: float) -> float:
 
 
 def test_marks_name_the_statements_that_were_executed_and_change_nothing() -> None:
-    tree, lines = marked(_SOURCE)
+    tree, statements = marked(_SOURCE)
     names: dict[str, Any] = {}
     exec(compile(tree, "speed.py", "exec"), names)
     for x, result, executed in ((4.0, 1.0, {10, 11}), (0.5, 2.0, {10, 14, 15}), (0.0, 0.0, {10, 14, 15, 17, 18})):
         hits = names["__hits__"]
         hits[:] = bytes(len(hits))
         assert names["speed"](x) == result
-        assert {line for i, hit in enumerate(hits) if hit for line in lines[i]} == executed
+        texts = [statement.text for i, hit in enumerate(hits) if hit for statement in statements[i]]
+        assert sorted(texts) == sorted(_SOURCE.splitlines()[line - 1].strip() for line in executed)
     assert names["__doc__"] == "What it is."
     assert names["speed"].__doc__ == "Return it."
 
 
 def test_a_line_belongs_to_the_innermost_statement_and_outside_functions_to_the_import() -> None:
-    assert [first_line(_SOURCE, line) for line in (5, 8, 10, 12, 15, 16)] == [None, None, 10, 11, 15, 14]
+    _, statements = marked(_SOURCE)
+    every = {statement for block in statements for statement in block}
+    at = [statement_at(_SOURCE, line) for line in (5, 8, 10, 12, 15, 16)]
+    assert [None if each is None else each.text for each in at] == [
+        *(None, None, "if x > LIMIT:", "return (", "return 1 / x", "try:")
+    ]
+    assert every >= set(at) - {None}
 
 
 def test_each_accepted_mistake_has_a_reason_and_its_lines_are_still_in_the_file() -> None:
