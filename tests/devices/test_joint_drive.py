@@ -123,9 +123,12 @@ def test_the_ramp_ends_at_the_end_of_the_range() -> None:
     for _ in range(200):
         read(drive, end - 0.001)
         drive.advance(TargetState.QUICK_STOPPED)
-        position, _, command = sent(drive)
+        position, speed, command = sent(drive)
         assert position <= end
+        # The controller would go on at a speed, so none leads out of the range.
+        assert speed == 0.0 or position < end
         assert command == STOP
+    assert position == end
 
 
 def test_a_drive_that_does_not_follow_yet_is_enabled_where_the_joint_is_then() -> None:

@@ -100,6 +100,15 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in (path, *sorted(shared)))).hexdigest()
 
 
+class _Record(NamedTuple):
+    """What the tests of one file did."""
+
+    executed: dict[str, dict[str, dict[str, list[str]]]]
+    """Source -> function -> statement -> tests."""
+    seconds: dict[str, float]
+    failed: set[str]
+
+
 class Recorder:
     """Plug-in of pytest: records the statements that each test executes, its CPU time, and whether it passes.
 
@@ -112,7 +121,7 @@ class Recorder:
         self._marks: dict[str, list[list[Statement]]] = {}
         self._began_s = 0.0
         self._file = ""
-        self._start("")
+        self._records: dict[str, _Record] = {}
         marking, load = frozenset(sources), SourceFileLoader.source_to_code
 
         def source_to_code(loader: Any, data: Any, path: Any, **options: Any) -> CodeType:
@@ -125,17 +134,16 @@ class Recorder:
         SourceFileLoader.source_to_code = source_to_code  # type: ignore[assignment]
 
     def _start(self, file: str) -> None:
-        """Write what the tests of the last file did, and begin another."""
+        """Write what the tests of the last file did, and begin or continue another: pytest may order tests anew."""
         if self._file:
-            seconds = {test: seconds for test, seconds in self._seconds.items() if test not in self._failed}
-            failed, digest = sorted(self._failed), _digest(Path(self._file))
+            record = self._records[self._file]
+            seconds = {test: seconds for test, seconds in record.seconds.items() if test not in record.failed}
+            failed, digest = sorted(record.failed), _digest(Path(self._file))
             content = {"digest": digest, "seconds": seconds, "failed": failed, "sources": self._sources}
             path = record_of(self._folder, self._file)
-            path.write_text(json.dumps(content | {"executed": self._executed}))
+            path.write_text(json.dumps(content | {"executed": record.executed}))
         self._file = file
-        self._executed: dict[str, dict[str, dict[str, list[str]]]] = {}
-        self._seconds: dict[str, float] = {}
-        self._failed: set[str] = set()
+        self._records.setdefault(file, _Record({}, {}, set()))
 
     def _take(self) -> set[tuple[str, Statement]]:
         """Return the statements of each source that were executed since the last call."""
@@ -156,12 +164,13 @@ class Recorder:
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         if not report.passed:
-            self._failed.add(report.nodeid)
+            self._records[self._file].failed.add(report.nodeid)
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        self._seconds[nodeid] = process_time() - self._began_s
+        record = self._records[self._file]
+        record.seconds[nodeid] = process_time() - self._began_s
         for name, (function, text) in self._take():
-            self._executed.setdefault(name, {}).setdefault(function, {}).setdefault(text, []).append(nodeid)
+            record.executed.setdefault(name, {}).setdefault(function, {}).setdefault(text, []).append(nodeid)
 
     def pytest_sessionfinish(self) -> None:
         for file in ("", *(file for file in self._files if not record_of(self._folder, file).exists()), ""):

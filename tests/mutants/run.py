@@ -43,6 +43,7 @@ LONGEST_S = 0.7
 FOLDERS = ("devices", "realtime", "processes", "fieldbus", "motion", "control", "cell", "sessions", "config", "faults")
 TESTS_S = 40.0
 """The tests of one mistake take this CPU time at most. The longest ones are left out, and the report says so."""
+_PLAIN = ("-q", "-p", "no:cacheprovider", "-p", "no:randomly")
 TEST_LIMIT_S = 30
 """A test that takes longer has noticed the mistake."""
 LEAST_KILLED = 85.0
@@ -101,7 +102,7 @@ def _files(target: str) -> list[str]:
 def _record(files: list[str], folder: Path) -> int:
     """Run these files of tests and record which statements each test executes. In the child process, in the copy."""
     recorder = Recorder((file for target in TARGETS for file in _files(target)), files, folder)
-    arguments = ["-q", "-p", "no:cacheprovider", "-m", TESTS, "--longest", str(LONGEST_S)]
+    arguments = [*_PLAIN, "-m", TESTS, "--longest", str(LONGEST_S)]
     return int(pytest.main([*arguments, *files], plugins=[recorder]))
 
 
@@ -156,7 +157,7 @@ def _sample(files: list[str], seed: int, count: int) -> Iterator[tuple[Mutant, s
 def _run(tests: list[str]) -> int:
     """Run the tests until one fails. In the child process, in the copy."""
     files = dict.fromkeys(test.partition("::")[0] for test in tests)
-    arguments = ["-q", "-x", "--tb=short", "-p", "no:cacheprovider", f"--timeout={TEST_LIMIT_S}"]
+    arguments = [*_PLAIN, "-x", "--tb=short", f"--timeout={TEST_LIMIT_S}"]
     return int(pytest.main([*arguments, *files], plugins=[_Chosen(tests)]))
 
 
