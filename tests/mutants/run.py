@@ -129,7 +129,7 @@ def _recorded(log: Path) -> Recording:
 def _change(before: str, after: str) -> tuple[str, str]:
     """Return the changed lines before and after, each as one line."""
     lines = list(difflib.unified_diff(before.splitlines(), after.splitlines(), n=0, lineterm=""))[2:]
-    removed, added = (" ⏎ ".join(line[1:].strip() for line in lines if line[0] == sign) for sign in "-+")
+    removed, added = (" ⏎ ".join(" ".join(line[1:].split()) for line in lines if line[0] == sign) for sign in "-+")
     return removed, added
 
 
@@ -161,10 +161,22 @@ def _run(tests: list[str]) -> int:
     return int(pytest.main([*arguments, *files], plugins=[_Chosen(tests)]))
 
 
+def _parts(path: str, tests: list[str]) -> Iterator[list[str]]:
+    """Yield the tests in three parts, those beside the file first: most mistakes are noticed there, and the files of
+    the other tests then need not be collected.
+    """
+    area, name = f"/{path.split('/')[1]}/", f"test_{Path(path).stem}"
+    files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
+    files.sort(key=lambda file: (name not in file, area not in file))
+    for part in (files[:2], files[2:8], files[8:]):
+        if part:
+            yield [test for test in tests if test.partition("::")[0] in part]
+
+
 def _verdict(status: int | None, log: str) -> str:
     if status is None or "Timeout (>" in log:
         return "timeout"
-    if status in (5, 70):
+    if status == 70:
         sys.exit(f"the tests could not be run:\n{log}")
     return "killed" if status else "survived"
 
@@ -234,7 +246,11 @@ def _judge(
         else:
             path = Path(mutant.path)
             path.write_text(after)
-            status = _forked(partial(_run, tests), log, 120.0 + 10.0 * seconds)
+            status: int | None = 0
+            for part in _parts(mutant.path, tests):
+                status = _forked(partial(_run, part), log, 120.0 + 10.0 * seconds)
+                if status != 0:
+                    break
             path.write_text(before)
             verdict = _verdict(status, log.read_text(errors="replace"))
             described += f"\n    tests:   {len(tests)} of {every} that execute the statement"
