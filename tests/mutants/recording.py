@@ -21,6 +21,9 @@ from typing import Any, NamedTuple
 _HITS = "__hits__"
 """In a module with marks: a byte for each mark, 1 once it was executed."""
 
+_DEFAULTS = "tests/config/test_pages.py::test_the_generated_parts"
+"""Tests that compare each default of a configuration file with the documentation."""
+
 
 class Statement(NamedTuple):
     """A statement of a file, by its function and its first line."""
@@ -211,8 +214,8 @@ class Recording:
         """Return the tests of a statement, the fastest ones that take so long together, file by file; how long they
         take, s; and how many tests there are in all.
 
-        None stands for what the import executes: the tests of the file. In a file that changed since, a statement that
-        was never executed has the tests of its function.
+        None stands for what the import executes: the tests of the file, and of the documented defaults. In a file that
+        changed since, a statement that was never executed has the tests of its function.
         """
         found: set[str] = set()
         for record in self._records:
@@ -221,6 +224,8 @@ class Recording:
             if statement is not None and (statement.text in blocks[0] or record["sources"].get(path) == _sha(source)):
                 blocks = [{"": blocks[0].get(statement.text, ())}]
             found.update(chain.from_iterable(chain.from_iterable(block.values() for block in blocks)))
+        if statement is None:
+            found.update(test for test in self._seconds if test.startswith(_DEFAULTS))
         chosen: dict[str, list[str]] = {}
         total = 0.0
         for test in sorted(found & self._seconds.keys(), key=self._seconds.__getitem__):
