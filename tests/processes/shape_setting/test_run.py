@@ -139,6 +139,26 @@ def test_what_hangs_keeps_neither_heat_nor_arms_from_stopping(tmp_path: Path, mo
     hang.set()
 
 
+def test_the_arms_stop_once_the_heat_is_commanded_off_while_the_relay_still_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    halted = threading.Event()
+
+    class Arm(FakeRobot):
+        def halt(self) -> None:
+            super().halt()
+            halted.set()
+
+    monkeypatch.setattr(module, "_HEAT_FIRST_S", 3.0)
+    monkeypatch.setattr(module, "Robot", lambda name, path: Arm(done, True))
+    run = make_run(tmp_path)
+    monkeypatch.setattr(run, "_await_off", lambda heater: halted.wait(1.0))
+    run._stop()
+    assert done[0] == "stop_heating"
+    assert run.heat_is_off
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_second_signal_keeps_nothing_from_stopping(number: signal.Signals) -> None:
     before = signal.getsignal(number)
