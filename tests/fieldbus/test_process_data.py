@@ -6,6 +6,7 @@ SOEM's part is a list of answers here; `test_bus.py` and `test_any_slave.py` do 
 from __future__ import annotations
 
 import socket
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -167,6 +168,46 @@ def test_outputs_of_another_length_are_ignored(lines: list[Line]) -> None:
     line.data.set_output(1, b"")
     line.cycle()
     assert line.master.sent == [[b"ab", bytes(4)]]
+
+
+@pytest.fixture
+def segment(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[FrameBarrier, socket.socket]]:
+    """A frame barrier, and the socket of the slaves that its frames come to."""
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    monkeypatch.setattr("rtcp.fieldbus.process_data.open_socket", lambda *_: near)
+    barrier = FrameBarrier("ecat0")
+    far.setblocking(False)
+    yield barrier, far
+    barrier.close()
+    far.close()
+
+
+def back(number: int) -> bytes:
+    """The barrier frame of this number as it comes back: Ethernet, the frame's header, that of a NOP, the number."""
+    return bytes(26) + number.to_bytes(8, "little") + bytes(26)
+
+
+def test_a_barrier_frame_passes_once_its_own_number_is_back(segment: tuple[FrameBarrier, socket.socket]) -> None:
+    barrier, slaves = segment
+    slaves.send(back(1))
+    assert barrier.pass_through(0)
+    sent = slaves.recv(1518)
+    assert (sent[12:14], sent[16:17], sent[26:34]) == (b"\x88\xa4", b"\0", (1).to_bytes(8, "little"))
+    for number in (1, 2 << 8, 2):  # frames from before it are read and skipped
+        slaves.send(back(number))
+    assert barrier.pass_through(0)
+    assert slaves.recv(1518)[26:34] == (2).to_bytes(8, "little")
+
+
+def test_a_barrier_frame_that_is_not_back_in_time_does_not_pass(segment: tuple[FrameBarrier, socket.socket]) -> None:
+    barrier, slaves = segment
+    began = time.monotonic_ns()
+    assert not barrier.pass_through(2_000_000)
+    assert time.monotonic_ns() - began >= 2_000_000
+    slaves.send(back(1))
+    assert not barrier.pass_through(0)
+    slaves.close()
+    assert not barrier.pass_through(60_000_000_000)  # cannot be sent: no wait
 
 
 def test_images_of_a_few_bits_share_bytes_and_keep_their_own_bits() -> None:
