@@ -8,7 +8,7 @@ PYTEST = $(BIN)/python -m pytest $(if $(SEED),--randomly-seed=$(SEED))
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup oracles run panel check test test-all test-flaky test-arms test-ros fast faults lint format clean
+.PHONY: help setup oracles run panel check test test-all test-flaky test-arms test-ros mutants fast faults lint format clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -51,6 +51,10 @@ test-ros: setup ## run the tests on ROS 1 and Fast DDS in network namespaces; as
 	@sh .ci/ros
 	@$(BIN)/python -m pytest tests/ros1 tests/ros2
 
+mutants: setup ## put small mistakes into a copy, and list those that no test notices; FILE=, SEED=, COUNT=
+	@$(BIN)/python -c 'import cosmic_ray' 2>/dev/null || sh .ci/install .venv --editable '.[dev,mutants]'
+	@$(BIN)/python -m tests.mutants.run $(if $(FILE),--file $(FILE)) $(if $(SEED),--seed $(SEED)) $(if $(COUNT),--count $(COUNT))
+
 fast: setup ## compile the cycle in place: about half the time for each; needs a C compiler, takes minutes
 	@$(BIN)/python hatch_build.py
 
@@ -67,5 +71,5 @@ format: setup ## put imports and layout in order
 	@$(BIN)/ruff format .
 
 clean: ## remove .venv and all else that can be made again
-	rm -rf .venv .venv-egm-peers .venv-foreign build dist kinematics/_fast .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-egm-peers .venv-foreign build dist kinematics/_fast .mypy_cache .ruff_cache .pytest_cache .hypothesis .mutants
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -46,6 +46,22 @@ def test_each_code_of_the_table_means_what_it_says(code: int, meaning: tuple[int
     assert shown(stick) == meaning
 
 
+@pytest.mark.parametrize("first", [1, 3, 8, 9, 17])
+def test_the_lines_may_begin_at_any_terminal_and_the_others_of_their_bytes_are_no_code(first: int) -> None:
+    forward, backward, left, right, up, down = range(first, first + 6)
+    joystick = JoystickConfig(
+        forward=forward, backward=backward, left=left, right=right, mode_up=up, mode_down=down, debounce_ms=0.0
+    )
+    for code, meaning in TABLE.items():
+        stick = read(JoystickInput(InputsConfig(joystick=joystick), CYCLE), code << first - 1, 1)
+        assert (stick.valid, shown(stick)) == (True, meaning)
+    bytes_of_lines = range((first - 1) // 8 * 8, (first + 4) // 8 * 8 + 8)
+    for other in range(24):
+        stick = read(JoystickInput(InputsConfig(joystick=joystick), CYCLE), NEUTRAL << first - 1 ^ 1 << other, 1)
+        is_line, is_checked = first - 1 <= other < first + 5, other in bytes_of_lines
+        assert stick.valid is (is_line or not is_checked), other
+
+
 def test_an_input_beside_the_joysticks_that_has_a_name_leaves_its_code_as_it_is() -> None:
     stick = read(stick_of(named=(NamedTerminal("part", 8),)), 62 | 1 << 7, 1)
     assert (stick.valid, shown(stick)) == (True, TABLE[62])

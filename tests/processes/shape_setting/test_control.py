@@ -69,6 +69,21 @@ def test_the_integral_stands_still_while_the_setpoint_moves() -> None:
     assert pid.target == pytest.approx(3.0 + 30.0 * 10.0 * 1e-3 * 100 * PERIOD_S)
 
 
+def test_after_a_reset_nothing_of_the_heating_before_remains_but_the_average() -> None:
+    used, new = control(integral=10.0, derivative=0.01), control(integral=10.0, derivative=0.01)
+    for i in range(100):
+        used.measure(30.0)
+        new.measure(30.0)
+        used.update(1.005, 1.0 + 1e-6 * i, 30.0, 30.0)
+    used.update(1.005, 1.0, 30.0, 3.0)
+    used.reset()
+    assert (used.target, used.is_limited, used.average) == (0.0, False, new.average)
+    for ratio in (1.001, 1.001, 1.0011, 1.0013):
+        used.update(1.005, ratio, 30.0, 30.0)
+        new.update(1.005, ratio, 30.0, 30.0)
+        assert used.target == new.target > 0.0
+
+
 def test_the_derivative_is_of_the_measured_ratio() -> None:
     pid = control(derivative=1.0)
     for _ in range(200):

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import math
 import os
 import signal
+import struct
 import threading
+import time
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rtcp.api import RtcpError, State
 from rtcp.api.cell import rod_file
 from rtcp.config.find import default_config
+from rtcp.processes.rod import Rod, integrate
 from rtcp.processes.shape_setting import run as module
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.interlocks import Mode
+from rtcp.processes.shape_setting.job import read_job
 from rtcp.processes.shape_setting.profile import read_profile, target_ratio
 from rtcp.processes.shape_setting.run import Outcome, ShapeSettingRun
 
@@ -125,6 +135,26 @@ def test_what_hangs_keeps_neither_heat_nor_arms_from_stopping(tmp_path: Path, mo
     assert done == ["halt"]
     assert not run.heat_is_off
     hang.set()
+
+
+def test_the_arms_stop_once_the_heat_is_commanded_off_while_the_relay_still_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    halted = threading.Event()
+
+    class Arm(FakeRobot):
+        def halt(self) -> None:
+            super().halt()
+            halted.set()
+
+    monkeypatch.setattr(module, "_HEAT_FIRST_S", 3.0)
+    monkeypatch.setattr(module, "Robot", lambda name, path: Arm(done, True))
+    run = make_run(tmp_path)
+    monkeypatch.setattr(run, "_await_off", lambda heater: halted.wait(1.0))
+    run._stop()
+    assert done[0] == "stop_heating"
+    assert run.heat_is_off
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -255,3 +285,235 @@ def test_a_rod_that_is_released_is_said_to_be_as_hot_as_it_is(
     assert run.middle_c == middle_c
     assert text in module._warmth(run.middle_c)
     assert ("HOT" in module._warmth(run.middle_c)) is (middle_c == 396.2)
+
+
+# -- what follows one another, and what is made of the measurements ---------------------------------------------------
+
+
+@pytest.mark.parametrize(("factor", "is_refused"), [(0.79, True), (0.81, False), (1.19, False), (1.21, True)])
+def test_an_initial_resistance_that_alloy_and_dimensions_do_not_explain_ends_the_run(
+    tmp_path: Path, factor: float, is_refused: bool
+) -> None:
+    run = make_run(tmp_path)
+    run._job, run._profile = read_job(default_config().parent / "shape_setting" / "arc.yaml")
+    area = math.pi * 0.0005**2
+    expected = float(run._profile.alloy.resistivity(run._profile.initial_c)) * 0.3 / area
+    run.outcome.initial_resistance = factor * expected
+    if is_refused:
+        with pytest.raises(RtcpError, match="20 % off at most") as raised:
+            run._check_resistance()
+        assert raised.value.reason == "implausible_resistance"
+    else:
+        run._check_resistance()
+
+
+@pytest.mark.parametrize(("closed", "verb"), [(True, "close"), (False, "open")])
+def test_a_relay_that_does_not_follow_ends_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closed: bool, verb: str
+) -> None:
+    monkeypatch.setattr(module, "_RELAY_S", 0.01)
+    run = make_run(tmp_path)
+    with_heater(run, relay_closed=closed)
+    run._await_relay(closed)
+    with_heater(run, relay_closed=not closed)
+    with pytest.raises(RtcpError, match=f"did not {verb} within"):
+        run._await_relay(closed)
+
+
+class Script:
+    """A cell, a heater and people that note what a run does with them."""
+
+    def __init__(self, run: ShapeSettingRun, virtual: bool) -> None:
+        self.done: list[str] = []
+        self.states = {"left": State.READY, "right": State.HOLDING}
+        self.heater_fields = {
+            **OFF, "latched": 0, "forbids": 0, "busy": 0, "rod_hot_s": 0.0, "mode": Mode.AUTO, "energy": 812.5,
+            "initial_resistance": 0.34, "relay_closed": 0,
+        }  # fmt: skip
+        self.approach: str | None = "the approach"
+        arms = {name: self._arm(name) for name in self.states}
+        run._cell = SimpleNamespace(  # type: ignore[assignment]
+            config=SimpleNamespace(members=[]), arms=arms, run_trajectory=lambda path: self.done.append(f"run {path}")
+        )
+        run._job, run._profile = read_job(default_config().parent / "shape_setting" / "arc.yaml")
+        run._say, run._confirm = (lambda step: None), (lambda text: self.done.append(f"confirm {text.split(',')[0]}"))
+        run._began = time.monotonic()
+        curve = np.zeros((2, 3))
+        last = SimpleNamespace(p=curve, s=np.array([0.0, 0.3]), largest_strain=0.0015)
+        run.plan = SimpleNamespace(steps=[last], begin={"left": 1, "right": 2}, trajectory="the bend")  # type: ignore[assignment]
+        run._heater = SimpleNamespace(fields=self.heater_fields, state="off", command=self._command)  # type: ignore[assignment]
+        robot_of_heater = SimpleNamespace(
+            state=State.READY, enable=lambda: self.done.append("enable heater"),
+            events=lambda since=0: [SimpleNamespace(number=number) for number in (3, 7)],
+        )  # fmt: skip
+        run._robot = robot_of_heater  # type: ignore[assignment]
+        bus = SimpleNamespace(interface="virtual" if virtual else "eth1")
+        run._member.config = SimpleNamespace(bus=bus)  # type: ignore[misc, assignment]
+
+    def _arm(self, name: str) -> SimpleNamespace:
+        status = SimpleNamespace(commanded_positions=name)
+        return SimpleNamespace(
+            state=self.states[name], enable=lambda: self.done.append(f"enable {name}"), status=lambda: status
+        )
+
+    def _command(self, name: str, **_: object) -> None:
+        self.done.append(name)
+        self.heater_fields["relay_closed"] = int(name == "arm_heater")
+
+
+@pytest.mark.parametrize("virtual", [False, True], ids=["real", "virtual"])
+def test_a_run_bends_a_rod_without_heat_and_heats_a_rod_that_nothing_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, virtual: bool
+) -> None:
+    run = make_run(tmp_path)
+    script = Script(run, virtual)
+    held = SimpleNamespace(p=np.ones((2, 3)))
+    for name, note in (("_check_heater", "check"), ("_check_resistance", "check resistance")):
+        monkeypatch.setattr(run, name, partial(script.done.append, note))
+    monkeypatch.setattr(run, "_await_relay", lambda closed: script.done.append(f"relay {closed}"))
+    monkeypatch.setattr(run, "_held", lambda: held)
+    monkeypatch.setattr(run, "_sampling", contextlib.nullcontext)
+    monkeypatch.setattr(run, "_check_target", lambda since: script.done.append(f"check target since {since}"))
+    monkeypatch.setattr(run, "_finish", lambda shape, rod: script.done.append(f"finish {shape is held} {rod}"))
+    monkeypatch.setattr(module, "plan_approach", lambda *given: given[2] == {"left": "left", "right": "right"} and "x")
+
+    class FakeRod:
+        def __init__(self, robot: object) -> None:
+            assert robot is run._robot
+
+        def renew(self) -> None:
+            script.done.append("renew")
+
+        def bend(self, shape: object) -> None:
+            script.done.append(f"impose {shape is held}")
+
+        def __repr__(self) -> str:
+            return "virtual"
+
+    monkeypatch.setattr(module, "VirtualRod", FakeRod)
+    run._steps()
+    expected = [
+        "confirm the chucks hold nothing", "check", "enable left", "run x", "confirm grip the rod", "renew",
+        "enable heater", "arm_heater", "relay True", "set_heat_profile", "measure_resistance", "stop_heating",
+        "check resistance", "relay False", "check", "run the bend", "impose True", "enable heater", "arm_heater",
+        "relay True", "set_heat_profile", "start_heating", "check target since 7",
+        f"finish True {'virtual' if virtual else None}", "confirm open the chucks and take the rod out",
+    ]  # fmt: skip
+    assert script.done == [step for step in expected if virtual or step not in ("renew", "impose True")]
+    outcome = run.outcome
+    assert (outcome.initial_resistance, outcome.energy, outcome.strain) == (0.34, 812.5, 0.0015)
+    assert outcome.held is held.p
+    assert outcome.wanted is run.plan.steps[-1].p
+    assert outcome.interlocks["fuse"] == "good"
+    assert [step.split()[0] for _, step in outcome.steps] == ["arms", "the", "the", "heating", "release:"]
+
+
+def test_samples_are_taken_while_the_rod_is_heated_and_end_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "SAMPLE_S", 0.005)
+    fields: dict[str, Any] = dict.fromkeys(Outcome().samples, 1.5) | {"ratio": None}
+    monkeypatch.setattr(module, "Robot", lambda name, path: FakeRobot([], True, **fields))
+    run = make_run(tmp_path)
+    with run._sampling():
+        while len(run.outcome.times) < 3:
+            time.sleep(0.001)
+    count = len(run.outcome.times)
+    time.sleep(0.02)
+    assert len(run.outcome.times) == count
+    assert run.outcome.samples["energy"] == [1.5] * count
+    assert run.outcome.samples["ratio"] == [0.0] * count
+    assert all(later > time for time, later in pairwise(run.outcome.times))
+
+
+HELD = integrate(Rod(0.3, 1e-3), [0.5, 1.0, 3.0, -10.0, 4.0, 2.0])
+
+
+def test_the_released_shape_follows_from_the_temperatures_and_is_not_made_up_without_them(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    run._profile = read_profile(default_config().parent / "shape_setting" / "nitinol.yaml")
+    outcome = run.outcome
+    outcome.wanted = HELD.p
+    outcome.times, outcome.samples["middle_temperature"] = [0.0], [20.0]
+    run._finish(HELD, None)
+    assert outcome.released is None
+    outcome.times, outcome.samples["middle_temperature"] = [0.0, 1.0, 61.0], [20.0, 510.0, 510.0]
+    run._finish(HELD, None)
+    assert outcome.highest[30] == pytest.approx(510.0, abs=1.0)
+    # The chucks stay cold, and so do the ends.
+    assert outcome.highest[0] < 100.0
+    assert outcome.fraction[0] < 0.01
+    assert outcome.fraction[30] > 0.95
+    assert 0.0 < outcome.straight[0] < 0.05
+    assert outcome.straight[1] == pytest.approx(outcome.straight[0])
+    assert 0.0 < outcome.error[1] < outcome.error[0] < 0.05
+
+
+class Box:
+    """A control box with a virtual rod behind SDOs: the inputs of its cells are 1 + number, and it must be disabled."""
+
+    def __init__(self) -> None:
+        self.state = State.HOLDING
+        self.written: list[tuple[int, int, int, bytes]] = []
+        self.disabled = 0
+
+    def scan(self) -> list[dict[str, int]]:
+        return [
+            {"position": 1, "vendor_id": 0xA55, "product_code": 0x11},
+            {"position": 4, "vendor_id": 0xA55, "product_code": 0x10},
+        ]
+
+    def disable(self) -> None:
+        self.state, self.disabled = State.READY, self.disabled + 1
+
+    def sdo_read(self, slave: int, index: int, number: int) -> bytes:
+        assert slave == 4
+        return struct.pack("<f", {0x2025: 0.3 * (number - 1) / 47, 0x2021: 0.5, 0x2026: 300.0 + number}[index])
+
+    def sdo_write(self, slave: int, index: int, number: int, data: bytes) -> None:
+        assert self.state is State.READY
+        self.written.append((slave, index, number, data))
+
+
+def test_a_virtual_rod_gets_what_the_arms_do_to_it_and_tells_what_it_became(tmp_path: Path) -> None:
+    box = Box()
+    rod = module.VirtualRod(box)  # type: ignore[arg-type]
+    rod.renew()
+    assert (box.written, box.disabled) == ([(4, 0x2013, 1, b"\x03")], 1)
+    box.written, box.state = [], State.HOLDING
+    rod.bend(HELD)
+    assert box.written.pop() == (4, 0x2013, 1, b"\x01")
+    assert [entry[:3] for entry in box.written] == [(4, 0x2010 + axis, n) for axis in range(3) for n in range(1, 49)]
+    curvatures = np.array([struct.unpack("<f", entry[3])[0] for entry in box.written]).reshape(3, 48)
+    at = np.linspace(0.0, 0.3, 48)
+    assert curvatures == pytest.approx(np.array([np.interp(at, HELD.s, u) for u in HELD.u.T]), abs=1e-6)
+    at, fraction, highest = rod.read()
+    assert (at[-1], fraction[0], highest[-1]) == (pytest.approx(0.3), 0.5, 348.0)
+    box.written = []
+    run = make_run(tmp_path)
+    run.outcome.wanted = HELD.p
+    run._finish(HELD, rod)
+    assert box.written == [(4, 0x2013, 1, b"\x02")]
+    assert run.outcome.fraction == pytest.approx(np.full(len(HELD.s), 0.5))
+    assert run.outcome.highest[-1] == pytest.approx(348.0)
+
+
+def test_panels_get_four_curves_of_the_bend_with_the_process_that_draws_them(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    curves = np.arange(10 * 9 * 3, dtype=np.float64).reshape(10, 9, 3) / 3.0
+    run.plan = SimpleNamespace(curves=curves)  # type: ignore[assignment]
+    run._draw(tmp_path / "rod.json")
+    content = json.loads((tmp_path / "rod.json").read_text())
+    assert content == {"pid": os.getpid(), "curves": curves[[0, 3, 6, 9]][:, [0, 4, 8]].round(4).tolist()}
+    run._draw(tmp_path / "none" / "rod.json")
+
+
+def test_a_cell_without_a_heater_is_refused() -> None:
+    heater = ShapeSettingConfig("shape_setting", "heater")
+    members = [SimpleNamespace(config=SimpleNamespace(processes=processes)) for processes in ([], ["other", heater])]
+    cell = SimpleNamespace(config=SimpleNamespace(name="lab", processes=members))
+    assert module._heater_of(cell) == (members[1], "heater")  # type: ignore[arg-type]
+    del members[1]
+    with pytest.raises(RtcpError, match="the cell lab has no process of kind shape_setting") as raised:
+        module._heater_of(cell)  # type: ignore[arg-type]
+    assert raised.value.reason == "no_heater"
