@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from rtcp.config import default_config, load
@@ -99,3 +100,9 @@ def test_a_recording_of_the_arms_file_that_cannot_start_is_a_message_of_the_stat
     begin(RecordingConfig(out="/proc/nowhere"))
     wanted = "the recording of the arm's file (recording) does not run: "
     until(lambda: any(text.startswith(wanted) for text in call(directory, "status")["messages"]), "the message")
+    until(lambda: not _recorders(directory), "the end of the recorder")
+
+
+def _recorders(directory: Path) -> list[psutil.Process]:
+    commands = ((process, process.info["cmdline"] or ()) for process in psutil.process_iter(["cmdline"]))
+    return [process for process, command in commands if {"rtcp.telemetry.recorder", str(directory)} <= {*command}]
