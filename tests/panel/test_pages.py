@@ -23,8 +23,6 @@ from tests.waiting import until
 
 pytestmark = [pytest.mark.platform, pytest.mark.browser]
 REPOSITORY = Path(__file__).parents[2]
-GRIPPER = 1 << 3
-"""Mask of the gripper's output, number 4."""
 DRIVE_IDENTITY = re.compile(r"vendor_id: (\w+)[\s\S]*product_id: (\w+)")
 
 
@@ -34,7 +32,7 @@ def tool_of(platform: Platform) -> tuple[float, ...]:
     return forward(arm, platform.status()["joints"]["commanded_position"]).position
 
 
-def test_whoever_comes_first_is_led_from_start_to_motion_on_a_phone(
+def test_a_platform_is_started_enabled_moved_ended_and_started_as_chosen(
     browser: Browser, panel: str, platform: Platform
 ) -> None:
     platform.rtcp("stop", check=None)
@@ -64,52 +62,48 @@ def test_whoever_comes_first_is_led_from_start_to_motion_on_a_phone(
         tab = page.get_by_role("link", name="Alarms", exact=True)
         expect(tab).to_be_in_viewport(ratio=1)
         assert tab.evaluate("tab => tab.parentElement.clientHeight") < 60
+        page.get_by_role("link", name="Start", exact=True).click()
+        page.set_viewport_size({"width": 1200, "height": 700})
+        page.get_by_role("button", name="Disable", exact=True).click()
+        expect(state).to_have_text("ready")
+        page.get_by_role("button", name="Stop the platform").click()
+        expect(state).to_have_text("off")
+        for name in ("Stop the platform", "Enable", "Disable", "Reset", "Halt"):
+            expect(page.get_by_role("button", name=name, exact=True)).to_be_disabled()
+        page.get_by_label("Configuration").fill("/nowhere.yaml")
+        page.get_by_role("button", name="Start", exact=True).click()
+        expect(page.locator("pre")).to_contain_text("/nowhere.yaml")
+        page.get_by_label("Configuration").fill(platform.environment["RTCP_CONFIG"])
+        page.get_by_label("Bus").select_option("virtual")
+        page.get_by_label("Mode", exact=True).select_option("cartesian")
+        page.get_by_label("Cycle, us").fill(f"{PERIOD_US // 2}")
+        page.get_by_role("button", name="Start", exact=True).click()
+        expect(state).to_have_text("ready")
+        status = platform.status()
+        assert (status["bus"], status["control_mode"], status["cycle_ns"]) == ("virtual", "cartesian", 500 * PERIOD_US)
+        page.get_by_label("Control mode").select_option("joint")
+        page.get_by_role("button", name="Set control mode").click()
+        until(lambda: platform.status()["control_mode"] == "joint", "mode joint")
+        expect(page.get_by_role("button", name="Start", exact=True)).to_be_disabled()
+        page.get_by_role("button", name="Scan the bus").click()
+        drive = DRIVE_IDENTITY.search((platform.directory / "config/devices/cubemars-orh.yaml").read_text())
+        assert drive is not None
+        for figure in drive.groups():
+            expect(page.get_by_role("cell", name=f"0x{int(figure, 0):08X}")).not_to_have_count(0)
+        page.get_by_label("Drive mode").select_option("csv")
+        page.get_by_role("button", name="Set drive mode").click()
+        until(lambda: platform.status()["drive_mode"] == "csv", "csv")
+        page.get_by_label("Drive mode").select_option("csp")
+        page.get_by_role("button", name="Set drive mode").click()
+        until(lambda: platform.status()["drive_mode"] == "csp", "csp")
+        page.get_by_role("button", name="Enable").click()
+        until(lambda: platform.status()["state"] == "holding", "holding")
+        page.get_by_role("button", name="Check this host").click()
+        finding = page.get_by_role("row", name=re.compile("^preempt-rt"))
+        expect(finding).to_contain_text(re.compile("kernel.*without it", re.DOTALL))
 
 
-def test_the_page_start_ends_the_platform_starts_what_is_chosen_and_sets_modes(page: Page, holding: Platform) -> None:
-    platform = holding
-    show(page, "/")
-    state = page.locator("header [data-live=state]")
-    page.get_by_role("button", name="Disable", exact=True).click()
-    expect(state).to_have_text("ready")
-    page.get_by_role("button", name="Stop the platform").click()
-    expect(state).to_have_text("off")
-    for name in ("Stop the platform", "Enable", "Disable", "Reset", "Halt"):
-        expect(page.get_by_role("button", name=name, exact=True)).to_be_disabled()
-    page.get_by_label("Configuration").fill("/nowhere.yaml")
-    page.get_by_role("button", name="Start", exact=True).click()
-    expect(page.locator("pre")).to_contain_text("/nowhere.yaml")
-    page.get_by_label("Configuration").fill(platform.environment["RTCP_CONFIG"])
-    page.get_by_label("Bus").select_option("virtual")
-    page.get_by_label("Mode", exact=True).select_option("cartesian")
-    page.get_by_label("Cycle, us").fill(f"{PERIOD_US // 2}")
-    page.get_by_role("button", name="Start", exact=True).click()
-    expect(state).to_have_text("ready")
-    status = platform.status()
-    assert (status["bus"], status["control_mode"], status["cycle_ns"]) == ("virtual", "cartesian", 500 * PERIOD_US)
-    page.get_by_label("Control mode").select_option("joint")
-    page.get_by_role("button", name="Set control mode").click()
-    until(lambda: platform.status()["control_mode"] == "joint", "mode joint")
-    expect(page.get_by_role("button", name="Start", exact=True)).to_be_disabled()
-    page.get_by_role("button", name="Scan the bus").click()
-    drive = DRIVE_IDENTITY.search((platform.directory / "config/devices/cubemars-orh.yaml").read_text())
-    assert drive is not None
-    for figure in drive.groups():
-        expect(page.get_by_role("cell", name=f"0x{int(figure, 0):08X}")).not_to_have_count(0)
-    page.get_by_label("Drive mode").select_option("csv")
-    page.get_by_role("button", name="Set drive mode").click()
-    until(lambda: platform.status()["drive_mode"] == "csv", "csv")
-    page.get_by_label("Drive mode").select_option("csp")
-    page.get_by_role("button", name="Set drive mode").click()
-    until(lambda: platform.status()["drive_mode"] == "csp", "csp")
-    page.get_by_role("button", name="Enable").click()
-    until(lambda: platform.status()["state"] == "holding", "holding")
-    page.get_by_role("button", name="Check this host").click()
-    finding = page.get_by_role("row", name=re.compile("^preempt-rt"))
-    expect(finding).to_contain_text(re.compile("kernel.*without it", re.DOTALL))
-
-
-def test_the_arm_page_shows_what_the_platform_reports_and_the_view_turns(drawing: Page, holding: Platform) -> None:
+def test_the_arm_is_drawn_as_the_platform_reports_it_with_a_ghost_at_its_goal(drawing: Page, holding: Platform) -> None:
     def camera() -> list[float]:
         place: list[float] = drawing.evaluate("JSON.parse(sessionStorage.getItem('rtcp-camera'))?.at ?? []")
         return place
@@ -149,9 +143,7 @@ def test_the_arm_page_shows_what_the_platform_reports_and_the_view_turns(drawing
     assert camera() == pytest.approx(above)
     canvas.press("+")
     assert math.dist(camera(), [0, 0, 0.5]) < math.dist(above, [0, 0, 0.5])
-
-
-def test_a_ghost_stands_where_a_plan_or_a_move_of_a_named_command_ends(drawing: Page, holding: Platform) -> None:
+    holding.call("move_joints", q=BENT)
     show_targets(drawing)
     view = drawing.locator(".arm-view")
     drawing.get_by_label("joint1, rad").fill("0.2")
@@ -169,78 +161,15 @@ def test_a_ghost_stands_where_a_plan_or_a_move_of_a_named_command_ends(drawing: 
     expect(drawing.locator("#operator")).to_have_text("Nobody operates the arm")
 
 
-def test_a_target_is_planned_sent_by_keys_or_refused_with_the_limit(drawing: Page, holding: Platform) -> None:
-    show_targets(drawing)
-    send = drawing.get_by_role("button", name="Send", exact=True)
-    drawing.get_by_label("joint1, rad").press("Control+a")
-    drawing.keyboard.type("0.2")
-    expect(send).to_be_disabled()
-    drawing.get_by_role("button", name="Plan").press("Enter")
-    expect(drawing.locator(".arm-view")).to_have_attribute("data-ghost", "plan")
-    assert holding.status()["joints"]["actual_position"][0] == pytest.approx(0.0, abs=1e-3)
-    send.press("Enter")
-    expect(drawing.get_by_text("There; largest error")).to_be_visible()
-    assert holding.status()["joints"]["actual_position"][0] == pytest.approx(0.2, abs=1e-3)
-    drawing.get_by_label("joint1, rad").fill("9")
-    drawing.get_by_role("button", name="Plan").click()
-    expect(
-        drawing.get_by_text(re.compile("No: joint1: target 9 rad is outside its range, beyond 3.1 rad"))
-    ).to_be_visible()
-    drawing.get_by_label("Target").select_option("pose")
-    drawing.get_by_label("x, m").fill("5")
-    drawing.get_by_role("button", name="Plan").click()
-    expect(drawing.get_by_text(re.compile("No: the pose cannot be reached.* m"))).to_be_visible()
-    drawing.get_by_label("Target").select_option("joints")
-    drawing.get_by_label("joint1, rad").fill("3")
-    drawing.get_by_label("joint2, rad").fill("0.1")
-    drawing.get_by_role("button", name="Plan").click()
-    expect(drawing.get_by_text(re.compile("No: .*keep-out box user"))).to_be_visible()
-    expect(drawing.get_by_role("button", name="Send", exact=True)).to_be_disabled()
-
-
-def test_a_pose_on_a_line_has_solutions_and_poses_are_kept_under_names(page: Page, holding: Platform) -> None:
-    show(page, "/targets")
-    expect(page.get_by_role("button", name="Solutions")).to_be_hidden()  # its pose would be too
-    page.get_by_label("Target").select_option("line")
-    expect(page.get_by_label("y, m")).not_to_have_value("")
-    y = float(page.get_by_label("y, m").input_value())
-    page.get_by_label("y, m").fill(f"{y + 0.05}")
-    page.get_by_role("button", name="Solutions").click()
-    expect(page.get_by_role("row", name=re.compile("inside"))).not_to_have_count(0)
-    page.get_by_role("button", name="Plan").click()
-    expect(page.get_by_text(re.compile(r"0\.050 m: look at the ghost"))).to_be_visible()
-    page.get_by_role("button", name="Send", exact=True).click()
-    expect(page.get_by_text("There; largest error")).to_be_visible()
-    expect(page.locator("[data-live=state]")).to_have_text("holding")
-    until(lambda: "arrived" in holding.events(), "it has arrived")
-    page.get_by_role("button", name="Use solution 1").click()
-    expect(page.get_by_label("Target")).to_have_value("joints")
-    page.get_by_label("joint1, rad").fill("0.125")
-    page.get_by_label("Name", exact=True).fill("<b>beside</b> the cup")
-    page.get_by_role("button", name="Keep these joint positions").click()
-    use = page.get_by_role("button", name="<b>beside</b> the cup", exact=True)
-    expect(use).to_be_visible()
-    assert "beside" in Path(holding.environment["RTCP_STATE_DIR"], "poses.yaml").read_text()
-    page.get_by_role("button", name="Here").click()
-    expect(page.get_by_label("joint1, rad")).to_have_value(re.compile(r"^-?\d"))
-    use.click()
-    expect(page.get_by_label("joint1, rad")).to_have_value("0.125")
-    page.get_by_role("button", name="Remove <b>beside</b> the cup").click()
-    expect(use).to_have_count(0)
-    slider = page.get_by_label("joint4, slider")
-    slider.focus()
-    for _ in range(10):
-        slider.press("ArrowRight")
-    expect(page.get_by_label("joint4, rad")).to_have_value("0.01")
-
-
 @pytest.fixture
 def limits_of_the_file(holding: Platform) -> Iterator[Platform]:
     yield holding
     holding.call("set_limits", changes={"joint2.max": 2.0, "box.max.z": 1.4})
 
 
-def test_limits_are_narrowed_and_never_widened(drawing: Page, limits_of_the_file: Platform) -> None:
+def test_limits_are_narrowed_and_never_widened_in_the_units_of_the_browser(
+    drawing: Page, limits_of_the_file: Platform
+) -> None:
     platform = limits_of_the_file
     show(drawing, "/limits")
     drawing.get_by_label("joint2 max").fill("1.5")
@@ -263,9 +192,30 @@ def test_limits_are_narrowed_and_never_widened(drawing: Page, limits_of_the_file
     drawing.get_by_role("button", name="As the file allows").click()
     until(lambda: platform.call("limits")["limits"] == platform.call("limits")["configured"], "the limits of the file")
     expect(drawing.get_by_label("joint2 max")).to_have_value("2")
+    show(drawing, "/targets")
+    drawing.get_by_label("Angles").select_option("deg")
+    drawing.get_by_label("Lengths").select_option("mm")
+    expect(drawing.get_by_label("joint3, deg")).to_have_value(re.compile(r"^(89\.9|90)"))
+    drawing.get_by_label("joint1, deg").fill("10")
+    drawing.get_by_label("joint4, slider").press("ArrowRight")
+    drawing.get_by_role("spinbutton", name="Speed (empty: the limit), deg/s").fill("20")
+    drawing.get_by_role("button", name="Plan").click()
+    drawing.get_by_role("button", name="Send", exact=True).click()
+    until(lambda: abs(platform.status()["joints"]["actual_position"][0] - math.radians(10)) < 1e-4, "10 degrees")
+    assert platform.status()["joints"]["commanded_position"][3] == pytest.approx(0.001, abs=1e-6)
+    show(drawing, "/arm")  # loaded anew: the browser has kept them
+    expect(drawing.locator("[data-live='actual_position.0']")).to_have_text("10.00")
+    expect(drawing.locator("[data-live='tool.2']")).to_have_text(f"{1000 * tool_of(platform)[2]:.1f}")
+    expect(drawing.locator("[data-bar='actual_position.0']")).to_have_attribute("title", "-177.6 to 177.6 deg")
+    show(drawing, "/limits")
+    expect(drawing.get_by_label("box max z, mm")).to_have_value("1400")
+    drawing.get_by_label("Lengths").select_option("m")
+    expect(drawing.get_by_label("box max z, m")).to_have_value("1.4")
+    drawing.get_by_label("Angles").select_option("rad")
+    expect(drawing.get_by_label("joint2 max, rad")).to_have_value("2")
 
 
-def test_a_recording_is_made_downloaded_and_drawn(page: Page, holding: Platform, tmp_path: Path) -> None:
+def test_a_recording_is_made_and_drawn_and_a_motion_file_is_run(page: Page, holding: Platform, tmp_path: Path) -> None:
     show(page, "/recorder")
     page.get_by_label("File name").fill("cup")
     page.get_by_role("button", name="Record", exact=True).click()
@@ -282,9 +232,6 @@ def test_a_recording_is_made_downloaded_and_drawn(page: Page, holding: Platform,
     picture = page.get_by_alt_text("Plot of cup.mcap")
     expect(picture).to_be_visible()
     assert picture.evaluate("image => image.naturalWidth") > 100
-
-
-def test_a_motion_file_is_checked_run_and_ends_with_its_page(page: Page, holding: Platform, tmp_path: Path) -> None:
     there = [0.2, *BENT[1:]]
     program = tmp_path / "program.yaml"
     program.write_text(f"trajectory:\n  - {{t: 0, q: {BENT}}}\n  - {{t: 2, q: {there}}}\n")
@@ -509,141 +456,6 @@ def test_every_page_is_usable_on_a_phone_in_the_dark_by_keys_and_shows_names_as_
         page.get_by_role("link", name="Jog", exact=True).click()
         expect(page.get_by_label("Frame")).to_have_value("joints")
     assert problems == {}
-
-
-def test_the_arm_is_guided_by_hand_and_carries_a_payload(page: Page, holding: Platform) -> None:
-    show(page, "/jog")
-    page.get_by_label("Payload, at the tool's point").fill("0.2")
-    page.get_by_role("button", name="Set the payload").click()
-    until(lambda: holding.status()["payload"]["mass"] == pytest.approx(0.2), "the payload")
-    page.get_by_role("button", name="Use this tool").click()
-    expect(page.get_by_text("The tool is tool; it holds nothing")).to_be_visible()
-    page.get_by_label("Payload, at the tool's point").fill("0")
-    page.get_by_role("button", name="Set the payload").click()
-    until(lambda: holding.status()["payload"]["mass"] == 0.0, "no payload")
-    before = holding.status()["joints"]["actual_position"][0]
-    page.get_by_role("button", name="Guide by hand").click()
-    until(lambda: holding.status()["state"] == "moving", "guiding")
-    holding.rtcp("segment", "push", "0", "25", "0", "--seconds", "20")
-    until(lambda: abs(holding.status()["joints"]["actual_position"][0] - before) > 0.05, "it follows")
-    page.get_by_role("button", name="Halt").click()
-    until(lambda: holding.status()["control_mode"] == "joint", "the mode before")
-    holding.rtcp("segment", "clear")
-
-
-def test_home_is_asked_for_and_then_reached(page: Page, holding: Platform) -> None:
-    holding.call("move_joints", q=[0.3, *BENT[1:]])
-    show(page, "/health")
-    page.get_by_role("button", name="Home", exact=True).click()
-    page.get_by_role("button", name="Leave it").click()
-    expect(page.get_by_role("button", name="Leave it")).to_have_count(0)
-    page.get_by_role("button", name="Home", exact=True).click()
-    page.get_by_role("button", name="Move home").click()
-    holding.until(lambda status: status["state"] == "moving", "on the way")
-    home = load(Path(holding.environment["RTCP_CONFIG"])).home
-    assert home is not None
-    expect(page.get_by_text("The arm is at home")).to_be_visible()
-    assert holding.status()["joints"]["actual_position"] == pytest.approx(home, abs=1e-3)
-
-
-def test_the_override_slows_what_the_page_moves_and_others_may_only_lower_it(
-    browser: Browser, panel: str, page: Page, holding: Platform
-) -> None:
-    show_targets(page)
-    page.get_by_label("joint1, rad").fill("1.2")
-    page.get_by_role("spinbutton", name="Speed").fill("0.1")
-    page.get_by_role("button", name="Plan").click()
-    page.get_by_role("button", name="Send", exact=True).click()
-    holding.until_moving()
-    slider = page.get_by_role("slider", name="Override", exact=True)
-    for _ in range(3):
-        slider.press("PageDown")
-    holding.until(lambda status: status["speed_override"] < 0.9, "slower")
-    assert holding.status()["state"] == "moving"
-    with visitor(browser, panel) as second:
-        show(second, "/health")
-        second.get_by_role("slider", name="Override", exact=True).press("Home")
-        holding.until(lambda status: status["speed_override"] == pytest.approx(0.01), "as slow as can be")
-        expect(page.locator("output")).to_have_text("1 %")
-        second.get_by_role("slider", name="Override", exact=True).press("End")
-        expect(second.get_by_role("button", name="Ask to take over")).to_be_visible()
-    assert holding.status()["speed_override"] == pytest.approx(0.01)
-    slider.press("End")
-    holding.until(lambda status: status["speed_override"] == 1.0, "at full speed")
-    page.keyboard.press("Escape")
-    holding.until(lambda status: status["state"] == "holding", "standstill")
-
-
-def test_values_are_shown_and_typed_in_the_units_that_the_browser_keeps(page: Page, holding: Platform) -> None:
-    show(page, "/targets")
-    page.get_by_label("Angles").select_option("deg")
-    page.get_by_label("Lengths").select_option("mm")
-    expect(page.get_by_label("joint3, deg")).to_have_value(re.compile(r"^(89\.9|90)"))
-    page.get_by_label("joint1, deg").fill("10")
-    page.get_by_label("joint4, slider").press("ArrowRight")
-    page.get_by_role("spinbutton", name="Speed (empty: the limit), deg/s").fill("20")
-    page.get_by_role("button", name="Plan").click()
-    page.get_by_role("button", name="Send", exact=True).click()
-    until(lambda: abs(holding.status()["joints"]["actual_position"][0] - math.radians(10)) < 1e-4, "10 degrees")
-    assert holding.status()["joints"]["commanded_position"][3] == pytest.approx(0.001, abs=1e-6)
-    show(page, "/arm")  # a page of its own: the browser has kept them
-    expect(page.locator("[data-live='actual_position.0']")).to_have_text("10.00")
-    expect(page.locator("[data-live='tool.2']")).to_have_text(f"{1000 * tool_of(holding)[2]:.1f}")
-    expect(page.locator("[data-bar='actual_position.0']")).to_have_attribute("title", "-177.6 to 177.6 deg")
-    show(page, "/limits")
-    expect(page.get_by_label("box max z, mm")).to_have_value("1400")
-    page.get_by_label("Lengths").select_option("m")
-    expect(page.get_by_label("box max z, m")).to_have_value("1.4")
-    page.get_by_label("Angles").select_option("rad")
-    expect(page.get_by_label("joint2 max, rad")).to_have_value("2")
-
-
-def test_a_click_or_a_key_moves_one_step_and_what_holds_a_jog_back_is_shown(page: Page, holding: Platform) -> None:
-    holding.call("mode", name="joint")
-    show(page, "/jog")
-    page.get_by_label("Movement").select_option("coarse")
-    before = tool_of(holding)[2]
-    up = page.get_by_role("button", name="Up, +Z")
-    expect(page.locator("[data-jog-step=coarse]")).to_be_visible()
-    up.hover()
-    page.mouse.down()
-    page.wait_for_timeout(500)
-    assert tool_of(holding)[2] == pytest.approx(before, abs=1e-6)
-    page.mouse.up()
-    until(lambda: tool_of(holding)[2] == pytest.approx(before + 0.01, abs=1e-5), "one step")
-    holding.until(lambda status: status["state"] == "holding", "rest")
-    page.get_by_label("Movement").select_option("fine")
-    expect(page.locator("[data-jog-step=fine]")).to_be_visible()
-    page.locator(".jog-area").focus()
-    page.keyboard.press("PageDown")
-    until(lambda: tool_of(holding)[2] == pytest.approx(before + 0.009, abs=1e-5), "one step back")
-    holding.until(lambda status: status["state"] == "holding", "rest")
-    page.get_by_label("Frame").select_option("joints")
-    page.get_by_role("button", name="joint1 +").click()
-    until(
-        lambda: holding.status()["joints"]["commanded_position"][0] == pytest.approx(math.radians(1), abs=1e-4), "1 deg"
-    )
-    page.get_by_role("button", name="Close gripper").click()
-    holding.until(lambda status: status["devices"]["io"]["outputs"]["value"] & GRIPPER, "closed")
-    expect(page.get_by_text("The gripper has closed")).to_be_visible()
-    page.locator(".jog-area").focus()
-    page.keyboard.press("o")
-    holding.until(lambda status: not status["devices"]["io"]["outputs"]["value"] & GRIPPER, "open")
-    holding.call("move_joints", q=[0.0] * 6)
-    holding.call("mode", name="cartesian")
-    page.get_by_label("Movement").select_option("")
-    page.get_by_label("Frame").select_option("base")
-    held = re.compile("Moving, limited: the elbow is 0.000 rad from its singularity, limit 0.08 rad: jog away from it")
-    page.get_by_role("button", name="Up, +Z").hover()
-
-    def is_held() -> bool:
-        page.mouse.up()
-        page.mouse.down()
-        page.wait_for_timeout(500)
-        return bool(held.search(page.locator("[data-live=message]").first.inner_text()))
-
-    until(is_held, "what holds the jog back")
-    page.mouse.up()
 
 
 def test_terminals_have_their_names_and_outputs_are_set_by_hand(page: Page, holding: Platform) -> None:
