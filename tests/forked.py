@@ -33,17 +33,19 @@ _SERVER.set_forkserver_preload(
 
 
 class Forked:
-    """`python -m module *arguments`, with its standard output, and its standard input where there is an input."""
+    """`python -m module *arguments`, with its output; `given` is its standard input. Its errors go to the test's."""
 
     def __init__(self, module: str, *arguments: str, given: str = "") -> None:
         reading, writing = _SERVER.Pipe(duplex=False)
         self._output = os.fdopen(os.dup(reading.fileno()), encoding="utf-8")
         reading.close()
+        errors = Connection(os.dup(2), readable=False)
         self._process = _SERVER.Process(
-            target=_run, args=(module, arguments, given, dict(os.environ), os.getcwd(), writing), daemon=True
+            target=_run, args=(module, arguments, given, dict(os.environ), os.getcwd(), writing, errors), daemon=True
         )
         self._process.start()
         writing.close()
+        errors.close()
         self.pid: int = self._process.pid
 
     def line(self) -> str:
@@ -92,12 +94,14 @@ def _run(
     environment: Mapping[str, str],
     directory: str,
     writing: Connection,
+    errors: Connection,
 ) -> None:
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(directory)
-    os.dup2(writing.fileno(), 1)
-    writing.close()
+    for connection, standard in ((writing, 1), (errors, 2)):
+        os.dup2(connection.fileno(), standard)
+        connection.close()
     sys.stdin = io.TextIOWrapper(io.BytesIO(given.encode()))
     sys.argv = [module, *arguments]
     warnings.simplefilter("ignore")  # of runpy: the module is imported already

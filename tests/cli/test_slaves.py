@@ -7,7 +7,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +17,40 @@ import yaml
 from rtcp.cli import slaves
 from rtcp.esi.sii import crc, write_sii
 from rtcp.fieldbus.eeprom import is_sound, with_alias
+from rtcp.ipc.errors import RtcpError
 from rtcp.launch import offline
 from tests.fieldbus.terminals import DEVICES, write_segment
-
-pytestmark = pytest.mark.platform
+from tests.forked import Forked
 
 Rtcp = Callable[..., Any]
 FILES, BITS4 = "slave 1 (Terminal 40, serial 140)", "slave 2 (Terminal 14, serial 114)"
 
 
+def ask(question: Mapping[str, Any], progress: Callable[[float], None]) -> dict[str, Any]:
+    """Ask the bus in a forked process; `tests/cli/test_offline.py` asks it in a process that the command starts."""
+    child = Forked("rtcp.launch.offline", given=json.dumps(question))
+    try:
+        while "progress" in (line := json.loads(child.line())):
+            progress(line["progress"])
+    finally:
+        child.terminate()
+        child.output()
+        child.end()
+    if "error" in line:
+        raise RtcpError(line["kind"], line["error"])
+    return line
+
+
 @pytest.fixture
 def lasting(arm: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], int]]:
     """Return a function that starts the arm's segment for several commands; it returns a pid."""
-    monkeypatch.setattr(offline, "SEGMENT_TIMEOUT_S", 120.0)  # for a host that is busy
+    monkeypatch.setattr(offline, "_question", ask)
     with contextlib.ExitStack() as stack:
 
         def start() -> int:
-            ready = stack.enter_context(offline._segment(arm.parent / "segment.yaml"))
+            segment = Forked("rtcp.virtual", "--config", str(arm.parent / "segment.yaml"))
+            stack.callback(segment.end)
+            ready = json.loads(segment.line())
             monkeypatch.setattr(offline, "_segment", lambda file: contextlib.nullcontext(ready))
             return int(ready["pid"])
 
@@ -61,7 +78,7 @@ def test_an_image_goes_into_the_eeprom_only_where_it_is_sound_and_of_this_device
 ) -> None:
     image = tmp_path / "image.bin"
     ended = rtcp("eeprom", "read", "1", "--out", str(image), *files)
-    assert (ended.out, image.read_bytes()) == (f"{FILES}: 2048 bytes written to {image}\n", write_sii(DEVICES["files"]))
+    assert (ended.out, image.read_bytes()) == (f"{FILES}: 512 bytes written to {image}\n", write_sii(DEVICES["files"]))
     changed = bytearray(image.read_bytes())
     changed[26:28] = b"\x2a\x00"  # its revision
     image.write_bytes(changed)
@@ -100,8 +117,8 @@ def test_an_eeprom_that_says_nothing_is_repaired_and_takes_no_alias_before(
 ) -> None:
     sound = eeprom(rtcp, "1", *files)
     bus = offline.OfflineBus("virtual", Path(files[1]))
-    bus.eeprom_write(1, sound[:16], 2048 * content)
-    assert eeprom(rtcp, "1", "--size", "2048", *files) == 2048 * content
+    bus.eeprom_write(1, sound[:16], 512 * content)
+    assert eeprom(rtcp, "1", "--size", "512", *files) == 512 * content
     refused = rtcp("alias", "set", "1", "7", "--yes", *files)
     assert refused.code == 3
     assert "the checksum in word 7 of its EEPROM is wrong" in refused.trouble
@@ -110,9 +127,9 @@ def test_an_eeprom_that_says_nothing_is_repaired_and_takes_no_alias_before(
     ended = rtcp("eeprom", "write", "1", str(image), "--yes", *files)
     assert (ended.code, eeprom(rtcp, "1", *files)) == (0, sound), ended.trouble
     long = tmp_path / "long.bin"
-    long.write_bytes(sound + 2048 * b"\xff")
+    long.write_bytes(sound + 512 * b"\xff")
     refused = rtcp("eeprom", "write", "1", str(long), "--yes", *files)
-    assert (refused.code, "from 128 to 2048, which the EEPROM has; --size gives its size" in refused.trouble) == (
+    assert (refused.code, "from 128 to 512, which the EEPROM has; --size gives its size" in refused.trouble) == (
         2,
         True,
     )

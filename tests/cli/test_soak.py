@@ -160,7 +160,7 @@ def test_ctrl_c_of_a_terminal_ends_all_workers_and_shows_what_is_known(
         "soak", "--simulated", "--sessions", "4000", "--seconds", "0.1", "--out", str(out), start_new_session=True
     )
     # A terminal reaches all processes of the command.
-    wait_until(out.is_dir if begun else lambda: bool(psutil.Process(process.pid).children(recursive=True)), 120.0)
+    wait_until(out.is_dir if begun else lambda: bool(psutil.Process(process.pid).children(recursive=True)))
     time.sleep(1.0 if begun else 0.0)  # the first sessions are submitted
     workers = psutil.Process(process.pid).children(recursive=True)
     assert workers

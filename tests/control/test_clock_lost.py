@@ -16,8 +16,8 @@ from rtcp.realtime.discipline import UNHEARD_CYCLES
 from rtcp.testing.simulation import Frame, Simulation
 
 CONFIG = load(default_config())
-CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=1000.0))
-PERIOD_S = 0.001
+CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=2000.0))
+PERIOD_S = 0.002
 SLOW_MOVE = MoveJoints((1.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.05, True)
 """Joint 1 to 1 rad at 0.05 rad/s: longer than any of these tests."""
 UNTIL_LOST_S = UNHEARD_CYCLES * PERIOD_S + 1.0
@@ -62,7 +62,7 @@ def test_a_reference_clock_that_stands_stops_the_arm_by_its_reaction_and_a_reset
         words.append(struct.unpack_from("<H", frame.sent[FIRST_DRIVE])[0])
 
     reference = Reference(moving)
-    moving.run(2 * UNTIL_LOST_S)
+    moving.run(0.1)
     assert moving.state is State.MOVING
     reference.stands = True
     moving.run(UNTIL_LOST_S - 0.01)
@@ -71,7 +71,7 @@ def test_a_reference_clock_that_stands_stops_the_arm_by_its_reaction_and_a_reset
     moving.bring_to(State.FAULT, 0.5)
     moving.run(0.01)
     # Set-points down to standstill, or the drives' own quick stop.
-    assert (words.count(ENABLE_OPERATION) > 50) is (moving.config.stops.clock_lost == "controlled_stop")
+    assert (words.count(ENABLE_OPERATION) > 25) is (moving.config.stops.clock_lost == "controlled_stop")
     assert words[-1] == QUICK_STOP
     assert [type(event.event) for event in moving.events].count(ClockLost) == 1
     assert moving.data.wkc == moving.data.expected_wkc
@@ -88,7 +88,7 @@ def test_a_reference_clock_that_stands_stops_the_arm_by_its_reaction_and_a_reset
 
 def test_a_reference_clock_that_stands_for_a_moment_stops_nothing(moving: Simulation) -> None:
     reference = Reference(moving)
-    for _ in range(3):
+    for _ in range(2):
         reference.stands = True
         moving.run(UNTIL_LOST_S - 0.4)
         reference.stands = False

@@ -17,6 +17,7 @@ from rtcp.ipc.states import DriveMode, State
 from rtcp.ipc.stop_reactions import StopReaction, bounds
 from rtcp.motion.guards.output_limiter import BACK_RAD_S
 from rtcp.motion.state import ArmState, Setpoint
+from tests.samples import examples
 
 from .rig import (
     CAUSES,
@@ -460,7 +461,7 @@ def do(rig: LoopRig, action: str, how: Any) -> None:
 
 
 # A failing example is not shortened: that would take minutes.
-@settings(max_examples=15, deadline=None, derandomize=True, phases=[Phase.generate])
+@settings(max_examples=examples(50), deadline=None, derandomize=True, phases=[Phase.generate])
 @given(actions=st.lists(ACTIONS, min_size=20, max_size=40))
 def test_whatever_happens_targets_stay_in_steps_and_only_enable_enables(actions: list[tuple[str, Any]]) -> None:
     with LoopRig() as rig:

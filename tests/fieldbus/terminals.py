@@ -83,7 +83,7 @@ def device(
         tx_pdos=tuple(pdos[1]),
         mailbox=model.Mailbox(model.Coe(sdo_information=True)) if mailbox else None,
         dc_modes=tuple(modes),
-        eeprom_bytes=2048,
+        eeprom_bytes=512,
     )
 
 

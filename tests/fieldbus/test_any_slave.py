@@ -119,7 +119,7 @@ def test_an_eeprom_is_read_and_written_word_by_word_and_only_where_it_differs(st
     assert bytes.fromhex(result["before"]) == write_sii(DEVICES["files"])
     assert result["written"] == [1, 0]
     assert result["same"]
-    assert result["parts"] == [8 / 2048, 1.0]
+    assert result["parts"] == [8 / 512, 1.0]
     # Half written, it has a wrong checksum whenever the write is broken off.
     assert (result["sound"], result["whole"]) == ([False, False, False, True], True)
 

@@ -26,6 +26,17 @@ def delay(slave: pysoem.CdefSlave) -> int | None:
         return None
 
 
+def unhurried(slave: pysoem.CdefSlave) -> None:
+    """Lengthen the watchdog of a slave, so that a busy host does not take it out of OP."""
+    for _ in range(5):
+        try:
+            slave._fpwr(0x0420, (50_000).to_bytes(2, "little"))
+            return
+        except pysoem.WkcError:
+            time.sleep(0.01)
+    raise RuntimeError("the watchdog cannot be set")
+
+
 def main() -> None:
     pid, interface, *outputs = sys.argv[1:]
     join(pid)
@@ -42,6 +53,8 @@ def main() -> None:
     result["codes"] = [[slave.state, slave.al_status] for slave in master.slaves]
     for slave, data in zip(master.slaves, outputs, strict=False):
         slave.output = bytes.fromhex(data)
+    for slave in master.slaves:
+        unhurried(slave)
     master.state = pysoem.OP_STATE
     master.write_state()
     counters = []

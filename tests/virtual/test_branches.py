@@ -84,7 +84,6 @@ def test_ports_latch_when_the_frame_comes_back_from_each_branch(tmp_path: Path) 
     assert esc.get(0x0908, 4) - first_port == 12000 + (12000 - (esc.get(0x0904, 4) - first_port))
 
 
-@pytest.mark.platform
 def test_soem_works_out_the_delays_of_a_tree(master: Master) -> None:
     result = master(*TREE)
     assert (result["slaves"], result["state"]) == (7, 8)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from random import Random
 from typing import NamedTuple
 
@@ -56,6 +57,13 @@ def hold(heated: HeatedRod, temperature: float, seconds: float) -> float:
     return power
 
 
+@cache
+def held(diameter: float, emissivity: float) -> tuple[HeatedRod, float]:
+    """Return a rod that was held at 500 C, and its power; several tests read it."""
+    heated = rod(diameter, Alloy(emissivity=emissivity))
+    return heated, hold(heated, 500.0, 120.0)
+
+
 def cool(heated: HeatedRod, seconds: float) -> None:
     heated.step(seconds, 0.0)
 
@@ -77,8 +85,7 @@ def test_the_first_millisecond_heats_at_the_rate_of_the_table(row: Row) -> None:
 @by_emissivity
 @by_diameter
 def test_holding_500_degrees_takes_power_current_and_duty_of_the_table(row: Row, case: int, emissivity: float) -> None:
-    heated = rod(row.diameter, Alloy(emissivity=emissivity))
-    power = hold(heated, 500.0, 120.0)
+    heated, power = held(row.diameter, emissivity)
     assert heated.middle_temperature == pytest.approx(500.0, abs=3.0)
     assert power == pytest.approx(row.hold[case], rel=0.03)
     current = 12.0 / (heated.resistance + SOURCE)
@@ -92,8 +99,7 @@ def test_cold_ends_are_up_to_30_percent_shorter_than_those_of_a_fin_with_constan
     row: Row, case: int, emissivity: float
 ) -> None:
     """The table takes the loss coefficient at 500 C for the whole fin; near 500 C the loss rises faster than that."""
-    heated = rod(row.diameter, Alloy(emissivity=emissivity))
-    hold(heated, 500.0, 120.0)
+    heated, _ = held(row.diameter, emissivity)
     half = len(heated.positions) // 2
     missing = heated.middle_temperature - heated.temperature[:half]
     cold_end = float(np.interp(-480.0 / np.e, -missing, heated.positions[:half])) * 1e3

@@ -13,6 +13,7 @@ import pytest
 
 from rtcp.virtual.faults.control import SegmentClient
 from rtcp.virtual.protocol import DatagramCommand
+from tests.forked import Forked
 from tests.virtual.frames import Datagram, build
 
 ROOT = Path(__file__).parents[3]
@@ -20,9 +21,9 @@ CHILD = Path(__file__).with_name("raw_child.py")
 
 
 class Running(NamedTuple):
-    """A segment that runs: its process and its control socket."""
+    """A segment that runs: its process id and its control socket."""
 
-    process: subprocess.Popen[str]
+    pid: int
     control: Path
 
     def client(self) -> SegmentClient:
@@ -75,22 +76,21 @@ def begin_segment(three_slaves: Path) -> Iterator[BeginSegment]:
 def segment(three_slaves: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """One segment for all tests of a file; each test clears its own faults."""
     control = tmp_path_factory.mktemp("control") / "segment.sock"
-    process = start(three_slaves, "--control", str(control))
+    process = Forked("tests.virtual.patient_segment", "--config", str(three_slaves), "--control", str(control))
     try:
-        assert process.stdout.readline()
-        yield Running(process, control)
+        assert process.line()
+        yield Running(process.pid, control)
         process.terminate()
-        assert (process.communicate()[1], process.returncode) == ("", 0)
+        assert (process.output(), process.code) == ("", 0)
     finally:
-        process.kill()
-        process.communicate()
+        process.end()
 
 
 @pytest.fixture(scope="module")
 def exchange(segment: Running) -> Iterator[Exchange]:
     """Send frames one after the other, wait for `answers` frames (default: one each) and `patience_s` longer."""
     with subprocess.Popen(
-        [sys.executable, str(CHILD), str(segment.process.pid), "ecat0"],
+        [sys.executable, str(CHILD), str(segment.pid), "ecat0"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     ) as child:  # fmt: skip
 

@@ -20,8 +20,6 @@ from rtcp.virtual.request_socket import LONGEST_REQUEST, MOST_CLIENTS, RequestRe
 from tests.virtual.faults.conftest import BeginSegment, Exchange, Running
 from tests.virtual.frames import Datagram, build, parse
 
-pytestmark = pytest.mark.platform
-
 BROADCASTS = [build(Datagram(DatagramCommand.BRD, number, 0, 0, bytes(2))) for number in range(20)]
 
 
@@ -270,7 +268,7 @@ def test_the_socket_is_its_owners_alone(segment: Running) -> None:
 
 def test_a_socket_in_use_is_refused_in_a_sentence_and_left_alone(begin_segment: BeginSegment, segment: Running) -> None:
     second = begin_segment("--control", str(segment.control))
-    _, stderr = second.communicate(timeout=20)
+    _, stderr = second.communicate()
     assert second.returncode == 2
     assert stderr == (
         f"the control socket {segment.control} is in use by a process that runs: choose another path\n"
@@ -285,7 +283,7 @@ def test_a_file_that_is_no_socket_is_refused_in_a_sentence_and_left_alone(
     path = tmp_path / "precious"
     path.write_text("data")
     refused = begin_segment("--control", str(path))
-    assert "there is a file that is no socket" in refused.communicate(timeout=20)[1]
+    assert "there is a file that is no socket" in refused.communicate()[1]
     assert (refused.returncode, path.read_text()) == (2, "data")
 
 
@@ -296,10 +294,10 @@ def test_a_killed_segments_socket_is_replaced_and_a_stopped_ones_removed(
     for end in (signal.SIGKILL, signal.SIGTERM):
         running = begin_segment("--control", str(path))
         assert running.stdout.readline()
-        with Running(running, path).client() as client:
+        with Running(running.pid, path).client() as client:
             assert client.faults() == []
             running.send_signal(end)
-            running.wait(10)
+            running.wait()
             with pytest.raises(ServerAway, match="has gone"):
                 client.faults()
         assert path.exists() == (end == signal.SIGKILL)
@@ -308,7 +306,7 @@ def test_a_killed_segments_socket_is_replaced_and_a_stopped_ones_removed(
 def test_where_there_is_no_segment_the_client_says_where_it_looked(tmp_path: Path) -> None:
     path = tmp_path / "segment.sock"
     with pytest.raises(ServerAway, match=f"no segment answers at {path}"):
-        Running(None, path).client()
+        Running(0, path).client()
 
 
 # -- scripts --------------------------------------------------------------------------------------------------------
@@ -324,7 +322,7 @@ def test_a_script_runs_by_itself_from_the_segments_start(begin_segment: BeginSeg
     )
     running = begin_segment("--control", str(path), "--faults", str(script))
     assert running.stdout.readline()
-    with Running(running, path).client() as client:
+    with Running(running.pid, path).client() as client:
         while len(active := client.faults()) < 2:
             time.sleep(0.01)
     assert [each["fault"].get("after") for each in active] == [2, 1]
@@ -337,7 +335,7 @@ def test_a_script_that_is_wrong_is_refused_with_its_lines_before_the_segment_sta
     script = tmp_path / "faults.yaml"
     script.write_text("faults:\n  - {at: 1, fault: cabel, after: 2}\n  - {fault: power, slave: 9}\n")
     refused = begin_segment("--faults", str(script))
-    stderr = refused.communicate(timeout=20)[1].splitlines()
+    stderr = refused.communicate()[1].splitlines()
     assert refused.returncode == 2
     assert stderr[0].startswith(f"{script}:2: faults[0].fault: this fault does not exist; did you mean cable?")
     assert stderr[1] == f"{script}:3: faults[1].slave: found 9, the segment has 3 slaves: allowed is at most 3"

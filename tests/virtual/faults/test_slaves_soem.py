@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.platform
-
-ROOT = Path(__file__).parents[3]
-CHILD = Path(__file__).with_name("soem_recovery_child.py")
+from tests.forked import answer_of
+from tests.virtual.conftest import segment
 
 
+@pytest.mark.platform
 def test_a_real_master_sees_each_fault_and_brings_all_back_after_a_broken_cable_and_a_loss_of_supply(
     tmp_path: Path,
 ) -> None:
     config, control = tmp_path / "segment.yaml", tmp_path / "control"
     slaves = "".join(f"  - {{model: {model}}}\n" for model in ["diewu-io", *["cubemars-orh70"] * 6])
     config.write_text("slaves:\n" + slaves, encoding="utf-8")
-    segment = subprocess.Popen(
-        [sys.executable, "-m", "rtcp.virtual", "--config", str(config), "--control", str(control)],
-        stdout=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
-    try:
-        ready = json.loads(segment.stdout.readline())
-        done = subprocess.run(
-            [sys.executable, str(CHILD), str(ready["pid"]), ready["interface"], str(control)],
-            stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
-    finally:
-        segment.kill()
-        segment.communicate()
-    result = json.loads(done.stdout)
+    with segment(config, "--control", str(control)) as pid:
+        result = answer_of("tests.virtual.faults.soem_recovery_child", str(pid), "ecat0", str(control))
     assert (result["slaves"], result["op"]) == (7, 8)
     # -1: the host delayed the frame beyond the master's timeout.
     assert {*result["broken"]} <= {9, -1}

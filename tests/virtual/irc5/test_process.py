@@ -20,8 +20,7 @@ pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip in
 
 from tests.virtual.irc5.wire import Robot, sensor
 from tests.virtual.test_segment_process import NOBODY, needs_nobody
-
-pytestmark = pytest.mark.platform
+from tests.waiting import until
 
 ROOT = Path(__file__).parents[3]
 PEERS = Path(os.environ.get("RTCP_EGM_PEERS", ROOT / ".venv-egm-peers")) / "bin" / "python"
@@ -73,7 +72,7 @@ def started(
             operator.connect(str(control))
             yield operator, ready
         process.send_signal(signal.SIGTERM)
-        assert process.communicate(timeout=20.0)[1] == ""
+        assert process.communicate()[1] == ""
         assert process.returncode == 0
         assert not control.exists()
     finally:
@@ -119,6 +118,7 @@ def lead(pc: socket.socket, joint: float) -> Robot:
     raise AssertionError(f"joint 1 stands at {robot.actual[0]}")
 
 
+@pytest.mark.timing
 def test_four_units_speak_each_to_its_port_with_a_period_of_its_own(tmp_path: Path) -> None:
     with ExitStack() as stack:
         pcs = [stack.enter_context(listening()) for _ in range(4)]
@@ -155,11 +155,13 @@ def test_datagrams_from_elsewhere_are_counted_and_dropped(tmp_path: Path) -> Non
         stranger.sendto(sensor(1, (50.0, 0, 0, 0, 30, 0)), robot)
         for datagram in (b"", b"hello", b"\xff" * 1500):
             pc.sendto(datagram, robot)
-        time.sleep(0.3)
-        state = ask(operator, do="status")["units"]["ROB_1"]
-        counts = state["counts"]
-        assert (counts["foreign_sender"], counts["garbled"], counts["foreign"]) == (1, 2, 1)
-        assert state["position_deg"][0] == 0.0
+
+        def counts() -> list[int]:
+            counted = ask(operator, do="status")["units"]["ROB_1"]["counts"]
+            return [counted.get(kind, 0) for kind in ("foreign_sender", "garbled", "foreign")]
+
+        until(lambda: counts() == [1, 2, 1], "all are counted")
+        assert ask(operator, do="status")["units"]["ROB_1"]["position_deg"][0] == 0.0
 
 
 def test_a_mistake_in_the_file_is_a_sentence_without_a_traceback(tmp_path: Path) -> None:

@@ -24,8 +24,6 @@ pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip in
 from rtcp.fieldbus.simple_message.messages import JointPosition, JointTrajPt, Message, ReplyCode, SpecialSequence
 from rtcp.ros.simple_message.client import MotionClient, StateClient
 
-pytestmark = pytest.mark.platform
-
 ROOT = Path(__file__).parents[3]
 ZERO = "initial_position: [0, 0, 0, 0, 0, 0]"
 STOP = struct.pack("<5i12f", 64, 11, 2, 0, -4, *[0.0] * 12)
