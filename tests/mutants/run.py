@@ -41,7 +41,7 @@ TESTS = "not alone and not slow"
 LONGEST_S = 0.7
 """Longer tests are left out, as in `make check`."""
 FOLDERS = ("devices", "realtime", "processes", "fieldbus", "motion", "control", "cell", "sessions", "config", "faults")
-TESTS_S = 20.0
+TESTS_S = 10.0
 """The tests of one mistake take this CPU time at most. The longest ones are left out, and the report says so."""
 _PLAIN = ("-q", "-p", "no:cacheprovider", "-p", "no:randomly")
 TEST_LIMIT_S = 30
