@@ -28,8 +28,8 @@ _OF_COSMIC_RAY = (
 )
 _LIMITING = ("abs", "max", "min")
 """Functions whose result is often one of their arguments."""
-_UNORDERED = ("max", "min", "isinstance", "hypot", "Field")
-"""Functions whose arguments are not swapped: it changes nothing, or every test notices it."""
+_UNORDERED = ("max", "min", "isinstance", "hypot", "in")
+"""Names before arguments and tuples that are not swapped: it changes nothing, or every test notices it."""
 
 
 class _Replace(Operator):
@@ -110,7 +110,8 @@ class SwapArguments(_Replace):
         """Yield the list with two neighbours swapped, for all neighbours."""
         if node.type not in ("arglist", "testlist_comp") or node.search_ancestor("funcdef") is None:
             return
-        if (called := node.parent.get_previous_sibling()) is not None and called.get_code().strip() in _UNORDERED:
+        before = node.parent.get_previous_sibling()
+        if before is not None and before.get_code().split()[-1] in _UNORDERED:
             return
         parts = [part.get_code().strip() for part in _arguments(node)]
         for i, (a, b) in enumerate(zip(_arguments(node), _arguments(node)[1:], strict=False)):

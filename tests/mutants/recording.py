@@ -166,7 +166,7 @@ class Recorder:
         self._began_s = process_time()
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        if not report.passed:
+        if report.failed:
             self._records[self._file].failed.add(report.nodeid)
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
