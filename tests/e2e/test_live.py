@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import time
 from typing import Any
 
 import pytest
 
-from rtcp.cli.__main__ import main
 from rtcp.ipc.session import read_processes
 from tests.viewer import Viewer
 
@@ -63,21 +61,3 @@ def test_the_view_ends_with_the_loop(running: Platform) -> None:
         kill(read_processes(running.directory).loop)
         _, said = view.communicate()
     assert (view.returncode, said) == (4, "rtcp: the platform has ended\n")
-
-
-def test_what_cannot_be_served_ends_in_one_message(
-    running: Platform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def said(code: int, *arguments: str) -> str:
-        assert main(("live", *arguments)) == code
-        return capsys.readouterr().err
-
-    assert "start one with `rtcp start`" in said(4)
-    for name, value in running.environment.items():
-        monkeypatch.setenv(name, value)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = str(server.getsockname()[1])
-        told = said(3, "--port", port)
-    assert told.startswith(f"rtcp: 127.0.0.1 port {port} cannot be listened at: Address already in use")
-    assert "nowhere.invalid port 8765 cannot be" in said(3, "--host", "nowhere.invalid")
-    assert "--port" in said(2, "--port", "70000")
