@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import time
 from typing import Any
 
 import pytest
 
-from rtcp.cli.__main__ import main
 from rtcp.ipc.session import read_processes
 from tests.viewer import Viewer
 
@@ -45,7 +43,7 @@ def test_a_view_shows_a_move_as_the_platform_reports_it_and_says_that_others_can
                 states.append(message["state"])
     assert numbers == list(range(numbers[0], numbers[-1] + 1, 2))
     assert states == ["holding", "moving", "holding"]
-    assert last["/joint_states"].position == pytest.approx(arrived["joints"]["actual_position"], abs=1e-4)
+    assert last["/joint_states"].position == pytest.approx(arrived["joints"]["actual_position"], abs=1e-3)
     assert last["/joint_targets"].name == last["/joint_states"].name
     assert [frame.child_frame_id for frame in last["/tf"].transforms][-1] == "tool0"
     # Also for one who comes when all has been said.
@@ -63,21 +61,3 @@ def test_the_view_ends_with_the_loop(running: Platform) -> None:
         kill(read_processes(running.directory).loop)
         _, said = view.communicate()
     assert (view.returncode, said) == (4, "rtcp: the platform has ended\n")
-
-
-def test_what_cannot_be_served_ends_in_one_message(
-    running: Platform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def said(code: int, *arguments: str) -> str:
-        assert main(("live", *arguments)) == code
-        return capsys.readouterr().err
-
-    assert "start one with `rtcp start`" in said(4)
-    for name, value in running.environment.items():
-        monkeypatch.setenv(name, value)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = str(server.getsockname()[1])
-        told = said(3, "--port", port)
-    assert told.startswith(f"rtcp: 127.0.0.1 port {port} cannot be listened at: Address already in use")
-    assert "nowhere.invalid port 8765 cannot be" in said(3, "--host", "nowhere.invalid")
-    assert "--port" in said(2, "--port", "70000")

@@ -48,8 +48,10 @@ BEGINS = {
 """Message of the command at the beginning of each phase."""
 
 
-ENDED_ELSEWHERE = pytest.mark.long("test_a_command_that_is_ended_anywhere_leaves_no_heat_and_arms_at_rest")
-OTHER_CAUSE = pytest.mark.long("test_heat_ends_by_itself_and_the_message_says_why")
+ENDED_OTHERWISE = pytest.mark.long("test_a_command_that_is_ended_anywhere_leaves_no_heat_and_arms_at_rest")
+OTHER_CAUSE = pytest.mark.long(
+    "test_by_hand_in_auto_with_each_arm_in_its_hand_mode_a_released_enabling_device_ends_the_heat"
+)
 
 
 class HeaterCell:
@@ -286,7 +288,12 @@ def test_a_rod_gets_its_shape_and_the_report_says_what_was_measured(cell: Heater
 @pytest.mark.parametrize(
     ("number", "phase"),
     [
-        pytest.param(number, phase, id=f"{number.name}-{phase}", marks=[] if phase == "heating" else [ENDED_ELSEWHERE])
+        pytest.param(
+            number,
+            phase,
+            id=f"{number.name}-{phase}",
+            marks=[] if (number, phase) == (signal.SIGKILL, "heating") else [ENDED_OTHERWISE],
+        )
         for number in (signal.SIGINT, signal.SIGKILL)
         for phase in BEGINS
     ],
@@ -340,9 +347,8 @@ CAUSES: dict[str, tuple[Callable[[HeaterCell], None], str]] = {
 }
 
 
-@pytest.mark.parametrize(
-    "cause", [pytest.param(cause, marks=[] if cause == "cell halt" else [OTHER_CAUSE]) for cause in CAUSES]
-)
+@OTHER_CAUSE
+@pytest.mark.parametrize("cause", CAUSES)
 def test_heat_ends_by_itself_and_the_message_says_why(cell: HeaterCell, cause: str) -> None:
     act, words = CAUSES[cause]
     run = begin(cell, "heating")

@@ -23,7 +23,7 @@ from tests.waiting import until as wait_for
 
 pytestmark = pytest.mark.platform
 TOLERANCE_RAD = 0.01
-STEPS = 12
+STEPS = 20
 
 
 @pytest.fixture

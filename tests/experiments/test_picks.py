@@ -18,7 +18,7 @@ from rtcp.testing.simulation import Simulation
 
 GRIPPER_OUTPUT = 0x08
 CONFIG = load(default_config())
-CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=2000.0))
+CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=5000.0))
 
 
 class Joystick:
@@ -47,8 +47,7 @@ class Joystick:
 
 @pytest.fixture
 def joystick() -> Iterator[Joystick]:
-    config = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=2000.0))
-    with Simulation(config, seed=1) as simulation:
+    with Simulation(CONFIG, seed=1) as simulation:
         simulation.hold()
         assert CONFIG.arm is not None
         start = begin_pose(CONFIG.arm)

@@ -41,7 +41,7 @@ def test_scans_and_configurations_on_mutated_answers_end_in_a_sentence_and_a_san
 
 
 def test_the_masters_own_parsers_end_in_an_answer_or_a_sentence_and_work_on() -> None:
-    outcome = mutated_answers.run(800, 1)
+    outcome = mutated_answers.run(800, 4)
     assert outcome.failures == []
     assert outcome.frames >= 800
     assert outcome.kinds["done"] > 40

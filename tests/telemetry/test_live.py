@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from rtcp.cli.__main__ import main
 from rtcp.ipc.runtime_directory import blackboard_file
 from tests.telemetry.test_recorder import Loop
 from tests.viewer import Viewer
@@ -57,3 +59,20 @@ def test_a_client_that_never_reads_is_dropped_and_takes_nothing_from_others(loop
     assert published > 7_000
     assert grown < 10e6
     assert process.returncode == 0
+
+
+def test_what_cannot_be_served_ends_in_one_message(
+    loop: Loop, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said(code: int, *arguments: str) -> str:
+        assert main(("live", *arguments)) == code
+        return capsys.readouterr().err
+
+    assert "start one with `rtcp start`" in said(4)
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(loop.directory))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = str(server.getsockname()[1])
+        told = said(3, "--port", port)
+    assert told.startswith(f"rtcp: 127.0.0.1 port {port} cannot be listened at: Address already in use")
+    assert "nowhere.invalid port 8765 cannot be" in said(3, "--host", "nowhere.invalid")
+    assert "--port" in said(2, "--port", "70000")
