@@ -106,6 +106,10 @@ def test_the_last_line_counts_what_was_not_selected_and_why(suite: Path, options
     )
 
 
+def test_the_suite_keeps_its_rules(request: pytest.FixtureRequest) -> None:
+    assert request.config.pluginmanager.get_plugin("verdicts").problems == []
+
+
 @pytest.mark.parametrize(
     ("test", "found"),
     [
@@ -113,9 +117,10 @@ def test_the_last_line_counts_what_was_not_selected_and_why(suite: Path, options
         ("@pytest.mark.platform\n@pytest.mark.parametrize('n', range(151))\ndef test_many(n): pass", "151 tests run"),
     ],
 )
-def test_a_suite_that_breaks_its_rules_is_refused(suite: Path, test: str, found: str) -> None:
-    status, printed = run(suite, test)
-    assert status != 0
+def test_a_broken_rule_of_the_suite_is_found(suite: Path, test: str, found: str) -> None:
+    rules = "\ndef test_rules(request):\n    assert not request.config.pluginmanager.get_plugin('verdicts').problems"
+    status, printed = run(suite, f"{test}\n{rules}", "-k", "rules")
+    assert status == 1
     assert found in printed
 
 

@@ -16,7 +16,15 @@ pytestmark = pytest.mark.platform
 STREAM = {"topic": "joint_command", "velocities": True, "radius": 0.3, "period_s": 20.0, "rate_hz": 50}
 
 
-@pytest.mark.parametrize("kind", [pytest.param("path", marks=pytest.mark.long("[stream] of the same test")), "stream"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(
+            "path", marks=pytest.mark.long("test_after_the_loss_of_its_node_the_arm_stops_and_the_drives_are_disabled")
+        ),
+        "stream",
+    ],
+)
 def test_after_the_loss_of_its_node_the_arm_stops_and_the_drives_are_disabled(
     ros: Ros, platform: Platform, client: Client, kind: str
 ) -> None:
