@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 
@@ -146,6 +146,21 @@ def test_it_closes_and_opens_under_the_lease_and_reports_each_time_where_it_rest
     assert reported == [(AXIS, pytest.approx(CLOSED), False), (AXIS, pytest.approx(OPEN), False)]
     assert kept_to_its_limits(hand.setpoints)
     assert hand.state is State.HOLDING
+
+
+def test_the_record_of_a_cycle_has_what_its_drive_measures_and_is_sent(hand: Hand) -> None:
+    gripper, drive = hand.gripper, hand.gripper.drive
+    drive.velocity, drive.torque, drive.target_position = 0.2, 0.3, 0.9
+    values: list[Any] = ["before"] * gripper.at + [None] * len(gripper.fields) + ["behind"]
+    gripper.publish(values)
+    names = [field.name.removeprefix("gripper_") for field in gripper.fields]
+    assert dict(zip(names, values[gripper.at : -1], strict=True)) == {
+        "actual_position": drive.position, "actual_velocity": 0.2, "actual_torque": 0.3, "sent_position": 0.9,
+        "drive_state": drive.state, "statusword": drive.statusword,
+    }  # fmt: skip
+    assert drive.statusword != 0
+    assert {*values[: gripper.at]} <= {"before"}
+    assert values[-1] == "behind"
 
 
 def test_without_the_lease_it_does_not_begin(hand: Hand) -> None:

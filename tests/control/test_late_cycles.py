@@ -9,7 +9,7 @@ from random import Random
 
 import pytest
 
-from rtcp.control.cycle import ahead_of_sync0
+from rtcp.control.cycle import ahead_of_sync0, make_discipline
 
 from .rig import CONFIG, PERIOD_S, LoopRig
 
@@ -105,3 +105,17 @@ def test_of_several_sync0_the_first_after_the_frame_counts() -> None:
     assert ahead_of_sync0(shifted) == pytest.approx(0.2 * PERIOD_NS, abs=1)
     none = tuple(replace(slave, device=replace(slave.device, assign_activate=0)) for slave in slaves)
     assert ahead_of_sync0(replace(shifted, slaves=none)) == PERIOD_NS // 2
+
+
+@pytest.mark.parametrize("phase", [0.25, 0.7])
+@pytest.mark.parametrize("shift_us", [0.0, 60.0, -40.0])
+def test_frames_are_sent_at_their_phase_after_the_first_sync0(phase: float, shift_us: float) -> None:
+    slaves = tuple(replace(slave, device=replace(slave.device, sync0_shift_us=shift_us)) for slave in CONFIG.slaves)
+    config = replace(CONFIG, slaves=slaves, bus=replace(CONFIG.ethercat, send_phase=phase))
+    discipline = make_discipline(config)
+    wanted = 1000 * PERIOD_NS + round(1000.0 * shift_us + phase * PERIOD_NS)
+    for late_ns in (0, 7000, -7000):
+        discipline.observe(10**12, wanted + late_ns)
+        assert discipline.raw_ns == late_ns
+    none = tuple(replace(slave, device=replace(slave.device, assign_activate=0)) for slave in slaves)
+    assert make_discipline(replace(config, slaves=none)) is None
