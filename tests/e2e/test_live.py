@@ -60,4 +60,5 @@ def test_the_view_ends_with_the_loop(running: Platform) -> None:
         viewer.first("/cycle")
         kill(read_processes(running.directory).loop)
         _, said = view.communicate()
+    running.restore()  # the other tests of this worker need a loop
     assert (view.returncode, said) == (4, "rtcp: the platform has ended\n")

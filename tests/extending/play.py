@@ -1,4 +1,4 @@
-"""One scene a function, played in a process that has the example package installed: `play.py SCENE CONFIG` prints JSON.
+"""One scene a function, played in a process that has the example package installed: `play.py CONFIG` prints JSON.
 
 A process of its own: what a package registers stays registered for the process's life.
 """
@@ -184,8 +184,6 @@ def methods(path: Path) -> Any:
 
 
 if __name__ == "__main__":
-    _, scene, config = sys.argv
-    json.dump(
-        {play.__name__: play for play in (sway, thermometer, alarm, wire_break, methods, fan)}[scene](Path(config)),
-        sys.stdout,
-    )
+    _, config = sys.argv
+    scenes = (sway, thermometer, alarm, wire_break, methods, fan)
+    json.dump({play.__name__: play(Path(config)) for play in scenes}, sys.stdout)
