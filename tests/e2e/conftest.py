@@ -26,6 +26,7 @@ from rtcp.ipc.session import read_processes
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.arms import replace_drives, slaves_of
 from tests.leftovers import Leftovers
+from tests.two_tools import add_tools
 from tests.waiting import HANG_S, until
 
 HERE = Path(__file__).parent
@@ -158,8 +159,9 @@ class Platform:
             lambda status: (
                 all(slave["state"] == "OP" for slave in status["slaves"])
                 and status["state"] not in ("moving", "stopping")
+                and status["dc"]["locked"]
             ),
-            "OP and rest",
+            "OP, rest and a followed clock",
         )
         if found["state"] in ("fault", "stopped_by_limit"):
             self.call("reset")
@@ -193,6 +195,11 @@ class Platform:
             lambda status: status["state"] == "moving" and abs(status["joints"]["actual_position"][0]) > far_rad,
             "motion",
         )
+
+    def pass_cycles(self, count: int) -> None:
+        """Wait until the loop has run so many cycles."""
+        end = self.status()["cycles"] + count
+        self.until(lambda status: status["cycles"] >= end, f"{count} cycles")
 
     def wire(self, *arguments: str) -> str:
         """Run `tests.e2e.wire` in the segment's namespace."""
@@ -234,8 +241,7 @@ class Platform:
         for pid in self.pids().values():
             _signal(pid, signal.SIGCONT)
         if all(lives(pid) for pid in self.pids().values()):
-            before = self.status()["cycles"]
-            self.until(lambda status: status["cycles"] > before + 250, "the cycles in which the loop notices the pause")
+            self.pass_cycles(250)  # in which the loop notices the pause
 
     def pids(self) -> dict[str, int]:
         """Return the process ids that the platform wrote down."""
@@ -279,7 +285,7 @@ def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> None:
 
 
 def _signal(pid: int, number: signal.Signals) -> None:
-    with contextlib.suppress(ProcessLookupError):
+    if lives(pid):  # 0 where the platform has ended: that would be the group of this process
         os.kill(pid, number)
 
 
@@ -293,10 +299,11 @@ def platform() -> Iterator[Platform]:
 
 @pytest.fixture(scope="session")
 def kept(leftovers: Leftovers) -> Iterator[Platform]:
-    """The started platform of this worker; its cycle is `PERIOD_US`."""
+    """The started platform of this worker; its cycle is `PERIOD_US`, and its arm has two tools."""
     made = Platform()
     leftovers.shared.add(str(made.directory))
     made.be_patient(2000)
+    add_tools(made.directory / "config")
     made.rtcp("start", "--detach")
     yield made
     made.thaw()

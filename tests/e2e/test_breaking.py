@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import signal
-import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
+import rtcp
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.observer import Observer, record_type
+from rtcp.ipc.errors import Faulted, RtcpError
+from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
-from rtcp.ipc.schema import FLAG_ALL_OP, FLAG_DC_LOCKED, arm_schema
+from rtcp.ipc.states import State
 from rtcp.telemetry.reading import target_steps
 from rtcp.virtual.faults.control import SegmentClient
-from tests.e2e.conftest import CUBEMARS, FULL_CIA402, SLAVES, Platform, gone, kill, lives
+from tests.e2e.conftest import CUBEMARS, SLAVES, Platform, gone, kill, lives
 from tests.e2e.wire import outputs
+from tests.waiting import until
 
 pytestmark = pytest.mark.platform
-
-PERIOD_US = 1000
-"""A cycle that a loaded host keeps."""
 
 ZERO = [0.0] * 6
 
@@ -35,24 +36,22 @@ def observe(platform: Platform) -> Observer:
     return Observer(blackboard_file(platform.directory))
 
 
-def stand_still(pid: int, seconds: float) -> None:
+@contextlib.contextmanager
+def stands_still(pid: int) -> Iterator[None]:
+    """Stop a process in this block."""
     os.kill(pid, signal.SIGSTOP)
     try:
-        time.sleep(seconds)
+        yield
     finally:
-        os.kill(pid, signal.SIGCONT)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
 
 
-def test_the_cycle_locks_onto_drifting_clocks_within_two_seconds_of_cycles(shared: Platform) -> None:
-    observer = observe(shared)
-    records, _ = observer.since(0)
-    observer.close()
-    locked = (records["flags"] & FLAG_DC_LOCKED) != 0
-    assert int(records["cycle"][0]) < 100
-    assert locked.any()
-    assert int(records["cycle"][np.argmax(locked)]) * PERIOD_US * 1e-6 < 2.0
-    # OP was requested only then.
-    assert not ((records["flags"] & FLAG_ALL_OP) != 0)[: np.argmax(locked)].any()
+def state(observer: Observer) -> State:
+    """Return the state of the machine in the last record."""
+    latest = observer.latest()
+    assert latest is not None
+    return State(int(latest[0]["state"]))
 
 
 def test_a_stop_leaves_slaves_in_init_and_nothing_behind(running: Platform) -> None:
@@ -71,18 +70,20 @@ def test_a_stop_leaves_slaves_in_init_and_nothing_behind(running: Platform) -> N
 
 
 @CUBEMARS  # Other drives saturate while they catch up, and the supervision of torque ends the motion.
-def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_grid(running: Platform) -> None:
+def test_a_segment_that_stands_still_for_a_moment_does_not_take_the_cycle_off_its_grid(running: Platform) -> None:
     running.call("enable")
-    moving = running.background("move", "1.0", "0", "0", "0", "0", "0", "--speed", "0.3")
+    moving = running.background("move", "0.4", "0", "0", "0", "0", "0", "--speed", "0.3")
     running.until_moving()
     observer = observe(running)
     first = observer.head
-    stand_still(running.pids()["segment"], 0.05)
-    time.sleep(0.1)
+    with stands_still(running.pids()["segment"]):
+        until(lambda: observer.head >= first + 15, "some cycles without a frame", 0.001)
+    # Shorter than allowed: the motion continues, and no target jumped.
+    assert moving.wait() == 0
     records, lost = observer.since(first)
     assert lost == 0
     without = records[records["wkc"] < 0]
-    assert len(without) >= 20
+    assert len(without) >= 10
     # Every wake-up was planned a whole number of periods after the previous one.
     planned = (records["time_ns"] - records["wakeup_ns"]).astype(np.int64)
     periods = np.diff(planned) / observer.period_ns
@@ -90,8 +91,6 @@ def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_g
     # A lost frame costs its cycle only: frameless cycles follow each other at the cycle's pace.
     waits = np.diff(without["time_ns"].astype(np.int64)) / observer.period_ns
     assert np.median(waits) < 1.5
-    # Shorter than allowed: the motion continues, and no target jumped.
-    assert moving.wait() == 0
     steps = np.abs(np.diff(records["sent_position"], axis=0))
     assert steps.max() <= 0.5 * observer.period_ns * 1e-9 * 1.001
     observer.close()
@@ -104,7 +103,8 @@ def test_a_segment_that_stands_still_for_longer_than_allowed_is_a_fault_and_can_
     running.until_moving()
     observer = observe(running)
     first, since = observer.head, running.last_event()
-    stand_still(running.pids()["segment"], 2.5)
+    with stands_still(running.pids()["segment"]):
+        running.until(lambda status: status["state"] == "fault", "the fault")
     moving.communicate()
     assert moving.returncode == 5
     assert LOST & set(running.events(since))
@@ -121,13 +121,10 @@ def test_a_segment_that_stands_still_for_longer_than_allowed_is_a_fault_and_can_
     assert running.al_states() == [OP] * SLAVES
     assert running.status()["state"] == "ready"
     running.call("enable")
-    running.call("move_joints", q=ZERO)
 
 
 @CUBEMARS
-@pytest.mark.parametrize("mode", ["csp", *(pytest.param(mode, marks=pytest.mark.long) for mode in ("csv", "cst"))])
-def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform, mode: str) -> None:
-    running.call("mode", name=mode)
+def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform) -> None:
     running.call("enable")
     moving = running.background("move", "1.5", "0.5", "0", "0", "0", "0", "--speed", "0.4")
     running.until_moving()
@@ -144,23 +141,20 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform
         def drives() -> list[dict[str, Any]]:
             return [slave for slave in segment.truth()["slaves"] if "position_rad" in slave]
 
-        time.sleep(0.5)
+        running.pass_cycles(125)
         before = drives()
-        time.sleep(0.5)
+        running.pass_cycles(125)
         after = drives()
         for drive_before, same_drive in zip(before, after, strict=True):
             assert drive_before["position_rad"] == pytest.approx(same_drive["position_rad"], abs=1e-3)
         assert before[0]["position_rad"] < 1.5
         # Without the box the button counts as pressed after a second.
-        end = time.monotonic() + 20
-        while "estop_unobservable" not in running.events(since):
-            assert time.monotonic() < end
-            time.sleep(0.05)
-        path = running.directory / f"frames-{mode}"
+        running.until(lambda _: "estop_unobservable" in running.events(since), "the button that counts as pressed")
+        path = running.directory / "frames"
         with running.capture(path):
-            time.sleep(0.2)
+            running.pass_cycles(60)
         sent = [targets for _, targets in outputs(path)]
-        assert len(sent) > 100
+        assert len(sent) > 50
         assert {drive.controlword for targets in sent for drive in targets} == {0x0000}
         assert {(drive.velocity, drive.torque) for targets in sent for drive in targets} == {(0, 0)}
         while "working counter" not in (said := running.rtcp("disable", check=5).stderr):
@@ -168,77 +162,19 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform
         assert running.rtcp("reset", check=5).stderr
 
 
-@FULL_CIA402
-def test_an_object_is_not_written_while_drives_have_torque(running: Platform) -> None:
-    running.call("enable")
-    done = running.rtcp("sdo", "write", "2", "0x6065:0", "9999", "--type", "uint32", check=3)
-    assert "ready" in done.stderr
-    running.call("disable")
-    before = running.rtcp("sdo", "read", "2", "0x6065:0", "--type", "uint32").stdout.split()[0]
-    # A little longer, so that the next tests have a window of this size.
-    written = str(int(before) + 1)
-    running.rtcp("sdo", "write", "2", "0x6065:0", written, "--type", "uint32")
-    assert running.rtcp("sdo", "read", "2", "0x6065:0", "--type", "uint32").stdout.split()[0] == written
-
-
-def test_a_gateway_that_stands_still_ends_the_motion_by_its_lease(running: Platform) -> None:
-    running.call("enable")
-    moving = running.background("move", "3.0", "0", "0", "0", "0", "0", "--speed", "0.2")
-    running.until_moving()
-    observer, since = observe(running), running.last_event()
-    gateway = running.pids()["gateway"]
-    os.kill(gateway, signal.SIGSTOP)
-    try:
-        end = time.monotonic() + 20
-        while True:
-            latest = observer.latest()
-            assert latest is not None
-            if int(latest[0]["state"]) == 4:
-                break
-            assert time.monotonic() < end
-            time.sleep(0.01)
-    finally:
-        os.kill(gateway, signal.SIGCONT)
-    observer.close()
-    assert moving.wait() == 5
-    assert "lease_expired" in running.events(since)
-
-
-def test_a_mover_that_is_suspended_loses_its_lease_and_the_arm_stops(running: Platform) -> None:
-    running.call("enable")
-    moving = running.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.05")
-    running.until_moving(0.02)
-    since = running.last_event()
-    os.kill(moving.pid, signal.SIGSTOP)
-    try:
-        # Before it would have arrived, 30 s later.
-        running.until(lambda status: status["state"] == "holding", "rest")
-        assert running.status()["lease"]["holder"] in ("", None)
-        assert "lease_expired" in running.events(since)
-        running.call("move_joints", q=[0.0] * 6)
-    finally:
-        os.kill(moving.pid, signal.SIGCONT)
-    moving.communicate()
-    assert moving.returncode == 5
-
-
-def test_disabling_ends_another_clients_move_at_once(running: Platform) -> None:
-    running.call("enable")
-    moving = running.background("move", "3.0", "0", "0", "0", "0", "0", "--speed", "0.2")
-    running.until_moving()
-    running.call("disable")
-    moving.communicate()
-    assert moving.returncode == 3
-    assert running.status()["state"] == "ready"
-
-
-def test_a_killed_loop_leaves_the_drives_to_their_watchdog(running: Platform) -> None:
+def test_a_killed_loop_leaves_the_drives_to_their_watchdog_and_its_stream_moves_nothing_of_the_next_one(
+    running: Platform,
+) -> None:
     running.call("enable")
     pids = running.pids()
-    kill(pids["loop"])
-    end = time.monotonic() + 20
-    while running.al_states()[1:] != [SAFE_OP_ERROR] * (SLAVES - 1):
-        assert time.monotonic() < end, running.al_states()
+    with rtcp.connect("a program", control_socket(running.directory)) as robot:
+        stream = robot.open_stream()
+        stream.send(ZERO)
+        kill(pids["loop"])
+        said = f"the loop (process {pids['loop']}) has ended: start the platform, then open another stream"
+        with pytest.raises(Faulted, match=re.escape(said)):
+            stream.send([0.5] * 6)
+    until(lambda: running.al_states()[1:] == [SAFE_OP_ERROR] * (SLAVES - 1), "the watchdog of every drive")
     status = running.status()
     assert status["state"] == "fault"
     assert "ended unexpectedly" in status["message"]
@@ -248,38 +184,39 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdog(running: Platform) ->
     assert not any(lives(pid) for pid in pids.values())
     running.rtcp("start", "--detach")
     assert running.status()["state"] == "ready"
+    running.call("enable")
+    with rtcp.connect("a program", control_socket(running.directory)) as robot, robot.open_stream() as other:
+        for _ in range(20):
+            with pytest.raises(Faulted, match="has ended"):
+                stream.send([0.5] * 6)
+            other.send(ZERO)
+        stream.close()
+        running.pass_cycles(25)
+        assert (stream.sent, other.sent) == (1, 20)
+        assert robot.status().commanded_positions == pytest.approx(ZERO, abs=1e-6)
 
 
 def test_a_gateway_that_hangs_stops_the_motion_is_named_and_can_be_killed_and_replaced(running: Platform) -> None:
     running.call("enable")
     moving = running.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
     running.until_moving()
-    observer = observe(running)
+    observer, since = observe(running), running.last_event()
     before = running.pids()
-    os.kill(before["gateway"], signal.SIGSTOP)
-    try:
-        end = time.monotonic() + 20
-        while True:
-            latest = observer.latest()
-            assert latest is not None
-            if int(latest[0]["state"]) == 4 and abs(float(latest[0]["actual_velocity"][0])) < 1e-3:
-                break
-            assert time.monotonic() < end
-            time.sleep(0.01)
+    with stands_still(before["gateway"]):
+        until(lambda: state(observer) is State.HOLDING, "rest")
         observer.close()
         with (
             ControlClient(path=control_socket(running.directory)) as client,
             pytest.raises(RtcpError, match=rf"its gateway \(process {before['gateway']}\) hangs"),
         ):
             client.call("status", timeout_s=0.5)
-    finally:
         kill(before["gateway"])
     assert moving.wait() in (4, 5)
     running.rtcp("start", "--detach")
     status = running.status()
     assert status["pids"]["loop"] == before["loop"]
     assert status["state"] == "holding"
-    running.call("move_joints", q=ZERO)
+    assert "lease_expired" in running.events(since)
 
 
 def test_a_killed_segment_is_a_fault_that_a_new_start_mends(running: Platform) -> None:
@@ -292,17 +229,3 @@ def test_a_killed_segment_is_a_fault_that_a_new_start_mends(running: Platform) -
     assert not any(lives(pid) for pid in pids.values())
     running.rtcp("start", "--detach")
     assert running.status()["state"] == "ready"
-
-
-@pytest.mark.parametrize("name", ["gateway", "segment"])
-def test_a_terminated_process_is_no_traceback(running: Platform, name: str) -> None:
-    pids = running.pids()
-    kill(pids[name], signal.SIGTERM)
-    assert "Traceback" not in running.logs()
-    running.rtcp("stop", check=None)
-    assert not any(lives(pid) for pid in pids.values())
-
-
-def test_the_record_layout_is_the_same_for_writer_and_reader() -> None:
-    for joints in (1, 6, 7):
-        assert record_type(arm_schema(joints)).itemsize == arm_schema(joints).size

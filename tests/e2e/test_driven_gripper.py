@@ -34,6 +34,7 @@ def add_gripper(directory: Path) -> None:
     segment.write_text(f"{segment.read_text()}  - model: cubemars-orh40\n    {options}\n")
 
 
+@pytest.mark.long("test_it_closes_and_opens_under_the_lease_and_reports_each_time_where_it_rests")
 def test_a_driven_gripper_opens_and_closes_and_its_target_never_leaves_its_range(
     platform: Platform, tmp_path: Path
 ) -> None:

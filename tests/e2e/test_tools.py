@@ -1,54 +1,30 @@
-"""Two tools on a real socket between real processes: lines, programs and status are those of the tool in use."""
+"""Two tools on a real socket between real processes: lines and status are those of the tool in use."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import rtcp
 from kinematics.forward import forward, forward_batch
-from rtcp.api import Invalid, Refused, Robot
+from rtcp.api import Robot
 from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import Platform
-from tests.two_tools import add_tools
 
 pytestmark = pytest.mark.platform
 
 HERE = [0.0, -0.2, 2.0, 0.0, 1.0, 0.0]
-PROGRAM = """
-speed: 0.1
-poses:
-  - {name: here, q: [0, -0.2, 2, 0, 1, 0]}
-  - {name: beside, pose: [X, 0.1, Z, RX, RY, RZ]}
-program:
-  - {tool: flange}
-  - {move: here}
-  - {tool: probe}
-  - {line: beside}
-  - {line: here}
-  - {tool: flange}
-"""
-
-
-@pytest.fixture(scope="module")
-def shared() -> Iterator[Platform]:
-    made = Platform()
-    made.be_patient(2000)
-    add_tools(made.directory / "config")
-    made.rtcp("start", "--detach")
-    yield made
-    made.end()
 
 
 @pytest.fixture
 def robot(enabled: Platform) -> Iterator[Robot]:
     with rtcp.connect("who has tools", control_socket(enabled.directory)) as robot:
-        robot.set_tool("flange")
         robot.move_joints(HERE)
         yield robot
+        robot.set_tool("flange")
+        robot.set_payload(0.0)
 
 
 def test_a_line_of_the_chosen_tool_is_a_line_of_its_point(shared: Platform, robot: Robot) -> None:
@@ -76,54 +52,6 @@ def test_a_line_of_the_chosen_tool_is_a_line_of_its_point(shared: Platform, robo
     assert moved["tool"].tolist() == [1] * len(moved)
     tip = [moved[name] for name in ("tool_x", "tool_y", "tool_z")]
     assert np.abs(np.column_stack(tip) - forward_batch(probe, moved["actual_position"])[0]).max() < 1e-9
-
-
-def test_a_program_changes_the_tool_and_is_planned_with_each(shared: Platform, robot: Robot, tmp_path: Path) -> None:
-    feed = rtcp.Feed(shared.directory)
-    probe = forward(feed.config.models[1], HERE)
-    feed.close()
-    text = PROGRAM
-    for name, number in zip(
-        ("RX", "RY", "RZ", "X", "Z"), (*probe.rpy, probe.position[0], probe.position[2]), strict=True
-    ):
-        text = text.replace(name, f"{number:.6f}")
-    file = tmp_path / "tools.yaml"
-    file.write_text(text)
-    program = rtcp.Program(file)
-    planned = program.check(robot)
-    assert planned[-2].plan.length_m == pytest.approx(0.1, abs=1e-4)
-    robot.set_payload(0.3)
-    said: list[str] = []
-    program.run(robot, lambda step: said.append(step.text))
-    assert [what for what in said if "tool" in what] == ["tool: flange", "tool: probe", "tool: flange"]
-    assert (robot.status().tool, robot.status().payload.mass) == ("flange", 0.0)
-    assert robot.positions == pytest.approx(HERE, abs=2e-3)
-
-
-def test_a_preview_with_another_tool_is_planned_as_if_it_were_in_use(shared: Platform, robot: Robot) -> None:
-    feed = rtcp.Feed(shared.directory)
-    lengths = {}
-    for model in feed.config.models:
-        (x, y, z), angles = forward(model, HERE).position, forward(model, HERE).rpy
-        beside = [x, y + 0.05, z, *angles]
-        lengths[model.tool_name] = robot.preview(pose=beside, line=True, tool=model.tool_name).length_m
-    feed.close()
-    assert lengths == pytest.approx({"flange": 0.05, "probe": 0.05}, abs=1e-6)
-    with pytest.raises(Invalid, match="allowed is one of flange, probe"):
-        robot.preview(pose=beside, tool="spoon")
-    assert robot.status().tool == "flange"
-
-
-def test_a_tool_that_does_not_exist_and_a_payload_too_heavy_are_refused(robot: Robot) -> None:
-    with pytest.raises(Invalid, match='name: found the text "spoon", allowed is one of flange, probe'):
-        robot.set_tool("spoon")
-    with pytest.raises(Refused) as refused:
-        robot.set_payload(2.0)
-    assert (refused.value.reason, refused.value.fields) == ("payload_too_heavy", {"mass": 2.0, "limit": 1.5})
-    with pytest.raises(Invalid, match="centre"):
-        robot.set_payload(0.5, [0.0, 0.1])
-    robot.set_payload(0.5, [0.0, 0.0, 0.1])
-    assert robot.status().payload == rtcp.api.Payload(0.5, (0.0, 0.0, 0.1))
 
 
 def test_the_command_line_lists_and_chooses_tools_and_says_what_is_held(enabled: Platform, robot: Robot) -> None:
