@@ -89,7 +89,7 @@ def stream(ros: Ros, client: Client, arm: Platform, **given: Any) -> Any:
                 until(arrived, "the last target")
             if not refused():
                 break
-        arm.until(lambda status: status["state"] in ("holding", "ready"), "rest")
+        arm.until(lambda status: not status["lease"]["holder"], "the end of the stream's lease")
         arm.restore()
         arm.call("enable")
     records = np.concatenate(taken)

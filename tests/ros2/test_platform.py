@@ -135,6 +135,7 @@ def test_without_a_router_the_node_waits_and_ends_when_it_is_asked_to() -> None:
 def test_the_latency_of_each_wire_is_measured_in_the_frames(platform: Platform, wire: str) -> None:
     if wire == "dds":
         pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: pip install 'rtcp[dds]' (x86_64)")
+    platform.until(lambda status: not status["lease"]["holder"], "the end of the lease of the test before")
     platform.call("enable")
     command = [sys.executable, "-m", "rtcp.ros.latency", wire, "5"]
     done = subprocess.run(command, env=platform.environment, capture_output=True, text=True, check=False)
