@@ -93,7 +93,7 @@ def stopped(cell: Cell, running: RunningCell, state: State = State.HOLDING) -> N
             while len(rest) < 50:
                 feed.ended(0.05)
                 rest += list(feed.records()[0]["commanded_position"])
-            assert np.ptp(rest, axis=0).max() < 1e-9
+            assert np.ptp(rest, axis=0).max() < 1e-4  # without torque the commanded position follows the actual one
 
 
 def begin(page: Page, running: RunningCell) -> None:

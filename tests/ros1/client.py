@@ -85,15 +85,14 @@ def follow(given: dict[str, Any]) -> dict[str, Any]:
     goal = FollowJointTrajectoryGoal(trajectory=trajectory_of(given))
     goal.path_tolerance = [JointTolerance(**tolerance) for tolerance in given.get("path_tolerance", ())]
     goal.goal_tolerance = [JointTolerance(**tolerance) for tolerance in given.get("goal_tolerance", ())]
-    moved: list[Any] = []
+    heard: list[float] = []
 
     def on_feedback(feedback: Any) -> None:
-        if abs(feedback.actual.positions[0]) > 0.01:
-            moved.append(feedback)
+        heard.append(feedback.actual.positions[0])
 
     client.send_goal(goal, feedback_cb=on_feedback)
     if given.get("cancels"):
-        while not moved:
+        while not heard or abs(heard[-1] - heard[0]) < 0.01:
             time.sleep(0.02)
         client.cancel_goal()
     client.wait_for_result()

@@ -101,7 +101,7 @@ def test_what_is_refused_has_its_reason_in_the_answer_or_the_log_and_moves_nothi
     until(lambda: "outside its range" in ros.logs(), "the reason of the point in the log")
     client.command("path", **path(arm, [9.0, 0, 0, 0, 0, 0]))
     until(lambda: "joint_path_command: point 2" in ros.logs(), "the reason of the trajectory in the log")
-    assert stays_at_rest(arm)
+    until(lambda: stays_at_rest(arm), "rest at 0")
     assert "moving" not in arm.events(since)
     assert client.command("robot_disable") == {"success": True, "message": "the drives are disabled"}
     assert arm.status()["state"] == "ready"
@@ -119,7 +119,7 @@ def test_goals_of_the_action_end_with_their_results(ros: Ros, client: Client, ar
     unknown = client.command("follow", **path(arm, THERE) | {"names": ["a", "b", "c", "d", "e", "f"]})
     assert (unknown["state"], unknown["code"]) == (REJECTED, -2)
     assert "joint 'a' is unknown" in unknown["text"]
-    assert stays_at_rest(arm)
+    until(lambda: stays_at_rest(arm), "rest at 0")
     every = [{"name": name, "position": 0.5} for name in arm.status()["joint_names"]]
     other = Client(ros)
     try:
