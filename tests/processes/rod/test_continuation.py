@@ -14,6 +14,7 @@ from rtcp.processes.rod import (
     Form,
     Rod,
     bend,
+    continuation,
     follow_parameters,
     follow_pose,
     integrate,
@@ -93,6 +94,7 @@ def test_an_unstable_goal_is_refused() -> None:
     assert refused.value.reason == "rod_unstable"
 
 
-def test_a_rod_too_thick_for_any_shape_is_refused() -> None:
+def test_a_rod_too_thick_for_any_shape_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(continuation, "_ATTEMPTS", 10)
     with pytest.raises(Refused):
         sample_equilibrium(Rod(0.05, 20e-3), Form.S, np.random.default_rng(0))
