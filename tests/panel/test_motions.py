@@ -177,6 +177,7 @@ def test_the_page_jog_steps_guides_by_hand_and_shows_what_holds_a_jog_back(page:
 
     until(is_held, "what holds the jog back")
     page.mouse.up()
+    holding.until(lambda status: not status["lease"]["holder"], "the end of the jog's lease")
     holding.call("move_joints", q=BENT)
     page.get_by_label("Payload, at the tool's point").fill("0.2")
     page.get_by_role("button", name="Set the payload").click()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from itertools import pairwise
@@ -22,7 +23,6 @@ from tests.waiting import HANG_S, until
 
 from .conftest import Ros, begin_node
 
-pytestmark = pytest.mark.platform
 LISTENER = Path(__file__).parent / "listener.py"
 
 
@@ -58,7 +58,9 @@ def description(ros: Ros) -> str:
     return ros.run("/usr/bin/rosparam", "get", "/robot_description", check=False).stdout
 
 
+@pytest.mark.platform
 def test_topics_show_the_platform_at_the_rate_asked_for(ros: Ros, platform: Platform) -> None:
+    platform.restore()
     ros.run("/usr/bin/rosparam", "set", "/robot_description", "my own")
     node, listener, feed = begin_node(ros, platform, "--rate", "50", "--tf"), Listener(ros), Feed(platform.directory)
     try:
@@ -98,20 +100,6 @@ def test_topics_show_the_platform_at_the_rate_asked_for(ros: Ros, platform: Plat
         assert {message["child"] for message in listener.heard("/tf")} == links
         assert description(ros).strip() == "my own"
 
-        bag = ros.directory / "joints.bag"
-        ros.run("/usr/bin/rosbag", "record", "-l", "20", "-O", bag, "/joint_states")
-        assert re.search(r"messages:\s+20\n", ros.run("/usr/bin/rosbag", "info", bag).stdout)
-    finally:
-        feed.close()
-        ros.stop(listener.process)
-        ros.stop(node)
-        ros.run("/usr/bin/rosparam", "delete", "/robot_description")
-
-
-def test_robot_status_follows_the_machine(ros: Ros, platform: Platform) -> None:
-    platform.restore()
-    node, listener = begin_node(ros, platform), Listener(ros)
-    try:
         ready = listener.until("robot_status", lambda message: message["drives_powered"] == 0)
         assert (ready["mode"], ready["motion_possible"], ready["in_error"], ready["e_stopped"]) == (2, 0, 0, 0)
         platform.call("enable")
@@ -125,11 +113,18 @@ def test_robot_status_follows_the_machine(ros: Ros, platform: Platform) -> None:
         )
         platform.call("disable")
         listener.until("robot_status", lambda message: message["drives_powered"] == 0, since)
+
+        bag = ros.directory / "joints.bag"
+        ros.run("/usr/bin/rosbag", "record", "-l", "20", "-O", bag, "/joint_states")
+        assert re.search(r"messages:\s+20\n", ros.run("/usr/bin/rosbag", "info", bag).stdout)
     finally:
+        feed.close()
         ros.stop(listener.process)
         ros.stop(node)
+        ros.run("/usr/bin/rosparam", "delete", "/robot_description")
 
 
+@pytest.mark.platform
 def test_after_the_loss_of_platform_and_master_everything_is_there_again(ros: Ros, platform: Platform) -> None:
     node, listener = begin_node(ros, platform), Listener(ros)
     try:
@@ -169,7 +164,10 @@ def test_after_the_loss_of_platform_and_master_everything_is_there_again(ros: Ro
         ros.stop(node)
 
 
-def test_a_word_that_is_no_remapping_is_refused(ros_on_the_path: None, platform: Platform) -> None:
-    assert platform.rtcp("ros", "joint_states", check=2).stderr == (
-        "rtcp: joint_states is no remapping: write NAME:=VALUE\n"
+def test_a_word_that_is_no_remapping_is_refused(ros_on_the_path: None) -> None:
+    command = [sys.executable, "-m", "rtcp.cli", "ros", "joint_states"]
+    refused = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (refused.returncode, refused.stderr) == (
+        2,
+        "rtcp: joint_states is no remapping: write NAME:=VALUE\n",
     )
