@@ -54,7 +54,7 @@ class Verdicts:
         is_whole = self._config.args_source is pytest.Config.ArgsSource.TESTPATHS
         for item in items:
             marker = item.get_closest_marker("long")
-            if marker is not None and (not marker.args or (is_whole and marker.args[0] not in names)):
+            if marker is not None and (not marker.args or (is_whole and marker.args[0].partition("[")[0] not in names)):
                 self.problems.append(f"{item.nodeid} is long and needs the name of its short sibling: {marker.args}")
         if (count := sum(item.get_closest_marker("platform") is not None for item in items)) > MAX_PLATFORM_TESTS:
             self.problems.append(f"{count} tests run on a real platform, allowed are {MAX_PLATFORM_TESTS}")

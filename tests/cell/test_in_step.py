@@ -49,7 +49,7 @@ def test_the_other_brakes_along_its_path(kind: str) -> None:
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_arms_that_know_nothing_of_each_others_targets_keep_apart(seed: int) -> None:
-    nearness = run_near(seed, count=4)
+    nearness = run_near(seed, count=6)
     assert nearness.problems == []
     assert nearness.stops > 0
     assert nearness.arrivals > 0

@@ -378,7 +378,7 @@ def test_arrows_are_the_joystick_and_letters_its_switches(
         return any(request["pressed"] == pressed for request in platform.asked("joystick"))
 
     wait_until(lambda: last() == [])
-    hold_until(keyboard, ARROW_UP, lambda: last() == ["forward"])
+    hold_until(keyboard, ARROW_UP, lambda: was(["forward"]))
     wait_until(lambda: last() == [])
     keyboard.press(b"+")
     wait_until(lambda: was(["mode_up"]))
