@@ -254,7 +254,6 @@ def each(processes: set[psutil.Process], do: Callable[[psutil.Process], None]) -
             do(process)
 
 
-@pytest.mark.long("test_a_jog_ends_when_its_browser_hangs_or_is_killed_and_does_not_resume")
 def test_a_jog_ends_when_its_panel_is_killed(browser: Browser, holding: Platform) -> None:
     with begun(holding) as (process, url), visitor(browser, url) as page:
         jogging(page, holding)
