@@ -11,6 +11,7 @@ import shutil
 import sys
 import sysconfig
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,23 @@ def build(target: Path) -> None:
     from setuptools import Distribution
     from setuptools.command.build_ext import build_ext
 
+    class ParallelBuild(build_ext):
+        """Runs the C compiler on every CPU: nearly all sources are of one extension, which setuptools compiles in turn."""
+
+        def build_extension(self, extension: Any) -> None:
+            compile_all: Any = self.compiler.compile
+
+            def compile_each(sources: list[str], **options: Any) -> list[str]:
+                with ThreadPoolExecutor(os.cpu_count()) as pool:
+                    compiled_each = pool.map(lambda source: compile_all([source], **options), sources)
+                    return [name for names in compiled_each for name in names]
+
+            self.compiler.compile = compile_each
+            try:
+                super().build_extension(extension)
+            finally:
+                self.compiler.compile = compile_all
+
     compiled = _compiled()
     os.chdir(ROOT)
     before = compiled.sources_digest(ROOT)
@@ -109,9 +127,8 @@ def build(target: Path) -> None:
         for extension in extensions:
             # No fused multiplication and addition, as on aarch64: results are those of the interpreter, to the bit.
             extension.extra_compile_args = [*extension.extra_compile_args, "-ffp-contract=off"]
-        command: Any = build_ext(Distribution({"name": "rtcp", "ext_modules": extensions}))
+        command: Any = ParallelBuild(Distribution({"name": "rtcp", "ext_modules": extensions}))
         command.build_lib, command.build_temp = f"{scratch}/lib", f"{scratch}/tmp"
-        command.parallel = os.cpu_count()
         command.ensure_finalized()
         command.run()
         files = {extension.name: f"{extension.name}{compiled.ABI}" for extension in extensions}

@@ -14,6 +14,8 @@ import pytest
 from rtcp.fieldbus.image import Place, Places
 from rtcp.fieldbus.process_data import FrameBarrier, SmallImages, SoemProcessData
 
+pytestmark = pytest.mark.interpreted  # `Barrier` takes the place of a compiled class
+
 EXPECTED = 6
 LOST = -1
 
