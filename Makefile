@@ -5,6 +5,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 # make test SEED=1234 repeats the order of an earlier run.
 PYTEST = $(BIN)/python -m pytest $(if $(SEED),--randomly-seed=$(SEED))
+SIDE_BY_SIDE = -m 'not platform and not long' --numprocesses 4
+# Two platforms at most run at a time, and nothing beside them: each takes CPU time before all that is not in real time.
+ON_PLATFORMS = -m 'platform and not long' --numprocesses 2 --dist loadfile
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -27,16 +30,17 @@ panel: setup ## run the virtual arm with the panel: http://127.0.0.1:8080 in a b
 	@$(BIN)/rtcp start --panel
 
 check: lint ## check style, format and types, and run the tests that need no platform: before each commit
-	@$(PYTEST) -m 'not platform and not long' --numprocesses auto
+	@$(PYTEST) $(SIDE_BY_SIDE)
 
 test: setup ## run all tests but those marked long
-	@$(PYTEST) -m 'not long' --numprocesses 4 --dist loadfile
+	@$(PYTEST) $(SIDE_BY_SIDE)
+	@$(PYTEST) $(ON_PLATFORMS)
 
 test-all: oracles ## run all tests, with every sample
-	@RTCP_THOROUGH=1 $(PYTEST) --numprocesses 4 --dist loadfile
+	@RTCP_THOROUGH=1 $(PYTEST) --numprocesses 2 --dist loadfile
 
 test-flaky: setup ## run all tests but the long ones five times on a busy host: no verdict may change
-	@$(BIN)/python -m tests.flaky $(if $(SEED),--seed $(SEED)) -- -m 'not long' --numprocesses 4 --dist loadfile
+	@$(BIN)/python -m tests.flaky $(if $(SEED),--seed $(SEED)) -- -m 'not long' --numprocesses 2 --dist loadfile
 
 test-arms: setup ## run the end-to-end tests of the arm with the drives of each other arm (tests/drive_esi.py)
 	@status=0; \

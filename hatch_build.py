@@ -99,7 +99,7 @@ def build(target: Path) -> None:
     from setuptools.command.build_ext import build_ext
 
     class ParallelBuild(build_ext):
-        """Runs the C compiler on every CPU: nearly all sources are of one extension, which setuptools compiles in turn."""
+        """Runs the C compiler on every CPU: setuptools compiles the sources of an extension one after the other."""
 
         def build_extension(self, extension: Any) -> None:
             compile_all: Any = self.compiler.compile

@@ -3,6 +3,8 @@
 A watcher process wakes up every 4 ms with real-time priority. It writes the longest delay of a wake-up into shared
 memory. As the platform's loop it would notice if the host stopped the whole machine. Where the user has no right to
 SCHED_FIFO, the watcher has an ordinary priority and sees the load of the other tests, too.
+
+A run of tests that is killed leaves its platforms behind, with real-time priority. The watcher ends them.
 """
 
 from __future__ import annotations
@@ -19,6 +21,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.leftovers import end_marked, mark
+
+ROOT = Path(__file__).resolve().parents[1]
 STALL_LIMIT_S = 0.005
 """From this delay of a wake-up on the host counts as stalled, s."""
 STEAL_LIMIT = 0.05
@@ -80,7 +85,7 @@ def watched() -> Iterator[Host]:
     with tempfile.NamedTemporaryFile(dir="/dev/shm") as file:
         file.write(bytes(_DELAY.size))
         file.flush()
-        watcher = subprocess.Popen([sys.executable, __file__, file.name, str(os.getpid())])
+        watcher = subprocess.Popen([sys.executable, "-m", "tests.host", file.name, str(os.getpid()), mark()], cwd=ROOT)
         try:
             with mmap.mmap(file.fileno(), _DELAY.size) as memory:
                 yield Host(memory)
@@ -90,7 +95,7 @@ def watched() -> Iterator[Host]:
 
 
 def main() -> None:
-    """Measure until the parent process has ended."""
+    """Measure until the parent process has ended, then end what it has left."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     except PermissionError:
@@ -104,6 +109,7 @@ def main() -> None:
             before = now
             if delay > _DELAY.unpack_from(memory)[0]:
                 _DELAY.pack_into(memory, 0, delay)
+    end_marked(sys.argv[3])
 
 
 if __name__ == "__main__":

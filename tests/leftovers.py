@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import uuid
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import psutil
 
 _MARK = ("RTCP_TESTS", str(uuid.uuid4()))
 """Environment variable of every process that the tests of this worker start."""
-_SERVICES = ("multiprocessing.resource_tracker", "multiprocessing.forkserver", "tests/host.py")
+_SERVICES = ("multiprocessing.resource_tracker", "multiprocessing.forkserver", "tests.host")
 """Processes that serve the tests of a whole session."""
 
 
@@ -65,6 +67,19 @@ class Leftovers:
         except psutil.Error:
             command = "ended by itself a moment later"
         return f"{pid}: {command}"
+
+
+def mark() -> str:
+    """Return what `end_marked` knows the processes of this worker by."""
+    return "=".join(_MARK)
+
+
+def end_marked(mark: str) -> None:
+    """Kill all processes that a worker has started, but this one."""
+    for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit() and int(name) != os.getpid()):
+        with contextlib.suppress(OSError):
+            if mark.encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0"):
+                os.kill(pid, signal.SIGKILL)
 
 
 def _environment(pid: int) -> dict[str, str]:

@@ -6,9 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 from tests.host import HostFigures
+from tests.waiting import until
 
 _CONFTEST = """
 import pytest
@@ -130,6 +132,20 @@ def test_a_process_that_a_test_leaves_fails_that_test_and_is_ended(suite: Path) 
     assert status == 1
     assert "left behind" in printed
     assert "2 passed, 1 error" in printed
+
+
+def test_what_a_killed_run_leaves_is_ended() -> None:
+    script = """
+import os, subprocess
+from tests.host import watched
+from tests.leftovers import Leftovers
+Leftovers()
+with watched():
+    print(subprocess.Popen(["sleep", "1000"], start_new_session=True).pid, flush=True)
+    os.kill(os.getpid(), 9)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    until(lambda: not psutil.pid_exists(int(done.stdout)), "the end of what it left")
 
 
 def test_stolen_time_counts_as_a_stall() -> None:

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
+from functools import cached_property
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args, get_type_hints
@@ -152,7 +153,7 @@ class PdoEntry:
         """Whether it is a channel with a value: no padding, and no array."""
         return self.index != 0 and self.type != "bytes"
 
-    @property
+    @cached_property
     def range(self) -> tuple[float, float]:
         """Smallest and largest value that is sent, SI: by `min` and `max`, and by the type."""
         ends = sorted(end * self.factor + self.offset for end in type_range(self.type, self.length))
@@ -162,7 +163,7 @@ class PdoEntry:
             high if self.max is None else min(high, self.max),
         )
 
-    @property
+    @cached_property
     def counts_range(self) -> tuple[float, float]:
         """`range` in counts; that of the type alone where the factor is 0."""
         least, most = type_range(self.type, self.length)

@@ -6,6 +6,7 @@ finds two different numbers, or another than it expects, knows that the record i
 
 from __future__ import annotations
 
+import errno
 import math
 import mmap
 import os
@@ -84,13 +85,14 @@ class Blackboard:
         path: file to make, on a memory file system; an older one is replaced.
         schema: of the cycle records.
         period_ns: of the cycle.
+        is_resident: whether its memory is taken in full at once, as a cycle in real time needs it.
 
     Raises:
         SchemaError: the schema is longer than `SCHEMA_SIZE`.
         BlackboardTooLarge: its file system has too little room.
     """
 
-    def __init__(self, path: Path, schema: RecordSchema, period_ns: int) -> None:
+    def __init__(self, path: Path, schema: RecordSchema, period_ns: int, is_resident: bool = True) -> None:
         records, text = records_for(period_ns), schema.definition()
         if len(text) > SCHEMA_SIZE:
             raise SchemaError(f"the schema of the cycle record has {len(text)} bytes, at most {SCHEMA_SIZE} fit")
@@ -102,8 +104,14 @@ class Blackboard:
         fresh.unlink(missing_ok=True)
         descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
         try:
-            # Allocated in full: a page that is missing later would end the process in the cycle.
-            os.posix_fallocate(descriptor, 0, size)
+            if is_resident:
+                # A page that is missing later would end the process in the cycle.
+                os.posix_fallocate(descriptor, 0, size)
+            else:
+                room = os.fstatvfs(descriptor)
+                if room.f_bavail * room.f_frsize < size:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                os.ftruncate(descriptor, size)
             self._map = mmap.mmap(descriptor, size)
         except OSError as error:
             fresh.unlink()
@@ -130,9 +138,10 @@ class Blackboard:
         self._event_lock = threading.Lock()
         for position in range(1, SLAVES_MAX + 1):
             self.health(position, 0, 0, math.nan, [(0, 0, 0)] * PORTS)
-        # Every page is touched now, so that none is faulted in by the cycle.
-        for page in range(0, size, mmap.PAGESIZE):
-            self._map[page] = self._map[page]
+        if is_resident:
+            # Every page is touched now, so that none is faulted in by the cycle.
+            for page in range(0, size, mmap.PAGESIZE):
+                self._map[page] = self._map[page]
 
     def publish(self, values: Sequence[float]) -> None:
         """Append a cycle record: the numbers of the schema's fields but the first, which is the record's own."""

@@ -102,7 +102,7 @@ class Simulation(Closing):
         self._remove = weakref.finalize(self, shutil.rmtree, directory, ignore_errors=True)
         self.path = path = directory / "blackboard"
         """File of the blackboard."""
-        self.board = Blackboard(path, record_schema(config, partners), self.period_ns)
+        self.board = Blackboard(path, record_schema(config, partners), self.period_ns, is_resident=False)
         self.observer = Observer(path)
         self.service = InlineService(self.bus, self.board, config)
         discipline = make_discipline(config) if follow_clock else None

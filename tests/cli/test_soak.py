@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -11,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,21 +21,29 @@ import psutil
 import pytest
 
 from rtcp.config import default_config
-from tests.sessions.session import narrowed, run_narrowed, run_still
+from tests.leftovers import Leftovers
+from tests.sessions.session import narrowed, run_narrowed, run_still, two_workers
 
 CLUSTER = all(map(importlib.util.find_spec, ("distributed", "pyarrow")))
 needs_cluster = pytest.mark.skipif(not CLUSTER, reason="needs rtcp[cluster]")
 pytestmark = pytest.mark.timeout(600)
 
 
+@pytest.fixture(scope="module")
+def workers(leftovers: Leftovers, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with two_workers(leftovers, str(tmp_path_factory.mktemp("workers"))) as client:
+        yield client
+
+
 @pytest.fixture
-def soak(rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+def soak(rtcp: Callable[..., Any], workers: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """Run sessions into `tmp_path / "results"`, their batches by a function of the test."""
 
     def run(run_batch: Callable[..., Any], *arguments: str) -> Any:
         from rtcp.testing.sessions import cluster
 
         monkeypatch.setattr(cluster, "SessionRun", partial(cluster.SessionRun, run=run_batch))
+        monkeypatch.setattr(cluster, "cluster", lambda address: contextlib.nullcontext(workers))
         return rtcp("soak", "--simulated", "--out", str(tmp_path / "results"), *arguments)
 
     return run

@@ -29,6 +29,7 @@ from rtcp.panel.live import (
     Page,
 )
 from tests import simulated_time
+from tests.waiting import HANG_S
 
 FORWARD = [0.05, 0.0, 0.0, 0.0, 0.0, 0.0]
 
@@ -269,7 +270,8 @@ def test_the_arm_is_handed_over_by_its_operator_or_after_ten_seconds_without_an_
         assert await taking is (answer is not False)
         assert panel.live.operator is not None
         assert panel.live.operator.page is (page if answer is False else other)
-        assert moving.done() is (answer is not False)
+        ended, _ = await asyncio.wait([moving], timeout=0.0 if answer is False else HANG_S)
+        assert bool(ended) is (answer is not False)
         assert answer is not None or time.monotonic() - at >= TAKE_OVER_S
         with contextlib.suppress(EndedOnPurpose, asyncio.CancelledError):
             moving.cancel()

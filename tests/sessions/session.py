@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,9 +13,12 @@ from unittest.mock import patch
 
 from rtcp.testing.sessions.checker import Bounds
 from rtcp.testing.sessions.session import Session
+from tests.leftovers import Leftovers
 from tests.sessions.oracle import PERIODS_US, configuration, reading
 
 if TYPE_CHECKING:
+    from distributed import Client
+
     from rtcp.testing.sessions.cluster import Batch, SessionPlan
 
 SECONDS = 3.0
@@ -117,3 +121,22 @@ def run_still(plan: SessionPlan, seeds: Sequence[int]) -> Batch:
 
     with patch.object(Commander, "send", refused):
         return run_batch(plan, seeds)
+
+
+@contextmanager
+def two_workers(leftovers: Leftovers, directory: str) -> Iterator[Client]:
+    """A local cluster for the tests of a module.
+
+    Args:
+        leftovers: of the tests: a worker that follows one that has ended is started in a test, and outlives the test.
+        directory: runtime directory of the workers, by which they are known.
+    """
+    import dask
+
+    from rtcp.testing.sessions.cluster import cluster
+
+    leftovers.shared.add(directory)
+    outliving = dask.config.set({"distributed.nanny.pre-spawn-environ.RTCP_RUNTIME_DIR": directory})
+    with outliving, patch.object(os, "sched_getaffinity", lambda pid: {0, 1}), cluster(None) as client:
+        yield client
+    leftovers.shared.discard(directory)

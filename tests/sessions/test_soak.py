@@ -30,12 +30,11 @@ from rtcp.ipc.recording import RecordingError, read
 from rtcp.testing.sessions.black_box import replay
 from rtcp.testing.sessions.session import Result, run_session
 from tests.leftovers import Leftovers
-from tests.sessions.session import narrowed, run_narrowed, session_of
+from tests.sessions.session import narrowed, run_narrowed, session_of, two_workers
 
 pytest.importorskip("distributed")
 pytest.importorskip("pyarrow")
 
-import dask
 import pyarrow.parquet as pq
 from distributed import Client
 
@@ -67,13 +66,8 @@ def plan(count: int, seconds: float = SHORT_S, first: int = 1) -> SessionPlan:
 
 @pytest.fixture(scope="module")
 def client(leftovers: Leftovers, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
-    # A worker that follows one that has ended is started in a test, and outlives the test.
-    directory = str(tmp_path_factory.mktemp("workers"))
-    leftovers.shared.add(directory)
-    outliving = dask.config.set({"distributed.nanny.pre-spawn-environ.RTCP_RUNTIME_DIR": directory})
-    with outliving, patch.object(os, "sched_getaffinity", lambda pid: {0, 1}), cluster(None) as made:
+    with two_workers(leftovers, str(tmp_path_factory.mktemp("workers"))) as made:
         yield made
-    leftovers.shared.discard(directory)
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:

@@ -35,7 +35,7 @@ PRE_OP, BOOT = 2, 3
     [
         ("Raises", "on_outputs", "RuntimeError: out of order"),
         ("Hangs", "on_outputs", "it has not returned for "),
-        ("Breaks", "the slave", "'NoneType' object "),
+        ("Breaks", "the slave", "None"),
     ],
 )
 def test_a_hook_that_raises_or_hangs_or_breaks_its_slave_takes_its_own_slave_out_of_op_with_one_sentence(
