@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -47,8 +48,11 @@ def run(suite: Path, test: str, *options: str, stall_s: float = 0.0) -> tuple[in
     """Run one test file; return the exit status and what was printed."""
     (suite / "conftest.py").write_text(f"STALL = {stall_s}\n{_CONFTEST}")
     (suite / "test_it.py").write_text(f"import subprocess, sys\nfrom pathlib import Path\nimport pytest\n{test}")
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--rootdir", str(suite), str(suite), *options]
-    done = subprocess.run(command, text=True, capture_output=True, check=False)
+    plugins = ("no:cacheprovider", "xdist", "pytest_rerunfailures", "pytest_randomly")
+    loaded = [word for plugin in plugins for word in ("-p", plugin)]
+    command = [sys.executable, "-m", "pytest", *loaded, "--rootdir", str(suite), str(suite), *options]
+    alone = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done = subprocess.run(command, env=alone, text=True, capture_output=True, check=False)
     return done.returncode, done.stdout + done.stderr
 
 

@@ -28,9 +28,10 @@ FLAGS = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
 ]
+WITHOUT_GPU = [*FLAGS, "--disable-gpu"]
+"""A page takes a third of the time where nothing imitates a GPU, and draws no arm."""
+WITH_GPU = [*FLAGS, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PASSWORD, VIEWERS_PASSWORD = "correct horse", "battery staple"
 PERIOD_US = 8000
 """Cycle of the platform, us: what a person does takes no shorter one, and the browser needs the time."""
@@ -66,7 +67,15 @@ def chromium() -> Iterator[BrowserType]:
 
 @pytest.fixture(scope="session")
 def browser(leftovers: Leftovers, chromium: BrowserType) -> Iterator[Browser]:
-    chrome = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    chrome = chromium.launch(executable_path=CHROMIUM, args=WITHOUT_GPU)
+    yield chrome
+    chrome.close()
+
+
+@pytest.fixture(scope="session")
+def drawing_browser(leftovers: Leftovers, chromium: BrowserType) -> Iterator[Browser]:
+    """A browser that draws the arm."""
+    chrome = chromium.launch(executable_path=CHROMIUM, args=WITH_GPU)
     yield chrome
     chrome.close()
 
@@ -119,20 +128,19 @@ def page(browser: Browser, panel: str) -> Iterator[Page]:
 
 
 @pytest.fixture
-def drawing(browser: Browser, panel: str) -> Iterator[Page]:
+def drawing(drawing_browser: Browser, panel: str) -> Iterator[Page]:
     """A page that draws the arm."""
-    with visitor(browser, panel, draws=True) as opened:
+    with visitor(drawing_browser, panel) as opened:
         yield opened
 
 
 @contextlib.contextmanager
-def visitor(browser: Browser, url: str, draws: bool = False, **options: Any) -> Iterator[Page]:
+def visitor(browser: Browser, url: str, **options: Any) -> Iterator[Page]:
     """A browser window of its own; an error of the panel's scripts, or a name that runs as one, fails the test.
 
     Args:
         browser: where.
         url: the panel.
-        draws: whether the arm is drawn; without a GPU that takes as long as everything else.
         options: of the window.
     """
     complaints: list[str] = []
@@ -143,12 +151,6 @@ def visitor(browser: Browser, url: str, draws: bool = False, **options: Any) -> 
 
     context = browser.new_context(base_url=url, viewport={"width": 1200, "height": 700}, **options)
     page = context.new_page()
-    if not draws:
-        page.add_init_script(
-            "HTMLCanvasElement.prototype.getContext = ((get) => function (kind, ...options) {"
-            " return kind.startsWith('webgl') ? null : get.call(this, kind, ...options);"
-            "})(HTMLCanvasElement.prototype.getContext)"
-        )
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("dialog", dismiss)
     page.set_default_timeout(HANG_S * 1000)
@@ -182,11 +184,11 @@ def log_in(page: Page, password: str = PASSWORD) -> None:
     page.wait_for_selector("[data-live=state][data-state]")
 
 
-def barriers(page: Page) -> dict[str, list[str]]:
-    """Return the serious and critical findings of axe-core, by rule."""
+def barriers(page: Page, part: str | None = None) -> dict[str, list[str]]:
+    """Return the serious and critical findings of axe-core, by rule, on a page or a part of it."""
     return {
         rule["id"]: [f"{node['html'][:150]}: {node['any'] and node['any'][0]['message']}" for node in rule["nodes"][:3]]
-        for rule in Axe().run(page).response["violations"]
+        for rule in Axe().run(page, part).response["violations"]
         if rule["impact"] in ("serious", "critical")
     }
 

@@ -28,9 +28,9 @@ from tests.panel.cable import NEAR, Cable
 from tests.panel.conftest import (
     BENT,
     CHROMIUM,
-    FLAGS,
     PASSWORD,
     VIEWERS_PASSWORD,
+    WITHOUT_GPU,
     barriers,
     begun,
     log_in,
@@ -230,7 +230,7 @@ def test_a_jog_ends_when_its_browser_hangs_or_is_killed_and_does_not_resume(
 ) -> None:
     """A machine whose lid is closed hangs with open connections, as a browser after SIGSTOP does."""
     before = set(psutil.Process().children(recursive=True))
-    own = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    own = chromium.launch(executable_path=CHROMIUM, args=WITHOUT_GPU)
     with contextlib.suppress(Error), visitor(own, panel) as page:
         jogging(page, holding)
         browser = set(psutil.Process().children(recursive=True)) - before
@@ -365,7 +365,7 @@ def test_the_arm_is_handed_over_only_when_asked(browser: Browser, panel: str, ho
         second.get_by_role("button", name="Disable").click()
         second.get_by_role("button", name="Ask to take over").click()
         expect(first.get_by_role("button", name="Keep it")).to_be_visible()
-        assert barriers(first) == {}
+        assert barriers(first, ".q-dialog") == {}
         # The question covers nothing.
         first.get_by_role("button", name="STOP not the emergency stop").click(trial=True)
         first.get_by_role("button", name="Keep it").click()
@@ -401,7 +401,7 @@ def far_page(chromium: BrowserType, platform: Platform, cable: Cable, tmp_path: 
     """A page at the far end of the cable, logged in; the platform holds."""
     access.set_password(Path(platform.environment["RTCP_STATE_DIR"], "panel.json"), "operator", PASSWORD)
     with begun(platform, "--host", NEAR) as (_, url):
-        browser = chromium.launch(executable_path=cable.far(CHROMIUM, tmp_path), args=FLAGS)
+        browser = chromium.launch(executable_path=cable.far(CHROMIUM, tmp_path), args=WITHOUT_GPU)
         ready(platform)
         with contextlib.suppress(Error), visitor(browser, url) as page:
             log_in(page)

@@ -33,10 +33,10 @@ def tool_of(platform: Platform) -> tuple[float, ...]:
 
 
 def test_a_platform_is_started_enabled_moved_ended_and_started_as_chosen(
-    browser: Browser, panel: str, platform: Platform
+    drawing_browser: Browser, panel: str, platform: Platform
 ) -> None:
     platform.rtcp("stop", check=None)
-    with visitor(browser, panel, draws=True) as page:
+    with visitor(drawing_browser, panel) as page:
         page.set_viewport_size({"width": 400, "height": 844})
         show(page, "/jog")
         state = page.locator("header [data-live=state]")
@@ -419,10 +419,10 @@ NOT_FOCUSED = """[unseen, [...wanted].filter((one) => one.isConnected && !one.di
 
 
 def test_every_page_is_usable_on_a_phone_in_the_dark_by_keys_and_shows_names_as_text(
-    browser: Browser, panel: str, holding: Platform
+    drawing_browser: Browser, panel: str, holding: Platform
 ) -> None:
     problems: dict[str, object] = {}
-    with visitor(browser, panel, draws=True) as page:
+    with visitor(drawing_browser, panel) as page:
         page.set_viewport_size({"width": 360, "height": 800})
         show(page, "/jog")
         page.get_by_label("Frame").select_option("joints")
