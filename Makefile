@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 # make test SEED=1234 repeats the order of an earlier run.
 PYTEST = $(BIN)/python -m pytest $(if $(SEED),--randomly-seed=$(SEED))
-SIDE_BY_SIDE = -m 'not platform and not long' --numprocesses 4
+SIDE_BY_SIDE = -m 'not platform and not long' --numprocesses 4 --dist loadfile
 # Two platforms at most run at a time, and nothing beside them: each takes CPU time before all that is not in real time.
 ON_PLATFORMS = -m 'platform and not long' --numprocesses 2 --dist loadfile
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.

@@ -12,9 +12,11 @@ from functools import cache
 from importlib.metadata import EntryPoints
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from xdist.scheduler import LoadFileScheduling
 
 from kinematics.compiled import BUILD
 from rtcp.config import find
@@ -57,6 +59,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(
                 pytest.mark.skip(reason="it does what compiled code does not allow: replace a method, or pickle")
             )
+
+
+class _Files(LoadFileScheduling):
+    """Gives a file to one worker, and all files with a browser to the same one: no two browsers run at a time."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = super()._split_scope(nodeid)
+        return "tests/panel" if file.startswith("tests/panel/") else file
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling | None:
+    """Distribute the tests by file where `--dist loadfile` says so."""
+    return _Files(config, log) if config.getoption("dist") == "loadfile" else None
 
 
 # -- every test has directories of its own, and leaves no process behind ------------------------------------------

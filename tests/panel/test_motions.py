@@ -193,7 +193,7 @@ def test_the_page_jog_steps_guides_by_hand_and_shows_what_holds_a_jog_back(page:
     holding.rtcp("segment", "push", "0", "25", "0", "--seconds", "20")
     until(lambda: abs(holding.status()["joints"]["actual_position"][0] - before) > 0.05, "it follows")
     page.get_by_role("button", name="Halt").click()
-    until(lambda: holding.status()["control_mode"] == "joint", "the mode before")
+    until(lambda: holding.status()["control_mode"] == "cartesian", "the mode before")
     holding.rtcp("segment", "clear")
 
 

@@ -143,6 +143,11 @@ def test_the_arm_is_drawn_as_the_platform_reports_it_with_a_ghost_at_its_goal(dr
     assert camera() == pytest.approx(above)
     canvas.press("+")
     assert math.dist(camera(), [0, 0, 0.5]) < math.dist(above, [0, 0, 0.5])
+    drawing.evaluate("window.canvas = document.querySelector('.arm-view canvas')")
+    drawing.get_by_role("link", name="Health", exact=True).click()
+    expect(drawing.get_by_role("heading", level=1)).to_have_text("Health")
+    assert drawing.evaluate("canvas.isConnected && canvas.clientHeight > 100")
+    drawing.get_by_role("link", name="Arm", exact=True).click()
     holding.call("move_joints", q=BENT)
     show_targets(drawing)
     view = drawing.locator(".arm-view")
@@ -419,42 +424,39 @@ NOT_FOCUSED = """[unseen, [...wanted].filter((one) => one.isConnected && !one.di
 
 
 def test_every_page_is_usable_on_a_phone_in_the_dark_by_keys_and_shows_names_as_text(
-    drawing_browser: Browser, panel: str, holding: Platform
+    page: Page, holding: Platform
 ) -> None:
     problems: dict[str, object] = {}
-    with visitor(drawing_browser, panel) as page:
+    page.set_viewport_size({"width": 360, "height": 800})
+    show(page, "/jog")
+    page.get_by_label("Frame").select_option("joints")
+    for path, tab in PAGES.items():
+        if path in ("/cell", "/processes"):
+            continue  # shown in a cell, and where a process runs
+        page.get_by_role("link", name=tab.name, exact=True).click()
+        expect(page.get_by_role("heading", level=1)).to_have_text(tab.name)
+        expect(page).to_have_url(re.compile(f"{path}$"))
+        page.wait_for_timeout(300)
+        problems |= {f"{path} {rule}": nodes for rule, nodes in barriers(page).items()}
+        if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
+            problems[f"{path} is wider than the screen"] = page.evaluate("document.documentElement.scrollWidth")
+        expect(page.get_by_role("button", name="STOP not the emergency stop")).to_be_in_viewport()
+        page.emulate_media(color_scheme="dark")
+        page.set_viewport_size({"width": 1920, "height": 800})
+        problems |= {f"{path} in the dark {rule}": nodes for rule, nodes in barriers(page, "color-contrast").items()}
+        for _ in range(page.evaluate(WATCH_FOCUS, FOCUSABLE) + 5):
+            page.keyboard.press("Tab")
+        unseen, left = page.evaluate(NOT_FOCUSED)
+        problems |= {f"{path} {what}": some for what, some in (("no focus", unseen), ("not reached", left)) if some}
+        page.emulate_media(color_scheme="light")
         page.set_viewport_size({"width": 360, "height": 800})
-        show(page, "/jog")
-        page.get_by_label("Frame").select_option("joints")
-        page.evaluate("window.canvas = document.querySelector('.arm-view canvas')")
-        for path, tab in PAGES.items():
-            if path in ("/cell", "/processes"):
-                continue  # shown in a cell, and where a process runs
-            page.get_by_role("link", name=tab.name, exact=True).click()
-            expect(page.get_by_role("heading", level=1)).to_have_text(tab.name)
-            expect(page).to_have_url(re.compile(f"{path}$"))
-            assert page.evaluate("canvas.isConnected && canvas.clientHeight > 100")
-            page.wait_for_timeout(300)
-            problems |= {f"{path} {rule}": nodes for rule, nodes in barriers(page).items()}
-            if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
-                problems[f"{path} is wider than the screen"] = page.evaluate("document.documentElement.scrollWidth")
-            expect(page.get_by_role("button", name="STOP not the emergency stop")).to_be_in_viewport()
-            page.emulate_media(color_scheme="dark")
-            page.set_viewport_size({"width": 3840, "height": 800})
-            problems |= {f"{path} in the dark {rule}": nodes for rule, nodes in barriers(page).items()}
-            for _ in range(page.evaluate(WATCH_FOCUS, FOCUSABLE) + 5):
-                page.keyboard.press("Tab")
-            unseen, left = page.evaluate(NOT_FOCUSED)
-            problems |= {f"{path} {what}": some for what, some in (("no focus", unseen), ("not reached", left)) if some}
-            page.emulate_media(color_scheme="light")
-            page.set_viewport_size({"width": 360, "height": 800})
-            assert page.locator("img[src=x]").count() == 0
-            if path == "/segment":
-                expect(page.get_by_role("cell", name=f"drive6 {HOSTILE}")).to_be_visible()
-            if path == "/arm":
-                expect(page.get_by_role("rowheader", name=f"joint6 {HOSTILE}")).to_be_visible()
-        page.get_by_role("link", name="Jog", exact=True).click()
-        expect(page.get_by_label("Frame")).to_have_value("joints")
+        assert page.locator("img[src=x]").count() == 0
+        if path == "/segment":
+            expect(page.get_by_role("cell", name=f"drive6 {HOSTILE}")).to_be_visible()
+        if path == "/arm":
+            expect(page.get_by_role("rowheader", name=f"joint6 {HOSTILE}")).to_be_visible()
+    page.get_by_role("link", name="Jog", exact=True).click()
+    expect(page.get_by_label("Frame")).to_have_value("joints")
     assert problems == {}
 
 
