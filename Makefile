@@ -6,8 +6,9 @@ BIN := .venv/bin
 # make test SEED=1234 repeats the order of an earlier run.
 PYTEST = $(BIN)/python -m pytest $(if $(SEED),--randomly-seed=$(SEED))
 SIDE_BY_SIDE = -m 'not platform and not long' --numprocesses 4 --dist loadfile
-# Two platforms at most run at a time, and nothing beside them: each takes CPU time before all that is not in real time.
-ON_PLATFORMS = -m 'platform and not long' --numprocesses 2 --dist loadfile
+# A platform has two CPUs to itself: its processes take CPU time before all that is not in real time.
+PLATFORMS := $(shell expr \( $$(nproc) + 1 \) / 2)
+ON_PLATFORMS = -m 'platform and not long' --numprocesses $(PLATFORMS) --dist loadfile
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -37,10 +38,10 @@ test: setup ## run all tests but those marked long
 	@$(PYTEST) $(ON_PLATFORMS)
 
 test-all: oracles ## run all tests, with every sample
-	@RTCP_THOROUGH=1 $(PYTEST) --numprocesses 2 --dist loadfile
+	@RTCP_THOROUGH=1 $(PYTEST) --numprocesses $(PLATFORMS) --dist loadfile
 
 test-flaky: setup ## run all tests but the long ones five times on a busy host: no verdict may change
-	@$(BIN)/python -m tests.flaky $(if $(SEED),--seed $(SEED)) -- -m 'not long' --numprocesses 2 --dist loadfile
+	@$(BIN)/python -m tests.flaky $(if $(SEED),--seed $(SEED)) -- -m 'not long' --numprocesses $(PLATFORMS) --dist loadfile
 
 test-arms: setup ## run the end-to-end tests of the arm with the drives of each other arm (tests/drive_esi.py)
 	@status=0; \
