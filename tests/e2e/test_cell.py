@@ -32,6 +32,7 @@ from tests.cell.running import (
     leftovers_of,
     put_in_order,
     restore,
+    shipped_cell,
     starts,
 )
 from tests.e2e.conftest import Platform
@@ -47,7 +48,7 @@ CYCLE_NS = 4_200_000
 def irbs(leftovers: Leftovers) -> Iterator[RunningCell]:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     with leftovers_of(leftovers, "left", "right") as platform:
-        made = RunningCell(CONFIG / "cell.yaml", platform)
+        made = RunningCell(shipped_cell(), platform)
         yield made
         made.end()
 
@@ -55,6 +56,7 @@ def irbs(leftovers: Leftovers) -> Iterator[RunningCell]:
 @pytest.fixture
 def cell(irbs: RunningCell) -> Iterator[Cell]:
     """Both arms enabled and at their home."""
+    irbs.start_ended("left", "right")
     with irbs.connect() as connected:
         for name in connected.arms:
             with RequestClient(irc5_control(irbs.of(name)), server="virtual IRC5") as operator:

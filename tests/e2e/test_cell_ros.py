@@ -19,7 +19,7 @@ from rtcp.config.cell_file import load_cell
 from rtcp.ros.group import group_urdf, joint_names
 from rtcp.ros.ros2_types import decode, encode, make
 from rtcp.ros.ros2_zenoh import key_of, open_session
-from tests.cell.running import ABB_HOME, CONFIG, Records, RunningCell, leftovers_of, starts
+from tests.cell.running import ABB_HOME, CONFIG, Records, RunningCell, leftovers_of, shipped_cell, starts
 from tests.leftovers import Leftovers
 from tests.ros2.node import point
 from tests.ros2.zenoh_client import JOINT_STATES, Router, call
@@ -34,7 +34,7 @@ POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
 @pytest.fixture(scope="module")
 def irbs(leftovers: Leftovers) -> Iterator[RunningCell]:
     with leftovers_of(leftovers, "left", "right") as platform:
-        made = RunningCell(CONFIG / "cell.yaml", platform)
+        made = RunningCell(shipped_cell(), platform)
         yield made
         made.end()
 

@@ -83,7 +83,7 @@ class Trials:
     """The running cell; restarted after a process was killed."""
 
     def __init__(self) -> None:
-        self.cell = RunningCell(CONFIG / "cell.yaml")
+        self.cell = RunningCell((CONFIG / "cell.yaml").read_text())
 
     def close(self) -> None:
         """Stop it."""
@@ -118,7 +118,7 @@ class Trials:
         if killed:
             for name in (LEFT, RIGHT):
                 self.cell.platform.rtcp("--name", name, "stop", check=None)
-            file = str(CONFIG / "cell.yaml")
+            file = str(self.cell.file)
             self.cell.platform.rtcp("cell", "start", "--detach", "--config", file)
         end = time.monotonic() + PATIENCE_S
         while True:

@@ -38,8 +38,6 @@ TARGETS = (
 )
 TESTS = "not platform and not long"
 """Marker expression of the tests, as in `make check`."""
-LONGEST_S = 0.7
-"""Longer tests are left out, as in `make check`."""
 FOLDERS = ("devices", "realtime", "processes", "fieldbus", "motion", "control", "cell", "sessions", "config", "faults")
 TESTS_S = 30.0
 """The tests of one mistake take this CPU time at most. The others are left out, and the report says so."""
@@ -104,8 +102,7 @@ def _files(target: str) -> list[str]:
 def _record(files: list[str], folder: Path) -> int:
     """Run these files of tests and record which statements each test executes. In the child process, in the copy."""
     recorder = Recorder((file for target in TARGETS for file in _files(target)), files, folder)
-    arguments = [*_PLAIN, "-m", TESTS, "--longest", str(LONGEST_S)]
-    return int(pytest.main([*arguments, *files], plugins=[recorder]))
+    return int(pytest.main([*_PLAIN, "-m", TESTS, *files], plugins=[recorder]))
 
 
 def _recorded(log: Path) -> Recording:

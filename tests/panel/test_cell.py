@@ -22,7 +22,7 @@ from rtcp.api.cell import Cell
 from rtcp.ipc.runtime_directory import control_socket, irc5_control
 from rtcp.ipc.session import read_processes, read_session
 from rtcp.virtual.request_socket import RequestClient
-from tests.cell.running import ABB_HOME, CONFIG, RunningCell, put_in_order, restore
+from tests.cell.running import ABB_HOME, RunningCell, put_in_order, restore, shipped_cell
 from tests.leftovers import Leftovers
 from tests.panel.conftest import barriers, begun, show, visitor
 from tests.waiting import until
@@ -36,9 +36,7 @@ FAR = {"left": "0.9, 0.2, 0.1, 0, 0.5, 0.3", "right": "-0.9, 0.1, -0.1, 0.1, 0.6
 def running(leftovers: Leftovers) -> Iterator[RunningCell]:
     """Two virtual IRB 120; their loops may be later than shipped, as a browser draws beside them."""
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
-    file, count = re.subn(r"^silence_s: \S+", "silence_s: 0.2", (CONFIG / "cell.yaml").read_text(), flags=re.MULTILINE)
-    assert count == 1
-    cell = RunningCell(file)
+    cell = RunningCell(shipped_cell())
     cell.platform.environment["RTCP_NAME"] = "left"
     directories = {str(directory) for directory in (cell.directory, cell.of("left"), cell.of("right"))}
     leftovers.shared |= directories
@@ -57,9 +55,7 @@ def panel(running: RunningCell) -> Iterator[str]:
 @pytest.fixture
 def cell(running: RunningCell) -> Iterator[Cell]:
     """Both arms run, are enabled and at their home."""
-    for name in ("left", "right"):
-        if not control_socket(running.of(name)).exists():
-            running.platform.rtcp("--name", name, "start", "--detach", "--cell", str(file_of(running)))
+    running.start_ended("left", "right")
     with running.connect() as connected:
         for name in connected.arms:
             with RequestClient(irc5_control(running.of(name)), server="virtual IRC5") as operator:
@@ -67,10 +63,6 @@ def cell(running: RunningCell) -> Iterator[Cell]:
         restore(connected)
         yield connected
     running.platform.end_commands()
-
-
-def file_of(running: RunningCell) -> str:
-    return str(running.directory / "config/cell.yaml")
 
 
 def states(cell: Cell) -> dict[str, State]:
@@ -154,7 +146,7 @@ def test_partners_are_drawn_live_while_they_run_and_a_missing_one_is_named(
     expect(drawing.get_by_text(re.compile("^right: .*rtcp --name right start"))).to_be_visible()
     with Robot("the tests", control_socket(running.of("left"))) as left:
         until(lambda: left.state is State.READY, "left is without torque again")
-    running.platform.rtcp("--name", "right", "start", "--detach", "--cell", file_of(running))
+    running.platform.rtcp("--name", "right", "start", "--detach", "--cell", str(running.file))
     until(lambda: "right" in drawn(drawing), "the partner is back")
 
 

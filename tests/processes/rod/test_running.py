@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.cell.running import CONFIG, RunningCell
+from tests.cell.running import RunningCell, shipped_cell
 from tests.processes.rod.test_bending import planned
 
 
@@ -13,7 +13,7 @@ from tests.processes.rod.test_bending import planned
 def test_the_shipped_cell_runs_a_planned_bend() -> None:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     plan = planned()
-    cell = RunningCell(CONFIG / "cell.yaml")
+    cell = RunningCell(shipped_cell())
     try:
         with cell.connect() as arms:
             arms.enable()
