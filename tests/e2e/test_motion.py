@@ -59,6 +59,22 @@ def test_the_tool_moves_to_a_pose_on_a_line_and_a_step_along_its_axis(bent: Plat
     bent.rtcp("step", "joint2", "1deg")
     after = bent.status()["joints"]["commanded_position"]
     assert np.subtract(after, status) == pytest.approx([0, np.pi / 180, 0, 0, 0, 0], abs=1e-6)
+    assert "3kg" in bent.rtcp("step", "z", "3kg", check=2).stderr
+    assert "150 is not allowed" in bent.rtcp("speed", "150", check=2).stderr
+    # Half a circle through a place beside its ends.
+    x, y, z = tool(bent.status())
+    rpy = [f"{angle:.6f}" for angle in forward(MODEL, after).rpy]
+    ends = [f"{number:.5f}" for number in (x, y + 0.03, z + 0.03, x, y + 0.06, z)]
+    bent.rtcp("arc", *ends[3:], *rpy, "--via", *ends[:3], "--speed", "0.1")
+    assert far(tool(bent.status()), [x, y + 0.06, z]) < 1e-4
+    bent.rtcp("move", "--home")
+    home = load(default_config()).home
+    assert far(bent.status()["joints"]["commanded_position"], list(home)) < 1e-4
+    bent.rtcp("speed", "50")
+    bent.rtcp("disable")
+    assert bent.status()["speed_override"] == 0.5
+    bent.rtcp("speed", "100")
+    bent.rtcp("enable")
 
 
 def jog(platform: Platform) -> subprocess.Popen[str]:

@@ -9,7 +9,7 @@ import pytest
 
 import rtcp
 from kinematics.forward import forward, forward_batch
-from rtcp.api import Robot
+from rtcp.api import Invalid, Robot
 from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import Platform
 
@@ -28,9 +28,13 @@ def robot(enabled: Platform) -> Iterator[Robot]:
 
 
 def test_a_line_of_the_chosen_tool_is_a_line_of_its_point(shared: Platform, robot: Robot) -> None:
-    robot.set_tool("probe")
+    with pytest.raises(Invalid, match="spoon"):
+        robot.set_tool("spoon")
     feed = rtcp.Feed(shared.directory)
     flange, probe = feed.config.models
+    tip = forward(probe, HERE)
+    assert robot.preview(pose=[*tip.position, *tip.rpy], tool="probe").path[-1] == pytest.approx(HERE, abs=1e-3)
+    robot.set_tool("probe")
     start, status = forward(probe, HERE), robot.status()
     assert (status.tool, status.payload.mass) == ("probe", 0.0)
     assert status.pose == pytest.approx([*start.position, *start.rpy], abs=1e-3)
