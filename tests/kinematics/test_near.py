@@ -263,10 +263,3 @@ def test_a_line_across_axis_1_is_tracked_without_a_jump(either: ArmModel) -> Non
     poses = [Pose.from_xyzrpy(x, 0.0, height, 0.0, 0.0, 0.0) @ hand for x in np.linspace(0.2, -0.2, 801)]
     start = InverseKinematics(either).solve_near(poses[0], [0.0, 0.3, 0.3, 0.0, 0.3, 0.0]).q
     assert steps(track(either, poses[1:], start)).max() < 0.01
-
-
-def test_a_joint_path_beyond_pi_is_tracked(irb120: ArmModel) -> None:
-    path = np.tile([0.3, 0.2, 0.4, 0.5, 0.6, 0.0], (500, 1))
-    path[:, 5] = np.linspace(-6.9, 6.9, 500)
-    tracked = track(irb120, map(arms.as_pose, arms.chain(irb120, path)[1:]), path[0])
-    assert np.abs(tracked - path).max() < 1e-12
