@@ -55,19 +55,6 @@ def smallest_move(model: ArmModel, pose: Pose, near: Sequence[float]) -> float:
 
 
 @settings(max_examples=arms.count(40, 100))
-@given(shape=shares, step=st.floats(1e-6, 0.05), direction=shares)
-def test_a_configuration_a_small_step_away_is_found(
-    shape: Sequence[float], step: float, direction: Sequence[float], either: ArmModel
-) -> None:
-    q = inside(either, shape)
-    near = [angle + step * share for angle, share in zip(q, direction, strict=True)]
-    answer = InverseKinematics(either).solve_near(forward(either, q), near)
-    assert answer.reason == ""
-    assert largest(answer.q, near) <= 4.0 * step + 1e-3  # the others take over the step of a free joint
-    assert (answer.out_of_reach, answer.limited) == (0.0, -1)
-
-
-@settings(max_examples=arms.count(40, 100))
 @given(shape=shares, elsewhere=shares)
 def test_no_other_solution_inside_the_limits_is_nearer(
     shape: Sequence[float], elsewhere: Sequence[float], either: ArmModel
