@@ -93,14 +93,11 @@ def test_progress_of_the_request_is_passed_on_before_the_result(listener: socket
     assert seen == [0.0, 0.5]
 
 
-def test_an_answer_in_pieces_is_put_together(listener: socket.socket) -> None:
-    Peer(listener, OK[:20], OK[20:50], OK[50:])
-    with ControlClient() as client:
-        assert client.call("status") == {"cycles": 5}
-
-
-def test_an_answer_to_another_request_is_skipped(listener: socket.socket) -> None:
-    Peer(listener, b'{"id": 9, "result": {}}\n' + OK)
+@pytest.mark.parametrize("packets", [(OK[:20], OK[20:50], OK[50:]), (b'{"id": 9, "result": {}}\n' + OK,)])
+def test_pieces_are_put_together_and_an_answer_to_another_request_is_skipped(
+    listener: socket.socket, packets: tuple[bytes, ...]
+) -> None:
+    Peer(listener, *packets)
     with ControlClient() as client:
         assert client.call("status") == {"cycles": 5}
 

@@ -345,21 +345,6 @@ def test_the_urdf_has_the_limits_of_the_joints(rtcp: Rtcp, arm_files: Path) -> N
     assert float(irb[2].get("upper", "nan")) == 1.22
 
 
-@pytest.mark.parametrize("arm", [(), IRB], ids=["assistive", "irb120"])
-def test_a_loader_that_nobody_here_wrote_reads_the_urdf_and_agrees(
-    rtcp: Rtcp, tmp_path: Path, arm: tuple[str, ...]
-) -> None:
-    pinocchio = pytest.importorskip("pinocchio")
-    out = tmp_path / "arm.urdf"
-    rtcp("arm", "urdf", "--out", str(out), *arm)
-    model = pinocchio.buildModelFromUrdf(str(out))
-    data = model.createData()
-    q = [0.4, -0.6, 0.9, -0.5, 0.8, 1.1]
-    pinocchio.framesForwardKinematics(model, data, _array(q))
-    tool = data.oMf[model.getFrameId("tool0")]
-    assert list(tool.translation) == pytest.approx(forward(rtcp, q, *arm)[:3], abs=1e-9)
-
-
 def _array(q: list[float]) -> Any:
     import numpy as np
 

@@ -18,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtcp.config import ConfigError, default_config, load
-from rtcp.config.model import GripperConfig, Joint, Range, SlaveConfig
 from rtcp.config.zero import read_zeros, state_directory, store_zero, zero_file
 from rtcp.launch.launcher import StartOptions, _configure
 from tests.findings import assert_finds, findings_of
@@ -41,10 +40,6 @@ def spoil(old: str, new: str) -> None:
 
 
 # -- where it is -------------------------------------------------------------------------------------------------------
-
-
-def test_the_file_lies_where_the_environment_says(state: Path) -> None:
-    assert zero_file("assistive-arm") == state / "assistive-arm.zero.yaml"
 
 
 @pytest.mark.parametrize(
@@ -83,14 +78,6 @@ def test_without_a_file_there_are_no_offsets() -> None:
     assert read_zeros(ARM) == ()
 
 
-def test_an_offset_is_stored_and_the_others_are_kept() -> None:
-    store_zero(ARM, 2, 0.125)
-    assert store_zero(ARM, 5, -1.5) == zero_file(ARM.name)
-    assert read_zeros(ARM) == (0.0, 0.0, 0.125, 0.0, 0.0, -1.5)
-    store_zero(ARM, 2, 0.0)
-    assert read_zeros(ARM) == (0.0, 0.0, 0.0, 0.0, 0.0, -1.5)
-
-
 @settings(max_examples=examples(100))
 @given(
     st.lists(st.floats(-99, 99), min_size=6, max_size=6), st.text(st.characters(codec="utf-8"), min_size=1, max_size=9)
@@ -110,17 +97,6 @@ def test_offsets_go_by_the_names_of_the_axes() -> None:
     store_zero(ARM, 0, 0.5)
     turned = replace(ARM, joints=ARM.joints[::-1])
     assert read_zeros(turned) == (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)
-
-
-def test_a_gripper_with_a_drive_has_an_offset_too() -> None:
-    finger = Joint("finger", "drive7", Range(0, 1), 1.0, 1.0, 1.0, 1.0)
-    arm = replace(
-        ARM,
-        slaves=(*ARM.slaves, SlaveConfig("drive7", ARM.slaves[1].device)),
-        gripper=GripperConfig(joint=finger, open_position=1.0, closed_position=0.0),
-    )
-    store_zero(arm, 6, 0.25)
-    assert read_zeros(arm)[6] == 0.25
 
 
 def test_the_start_puts_the_offsets_into_the_configuration() -> None:

@@ -103,15 +103,6 @@ def test_inputs_are_forced_while_the_arm_moves(arm: FakePlatform) -> None:
     assert written(arm) == [(2, 61), (1, 0xFF)]
 
 
-def test_null_releases(arm: FakePlatform) -> None:
-    async def force() -> None:
-        await arm.call("joystick", {"byte": 61})
-        await arm.call("joystick", {"byte": None})
-
-    arm.run(force)
-    assert written(arm)[-1] == (1, 0)
-
-
 def test_nothing_pressed_holds_the_joystick_neutral_and_leaves_the_other_inputs_alone(arm: FakePlatform) -> None:
     arm.ask("joystick", pressed=[])
     assert written(arm) == [(2, 63), (1, 0x3F)]

@@ -19,36 +19,6 @@ from kinematics.pose import IDENTITY, Pose, rpy_batch
 from tests.kinematics.arms import Change, chain, matrix, random_configurations, with_general_rows, with_tool
 
 
-def test_the_assistive_arm_points_straight_up_at_zero(assistive: ArmModel) -> None:
-    pose = forward(assistive, [0.0] * 6)
-    assert pose.position == pytest.approx((0.0, 0.0, 1.300), abs=1e-15)
-    assert pose.rotation == pytest.approx(IDENTITY.rotation, abs=1e-15)
-
-
-def test_the_assistive_arm_with_a_bent_elbow_matches_its_document(assistive: ArmModel) -> None:
-    assert forward(assistive, [0.0, 0.0, pi / 2, 0.0, 0.0, 0.0]).position == pytest.approx((-0.690, 0.0, 0.610))
-
-
-def test_the_irb_120_matches_its_data_sheet_at_zero(irb120: ArmModel) -> None:
-    pose = forward(irb120, [0.0] * 6)
-    assert pose.position == pytest.approx((0.374, 0.0, 0.630), abs=1e-15)
-    assert matrix(pose)[:3, 2] == pytest.approx((1.0, 0.0, 0.0), abs=1e-15)  # the flange faces forward
-
-
-@pytest.mark.parametrize(
-    ("joint", "direction"),
-    [(0, (0, 1, 0)), (1, (1, 0, -1)), (2, (1, 0, -1)), (4, (0, 0, -1))],
-    ids=["joint 1 turns left", "joint 2 leans forward", "joint 3 lowers the forearm", "joint 5 lowers the flange"],
-)
-def test_the_axes_of_the_irb_120_turn_in_the_drawn_directions(
-    joint: int, direction: tuple[int, int, int], irb120: ArmModel
-) -> None:
-    q = [0.0] * 6
-    q[joint] = 1e-3
-    moved = np.subtract(forward(irb120, q).position, forward(irb120, [0.0] * 6).position)
-    assert np.sign(np.where(abs(moved) < 1e-6, 0.0, moved)).tolist() == list(direction)
-
-
 @pytest.mark.parametrize("change", [replace, with_tool, with_general_rows])
 def test_forward_forward_batch_and_frames_agree_with_the_product_of_matrices(change: Change, either: ArmModel) -> None:
     model = change(either)

@@ -13,7 +13,7 @@ import pytest
 from kinematics.forward import forward, frames
 from kinematics.gravity import gravity_torques
 from kinematics.model import ArmModel, LinkMass
-from kinematics.pose import IDENTITY, Pose, Vector
+from kinematics.pose import Pose, Vector
 
 G = 9.80665
 # The masses of the actuators, each on the link before its joint; the tubes are massless.
@@ -64,16 +64,6 @@ def test_the_torques_are_the_gradient_of_the_potential_energy(
         assert gravity_torques(model, q, gravity, payload) == pytest.approx(slopes, abs=1e-7)
 
 
-def test_a_balanced_arm_pointing_straight_up_needs_no_torque(assistive: ArmModel) -> None:
-    centred = tuple(LinkMass(link.mass, frame_centre) for link, frame_centre in zip(LINKS, _on_axis(), strict=True))
-    assert gravity_torques(replace(assistive, links=centred), [0.0] * 6) == pytest.approx([0.0] * 6, abs=1e-14)
-
-
-def _on_axis() -> list[Vector]:
-    """Points on the vertical through the straight arm, in each link's frame."""
-    return [(0, 0, 0.1), (0.2, 0, 0), (0, 0.3, 0), (0, 0, -0.1), (0, 0, 0), (0, 0, 0.02)]
-
-
 def test_joint_2_of_the_stretched_arm_carries_every_mass_times_its_distance(loaded: ArmModel) -> None:
     expected = G * (0.720 * 0.440 + 0.650 * 0.890 + 0.500 * 0.990 + 0.335 * 1.050 + 0.100 * 1.090)
     assert forward(loaded, ALONG_X).position == pytest.approx((1.130, 0.0, 0.170))
@@ -81,19 +71,6 @@ def test_joint_2_of_the_stretched_arm_carries_every_mass_times_its_distance(load
     # Positive angles of joint 2 lower the arm: the torque is negative.
     assert torques[1] == pytest.approx(-expected)
     assert torques[0] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_a_payload_is_a_mass_at_the_tool(loaded: ArmModel) -> None:
-    empty = gravity_torques(loaded, ALONG_X)
-    carrying = gravity_torques(loaded, ALONG_X, payload=LinkMass(1.0, (0.0, 0.0, 0.050)))
-    assert carrying[1] - empty[1] == pytest.approx(-G * (1.130 + 0.050))
-
-
-def test_the_centre_of_the_payload_is_in_the_tool_frame(loaded: ArmModel) -> None:
-    longer = replace(loaded, tool=Pose((0.0, 0.0, 0.2), IDENTITY.rotation))
-    at_the_tool = gravity_torques(longer, ALONG_X, payload=LinkMass(1.0, (0.0, 0.0, 0.0)))
-    from_the_flange = gravity_torques(loaded, ALONG_X, payload=LinkMass(1.0, (0.0, 0.0, 0.2)))
-    assert at_the_tool == pytest.approx(from_the_flange)
 
 
 def test_an_arm_without_masses_is_refused_by_name(assistive: ArmModel) -> None:

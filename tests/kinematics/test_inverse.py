@@ -15,7 +15,7 @@ from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel, JointLimit
 from kinematics.pose import IDENTITY, Pose
-from kinematics.solution import BRANCHES, Branch, Singularity
+from kinematics.solution import BRANCHES, Singularity
 from tests.kinematics import arms
 
 ACCURACY = 1e-9  # m and rad
@@ -217,13 +217,3 @@ def test_known_configurations_of_the_assistive_arm_keep_their_branch(
     assert name == name_by_sight(assistive, q)
     solutions = InverseKinematics(assistive).solve(forward(assistive, q)).solutions
     assert [str(solution.branch) for solution in solutions if np.allclose(solution.q, q)] == [name]
-
-
-def test_the_branch_is_constant_along_a_motion_that_crosses_no_singularity(either: ArmModel) -> None:
-    start, end = np.array([-1.0, 0.9, -0.6, -0.5, 0.4, -1.0]), np.array([1.0, 0.7, -0.3, 0.8, 1.2, 1.0])
-    names: set[Branch] = set()
-    for share in np.linspace(0.0, 1.0, 50):
-        q = ((1.0 - share) * start + share * end).tolist()
-        solutions = InverseKinematics(either).solve(forward(either, q)).solutions
-        names.add(min(solutions, key=lambda solution: np.abs(np.subtract(solution.q, q)).max()).branch)
-    assert len(names) == 1

@@ -9,10 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kinematics.pose import IDENTITY, Pose, orthonormality_error, rotation_from_rpy, rpy_from_rotation
+from kinematics.pose import Pose, orthonormality_error, rotation_from_rpy, rpy_from_rotation
 from tests.kinematics.arms import matrix
 
 angles = st.floats(-pi, pi)
+beside_a_right_angle = st.builds(
+    lambda side, exponent: side * (pi / 2 - 10**exponent), st.sampled_from([-1, 1]), st.floats(-12, -5)
+)
 lengths = st.floats(-2.0, 2.0)
 poses = st.builds(Pose.from_xyzrpy, lengths, lengths, lengths, angles, angles, angles)
 
@@ -33,12 +36,6 @@ def test_the_rotation_is_rx_ry_rz_in_this_order(rx: float, ry: float, rz: float)
     )
 
 
-@given(angles, angles, angles)
-def test_the_angles_of_a_rotation_reproduce_it(rx: float, ry: float, rz: float) -> None:
-    rotation = rotation_from_rpy(rx, ry, rz)
-    assert rotation_from_rpy(*rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-14)
-
-
 @given(angles, st.floats(-1.5, 1.5), angles)
 def test_angles_away_from_the_singular_orientations_are_recovered(rx: float, ry: float, rz: float) -> None:
     recovered = rpy_from_rotation(rotation_from_rpy(rx, ry, rz))
@@ -46,11 +43,9 @@ def test_angles_away_from_the_singular_orientations_are_recovered(rx: float, ry:
     assert max(error) < 1e-13
 
 
-@given(angles, st.sampled_from([-1, 1]), st.floats(-12, -5), angles)
-def test_the_angles_of_a_rotation_beside_a_singular_one_reproduce_it(
-    rx: float, side: float, exponent: float, rz: float
-) -> None:
-    rotation = rotation_from_rpy(rx, side * (pi / 2 - 10**exponent), rz)
+@given(angles, angles | beside_a_right_angle, angles)
+def test_the_angles_of_a_rotation_reproduce_it_also_beside_a_singular_one(rx: float, ry: float, rz: float) -> None:
+    rotation = rotation_from_rpy(rx, ry, rz)
     assert rotation_from_rpy(*rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-14)
 
 
@@ -80,23 +75,8 @@ def test_a_value_that_is_not_finite_is_refused_by_name(index: int, value: float)
         Pose.from_xyzrpy(*numbers)
 
 
-def test_a_rotation_with_an_entry_that_is_not_finite_is_refused_by_its_place() -> None:
-    rotation = (*IDENTITY.rotation[:5], nan, *IDENTITY.rotation[6:])
-    with pytest.raises(ValueError, match=r"rotation\[1\]\[2\] is nan"):
-        Pose((0.0, 0.0, 0.0), rotation).require_finite()
-
-
-@given(poses)
-def test_rotations_have_no_orthonormality_error(pose: Pose) -> None:
-    assert orthonormality_error(pose.rotation) < 1e-14
-
-
 @pytest.mark.parametrize("index", range(9))
 def test_a_change_of_any_entry_is_an_orthonormality_error(index: int) -> None:
     rotation = np.array(rotation_from_rpy(0.3, 0.5, 0.7))
     rotation[index] += 1e-3
     assert orthonormality_error(tuple(rotation.tolist())) > 1e-4
-
-
-def test_a_reflection_is_no_rotation() -> None:
-    assert orthonormality_error((1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0)) == 2.0

@@ -136,14 +136,6 @@ def test_both_wrist_solutions_coincide_where_the_forearm_points_along_axis_6(
     assert len(solutions) == 8 - count
 
 
-def test_straight_up_has_one_solution_which_holds_joints_1_and_4(assistive: ArmModel) -> None:
-    near = [0.3, 0.1, -0.1, -0.8, 0.2, 0.9]
-    (solution,) = InverseKinematics(assistive).solve(forward(assistive, [0.0] * 6), near).solutions
-    assert solution.q == pytest.approx((0.3, 0.0, 0.0, -0.8, 0.0, 0.5), abs=1e-15)
-    assert solution.singularity == Singularity.SHOULDER | Singularity.ELBOW | Singularity.WRIST
-    assert solution.within_limits
-
-
 def equal_lengths(model: ArmModel) -> ArmModel:
     """The upper arm as long as the forearm, which can fold onto axis 2."""
     return with_row(model, 2, a=hypot(model.rows[3].a, model.rows[3].d))

@@ -16,6 +16,7 @@ from kinematics.c_source import to_c
 from rtcp.cli.__main__ import main
 from rtcp.cli.arm_moveit import moveit_package
 from rtcp.config import find_arm, load, load_kinematics
+from tests.cli.test_arm import UR5
 from tests.moveit.solver import needs_cpp
 from tests.moveit.test_plugin import HEADERS
 
@@ -30,18 +31,6 @@ STUBS = {
 }  # fmt: skip
 """Stand-ins of the CMake packages that CMakeLists.txt looks for."""
 HERE = Path(__file__).parent
-UR5 = """\
-name: ur5
-kinematics:
-  dh:
-    - {alpha: 0, a: 0, d: 0.089}
-    - {alpha: pi/2, a: 0, d: 0}
-    - {alpha: 0, a: -0.425, d: 0}
-    - {alpha: 0, a: -0.392, d: 0.109}
-    - {alpha: pi/2, a: 0, d: 0.095}
-    - {alpha: -pi/2, a: 0, d: 0.082}
-  limits: [&l {min: -pi, max: pi}, *l, *l, *l, *l, *l]
-"""
 
 
 @pytest.fixture(scope="module")

@@ -6,24 +6,15 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import psutil
 import pytest
 
 from rtcp.cli.__main__ import main
-from rtcp.ipc.runtime_directory import blackboard_file
-from tests.telemetry.test_recorder import Loop
+from tests.telemetry.test_recorder import Loop, loop
 from tests.viewer import Viewer
 
-
-@pytest.fixture
-def loop(tmp_path: Path) -> Iterator[Loop]:
-    made = Loop(tmp_path)
-    yield made
-    made.board.close()
-    blackboard_file(tmp_path).unlink()
+__all__ = ["loop"]
 
 
 def memory_of(pid: int) -> int:

@@ -93,11 +93,6 @@ def test_the_trajectory_deviates_by_less_than_1_mrad_with_few_points(tmp_path: P
     assert points[-1]["q"] == pytest.approx(TARGETS[-1], abs=1e-6)
 
 
-def test_a_motion_at_the_limits_of_the_joints_is_accepted_a_little_slower(tmp_path: Path) -> None:
-    points = trajectory(read(mcap(tmp_path / "a.mcap", moved()), ["*_position"]), 0.9)
-    plan_trajectory([Point(point["t"], point["q"], point["v"]) for point in points], LIMITS, points[0]["q"])
-
-
 def test_a_motion_that_turns_at_the_end_of_a_range_stays_within_it(tmp_path: Path) -> None:
     """The first stop of joint 3 is short of its end; its last there is followed by a motion of the others alone."""
     top = LIMITS.high[2]

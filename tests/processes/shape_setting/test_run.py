@@ -62,8 +62,9 @@ OFF = {
 }  # fmt: skip
 
 
-def make_run(tmp_path: Path) -> ShapeSettingRun:
-    """Return a run whose cell has one arm and the heater."""
+@pytest.fixture
+def run(tmp_path: Path) -> ShapeSettingRun:
+    """A run whose cell has one arm and the heater."""
     run = object.__new__(ShapeSettingRun)
     members = [SimpleNamespace(directory=tmp_path / name) for name in ("left", "heater")]
     run._member = members[1]  # type: ignore[assignment]
@@ -79,7 +80,12 @@ def make_run(tmp_path: Path) -> ShapeSettingRun:
 )
 @pytest.mark.parametrize("ending", [KeyboardInterrupt(), RtcpError("fault", "x"), ValueError()], ids=repr)
 def test_what_ends_a_run_turns_the_heat_off_before_it_stops_the_arms(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: BaseException, answers: bool, expected: list[str]
+    run: ShapeSettingRun,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    ending: BaseException,
+    answers: bool,
+    expected: list[str],
 ) -> None:
     done: list[str] = []
     monkeypatch.setattr(module, "Robot", lambda name, path: FakeRobot(done, answers))
@@ -89,7 +95,6 @@ def test_what_ends_a_run_turns_the_heat_off_before_it_stops_the_arms(
 
     monkeypatch.setattr(ShapeSettingRun, "_steps", fail)
     monkeypatch.setattr(ShapeSettingRun, "_draw", lambda self, path: path.write_text("[]"))
-    run = make_run(tmp_path)
     with pytest.raises(type(ending)):
         run.run()
     assert done == expected
@@ -108,17 +113,18 @@ def test_what_ends_a_run_turns_the_heat_off_before_it_stops_the_arms(
     ids=str,
 )
 def test_heat_counts_as_off_only_by_what_is_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fields: dict[str, float]
+    run: ShapeSettingRun, monkeypatch: pytest.MonkeyPatch, fields: dict[str, float]
 ) -> None:
     monkeypatch.setattr(module, "_RELAY_S", 0.1)
     monkeypatch.setattr(module, "Robot", lambda name, path: FakeRobot([], True, **fields))
-    run = make_run(tmp_path)
     run._stop()
     assert not run.heat_is_off
     assert run.outcome.interlocks["arm_lost"] == "latched"
 
 
-def test_what_hangs_keeps_neither_heat_nor_arms_from_stopping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_hangs_keeps_neither_heat_nor_arms_from_stopping(
+    run: ShapeSettingRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
     done: list[str] = []
     hang = threading.Event()
 
@@ -130,7 +136,6 @@ def test_what_hangs_keeps_neither_heat_nor_arms_from_stopping(tmp_path: Path, mo
     monkeypatch.setattr(module, "_HEAT_FIRST_S", 0.1)
     monkeypatch.setattr(module, "_STOP_S", 0.5)
     monkeypatch.setattr(module, "Robot", connect)
-    run = make_run(tmp_path)
     run._stop()  # it ends, though a part hangs
     assert done == ["halt"]
     assert not run.heat_is_off
@@ -138,7 +143,7 @@ def test_what_hangs_keeps_neither_heat_nor_arms_from_stopping(tmp_path: Path, mo
 
 
 def test_the_arms_stop_once_the_heat_is_commanded_off_while_the_relay_still_opens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: ShapeSettingRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
     halted = threading.Event()
@@ -150,7 +155,6 @@ def test_the_arms_stop_once_the_heat_is_commanded_off_while_the_relay_still_open
 
     monkeypatch.setattr(module, "_HEAT_FIRST_S", 3.0)
     monkeypatch.setattr(module, "Robot", lambda name, path: Arm(done, True))
-    run = make_run(tmp_path)
     monkeypatch.setattr(run, "_await_off", lambda heater: halted.wait(1.0))
     run._stop()
     assert done[0] == "stop_heating"
@@ -210,9 +214,8 @@ def test_a_second_run_is_refused_while_the_first_one_works(tmp_path: Path) -> No
     ],
 )
 def test_nothing_begins_while_another_uses_the_heater_or_the_rod_may_be_hot(
-    tmp_path: Path, fields: dict[str, float], reason: str
+    run: ShapeSettingRun, fields: dict[str, float], reason: str
 ) -> None:
-    run = make_run(tmp_path)
     commands = with_heater(run, **fields)
     if reason:
         with pytest.raises(RtcpError) as raised:
@@ -223,8 +226,7 @@ def test_nothing_begins_while_another_uses_the_heater_or_the_rod_may_be_hot(
     assert commands == []
 
 
-def test_the_heater_has_to_supervise_both_arms(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
+def test_the_heater_has_to_supervise_both_arms(run: ShapeSettingRun) -> None:
     run._config = ShapeSettingConfig("shape_setting", "heater", arms=("left",))
     run._member.config = SimpleNamespace(source="heater.yaml")  # type: ignore[misc, assignment]
     run._job = SimpleNamespace(holders={"left": None})  # type: ignore[assignment]
@@ -235,8 +237,7 @@ def test_the_heater_has_to_supervise_both_arms(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", Mode)
-def test_the_heater_is_armed_with_the_key_at_auto_only(tmp_path: Path, mode: Mode) -> None:
-    run = make_run(tmp_path)
+def test_the_heater_is_armed_with_the_key_at_auto_only(run: ShapeSettingRun, mode: Mode) -> None:
     commands = with_heater(run, mode=mode, relay_closed=1)
     if mode is Mode.AUTO:
         run._arm()
@@ -258,9 +259,8 @@ def test_the_heater_is_armed_with_the_key_at_auto_only(tmp_path: Path, mode: Mod
     ],
 )
 def test_a_heating_to_another_profile_ends_the_run_with_an_error(
-    tmp_path: Path, heated: list[tuple[float, float]], is_right: bool
+    run: ShapeSettingRun, heated: list[tuple[float, float]], is_right: bool
 ) -> None:
-    run = make_run(tmp_path)
     run._profile = read_profile(default_config().parent / "shape_setting" / "nitinol.yaml")
     assert run._profile.target_c == 510.0
     ratio = target_ratio(run._profile)
@@ -278,9 +278,8 @@ def test_a_heating_to_another_profile_ends_the_run_with_an_error(
     [(396.2, "its middle has 396 C: HOT, do not touch it"), (48.0, "its middle has 48 C"), (None, "is not known")],
 )
 def test_a_rod_that_is_released_is_said_to_be_as_hot_as_it_is(
-    tmp_path: Path, middle_c: float | None, text: str
+    run: ShapeSettingRun, middle_c: float | None, text: str
 ) -> None:
-    run = make_run(tmp_path)
     run.outcome.samples["middle_temperature"] = [] if middle_c is None else [510.0, middle_c, 0.0]
     assert run.middle_c == middle_c
     assert text in module._warmth(run.middle_c)
@@ -292,9 +291,8 @@ def test_a_rod_that_is_released_is_said_to_be_as_hot_as_it_is(
 
 @pytest.mark.parametrize(("factor", "is_refused"), [(0.79, True), (0.81, False), (1.19, False), (1.21, True)])
 def test_an_initial_resistance_that_alloy_and_dimensions_do_not_explain_ends_the_run(
-    tmp_path: Path, factor: float, is_refused: bool
+    run: ShapeSettingRun, factor: float, is_refused: bool
 ) -> None:
-    run = make_run(tmp_path)
     run._job, run._profile = read_job(default_config().parent / "shape_setting" / "arc.yaml")
     area = math.pi * 0.0005**2
     expected = float(run._profile.alloy.resistivity(run._profile.initial_c)) * 0.3 / area
@@ -309,10 +307,9 @@ def test_an_initial_resistance_that_alloy_and_dimensions_do_not_explain_ends_the
 
 @pytest.mark.parametrize(("closed", "verb"), [(True, "close"), (False, "open")])
 def test_a_relay_that_does_not_follow_ends_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closed: bool, verb: str
+    run: ShapeSettingRun, monkeypatch: pytest.MonkeyPatch, closed: bool, verb: str
 ) -> None:
     monkeypatch.setattr(module, "_RELAY_S", 0.01)
-    run = make_run(tmp_path)
     with_heater(run, relay_closed=closed)
     run._await_relay(closed)
     with_heater(run, relay_closed=not closed)
@@ -363,9 +360,8 @@ class Script:
 
 @pytest.mark.parametrize("virtual", [False, True], ids=["real", "virtual"])
 def test_a_run_bends_a_rod_without_heat_and_heats_a_rod_that_nothing_moves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, virtual: bool
+    run: ShapeSettingRun, monkeypatch: pytest.MonkeyPatch, virtual: bool
 ) -> None:
-    run = make_run(tmp_path)
     script = Script(run, virtual)
     held = SimpleNamespace(p=np.ones((2, 3)))
     for name, note in (("_check_heater", "check"), ("_check_resistance", "check resistance")):
@@ -409,12 +405,11 @@ def test_a_run_bends_a_rod_without_heat_and_heats_a_rod_that_nothing_moves(
 
 
 def test_samples_are_taken_while_the_rod_is_heated_and_end_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: ShapeSettingRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "SAMPLE_S", 0.005)
     fields: dict[str, Any] = dict.fromkeys(Outcome().samples, 1.5) | {"ratio": None}
     monkeypatch.setattr(module, "Robot", lambda name, path: FakeRobot([], True, **fields))
-    run = make_run(tmp_path)
     with run._sampling():
         while len(run.outcome.times) < 3:
             time.sleep(0.001)
@@ -429,8 +424,7 @@ def test_samples_are_taken_while_the_rod_is_heated_and_end_with_it(
 HELD = integrate(Rod(0.3, 1e-3), [0.5, 1.0, 3.0, -10.0, 4.0, 2.0])
 
 
-def test_the_released_shape_follows_from_the_temperatures_and_is_not_made_up_without_them(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
+def test_the_released_shape_follows_from_the_temperatures_and_is_not_made_up_without_them(run: ShapeSettingRun) -> None:
     run._profile = read_profile(default_config().parent / "shape_setting" / "nitinol.yaml")
     outcome = run.outcome
     outcome.wanted = HELD.p
@@ -475,7 +469,7 @@ class Box:
         self.written.append((slave, index, number, data))
 
 
-def test_a_virtual_rod_gets_what_the_arms_do_to_it_and_tells_what_it_became(tmp_path: Path) -> None:
+def test_a_virtual_rod_gets_what_the_arms_do_to_it_and_tells_what_it_became(run: ShapeSettingRun) -> None:
     box = Box()
     rod = module.VirtualRod(box)  # type: ignore[arg-type]
     rod.renew()
@@ -490,7 +484,6 @@ def test_a_virtual_rod_gets_what_the_arms_do_to_it_and_tells_what_it_became(tmp_
     at, fraction, highest = rod.read()
     assert (at[-1], fraction[0], highest[-1]) == (pytest.approx(0.3), 0.5, 348.0)
     box.written = []
-    run = make_run(tmp_path)
     run.outcome.wanted = HELD.p
     run._finish(HELD, rod)
     assert box.written == [(4, 0x2013, 1, b"\x02")]
@@ -498,8 +491,9 @@ def test_a_virtual_rod_gets_what_the_arms_do_to_it_and_tells_what_it_became(tmp_
     assert run.outcome.highest[-1] == pytest.approx(348.0)
 
 
-def test_panels_get_four_curves_of_the_bend_with_the_process_that_draws_them(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
+def test_panels_get_four_curves_of_the_bend_with_the_process_that_draws_them(
+    run: ShapeSettingRun, tmp_path: Path
+) -> None:
     curves = np.arange(10 * 9 * 3, dtype=np.float64).reshape(10, 9, 3) / 3.0
     run.plan = SimpleNamespace(curves=curves)  # type: ignore[assignment]
     run._draw(tmp_path / "rod.json")
