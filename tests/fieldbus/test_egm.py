@@ -120,6 +120,18 @@ class Wire:
         assert len(replies) <= 1
         return Reply(replies[0]) if replies else None
 
+    def follow(self) -> None:
+        """Begin a session and command its joints."""
+        self.cycle(message(0))
+        self.command([0.5] * 6, [0.3] * 6)
+        self.cycle(message(1))
+
+    def reply(self, *datagrams: bytes) -> Reply:
+        """Run a cycle that is answered."""
+        reply = self.cycle(*datagrams)
+        assert reply is not None
+        return reply
+
     def replies(self) -> list[bytes]:
         """Return all datagrams that wait at the controller."""
         datagrams = []
@@ -172,17 +184,10 @@ def test_a_reply_is_these_bytes(wire: Wire) -> None:
     assert reply == wanted
 
 
-def test_positions_arrive_in_rad(wire: Wire) -> None:
-    wire.cycle(message(0))
-    positions = [struct.unpack("<dBBd", wire.data.input(i))[0] for i in range(6)]
-    assert positions == pytest.approx([math.radians(value) for value in AT])
-
-
 def test_a_joint_without_a_command_is_answered_with_where_it_stands(wire: Wire) -> None:
     wire.command([0.0] * 6, [0.3] * 6, STAND)
     for seqno in range(3):
-        reply = wire.cycle(message(seqno))
-        assert reply is not None
+        reply = wire.reply(message(seqno))
         assert reply.position == pytest.approx(AT)
         assert reply.speed == [0.0] * 6
 
@@ -190,8 +195,7 @@ def test_a_joint_without_a_command_is_answered_with_where_it_stands(wire: Wire) 
 def test_a_ramp_to_rest_is_sent_as_targets_are(wire: Wire) -> None:
     wire.cycle(message(0))
     wire.command([0.1] * 6, [0.2] * 6, STOP)
-    reply = wire.cycle(message(1))
-    assert reply is not None
+    reply = wire.reply(message(1))
     assert reply.position == pytest.approx([math.degrees(0.1)] * 6)
     assert reply.speed == pytest.approx([math.degrees(0.2)] * 6)
 
@@ -201,8 +205,7 @@ def test_after_a_command_the_joint_stands_at_the_last_reference(wire: Wire) -> N
     wire.command([0.1] * 6, [0.2] * 6)
     wire.cycle(message(1))
     wire.command([0.5] * 6, [0.2] * 6, STAND)
-    reply = wire.cycle(message(2))
-    assert reply is not None
+    reply = wire.reply(message(2))
     assert reply.position == pytest.approx([math.degrees(0.1)] * 6)
     assert reply.speed == [0.0] * 6
 
@@ -213,16 +216,14 @@ def test_the_external_joint_is_the_third() -> None:
         positions = [math.degrees(struct.unpack("<dBBd", wire.data.input(i))[0]) for i in range(7)]
         assert positions == pytest.approx([10.0, -20.0, 70.0, 30.0, -40.0, 50.0, -60.0])
         wire.command([math.radians(value) for value in range(7)], [math.radians(-value) for value in range(7)])
-        reply = wire.cycle(message(1, external=(70.0,)))
-        assert reply is not None
+        reply = wire.reply(message(1, external=(70.0,)))
         assert reply.position == pytest.approx([0, 1, 3, 4, 5, 6, 2])
         assert reply.speed == pytest.approx([0, -1, -3, -4, -5, -6, -2])
 
 
 def test_there_is_one_reply_to_what_waits_and_it_follows_the_newest(wire: Wire) -> None:
     newest = tuple(value + 2.0 for value in AT)
-    reply = wire.cycle(message(0), message(1), message(2, newest))
-    assert reply is not None
+    reply = wire.reply(message(0), message(1), message(2, newest))
     assert reply.position == pytest.approx(newest)
     assert wire.counts()["superseded"] == 2
 
@@ -276,30 +277,24 @@ def test_who_speaks_after_a_silence_begins_a_session(wire: Wire) -> None:
     wire.data._heard_ns -= 10**10
     wire.cycle()
     wire.command([0.0] * 6, [0.3] * 6)
-    reply = wire.cycle(message(6))
-    assert reply is not None
+    reply = wire.reply(message(6))
     assert reply.position == pytest.approx(AT)
     assert wire.counts()["session"] == 2
 
 
 def test_after_a_stall_of_the_loop_what_waited_is_dropped_and_a_session_begins(wire: Wire) -> None:
-    wire.cycle(message(0))
-    wire.command([0.5] * 6, [0.3] * 6)
-    wire.cycle(message(1))
+    wire.follow()
     wire.data._called_ns -= 10**10
     assert wire.cycle(*(message(2 + i) for i in range(20))) is None
     assert wire.counts()["session"] == 1
-    reply = wire.cycle(message(22))
-    assert reply is not None
+    reply = wire.reply(message(22))
     assert (reply.position, reply.speed) == (pytest.approx(AT), [0.0] * 6)
     assert wire.states() == [DriveState.SWITCHED_ON] * 6
     assert wire.counts()["superseded"] == 20
 
 
 def test_another_unit_that_speaks_after_a_silence_does_not_go_on_with_the_session(wire: Wire) -> None:
-    wire.cycle(message(0))
-    wire.command([0.5] * 6, [0.3] * 6)
-    wire.cycle(message(1))
+    wire.follow()
     wire.data._heard_ns -= 10**10  # no cycle has noticed it yet
     with wire.other() as other:
         other.sendto(message(40, (0.0,) * 6), wire.address)
@@ -311,11 +306,8 @@ def test_another_unit_that_speaks_after_a_silence_does_not_go_on_with_the_sessio
 
 
 def test_a_stop_that_is_superseded_at_once_ends_the_motion_all_the_same(wire: Wire) -> None:
-    wire.cycle(message(0))
-    wire.command([0.5] * 6, [0.3] * 6)
-    wire.cycle(message(1))
-    reply = wire.cycle(message(2, mci=STOPPED, motors=OFF), message(3))
-    assert reply is not None
+    wire.follow()
+    reply = wire.reply(message(2, mci=STOPPED, motors=OFF), message(3))
     assert (reply.position, reply.speed) == (pytest.approx(AT), [0.0] * 6)
     assert wire.states() == [DriveState.SWITCHED_ON] * 6
 
@@ -351,12 +343,10 @@ def test_the_velocity_is_that_of_the_controllers_clock_whatever_is_lost(wire: Wi
 
 def test_the_first_reply_of_a_session_is_where_the_unit_stands(wire: Wire) -> None:
     wire.command([0.0] * 6, [0.3] * 6)
-    first = wire.cycle(message(0))
-    assert first is not None
+    first = wire.reply(message(0))
     assert (first.position, first.speed) == (pytest.approx(AT), [0.0] * 6)
     assert wire.states() == [DriveState.SWITCHED_ON] * 6
-    second = wire.cycle(message(1))
-    assert second is not None
+    second = wire.reply(message(1))
     assert second.position == [0.0] * 6
 
 
@@ -366,8 +356,7 @@ def test_a_seqno_that_goes_back_with_a_newer_time_begins_a_session(wire: Wire, l
     wire.command([0.0] * 6, [0.3] * 6)
     wire.cycle(message(last))
     moved = tuple(value + 3.0 for value in AT)
-    reply = wire.cycle(message(first, moved, clock_us=4000 * last + 20_000))
-    assert reply is not None
+    reply = wire.reply(message(first, moved, clock_us=4000 * last + 20_000))
     assert (reply.position, reply.speed) == (pytest.approx(moved), [0.0] * 6)
     assert wire.states() == [DriveState.SWITCHED_ON] * 6
     assert wire.counts()["session"] == 2

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, cast
@@ -179,6 +179,13 @@ def reason_of(trajectory: Trajectory, allows_partial: bool = False) -> str:
     return refused.value.reason
 
 
+async def refusal_of(command: Awaitable[object]) -> str:
+    """Return the reason for which a command is refused."""
+    with pytest.raises(RtcpError) as refused:
+        await command
+    return refused.value.reason
+
+
 # -- points ---------------------------------------------------------------------------------------------------------
 
 
@@ -312,9 +319,7 @@ def test_a_trajectory_that_waits_for_its_stamp_gives_way_to_what_comes_after_it(
             await commander.command_point(point(1.0))
         else:
             arm.is_open = False
-        with pytest.raises(RtcpError) as refused:
-            await waiting
-        assert refused.value.reason == "superseded"
+        assert await refusal_of(waiting) == "superseded"
         arm.end()
 
     carry_out(arm, test)
@@ -340,9 +345,7 @@ def test_a_stop_that_comes_while_a_trajectory_waits_for_the_drives_is_the_end_of
         stopping = asyncio.create_task(commander.stop())
         await asyncio.sleep(0.01)
         may_go_on.set()
-        with pytest.raises(RtcpError) as refused:
-            await beginning
-        assert refused.value.reason == "superseded"
+        assert await refusal_of(beginning) == "superseded"
         await stopping
 
     carry_out(arm, test, enables=True)
@@ -422,30 +425,20 @@ def test_joints_that_are_not_named_hold_at_the_newest_target_and_not_where_the_s
         await commander.command_joints(one("a", 0.5))
         await commander.command_joints(one("b", 0.7))
         arm.state = State.MOVING
-        with pytest.raises(RtcpError) as refused:
-            await commander.begin_trajectory(
-                Trajectory(("a",), (TrajectoryPoint(1.0, (0.1,)), TrajectoryPoint(2.0, (0.2,))))
-            )
-        assert refused.value.reason == "moving"
+        two = Trajectory(("a",), (TrajectoryPoint(1.0, (0.1,)), TrajectoryPoint(2.0, (0.2,))))
+        assert await refusal_of(commander.begin_trajectory(two)) == "moving"
 
     carry_out(arm, test, allows_partial=True)
     assert arm.streams[0].sent[1][0][:2] == (0.5, 0.7)
 
 
-def test_a_trajectory_whose_stamp_is_far_ahead_is_refused(arm: FakeArm) -> None:
+@pytest.mark.parametrize(("ahead_s", "reason"), [(3600.0, "far_stamp"), (-10.0, "old_stamp")])
+def test_a_trajectory_whose_stamp_is_far_ahead_or_that_was_over_before_it_came_is_refused(
+    arm: FakeArm, ahead_s: float, reason: str
+) -> None:
     async def test(commander: Commander) -> None:
-        with pytest.raises(RtcpError) as refused:
-            await commander.begin_trajectory(Trajectory(NAMES, PATH.points, time.time() + 3600.0))
-        assert refused.value.reason == "far_stamp"
-
-    carry_out(arm, test)
-
-
-def test_a_trajectory_that_was_over_before_it_came_is_refused(arm: FakeArm) -> None:
-    async def test(commander: Commander) -> None:
-        with pytest.raises(RtcpError) as refused:
-            await commander.begin_trajectory(Trajectory(NAMES, PATH.points, time.time() - 10.0))
-        assert refused.value.reason == "old_stamp"
+        late = Trajectory(NAMES, PATH.points, time.time() + ahead_s)
+        assert await refusal_of(commander.begin_trajectory(late)) == reason
 
     carry_out(arm, test)
     assert arm.calls == []
@@ -465,6 +458,13 @@ def test_after_the_end_of_the_platform_the_next_command_connects_anew(arm: FakeA
 # -- the action -----------------------------------------------------------------------------------------------------
 
 
+async def begun(commander: Commander, tolerances: Tolerances | None = None) -> asyncio.Task[tuple[FollowCode, str]]:
+    """Return a goal whose motion is under way."""
+    following = asyncio.create_task(commander.follow(PATH, tolerances or Tolerances(), lambda: None))
+    await asyncio.sleep(0.01)
+    return following
+
+
 def test_a_goal_is_accepted_once_and_ends_with_its_code(arm: FakeArm) -> None:
     accepted: list[bool] = []
 
@@ -482,8 +482,7 @@ def test_the_tolerances_of_a_goal_reach_the_arm(arm: FakeArm) -> None:
     path, goal = [Tolerance("b", 0.1), Tolerance("c", -1)], [Tolerance("b", -1), Tolerance("c", 0.02)]
 
     async def test(commander: Commander) -> None:
-        following = asyncio.create_task(commander.follow(PATH, Tolerances(path, goal, 0.5), lambda: None))
-        await asyncio.sleep(0.01)
+        following = await begun(commander, Tolerances(path, goal, 0.5))
         arm.end()
         await following
 
@@ -524,8 +523,7 @@ def test_a_tolerance_that_cannot_be_honoured_refuses_the_goal(
 )
 def test_a_violated_tolerance_has_its_code_and_says_why(arm: FakeArm, reason: str, code: FollowCode) -> None:
     async def test(commander: Commander) -> None:
-        following = asyncio.create_task(commander.follow(PATH, Tolerances(), lambda: None))
-        await asyncio.sleep(0.01)
+        following = await begun(commander)
         arm.end(RtcpError("fault", "joint a was 0.2 rad beside the path", reason))
         assert await following == (code, "joint a was 0.2 rad beside the path")
 
@@ -539,8 +537,7 @@ def test_a_goal_that_is_refused_is_invalid_and_one_that_is_stopped_raises(arm: F
         arm.refusal = RtcpError("refused", "too fast")
         assert await commander.follow(PATH, Tolerances(), lambda: None) == (FollowCode.INVALID_GOAL, "too fast")
         arm.refusal = None
-        following = asyncio.create_task(commander.follow(PATH, Tolerances(), lambda: None))
-        await asyncio.sleep(0.01)
+        following = await begun(commander)
         await commander.stop()
         with pytest.raises(RtcpError, match="was stopped"):
             await following
@@ -550,8 +547,7 @@ def test_a_goal_that_is_refused_is_invalid_and_one_that_is_stopped_raises(arm: F
 
 def test_a_goal_that_is_cancelled_brakes(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
-        following = asyncio.create_task(commander.follow(PATH, Tolerances(), lambda: None))
-        await asyncio.sleep(0.01)
+        following = await begun(commander)
         following.cancel()
         with pytest.raises(asyncio.CancelledError):
             await following
@@ -604,9 +600,7 @@ def test_a_slow_joint_command_is_sent_again_until_the_arm_is_there_and_then_its_
 def test_a_joint_command_from_the_past_is_dropped(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
         await commander.command_point(point(1.0, 2.0))
-        with pytest.raises(RtcpError) as refused:
-            await commander.command_point(point(2.0, 1.5))
-        assert refused.value.reason == "point_in_the_past"
+        assert await refusal_of(commander.command_point(point(2.0, 1.5))) == "point_in_the_past"
         await commander.command_point(point(2.0, 1.6))  # said once
         await commander.command_point(point(3.0, 2.5))
 
@@ -627,9 +621,7 @@ def test_a_joint_command_that_no_arm_could_follow_opens_no_stream(
     arm: FakeArm, given: TrajectoryPoint, reason: str
 ) -> None:
     async def test(commander: Commander) -> None:
-        with pytest.raises(RtcpError) as refused:
-            await commander.command_point(given)
-        assert refused.value.reason == reason
+        assert await refusal_of(commander.command_point(given)) == reason
         assert not commander.is_moving
 
     carry_out(arm, test)
@@ -679,9 +671,7 @@ def test_what_waited_while_the_node_did_not_run_moves_nothing(arm: FakeArm, monk
         time.sleep(0.4)  # the whole process is stopped
         await commander.command_point(point(2.0))
         for command in (commander.begin_trajectory(PATH), commander.enable(), commander.set_outputs([("io", "3", 1)])):
-            with pytest.raises(RtcpError) as refused:
-                await command
-            assert refused.value.reason == "held_up"
+            assert await refusal_of(command) == "held_up"
         for _ in range(7):  # a sender that goes on
             await asyncio.sleep(0.1)
             await commander.command_point(point(3.0))
@@ -773,9 +763,7 @@ def test_after_a_stop_only_robot_enable_enables(arm: FakeArm, stop: str) -> None
         else:
             commander.note_stop()
         arm.state = State.READY
-        with pytest.raises(RtcpError) as refused:
-            await commander.begin_trajectory(PATH)
-        assert refused.value.reason == "needs_enable"
+        assert await refusal_of(commander.begin_trajectory(PATH)) == "needs_enable"
         await commander.enable()
         arm.state = State.READY
         await commander.begin_trajectory(PATH)

@@ -136,6 +136,14 @@ def run(test: Callable[[Rig], Awaitable[None]], **options: Any) -> FakeArm:
     return simulated_time.run(whole())
 
 
+async def streaming(rig: Rig) -> Peer:
+    """Return a client whose arm moves along its first two points."""
+    peer = await rig.motion()
+    await peer.codes(point(0), point(1))
+    await rig.arm.until("open_trajectory")
+    return peer
+
+
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
 
@@ -206,9 +214,7 @@ def test_requests_are_answered_while_the_arm_moves() -> None:
 
 def test_points_after_the_arm_has_run_out_of_them_begin_again_from_where_it_rests() -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         rig.arm.arrive()
         await peer.codes(point(2, 0.75, 0.25), point(3, 1.0, 0.25))
         await rig.arm.until("open_trajectory", "open_trajectory")
@@ -247,9 +253,7 @@ def test_points_that_the_arm_ran_out_of_just_then_are_not_lost() -> None:
         is_over = False
 
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         await peer.codes(point(2))
         await rig.arm.until("append", "open_trajectory")
 
@@ -275,17 +279,6 @@ def test_a_downloaded_trajectory_is_executed_when_complete_and_its_topics_are_no
         assert (await peer.frame()).msg_type == MessageType.PING
 
     assert run(client).calls[0] == ("run_trajectory", at(0.0, 0.0), at(0.5, 0.25), at(1.0, 0.5))
-
-
-def test_a_download_that_is_too_long_is_refused_with_one_line(caplog: pytest.LogCaptureFixture) -> None:
-    async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        peer.topic(point(START), *(point(number) for number in range(1, BUFFER_POINTS + 100)), point(END))
-        assert await peer.codes(Ping()) == [OK]
-        assert len(lines(caplog)) == 1
-        assert "too long" in lines(caplog)[0]
-
-    assert "run_trajectory" not in run(client).names
 
 
 def test_a_stream_of_100_000_points_is_refused_where_the_buffer_is_full(caplog: pytest.LogCaptureFixture) -> None:
@@ -316,9 +309,7 @@ def test_a_stream_of_100_000_points_is_refused_where_the_buffer_is_full(caplog: 
 
 def test_a_new_trajectory_takes_the_place_of_the_one_under_way_without_a_stop() -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         await peer.codes(point(0, 0.25), point(1, 0.125))
         await rig.arm.until("open_trajectory", "open_trajectory")
         assert rig.arm.calls[1] == ("open_trajectory", at(0.5, 0.25), at(1.0, 0.125))
@@ -331,10 +322,8 @@ def test_a_new_trajectory_takes_the_place_of_the_one_under_way_without_a_stop() 
 
 def test_a_stop_is_answered_at_once_and_what_follows_is_ignored_until_a_new_sequence() -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
+        peer = await streaming(rig)
         rig.arm.stopped.clear()  # the stop lasts
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
         assert await peer.codes(STOP_POINT, point(2), point(3)) == [OK, NO, NO]
         await rig.arm.until("open_trajectory", "halt")
         assert await peer.codes(point(0), point(1)) == [OK, OK]
@@ -357,9 +346,7 @@ def test_a_trajectory_and_its_stop_in_one_segment_move_nothing() -> None:
 
 def test_a_gap_stops_the_arm_and_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         assert await peer.codes(point(3), point(4), point(5)) == [NO, NO, NO]
         await rig.arm.until("halt")
         assert len(lines(caplog)) == 1
@@ -372,9 +359,7 @@ def test_a_gap_stops_the_arm_and_is_logged_once(caplog: pytest.LogCaptureFixture
 def test_a_refusal_of_the_arm_stops_it_and_the_rest_is_refused(call: str, caplog: pytest.LogCaptureFixture) -> None:
     async def client(rig: Rig) -> None:
         rig.arm.refuses[call] = RtcpError("refused", "joint 1 would leave its range")
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         await peer.codes(point(2))
         if call == "append":
             await rig.arm.until("append", "halt")
@@ -391,9 +376,7 @@ def test_a_refusal_of_the_arm_stops_it_and_the_rest_is_refused(call: str, caplog
 
 def test_a_motion_that_ends_with_an_error_is_logged_and_the_rest_refused(caplog: pytest.LogCaptureFixture) -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         rig.arm.fail(RtcpError("fault", "emergency stop"))
         while not lines(caplog):
             await peer.codes(Ping())
@@ -479,9 +462,7 @@ def test_bytes_that_are_no_frame_close_the_connection_with_one_line_and_the_arm_
     data: bytes, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         peer.writer.write(data)
         assert await peer.is_closed()
         await rig.arm.until("halt", "disable")
@@ -493,9 +474,7 @@ def test_bytes_that_are_no_frame_close_the_connection_with_one_line_and_the_arm_
 
 def test_an_end_within_a_frame_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         peer.writer.write(struct.pack("<2i", 64, 11))
         peer.writer.close()
         await rig.arm.until("halt", "disable")
@@ -508,9 +487,7 @@ def test_an_end_within_a_frame_is_one_line(caplog: pytest.LogCaptureFixture) -> 
 @pytest.mark.parametrize("is_reset", [False, True])
 def test_a_lost_client_stops_the_arm_and_disables_its_drives_and_nothing_moves_after_it(is_reset: bool) -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         if is_reset:
             peer.writer.get_extra_info("socket").setsockopt(
                 socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("2i", 1, 0)
@@ -533,9 +510,7 @@ def test_points_that_waited_while_the_server_did_not_run_are_a_lost_link(
     monkeypatch.setattr(held_up, "HELD_UP_S", 0.3)
 
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         peer.send(point(2), point(0, 0.7), JointPosition(0, THERE))
         await peer.writer.drain()
         time.sleep(0.4)  # the whole process is stopped
@@ -560,9 +535,7 @@ def test_a_client_that_never_moved_the_arm_leaves_it_alone() -> None:
 def test_a_fault_while_stopping_does_not_keep_the_drives_enabled() -> None:
     async def client(rig: Rig) -> None:
         rig.arm.refuses["halt"] = RtcpError("fault", "the drive of joint 2 is lost")
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        peer = await streaming(rig)
         peer.writer.close()
         await rig.arm.until("halt", "disable")
 
@@ -571,19 +544,15 @@ def test_a_fault_while_stopping_does_not_keep_the_drives_enabled() -> None:
 
 def test_the_end_of_the_server_stops_what_its_client_moves() -> None:
     async def client(rig: Rig) -> None:
-        peer = await rig.motion()
-        await peer.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        await streaming(rig)
 
     assert sorted(run(client).names) == ["cancelled", "disable", "halt", "open_trajectory"]
 
 
 def test_a_client_from_the_same_address_takes_over_and_gets_no_arm_before_it_rests() -> None:
     async def client(rig: Rig) -> None:
-        old = await rig.motion()
+        old = await streaming(rig)
         rig.arm.stopped.clear()
-        await old.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
         new = await rig.motion(BIG)
         assert await old.is_closed()
         assert await new.codes(point(0), point(1), STOP_POINT) == [NO, NO, OK]
@@ -601,10 +570,8 @@ def test_a_client_from_the_same_address_takes_over_and_gets_no_arm_before_it_res
 
 def test_points_that_come_with_a_connection_that_takes_over_find_the_arm_already_stopping() -> None:
     async def client(rig: Rig) -> None:
-        old = await rig.motion()
+        await streaming(rig)
         rig.arm.stopped.clear()
-        await old.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
         with socket.create_connection(("127.0.0.1", rig.server.ports[0])) as new:
             # It waits in the buffer of the kernel before the server accepts the connection.
             new.sendall(Frame.request(point(0), LITTLE).pack(LITTLE))
@@ -618,9 +585,7 @@ def test_points_that_come_with_a_connection_that_takes_over_find_the_arm_already
 
 def test_a_client_from_another_address_is_turned_away(caplog: pytest.LogCaptureFixture) -> None:
     async def client(rig: Rig) -> None:
-        first = await rig.motion()
-        await first.codes(point(0), point(1))
-        await rig.arm.until("open_trajectory")
+        first = await streaming(rig)
         for _ in range(3):
             assert await (await rig.motion(host="127.0.0.2")).is_closed()
         assert await first.codes(point(2)) == [OK]

@@ -7,15 +7,13 @@ brings the slaves in the namespaces of process PID to OP, sends the outputs (one
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 
 import pysoem
 
-from tests.virtual.soem_child import join, without_blocking
+from tests.virtual.soem_child import PATIENCE_US, end, opened
 
-PATIENCE_US = 2_000_000
 PERIOD_S = 0.004
 
 
@@ -39,11 +37,7 @@ def unhurried(slave: pysoem.CdefSlave) -> None:
 
 def main() -> None:
     pid, interface, *outputs = sys.argv[1:]
-    join(pid)
-    pysoem.settings.timeouts.ret = 40_000
-    pysoem.settings.timeouts.safe = pysoem.settings.timeouts.eeprom = PATIENCE_US
-    master = pysoem.Master()
-    without_blocking(master, interface)
+    master = opened(pid, interface)
     result: dict[str, object] = {"slaves": master.config_init()}
     result["names"] = [slave.name for slave in master.slaves]
     master.state_check(pysoem.PREOP_STATE, PATIENCE_US)
@@ -69,10 +63,7 @@ def main() -> None:
     result["inputs"] = [slave.input.hex() for slave in master.slaves]
     result["outputs"] = [slave.output.hex() for slave in master.slaves]
     result["delays"] = [delay(slave) for slave in master.slaves]
-    master.state = pysoem.INIT_STATE
-    master.write_state()
-    master.close()
-    print(json.dumps(result))
+    end(master, result)
 
 
 if __name__ == "__main__":

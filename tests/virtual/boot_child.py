@@ -8,9 +8,8 @@ import sys
 
 import pysoem
 
-from tests.virtual.soem_child import join, without_blocking
+from tests.virtual.soem_child import PATIENCE_US, opened
 
-PATIENCE_US = 2_000_000
 FIRMWARE = bytes(range(256)) * 20
 
 
@@ -20,11 +19,7 @@ def words(slave: pysoem.CdefSlave, word: int, count: int) -> list[int]:
 
 
 def main() -> None:
-    pid, interface = sys.argv[1:]
-    join(pid)
-    pysoem.settings.timeouts.ret = 40_000
-    master = pysoem.Master()
-    without_blocking(master, interface)
+    master = opened(*sys.argv[1:])
     master.config_init()
     (slave,) = master.slaves
     slave.state = pysoem.INIT_STATE

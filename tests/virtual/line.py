@@ -175,6 +175,13 @@ class Line:
         assert [self.al(number) for number in range(len(self.devices))] == [(OP, 0)] * len(self.devices)
 
 
+def in_op(count: int = 4, **line: Sequence[int]) -> Line:
+    """Tiny devices in OP."""
+    made = Line([TinyDevice() for _ in range(count)], **line)
+    made.to_op()
+    return made
+
+
 def fmmu(logical: int, length: int, physical: int, *, write: bool, start_bit: int = 0, end_bit: int = 7,
          physical_bit: int = 0) -> bytes:  # fmt: skip
     """The 16 bytes of an FMMU."""

@@ -18,9 +18,10 @@ from pathlib import Path
 import pysoem
 
 PERIOD_NS = 2_000_000
+PATIENCE_US = 2_000_000
 
 
-def join(pid: str) -> None:
+def join(pid: str | int) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     for kind in ("user", "net"):
         if os.stat(f"/proc/{pid}/ns/{kind}").st_ino == os.stat(f"/proc/self/ns/{kind}").st_ino:
@@ -30,20 +31,36 @@ def join(pid: str) -> None:
                 raise OSError(ctypes.get_errno(), f"cannot join the {kind} namespace")
 
 
-def without_blocking(master: pysoem.Master, interface: str) -> None:
+def opened(pid: str, interface: str) -> pysoem.Master:
+    """Join the namespaces of a process, unless it is "-", and open a master that waits longer than a host stalls."""
+    if pid != "-":
+        join(pid)
+    pysoem.settings.timeouts.ret = 40_000
+    pysoem.settings.timeouts.safe = pysoem.settings.timeouts.eeprom = PATIENCE_US
+    master = pysoem.Master()
     before = set(os.listdir("/proc/self/fd"))
     master.open(interface)
     for entry in set(os.listdir("/proc/self/fd")) - before:
         link = Path(f"/proc/self/fd/{entry}")
         if link.is_symlink() and os.readlink(link).startswith("socket:"):
             os.set_blocking(int(entry), False)
+    return master
 
 
-def read(slave: pysoem.CdefSlave, register: int) -> int:
-    """A register of four bytes; read again if the host stalled beyond the frame's timeout."""
+def end(master: pysoem.Master, result: dict[str, object]) -> None:
+    """Take the slaves to INIT and print the result."""
+    master.state = pysoem.INIT_STATE
+    master.write_state()
+    result["init"] = master.state_check(pysoem.INIT_STATE, PATIENCE_US)
+    master.close()
+    print(json.dumps(result))
+
+
+def read(slave: pysoem.CdefSlave, register: int, size: int = 4) -> int:
+    """A register; read again if the host stalled beyond the frame's timeout."""
     for _ in range(5):
         try:
-            return int.from_bytes(slave._fprd(register, 4), "little")
+            return int.from_bytes(slave._fprd(register, size), "little")
         except pysoem.WkcError:
             time.sleep(0.01)
     raise RuntimeError(f"register 0x{register:04X} cannot be read")
@@ -52,15 +69,9 @@ def read(slave: pysoem.CdefSlave, register: int) -> int:
 def main() -> None:
     pid, interface, cycles = sys.argv[1], sys.argv[2], int(sys.argv[3])
     to_stop = int(sys.argv[4]) if len(sys.argv) > 4 else None
-    if pid != "-":
-        join(pid)
-    # By default SOEM waits 2 ms for a frame; a shared host stalls for longer.
-    pysoem.settings.timeouts.ret = 40_000
-    pysoem.settings.timeouts.safe = pysoem.settings.timeouts.eeprom = 2_000_000
-    master = pysoem.Master()
-    without_blocking(master, interface)
+    master = opened(pid, interface)
     result: dict[str, object] = {"slaves": master.config_init()}
-    master.state_check(pysoem.PREOP_STATE, 2_000_000)
+    master.state_check(pysoem.PREOP_STATE, PATIENCE_US)
     synchronous = []
     for slave in master.slaves:
         try:
@@ -72,7 +83,7 @@ def main() -> None:
     master.config_map()
     master.config_dc()
     result["delays"] = [read(slave, 0x0928) for slave in master.slaves]
-    result["safe_op"] = master.state_check(pysoem.SAFEOP_STATE, 2_000_000)
+    result["safe_op"] = master.state_check(pysoem.SAFEOP_STATE, PATIENCE_US)
     result["sizes"] = [[len(slave.output), len(slave.input)] for slave in master.slaves]
     for slave in synchronous:
         slave.dc_sync(True, PERIOD_NS, PERIOD_NS // 2)
@@ -96,11 +107,7 @@ def main() -> None:
     result["expected"] = master.expected_wkc
     result["counters"] = counters[150:]
     result["differences"] = [read(slave, 0x092C) & 0x7FFFFFFF for slave in master.slaves]
-    master.state = pysoem.INIT_STATE
-    master.write_state()
-    result["init"] = master.state_check(pysoem.INIT_STATE, 2_000_000)
-    master.close()
-    print(json.dumps(result))
+    end(master, result)
 
 
 if __name__ == "__main__":

@@ -56,13 +56,6 @@ class Pattern(Behaviour):
         self[0x6000, 1], self[0x6010, 1] = levels & 1, levels >> 1
 
 
-def test_a_drive_with_coe_of_an_esi_file_goes_to_op(master: Master) -> None:
-    result = master(described(DRIVE), described(DRIVE, "alias: 7"))
-    assert_op(result, 6)
-    assert [len(data) for data in result["inputs"]] == [26, 26]
-    assert result["dc"]
-
-
 def test_two_sync_managers_a_direction_one_of_a_single_buffer_carry_bits_24_bits_and_bytes(master: Master) -> None:
     behaviour = "behaviour: 'tests.virtual.behaviours:Echo', options: {gain: 3}"
     outputs = (100_000).to_bytes(3, "little").hex() + f"{9 << 3:02x}" + bytes(range(31)).hex()
@@ -72,14 +65,6 @@ def test_two_sync_managers_a_direction_one_of_a_single_buffer_carry_bits_24_bits
     assert int.from_bytes(bytes.fromhex(value), "little", signed=True) == -300_000
     assert struct.unpack("<f", bytes.fromhex(temperature)) == (4.5,)
     assert int.from_bytes(bytes.fromhex(answer), "little") == sum(range(31))
-
-
-def test_an_sii_image_alone_makes_the_same_slave(master: Master, tmp_path: Path) -> None:
-    image = write_sii(find_device(read_esi(VENDOR), product=DRIVE))
-    (tmp_path / "drive.bin").write_bytes(image)
-    result = master("sii: drive.bin", "sii: drive.bin, alias: 5")
-    assert_op(result, 6)
-    assert [len(data) for data in result["inputs"]] == [26, 26]
 
 
 def test_the_eeprom_is_that_of_the_description_with_the_alias_under_the_checksum(tmp_path: Path) -> None:

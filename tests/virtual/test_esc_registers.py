@@ -45,10 +45,6 @@ def test_a_slave_reports_its_fmmus_sync_managers_memory_and_clocks() -> None:
     assert line.number(1, 0x0008, 2) & 0x000C == 0
 
 
-def test_every_slave_but_the_last_has_two_open_ports(line: Line) -> None:
-    assert [line.number(slave, 0x0110, 2) & 0xFFF0 for slave in range(3)] == [0x5A30, 0x5A30, 0x5610]
-
-
 @pytest.mark.parametrize(("written", "cleared"), [(0x0300, range(0x0300, 0x030C)), (0x0310, range(0x0310, 0x0314))])
 def test_a_write_to_an_error_counter_clears_its_group_alone(line: Line, written: int, cleared: range) -> None:
     line.slaves[0].esc.memory[0x0300:0x0314] = b"\x01" * 20
@@ -107,10 +103,6 @@ def test_the_link_that_came_up_at_power_on_is_an_event_until_the_dl_status_is_re
 
 
 # EEPROM
-
-
-def test_the_identity_stands_at_words_8_to_15_of_the_eeprom(line: Line) -> None:
-    assert eeprom_read(line, 1, 8) == bytes.fromhex("ad0b0000 feca0000")
 
 
 def test_the_eeprom_is_busy_right_after_a_command(line: Line) -> None:

@@ -164,18 +164,6 @@ def test_a_datagram_that_is_cut_goes_back_as_it_came_and_those_before_it_are_ans
     assert answer[29:] == sent[29:]
 
 
-def test_random_bytes_behind_an_ethercat_header_never_raise() -> None:
-    import random
-
-    source = random.Random(7)
-    line = Line()
-    for _ in range(3000):
-        body = source.randbytes(source.randrange(0, 80))
-        length = source.randrange(0, 100)
-        line.raw(bytes.fromhex("ffffffffffff01010101010188a4") + (length | 0x1000).to_bytes(2, "little") + body)
-        line.pass_time(100_000)
-
-
 def test_an_event_that_is_masked_in_shows_in_the_datagram_until_al_status_is_read(line: Line) -> None:
     line.write(1, 0x0200, b"\x08\x00")
     line.write(1, 0x0800, SM_MAILBOXES)

@@ -136,12 +136,6 @@ def test_a_long_step_is_as_good_as_many_short_ones() -> None:
     assert long.temperature == pytest.approx(short.temperature, abs=0.5)
 
 
-def test_a_pulse_of_one_cycle_heats_by_a_quarter_of_a_kelvin() -> None:
-    heated = rod()
-    heated.step(CYCLE, 12.0 / (heated.resistance + SOURCE))
-    assert heated.middle_temperature - 20.0 == pytest.approx(0.26, abs=0.01)
-
-
 def test_the_ratio_of_resistances_gives_the_mean_temperature() -> None:
     heated = rod()
     initial = heated.resistance

@@ -77,14 +77,6 @@ def test_a_malformed_message_is_answered_with_its_error(sent: str, received: str
     assert drain(box) == [message(received)]
 
 
-def test_a_request_is_answered_through_the_mailbox() -> None:
-    box = mailbox()
-    assert not box.pending()
-    box.receive(buffer(UPLOAD, 1), PREOP)
-    assert drain(box) == [message(UPLOADED, 1)]
-    assert box.next_message() is None
-
-
 def test_the_priority_of_a_message_is_no_part_of_its_channel() -> None:
     box = mailbox()
     box.receive(message("0a00 0000 c0 13 0020 40 0010 00 00000000"), PREOP)
@@ -96,13 +88,6 @@ def test_a_repeated_request_is_answered_once() -> None:
     box.receive(buffer(UPLOAD, 3), PREOP)
     box.receive(buffer(UPLOAD, 3), PREOP)
     assert len(drain(box)) == 1
-
-
-def test_requests_without_a_counter_are_all_answered() -> None:
-    box = mailbox()
-    box.receive(buffer(UPLOAD), PREOP)
-    box.receive(buffer(UPLOAD), PREOP)
-    assert len(drain(box)) == 2
 
 
 def test_the_slave_counts_its_own_messages_from_one_to_seven() -> None:

@@ -119,14 +119,6 @@ def test_floats_and_octet_strings_are_mapped_too(with_bit: bool) -> None:
     assert target == wire
 
 
-def test_an_assignment_without_pdos_has_an_empty_image() -> None:
-    objects = dictionary()
-    put(objects, RX_ASSIGN, 0, 0, 1)
-    image = PdoImage.from_assignment(objects, RX_ASSIGN)
-    image.unpack(b"")
-    assert (image.bit_length, image.entries) == (0, ())
-
-
 def test_an_image_longer_than_its_buffer_is_refused_with_both_lengths() -> None:
     objects = dictionary()
     long = [0x2F0000F8] * 9
@@ -135,12 +127,6 @@ def test_an_image_longer_than_its_buffer_is_refused_with_both_lengths() -> None:
     objects[RX_MAP, 0].value = len(long)
     with pytest.raises(ValueError, match="0x1C12 take 279 bytes, allowed are 256"):
         PdoImage.from_assignment(objects, RX_ASSIGN)
-
-
-def test_a_fixed_mapping_that_names_no_object_is_refused() -> None:
-    objects = ObjectDictionary()
-    define_pdo_objects(objects, {RX_MAP: [(0x7FFF, 0, 8)]}, {}, [RX_MAP], [], True)
-    assert abort_of(PdoImage.from_assignment, objects, RX_ASSIGN) == 0x06020000
 
 
 def test_a_new_mapping_changes_the_next_image_and_not_the_present_one() -> None:

@@ -6,23 +6,11 @@ import pytest
 
 from rtcp.virtual.protocol import DatagramCommand
 from rtcp.virtual.segment import REPLAYED_PULSES
-from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, Line, TinyDevice, by_sync0
-
-
-def in_op() -> Line:
-    line = Line([TinyDevice(), TinyDevice()])
-    line.to_op()
-    return line
-
-
-def test_inputs_follow_the_outputs_of_the_frame_before() -> None:
-    line = in_op()
-    line.exchange(100, 200)
-    assert line.exchange(100, 200) == ([101, 201], 6)
+from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, Line, TinyDevice, by_sync0, in_op
 
 
 def test_the_watchdog_takes_a_slave_without_outputs_to_safe_op_and_makes_them_safe() -> None:
-    line = in_op()
+    line = in_op(2)
     line.exchange(9, 9)
     line.pass_time(99 * MS)
     assert line.al(0) == (OP, 0)
@@ -35,7 +23,7 @@ def test_the_watchdog_takes_a_slave_without_outputs_to_safe_op_and_makes_them_sa
 
 
 def test_after_the_watchdog_the_working_counter_lacks_the_outputs_until_the_error_is_acknowledged() -> None:
-    line = in_op()
+    line = in_op(2)
     line.pass_time(110 * MS)
     assert line.exchange()[1] == 2
     assert line.request(0, SAFE_OP | ACK) == (SAFE_OP, 0)
@@ -47,7 +35,7 @@ def test_after_the_watchdog_the_working_counter_lacks_the_outputs_until_the_erro
 
 @pytest.mark.parametrize(("divider", "time", "expected_ms"), [(2498, 50, 5), (248, 1000, 10)])
 def test_the_watchdog_time_is_divider_times_count(divider: int, time: int, expected_ms: int) -> None:
-    line = in_op()
+    line = in_op(2)
     line.write(0, 0x0400, divider.to_bytes(2, "little"))
     line.write(0, 0x0420, time.to_bytes(2, "little"))
     line.exchange()

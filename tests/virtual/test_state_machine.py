@@ -7,7 +7,6 @@ from collections.abc import Callable
 import pytest
 
 from rtcp.virtual.objects import DataType, Entry
-from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.line import (
     ACK,
     BOOT,
@@ -20,7 +19,6 @@ from tests.virtual.line import (
     SM_INPUTS,
     SM_MAILBOXES,
     SM_OUTPUTS,
-    STATION,
     Line,
     TinyDevice,
     start_sync0,
@@ -183,14 +181,6 @@ def test_op_waits_for_outputs_and_is_refused_when_none_come() -> None:
     assert line.al(0) == (SAFE_OP | ERROR, 0x001B)
 
 
-def test_op_is_granted_with_the_first_outputs_after_the_request() -> None:
-    line = reach(SAFE_OP)
-    line.request(0, OP)
-    line.exchange(5)
-    assert line.al(0) == (OP, 0)
-    assert line.tiny[0].valid == [True]
-
-
 def test_op_with_sync0_that_never_starts_is_refused_with_0x002d() -> None:
     line = set_up(Line([TinyDevice()]))
     line.configure_process_data()
@@ -211,12 +201,6 @@ def test_an_error_keeps_the_slave_until_it_is_acknowledged() -> None:
     assert line.request(0, SAFE_OP) == (PRE_OP | ERROR, 0x0011)
     assert line.request(0, PRE_OP | ACK) == (PRE_OP, 0)
     assert line.request(0, SAFE_OP) == (SAFE_OP, 0)
-
-
-def test_acknowledging_and_asking_for_more_can_be_one_request() -> None:
-    line = reach(PRE_OP)
-    line.request(0, OP)
-    assert line.request(0, SAFE_OP | ACK) == (SAFE_OP, 0)
 
 
 def test_init_is_granted_without_acknowledging() -> None:
@@ -265,7 +249,3 @@ def test_a_device_without_outputs_goes_to_op_without_any() -> None:
     line = set_up(Line([device]), sm2=bytes(8))
     assert line.request(0, SAFE_OP) == (SAFE_OP, 0)
     assert line.request(0, OP) == (OP, 0)
-
-
-def test_al_status_cannot_be_asked_of_a_station_that_is_not_there() -> None:
-    assert reach(INIT).one(DatagramCommand.FPRD, STATION + 9, 0x0130, bytes(2)).counter == 0

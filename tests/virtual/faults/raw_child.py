@@ -9,28 +9,21 @@ frames have arrived, then `patience_s` for more.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import math
-import os
 import select
 import socket
 import sys
 import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[3]))
+
+from tests.virtual.soem_child import join
 
 EVERYTHING = 0x0003
 LONGEST_WAIT_NS = 20_000_000_000
 OUTGOING = 4
-
-
-def join(pid: str) -> None:
-    libc = ctypes.CDLL(None, use_errno=True)
-    for kind in ("user", "net"):
-        if os.stat(f"/proc/{pid}/ns/{kind}").st_ino == os.stat(f"/proc/self/ns/{kind}").st_ino:
-            continue
-        with open(f"/proc/{pid}/ns/{kind}", "rb") as namespace:
-            if libc.setns(namespace.fileno(), 0):
-                raise OSError(ctypes.get_errno(), f"cannot join the {kind} namespace")
 
 
 def collect(raw: socket.socket, until: int, received: list[tuple[int, str]], enough: float = math.inf) -> None:

@@ -7,7 +7,6 @@ joins the namespaces of process PID; CONTROL is the segment's control socket.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import pysoem
 
 from rtcp.virtual.faults.control import SegmentClient
-from tests.virtual.soem_child import join, without_blocking
+from tests.virtual.soem_child import end, opened, read
 
 PERIOD = 0.002
 
@@ -30,15 +29,6 @@ def cycle(master: pysoem.Master, seconds: float) -> list[int]:
     return counters
 
 
-def register(slave: pysoem.CdefSlave, address: int, size: int) -> int:
-    for _ in range(5):
-        try:
-            return int.from_bytes(slave._fprd(address, size), "little")
-        except pysoem.WkcError:
-            time.sleep(0.01)
-    raise RuntimeError(f"register 0x{address:04X} cannot be read")
-
-
 def to_op(master: pysoem.Master) -> int:
     """Request OP of all slaves while process data flow; return the lowest state reached."""
     master.state = pysoem.OP_STATE
@@ -51,9 +41,7 @@ def to_op(master: pysoem.Master) -> int:
 
 
 def main() -> None:
-    join(sys.argv[1])
-    master = pysoem.Master()
-    without_blocking(master, sys.argv[2])
+    master = opened(*sys.argv[1:3])
     result: dict[str, object] = {"slaves": master.config_init()}
     master.config_map()
     master.state_check(pysoem.SAFEOP_STATE, 2_000_000)
@@ -61,10 +49,10 @@ def main() -> None:
     with SegmentClient(Path(sys.argv[3])) as segment:
         number = segment.fault({"fault": "cable", "after": 3})
         result["broken"] = cycle(master, 0.3)
-        result["links"] = [register(slave, 0x0110, 2) >> 4 & 3 for slave in master.slaves[:3]]
+        result["links"] = [read(slave, 0x0110, 2) >> 4 & 3 for slave in master.slaves[:3]]
         result["watched"] = [each["reachable"] for each in segment.truth()["slaves"]]
         segment.clear(number)
-        result["lost_links"] = [register(slave, 0x0310, 2) for slave in master.slaves]
+        result["lost_links"] = [read(slave, 0x0310, 2) for slave in master.slaves]
         cycle(master, 0.02)
         master.read_state()
         result["behind"] = [(slave.state, slave.al_status) for slave in master.slaves[2:5]]
@@ -88,7 +76,7 @@ def main() -> None:
         segment.clear(number)
         segment.fault({"fault": "corrupt", "after": 4, "burst": 5})
         result["damaged"] = cycle(master, 0.02)
-        result["errors"] = [register(slave, 0x0300, 1) + 256 * register(slave, 0x0308, 1) for slave in master.slaves]
+        result["errors"] = [read(slave, 0x0300, 1) + 256 * read(slave, 0x0308, 1) for slave in master.slaves]
         segment.fault({"fault": "sdo_abort", "slave": 3, "code": 0x08000022})
         try:
             master.slaves[2].sdo_read(0x6041, 0)
@@ -99,10 +87,7 @@ def main() -> None:
         result["fallen"] = cycle(master, 0.02)[-5:]
         master.read_state()
         result["al"] = [(slave.state, slave.al_status) for slave in master.slaves[:3]]
-    master.state = pysoem.INIT_STATE
-    master.write_state()
-    master.close()
-    print(json.dumps(result))
+    end(master, result)
 
 
 if __name__ == "__main__":

@@ -85,22 +85,6 @@ def test_answers_that_are_late_come_as_late_as_asked_for(segment: Running, excha
     assert received[0][0] > sent[1], "frames went on being sent and answered meanwhile"
 
 
-def test_answers_come_twice_or_after_the_next_one(segment: Running, exchange: Exchange) -> None:
-    with segment.client() as client:
-        client.fault({"fault": "duplicate", "burst": 2})
-        assert indices(exchange(BROADCASTS[:4], answers=6).received) == [0, 0, 1, 1, 2, 3]
-        client.fault({"fault": "reorder", "burst": 1})
-        assert indices(exchange(BROADCASTS[:4]).received) == [1, 0, 2, 3]
-
-
-def test_a_garbled_answer_differs_in_as_many_bits_as_asked_for(segment: Running, exchange: Exchange) -> None:
-    ((_, whole),) = exchange(BROADCASTS[:1]).received
-    with segment.client() as client:
-        client.fault({"fault": "garble", "bits": 3, "rate": 1.0})
-        ((_, garbled),) = exchange(BROADCASTS[:1]).received
-    assert sum((a ^ b).bit_count() for a, b in zip(whole, garbled, strict=True)) == 3
-
-
 def test_noise_comes_without_a_frame_of_the_masters_and_ends_with_its_time(
     segment: Running, exchange: Exchange
 ) -> None:

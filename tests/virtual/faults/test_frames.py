@@ -47,10 +47,6 @@ def differing_bits(frame: bytes, number: int) -> int:
     return sum((a ^ number).bit_count() for a in frame)
 
 
-def test_without_a_fault_frames_are_not_examined(cable: Cable) -> None:
-    assert (cable.frames.active, cable.frames.due) == (False, FOR_EVER)
-
-
 def test_frames_are_lost_at_their_rate_half_of_them_before_the_segment(cable: Cable) -> None:
     undo = cable.begin(Loss(rate=0.25))
     reached = sum(len(cable.send(number % 256)) for number in range(2000))

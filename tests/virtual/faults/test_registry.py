@@ -44,11 +44,6 @@ class Bench:
         self.t = until
 
 
-def test_an_empty_registry_waits_for_nothing() -> None:
-    bench = Bench()
-    assert (bench.registry.due, bench.active()) == (FOR_EVER, [])
-
-
 def test_a_fault_is_active_until_it_is_cleared() -> None:
     bench = Bench()
     number = bench.begin(fault="loss", rate=0.5)
@@ -78,14 +73,6 @@ def test_all_are_cleared_at_once_and_numbers_are_not_given_twice() -> None:
     assert bench.registry.clear(None, bench.t) == first
     assert bench.registry.clear(None, bench.t) == []
     assert bench.begin(fault="garble", rate=0.5) > max(first)
-
-
-def test_a_broken_cable_is_whole_again_when_its_time_is_over() -> None:
-    bench = Bench()
-    bench.begin(fault="cable", after=1, lasts=0.1)
-    assert len(bench.line.segment.topology.reached) == 1
-    bench.pass_time(100 * MS)
-    assert len(bench.line.segment.topology.reached) == 3
 
 
 def test_a_script_begins_and_ends_faults_at_its_times() -> None:
@@ -124,25 +111,12 @@ def test_a_late_answer_is_the_next_event_of_the_registry() -> None:
     assert bench.sent == [b"late"]
 
 
-def test_a_fault_that_happens_once_has_a_number_and_is_never_active() -> None:
-    bench = Bench()
-    assert bench.begin(fault="clock_jump", slave=1, us=50) > 0
-    assert bench.active() == []
-
-
 def test_clearing_an_unknown_fault_is_refused_with_the_active_ones() -> None:
     bench = Bench()
     bench.begin(fault="loss", rate=0.5)
     with pytest.raises(FaultRefused, match="there was no fault 7; active now: 1"):
         bench.registry.clear(7, bench.t)
     assert bench.active() == [1]
-
-
-def test_a_refused_fault_leaves_nothing_behind() -> None:
-    bench = Bench()
-    with pytest.raises(FaultRefused):
-        bench.begin(fault="cable", after=9)
-    assert bench.active() == []
 
 
 def test_there_is_an_end_to_the_number_of_faults() -> None:

@@ -16,17 +16,24 @@ from rtcp.virtual.models.cubemars import CubemarsOrh70
 from rtcp.virtual.objects import Value
 from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.frames import Datagram, build
-from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, STATION, Line, TinyDevice, begin, start_sync0
+from tests.virtual.line import (
+    ACK,
+    ERROR,
+    INIT,
+    MS,
+    OP,
+    PRE_OP,
+    SAFE_OP,
+    STATION,
+    Line,
+    TinyDevice,
+    begin,
+    in_op,
+    start_sync0,
+)
 
 DL_STATUS, LOST_LINKS = 0x0110, 0x0310
 LINK_0, LINK_1, CLOSED_0, CLOSED_1 = 0x10, 0x20, 0x100, 0x400
-DELAYS = (0, 820, 1660, 2500)
-
-
-def in_op(count: int = 4) -> Line:
-    line = Line([TinyDevice() for _ in range(count)], delays=DELAYS[:count])
-    line.to_op()
-    return line
 
 
 def cut(line: Line, after: int) -> ActiveFault:
@@ -158,7 +165,7 @@ def test_lost_links_are_counted_to_255() -> None:
 
 
 def test_the_delays_measured_are_those_of_the_slaves_reached_and_afterwards_as_before() -> None:
-    line = in_op()
+    line = in_op(delays=(0, 820, 1660, 2500))
 
     def around() -> list[int]:
         reached = line.one(DatagramCommand.BWR, 0, 0x0900, bytes(4)).counter

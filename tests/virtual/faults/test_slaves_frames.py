@@ -13,7 +13,7 @@ from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.slaves import CableFault, Corrupt, WorkingCounter
 from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.frames import Datagram, build
-from tests.virtual.line import MS, STATION, Line, TinyDevice, begin
+from tests.virtual.line import MS, STATION, Line, begin, in_op
 
 COUNTERS = 0x0300
 
@@ -30,21 +30,15 @@ class Direct(RegisterPort):
         return Answer(answer.data, answer.counter)
 
 
-def in_op(count: int = 4) -> Line:
-    line = Line([TinyDevice() for _ in range(count)])
-    line.to_op()
-    return line
-
-
 def lrw(*outputs: int) -> bytes:
     data = b"".join(value.to_bytes(2, "little") for value in outputs)
     return build(Datagram(DatagramCommand.LRW, 0, 0, 0, data + bytes(len(data))))
 
 
-def errors(line: Line) -> list[tuple[int, int, int]]:
-    """For each slave: invalid frames, receive errors and forwarded errors of port 0."""
+def errors(line: Line, port: int = 0) -> list[tuple[int, int, int]]:
+    """For each slave: invalid frames, receive errors and forwarded errors of a port."""
     counters = [line.read(n, COUNTERS, 20) for n in range(len(line.slaves))]
-    return [(raw[0], raw[1], raw[8]) for raw in counters]
+    return [(raw[2 * port], raw[2 * port + 1], raw[8 + port]) for raw in counters]
 
 
 @pytest.mark.parametrize("after", [0, 1, 3])
@@ -95,12 +89,6 @@ def test_a_rate_damages_its_share_and_the_same_frames_with_the_same_seed() -> No
     assert damaged() == first
 
 
-def errors_behind(line: Line) -> list[tuple[int, int, int]]:
-    """For each slave: invalid frames, receive errors and forwarded errors of port 1."""
-    counters = [line.read(n, COUNTERS, 20) for n in range(len(line.slaves))]
-    return [(raw[2], raw[3], raw[9]) for raw in counters]
-
-
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
 def test_all_slaves_have_worked_when_a_frame_is_damaged_on_its_way_back_and_those_before_the_cable_count_at_port_1(
     after: int,
@@ -112,7 +100,7 @@ def test_all_slaves_have_worked_when_a_frame_is_damaged_on_its_way_back_and_thos
     assert undo.over
     assert undo.counts == {"corrupted": 1}
     assert [device.out.value for device in line.tiny] == [1, 2, 3, 4]
-    assert errors_behind(line) == ([(0, 0, 1)] * (after - 1) + [(1, 1, 0)] * bool(after) + [(0, 0, 0)] * (4 - after))
+    assert errors(line, 1) == ([(0, 0, 1)] * (after - 1) + [(1, 1, 0)] * bool(after) + [(0, 0, 0)] * (4 - after))
     assert errors(line) == [(0, 0, 0)] * 4
     assert line.exchange(5, 6, 7, 8)[1] == 12
     assert line.exchange(5, 6, 7, 8) == ([6, 7, 8, 9], 12)
@@ -138,7 +126,7 @@ def test_a_frame_that_is_damaged_twice_counts_as_an_error_where_it_is_damaged_fi
     assert [each.counts["corrupted"] for each in undo] == [2, 2, 1]
     for each in undo:
         each(line.now)
-    assert errors_behind(line) == [(0, 0, 1), (1, 1, 0), (0, 0, 0), (0, 0, 0)]
+    assert errors(line, 1) == [(0, 0, 1), (1, 1, 0), (0, 0, 0), (0, 0, 0)]
     assert errors(line) == [(0, 0, 0)] * 3 + [(1, 1, 0)]
     assert not line.segment.damages
 

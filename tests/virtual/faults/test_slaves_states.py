@@ -9,15 +9,23 @@ import pytest
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.slaves import AlFall, AlHang, AlRefuse, PowerFault
 from rtcp.virtual.protocol import DatagramCommand
-from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, SM_MAILBOXES, STATION, Line, TinyDevice, begin
+from tests.virtual.line import (
+    ACK,
+    ERROR,
+    INIT,
+    MS,
+    OP,
+    PRE_OP,
+    SAFE_OP,
+    SM_MAILBOXES,
+    STATION,
+    Line,
+    TinyDevice,
+    begin,
+    in_op,
+)
 
 REFUSED = 0x0042
-
-
-def in_op() -> Line:
-    line = Line([TinyDevice(), TinyDevice()])
-    line.to_op()
-    return line
 
 
 @pytest.mark.parametrize(("name", "state", "below"), [("OP", OP, SAFE_OP), ("SAFE-OP", SAFE_OP, PRE_OP),
@@ -25,7 +33,7 @@ def in_op() -> Line:
 def test_a_refused_state_gives_the_code_until_cleared_and_lower_states_are_free(
     name: Literal["PRE-OP", "SAFE-OP", "OP"], state: int, below: int
 ) -> None:
-    line = in_op()
+    line = in_op(2)
     end = begin(line.segment, AlRefuse(2, name, REFUSED), line.now)
     assert line.al(1) == (OP, 0), "who is there stays there"
     assert line.request(1, below) == (below, 0)
@@ -41,13 +49,13 @@ def test_a_refused_state_gives_the_code_until_cleared_and_lower_states_are_free(
 
 
 def test_a_request_downwards_is_not_refused() -> None:
-    line = in_op()
+    line = in_op(2)
     begin(line.segment, AlRefuse(1, "SAFE-OP", REFUSED), line.now)
     assert line.request(0, SAFE_OP) == (SAFE_OP, 0)
 
 
 def test_a_slave_that_hangs_neither_follows_nor_refuses_and_does_it_afterwards() -> None:
-    line = in_op()
+    line = in_op(2)
     end = begin(line.segment, AlHang(2), line.now)
     assert line.request(1, INIT) == (OP, 0)
     assert line.one(DatagramCommand.FPWR, STATION + 1, 0x0120, b"\x02\x00").counter == 0, "AL control was not read yet"
@@ -75,7 +83,7 @@ def test_a_slave_that_hangs_on_its_way_to_op_does_not_arrive_there() -> None:
 def test_a_fall_is_a_state_with_error_and_code_a_working_counter_and_invalid_outputs(
     name: Literal["PRE-OP", "SAFE-OP"], state: int, counter: int
 ) -> None:
-    line = in_op()
+    line = in_op(2)
     undo = begin(line.segment, AlFall(2, name, REFUSED), line.now)
     assert undo.over
     assert line.al(1) == (state | ERROR, REFUSED)
@@ -98,7 +106,7 @@ def test_who_is_not_in_op_cannot_fall_out_of_it() -> None:
 
 
 def test_a_refusal_outlives_a_loss_of_supply() -> None:
-    line = in_op()
+    line = in_op(2)
     begin(line.segment, AlRefuse(1, "PRE-OP", REFUSED), line.now)
     begin(line.segment, PowerFault(1), line.now)(line.now)
     line.pass_time(5 * MS)

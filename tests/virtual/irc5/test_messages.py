@@ -71,11 +71,6 @@ def test_positions_alone_and_speeds_alone_are_read() -> None:
     assert codec.decode(bytes.fromhex(HEADER + SPEED), 6) == Reference(5, None, (-0.5, 0.0, 0.0, 0.0, 2.0, 0.0))
 
 
-def test_the_seventh_joint_is_the_first_external_one() -> None:
-    seven = (*JOINTS, 7.5)
-    assert EgmCodec(7).decode(sensor(1, seven), 7).position == seven
-
-
 def test_joints_beside_a_pose_are_read_as_abb_libegm_sends_them() -> None:
     pose = entry(2, entry(1, doubles(1, JOINTS)) + entry(2, entry(1, entry(1, 1.0) + entry(2, 1.0) + entry(3, 1.0))))
     assert EgmCodec(7).decode(bytes.fromhex(HEADER) + pose, 6).position == JOINTS

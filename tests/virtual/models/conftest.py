@@ -70,6 +70,12 @@ class Bench:
                 each(n * self.dt)
             self.drive.step(self.dt)
 
+    def largest(self, seconds: float, value: Callable[[], float]) -> float:
+        """Let time pass; return the largest value, at least 0."""
+        values = [0.0]
+        self.run(seconds, lambda _: values.append(value()))
+        return max(values)
+
     def until(self, condition: Callable[[], bool], seconds: float) -> float:
         """Step until `condition`; return the time it took, and fail after `seconds`."""
         for n in range(round(seconds / self.dt)):

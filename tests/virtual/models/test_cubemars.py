@@ -5,8 +5,16 @@ import pytest
 from rtcp.virtual.device import create, models
 from rtcp.virtual.models.cia402 import DriveState, DriveStateMachine
 from rtcp.virtual.objects import SdoAbort
-from rtcp.virtual.pdo import PdoImage
-from tests.virtual.models.conftest import Maker
+from tests.virtual.models.conftest import Bench, Maker
+
+
+def turning(drive: Maker) -> Bench:
+    """Return a drive in CSV whose joint turns at 1 rad/s."""
+    bench = drive().enabled(9)
+    bench[0x60FF] = 10000
+    bench.run(0.5)
+    return bench
+
 
 TRANSITIONS = [
     (DriveState.SWITCH_ON_DISABLED, 0x06, 2, DriveState.READY_TO_SWITCH_ON),
@@ -124,10 +132,8 @@ def test_holding_bit_7_lets_no_other_command_through(drive: Maker) -> None:
 
 @pytest.mark.parametrize("option", [0, 1, 2, 5, 6])
 def test_a_quick_stop_ends_as_its_option_says(drive: Maker, option: int) -> None:
-    bench = drive().enabled(9)
+    bench = turning(drive)
     bench[0x605A] = option
-    bench[0x60FF] = 10000
-    bench.run(0.5)
     assert bench.velocity == pytest.approx(1.0, abs=0.02)
     bench.control(0x02)
     took = bench.until(lambda: abs(bench.velocity) < 0.005, 1.0)
@@ -178,10 +184,8 @@ def test_halt_stops_every_mode_and_its_release_goes_on(drive: Maker, mode: int) 
 
 @pytest.mark.parametrize(("controlword", "option"), [(0x07, 0x605C), (0x06, 0x605B)])
 def test_disabling_ramps_down_first_where_the_option_says_so(drive: Maker, controlword: int, option: int) -> None:
-    bench = drive().enabled(9)
+    bench = turning(drive)
     bench[option] = 1
-    bench[0x60FF] = 10000
-    bench.run(0.5)
     assert bench.control(controlword) == "enabled"
     took = bench.until(lambda: bench.state != "enabled", 1.0)
     assert took == pytest.approx(0.25, abs=0.05)
@@ -190,9 +194,7 @@ def test_disabling_ramps_down_first_where_the_option_says_so(drive: Maker, contr
 
 
 def test_enabling_again_during_the_ramp_goes_on(drive: Maker) -> None:
-    bench = drive().enabled(9)
-    bench[0x60FF] = 10000
-    bench.run(0.5)
+    bench = turning(drive)
     bench.control(0x07)
     bench.run(0.1)
     assert bench.control(0x0F) == "enabled"
@@ -242,13 +244,7 @@ def test_a_following_error_shorter_than_its_time_out_is_no_fault(drive: Maker) -
 def test_over_speed_in_torque_mode_faults(drive: Maker) -> None:
     bench = drive(initial_position=-10.0).enabled(10)
     bench[0x6071] = 500000
-    fastest = 0.0
-
-    def watch(_: float) -> None:
-        nonlocal fastest
-        fastest = max(fastest, bench.velocity)
-
-    bench.run(0.8, watch)
+    fastest = bench.largest(0.8, lambda: bench.velocity)
     assert 10.0 < fastest < 10.2
     bench.expect_fault(0x8400, 0x20)
 
@@ -299,9 +295,7 @@ def test_heat_warns_and_then_locks_the_drive_until_it_has_cooled(drive: Maker) -
 
 
 def test_a_supply_above_60_v_takes_the_torque_at_once(drive: Maker) -> None:
-    bench = drive().enabled(9)
-    bench[0x60FF] = 10000
-    bench.run(0.5)
+    bench = turning(drive)
     bench.drive.condition.bus_voltage = 61.0
     bench.until(lambda: bench[0x603F] != 0, 0.1)
     assert not bench.drive.powered
@@ -321,9 +315,7 @@ def test_a_position_beyond_the_encoder_faults_and_cannot_be_reset_there(drive: M
 
 
 def test_outputs_lost_while_enabled_ramp_down_and_fault(drive: Maker) -> None:
-    bench = drive().enabled(9)
-    bench[0x60FF] = 10000
-    bench.run(0.5)
+    bench = turning(drive)
     bench.drive.set_outputs_valid(False)
     bench.run(0.05)
     assert bench.state == "fault reaction"
@@ -343,10 +335,8 @@ def test_outputs_lost_while_disabled_are_no_fault(drive: Maker) -> None:
 
 @pytest.mark.parametrize(("option", "expected"), [(0, 0.05), (1, 0.25), (2, 0.1)])
 def test_the_fault_reaction_is_the_one_chosen(drive: Maker, option: int, expected: float) -> None:
-    bench = drive().enabled(9)
+    bench = turning(drive)
     bench[0x605E] = option
-    bench[0x60FF] = 10000
-    bench.run(0.5)
     bench.drive.inject_fault(0x7121)
     took = bench.until(lambda: abs(bench.velocity) < 0.005, 1.0)
     assert took == pytest.approx(expected, abs=0.06)
@@ -393,12 +383,6 @@ def test_every_model_can_be_created_and_stepped_without_a_socket() -> None:
         device = create(model, serial=7)
         device.step(0.001)
         assert device.identity.serial == 7
-
-
-def test_the_process_data_take_15_bytes_each_way() -> None:
-    objects = create("cubemars-orh60").objects
-    assert PdoImage.from_assignment(objects, 0x1C12).byte_length == 15
-    assert PdoImage.from_assignment(objects, 0x1C13).byte_length == 15
 
 
 @pytest.mark.parametrize(

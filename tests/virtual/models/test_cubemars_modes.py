@@ -142,13 +142,7 @@ def test_a_mode_without_a_target_position_stops_at_the_software_limit(drive: Mak
     bench[0x607D, 2] = 10000
     bench[0x60FF] = 10000
     bench[0x6071] = 200000
-    highest = 0.0
-
-    def watch(_: float) -> None:
-        nonlocal highest
-        highest = max(highest, bench.position)
-
-    bench.run(3.0, watch)
+    highest = bench.largest(3.0, lambda: bench.position)
     assert 0.99 < highest < 1.003
     assert abs(bench.velocity) < 2e-3
     assert bench.bit(11)
@@ -225,13 +219,7 @@ def test_a_second_set_point_waits_for_the_first(drive: Maker) -> None:
     bench.control(0x0F)
     # The buffer is full: the acknowledgement stays until the first target is reached.
     assert bench.bit(12)
-    highest = 0.0
-
-    def watch(_: float) -> None:
-        nonlocal highest
-        highest = max(highest, bench.position)
-
-    bench.run(2.0, watch)
+    highest = bench.largest(2.0, lambda: bench.position)
     assert highest == pytest.approx(0.5, abs=2e-3)
     assert bench.position == pytest.approx(0.2, abs=1e-3)
     assert not bench.bit(12)
@@ -243,13 +231,7 @@ def test_change_immediately_leaves_the_first_set_point(drive: Maker) -> None:
     _set_point(bench, 20000)
     bench.run(0.5)
     _set_point(bench, -2000, 0x3F)
-    highest = 0.0
-
-    def watch(_: float) -> None:
-        nonlocal highest
-        highest = max(highest, bench.position)
-
-    bench.run(3.0, watch)
+    highest = bench.largest(3.0, lambda: bench.position)
     assert highest < 0.7
     assert bench.position == pytest.approx(-0.2, abs=1e-3)
 
@@ -392,13 +374,7 @@ def test_a_velocity_mode_takes_the_torque_over_that_holds_the_load(drive: Maker)
     bench.run(0.3)
     before = bench.position
     bench[0x6060] = 9
-    fastest = 0.0
-
-    def watch(_: float) -> None:
-        nonlocal fastest
-        fastest = max(fastest, abs(bench.velocity))
-
-    bench.run(0.3, watch)
+    fastest = bench.largest(0.3, lambda: abs(bench.velocity))
     assert bench[0x6061] == 9
     assert fastest < 0.005
     assert bench.position == pytest.approx(before, abs=1e-3)
