@@ -32,8 +32,8 @@ def test_a_line_of_the_chosen_tool_is_a_line_of_its_point(shared: Platform, robo
         robot.set_tool("spoon")
     feed = rtcp.Feed(shared.directory)
     flange, probe = feed.config.models
-    tip = forward(probe, HERE)
-    assert robot.preview(pose=[*tip.position, *tip.rpy], tool="probe").path[-1] == pytest.approx(HERE, abs=1e-3)
+    there = forward(probe, HERE)
+    assert robot.preview(pose=[*there.position, *there.rpy], tool="probe").path[-1] == pytest.approx(HERE, abs=1e-3)
     robot.set_tool("probe")
     start, status = forward(probe, HERE), robot.status()
     assert (status.tool, status.payload.mass) == ("probe", 0.0)

@@ -56,6 +56,13 @@ class Pattern(Behaviour):
         self[0x6000, 1], self[0x6010, 1] = levels & 1, levels >> 1
 
 
+def test_a_drive_with_coe_of_an_esi_file_goes_to_op(master: Master) -> None:
+    result = master(described(DRIVE), described(DRIVE, "alias: 7"))
+    assert_op(result, 6)
+    assert [len(data) for data in result["inputs"]] == [26, 26]
+    assert result["dc"]
+
+
 def test_two_sync_managers_a_direction_one_of_a_single_buffer_carry_bits_24_bits_and_bytes(master: Master) -> None:
     behaviour = "behaviour: 'tests.virtual.behaviours:Echo', options: {gain: 3}"
     outputs = (100_000).to_bytes(3, "little").hex() + f"{9 << 3:02x}" + bytes(range(31)).hex()

@@ -119,6 +119,14 @@ def test_floats_and_octet_strings_are_mapped_too(with_bit: bool) -> None:
     assert target == wire
 
 
+def test_an_assignment_without_pdos_has_an_empty_image() -> None:
+    objects = dictionary()
+    put(objects, RX_ASSIGN, 0, 0, 1)
+    image = PdoImage.from_assignment(objects, RX_ASSIGN)
+    image.unpack(b"")
+    assert (image.bit_length, image.entries) == (0, ())
+
+
 def test_an_image_longer_than_its_buffer_is_refused_with_both_lengths() -> None:
     objects = dictionary()
     long = [0x2F0000F8] * 9

@@ -127,6 +127,16 @@ def test_a_segment_that_polls_answers_too(config: Path) -> None:
         assert_all_in_op(master(str(segment.pid), "ecat0", 100))
 
 
+def test_a_model_of_another_package_serves_files_over_foe(tmp_path: Path) -> None:
+    config = tmp_path / "files.yaml"
+    config.write_text("slaves:\n  - model: tests.virtual.file_models:FileServer\n", encoding="utf-8")
+    with running(config) as (segment, _):
+        child = [sys.executable, "-m", "tests.virtual.foe_child", str(segment.pid), "ecat0"]
+        files = json.loads(subprocess.run(child, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT).stdout)
+    assert files["firmware"] == (bytes(range(256)) * 2).hex()
+    assert files["settings"] == files["written"]
+
+
 @pytest.mark.skipif(os.getuid() != 0, reason="an ordinary user runs every test of this file this way")
 @needs_nobody
 def test_an_ordinary_user_gets_the_same_from_user_namespaces(config: Path) -> None:
