@@ -26,6 +26,8 @@ class Leftovers:
         os.environ.update([_MARK])
         self.shared: set[str] = set()
         """Runtime directories of platforms that several tests share: their processes may outlive a test."""
+        self.services = set(_SERVICES)
+        """Parts of the command lines of processes that serve several tests."""
 
     def running(self) -> set[int]:
         """Return the ids of all processes."""
@@ -55,7 +57,7 @@ class Leftovers:
             parents = [parent.pid for parent in process.parents()]
             if os.getpid() in parents:
                 parents = parents[: parents.index(os.getpid())]
-            return not before.intersection(parents) - {1} and not any(service in command for service in _SERVICES)
+            return not before.intersection(parents) - {1} and not any(service in command for service in self.services)
         except (psutil.Error, OSError):
             return False  # it has ended
 

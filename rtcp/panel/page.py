@@ -118,6 +118,8 @@ def text(tag: str, content: str, classes: str = "", **attributes: str) -> TextEl
     """Return an element with text, which is never read as HTML."""
     element = TextElement(tag=tag, text=content)
     element.props.update(attributes)
+    if tag == "pre":
+        element.props["tabindex"] = "0"  # a long text is scrolled, by keys too
     return element.classes(classes) if classes else element
 
 

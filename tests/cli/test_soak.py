@@ -30,8 +30,8 @@ pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture(scope="module")
-def workers(leftovers: Leftovers, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    with two_workers(leftovers, str(tmp_path_factory.mktemp("workers"))) as client:
+def workers(leftovers: Leftovers) -> Iterator[Any]:
+    with two_workers(leftovers) as client:
         yield client
 
 

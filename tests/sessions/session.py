@@ -124,19 +124,11 @@ def run_still(plan: SessionPlan, seeds: Sequence[int]) -> Batch:
 
 
 @contextmanager
-def two_workers(leftovers: Leftovers, directory: str) -> Iterator[Client]:
-    """A local cluster for the tests of a module.
-
-    Args:
-        leftovers: of the tests: a worker that follows one that has ended is started in a test, and outlives the test.
-        directory: runtime directory of the workers, by which they are known.
-    """
-    import dask
-
+def two_workers(leftovers: Leftovers) -> Iterator[Client]:
+    """A local cluster for the tests of a module: a worker that follows one that has ended begins during a test."""
     from rtcp.testing.sessions.cluster import cluster
 
-    leftovers.shared.add(directory)
-    outliving = dask.config.set({"distributed.nanny.pre-spawn-environ.RTCP_RUNTIME_DIR": directory})
-    with outliving, patch.object(os, "sched_getaffinity", lambda pid: {0, 1}), cluster(None) as client:
+    leftovers.services.add("multiprocessing.spawn")
+    with patch.object(os, "sched_getaffinity", lambda pid: {0, 1}), cluster(None) as client:
         yield client
-    leftovers.shared.discard(directory)
+    leftovers.services.remove("multiprocessing.spawn")

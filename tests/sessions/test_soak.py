@@ -65,8 +65,8 @@ def plan(count: int, seconds: float = SHORT_S, first: int = 1) -> SessionPlan:
 
 
 @pytest.fixture(scope="module")
-def client(leftovers: Leftovers, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
-    with two_workers(leftovers, str(tmp_path_factory.mktemp("workers"))) as made:
+def client(leftovers: Leftovers) -> Iterator[Client]:
+    with two_workers(leftovers) as made:
         yield made
 
 
