@@ -6,7 +6,7 @@ import dataclasses
 import math
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -37,7 +37,7 @@ from rtcp.ipc.states import ControlMode, DriveMode, DriveState, State
 from rtcp.ipc.tool_motion import ToolMotion
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
-from rtcp.realtime.statistics import SlidingPercentiles, diagnose
+from rtcp.realtime.statistics import Percentiles, SlidingPercentiles, diagnose
 
 _MESSAGES = 50
 _SHOWN = 10
@@ -286,9 +286,9 @@ class StatusSnapshot:
             processes[process.name] = {"kind": process.kind, "state": words, "commands": commands}
         return processes
 
-    def _skipped_ticks(self, cycles: int, missed: int) -> dict[str, Any] | None:
+    def _skipped_ticks(self, cycles: int, missed: int, figures: Mapping[str, Percentiles]) -> dict[str, Any] | None:
         """Return cause and remedy if the loop skips too many ticks, else None."""
-        wakeup, exchange, compute = (self._figures[name].read() for name in ("wakeup", "exchange", "compute"))
+        wakeup, exchange, compute = (figures[name] for name in ("wakeup", "exchange", "compute"))
         cause = diagnose(self._observer.period_ns * 1e-3, cycles, missed, wakeup, exchange, compute)
         if cause is None:
             return None
@@ -303,7 +303,7 @@ class StatusSnapshot:
         state, control_mode, flags = State(int(record["state"])), int(record["control_mode"]), int(record["flags"])
         problem = self._loop_problem((time.monotonic_ns() - int(record["time_ns"])) * 1e-9)
         robot = RobotStatus.lost(control_mode) if problem else RobotStatus.of_record(record)
-        figures = {name: figure.read().as_json() for name, figure in self._figures.items()}
+        figures = {name: figure.read() for name, figure in self._figures.items()}
         newest = list(self.messages)[-_SHOWN:]
         last_second, wkc = self._last_second()
         limits = self._limited_by(record) if state is State.MOVING else {}
@@ -331,7 +331,7 @@ class StatusSnapshot:
             "cycles": int(record["cycle"]),
             "time_ns": int(record["time_ns"]),
             "missed": int(record["missed"]),
-            "skipped_ticks": self._skipped_ticks(int(record["cycle"]), int(record["missed"])),
+            "skipped_ticks": self._skipped_ticks(int(record["cycle"]), int(record["missed"]), figures),
             "lost_s": round(int(record["lost"]) * self._observer.period_ns * 1e-9, 3),
             "wkc": {"expected": int(record["wkc_expected"]), "actual": -1 if problem else wkc},
             "last_second": last_second,
@@ -351,17 +351,17 @@ class StatusSnapshot:
             "statuswords": [int(word) for word in record["statusword"]],
             "devices": self._devices(record),
             "processes": self._processes(record),
-            "wakeup_us": figures["wakeup"],
-            "exchange_us": figures["exchange"],
-            "compute_us": figures["compute"],
+            "wakeup_us": figures["wakeup"].as_json(),
+            "exchange_us": figures["exchange"].as_json(),
+            "compute_us": figures["compute"].as_json(),
             "dc": None
             if "clocks" in self._session.config.bus.LACKS
             else {
                 "locked": not problem and bool(flags & FLAG_DC_LOCKED),
                 "offset_ns": int(record["dc_offset_ns"]),
                 "filtered_ns": int(record["dc_filtered_ns"]),
-                "offset_us": figures["offset"],
-                "filtered_us": figures["filtered"],
+                "offset_us": figures["offset"].as_json(),
+                "filtered_us": figures["filtered"].as_json(),
             },
             "realtime": self._started.get("realtime", {}),
             "start_to_op_s": self._started.get("start_to_op_s"),

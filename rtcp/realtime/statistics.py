@@ -49,12 +49,15 @@ class SlidingPercentiles:
 
     def __init__(self) -> None:
         self._counts = np.zeros((WINDOW_S, _BINS + 1), dtype=np.int32)
+        self._sum = np.zeros(_BINS + 1, dtype=np.int64)
+        """Counts of the whole window."""
         self._largest = np.zeros(WINDOW_S)
         self._second: int | None = None
 
     def reset(self) -> None:
         """Forget everything."""
         self._counts[:] = 0
+        self._sum[:] = 0
         self._largest[:] = 0
         self._second = None
 
@@ -65,24 +68,26 @@ class SlidingPercentiles:
             return
         row = int(now_s) % WINDOW_S
         bins = np.clip(samples_us / _BIN_US, 0, _BINS).astype(np.int64)
-        self._counts[row] += np.bincount(bins, minlength=_BINS + 1)
+        counts = np.bincount(bins, minlength=_BINS + 1)
+        self._counts[row] += counts
+        self._sum += counts
         self._largest[row] = max(self._largest[row], float(samples_us.max()))
 
     def _forget(self, second: int) -> None:
         if self._second is None:
             self._second = second
         for passed in range(self._second + 1, min(second, self._second + WINDOW_S) + 1):
+            self._sum -= self._counts[passed % WINDOW_S]
             self._counts[passed % WINDOW_S] = 0
             self._largest[passed % WINDOW_S] = 0
         self._second = max(second, self._second)
 
     def read(self) -> Percentiles:
         """Return the percentiles of the window."""
-        counts = self._counts.sum(axis=0)
-        total = int(counts.sum())
+        cumulative = np.cumsum(self._sum)
+        total = int(cumulative[-1])
         if total == 0:
             return Percentiles(0.0, 0.0, 0.0, 0.0)
-        cumulative = np.cumsum(counts)
         largest = float(self._largest.max())
         at = [min(float(np.searchsorted(cumulative, total * q)) * _BIN_US, largest) for q in (0.5, 0.99, 0.999)]
         return Percentiles(at[0], at[1], at[2], largest)
