@@ -29,7 +29,7 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-WITHOUT_GPU = [*FLAGS, "--disable-gpu"]
+WITHOUT_GPU = [*FLAGS, "--disable-gpu", "--disable-3d-apis"]
 """A page takes a third of the time where nothing imitates a GPU, and draws no arm."""
 WITH_GPU = [*FLAGS, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PASSWORD, VIEWERS_PASSWORD = "correct horse", "battery staple"
@@ -39,7 +39,7 @@ _PATIENT_PANEL = """
 from rtcp.panel import live
 
 # Shipped: 1 s and 10 s. On a busy host a browser takes longer for some of its answers.
-live.PRESENCE_S, live.TAKE_OVER_S = 15.0, 60.0
+live.PRESENCE_S, live.TAKE_OVER_S = 5.0, 60.0
 
 from rtcp.cli.__main__ import main
 

@@ -357,8 +357,8 @@ def test_a_viewer_looks_and_stops_and_commands_nothing(browser: Browser, holding
 
 def test_the_arm_is_handed_over_only_when_asked(browser: Browser, panel: str, holding: Platform) -> None:
     with visitor(browser, panel) as first, visitor(browser, panel) as second:
-        show(second, "/")  # before the motion: a page that loads in the same browser can hold up the one that operates
         begin(first, holding)
+        show(second, "/")
         expect(second.locator("#operator")).to_have_text(
             re.compile(r"local at this machine \(page \d+\) operates the arm")
         )
