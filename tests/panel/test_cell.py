@@ -85,7 +85,7 @@ def stopped(cell: Cell, running: RunningCell, state: State = State.HOLDING) -> N
             while len(rest) < 50:
                 feed.ended(0.05)
                 rest += list(feed.records()[0]["commanded_position"])
-            # A motion of 0.15 rad/s is 60 times farther; without torque the commanded position follows the settling arm.
+            # Without torque the commanded position follows the settling arm; a motion is 60 times farther.
             assert np.ptp(rest, axis=0).max() < 1e-3
 
 
