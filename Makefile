@@ -5,10 +5,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 # make test SEED=1234 repeats the order of an earlier run.
 PYTEST = $(BIN)/python -m pytest $(if $(SEED),--randomly-seed=$(SEED))
-SIDE_BY_SIDE = -m 'not platform and not long' --numprocesses 4 --dist loadfile
+SIDE_BY_SIDE = --numprocesses 4 --dist loadfile
 # A platform has two CPUs to itself: its processes take CPU time before all that is not in real time.
 PLATFORMS := $(shell expr \( $$(nproc) + 1 \) / 2)
-ON_PLATFORMS = -m 'platform and not long' --numprocesses $(PLATFORMS) --dist loadfile
+ON_PLATFORMS = --numprocesses $(PLATFORMS) --dist loadfile
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -31,17 +31,18 @@ panel: setup ## run the virtual arm with the panel: http://127.0.0.1:8080 in a b
 	@$(BIN)/rtcp start --panel
 
 check: lint ## check style, format and types, and run the tests that need no platform: before each commit
-	@$(PYTEST) $(SIDE_BY_SIDE)
+	@$(PYTEST) -m 'not platform and not long' $(SIDE_BY_SIDE)
 
 test: setup ## run all tests but those marked long
-	@$(PYTEST) $(SIDE_BY_SIDE)
-	@$(PYTEST) $(ON_PLATFORMS)
+	@$(PYTEST) -m 'not platform and not long' $(SIDE_BY_SIDE)
+	@$(PYTEST) -m 'platform and not long' $(ON_PLATFORMS)
 
 test-all: oracles ## run all tests, with every sample
-	@RTCP_THOROUGH=1 $(PYTEST) --numprocesses $(PLATFORMS) --dist loadfile
+	@RTCP_THOROUGH=1 $(PYTEST) -m 'not platform' $(SIDE_BY_SIDE)
+	@RTCP_THOROUGH=1 $(PYTEST) -m platform $(ON_PLATFORMS)
 
 test-flaky: setup ## run all tests but the long ones five times on a busy host: no verdict may change
-	@$(BIN)/python -m tests.flaky $(if $(SEED),--seed $(SEED)) -- -m 'not long' --numprocesses $(PLATFORMS) --dist loadfile
+	@$(BIN)/python -m tests.flaky $(if $(SEED),--seed $(SEED)) -- -m 'not long' $(ON_PLATFORMS)
 
 test-arms: setup ## run the end-to-end tests of the arm with the drives of each other arm (tests/drive_esi.py)
 	@status=0; \

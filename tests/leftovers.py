@@ -31,7 +31,7 @@ class Leftovers:
 
     def running(self) -> set[int]:
         """Return the ids of all processes."""
-        return {int(name) for name in os.listdir("/proc") if name.isdigit()}
+        return _running()
 
     def end_new(self, before: set[int]) -> list[str]:
         """Kill the processes that were started since `before` and still run; return their command lines.
@@ -73,15 +73,19 @@ class Leftovers:
 
 def mark() -> str:
     """Return what `end_marked` knows the processes of this worker by."""
-    return "=".join(_MARK)
+    return _MARK[1]
 
 
 def end_marked(mark: str) -> None:
     """Kill all processes that a worker has started, but this one."""
-    for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit() and int(name) != os.getpid()):
+    for pid in _running() - {os.getpid()}:
         with contextlib.suppress(OSError):
-            if mark.encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0"):
+            if _environment(pid).get(_MARK[0]) == mark:
                 os.kill(pid, signal.SIGKILL)
+
+
+def _running() -> set[int]:
+    return {int(name) for name in os.listdir("/proc") if name.isdigit()}
 
 
 def _environment(pid: int) -> dict[str, str]:

@@ -67,9 +67,8 @@ class RunningCell:
     def start_ended(self, *names: str) -> None:
         """Start the arms again whose processes a test has ended."""
         for name in names:
-            with contextlib.suppress(OSError):
-                if all(lives(int(pid)) for pid in vars(read_processes(self.of(name))).values()):
-                    continue
+            if all(lives(int(pid)) for pid in vars(read_processes(self.of(name))).values()):
+                continue
             self.platform.rtcp("--name", name, "stop", check=None)
             self.platform.rtcp("--name", name, "start", "--detach", "--cell", str(self.file))
 

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -275,4 +276,16 @@ def test_a_ring_without_room_is_refused_before_the_cycle_and_leaves_nothing(path
             Blackboard(path, arm_schema(6), 500_000)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(path.parent.glob(path.name + "*"))
+
+
+def test_a_ring_that_need_not_be_resident_takes_no_memory_and_is_refused_without_room(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Blackboard(path, arm_schema(6), 500_000, is_resident=False).close()
+    assert 512 * path.stat().st_blocks < 0.1 * path.stat().st_size
+    path.unlink()
+    monkeypatch.setattr(os, "fstatvfs", lambda _: SimpleNamespace(f_bavail=100, f_frsize=4096))
+    with pytest.raises(BlackboardTooLarge):
+        Blackboard(path, arm_schema(6), 500_000, is_resident=False)
     assert not list(path.parent.glob(path.name + "*"))

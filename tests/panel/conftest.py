@@ -30,7 +30,7 @@ FLAGS = [
     "--disable-sync",
 ]
 WITHOUT_GPU = [*FLAGS, "--disable-gpu", "--disable-3d-apis"]
-"""A page takes a third of the time where nothing imitates a GPU, and draws no arm."""
+"""For pages that draw no arm: where nothing imitates a GPU or WebGL, they cost a fraction of the time."""
 WITH_GPU = [*FLAGS, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PASSWORD, VIEWERS_PASSWORD = "correct horse", "battery staple"
 PERIOD_US = 8000
