@@ -101,7 +101,7 @@ def build(target: Path) -> None:
     class ParallelBuild(build_ext):
         """Runs the C compiler on every CPU: setuptools compiles the sources of an extension one after the other."""
 
-        def build_extension(self, extension: Any) -> None:
+        def build_extensions(self) -> None:
             compile_all: Any = self.compiler.compile
 
             def compile_each(sources: list[str], **options: Any) -> list[str]:
@@ -110,10 +110,7 @@ def build(target: Path) -> None:
                     return [name for names in compiled_each for name in names]
 
             self.compiler.compile = compile_each
-            try:
-                super().build_extension(extension)
-            finally:
-                self.compiler.compile = compile_all
+            super().build_extensions()
 
     compiled = _compiled()
     os.chdir(ROOT)
