@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -285,7 +284,8 @@ def test_a_ring_that_need_not_be_resident_takes_no_memory_and_is_refused_without
     Blackboard(path, arm_schema(6), 500_000, is_resident=False).close()
     assert 512 * path.stat().st_blocks < 0.1 * path.stat().st_size
     path.unlink()
-    monkeypatch.setattr(os, "fstatvfs", lambda _: SimpleNamespace(f_bavail=100, f_frsize=4096))
+    full = os.statvfs_result((4096, 4096, 200, 100, 100, 0, 0, 0, 0, 255))
+    monkeypatch.setattr(os, "fstatvfs", lambda _: full)
     with pytest.raises(BlackboardTooLarge):
         Blackboard(path, arm_schema(6), 500_000, is_resident=False)
     assert not list(path.parent.glob(path.name + "*"))

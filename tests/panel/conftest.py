@@ -66,8 +66,9 @@ def begun(platform: Platform, *arguments: str) -> Iterator[tuple[subprocess.Pope
         assert "most recent call last" not in complaints, complaints
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[BrowserType]:
+    """Chromium for one module: until Playwright ends, no other test of this process can run an event loop."""
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed (Debian: apt install chromium)")
     expect.set_options(timeout=HANG_S * 1000)
@@ -75,14 +76,14 @@ def chromium() -> Iterator[BrowserType]:
         yield playwright.chromium
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser(leftovers: Leftovers, chromium: BrowserType) -> Iterator[Browser]:
     chrome = chromium.launch(executable_path=CHROMIUM, args=WITHOUT_GPU)
     yield chrome
     chrome.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def drawing_browser(leftovers: Leftovers, chromium: BrowserType) -> Iterator[Browser]:
     """A browser that draws the arm."""
     chrome = chromium.launch(executable_path=CHROMIUM, args=WITH_GPU)

@@ -74,6 +74,14 @@ def test_two_sync_managers_a_direction_one_of_a_single_buffer_carry_bits_24_bits
     assert int.from_bytes(bytes.fromhex(answer), "little") == sum(range(31))
 
 
+def test_an_sii_image_alone_makes_the_same_slave(master: Master, tmp_path: Path) -> None:
+    image = write_sii(find_device(read_esi(VENDOR), product=DRIVE))
+    (tmp_path / "drive.bin").write_bytes(image)
+    result = master("sii: drive.bin", "sii: drive.bin, alias: 5")
+    assert_op(result, 6)
+    assert [len(data) for data in result["inputs"]] == [26, 26]
+
+
 def test_the_eeprom_is_that_of_the_description_with_the_alias_under_the_checksum(tmp_path: Path) -> None:
     image = write_sii(find_device(read_esi(VENDOR), product=DRIVE))
     (tmp_path / "drive.bin").write_bytes(image)
