@@ -17,7 +17,7 @@ import rtcp
 from rtcp.api import Arrival, AsyncRobot, Robot, State
 from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import Platform
-from tests.waiting import until
+from tests.waiting import HANG_S, until
 
 pytestmark = pytest.mark.platform
 
@@ -173,6 +173,16 @@ def test_points_are_appended_while_the_trajectory_runs_and_it_stops_where_it_has
     with pytest.raises(rtcp.Refused) as refused:
         robot.append([{"t": 3.0, "q": at(0.2)}])
     assert refused.value.reason == "not_open"
+
+
+def test_whoever_waits_gets_every_record(shared: Platform) -> None:
+    feed = rtcp.Feed(shared.directory)
+    numbers: list[int] = []
+    while len(numbers) < 200:
+        assert feed.wait(HANG_S)
+        numbers += feed.records()[0]["number"].tolist()
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    feed.close()
 
 
 # -- streams ---------------------------------------------------------------------------------------------------------

@@ -172,3 +172,26 @@ def test_a_defect_in_the_cycle_ramps_the_joints_down_and_leaves_slaves_in_init(p
     assert {drive.statusword & 0x4F for drive in shown[-1][1]} == {SWITCH_ON_DISABLED}
     assert platform.al_states() == [INIT] * SLAVES
     assert "ended unexpectedly" in platform.status()["message"]
+
+
+def test_an_interrupted_start_leaves_nothing_and_a_start_in_the_foreground_ends_in_order_with_its_terminal(
+    platform: Platform,
+) -> None:
+    platform.be_patient(2000)
+    starting = platform.background("start")
+    until(lambda: platform.pids()["segment"], "the segment")
+    pids = platform.pids()
+    starting.send_signal(signal.SIGINT)
+    _, said = starting.communicate()
+    assert (starting.returncode, "Traceback" in said) == (130, False), said
+    assert "nothing is left running" in said
+    assert not any(map(lives, (*pids.values(), *platform.pids().values())))
+    started = platform.background("start")
+    assert started.stdout is not None
+    until(lambda: "ready" in started.stdout.readline(), "ready")
+    platform.call("enable")
+    pids = platform.pids()
+    started.send_signal(signal.SIGHUP)
+    _, said = started.communicate()
+    assert (started.returncode, said) == (0, "")
+    assert not any(map(lives, pids.values()))

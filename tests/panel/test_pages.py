@@ -237,6 +237,10 @@ def test_a_recording_is_made_and_drawn_and_a_motion_file_is_run(page: Page, hold
     picture = page.get_by_alt_text("Plot of cup.mcap")
     expect(picture).to_be_visible()
     assert picture.evaluate("image => image.naturalWidth") > 100
+    # Whoever leaves the page while it works prints nothing: `begun` would find it.
+    page.get_by_role("button", name="Plot cup.mcap").click()
+    show(page, "/")
+    page.get_by_role("button", name="Scan the bus").click()
     there = [0.2, *BENT[1:]]
     program = tmp_path / "program.yaml"
     program.write_text(f"trajectory:\n  - {{t: 0, q: {BENT}}}\n  - {{t: 2, q: {there}}}\n")

@@ -58,6 +58,12 @@ def description(ros: Ros) -> str:
     return ros.run("/usr/bin/rosparam", "get", "/robot_description", check=False).stdout
 
 
+def handles(pid: int, number: signal.Signals) -> bool:
+    """Whether a process has a handler for a signal."""
+    (caught,) = re.findall(r"SigCgt:\s*(\w+)", Path(f"/proc/{pid}/status").read_text())
+    return bool(int(caught, 16) >> (number - 1) & 1)
+
+
 @pytest.mark.platform
 def test_topics_show_the_platform_at_the_rate_asked_for(ros: Ros, platform: Platform) -> None:
     platform.restore()
@@ -159,6 +165,17 @@ def test_after_the_loss_of_platform_and_master_everything_is_there_again(ros: Ro
         node.send_signal(signal.SIGTERM)
         assert node.wait(HANG_S) == 0
         assert "/rtcp" not in ros.run("/usr/bin/rosnode", "list").stdout.split()
+        ros.kill_core()
+        try:
+            node = begin_node(ros, platform)
+            # It waits for the master, and ends in order meanwhile.
+            until(lambda: handles(node.pid, signal.SIGTERM), "the start of the node")
+            node.send_signal(signal.SIGTERM)
+            assert node.wait(HANG_S) == 0
+            node = begin_node(ros, platform)
+        finally:
+            ros.start_core()
+        until(lambda: "/rtcp" in ros.run("/usr/bin/rosnode", "list").stdout.split(), "the node")
     finally:
         ros.stop(listener.process)
         ros.stop(node)
