@@ -388,7 +388,8 @@ window.rtcp = (() => {
 
   window.addEventListener("load", () => {
     const wait = setInterval(() => {
-      if (!pageKey()) return;
+      // Before the handshake of NiceGUI's socket a click or a choice on the page would be lost.
+      if (!pageKey() || !window.did_handshake) return;
       clearInterval(wait);
       connect();
       const head = document.getElementById("head"); // notifications lie below it
