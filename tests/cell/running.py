@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -36,10 +35,19 @@ silence_s: 0.5
 MIXED = PAIR.replace("{name: left, config: assistive_arm.yaml", "{name: left, config: abb_irb120.yaml")
 
 
-def shipped_cell() -> str:
-    """Return the shipped cell of two IRB 120; its loops may be as late as the format allows."""
-    text, count = re.subn(r"^silence_s: \S+", "silence_s: 0.5", (CONFIG / "cell.yaml").read_text(), flags=re.MULTILINE)
-    assert count == 1
+def shipped_cell(apart_m: float = 1.6) -> str:
+    """Return the shipped cell of two IRB 120; its loops may be as late as the format allows.
+
+    An arm that may be silent for so long needs room to stop in: the arms stand farther from each other.
+    """
+    text = (CONFIG / "cell.yaml").read_text()
+    for old, new in {
+        "silence_s: 0.1": "silence_s: 0.5",
+        "[0, 0.6, 0]": f"[0, {apart_m / 2:g}, 0]",
+        "[0, -0.6, 0]": f"[0, {-apart_m / 2:g}, 0]",
+    }.items():
+        assert old in text
+        text = text.replace(old, new)
     return text
 
 

@@ -134,11 +134,11 @@ def test_a_motion_that_one_arm_cannot_carry_out_moves_no_arm(irbs: RunningCell, 
         cell.move_joints({"left": list(ABB_HOME), "right": [9.0, *ABB_HOME[1:]]})
     assert refused.value.kind == "refused"
     with pytest.raises(RtcpError, match="bodies of left and right") as refused:
-        cell.move_joints({name: [0.0, 1.2, -0.3, 0.0, 0.5, 0.0] for name in cell.arms})
+        cell.move_joints({name: [0.0, 1.4, -1.4, 0.0, 0.0, 0.0] for name in cell.arms})
     assert refused.value.kind == "refused"
     cell.arms["right"].disable()
     with pytest.raises(RtcpError) as refused:
-        cell.move_joints(near(cell))
+        cell.move_joints(near(cell), 0.3)
     assert refused.value.message.startswith("right: ")
     assert [np.abs(rows["commanded_velocity"]).max() for rows in records.read().values()] == [0.0, 0.0]
 

@@ -13,7 +13,7 @@ from tests.processes.rod.test_bending import planned
 def test_the_shipped_cell_runs_a_planned_bend() -> None:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     plan = planned()
-    cell = RunningCell(shipped_cell())
+    cell = RunningCell(shipped_cell(1.2))
     try:
         with cell.connect() as arms:
             arms.enable()
