@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from rtcp.config.cell import CellConfig, Member
 from rtcp.control.part import Part
-from rtcp.ipc.record_view import RecordView, RecordViewError
+from rtcp.ipc.record_view import RecordView, RecordViewError, replace_view
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import FLAG_EMERGENCY_STOP, FLAG_MOTION_ALLOWED, Field
 from rtcp.ipc.states import State
@@ -93,7 +93,7 @@ class Partners(Part):
             with contextlib.suppress(OSError):
                 inode = path.stat().st_ino
                 if inode != self._inodes[index]:
-                    self._views[index] = _view(path, len(self.group.members[index].position))
+                    replace_view(self._views, index, _view(path, len(self.group.members[index].position)))
                     self._inodes[index] = inode
 
     def close(self) -> None:

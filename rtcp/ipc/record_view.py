@@ -74,6 +74,15 @@ class RecordView:
         return whole
 
 
+def replace_view(views: list[RecordView | None], index: int, view: RecordView | None) -> None:
+    """Store a view in a list that another thread reads.
+
+    Compiled code releases what it replaces before it stores the new object. The release of a mapping lets other threads
+    run, and they would read an object that is freed; the interpreter stores first.
+    """
+    views[index] = view
+
+
 def _place(schema: RecordSchema, name: str) -> tuple[int, int, Any]:
     """Return the offset of a field in the record, its count of numbers, and the function that unpacks it."""
     before = 0

@@ -125,3 +125,20 @@ def test_the_guard_brakes_a_partner_by_its_acceleration_in_force_and_after_its_s
     assert partner.acceleration is beside.record.acceleration
     assert (guard._period_s, guard._delay_s) == (0.001, CELL.longest_silence_s + CELL.slowest_s)
     assert guard._clearance == CELL.clearance
+
+
+def test_the_new_records_of_a_partner_are_in_place_before_the_old_ones_are_released(beside: Beside, path: Path) -> None:
+    partners, found = beside.partners, []
+
+    class Old:
+        def __del__(self) -> None:
+            # In the loop another thread reads here, while the mapping of the old records is released.
+            found.append(partners._views[0])
+
+    views: list[Any] = partners._views
+    views[0] = Old()
+    path.rename(path.with_name(f"{path.name}.old"))
+    Beside(path).close()
+    partners.open()
+    path.with_name(f"{path.name}.old").unlink()
+    assert [type(view).__name__ for view in found] == ["RecordView"]
