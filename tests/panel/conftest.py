@@ -9,16 +9,21 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
+from http import HTTPStatus
 from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserType, Dialog, Error, Page, expect, sync_playwright
 
 from rtcp.api import RtcpError
+from rtcp.ipc.session import read_processes
 from tests.e2e.conftest import Platform
 from tests.leftovers import Leftovers
-from tests.waiting import HANG_S
+from tests.waiting import HANG_S, until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = [
@@ -58,12 +63,25 @@ def begun(platform: Platform, *arguments: str) -> Iterator[tuple[subprocess.Pope
     )
     assert panel.stdout is not None
     try:
-        yield panel, panel.stdout.readline().partition(": ")[0].rstrip("/")
+        url = panel.stdout.readline().partition(": ")[0].rstrip("/")
+        if read_processes(platform.directory / platform.environment.get("RTCP_NAME", "")).loop:
+            # A page that is opened before begins anew when the platform is found.
+            until(partial(knows_the_platform, url), "the platform in the panel")
+        yield panel, url
     finally:
         if panel.poll() is None:
             panel.terminate()
         _, complaints = panel.communicate(timeout=HANG_S)
         assert "most recent call last" not in complaints, complaints
+
+
+def knows_the_platform(url: str) -> bool:
+    """Whether a panel shows the platform, or says nothing to whoever has not logged in."""
+    try:
+        with urlopen(f"{url}/metrics") as answer:
+            return b"rtcp_up 1" in answer.read()
+    except HTTPError as error:
+        return error.code == HTTPStatus.UNAUTHORIZED
 
 
 @pytest.fixture(scope="module")
