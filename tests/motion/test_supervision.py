@@ -64,6 +64,14 @@ def test_a_limit_that_is_passed_in_so_many_cycles_in_a_row_is_found_in_the_last(
 
 
 @KINDS
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_limit_that_every_joint_passes_at_once_is_found(kind: Kind, sign: float) -> None:
+    arm, value = Supervised(), 10.0 * sign * BOUNDS[kind]
+    put(arm.state, kind, 0, value)
+    assert isinstance(arm.check(kind, *[value] * CYCLES)[-1], kind)
+
+
+@KINDS
 def test_after_a_reset_the_count_begins_anew(kind: Kind) -> None:
     arm = Supervised()
     arm.check(kind, *[BOUNDS[kind] * 2] * (CYCLES - 1))
