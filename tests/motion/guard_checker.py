@@ -68,6 +68,8 @@ class GuardChecker:
                 i,
                 state.commanded_acceleration[i],
             )
+            if verdict is GuardResult.STOPPING:
+                assert abs(state.commanded_acceleration[i] - (mean - self.mean[i]) / dt) < 1e-6 / dt
             self.mean[i] = mean
         now = self.depths()
         for was, deep in zip(self._depths, now, strict=True):
