@@ -374,7 +374,8 @@ def test_health_is_drawn_and_served_and_an_alarm_waits_until_it_is_acknowledged(
     expect(line).to_have_attribute("points", re.compile(r"^\d"))
     expect(page.get_by_role("row", name=re.compile(r"^wake-up p99 [\d.]+ [\d.]+ [\d.]+ us"))).to_be_visible()
     page.get_by_role("link", name="Alarms", exact=True).click()
-    expect(page.get_by_role("row", name="enabled").first).to_be_visible()
+    holding.call("halt")
+    expect(page.get_by_role("row", name="halted at rest").first).to_be_visible()
     while page.locator("tr.waits").count():
         page.locator("tr.waits").get_by_role("button", name=re.compile("^Acknowledge")).first.click()
         page.wait_for_timeout(200)
