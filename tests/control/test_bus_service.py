@@ -364,3 +364,9 @@ def test_drives_that_fail_together_are_all_explained_whatever_they_answer(
     release.set()
     until(lambda: len(events(observer)) == 2)
     assert events(observer) == [DriveErrorCode(0, 2, 1, code), DriveErrorCode(1, 3, 1, code)]
+
+
+def test_the_states_that_the_watcher_sees_are_published(bus: Bus, service: BusService, observer: Observer) -> None:
+    for slave, code in zip(bus.watching.slaves, (0x1A, 0x1B), strict=True):
+        slave.update(AlState.SAFEOP, True, code)
+    until(lambda: observer.slaves(2) == [(0x14, 0x1A), (0x14, 0x1B)])

@@ -432,6 +432,19 @@ def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
     assert zones.clearances(poses, min(zones.room(poses), 0.0)) == []
 
 
+@given(q=JOINTS)
+@settings(max_examples=examples(50))
+def test_every_gap_is_measured_again_between_what_it_was_found(q: Sequence[float]) -> None:
+    zones = Zones(MODEL, Limits(ARM), CLEARANCE)
+    poses = frames(MODEL, q)
+    gaps = zones.gaps(poses, 9.0, 9.0)
+    zones.after.place(poses)
+    assert [zones.remeasure(gap, poses) for gap in gaps] == pytest.approx([gap.distance for gap in gaps], abs=1e-12)
+    pairs = [gap for gap in gaps if gap.zone >= ITSELF]
+    assert len({gap.zone for gap in pairs}) == len(pairs) > 1
+    assert all(gap.bend > zones._shares[gap.body] for gap in pairs), "both bodies of a pair bend"
+
+
 @given(q=JOINTS, direction=DIRECTION)
 @settings(max_examples=examples(60))
 def test_no_point_moves_further_than_the_reach_of_each_joint_says(q: Sequence[float], direction: list[float]) -> None:

@@ -69,3 +69,12 @@ def test_the_uncertainty_is_the_scatter_of_what_it_is_made_of() -> None:
         line = temperature.RatioScale(initial, alloy.resistivity(initial) / alloy.alpha, 22.0, cold.mean_by_middle())
         drawn.append(line.middle(ratio + 1e-3 * chance.gauss(0, 1)))
     assert stated.uncertainty_k == pytest.approx(stdev(drawn), rel=0.05)
+
+
+def test_the_mean_of_a_very_long_rod_goes_on_where_its_series_ends() -> None:
+    def mean(length: float) -> float:
+        return temperature.ColdEnds(length, 1e-3, 0.0).mean_by_middle()
+
+    # Beyond 350 end lengths to each side cosh would overflow soon.
+    assert mean(0.7001) == pytest.approx(mean(0.6999), abs=1e-6)
+    assert mean(2.0) == pytest.approx(0.999)
