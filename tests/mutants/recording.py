@@ -16,7 +16,7 @@ from importlib.machinery import SourceFileLoader
 from itertools import chain
 from pathlib import Path
 from time import process_time
-from types import CodeType
+from types import CodeType, ModuleType
 from typing import Any, NamedTuple
 
 _HITS = "__hits__"
@@ -152,17 +152,26 @@ class Recorder:
     def _take(self) -> set[tuple[str, Statement]]:
         """Return the statements of each source that were executed since the last call."""
         executed: set[tuple[str, Statement]] = set()
-        for name, marks in self._marks.items():
-            module = sys.modules.get(name.removesuffix("/__init__.py").removesuffix(".py").replace("/", "."))
-            hits: bytearray = getattr(module, _HITS, bytearray())
-            executed.update((name, statement) for i, hit in enumerate(hits) if hit for statement in marks[i])
+        for name, module in self._modules():
+            hits: bytearray = getattr(module, _HITS)
+            executed.update((name, each) for i, hit in enumerate(hits) if hit for each in self._marks[name][i])
             hits[:] = bytes(len(hits))
         return executed
+
+    def _modules(self) -> Iterator[tuple[str, ModuleType]]:
+        for name in self._marks:
+            module = sys.modules.get(name.removesuffix("/__init__.py").removesuffix(".py").replace("/", "."))
+            if hasattr(module, _HITS):
+                yield name, module
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         file = nodeid.partition("::")[0]
         if file != self._file:
             self._start(file)
+        for _, module in self._modules():
+            for value in list(vars(module).values()):
+                # Each test computes by itself what functions keep of a test before.
+                getattr(value, "cache_clear", lambda: None)()
         self._take()
         self._began_s = process_time()
 
