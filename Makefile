@@ -3,7 +3,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-# make test SEED=1234 repeats the order of an earlier run.
+# make test SEED=1234 repeats the order of an earlier run within each file.
 PYTEST = $(BIN)/python -m pytest $(if $(SEED),--randomly-seed=$(SEED))
 SIDE_BY_SIDE = --numprocesses 4 --dist loadfile
 # A platform has two CPUs to itself: its processes take CPU time before all that is not in real time.

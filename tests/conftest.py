@@ -22,7 +22,7 @@ from kinematics.compiled import BUILD
 from rtcp.config import find
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.schema import arm_schema
-from tests.leftovers import Leftovers
+from tests.leftovers import FoundAtTheEnd, Leftovers
 from tests.samples import THOROUGH
 from tests.verdicts import Verdicts
 
@@ -84,7 +84,8 @@ def leftovers() -> Iterator[Leftovers]:
     """The process table. At the end of the session no process of a test may be left."""
     table = Leftovers()
     yield table
-    assert not (left := table.end_all()), f"left by the fixtures of modules or of the session: {left}"
+    if left := table.end_all():
+        raise FoundAtTheEnd(f"left by the fixtures of modules or of the session: {left}")
 
 
 @pytest.fixture(autouse=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import multiprocessing
+import os
 import random
 import subprocess
 import sys
@@ -24,16 +25,17 @@ PAGE_CACHE_BYTES = 2 << 30
 _BLOCK = bytes(1 << 20)
 
 
-def burn() -> None:
-    """Use a whole CPU."""
-    while True:
-        pass
+def burn(parent: int) -> None:
+    """Use a whole CPU while the parent process runs."""
+    while os.getppid() == parent:
+        for _ in range(100_000):
+            pass
 
 
-def fill_page_cache(directory: str) -> None:
-    """Write and read a large file over and over."""
+def fill_page_cache(directory: str, parent: int) -> None:
+    """Write and read a large file over and over while the parent process runs."""
     with tempfile.TemporaryFile(dir=directory) as file:
-        while True:
+        while os.getppid() == parent:
             file.seek(0)
             for _ in range(PAGE_CACHE_BYTES // len(_BLOCK)):
                 file.write(_BLOCK)
@@ -46,8 +48,8 @@ def fill_page_cache(directory: str) -> None:
 def busy_host() -> Iterator[None]:
     """Keep the host busy in this block."""
     with tempfile.TemporaryDirectory() as directory:
-        load = [multiprocessing.Process(target=burn, daemon=True) for _ in range(BURNERS)]
-        load.append(multiprocessing.Process(target=fill_page_cache, args=(directory,), daemon=True))
+        load = [multiprocessing.Process(target=burn, args=(os.getpid(),), daemon=True) for _ in range(BURNERS)]
+        load.append(multiprocessing.Process(target=fill_page_cache, args=(directory, os.getpid()), daemon=True))
         for process in load:
             process.start()
         try:

@@ -14,7 +14,6 @@ import os
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.leftovers import end_marked, mark
+from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[1]
 STALL_LIMIT_S = 0.005
@@ -32,6 +32,8 @@ _INTERVAL_S = 0.004
 _PRIORITY = 81
 """One above the loop's, so that the watcher measures the host and not the loops of the tests."""
 _DELAY = struct.Struct("d")
+_NOT_YET = -1.0
+"""In place of the delay before the watcher runs."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +84,16 @@ def _cpu_ticks() -> tuple[int, int]:
 @contextmanager
 def watched() -> Iterator[Host]:
     """Watch the host in this block."""
-    with tempfile.NamedTemporaryFile(dir="/dev/shm") as file:
-        file.write(bytes(_DELAY.size))
-        file.flush()
-        watcher = subprocess.Popen([sys.executable, "-m", "tests.host", file.name, str(os.getpid()), mark()], cwd=ROOT)
-        with mmap.mmap(file.fileno(), _DELAY.size) as memory:
-            yield Host(memory)
-        watcher.returncode = 0  # it lives until this process ends, and is not waited for
+    descriptor = os.memfd_create("rtcp-host")
+    os.ftruncate(descriptor, _DELAY.size)
+    command = [sys.executable, "-m", "tests.host", str(descriptor), str(os.getpid()), mark()]
+    with mmap.mmap(descriptor, _DELAY.size) as memory:
+        _DELAY.pack_into(memory, 0, _NOT_YET)
+        watcher = subprocess.Popen(command, cwd=ROOT, pass_fds=(descriptor,))
+        os.close(descriptor)
+        until(lambda: _DELAY.unpack_from(memory)[0] != _NOT_YET, "the watcher of the host")
+        yield Host(memory)
+    watcher.returncode = 0  # it lives until this process ends, and is not waited for
 
 
 def main() -> None:
@@ -97,8 +102,9 @@ def main() -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     except PermissionError:
         pass
-    with open(sys.argv[1], "r+b") as file, mmap.mmap(file.fileno(), _DELAY.size) as memory:
+    with mmap.mmap(int(sys.argv[1]), _DELAY.size) as memory:
         parent, before = int(sys.argv[2]), time.monotonic()
+        _DELAY.pack_into(memory, 0, 0.0)
         while os.getppid() == parent:
             time.sleep(_INTERVAL_S)
             now = time.monotonic()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import uuid
 from pathlib import Path
@@ -14,6 +15,10 @@ _MARK = ("RTCP_TESTS", str(uuid.uuid4()))
 """Environment variable of every process that the tests of this worker start."""
 _SERVICES = ("multiprocessing.resource_tracker", "multiprocessing.forkserver", "tests.host")
 """Processes that serve the tests of a whole session."""
+
+
+class FoundAtTheEnd(AssertionError):
+    """What only the end of the session shows fails the run: a second try of the last test would show nothing."""
 
 
 class Leftovers:
@@ -77,11 +82,21 @@ def mark() -> str:
 
 
 def end_marked(mark: str) -> None:
-    """Kill all processes that a worker has started, but this one."""
+    """Kill all processes that a worker has started, but this one; remove the files of its platforms."""
+    from rtcp.ipc.runtime_directory import blackboard_file
+
+    directories: set[Path] = set()
     for pid in _running() - {os.getpid()}:
         with contextlib.suppress(OSError):
-            if _environment(pid).get(_MARK[0]) == mark:
+            environment = _environment(pid)
+            if environment.get(_MARK[0]) == mark:
                 os.kill(pid, signal.SIGKILL)
+                directories.add(Path(environment.get("RTCP_RUNTIME_DIR", "/nowhere")))
+    for directory in directories:
+        blackboard_file(directory).unlink(missing_ok=True)
+        for made in (directory, directory.parent):
+            if made.name.startswith("rtcp-e2e-"):
+                shutil.rmtree(made, ignore_errors=True)
 
 
 def _running() -> set[int]:

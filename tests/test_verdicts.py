@@ -96,8 +96,31 @@ def test_a_test_that_passes_at_the_second_try_is_listed_with_seed_and_host(suite
     assert "test_luck (call): longest stall 20.0 ms" in printed
 
 
-def test_a_flaky_test_fails_the_run_on_request(suite: Path) -> None:
-    assert run(suite, _FLAKY, "--fail-on-flaky")[0] != 0
+@pytest.mark.parametrize("options", [(), ("--numprocesses", "2")])
+def test_a_flaky_test_fails_the_run_on_request(suite: Path, options: tuple[str, ...]) -> None:
+    assert run(suite, _FLAKY, "--fail-on-flaky", *options)[0] == 7
+
+
+def test_what_the_end_of_the_session_finds_fails_the_run_though_its_last_test_runs_again(suite: Path) -> None:
+    at_the_end = """
+from tests.leftovers import FoundAtTheEnd
+@pytest.fixture(scope="session")
+def table():
+    yield
+    ran = Path(__file__ + '.ran')
+    found = not ran.exists()
+    ran.touch()
+    if found:
+        raise FoundAtTheEnd()
+@pytest.mark.platform
+def test_it(table): pass
+"""
+    assert run(suite, at_the_end)[0] == 1
+
+
+def test_a_stalled_host_does_not_excuse_what_a_measurement_leaves(suite: Path) -> None:
+    leaves = "@pytest.fixture\ndef left():\n    yield\n    assert False\n@pytest.mark.timing\ndef test_it(left): pass"
+    assert run(suite, leaves, stall_s=0.02)[0] == 1
 
 
 def test_only_tests_on_a_platform_have_a_second_try(suite: Path) -> None:

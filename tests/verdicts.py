@@ -1,8 +1,9 @@
 """The verdicts of a run: what was inconclusive, what was flaky, and which tests were not selected and why.
 
 - A test marked `timing` measures time. If it fails and the host stalled during the test, it is inconclusive.
-- A test marked `platform` runs processes in real time. If it fails, it runs once more. If it passes then, it is flaky.
-  A flaky test is listed with the seed and the figures of the host. `--fail-on-flaky` makes it a failure.
+- A test marked `platform` runs processes in real time. If it fails, it runs once more, unless it measures time. If it
+  passes then, it is flaky. A flaky test is listed with the seed and the figures of the host. With `--fail-on-flaky` the
+  run fails.
 - The last line of the run counts the tests that were not selected.
 """
 
@@ -16,14 +17,17 @@ from typing import Any
 import pytest
 
 from tests.host import Host, watched
+from tests.leftovers import FoundAtTheEnd
 
 _REASONS = {
     "long": "long, `make test-all` runs them",
     "platform": "on a real platform, `make test` runs them",
-    "other_arms": "of another arm, `make test-arms` runs them",
 }
 """Why tests with a marker are not selected. The first marker that a test has counts."""
+_NO_PLATFORM = "without a platform, `make check` runs them"
 _OTHER_REASON = "by the options of this run"
+_FLAKY_STATUS = 7
+"""Exit status of a run with a flaky test, as of pytest-rerunfailures, which does not see the tests of workers."""
 MAX_PLATFORM_TESTS = 150
 """At most this many tests of `make test` run on a real platform: simulated time is faster and shows more."""
 
@@ -34,6 +38,7 @@ class Verdicts:
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
         self._not_selected: Counter[str] = Counter()
+        self._was_repeated = False
         self._resources = contextlib.ExitStack()
         self._host: Host | None = None
         self.problems: list[str] = []
@@ -43,9 +48,11 @@ class Verdicts:
 
     def pytest_deselected(self, items: Iterable[pytest.Item]) -> None:
         """Count why tests are not selected."""
+        on_platforms = self._config.getoption("markexpr").startswith("platform")
+        other = _NO_PLATFORM if on_platforms else _OTHER_REASON
         for item in items:
             markers = (reason for name, reason in _REASONS.items() if item.get_closest_marker(name))
-            self._not_selected[next(markers, _OTHER_REASON)] += 1
+            self._not_selected[next(markers, other)] += 1
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -61,7 +68,7 @@ class Verdicts:
             self.problems.append(f"{count} tests run on a real platform, allowed are {MAX_PLATFORM_TESTS}")
         for item in items:
             if item.get_closest_marker("platform") and not item.get_closest_marker("timing"):
-                item.add_marker(pytest.mark.flaky(reruns=1))
+                item.add_marker(pytest.mark.flaky(reruns=1, rerun_except=[FoundAtTheEnd]))
 
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
         """Watch the host from the first test on whose verdict may depend on it."""
@@ -77,18 +84,24 @@ class Verdicts:
             figures = self._host.figures()
             report.sections.append(("host", str(figures)))
             report.host = str(figures)  # type: ignore[attr-defined]
-            if figures.stalled and item.get_closest_marker("timing"):
+            if figures.stalled and item.get_closest_marker("timing") and report.when != "teardown":
                 report.outcome, report.inconclusive = "skipped", True  # type: ignore[attr-defined]
                 report.longrepr = (str(item.path), 0, f"inconclusive, the host: {figures}")
         return report
 
-    def pytest_sessionfinish(self) -> None:
-        """Give the counts to the controller of a distributed run."""
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        """Give the counts to the controller of a distributed run. Let a flaky test fail the run where that is asked."""
         self._resources.close()
+        if self._was_repeated and self._config.getoption("fail_on_flaky", False) and session.exitstatus == 0:
+            session.exitstatus = _FLAKY_STATUS
         if output := getattr(self._config, "workeroutput", None):
             output["not_selected"] = dict(self._not_selected)
 
     # -- in the process that prints -------------------------------------------------------------------------------
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note that a test was repeated."""
+        self._was_repeated = self._was_repeated or report.outcome == "rerun"
 
     def pytest_testnodedown(self, node: Any) -> None:
         """Take the counts of a worker: every worker collects all tests."""

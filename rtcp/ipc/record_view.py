@@ -78,7 +78,7 @@ def replace_view(views: list[RecordView | None], index: int, view: RecordView | 
     """Store a view in a list that another thread reads.
 
     Compiled code releases what it replaces before it stores the new object. The release of a mapping lets other threads
-    run, and they would read an object that is freed; the interpreter stores first.
+    run, and they would read an object that is freed. The interpreter stores first: this module must not be compiled.
     """
     views[index] = view
 

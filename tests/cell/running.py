@@ -57,8 +57,17 @@ def leftovers_of(leftovers: Leftovers, *names: str) -> Iterator[Platform]:
     platform = Platform()
     directories = {str(platform.directory), *(str(platform.directory / name) for name in names)}
     leftovers.shared |= directories
-    yield platform
-    leftovers.shared -= directories
+    try:
+        yield platform
+    finally:
+        end(platform)
+        leftovers.shared -= directories
+
+
+def end(platform: Platform) -> None:
+    """Stop a cell and the platforms of its arms, also where its start failed."""
+    platform.rtcp("cell", "stop", check=None)
+    platform.end()
 
 
 class RunningCell:
@@ -90,8 +99,7 @@ class RunningCell:
 
     def end(self) -> None:
         """Stop it."""
-        self.platform.rtcp("cell", "stop", check=None)
-        self.platform.end()
+        end(self.platform)
 
 
 def put_in_order(operator: RequestClient) -> None:

@@ -23,6 +23,7 @@ from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import DriveErrorCode, EmergencyMessage, ErrorReported, Event
 from rtcp.ipc.observer import Health, Observer
 from tests.control import rig
+from tests.waiting import until
 
 GONE = "the interface does not take frames any more"
 
@@ -148,7 +149,7 @@ def service(bus: Bus, board: Blackboard) -> Iterator[BusService]:
     made = BusService(rig.master(bus), board, [(2, 1), (3, 1)], 5.0, 0, 1, watch_s=0.001)
     made.want_op()
     made.start()
-    until(lambda: made.all_op)
+    until(lambda: made.all_op, "the service", interval_s=0.001)
     yield made
     made.finish()
 
@@ -158,13 +159,6 @@ def observer(board: Blackboard, path: Path) -> Iterator[Observer]:
     made = Observer(path)
     yield made
     made.close()
-
-
-def until(met: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
-    while not met():
-        assert time.monotonic() < end
-        time.sleep(0.0005)
 
 
 def events(observer: Observer) -> list[Event]:
@@ -180,7 +174,7 @@ def answer_of(observer: Observer) -> dict[str, Any]:
         answers.extend([] if answer is None else [answer])
         return bool(answers)
 
-    until(answered)
+    until(answered, "the service", interval_s=0.001)
     return answers[0]
 
 
@@ -200,43 +194,43 @@ def hold_turn(bus: Bus) -> threading.Event:
 
 def turns(bus: Bus, count: int = 20) -> None:
     before = bus.watching.turns
-    until(lambda: bus.watching.turns >= before + count)
+    until(lambda: bus.watching.turns >= before + count, "the service", interval_s=0.001)
 
 
 def test_a_slave_that_is_back_before_anybody_looked_stays_lost_until_it_is_recovered(
     bus: Bus, service: BusService
 ) -> None:
     bus.watching.left = 2
-    until(lambda: service.lost_slave == 2)
+    until(lambda: service.lost_slave == 2, "the service", interval_s=0.001)
     turns(bus)
     assert bus.watching.all_op
     assert (service.lost_slave, service.all_op) == (2, False)
     service.recover()
     assert not service.all_op
-    until(lambda: service.all_op)
+    until(lambda: service.all_op, "the service", interval_s=0.001)
     assert (service.lost_slave, bus.watching.resumed) == (0, 1)
 
 
 def test_a_recovery_lasts_until_every_slave_is_in_op(bus: Bus, service: BusService) -> None:
     bus.watching.left = 2
-    until(lambda: service.lost_slave == 2)
+    until(lambda: service.lost_slave == 2, "the service", interval_s=0.001)
     bus.watching.resume = lambda: None  # type: ignore[method-assign]
     bus.watching.all_op = False
     service.recover()
     turns(bus)
     assert not service.all_op
     bus.watching.all_op = True
-    until(lambda: service.all_op)
+    until(lambda: service.all_op, "the service", interval_s=0.001)
 
 
 def test_parked_slaves_are_in_op_again_only_when_they_are_recovered(bus: Bus, service: BusService) -> None:
     service.park()
-    until(lambda: bus.watching.parked)
+    until(lambda: bus.watching.parked, "the service", interval_s=0.001)
     bus.watching.all_op = True
     turns(bus)
     assert not service.all_op
     service.recover()
-    until(lambda: service.all_op)
+    until(lambda: service.all_op, "the service", interval_s=0.001)
 
 
 def test_of_recovery_and_parking_asked_within_one_turn_the_last_one_counts(bus: Bus, service: BusService) -> None:
@@ -264,7 +258,7 @@ def test_what_was_seen_before_a_recovery_was_asked_for_is_not_taken_for_its_succ
     service.recover()
     release.set()
     seen = []
-    until(lambda: seen.append(service.all_op) or len(seen) > 50)  # type: ignore[func-returns-value]
+    until(lambda: seen.append(service.all_op) or len(seen) > 50, "the service", interval_s=0.001)  # type: ignore[func-returns-value]
     assert True not in seen
 
 
@@ -300,7 +294,11 @@ def test_what_slaves_have_been_through_is_read_as_it_was_written(
     bus.watching.slaves[1].lost, bus.watching.slaves[1].recovered = 3, 2
     service.temperature = {1: 40.5, 2: -3.25}.__getitem__
     bus.watching.errors.of[1] = PortErrors([0, 70_000, 0, 0], [0, 0, 0, 1 << 40], [5, 0, 0, 0])
-    until(lambda: observer.health(2)[1] == Health(3, 2, -3.25, (0, 70_000, 0, 0), (0, 0, 0, 0xFF_FFFF), (5, 0, 0, 0)))
+    until(
+        lambda: observer.health(2)[1] == Health(3, 2, -3.25, (0, 70_000, 0, 0), (0, 0, 0, 0xFF_FFFF), (5, 0, 0, 0)),
+        "the service",
+        interval_s=0.001,
+    )
     assert observer.health(2)[0] == Health(0, 0, 40.5, *[(0, 0, 0, 0)] * 3)
 
 
@@ -362,11 +360,11 @@ def test_drives_that_fail_together_are_all_explained_whatever_they_answer(
     service.explain_drive(1)
     service.explain_drive(0)
     release.set()
-    until(lambda: len(events(observer)) == 2)
+    until(lambda: len(events(observer)) == 2, "the service", interval_s=0.001)
     assert events(observer) == [DriveErrorCode(0, 2, 1, code), DriveErrorCode(1, 3, 1, code)]
 
 
 def test_the_states_that_the_watcher_sees_are_published(bus: Bus, service: BusService, observer: Observer) -> None:
     for slave, code in zip(bus.watching.slaves, (0x1A, 0x1B), strict=True):
         slave.update(AlState.SAFEOP, True, code)
-    until(lambda: observer.slaves(2) == [(0x14, 0x1A), (0x14, 0x1B)])
+    until(lambda: observer.slaves(2) == [(0x14, 0x1A), (0x14, 0x1B)], "the service", interval_s=0.001)

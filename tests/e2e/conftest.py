@@ -302,13 +302,15 @@ def kept(leftovers: Leftovers) -> Iterator[Platform]:
     """The started platform of this worker; its cycle is `PERIOD_US`, and its arm has two tools."""
     made = Platform()
     leftovers.shared.add(str(made.directory))
-    made.be_patient(2000)
-    add_tools(made.directory / "config")
-    made.rtcp("start", "--detach")
-    yield made
-    made.thaw()
-    made.end()
-    leftovers.shared.discard(str(made.directory))
+    try:
+        made.be_patient(2000)
+        add_tools(made.directory / "config")
+        made.rtcp("start", "--detach")
+        yield made
+        made.thaw()
+    finally:
+        made.end()
+        leftovers.shared.discard(str(made.directory))
 
 
 @pytest.fixture(scope="module")

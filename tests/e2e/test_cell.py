@@ -48,9 +48,7 @@ CYCLE_NS = 4_200_000
 def irbs(leftovers: Leftovers) -> Iterator[RunningCell]:
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
     with leftovers_of(leftovers, "left", "right") as platform:
-        made = RunningCell(shipped_cell(), platform)
-        yield made
-        made.end()
+        yield RunningCell(shipped_cell(), platform)
 
 
 @pytest.fixture

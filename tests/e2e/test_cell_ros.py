@@ -34,9 +34,7 @@ POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
 @pytest.fixture(scope="module")
 def irbs(leftovers: Leftovers) -> Iterator[RunningCell]:
     with leftovers_of(leftovers, "left", "right") as platform:
-        made = RunningCell(shipped_cell(), platform)
-        yield made
-        made.end()
+        yield RunningCell(shipped_cell(), platform)
 
 
 @pytest.mark.platform

@@ -181,6 +181,8 @@ def test_an_interrupted_start_leaves_nothing_and_a_start_in_the_foreground_ends_
     starting = platform.background("start")
     until(lambda: platform.pids()["segment"], "the segment")
     pids = platform.pids()
+    # A segment that answers nothing: the start cannot be complete before the signal.
+    os.kill(pids["segment"], signal.SIGSTOP)
     starting.send_signal(signal.SIGINT)
     _, said = starting.communicate()
     assert (starting.returncode, "Traceback" in said) == (130, False), said

@@ -74,9 +74,11 @@ class Heater:
 def started(leftovers: Leftovers) -> Iterator[Heater]:
     platform = Platform()
     leftovers.shared.add(str(platform.directory))
-    yield Heater(platform)
-    platform.end()
-    leftovers.shared.discard(str(platform.directory))
+    try:
+        yield Heater(platform)
+    finally:
+        platform.end()
+        leftovers.shared.discard(str(platform.directory))
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from rtcp.ipc.jsonrpc import LINE_LIMIT
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.ipc.states import State
 from tests.gateway.fake_loop import JOINTS, FakeLoop
+from tests.waiting import until
 
 OBJECT = {"slave": 2, "index": 0x6065, "subindex": 0}
 MOVE = {"q": [0.1] * JOINTS}
@@ -64,13 +64,6 @@ def raw(directory: Path, loop: FakeLoop) -> Iterator[Raw]:
     made = Raw(directory)
     yield made
     made.close()
-
-
-def wait_until(holds: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    until = time.monotonic() + timeout_s
-    while not holds():
-        assert time.monotonic() < until, "it did not happen"
-        time.sleep(0.01)
 
 
 # -- messages ---------------------------------------------------------------------------------------------------------
@@ -148,25 +141,25 @@ def test_the_holder_of_the_lease_has_the_name_it_gave(client: ControlClient, loo
         assert client.call("status")["lease"]["holder"] == "a jogger"
         with pytest.raises(Refused, match="the arm is commanded by a jogger"):
             client.call("move_joints", MOVE)
-    wait_until(lambda: client.call("status")["lease"]["holder"] == "")
+    until(lambda: client.call("status")["lease"]["holder"] == "", "the end of the lease")
 
 
 def test_a_connection_that_closes_during_a_move_ends_the_move(raw: Raw, loop: FakeLoop, client: ControlClient) -> None:
     loop.state, loop.moves_for = State.HOLDING, LONG
     raw.send({"id": 1, "method": "move_joints", "params": MOVE})
-    wait_until(lambda: loop.state is State.MOVING)
+    until(lambda: loop.state is State.MOVING, "moving")
     raw.close()
-    wait_until(lambda: loop.state is State.HOLDING)
+    until(lambda: loop.state is State.HOLDING, "holding")
     assert client.call("status")["lease"]["holder"] == ""
 
 
 def test_a_request_that_is_cancelled_ends_its_move_and_is_answered(raw: Raw, loop: FakeLoop) -> None:
     loop.state, loop.moves_for = State.HOLDING, LONG
     raw.send({"id": "a", "method": "move_joints", "params": MOVE})
-    wait_until(lambda: loop.state is State.MOVING)
+    until(lambda: loop.state is State.MOVING, "moving")
     answer = raw.ask({"method": "cancel", "params": {"request": "a"}})
     assert (answer["id"], answer["error"]["message"]) == ("a", "move_joints was cancelled")
-    wait_until(lambda: loop.state is State.HOLDING)
+    until(lambda: loop.state is State.HOLDING, "holding")
 
 
 def test_a_call_that_an_exception_leaves_ends_its_move(client: ControlClient, loop: FakeLoop) -> None:
@@ -177,7 +170,7 @@ def test_a_call_that_an_exception_leaves_ends_its_move(client: ControlClient, lo
 
     with pytest.raises(KeyboardInterrupt):
         client.call("move_joints", MOVE, interrupt)
-    wait_until(lambda: loop.state is State.HOLDING)
+    until(lambda: loop.state is State.HOLDING, "holding")
     assert client.call("status")["lease"]["holder"] == ""
 
 
@@ -187,9 +180,9 @@ def test_halt_does_not_wait_for_the_move_of_its_own_connection_and_other_request
         {"id": 1, "method": "move_joints", "params": MOVE},
         {"id": 2, "method": "set_output", "params": {"output": 1, "value": True}},
     )
-    wait_until(lambda: loop.state is State.MOVING)
+    until(lambda: loop.state is State.MOVING, "moving")
     raw.send({"id": 3, "method": "halt"})
-    wait_until(lambda: loop.kinds == [MoveJoints, Halt])
+    until(lambda: loop.kinds == [MoveJoints, Halt], "the halt")
     loop.state = State.HOLDING
     assert sorted(raw.receive()["id"] for _ in range(3)) == [1, 2, 3]
 
@@ -206,9 +199,9 @@ def test_a_client_stopped_by_sigstop_during_a_move_loses_its_lease(
         [sys.executable, "-c", program, str(control_socket(directory))], stderr=subprocess.DEVNULL
     )
     try:
-        wait_until(lambda: loop.state is State.MOVING, 20.0)
+        until(lambda: loop.state is State.MOVING, "moving")
         process.send_signal(signal.SIGSTOP)
-        wait_until(lambda: loop.state is State.HOLDING, 10.0)
+        until(lambda: loop.state is State.HOLDING, "holding")
         assert client.call("status")["lease"]["holder"] == ""
     finally:
         process.kill()

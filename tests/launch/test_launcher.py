@@ -24,6 +24,7 @@ from rtcp.ipc.schema import arm_schema
 from rtcp.launch import launcher, platform
 from rtcp.launch.platform import Platform
 from tests.records import numbers
+from tests.waiting import until
 
 JOINTS = 6
 
@@ -171,14 +172,14 @@ def replacement(directory: Path, config: ArmConfig) -> Iterator[Replacement]:
 
 
 def test_the_lock_is_free_while_a_new_gateway_is_waited_for(directory: Path, replacement: Replacement) -> None:
-    until = time.monotonic() + 20
-    while True:
+    def is_free() -> bool:
         try:
             with exclusive(directory):
-                break
+                return True
         except LockHeld:
-            assert time.monotonic() < until, "the lock is held until the gateway is ready"
-            time.sleep(0.01)
+            return False
+
+    until(is_free, "the free lock")
     assert replacement.ended == []
     # While a gateway is starting no other launcher starts one.
     assert launcher.replace_gateway(directory) == 0

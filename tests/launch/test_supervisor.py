@@ -6,7 +6,6 @@ import os
 import resource
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from rtcp.ipc.session import Pid, Processes, identify, is_running, read_processe
 from rtcp.launch import supervisor
 from rtcp.launch.platform import Platform
 from rtcp.launch.supervisor import GatewaySupervisor
+from tests.waiting import until
 
 
 class Supervised:
@@ -31,11 +31,11 @@ class Supervised:
         self.supervisor = GatewaySupervisor(self.platform, self.reports.append)
 
     def poll_until(self, met: Callable[[], bool]) -> None:
-        end = time.monotonic() + 60
-        while not met():
-            assert time.monotonic() < end, self.reports
+        def polled() -> bool:
             self.supervisor.poll()
-            time.sleep(0.01)
+            return met()
+
+        until(polled, "what the supervisor should do")
 
     @property
     def starts(self) -> int:

@@ -434,7 +434,7 @@ def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
 
 @given(q=JOINTS)
 @settings(max_examples=examples(50))
-def test_every_gap_is_measured_again_between_what_it_was_found(q: Sequence[float]) -> None:
+def test_every_gap_is_measured_again_between_the_bodies_where_it_was_found(q: Sequence[float]) -> None:
     zones = Zones(MODEL, Limits(ARM), CLEARANCE)
     poses = frames(MODEL, q)
     gaps = zones.gaps(poses, 9.0, 9.0)

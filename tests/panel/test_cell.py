@@ -101,6 +101,12 @@ def begin(page: Page, running: RunningCell) -> None:
             until(partial(moves, feed), "motion")
 
 
+def robot_event(cell: Cell) -> str:
+    """Return the last event about the controller of the right arm."""
+    names = [event.name for event in cell.arms["right"].events()]
+    return next((name for name in reversed(names) if name in ("waiting_for_robot", "robot_ready")), "")
+
+
 def speed(feed: Feed) -> float:
     record = feed.latest()
     return 0.0 if record is None else float(np.abs(record["commanded_velocity"]).max())
@@ -228,17 +234,12 @@ def test_all_arms_are_enabled_moved_in_step_and_disabled(page: Page, running: Ru
     with RequestClient(irc5_control(running.of("right")), server="virtual IRC5") as operator:
         operator.ask({"do": "stop", "circuit": "emergency"})
         until(lambda: states(cell)["right"] is State.FAULT, "fault")
+        until(lambda: robot_event(cell) == "waiting_for_robot", "the loop notices the controller")
         put_in_order(operator)
+    until(lambda: robot_event(cell) == "robot_ready", "the controller is ready")
     until(lambda: cell_text("right", "state") == "fault", "the table says so")
-    reset = page.get_by_role("button", name="Reset all")
-
-    def is_reset() -> bool:
-        # Pressed again where the controller was not ready yet, as an operator does.
-        if states(cell)["right"] is State.FAULT:
-            reset.click()
-        return states(cell)["right"] is State.READY
-
-    until(is_reset, "reset", interval_s=1.0)
+    page.get_by_role("button", name="Reset all").click()
+    until(lambda: states(cell)["right"] is State.READY, "reset")
     page.get_by_role("button", name="Disable all").click()
     until(lambda: states(cell) == dict.fromkeys(cell.arms, State.READY), "no arm has torque")
 

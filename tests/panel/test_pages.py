@@ -237,7 +237,7 @@ def test_a_recording_is_made_and_drawn_and_a_motion_file_is_run(page: Page, hold
     picture = page.get_by_alt_text("Plot of cup.mcap")
     expect(picture).to_be_visible()
     assert picture.evaluate("image => image.naturalWidth") > 100
-    # Whoever leaves the page while it works prints nothing: `begun` would find it.
+    # If a visitor leaves while the panel works, the panel prints no traceback: `begun` would find it.
     page.get_by_role("button", name="Plot cup.mcap").click()
     show(page, "/")
     page.get_by_role("button", name="Scan the bus").click()

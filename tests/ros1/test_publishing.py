@@ -168,7 +168,7 @@ def test_after_the_loss_of_platform_and_master_everything_is_there_again(ros: Ro
         ros.kill_core()
         try:
             node = begin_node(ros, platform)
-            # It waits for the master, and ends in order meanwhile.
+            # The node waits for the master. SIGTERM ends it during this wait.
             until(lambda: handles(node.pid, signal.SIGTERM), "the start of the node")
             node.send_signal(signal.SIGTERM)
             assert node.wait(HANG_S) == 0
