@@ -522,12 +522,23 @@ class LeftRange(FaultEvent, number=20):
 
 
 class PositionJumped(FaultEvent, number=43):
-    """{joint} jumped from {before:.6g} to {position:.6g} rad while being enabled, for {supervision}: it was turned, or
-    its drive shows a false position; {reaction}; compare it with `rtcp status`, then `rtcp reset`"""
+    """{joint} jumped from {before:.6g} to {position:.6g} rad, possible are {bound:.3g} rad, for {supervision}: it was
+    turned, or its drive shows a false position; {reaction}; compare it with `rtcp status`, then `rtcp reset`"""
 
     axis: int
     position: float
     before: float
+    bound: float
+
+
+class VelocityJumped(FaultEvent, number=76):
+    """{joint}: the measured speed jumped from {before:.6g} to {velocity:.6g} rad/s, possible are {bound:.3g} rad/s, for
+    {supervision}: it was hit, or its drive shows a false speed; {reaction}; then `rtcp reset`"""
+
+    axis: int
+    velocity: float
+    before: float
+    bound: float
 
 
 class HomingStillMoving(FaultEvent, number=39):
