@@ -49,7 +49,7 @@ class Arm(JointGroup):
         self.speed_override = SpeedOverride()
         self.tool = ToolInUse()
         self._publishes_load = False
-        self.gravity = Gravity(config, self.tool)
+        self.gravity = self.output_limiter.gravity = Gravity(config, self.tool)
         self.controllers: dict[type[Command], Controller] = load_controllers(
             ControllerSetup(
                 config,

@@ -62,7 +62,8 @@ class JointGroup(Part):
         """The measurements as the drives sent them, for the supervision; its commanded values are those of `state`."""
         self.samples.commanded = self.state.commanded
         self.limits = Limits(config)
-        self.output_limiter = OutputLimiter(self.limits, self.period_s)
+        damping = [joint.cst_damping for joint in config.joints]
+        self.output_limiter = OutputLimiter(self.limits, self.period_s, damping)
         self.supervision = Supervision(config, self.limits, first)
 
     def decode(self, data: ProcessData) -> None:
