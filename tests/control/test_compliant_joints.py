@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import MoveJoints, SetLimits
+from rtcp.ipc.commands import ApplyTorque, MoveJoints, SetLimits
+from rtcp.ipc.refusals import WeightUnknown
 from rtcp.ipc.states import State
 from rtcp.motion.limits import rows
 from rtcp.testing import Simulation
@@ -20,6 +21,7 @@ PERIOD_S = 0.002
 _OUTPUTS = struct.Struct("<Hiiib")
 ONE_NM = 10000
 """Counts of the drives' torques."""
+NOTHING = (0.0,) * 6
 
 
 @pytest.fixture
@@ -59,3 +61,16 @@ def test_the_torque_that_holds_a_joint_at_the_end_of_its_range_is_continuous(arm
     assert min(torques[arrived:]) > 10.0
     assert max(positions) < high + 0.01
     assert min(positions[arrived:]) > high - 0.005
+
+
+@in_mode(control_mode="torque")
+def test_a_torque_motion_that_begins_while_a_joint_turns_is_refused_as_its_weight_is_unknown(arm: Simulation) -> None:
+    joint = arm.models[5].mechanics
+    joint.external_torque = 6.0
+    assert arm.until(lambda: abs(arm.loop.arm.state.actual_velocity[5]) > 0.011, 1.0)
+    refusal = arm.send(ApplyTorque(NOTHING, 0.0, 0.0, 0.2)).refusal
+    assert isinstance(refusal, WeightUnknown)
+    joint.external_torque = 0.0
+    measured = arm.loop.arm.state.actual_velocity
+    assert arm.until(lambda: max(map(abs, measured)) < 0.009, 3.0)
+    arm.do(ApplyTorque(NOTHING, 0.0, 0.0, 0.2))

@@ -7,7 +7,7 @@ from typing import Final
 
 from rtcp.ipc.commands import ApplyTorque, Command
 from rtcp.ipc.events import CommandExpired
-from rtcp.ipc.refusals import FractionOutOfRange, Refusal, TorqueOutOfRange
+from rtcp.ipc.refusals import FractionOutOfRange, Refusal, TorqueOutOfRange, WeightUnknown
 from rtcp.ipc.states import ControlMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.state import ArmState, Phase, Setpoint
@@ -71,6 +71,9 @@ class TorqueController(Controller):
             if not 0.0 <= fraction <= 1.0:
                 return FractionOutOfRange(fraction)
         if not continues or self.phase is not Phase.MOVE:
+            for i, speed in enumerate(state.actual_velocity):
+                if not abs(speed) <= _STILL_RAD_S:
+                    return WeightUnknown(i, speed)
             self._start(state)
         self._wanted[:] = command.torque
         if command.stiffness > 0.0 and self._stiff == 0.0:
@@ -80,13 +83,10 @@ class TorqueController(Controller):
         return None
 
     def _start(self, state: ArmState) -> None:
-        """Begin with the torques that hold the arm now, so that it does not sag."""
+        """Begin with the torques that hold the arm now, at rest, so that it does not sag."""
         carried = self._gravity.torques(state.actual)
-        # During motion the actual torque does not show the weight: keep the previous bias.
-        rests = not any(abs(v) > _STILL_RAD_S for v in state.actual_velocity)
         for i in self._joints:
-            if rests:
-                self._bias[i] = state.actual_torque[i] - carried[i]
+            self._bias[i] = state.actual_torque[i] - carried[i]
             self._applied[i] = 0.0
             q, limits = state.actual[i], self.limits
             self._extra_low[i] = max(0.0, limits.low[i] + _MARGIN_RAD - q)
