@@ -71,9 +71,9 @@ class Arm(JointGroup):
         self.control_mode = ControlMode[config.control_mode.upper()]
         self.configured_mode = DriveMode[config.drive_mode.upper()]
         """Drive mode of moves, lines, streams and jogs."""
-        self._cst = CstWriter(joints, self.period_s)
+        self._csp, self._cst = CspWriter(joints, self.period_s), CstWriter(joints, self.period_s)
         self._writers: dict[DriveMode, DriveWriter] = {
-            DriveMode.CSP: CspWriter(),
+            DriveMode.CSP: self._csp,
             DriveMode.CSV: CsvWriter(joints, self.period_s),
             DriveMode.CST: self._cst,
         }
@@ -94,6 +94,18 @@ class Arm(JointGroup):
         self._writer.start(self.drives)
         for drive in self.drives:
             drive.mode = mode
+
+    def change_mode(self, mode: DriveMode) -> None:
+        """Command enabled drives to change to `mode`; only at standstill of the setpoints.
+
+        A hand may have moved a joint away from its setpoint in CST, and may still move it.
+        """
+        compliant = self.mode is DriveMode.CST and mode is not DriveMode.CST
+        self.set_mode(mode)
+        if compliant:
+            self._csp.take_over(self.drives)
+            for i, drive in enumerate(self.drives):
+                self.output_limiter.latch(i, drive.position + drive.velocity * self.period_s, drive.velocity)
 
     def use_tool(self, number: int) -> None:
         """Use another tool, without a payload; only at rest."""

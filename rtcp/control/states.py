@@ -283,7 +283,7 @@ class Holding(MachineState):
 
     def change_mode(self, ctx: Context, mode: DriveMode) -> None:
         """Let the drives change to `mode`; only at standstill."""
-        ctx.arm.set_mode(mode)
+        ctx.arm.change_mode(mode)
         self.changing_mode = True
         self._since = ctx.cycle
 

@@ -226,7 +226,9 @@ class Cia402Drive(Drive):
         if word == ENABLE_OPERATION and self.state is _ENABLED:
             if commanded == CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
-            elif commanded == self.mode_display and commanded in _WITH_SPEED:
+            elif self.mode_display == CST:
+                effort = fields[torque]
+            if commanded in _WITH_SPEED and self.mode_display in (commanded, CST):
                 # A speed limit is positive even if joint and drive turn in opposite directions.
                 wanted = abs(self.speed_limit * by_velocity) if commanded == CSP else self.target_velocity * by_velocity
                 speed = self._counts(wanted, 1, fields[velocity])

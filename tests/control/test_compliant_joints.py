@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import ApplyTorque, MoveJoints, SetLimits
+from rtcp.ipc.commands import ApplyTorque, MoveJoints, SetDriveMode, SetLimits
 from rtcp.ipc.refusals import WeightUnknown
-from rtcp.ipc.states import State
+from rtcp.ipc.states import DriveMode, State
 from rtcp.motion.limits import rows
 from rtcp.testing import Simulation
 
@@ -61,6 +61,27 @@ def test_the_torque_that_holds_a_joint_at_the_end_of_its_range_is_continuous(arm
     assert min(torques[arrived:]) > 10.0
     assert max(positions) < high + 0.01
     assert min(positions[arrived:]) > high - 0.005
+
+
+@in_mode(drive_mode="cst")
+@pytest.mark.parametrize("mode", [DriveMode.CSP, DriveMode.CSV])
+def test_a_joint_that_a_hand_moves_does_not_snap_when_its_drive_leaves_cst(arm: Simulation, mode: DriveMode) -> None:
+    joint = arm.models[1].mechanics
+    joint.external_torque = 25.0
+    arm.run(0.1)
+    assert joint.velocity > 0.3
+    speeds: list[float] = []
+    arm.on_frame = lambda frame: speeds.append(joint.velocity)
+    arm.do(SetDriveMode(mode))
+    arm.run(1.0)
+    arm.on_frame = None
+    joint.external_torque = 0.0
+    arm.run(2.0)
+    limit = arm.config.joints[1].acceleration
+    # Over 8 ms, as the drive's own loop needs some time to follow.
+    assert max(abs(b - a) for a, b in zip(speeds, speeds[4:], strict=False)) < 2.0 * limit * 4 * PERIOD_S
+    assert arm.state is State.HOLDING
+    assert joint.position == pytest.approx(-1.1, abs=2e-3)
 
 
 @in_mode(control_mode="torque")

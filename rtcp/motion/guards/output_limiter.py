@@ -62,8 +62,8 @@ class OutputLimiter:
         self._step = [velocity * self._period_s * (1 + 1e-6) for velocity in limits.velocity]
         self._back = [min(BACK_RAD_S, velocity) for velocity in limits.velocity]
 
-    def latch(self, axis: int, position: float) -> None:
-        """Set the last target to `position`, rad: without torque, a drive's target follows its actual position."""
+    def latch(self, axis: int, position: float, velocity: float = 0.0) -> None:
+        """Set the last targets, rad and rad/s: without torque, and in CST, the joint is not at its target."""
         self.sent[axis] = position
         self._pace[axis], self._velocity[axis] = 0.0, velocity
 
