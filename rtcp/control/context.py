@@ -223,7 +223,7 @@ class Context(PartContext):
         axis = joints.first_not_enabled()
         if axis >= 0:
             return self.drive_event(DriveLeftEnabled, axis)
-        event = joints.beyond_limits() or self._supervise_gripper()
+        event = joints.beyond_limits() or arm.pushed() or self._supervise_gripper()
         if event is not None:
             return event
         result = joints.command()

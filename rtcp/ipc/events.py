@@ -613,6 +613,13 @@ class FollowingError(EmergencyStop, number=26):
     limit: float
 
 
+class PushedNear(FaultEvent, number=77):
+    """the arm was pushed towards {box_name}, to {distance:.3g} m before its bounds: {reaction}; then `rtcp reset`"""
+
+    box: int
+    distance: float
+
+
 # -- why a motion ended before its goal -------------------------------------------------------------------------------
 
 

@@ -142,6 +142,9 @@ class CstWriter:
         self._integral_step = [joint.cst_integral * period_s for joint in joints]
         self._bound = [joint.torque for joint in joints]
         self._integral = [0.0] * len(self._bound)
+        self._fade = exp(-period_s / _PASSED_S)
+        self._excess = [0.0] * len(self._bound)
+        """Rest of the last passed torque beyond the weight and the position loop, Nm."""
         self._passed = False
 
     def start(self, drives: Sequence[Commanded]) -> None:
@@ -150,34 +153,40 @@ class CstWriter:
         for i, drive in enumerate(drives):
             bound = self._bound[i]
             self._integral[i] = min(max(drive.torque, -bound), bound)
+            self._excess[i] = 0.0
 
-    def pass_on(self, position: Sequence[float], torque: Sequence[float], drives: Sequence[Commanded]) -> None:
+    def pass_on(
+        self,
+        position: Sequence[float],
+        torque: Sequence[float],
+        weight: Sequence[float],
+        drives: Sequence[Commanded],
+    ) -> None:
         """Write `torque` (Nm) itself, without a position loop; `position` (rad) is the actual position.
 
-        `update` takes over without a step, from any setpoint.
+        `update` takes over without a step, from any setpoint. Of the torque only `weight` (Nm), which holds the arm
+        still, stays: the rest would push the arm on against the loop.
         """
         integral = self._integral
         self._passed = True
         for i, drive in enumerate(drives):
-            bound, wanted = self._bound[i], torque[i]
-            integral[i] = bounded = bound if wanted > bound else -bound if wanted < -bound else wanted
+            bound, wanted, held = self._bound[i], torque[i], weight[i]
+            integral[i] = bound if held > bound else -bound if held < -bound else held
             drive.target_position = position[i]
             drive.target_velocity = 0.0
-            drive.target_torque = bounded
+            drive.target_torque = bound if wanted > bound else -bound if wanted < -bound else wanted
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write target torques (Nm)."""
-        integral = self._integral
+        integral, excess, fade = self._integral, self._excess, self._fade
         for i, drive in enumerate(drives):
             error = position[i] - drive.position
             bound = self._bound[i]
-            if self._passed:
-                integral[i] -= self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity)
+            loop = self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity)
+            excess[i] = drive.target_torque - integral[i] - loop if self._passed else excess[i] * fade
             summed = integral[i] + self._integral_step[i] * error
             integral[i] = summed = bound if summed > bound else -bound if summed < -bound else summed
             drive.target_position = position[i]
             drive.target_velocity = 0.0
-            drive.target_torque = (
-                self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity) + summed
-            )
+            drive.target_torque = loop + summed + excess[i]
         self._passed = False

@@ -41,6 +41,7 @@ class TorqueController(Controller):
     commands = (ApplyTorque,)
     control_modes = frozenset({ControlMode.TORQUE})
     tolerates_saturation = True
+    follows_joints = True
 
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
@@ -133,7 +134,8 @@ class TorqueController(Controller):
             elif ahead < -2.0 * _AHEAD_RAD_S:
                 drag += ahead + 2.0 * _AHEAD_RAD_S
             wall = above if above < 0.0 else -below if below < 0.0 else 0.0
-            whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag + self._stiffness[i] * wall
+            weight = target.weight[i] = carried[i] + self._bias[i]
+            whole = weight + pushed - self._damping[i] * drag + self._stiffness[i] * wall
             torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
             position[i] = q
             speeds[i] = speed = chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
