@@ -393,8 +393,8 @@ class MessagesLeftOut(ServiceEvent, number=75):
 
 
 class ProcessDataLost(FaultEvent, number=1):
-    """process data lost: {in_a_row} cycles in a row, and {allowed} more without than with the expected working counter
-    ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers come again"""
+    """process data lost: {in_a_row} cycles in a row, and {allowed} more without the expected working counter than a
+    quarter of those with it ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers come again"""
 
     stop_key = "lost_frames"
     in_a_row: int
