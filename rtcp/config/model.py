@@ -467,7 +467,7 @@ class BusConfig:
     segment: str = "segment.yaml"
     """File of the virtual segment, relative to the arm's file."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
-    """Lost cycles (wrong working counter) that are a fault: in a row, or more than good ones."""
+    """Lost cycles (wrong working counter) that are a fault: in a row, or more than a quarter of the good ones."""
     timeout_scale: Annotated[float, Ge(1), Le(100)] = 100.0
     """Factor on time limits on the virtual bus, where the host may be slow: [real time](realtime.md)."""
     op_timeout_s: Positive = 5.0
@@ -602,16 +602,23 @@ class GuidingConfig:
 
 @dataclass(frozen=True)
 class SupervisionConfig:
-    """Limits on measured values; the emergency stop follows when one is exceeded for `cycles` in a row."""
+    """Limits on measured values; the emergency stop follows when one is exceeded for `cycles` in a row.
+
+    False measurements are not used; `cycles` in a row are a fault.
+    """
 
     cycles: Annotated[int, Ge(1), Le(1000)] = 5
-    """Cycles in a row beyond a limit that cause the emergency stop."""
+    """Cycles in a row beyond a limit that cause the emergency stop, or with a false measurement that cause a fault."""
     speed: Annotated[float, Ge(1), Le(10)] = 1.5
     """Measured speed limit, multiple of the joint's `velocity`."""
     torque: Annotated[float, Ge(1), Le(10)] = 1.5
     """Measured torque limit, multiple of the joint's `torque`."""
     following_error: Annotated[float, Gt(0), Le(1)] = 0.15
     """Following error limit, rad: commanded minus actual position."""
+    position_tolerance: Annotated[float, Gt(0), Le(1)] = 0.002
+    """A measured position is false if its step is larger than the way at the measured speed limit plus this, rad."""
+    acceleration: Annotated[float, Ge(1), Le(1000)] = 25.0
+    """Largest possible acceleration, multiple of the joint's `acceleration`: a speed that changes faster is false."""
 
 
 @dataclass(frozen=True)
@@ -619,7 +626,7 @@ class StopsConfig:
     """The stop reaction to each event. Stop categories are those of IEC 60204-1."""
 
     lost_frames: HardStop = "quick_stop"
-    """`bus.lost_cycles` lost cycles in a row, or as many more than good ones."""
+    """`bus.lost_cycles` lost cycles in a row, or as many more than a quarter of the good ones."""
     slave_lost: HardStop = "quick_stop"
     """A slave has left OP or does not answer."""
     drive_fault: HardStop = "quick_stop"

@@ -10,11 +10,19 @@ from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
 from rtcp.devices.drive import Drive
 from rtcp.ipc.commands import Command, Jog, MoveJoints
+from rtcp.ipc.events import PushedNear
 from rtcp.ipc.schema import ARM_MODES, LOAD_FIELDS, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
 from rtcp.motion.controllers.jog import JogController
 from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveWriter
+from rtcp.motion.guards.compliance import (
+    PUSH_REACTION_S,
+    PUSHED_CLEARANCE,
+    TORQUE_MARGIN_M,
+    TORQUE_REACTION_S,
+    ComplianceGuard,
+)
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import Phase
@@ -46,10 +54,15 @@ class Arm(JointGroup):
         joints = config.joints
         super().__init__("arm", arm_fields(len(joints)), config, drives)
         self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
+        clearance = config.cartesian.clearance
+        self._compliance = ComplianceGuard(
+            config, self.limits, clearance + TORQUE_MARGIN_M, TORQUE_MARGIN_M, TORQUE_REACTION_S
+        )
+        self._pushes = ComplianceGuard(config, self.limits, PUSHED_CLEARANCE * clearance, 0.0, PUSH_REACTION_S)
         self.speed_override = SpeedOverride()
         self.tool = ToolInUse()
         self._publishes_load = False
-        self.gravity = Gravity(config, self.tool)
+        self.gravity = self.output_limiter.gravity = Gravity(config, self.tool)
         self.controllers: dict[type[Command], Controller] = load_controllers(
             ControllerSetup(
                 config,
@@ -71,9 +84,9 @@ class Arm(JointGroup):
         self.control_mode = ControlMode[config.control_mode.upper()]
         self.configured_mode = DriveMode[config.drive_mode.upper()]
         """Drive mode of moves, lines, streams and jogs."""
-        self._cst = CstWriter(joints, self.period_s)
+        self._csp, self._cst = CspWriter(joints, self.period_s), CstWriter(joints, self.period_s)
         self._writers: dict[DriveMode, DriveWriter] = {
-            DriveMode.CSP: CspWriter(),
+            DriveMode.CSP: self._csp,
             DriveMode.CSV: CsvWriter(joints, self.period_s),
             DriveMode.CST: self._cst,
         }
@@ -95,10 +108,24 @@ class Arm(JointGroup):
         for drive in self.drives:
             drive.mode = mode
 
+    def change_mode(self, mode: DriveMode) -> None:
+        """Command enabled drives to change to `mode`; only at standstill of the setpoints.
+
+        A hand may have moved a joint away from its setpoint in CST, and may still move it.
+        """
+        compliant = self.mode is DriveMode.CST and mode is not DriveMode.CST
+        self.set_mode(mode)
+        if compliant:
+            self._csp.take_over(self.drives)
+            for i, drive in enumerate(self.drives):
+                self.output_limiter.latch(i, drive.position + drive.velocity * self.period_s, drive.velocity)
+
     def use_tool(self, number: int) -> None:
         """Use another tool, without a payload; only at rest."""
         self.tool.number, self.tool.payload = number, None
         self.trajectory_guard.use_tool(number)
+        self._compliance.use_tool(number)
+        self._pushes.use_tool(number)
         for controller in self.controllers.values():
             controller.use_tool(number)
         self._publishes_load = True
@@ -158,13 +185,37 @@ class Arm(JointGroup):
         """Write the targets of this cycle: controller -> guard -> writer of the drive mode -> limiter."""
         state, drives, controller = self.state, self.drives, self.active
         setpoint = controller.update(state)
+        if setpoint.direct and controller.follows_joints:
+            self._look_ahead()
         result = self.trajectory_guard.apply(state, setpoint, controller.tolerates_saturation)
-        if setpoint.direct:
-            self._cst.pass_on(state.commanded, setpoint.torque, drives)
+        if setpoint.direct and not self.trajectory_guard.stopping and result is not GuardResult.STOPPED:
+            self._cst.pass_on(state.commanded, setpoint.torque, setpoint.weight, drives)
         else:
             self._writer.update(state.commanded, state.commanded_velocity, drives)
         self.output_limiter.check(drives)
         return result
+
+    def _look_ahead(self) -> None:
+        """Stop a torque motion before the measured joints come too near to a box, a partner or the arm itself."""
+        guard, state, compliance = self.trajectory_guard, self.state, self._compliance
+        contact = compliance.ahead(state.actual, state.actual_velocity)
+        if contact is not None:
+            guard.stop_for(guard.reached(*contact))
+            return
+        near = compliance.partner_ahead(guard.neighbours, state.actual, state.actual_velocity)
+        if near is not None:
+            guard.stop_for(near)
+
+    def pushed(self) -> PushedNear | None:
+        """Return the event of joints in CST that are about to come too near to a box or the arm itself, or None."""
+        if self.mode is not DriveMode.CST:
+            return None
+        state = self.state
+        contact = self._pushes.ahead(state.actual, state.actual_velocity)
+        # Joints that stand there already are led out by their commander.
+        if contact is None or self._pushes.is_inside:
+            return None
+        return PushedNear(contact[0], max(contact[1], 0.0))
 
     def first_without(self, mode: DriveMode) -> int:
         """Return the first joint whose drive does not map what `mode` needs, or -1."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
@@ -37,6 +38,8 @@ from rtcp.ipc.stop_reactions import StopReaction, reactions
 from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.realtime.discipline import Discipline
 
+_GOOD_FOR_LOST: Final = 4
+"""Good cycles that make up for a lost one."""
 _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 
 
@@ -91,7 +94,7 @@ class Context(PartContext):
         self.homing = HomingSequence(arm, self.joints, self.period_s)
         self.reactions = reactions(config.stops)
         self._discipline = discipline
-        self._lost_limit = config.bus.lost_cycles
+        self._lost_limit = _GOOD_FOR_LOST * config.bus.lost_cycles
         self._clock_cycles = round(config.ethercat.clock_lost_s / self.period_s)
         self._unlocked = 0
         self.entered = 0
@@ -99,7 +102,8 @@ class Context(PartContext):
         self.lost = 0
         """Consecutive cycles without the expected working counter."""
         self.wkc_error_count = 0
-        """Cycles without the expected working counter minus cycles with it, 0 to `bus.lost_cycles`."""
+        """Cycles without the expected working counter, `_GOOD_FOR_LOST` each, minus cycles with it; 0 to as many times
+        `bus.lost_cycles`."""
         self.lease = 0
         """Lease of the running motion's commander; 0: the joystick, which needs none."""
         self.limited = False
@@ -120,8 +124,7 @@ class Context(PartContext):
             self.operator.read()
             return
         self.lost += 1
-        if self.wkc_error_count < self._lost_limit:
-            self.wkc_error_count += 1
+        self.wkc_error_count = min(self.wkc_error_count + _GOOD_FOR_LOST, self._lost_limit)
 
     @property
     def waited(self) -> int:
@@ -168,9 +171,9 @@ class Context(PartContext):
         """Return the event of lost frames, slaves or clock, or one that a part has reported; None: none."""
         if self.reported is not None:
             return self.reported
-        # Not only consecutive ones: otherwise one good cycle in ten would keep the arm moving.
+        # Not only consecutive ones: each burst of lost cycles stops the joints and starts them again.
         if not self.good and self.wkc_error_count >= self._lost_limit:
-            return ProcessDataLost(self.lost, self._lost_limit)
+            return ProcessDataLost(self.lost, self.config.bus.lost_cycles)
         if self.service.lost_slave:
             return SlaveLost(self.service.lost_slave)
         self._unlocked = 0 if self.clock_locked else self._unlocked + 1
@@ -223,7 +226,7 @@ class Context(PartContext):
         axis = joints.first_not_enabled()
         if axis >= 0:
             return self.drive_event(DriveLeftEnabled, axis)
-        event = joints.beyond_limits() or self._supervise_gripper()
+        event = joints.beyond_limits() or arm.pushed() or self._supervise_gripper()
         if event is not None:
             return event
         result = joints.command()

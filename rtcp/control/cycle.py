@@ -192,7 +192,9 @@ class Cycle:
         """Compute the next outputs from an answer."""
         data, machine, parts, context = self._data, self.machine, self.parts, self._context
         good = wkc == self._expected
-        context.now_ns = self.arm.state.now_ns = woken
+        context.now_ns = woken
+        for group in self.joints.groups:
+            group.state.now_ns = woken
         if good:
             for part in parts:
                 part.decode(data)

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import Final
 
 from rtcp.config.model import ArmConfig
+from rtcp.control.measurements import Measurements
 from rtcp.control.part import Part
 from rtcp.devices.drive import Drive, TargetState, share_slaves
 from rtcp.fieldbus.bus import ProcessData
-from rtcp.ipc.events import EmergencyStop, PositionJumped
+from rtcp.ipc.events import FaultEvent
 from rtcp.ipc.schema import Field
 from rtcp.ipc.states import WITH_TORQUE, DriveState, Missing
 from rtcp.motion.guards.output_limiter import OutputLimiter
@@ -27,9 +28,6 @@ _STILL_RAD_S: Final = 0.01
 RANGE_MARGIN_RAD: Final = 0.02
 """Largest distance of a joint from its range, rad, at which it can be enabled, to return to the edge: an overshoot in
 CST must not leave an arm that no command can move."""
-TRACKED_RAD: Final = 0.03
-"""Largest step of a joint without torque between two frames, rad; a larger one is a jump: enabling ends in a fault.
-Greater than `RANGE_MARGIN_RAD`."""
 
 
 class JointGroup(Part):
@@ -59,16 +57,27 @@ class JointGroup(Part):
         self.shares_slaves = False
         """Whether one of its drives is one of several axes of a slave."""
         self.state = ArmState(len(config.joints))
+        self.measurements = Measurements(config, first)
+        self.samples = ArmState(len(config.joints))
+        """The measurements as the drives sent them, for the supervision; its commanded values are those of `state`."""
+        self.samples.commanded = self.state.commanded
         self.limits = Limits(config)
-        self.output_limiter = OutputLimiter(self.limits, self.period_s)
+        damping = [joint.cst_damping for joint in config.joints]
+        self.output_limiter = OutputLimiter(self.limits, self.period_s, damping)
         self.supervision = Supervision(config, self.limits, first)
 
     def decode(self, data: ProcessData) -> None:
         """Read the inputs of the drives."""
-        state = self.state
+        state, samples, measurements = self.state, self.samples, self.measurements
         actual, speed, torque = state.actual, state.actual_velocity, state.actual_torque
+        measurements.begin(state.now_ns)
         for axis, (slot, drive) in enumerate(self.pairs):
+            before = drive.position, drive.velocity, drive.torque
             drive.decode(data.input(slot))
+            samples.actual[axis] = drive.position
+            samples.actual_velocity[axis] = drive.velocity
+            samples.actual_torque[axis] = drive.torque
+            measurements.check(axis, drive, *before)
             actual[axis] = drive.position
             speed[axis] = drive.velocity
             torque[axis] = drive.torque
@@ -192,10 +201,10 @@ class Joints:
         """Whether all setpoints stand still and no guard brakes: the torque may be removed."""
         return all(group.at_rest for group in self.groups)
 
-    def beyond_limits(self) -> EmergencyStop | None:
-        """Return the event of a measurement beyond its limit for too long, or None."""
+    def beyond_limits(self) -> FaultEvent | None:
+        """Return the event of a measurement that was beyond its limit, or false, for too long, or None."""
         for group in self.groups:
-            event = group.supervision.check(group.state)
+            event = group.supervision.check(group.samples) or group.measurements.event
             if event is not None:
                 return event
         return None
@@ -270,12 +279,3 @@ class Joints:
                 if group.beyond_range(i) > 0.0:
                     return group.first + i
         return -1
-
-    def position_jump(self) -> PositionJumped | None:
-        """Return the event of the first joint that `track_actual` would move by more than `TRACKED_RAD`, or None."""
-        for group in self.groups:
-            sent = group.output_limiter.sent
-            for i, drive in enumerate(group.drives):
-                if drive.state not in _HOLDING and not abs(drive.position - sent[i]) <= TRACKED_RAD:
-                    return PositionJumped(group.first + i, drive.position, sent[i])
-        return None

@@ -171,8 +171,7 @@ class Enabling(MachineState):
     """To Operation Enabled: target = actual until every drive is there, in CSP.
 
     A joint slightly outside its range then returns to the edge before any other motion. A drive follows its target some
-    frames before its statusword shows that, and no limiter applies to tracked positions: a position to which the joint
-    cannot have turned is not tracked.
+    frames before its statusword shows that, and no limiter applies to tracked positions.
     """
 
     state = State.ENABLING
@@ -187,8 +186,6 @@ class Enabling(MachineState):
         ctx.arm.set_mode(DriveMode.CSP)
         ctx.joints.hold()
         ctx.operator.require_neutral()
-        self._false_cycles = 0
-        """Consecutive cycles in which a drive shows a position to which it cannot have turned."""
         self._were_enabled = 0
         """Bit mask of the drives that have been enabled."""
         self._returning = False
@@ -201,9 +198,8 @@ class Enabling(MachineState):
         event = ctx.bus_fault()
         if event is not None or not ctx.good:
             return event
-        event = self._drive_problem(ctx) or self._jump(ctx) or joints.beyond_limits()
-        if event is not None or self._false_cycles:
-            # While a position is false the last targets are repeated.
+        event = self._drive_problem(ctx) or joints.beyond_limits()
+        if event is not None:
             return event
         joints.advance(TargetState.ENABLED)
         joints.track_actual()
@@ -233,11 +229,6 @@ class Enabling(MachineState):
             elif self._were_enabled >> axis & 1:
                 return ctx.drive_event(DriveLeftEnabled, axis)
         return None
-
-    def _jump(self, ctx: Context) -> Event | None:
-        jump = ctx.joints.position_jump()
-        self._false_cycles = 0 if jump is None else self._false_cycles + 1
-        return None if self._false_cycles < ctx.config.supervision.cycles else jump
 
     def _all_enabled(self, ctx: Context) -> Event | None:
         joints = ctx.joints
@@ -292,7 +283,7 @@ class Holding(MachineState):
 
     def change_mode(self, ctx: Context, mode: DriveMode) -> None:
         """Let the drives change to `mode`; only at standstill."""
-        ctx.arm.set_mode(mode)
+        ctx.arm.change_mode(mode)
         self.changing_mode = True
         self._since = ctx.cycle
 

@@ -67,6 +67,8 @@ _STATE_OF = tuple(
 )
 _RESET_HOLD: Final = 5
 """Calls of `advance` for which the fault reset bit stays set before the next edge: a drive answers cycles later."""
+_EXACT: Final = 1e-9
+"""Largest round-off of a conversion between counts and SI units, in either unit."""
 _OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
 _WITH_SPEED = (CSP, CSV)
@@ -133,6 +135,7 @@ class Cia402Drive(Drive):
             self._in = (*self._in[:4], len(self.tpdo.channels))
         self._fields = cast(list[int], [self._counts_of(channel) for channel in self.rpdo.channels])
         self._position_slot, self._scale, self._range = self._out[1], self._scales[0], self._limits[0]
+        self._factor = self.rpdo.channels[self._position_slot].factor
         self.controlword = DISABLE_VOLTAGE
         self._sent_mode, self._sent_word, self._changed = 0, -1, True
         """Mode and controlword of the present outputs, and whether the drive's state has changed since."""
@@ -193,13 +196,19 @@ class Cia402Drive(Drive):
 
         Velocity and torque are sent only to a drive that is enabled and commanded to be. The velocity (in CSP: the
         speed limit) is sent once the drive displays the commanded mode: in a change from CSV to CSP it would take the
-        limit for a target velocity, and run. The torque has no effect in CSP and CSV, and is valid when CST begins.
-        A target that is not finite leaves its field unchanged; one out of the field's range is clamped to it.
+        limit for a target velocity, and run. A drive that still displays CST ignores it, and needs it when it changes.
+        The torque has no effect in CSP and CSV, is valid when CST begins, and stays until CST has ended.
+        A target that is not finite leaves its field unchanged; one out of the field's range is clamped to it. A target
+        inside the joint's range is rounded to a count inside the range, a velocity or a torque towards zero.
         """
         fields, at, word, commanded = self._fields, self._position_slot, self.controlword, self.mode
         counts = (self.target_position + self._zero) * self._scale
         low, high = self._range
-        fields[at] = round(counts) if low <= counts <= high else self._counts(counts, 0, fields[at])
+        count = round(counts) if low <= counts <= high else self._counts(counts, 0, fields[at])
+        sent = count * self._factor - self._zero
+        if (sent > self.high + _EXACT or sent < self.low - _EXACT) and self.low <= self.target_position <= self.high:
+            count += 1 if count < counts else -1
+        fields[at] = count
         # In CSP only the position changes while the drive follows it.
         if commanded != CSP or self._changed or commanded != self._sent_mode or word != self._sent_word:
             self._sent_mode, self._sent_word, self._changed = commanded, word, False
@@ -217,7 +226,9 @@ class Cia402Drive(Drive):
         if word == ENABLE_OPERATION and self.state is _ENABLED:
             if commanded == CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
-            elif commanded == self.mode_display and commanded in _WITH_SPEED:
+            elif self.mode_display == CST:
+                effort = fields[torque]
+            if commanded in _WITH_SPEED and self.mode_display in (commanded, CST):
                 # A speed limit is positive even if joint and drive turn in opposite directions.
                 wanted = abs(self.speed_limit * by_velocity) if commanded == CSP else self.target_velocity * by_velocity
                 speed = self._counts(wanted, 1, fields[velocity])
@@ -229,7 +240,7 @@ class Cia402Drive(Drive):
     def _counts(self, value: float, index: int, last: int) -> int:
         low, high = self._limits[index]
         if low <= value <= high:
-            return round(value)
+            return int(value + _EXACT if value > 0.0 else value - _EXACT)
         if value - value != 0.0:
             # NaN or infinite: keep the last counts.
             return last

@@ -102,6 +102,12 @@ class Drive(Driver):
         self.target_position = self.position
         self.target_velocity = self.target_torque = 0.0
 
+    def replace_position(self, position: float) -> None:
+        """Use `position`, rad, in place of the sample of this cycle."""
+        self.position = position
+        if self._past:
+            self._past[self._past_at - 1] = position + self._zero
+
     def _measured_velocity(self, position: float) -> float:
         """Return the mean velocity over 20 ms, rad/s; `position`: of this cycle, rad."""
         past = self._past

@@ -393,8 +393,8 @@ class MessagesLeftOut(ServiceEvent, number=75):
 
 
 class ProcessDataLost(FaultEvent, number=1):
-    """process data lost: {in_a_row} cycles in a row, and {allowed} more without than with the expected working counter
-    ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers come again"""
+    """process data lost: {in_a_row} cycles in a row, and {allowed} more without the expected working counter than a
+    quarter of those with it ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers come again"""
 
     stop_key = "lost_frames"
     in_a_row: int
@@ -522,12 +522,23 @@ class LeftRange(FaultEvent, number=20):
 
 
 class PositionJumped(FaultEvent, number=43):
-    """{joint} jumped from {before:.6g} to {position:.6g} rad while being enabled, for {supervision}: it was turned, or
-    its drive shows a false position; {reaction}; compare it with `rtcp status`, then `rtcp reset`"""
+    """{joint} jumped from {before:.6g} to {position:.6g} rad, possible are {bound:.3g} rad, for {supervision}: it was
+    turned, or its drive shows a false position; {reaction}; compare it with `rtcp status`, then `rtcp reset`"""
 
     axis: int
     position: float
     before: float
+    bound: float
+
+
+class VelocityJumped(FaultEvent, number=76):
+    """{joint}: the measured speed jumped from {before:.6g} to {velocity:.6g} rad/s, possible are {bound:.3g} rad/s, for
+    {supervision}: it was hit, or its drive shows a false speed; {reaction}; then `rtcp reset`"""
+
+    axis: int
+    velocity: float
+    before: float
+    bound: float
 
 
 class HomingStillMoving(FaultEvent, number=39):
@@ -600,6 +611,13 @@ class FollowingError(EmergencyStop, number=26):
     axis: int
     value: float
     limit: float
+
+
+class PushedNear(FaultEvent, number=77):
+    """the arm was pushed towards {box_name}, to {distance:.3g} m before its bounds: {reaction}; then `rtcp reset`"""
+
+    box: int
+    distance: float
 
 
 # -- why a motion ended before its goal -------------------------------------------------------------------------------

@@ -537,6 +537,14 @@ class NoEnablingSwitch(Refusal):
     held; guiding.enabling_switch: false allows it without"""
 
 
+class WeightUnknown(Refusal):
+    """{joint} turns at {velocity:.6g} rad/s: while it turns, its torque does not show the weight that a torque motion
+    has to carry; send the torque when the arm rests"""
+
+    axis: int
+    velocity: float
+
+
 class WeightDiffers(Refusal):
     """{joint} holds {held:.6g} Nm, its weight by the masses is {expected:.6g} Nm: at most {limit:.6g} Nm apart are
     allowed (guiding.weight_error in {file}); set kinematics.links, or take off the load"""

@@ -12,9 +12,15 @@ from typing import Final, Protocol
 
 from rtcp.config.model import Joint
 from rtcp.ipc.states import DriveMode
+from rtcp.motion.guards.braking import fastest_stoppable
 
 _FADE_S: Final = 0.3
 """Time constant of the transition from the drive's own following error to the position loop closed here."""
+
+_PASSED_S: Final = 0.03
+"""Time constant of the transition from a passed torque to the position loop, s."""
+_RETURN_RAD_S: Final = 0.05
+"""Speed of the uncommanded return to the setpoint after CST, rad/s."""
 
 
 class Commanded(Protocol):
@@ -41,19 +47,63 @@ class DriveWriter(Protocol):
 
 
 class CspWriter:
-    """CSP: writes the setpoint itself."""
+    """CSP: writes the setpoint itself.
+
+    After CST, in which a hand can move a joint away from its setpoint, the targets begin where the joints are and at
+    their velocities. They return to the setpoints at the joints' acceleration.
+
+    Args:
+        joints: the joints.
+        period_s: cycle time, s.
+    """
 
     mode = DriveMode.CSP
 
+    def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
+        self._period_s = period_s
+        self._change = [joint.acceleration * period_s for joint in joints]
+        self._back = [min(_RETURN_RAD_S, joint.velocity) for joint in joints]
+        self._away = [0.0] * len(joints)
+        """Distance of each target from its setpoint, rad."""
+        self._pace = [0.0] * len(joints)
+        self._returning = False
+
     def start(self, drives: Sequence[Commanded]) -> None:
-        """No state to reset."""
+        """Start at the setpoints."""
+        self._returning = False
+
+    def take_over(self, drives: Sequence[Commanded]) -> None:
+        """Start at the joints of drives that leave CST."""
+        self._returning = True
+        for i, drive in enumerate(drives):
+            # The targets of this cycle arrive a cycle later than the positions were read.
+            self._away[i] = drive.position + drive.velocity * self._period_s - drive.target_position
+            self._pace[i] = drive.velocity
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write the positions; drives with a velocity field use it as their speed limit, which the driver fills in."""
+        if self._returning:
+            self._return()
+        returning, away = self._returning, self._away
         for i, drive in enumerate(drives):
-            drive.target_position = position[i]
+            drive.target_position = position[i] + away[i] if returning else position[i]
             drive.target_velocity = 0.0
             drive.target_torque = 0.0
+
+    def _return(self) -> None:
+        away, pace, dt = self._away, self._pace, self._period_s
+        self._returning = False
+        for i, change in enumerate(self._change):
+            distance, speed = away[i], pace[i]
+            if abs(distance) <= change * dt and abs(speed) <= change:
+                away[i] = pace[i] = 0.0
+                continue
+            self._returning = True
+            back = min(self._back[i], fastest_stoppable(abs(distance), change, dt))
+            wanted = -back if distance > 0.0 else back
+            speed = min(max(wanted, speed - change), speed + change)
+            pace[i] = speed
+            away[i] = distance + speed * dt
 
 
 class CsvWriter:
@@ -92,6 +142,9 @@ class CstWriter:
         self._integral_step = [joint.cst_integral * period_s for joint in joints]
         self._bound = [joint.torque for joint in joints]
         self._integral = [0.0] * len(self._bound)
+        self._fade = exp(-period_s / _PASSED_S)
+        self._excess = [0.0] * len(self._bound)
+        """Rest of the last passed torque beyond the weight and the position loop, Nm."""
         self._passed = False
 
     def start(self, drives: Sequence[Commanded]) -> None:
@@ -100,34 +153,40 @@ class CstWriter:
         for i, drive in enumerate(drives):
             bound = self._bound[i]
             self._integral[i] = min(max(drive.torque, -bound), bound)
+            self._excess[i] = 0.0
 
-    def pass_on(self, position: Sequence[float], torque: Sequence[float], drives: Sequence[Commanded]) -> None:
+    def pass_on(
+        self,
+        position: Sequence[float],
+        torque: Sequence[float],
+        weight: Sequence[float],
+        drives: Sequence[Commanded],
+    ) -> None:
         """Write `torque` (Nm) itself, without a position loop; `position` (rad) is the actual position.
 
-        `update` takes over without a step, from any setpoint.
+        `update` takes over without a step, from any setpoint. Of the torque only `weight` (Nm), which holds the arm
+        still, stays: the rest would push the arm on against the loop.
         """
         integral = self._integral
         self._passed = True
         for i, drive in enumerate(drives):
-            bound, wanted = self._bound[i], torque[i]
-            integral[i] = bounded = bound if wanted > bound else -bound if wanted < -bound else wanted
+            bound, wanted, held = self._bound[i], torque[i], weight[i]
+            integral[i] = bound if held > bound else -bound if held < -bound else held
             drive.target_position = position[i]
             drive.target_velocity = 0.0
-            drive.target_torque = bounded
+            drive.target_torque = bound if wanted > bound else -bound if wanted < -bound else wanted
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write target torques (Nm)."""
-        integral = self._integral
+        integral, excess, fade = self._integral, self._excess, self._fade
         for i, drive in enumerate(drives):
             error = position[i] - drive.position
             bound = self._bound[i]
-            if self._passed:
-                integral[i] -= self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity)
+            loop = self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity)
+            excess[i] = drive.target_torque - integral[i] - loop if self._passed else excess[i] * fade
             summed = integral[i] + self._integral_step[i] * error
             integral[i] = summed = bound if summed > bound else -bound if summed < -bound else summed
             drive.target_position = position[i]
             drive.target_velocity = 0.0
-            drive.target_torque = (
-                self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity) + summed
-            )
+            drive.target_torque = loop + summed + excess[i]
         self._passed = False

@@ -45,13 +45,15 @@ class ArmState:
 
 
 class Setpoint:
-    """Setpoints of the next cycle: rad, rad/s; in CST also a torque, Nm."""
+    """Setpoints of the next cycle: rad, rad/s; in CST also torques, Nm."""
 
-    __slots__ = ("direct", "position", "torque", "velocity")
+    __slots__ = ("direct", "position", "torque", "velocity", "weight")
 
     def __init__(self, joints: int) -> None:
         self.position = [0.0] * joints
         self.velocity = [0.0] * joints
         self.torque = [0.0] * joints
+        self.weight = [0.0] * joints
+        """Part of `torque` that holds the arm still: the position loop of CST begins with it."""
         self.direct = False
         """True: `torque` is the whole torque of the joints, without the position loop of CST."""

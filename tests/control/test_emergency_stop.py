@@ -144,7 +144,7 @@ def test_a_torque_beyond_its_limit_counts_after_five_cycles_in_a_row(rig: LoopRi
 
     def too_much(data: object) -> None:
         decode(data)  # type: ignore[arg-type]
-        rig.arm.state.actual_torque[0] = 1.6 * CONFIG.joints[0].torque
+        rig.arm.samples.actual_torque[0] = 1.6 * CONFIG.joints[0].torque
 
     rig.arm.decode = too_much  # type: ignore[method-assign]
     for _ in range(cycles):

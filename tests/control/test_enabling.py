@@ -32,6 +32,8 @@ from .rig import (
 _INPUTS = struct.Struct("<Hiiib")
 ENABLED, SWITCHED_ON, NO_STATE = 0x0237, 0x0233, 0x0213
 """Statuswords; the standard does not define the last."""
+BOUND = CONFIG.supervision.speed * CONFIG.joints[0].velocity * CONFIG.supervision.cycles * PERIOD_S + 0.002
+"""How far a joint can come while its samples are false until the fault, rad."""
 
 
 def falsify(rig: LoopRig, axis: int = 0, word: int | None = None, position: float | None = None) -> Callable[[], None]:
@@ -91,7 +93,7 @@ def test_a_position_that_stays_false_while_enabling_is_a_fault_that_names_both_p
     assert rig.state is State.ENABLING
     rig.cycle()
     assert (rig.state, rig.kinds[-1]) == (State.FAULT, PositionJumped)
-    assert rig.last == PositionJumped(0, about(0.1), about(0.0, abs=1e-4))
+    assert rig.last == PositionJumped(0, about(0.1), about(0.0, abs=1e-4), about(BOUND))
     assert largest_distance(rig, 0.5) < 1e-4
 
 
@@ -222,7 +224,7 @@ def test_a_false_position_is_judged_by_where_a_joint_beyond_its_range_is_and_not
     falsify(rig, axis=1, word=SWITCHED_ON, position=1.98)
     rig.bring_to(State.FAULT, 2 * CONFIG.supervision.cycles * PERIOD_S)
     assert rig.kinds[-1] is PositionJumped
-    assert rig.last == PositionJumped(1, about(1.98), about(2.015))
+    assert rig.last == PositionJumped(1, about(1.98), about(2.015), about(BOUND))
 
 
 def test_each_time_enabling_disabling_and_a_reset_take_as_long_as_the_first(rig: LoopRig) -> None:

@@ -109,19 +109,28 @@ def joint_turned_by_hand(position: float) -> Step:
 
 
 def joint_out_of_range(rig: LoopRig) -> None:
-    rig.start().do(Enable())
-    joint_turned_by_hand(2.1)(rig)
+    rig.start()
+    joint_turned_by_hand(2.019)(rig)
+    rig.run(0.01)
+    rig.do(Enable())
+    joint_turned_by_hand(2.021)(rig)
 
 
-def position_jumps(rig: LoopRig) -> None:
-    rig.start().do(Enable())
-    sound = rig.data.input
+def jumps(at: int, counts: int) -> Step:
+    """An input of the second drive shows other counts while it is being enabled."""
 
-    def false(slot: int) -> bytes:
-        values = _WIRE.unpack(sound(slot))
-        return _WIRE.pack(values[0], 1000, *values[2:])
+    def cause(rig: LoopRig) -> None:
+        rig.start().do(Enable())
+        sound = rig.data.input
 
-    rig.data.input = lambda index: false(index) if index == 2 else sound(index)  # type: ignore[method-assign]
+        def false(slot: int) -> bytes:
+            values = list(_WIRE.unpack(sound(slot)))
+            values[at] = counts
+            return _WIRE.pack(*values)
+
+        rig.data.input = lambda index: false(index) if index == 2 else sound(index)  # type: ignore[method-assign]
+
+    return cause
 
 
 def inputs_are_true(rig: LoopRig) -> None:
@@ -178,11 +187,14 @@ FAULTS = (
          lambda rig: rig.lead_to(State.RESETTING), lambda rig: setattr(rig, "slaves_come_back", True),
          after_s=3.0 + DEBOUNCE_S),
     Case("joint outside its range while enabling", events.LeftRange, 1,
-         ("joint2", "left its range", "2.1 rad", "joints[1].position in assistive_arm.yaml"),
+         ("joint2", "left its range", "2.021 rad", "joints[1].position in assistive_arm.yaml"),
          joint_out_of_range, joint_turned_by_hand(1.9)),
     Case("position jumps while enabling", events.PositionJumped, 1,
          ("joint2", "jumped from 0 to 0.1 rad", "5 cycles (supervision in assistive_arm.yaml)", "`rtcp reset`"),
-         position_jumps, inputs_are_true),
+         jumps(1, 1000), inputs_are_true),
+    Case("speed jumps while enabling", events.VelocityJumped, 1,
+         ("joint2", "jumped from 0 to 0.6 rad/s", "5 cycles (supervision in assistive_arm.yaml)", "`rtcp reset`"),
+         jumps(2, 6000), inputs_are_true),
     Case("driver raises", events.DriverFailed, 1,
     ("slave 1 (io)", "raised an error", "outputs are safe", "`rtcp reset`"),
          box_cannot_be_read, inputs_are_true),

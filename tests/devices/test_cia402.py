@@ -164,7 +164,8 @@ def test_no_speed_is_sent_to_a_drive_in_another_mode_and_torque_only_on_the_way_
     drive.controlword = 0x0F
     _, _, velocity, torque, mode = wire.sent()
     assert mode == commanded
-    assert velocity == 0 or commanded == displayed
+    # A drive in CST uses neither, and needs them when it changes.
+    assert velocity == 0 or displayed in (commanded, 10)
     assert torque == (12_0000 if commanded == 10 else 0)
 
 
@@ -310,3 +311,27 @@ def test_a_drive_serves_the_modes_whose_entries_it_maps(without: str, modes: lis
     rpdo, tpdo = ([row for row in rows if row[0] != without] for rows in (RPDO, TPDO))
     drive = Cia402Drive(slave(tuple(rpdo), tuple(tpdo)), 0.001)
     assert [mode for mode in (8, 9, 10) if drive.supports(mode)] == modes
+
+
+@pytest.mark.parametrize("factor", [FACTOR, -FACTOR])
+@pytest.mark.parametrize("zero", [0.00006, -0.00006, 0.0])
+@pytest.mark.parametrize("edge", [3.1, -3.1, 1.00004])
+def test_a_target_at_the_end_of_the_range_is_rounded_inward(factor: float, zero: float, edge: float) -> None:
+    rpdo = [(name, index, kind, factor if index == 0x607A else scale) for name, index, kind, scale in RPDO]
+    drive = Cia402Drive(slave(rpdo), 0.001, zero=zero)
+    drive.low, drive.high = (-4.0, edge) if edge > 0.0 else (edge, 4.0)
+    wire = Wire(drive)
+    wire.receive(ENABLED)
+    drive.target_position = edge
+    sent = wire.sent()[1] * factor - zero
+    assert drive.low - 1e-9 <= sent <= drive.high + 1e-9
+    assert sent == pytest.approx(edge, abs=FACTOR)
+
+
+def test_a_velocity_and_a_torque_are_rounded_towards_zero(drive: Cia402Drive, wire: Wire) -> None:
+    for mode, sign in ((9, 1), (9, -1), (10, 1), (10, -1)):
+        drive.mode = mode
+        wire.receive(ENABLED, mode=mode)
+        drive.advance(T.ENABLED)
+        drive.target_velocity = drive.target_torque = sign * 0.33338
+        assert (wire.sent()[2] if mode == 9 else wire.sent()[3]) == sign * 3333

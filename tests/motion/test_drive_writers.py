@@ -45,7 +45,7 @@ def test_in_cst_each_start_holds_with_the_present_torque_inside_its_bound(sign: 
         joints, error = drives(*[sign * 1e-3] * 3), sign * 1e-3
         for joint, share in zip(joints, (0.5, -0.8, 9.0), strict=True):
             joint.torque = sign * factor * share * JOINTS[0].torque
-        writer.pass_on([0.2] * 3, [1.0] * 3, joints)  # what came before is forgotten
+        writer.pass_on([0.2] * 3, [1.0] * 3, [1.0] * 3, joints)  # what came before is forgotten
         writer.start(joints)
         writer.update([0.1] * 3, [0.0] * 3, joints)
         for drive, config in zip(joints, JOINTS, strict=True):
@@ -60,22 +60,26 @@ def test_in_cst_the_loop_takes_over_from_passed_torques_without_a_step_and_then_
     writer, joints = CstWriter(JOINTS, DT), drives(sign * 1e-3, -sign * 2e-3, 0.0)
     joints[2].velocity = sign * 0.01
     for passed in ([sign * 1.0, -sign * 2.0, sign * 3.0], [-sign * 4.0, sign * 5.0, 0.0]):
-        writer.pass_on([drive.position for drive in joints], passed, joints)
+        weight = [0.5 * torque for torque in passed]
+        writer.pass_on([drive.position for drive in joints], passed, weight, joints)
         assert [drive.target_torque for drive in joints] == passed
-        for further in (0.0, 1e-3):
+        excess = [0.0] * 3
+        for cycle, further in enumerate((0.0, 1e-3, 1e-3)):
             writer.update([0.1 + further] * 3, [0.0] * 3, joints)
             for i, (drive, config) in enumerate(zip(joints, JOINTS, strict=True)):
-                integrated = config.cst_integral * DT * (0.1 + further - drive.position)
-                expected = passed[i] + integrated + config.cst_stiffness * further
-                assert drive.target_torque == pytest.approx(expected), i
-                passed[i] += integrated
+                error = 0.1 + further - drive.position
+                loop = config.cst_stiffness * error - config.cst_damping * drive.velocity
+                # Of the passed torque the weight stays, and the rest fades out.
+                excess[i] = excess[i] * exp(-DT / 0.03) if cycle else passed[i] - weight[i] - loop
+                weight[i] += config.cst_integral * DT * error
+                assert drive.target_torque == pytest.approx(weight[i] + loop + excess[i]), i
 
 
 @SIGNS
 def test_in_cst_a_passed_torque_and_the_integral_stay_inside_their_bound(sign: float) -> None:
     writer, joints = CstWriter(JOINTS, DT), drives(sign * 0.02, -sign * 0.02, 0.0)
     bound = JOINTS[0].torque
-    writer.pass_on([0.1] * 3, [sign * 1e4, -sign * 1e4, 0.0], joints)
+    writer.pass_on([0.1] * 3, [sign * 1e4, -sign * 1e4, 0.0], [0.0] * 3, joints)
     assert [drive.target_torque for drive in joints] == [sign * bound, -sign * bound, 0.0]
     writer.start(joints)
     for _ in range(5000):

@@ -77,7 +77,7 @@ class Plant:
         self.guard.apply(state, target, self.mode.tolerates_saturation)
         if target.direct:
             assert all(-most <= torque <= most for torque, most in zip(target.torque, self.limits.torque, strict=True))
-            self.law.pass_on(state.commanded, target.torque, joints)
+            self.law.pass_on(state.commanded, target.torque, target.weight, joints)
         else:
             self.law.update(state.commanded, state.commanded_velocity, joints)
         load = self.holding([joint.position for joint in joints])
@@ -245,7 +245,7 @@ def test_a_law_whose_set_point_is_elsewhere_takes_over_without_a_step(plant: Pla
     """For example after a blow, which the setpoint follows only slowly."""
     joint = plant.joints
     there = [drive.position + 0.05 for drive in joint]
-    plant.law.pass_on(there, [3.0] * 6, joint)
+    plant.law.pass_on(there, [3.0] * 6, [3.0] * 6, joint)
     plant.law.update(there, [0.2] * 6, joint)
     for i in range(6):
         assert joint[i].target_torque == pytest.approx(3.0, abs=0.05)

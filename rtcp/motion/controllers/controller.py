@@ -68,6 +68,8 @@ class Controller:
     """Control modes in which it accepts commands."""
     tolerates_saturation: ClassVar[bool] = False
     """True: a setpoint cut by a guard is normal (jog, velocity). False: a cut ends the motion."""
+    follows_joints: ClassVar[bool] = False
+    """True: torques move the joints, and the setpoints only follow: a guard looks ahead from the measured joints."""
     pausable: ClassVar[bool] = False
     """True: a speed override of 0 pauses the motion on its path."""
     needs_geometry: ClassVar[bool] = False

@@ -161,7 +161,8 @@ class GuideController(Controller):
             # Damp the joint's speed relative to its anchor; never push in the direction of motion.
             along = moved if 0.0 <= moved <= v or v <= moved <= 0.0 else v if moved * v > 0.0 else 0.0
             pulled = self._stiffness[i] * (anchor[i] - q) - self._damping[i] * (v - along) - self._drag[i] * v
-            whole, most = carried[i] + bias[i] + pulled, limits.torque[i]
+            weight = target.weight[i] = carried[i] + bias[i]
+            whole, most = weight + pulled, limits.torque[i]
             torque[i] = most if whole > most else -most if whole < -most else whole
             here, fastest = state.commanded[i], limits.velocity[i]
             speeds[i] = speed = chase(

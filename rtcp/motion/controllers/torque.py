@@ -7,7 +7,7 @@ from typing import Final
 
 from rtcp.ipc.commands import ApplyTorque, Command
 from rtcp.ipc.events import CommandExpired
-from rtcp.ipc.refusals import FractionOutOfRange, Refusal, TorqueOutOfRange
+from rtcp.ipc.refusals import FractionOutOfRange, Refusal, TorqueOutOfRange, WeightUnknown
 from rtcp.ipc.states import ControlMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.state import ArmState, Phase, Setpoint
@@ -41,6 +41,7 @@ class TorqueController(Controller):
     commands = (ApplyTorque,)
     control_modes = frozenset({ControlMode.TORQUE})
     tolerates_saturation = True
+    follows_joints = True
 
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
@@ -71,6 +72,9 @@ class TorqueController(Controller):
             if not 0.0 <= fraction <= 1.0:
                 return FractionOutOfRange(fraction)
         if not continues or self.phase is not Phase.MOVE:
+            for i, speed in enumerate(state.actual_velocity):
+                if not abs(speed) <= _STILL_RAD_S:
+                    return WeightUnknown(i, speed)
             self._start(state)
         self._wanted[:] = command.torque
         if command.stiffness > 0.0 and self._stiff == 0.0:
@@ -80,13 +84,10 @@ class TorqueController(Controller):
         return None
 
     def _start(self, state: ArmState) -> None:
-        """Begin with the torques that hold the arm now, so that it does not sag."""
+        """Begin with the torques that hold the arm now, at rest, so that it does not sag."""
         carried = self._gravity.torques(state.actual)
-        # During motion the actual torque does not show the weight: keep the previous bias.
-        rests = not any(abs(v) > _STILL_RAD_S for v in state.actual_velocity)
         for i in self._joints:
-            if rests:
-                self._bias[i] = state.actual_torque[i] - carried[i]
+            self._bias[i] = state.actual_torque[i] - carried[i]
             self._applied[i] = 0.0
             q, limits = state.actual[i], self.limits
             self._extra_low[i] = max(0.0, limits.low[i] + _MARGIN_RAD - q)
@@ -133,7 +134,8 @@ class TorqueController(Controller):
             elif ahead < -2.0 * _AHEAD_RAD_S:
                 drag += ahead + 2.0 * _AHEAD_RAD_S
             wall = above if above < 0.0 else -below if below < 0.0 else 0.0
-            whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag + self._stiffness[i] * wall
+            weight = target.weight[i] = carried[i] + self._bias[i]
+            whole = weight + pushed - self._damping[i] * drag + self._stiffness[i] * wall
             torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
             position[i] = q
             speeds[i] = speed = chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)

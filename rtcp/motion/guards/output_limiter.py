@@ -2,7 +2,8 @@
 
 Position inside the joint's range, no step beyond speed x cycle, speed and torque inside their bounds, finite numbers
 only; no change of target velocity beyond acceleration x cycle, whatever the position loop closed in CSV makes of a
-disturbance. A joint that was enabled outside its range returns slowly.
+disturbance. A joint that was enabled outside its range returns slowly. Outside its range no torque accelerates a joint
+further out; the torque that carries its weight stays.
 """
 
 from __future__ import annotations
@@ -14,10 +15,16 @@ from typing import Final
 from rtcp.motion.drive_writers import Commanded
 from rtcp.motion.guards.braking import fastest_stoppable
 from rtcp.motion.limits import Limits
+from rtcp.motion.tool_in_use import Gravity
 
 BACK_RAD_S: Final = 0.05
 """Speed limit of the uncommanded return of a joint into its range, rad/s. At a reach of 1.3 m it is 65 mm/s, below the
 250 mm/s of reduced speed (ISO 10218-1)."""
+_FADE_RAD: Final = 0.003
+"""Distance from the range, rad, over which an outward torque fades to the joint's weight. A torque that is cut at the
+edge would let a joint whose weight pulls inward fall and catch it, again and again."""
+_BRAKING: Final = 4.0
+"""Damping of a joint that still moves outward there, as a multiple of `cst_damping`."""
 
 
 class OutputLimiter:
@@ -25,10 +32,20 @@ class OutputLimiter:
 
     `held` is a bit mask of the joints whose target was clamped in the last call; `sent` has the last target positions,
     rad.
+
+    Args:
+        limits: of the joints.
+        period_s: cycle time, s.
+        damping: by which the outward torque of a joint outside its range depends on its velocity, Nm s/rad; empty: 0.
+        gravity: weight of the joints; None: unknown.
     """
 
-    def __init__(self, limits: Limits, period_s: float) -> None:
+    def __init__(
+        self, limits: Limits, period_s: float, damping: Sequence[float] = (), gravity: Gravity | None = None
+    ) -> None:
         self._period_s = period_s
+        self._damping = list(damping) or [0.0] * len(limits.low)
+        self.gravity = gravity
         self.take(limits)
         self.sent = [0.0] * len(self._low)
         self._pace = [0.0] * len(self._low)
@@ -45,10 +62,10 @@ class OutputLimiter:
         self._step = [velocity * self._period_s * (1 + 1e-6) for velocity in limits.velocity]
         self._back = [min(BACK_RAD_S, velocity) for velocity in limits.velocity]
 
-    def latch(self, axis: int, position: float) -> None:
-        """Set the last target to `position`, rad: without torque, a drive's target follows its actual position."""
+    def latch(self, axis: int, position: float, velocity: float = 0.0) -> None:
+        """Set the last targets, rad and rad/s: without torque, and in CST, the joint is not at its target."""
         self.sent[axis] = position
-        self._pace[axis] = self._velocity[axis] = 0.0
+        self._pace[axis], self._velocity[axis] = 0.0, velocity
 
     def check(self, drives: Sequence[Commanded]) -> None:
         """Clamp every target of every drive in place."""
@@ -78,16 +95,16 @@ class OutputLimiter:
                 torque = bound if torque > bound else -bound if torque < -bound else 0.0
             # Outside the range no target leads further out.
             position = drive.position
-            if position > highest:
-                outward = speed > 0.0 or torque > 0.0
-                speed, torque = min(speed, 0.0), min(torque, 0.0)
-            elif position < lowest:
-                outward = speed < 0.0 or torque < 0.0
-                speed, torque = max(speed, 0.0), max(torque, 0.0)
-            else:
-                outward = False
-            if outward:
-                held |= 1 << i
+            if not lowest <= position <= highest:
+                side = 1.0 if position > highest else -1.0
+                if speed * side > 0.0:
+                    held |= 1 << i
+                    speed = 0.0
+                if torque * side > 0.0:
+                    outward = self._outward(i, drives, side, position - highest if side > 0.0 else lowest - position)
+                    if torque * side > outward:
+                        held |= 1 << i
+                        torque = side * outward
             before, change = velocity[i], changes[i]
             if speed > before + change:
                 speed = before + change
@@ -96,6 +113,16 @@ class OutputLimiter:
             velocity[i] = drive.target_velocity = speed
             drive.target_torque = torque
         self.held = held
+
+    def _outward(self, i: int, drives: Sequence[Commanded], side: float, beyond: float) -> float:
+        """Return the largest outward torque, Nm, of a joint that is `beyond` rad outside its range."""
+        weight = 0.0
+        if self.gravity is not None:
+            weight = max(side * self.gravity.torques([drive.position for drive in drives])[i], 0.0)
+        share = max(1.0 - beyond / _FADE_RAD, 0.0)
+        velocity = side * drives[i].velocity
+        braking = self._damping[i] * velocity * (_BRAKING * (1.0 - share) if velocity > 0.0 else 1.0)
+        return max(weight + share * max(self._torque[i] - weight, 0.0) - braking, 0.0)
 
     def _allowed(self, i: int, wanted: float) -> float:
         """Return the allowed target nearest to `wanted`, rad; for NaN the last target."""

@@ -137,11 +137,19 @@ class TrajectoryGuard:
         here, nearest = self.zones.distance(self.poses)
         if here < 0.0 and nearest == zone:
             return NotLeavingBox(zone, -here)
-        return (
-            BoxReached(zone, max(ahead, 0.0))
-            if zone < ITSELF
-            else CollisionAhead(*self.zones.links(zone), max(ahead, 0.0))
-        )
+        return self.reached(zone, ahead)
+
+    def stop_for(self, ended: MotionEnded) -> None:
+        """Brake from the next cycle on, for a reason that the setpoints do not show."""
+        if not self.stopping:
+            self.stopping, self.ended = True, ended
+
+    def reached(self, zone: int, ahead: float) -> MotionEnded:
+        """Return the reason of a stop before a box or pair, `ahead` m away."""
+        assert self.zones is not None
+        if zone < ITSELF:
+            return BoxReached(zone, max(ahead, 0.0))
+        return CollisionAhead(*self.zones.links(zone), max(ahead, 0.0))
 
     def refusal_of(self, state: ArmState, new: Values) -> Refusal | None:
         """Return a refusal of `new` limits if the arm is, or would come to rest, outside them; or None."""

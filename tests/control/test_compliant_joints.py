@@ -1,0 +1,97 @@
+"""In CST a hand can move the joints: what then stays continuous, and what is refused."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.ipc.commands import ApplyTorque, MoveJoints, SetDriveMode, SetLimits
+from rtcp.ipc.refusals import WeightUnknown
+from rtcp.ipc.states import DriveMode, State
+from rtcp.motion.limits import rows
+from rtcp.testing import Simulation
+
+PERIOD_S = 0.002
+_OUTPUTS = struct.Struct("<Hiiib")
+ONE_NM = 10000
+"""Counts of the drives' torques."""
+NOTHING = (0.0,) * 6
+
+
+@pytest.fixture
+def arm(request: pytest.FixtureRequest) -> Iterator[Simulation]:
+    """The arm holds; its second joint carries 18 to 24 Nm. The parameter replaces keys of the configuration."""
+    config = load(default_config())
+    config = replace(config, cycle=replace(config.cycle, period_us=PERIOD_S * 1e6), **request.param)
+    with Simulation(config, positions=[0.0, -1.1, 0.3, 0.0, 0.5, 0.0], follow_clock=False) as arm:
+        arm.hold()
+        arm.run(1.0)
+        yield arm
+
+
+def in_mode(**keys: Any) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("arm", [keys], indirect=True)
+
+
+@in_mode(drive_mode="cst")
+def test_the_torque_that_holds_a_joint_at_the_end_of_its_range_is_continuous(arm: Simulation) -> None:
+    widest = arm.loop.arm.limits.widest
+    high = -1.0
+    new = rows(replace(widest, high=(widest.high[0], high, *widest.high[2:])))
+    arm.do(SetLimits(arm.observer.write_plan(new), len(new)))
+    arm.do(MoveJoints((0.0, high, 0.3, 0.0, 0.5, 0.0), 0.5, True))
+    torques: list[float] = []
+    positions: list[float] = []
+
+    def see(frame: Any) -> None:
+        torques.append(_OUTPUTS.unpack(frame.sent[2])[3] / ONE_NM)
+        positions.append(arm.models[1].mechanics.position)
+
+    arm.on_frame = see
+    arm.bring_to(State.HOLDING)
+    arrived = len(torques)
+    arm.run(1.0)
+    assert max(abs(b - a) for a, b in pairwise(torques[arrived:])) < 1.0
+    assert min(torques[arrived:]) > 10.0
+    assert max(positions) < high + 0.01
+    assert min(positions[arrived:]) > high - 0.005
+
+
+@in_mode(drive_mode="cst")
+@pytest.mark.parametrize("mode", [DriveMode.CSP, DriveMode.CSV])
+def test_a_joint_that_a_hand_moves_does_not_snap_when_its_drive_leaves_cst(arm: Simulation, mode: DriveMode) -> None:
+    joint = arm.models[1].mechanics
+    joint.external_torque = 25.0
+    arm.run(0.1)
+    assert joint.velocity > 0.3
+    speeds: list[float] = []
+    arm.on_frame = lambda frame: speeds.append(joint.velocity)
+    arm.do(SetDriveMode(mode))
+    arm.run(1.0)
+    arm.on_frame = None
+    joint.external_torque = 0.0
+    arm.run(2.0)
+    limit = arm.config.joints[1].acceleration
+    # Over 8 ms, as the drive's own loop needs some time to follow.
+    assert max(abs(b - a) for a, b in zip(speeds, speeds[4:], strict=False)) < 2.0 * limit * 4 * PERIOD_S
+    assert arm.state is State.HOLDING
+    assert joint.position == pytest.approx(-1.1, abs=2e-3)
+
+
+@in_mode(control_mode="torque")
+def test_a_torque_motion_that_begins_while_a_joint_turns_is_refused_as_its_weight_is_unknown(arm: Simulation) -> None:
+    joint = arm.models[5].mechanics
+    joint.external_torque = 6.0
+    assert arm.until(lambda: abs(arm.loop.arm.state.actual_velocity[5]) > 0.011, 1.0)
+    refusal = arm.send(ApplyTorque(NOTHING, 0.0, 0.0, 0.2)).refusal
+    assert isinstance(refusal, WeightUnknown)
+    joint.external_torque = 0.0
+    measured = arm.loop.arm.state.actual_velocity
+    assert arm.until(lambda: max(map(abs, measured)) < 0.009, 3.0)
+    arm.do(ApplyTorque(NOTHING, 0.0, 0.0, 0.2))

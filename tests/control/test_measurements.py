@@ -1,0 +1,123 @@
+"""A measurement that a joint cannot have is not used; one that stays is a fault with its name."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+import pytest
+
+from rtcp.ipc.events import DriveModeTimeout, PositionJumped, VelocityJumped
+from rtcp.ipc.states import DriveMode, State
+
+from .rig import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, LoopRig, about
+
+_INPUTS = struct.Struct("<Hiiib")
+POSITION, VELOCITY, TORQUE, MODE = 1, 2, 3, 4
+CYCLES = CONFIG.supervision.cycles
+MODES = pytest.mark.parametrize("mode", [CSP, CSV, CST])
+ONE_TURN = 62832
+
+Falsify = Callable[[int], int]
+FALSE: dict[str, tuple[int, Falsify]] = {
+    "one turn off": (POSITION, lambda counts: counts + ONE_TURN),
+    "a hundredth of a radian off": (POSITION, lambda counts: counts - 100),
+    "an overflow": (POSITION, lambda counts: (counts & 0xFFFF) - (1 << 31)),
+    "a position of 0": (POSITION, lambda counts: 0),
+    "a speed of 0": (VELOCITY, lambda counts: 0),
+    "a speed of 5 rad/s": (VELOCITY, lambda counts: 50000),
+    "a torque of 40 Nm": (TORQUE, lambda counts: 400000),
+    "mode 0": (MODE, lambda counts: 0),
+    "mode 10 or 9": (MODE, lambda counts: CST if counts != CST else CSV),
+}
+
+
+def falsify(rig: LoopRig, at: int, change: Falsify, axis: int = 0) -> Callable[[], None]:
+    """Falsify an input of a drive in all frames from now on; return a function that ends it."""
+    real = rig.data.input
+
+    def read(index: int) -> bytes:
+        if index != axis + 1:
+            return real(index)
+        values = list(_INPUTS.unpack(real(index)))
+        values[at] = change(values[at])
+        return _INPUTS.pack(*values)
+
+    rig.data.input = read  # type: ignore[method-assign]
+    return lambda: setattr(rig.data, "input", real)
+
+
+def frames_after(mode: int, false: str, cycles: int) -> tuple[LoopRig, list[tuple[int, int, int]]]:
+    """Move at full speed with false samples of the first joint; return what its drive received for 0.1 s."""
+    rig = LoopRig()
+    rig.set_in_motion(mode)
+    begun, events = len(rig.log), len(rig.events)
+    end = falsify(rig, *FALSE[false])
+    rig.run(cycles * PERIOD_S)
+    end()
+    rig.run(0.1 - cycles * PERIOD_S)
+    assert rig.state is State.MOVING
+    assert len(rig.events) == events
+    return rig, [(cycle.drives[0].target, cycle.drives[0].speed, cycle.drives[0].effort) for cycle in rig.log[begun:]]
+
+
+@MODES
+@pytest.mark.parametrize("false", FALSE)
+def test_false_samples_change_no_target_beyond_what_a_joint_notices(mode: int, false: str) -> None:
+    rig, frames = frames_after(mode, false, CYCLES - 1)
+    rig.close()
+    true, expected = frames_after(mode, false, 0)
+    true.close()
+    # The position continues at the joint's velocity, which changes little in four cycles.
+    speed, torque = 0.02 * SPEED * COUNTS, 0.5 * COUNTS
+    for (position, velocity, effort), (a, b, c) in zip(frames, expected, strict=True):
+        assert position == a
+        assert abs(velocity - b) <= speed
+        assert abs(effort - c) <= torque
+
+
+@pytest.mark.parametrize(
+    ("false", "event"),
+    [
+        ("one turn off", PositionJumped),
+        ("a hundredth of a radian off", PositionJumped),
+        ("a speed of 0", VelocityJumped),
+        ("mode 0", DriveModeTimeout),
+    ],
+)
+@MODES
+def test_samples_that_stay_false_are_a_fault_that_names_joint_sample_and_bound(
+    rig: LoopRig, mode: int, false: str, event: type
+) -> None:
+    rig.set_in_motion(mode)
+    falsify(rig, *FALSE[false], axis=1)
+    rig.run((CYCLES - 1) * PERIOD_S)
+    assert rig.state is State.MOVING
+    rig.cycle()
+    assert rig.state in (State.FAULT, State.EMERGENCY_STOP)
+    found = rig.last
+    if false == "one turn off":
+        # The following error is beyond its limit too, and is the harder stop.
+        return
+    assert type(found) is event
+    limits = CONFIG.supervision
+    if isinstance(found, PositionJumped):
+        bound = limits.speed * CONFIG.joints[1].velocity * CYCLES * PERIOD_S + limits.position_tolerance
+        assert (found.axis, found.bound) == (1, about(bound))
+    elif isinstance(found, VelocityJumped):
+        assert (found.axis, found.velocity, found.before) == (1, 0.0, about(SPEED, rel=0.05))
+    else:
+        assert found == DriveModeTimeout(1, 0, DriveMode(mode))
+
+
+def test_a_velocity_that_is_computed_from_positions_forgets_a_false_position(rig: LoopRig) -> None:
+    rig.set_in_motion()
+    drive = rig.arm.drives[0]
+    drive._in = (*drive._in[:2], -1, *drive._in[3:])  # type: ignore[attr-defined]
+    rig.run(0.1)
+    end = falsify(rig, *FALSE["a hundredth of a radian off"])
+    rig.run(2 * PERIOD_S)
+    end()
+    for _ in range(40):
+        rig.cycle()
+        assert rig.arm.state.actual_velocity[0] == about(SPEED, rel=0.05)
