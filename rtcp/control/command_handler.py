@@ -204,6 +204,8 @@ class CommandHandler:
         if self._operator.emergency_stop:
             return refusals.EmergencyStopPressed()
         if (refused := self._refused_by_partner()) is not None:
+        if not self._operator.permitted:
+            return refusals.NotPermitted()
             return refused
         axis = joints.first_blocked()
         if axis >= 0:
@@ -218,7 +220,7 @@ class CommandHandler:
         axis = joints.first_outside()
         if axis >= 0:
             return refusals.JointOutsideRange(axis, joints.drives[axis].position)
-        self._machine.change(command)
+        self._machine.change(command, lease)
         return None
 
     def _disable(self, command: commands.Disable, lease: int) -> refusals.Refusal | None:
@@ -241,6 +243,8 @@ class CommandHandler:
         if partners.stopped >= 0:
             return refusals.PartnerStopPressed(partners.stopped)
         return refusals.PartnerOfAnotherCell(partners.group.foreign) if partners.group.foreign >= 0 else None
+        if partners.unread >= 0:
+            return refusals.PartnerStopUnread(partners.unread)
 
     def _shut_down(self, command: commands.Shutdown, lease: int) -> refusals.Refusal | None:
         self._machine.close()
@@ -389,11 +393,11 @@ class CommandHandler:
             return refused
         gripper = self._context.gripper
         if gripper is not None:
-            if not self._operator.permitted:
-                return refusals.NotPermitted()
             if not gripper.grip(not command.open, lease):
                 return refusals.GripperDisabled()
         elif self._operator.has_gripper:
+        if not self._operator.permitted:
+            return refusals.NotPermitted()
             self._operator.grip(not command.open)
         else:
             return refusals.NoGripper()

@@ -193,6 +193,7 @@ class Cycle:
         data, machine, parts, context = self._data, self.machine, self.parts, self._context
         good = wkc == self._expected
         context.now_ns = self.arm.state.now_ns = woken
+        self.operator.unread_cycles += 1
         if good:
             for part in parts:
                 part.decode(data)
@@ -234,7 +235,7 @@ class Cycle:
             flags |= FLAG_ENABLED
         if machine.changing_mode:
             flags |= FLAG_SWITCHING
-        if operator.emergency_stop:
+        if operator.emergency_stop or operator.stop_unread:
             flags |= FLAG_EMERGENCY_STOP
         if operator.permitted:
             flags |= FLAG_MOTION_ALLOWED

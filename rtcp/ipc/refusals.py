@@ -445,6 +445,13 @@ class PathStartsElsewhere(Refusal):
 
 class PlanStartsMoving(Refusal):
     """{joint}: the plan starts at time 0 with {planned:.6g} rad/s, the arm is commanded {commanded:.6g} rad/s: give its
+class PartnerStopUnread(Refusal):
+    """{partner_name} publishes no records, so that its emergency stop, which the cell shares, is not read and counts as
+    pressed: start {partner_name} first (`rtcp cell start`)"""
+
+    partner: int
+
+
     first point a later time"""
 
     axis: int

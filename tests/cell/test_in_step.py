@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import pytest
 
 from rtcp.config.model import MOST_AXES
+from rtcp.control.operator import UNREAD_S
 from rtcp.ipc.commands import Disable, Enable, MoveGripper, MoveJoints, OpenStream, Reset, RunInStep
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import State
@@ -299,4 +300,27 @@ def test_a_stream_whose_partner_gets_no_setpoint_ends_where_it_began() -> None:
     assert pair.last_end("left") == "PartnerNotReady"
     assert pair.commanded("left") == begin
     assert pair.simulation.until(lambda: pair.simulation.all_in(State.HOLDING), 1.0)
+    pair.close()
+
+
+@pytest.mark.parametrize(
+    ("mishap", "event"), [("loop hangs", "PartnerStopUnread"), ("frames lost", "PartnerEmergencyStop")]
+)
+def test_a_shared_emergency_stop_that_nobody_reads_counts_as_pressed(mishap: str, event: str) -> None:
+    pair = Pair(16)
+    right = pair.arm("right")
+    goal = [q + 0.3 for q in pair.commanded("right")]
+    assert pair.simulation.send("right", MoveJoints(tuple(goal), 0.1, True)).refusal is None
+    pair.mishaps[mishap]("left")
+    if mishap == "frames lost":
+        pair.arm("left").data.lose(3000)
+    assert pair.simulation.until(lambda: right.state is State.EMERGENCY_STOP, UNREAD_S + 0.02)
+    assert event in pair.events("right")
+    pair.simulation.run(1.0)
+    assert pair.simulation.send("right", Reset()).refusal is None
+    assert pair.simulation.until(lambda: right.state is State.READY, 5.0)
+    for command in (Enable(), MoveGripper(open=True)):
+        refusal = pair.simulation.send("right", command).refusal
+        assert refusal is not None
+        assert refusal.name == ("partner_stop_unread" if mishap == "loop hangs" else "partner_stop_pressed")
     pair.close()
