@@ -417,6 +417,14 @@ class BrakesOutOfRange(Refusal):
     most_s: float
 
 
+class BrakeStepOutOfRange(Refusal):
+    """the table of the brakes has an entry every {step_s:.3g} s of the path, allowed is {least_s:g} to {most_s:g} s"""
+
+    step_s: float
+    least_s: float
+    most_s: float
+
+
 class PartnerMissing(Refusal):
     """{partner_name} does not run, or publishes no records: a motion in step needs all its arms"""
 

@@ -121,8 +121,10 @@ def test_the_guard_knows_the_acceleration_limits_in_force_at_a_partner() -> None
         ({"rows": 0}, "wrong_row_count"),
         ({"rows": 1 << 60}, "wrong_row_count"),
         ({"slot": 9}, "wrong_row_count"),
-        ({"brake_step_s": float("nan")}, "wrong_row_count"),
-        ({"brake_step_s": -1.0}, "wrong_row_count"),
+        ({"brake_step_s": float("nan")}, "brake_step_out_of_range"),
+        ({"brake_step_s": -1.0}, "brake_step_out_of_range"),
+        ({"brake_step_s": 5e-324}, "brake_step_out_of_range"),
+        ({"brake_step_s": 1e308}, "brake_step_out_of_range"),
     ],
 )
 def test_a_command_that_cannot_be_is_refused(change: dict[str, float], reason: str) -> None:
