@@ -33,6 +33,7 @@ _FARTHEST_PAYLOAD_M: Final = 1.0
 _FIXED_DRIVE_MODE = frozenset({ControlMode.VELOCITY, ControlMode.TORQUE})
 _PLANNED = (commands.RunTrajectory, commands.RunInStep, commands.RunLines)
 _AUTOMATIC = frozenset({ControlMode.JOINT, ControlMode.CARTESIAN})
+_STOPPED_BY_DRIVES = frozenset({State.FAULT, State.EMERGENCY_STOP})
 
 
 _MOST_SETPOINTS: Final = 8
@@ -203,9 +204,9 @@ class CommandHandler:
         joints = self._joints
         if self._operator.emergency_stop:
             return refusals.EmergencyStopPressed()
-        if (refused := self._refused_by_partner()) is not None:
         if not self._operator.permitted:
             return refusals.NotPermitted()
+        if (refused := self._refused_by_partner()) is not None:
             return refused
         axis = joints.first_blocked()
         if axis >= 0:
@@ -242,9 +243,9 @@ class CommandHandler:
             return None
         if partners.stopped >= 0:
             return refusals.PartnerStopPressed(partners.stopped)
-        return refusals.PartnerOfAnotherCell(partners.group.foreign) if partners.group.foreign >= 0 else None
         if partners.unread >= 0:
             return refusals.PartnerStopUnread(partners.unread)
+        return refusals.PartnerOfAnotherCell(partners.group.foreign) if partners.group.foreign >= 0 else None
 
     def _shut_down(self, command: commands.Shutdown, lease: int) -> refusals.Refusal | None:
         self._machine.close()
@@ -286,6 +287,12 @@ class CommandHandler:
         new = read(self._blackboard.plan(command.slot), command.rows)
         if new is None:
             return refusals.WrongRowCount(command.rows, MOST_LIMIT_ROWS)
+        if arm.group.under_way:
+            return refusals.LimitsInStep()
+        axis = self._joints.first_moving() if self._machine.state in _STOPPED_BY_DRIVES else -1
+        if axis >= 0:
+            # A drive without a ramp of its own stops under the limits.
+            return refusals.NotAtStandstill(axis, self._joints.drives[axis].velocity)
         refusal = arm.trajectory_guard.refusal_of(arm.state, new)
         if refusal is not None:
             return refusal
@@ -391,13 +398,13 @@ class CommandHandler:
             return refusals.EmergencyStopPressed()
         if (refused := self._refused_by_partner()) is not None:
             return refused
+        if not self._operator.permitted:
+            return refusals.NotPermitted()
         gripper = self._context.gripper
         if gripper is not None:
             if not gripper.grip(not command.open, lease):
                 return refusals.GripperDisabled()
         elif self._operator.has_gripper:
-        if not self._operator.permitted:
-            return refusals.NotPermitted()
             self._operator.grip(not command.open)
         else:
             return refusals.NoGripper()

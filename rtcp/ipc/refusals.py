@@ -69,7 +69,7 @@ class NotPermitted(Refusal):
 
 
 class NotAtStandstill(Refusal):
-    """{joint} turns at {velocity:.6g} rad/s: drives are enabled at standstill only"""
+    """{joint} turns at {velocity:.6g} rad/s: wait until the joint stands still"""
 
     axis: int
     velocity: float
@@ -445,6 +445,13 @@ class PartnerStopPressed(Refusal):
     partner: int
 
 
+class PartnerStopUnread(Refusal):
+    """{partner_name} publishes no records, so that its emergency stop, which the cell shares, is not read and counts as
+    pressed: start {partner_name} first (`rtcp cell start`)"""
+
+    partner: int
+
+
 class PathStartsElsewhere(Refusal):
     """the path starts {distance:.6g} (m or rad) away from the tool: move there first (`rtcp run --approach`)"""
 
@@ -453,13 +460,6 @@ class PathStartsElsewhere(Refusal):
 
 class PlanStartsMoving(Refusal):
     """{joint}: the plan starts at time 0 with {planned:.6g} rad/s, the arm is commanded {commanded:.6g} rad/s: give its
-class PartnerStopUnread(Refusal):
-    """{partner_name} publishes no records, so that its emergency stop, which the cell shares, is not read and counts as
-    pressed: start {partner_name} first (`rtcp cell start`)"""
-
-    partner: int
-
-
     first point a later time"""
 
     axis: int
@@ -494,6 +494,19 @@ class LimitsExcludeArm(Refusal):
     """the arm would cross the new bounds of {box_name}: nothing was changed"""
 
     box: int
+
+
+class LimitsTooNearPartner(Refusal):
+    """under the new acceleration limits the arm would not stop in time: it would come to {distance:.3g} m from
+    {partner_name}; nothing was changed, repeat the change when the arm is slower or stands"""
+
+    partner: int
+    distance: float
+
+
+class LimitsInStep(Refusal):
+    """the arm is in a motion in step, whose arms brake together under the limits that it was planned with: nothing was
+    changed, repeat the change when the motion has ended"""
 
 
 class ImpossibleLimit(Refusal):

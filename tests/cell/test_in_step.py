@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
 from rtcp.config.model import MOST_AXES
 from rtcp.control.operator import UNREAD_S
-from rtcp.ipc.commands import Disable, Enable, MoveGripper, MoveJoints, OpenStream, Reset, RunInStep
+from rtcp.ipc.commands import Disable, Enable, MoveGripper, MoveJoints, OpenStream, Reset, RunInStep, SetLimits
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import State
+from rtcp.motion.guards.neighbours import certain
+from rtcp.motion.limits import rows
 from rtcp.testing.simulation import Simulation
 from tests.cell.random_steps import Pair, run_mishaps, run_motions, run_near
 
@@ -325,4 +328,43 @@ def test_a_shared_emergency_stop_that_nobody_reads_counts_as_pressed(mishap: str
         refusal = pair.simulation.send("right", command).refusal
         assert refusal is not None
         assert refusal.name == ("partner_stop_unread" if mishap == "loop hangs" else "partner_stop_pressed")
+    pair.close()
+
+
+def slower_limits(arm: Simulation, share: float) -> SetLimits:
+    """Write the limits in force with a share of the accelerations to the plan area; return the command for them."""
+    widest = arm.loop.arm.limits.widest
+    plan = rows(replace(widest, acceleration=tuple(share * rate for rate in widest.acceleration)))
+    return SetLimits(arm.observer.write_plan(plan), len(plan))
+
+
+def test_limits_under_which_the_stop_would_end_too_near_the_partner_are_refused_under_way() -> None:
+    pair = Pair(17)
+    left, guard = pair.arm("left"), pair.arm("left").loop.arm.trajectory_guard
+    goal = [q + 0.3 for q in pair.commanded("left")]
+    assert pair.simulation.send("left", MoveJoints(tuple(goal), 0.4, True)).refusal is None
+    assert pair.simulation.until(lambda: pair.speed("left") > 0.2, 2.0)
+    own, (other,) = guard.neighbours._own, guard.neighbours._partners
+    assert other is not None
+    state, partner = left.loop.arm.state, pair.simulation.partners["left"].group.members[0]
+    args = state.commanded, state.commanded_velocity, other, partner.position, partner.velocity
+    # With this clearance the arm can stop in time under the limits in force, and not much later.
+    guard.neighbours._clearance = certain(own, *args, (0.005, 0.1))[0]
+    before = list(left.loop.arm.limits.acceleration)
+    refusal = pair.simulation.send("left", slower_limits(left, 0.2)).refusal
+    assert refusal is not None
+    assert refusal.name == "limits_too_near_partner"
+    assert left.loop.arm.limits.acceleration == before
+    assert pair.simulation.until(lambda: left.state in (State.HOLDING, State.STOPPED_BY_LIMIT), 5.0)
+    assert pair.simulation.send("left", slower_limits(left, 0.2)).refusal is None
+    pair.close()
+
+
+def test_limits_do_not_change_in_a_motion_in_step() -> None:
+    pair = Pair(18)
+    motion = pair.begin()
+    pair.follow(motion, lambda: pair.speed("left") > 0.01)
+    refusal = pair.simulation.send("left", slower_limits(pair.arm("left"), 0.9)).refusal
+    assert refusal is not None
+    assert refusal.name == "limits_in_step"
     pair.close()

@@ -11,6 +11,7 @@ import pytest
 from kinematics.capsules import distance
 from rtcp.config.cell import Base, Member
 from rtcp.ipc.events import MotionEnded, PartnerForeign, PartnerNear
+from rtcp.ipc.refusals import LimitsTooNearPartner
 from rtcp.motion.guards.neighbours import Body, Neighbours, body_of, certain
 from rtcp.motion.step_group import Partner, StepGroup
 
@@ -170,6 +171,19 @@ def test_arms_that_are_too_near_may_rest_and_part_slowly_and_nothing_else(speed:
     two.ahead(NEAR, first(-1.0), UPRIGHT)  # where that stop would have ended does not count
     answer = two.ahead(NEAR, first(speed), UPRIGHT)
     assert answer is None if may else isinstance(answer, PartnerNear)
+
+
+@pytest.mark.parametrize(("share", "may"), [(1.0, True), (0.8, True), (0.2, False)])
+def test_limits_under_which_the_arm_would_not_stop_before_its_partner_are_refused(share: float, may: bool) -> None:
+    two, velocity = Two(body(-0.3)), first(0.3)
+    q = [NEAR[0] - 0.15, *NEAR[1:]]
+    assert two.ahead(q, velocity, UPRIGHT) is None
+    slower = [share * rate for rate in ACCELERATION]
+    refusal = two.guard.refusal_of(q, velocity, slower)
+    assert refusal is None if may else isinstance(refusal, LimitsTooNearPartner)
+    assert two.guard.refusal_of(q, STILL, slower) is None
+    # The limits in force have not changed.
+    assert two.ahead(q, velocity, UPRIGHT) is None
 
 
 def test_every_partner_counts_whose_geometry_and_record_are_known_and_the_near_one_is_named() -> None:

@@ -17,6 +17,7 @@ from kinematics.model import JOINTS, ArmModel
 from kinematics.pose import Pose
 from rtcp.config.cell import Member
 from rtcp.ipc.events import MotionEnded, PartnerForeign, PartnerNear
+from rtcp.ipc.refusals import LimitsTooNearPartner, Refusal
 from rtcp.motion.step_group import StepGroup
 
 _SLOW_M: Final = 0.02
@@ -171,3 +172,17 @@ class Neighbours:
                 continue
             return PartnerNear(index, max(min(here, then), 0.0))
         return None
+        return self._near(q, velocity)
+
+    def refusal_of(
+        self, q: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]
+    ) -> Refusal | None:
+        """Return a refusal if the stop from `q`, rad, at these rates, rad/s^2, comes too near a partner; or None."""
+        own = self._own
+        in_force, own.acceleration = own.acceleration, acceleration
+        near = self._near(q, velocity)
+        own.acceleration = in_force
+        return None if near is None else LimitsTooNearPartner(near.partner, near.distance)
+
+    def _near(self, q: Sequence[float], velocity: Sequence[float]) -> PartnerNear | None:
+        """Return the partner that this arm could come too near to before both stand, or None."""
