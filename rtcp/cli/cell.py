@@ -26,7 +26,7 @@ from rtcp.config.cell import CellConfig
 from rtcp.config.model import Point
 from rtcp.config.numbers import angle, plain_number
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
-from rtcp.ipc.session import SessionError, read_session
+from rtcp.ipc.session import SessionError, is_running, read_processes, read_session
 
 _READY_S = 90.0
 _POLL_S = 0.1
@@ -68,11 +68,12 @@ def _start(
 
 
 def _to_start(cell: CellConfig) -> list[str]:
-    """Return the arms that do not run yet; raises CommandError where one runs outside this cell, or all run."""
+    """Return the arms whose loop does not run; raises CommandError where one runs outside this cell, or all run."""
     names = []
     for arm in cell.members:
         directory = runtime_directory(arm.name)
-        if not control_socket(directory).exists():
+        if not is_running(read_processes(directory).loop):
+            # The gateway of a loop that was killed may still have its socket: the start removes both.
             names.append(arm.name)
             continue
         with contextlib.suppress(SessionError):
@@ -137,11 +138,12 @@ def _all_ready(children: dict[str, subprocess.Popen[str]]) -> bool:
     while waiting and time.monotonic() < until:
         if any(child.poll() is not None for child in children.values()):
             return False
-        path = control_socket(runtime_directory(waiting[0]))
-        with contextlib.suppress(RtcpError), Robot("rtcp cell start", path) as robot:
-            if robot.state is not State.STARTING:
-                waiting.pop(0)
-                continue
+        directory = runtime_directory(waiting[0])
+        if is_running(read_processes(directory).loop):
+            with contextlib.suppress(RtcpError), Robot("rtcp cell start", control_socket(directory)) as robot:
+                if robot.state is not State.STARTING:
+                    waiting.pop(0)
+                    continue
         time.sleep(_POLL_S)
     return not waiting
 

@@ -33,6 +33,7 @@ _FARTHEST_PAYLOAD_M: Final = 1.0
 _FIXED_DRIVE_MODE = frozenset({ControlMode.VELOCITY, ControlMode.TORQUE})
 _PLANNED = (commands.RunTrajectory, commands.RunInStep, commands.RunLines)
 _AUTOMATIC = frozenset({ControlMode.JOINT, ControlMode.CARTESIAN})
+_STOPPED_BY_DRIVES = frozenset({State.FAULT, State.EMERGENCY_STOP})
 
 
 _MOST_SETPOINTS: Final = 8
@@ -203,6 +204,8 @@ class CommandHandler:
         joints = self._joints
         if self._operator.emergency_stop:
             return refusals.EmergencyStopPressed()
+        if not self._operator.permitted:
+            return refusals.NotPermitted()
         if (refused := self._refused_by_partner()) is not None:
             return refused
         axis = joints.first_blocked()
@@ -218,7 +221,7 @@ class CommandHandler:
         axis = joints.first_outside()
         if axis >= 0:
             return refusals.JointOutsideRange(axis, joints.drives[axis].position)
-        self._machine.change(command)
+        self._machine.change(command, lease)
         return None
 
     def _disable(self, command: commands.Disable, lease: int) -> refusals.Refusal | None:
@@ -240,6 +243,8 @@ class CommandHandler:
             return None
         if partners.stopped >= 0:
             return refusals.PartnerStopPressed(partners.stopped)
+        if partners.unread >= 0:
+            return refusals.PartnerStopUnread(partners.unread)
         return refusals.PartnerOfAnotherCell(partners.group.foreign) if partners.group.foreign >= 0 else None
 
     def _shut_down(self, command: commands.Shutdown, lease: int) -> refusals.Refusal | None:
@@ -282,6 +287,12 @@ class CommandHandler:
         new = read(self._blackboard.plan(command.slot), command.rows)
         if new is None:
             return refusals.WrongRowCount(command.rows, MOST_LIMIT_ROWS)
+        if arm.group.under_way:
+            return refusals.LimitsInStep()
+        axis = self._joints.first_moving() if self._machine.state in _STOPPED_BY_DRIVES else -1
+        if axis >= 0:
+            # A drive without a ramp of its own stops under the limits.
+            return refusals.NotAtStandstill(axis, self._joints.drives[axis].velocity)
         refusal = arm.trajectory_guard.refusal_of(arm.state, new)
         if refusal is not None:
             return refusal
@@ -387,10 +398,10 @@ class CommandHandler:
             return refusals.EmergencyStopPressed()
         if (refused := self._refused_by_partner()) is not None:
             return refused
+        if not self._operator.permitted:
+            return refusals.NotPermitted()
         gripper = self._context.gripper
         if gripper is not None:
-            if not self._operator.permitted:
-                return refusals.NotPermitted()
             if not gripper.grip(not command.open, lease):
                 return refusals.GripperDisabled()
         elif self._operator.has_gripper:

@@ -105,7 +105,7 @@ class Context(PartContext):
         """Cycles without the expected working counter, `_GOOD_FOR_LOST` each, minus cycles with it; 0 to as many times
         `bus.lost_cycles`."""
         self.lease = 0
-        """Lease of the running motion's commander; 0: the joystick, which needs none."""
+        """Lease of the commander of the enabling or the motion; 0: the joystick, which needs none."""
         self.limited = False
         """Whether the present stop ends in the state stopped by limit; written by states."""
         self.pending: ClockLost | None = None
@@ -124,6 +124,7 @@ class Context(PartContext):
             self.operator.read()
             return
         self.lost += 1
+        self.operator.miss()
         self.wkc_error_count = min(self.wkc_error_count + _GOOD_FOR_LOST, self._lost_limit)
 
     @property
@@ -245,7 +246,8 @@ class Context(PartContext):
             return self.drive_event(DriveLeftEnabled, axis)
         event = self.permission_lost(self.lease)
         if event is not None:
-            if not self.is_controlled(event):
+            # After the end of the homing the joint returns to its range, which only the removal of torque stops.
+            if homing.ended or not self.is_controlled(event):
                 return event
             homing.stop()
         homing.step()

@@ -195,6 +195,7 @@ class Cycle:
         context.now_ns = woken
         for group in self.joints.groups:
             group.state.now_ns = woken
+        self.operator.unread_cycles += 1
         if good:
             for part in parts:
                 part.decode(data)
@@ -236,7 +237,7 @@ class Cycle:
             flags |= FLAG_ENABLED
         if machine.changing_mode:
             flags |= FLAG_SWITCHING
-        if operator.emergency_stop:
+        if operator.emergency_stop or operator.stop_unread:
             flags |= FLAG_EMERGENCY_STOP
         if operator.permitted:
             flags |= FLAG_MOTION_ALLOWED

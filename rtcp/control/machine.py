@@ -33,6 +33,7 @@ from rtcp.ipc.events import (
     LeaseExpired,
     MotionEnded,
     PartnerEmergencyStop,
+    PartnerStopUnread,
     PermissionWithdrawn,
     ResetDone,
 )
@@ -141,8 +142,11 @@ class StateMachine:
         operator = ctx.operator
         if operator.emergency_stop and ctx.state in _ENDED_BY_EMERGENCY_STOP:
             self.change(EmergencyStopActivated())
-        if partners is not None and partners.pressed >= 0 and ctx.state in _ENDED_BY_PARTNER:
-            self.change(PartnerEmergencyStop(partners.pressed))
+        if partners is not None and ctx.state in _ENDED_BY_PARTNER:
+            if partners.pressed >= 0:
+                self.change(PartnerEmergencyStop(partners.pressed))
+            elif partners.unread >= 0:
+                self.change(PartnerStopUnread(partners.unread))
         event = self._active.update(ctx)
         if event is not None and self._handle(event):
             # The state ended before it commanded the arm: the next state commands it in this cycle.

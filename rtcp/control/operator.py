@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
@@ -24,6 +24,10 @@ from rtcp.ipc.schema import OPERATOR_FIELDS
 from rtcp.ipc.states import ControlMode, State
 from rtcp.motion.controllers.joystick import Joystick
 from rtcp.motion.state import Phase
+
+UNREAD_S: Final = 0.5
+"""Time without a reading after which an emergency stop counts as pressed and an enabling switch as released, s. It is
+the longest `silence_s` of a cell, so that arms in step brake along their paths first."""
 
 
 class Operator(Part):
@@ -68,6 +72,9 @@ class Operator(Part):
         """Whether the emergency stop is pressed; true until the box was read."""
         self.permitted = self._switch_box is None or self._inputs.enabling_switch.active
         """Whether the enabling switch allows motion."""
+        self._unread_limit = round(UNREAD_S / cycle_s)
+        self.unread_cycles = self._missed = 0
+        """Consecutive cycles in which the emergency stop was not read, and in which not all inputs arrived."""
         self.joystick_granted = False
         lamps = [(config.box_of(outputs), led) for led in (outputs.state_lamp, outputs.motion_lamp, outputs.heartbeat)]
         grip = None if gripper is None else gripper.output
@@ -89,6 +96,7 @@ class Operator(Part):
     def read(self) -> None:
         """Read the inputs of the cycle."""
         inputs = self._inputs
+        self.unread_cycles = self._missed = 0
         if self._stop_box is not None:
             inputs.emergency_stop.read(self._stop_box.inputs)
             self.emergency_stop = inputs.emergency_stop.active
@@ -107,6 +115,18 @@ class Operator(Part):
             stop = self._inputs.emergency_stop
             stop.read_active(self._stop_box.inputs)
             self.emergency_stop = stop.active
+            self.unread_cycles = 0
+
+    def miss(self) -> None:
+        """Count a cycle in which not all inputs arrived: after `UNREAD_S` the enabling switch counts as released."""
+        self._missed += 1
+        if self._missed > self._unread_limit and self._switch_box is not None:
+            self.permitted = False
+
+    @property
+    def stop_unread(self) -> bool:
+        """Whether the emergency stop was not read for `UNREAD_S`: for the partners it counts as pressed."""
+        return self.has_button and self.unread_cycles > self._unread_limit
 
     @property
     def holds_grip(self) -> bool:
@@ -122,6 +142,7 @@ class Operator(Part):
         """Treat the emergency stop as released until its box reports it pressed."""
         self._inputs.emergency_stop.forget()
         self.emergency_stop = False
+        self.unread_cycles = 0
 
     def update(self, context: PartContext) -> None:
         """Switch the lamps and toggle the heartbeat."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rtcp.config.cell import CellConfig, Member
+from rtcp.control.operator import UNREAD_S
 from rtcp.control.part import Part
 from rtcp.ipc.record_view import RecordView, RecordViewError, replace_view
 from rtcp.ipc.runtime_directory import blackboard_file
@@ -26,7 +27,10 @@ _NOTICE_CYCLES: Final = 1.5
 _AHEAD_NS: Final = 1_000_000_000
 """Greatest time of a record in the future, ns; later ones are ignored."""
 _FORGOTTEN_NS: Final = 1_000_000_000
-"""Age of a partner's newest record from which its emergency stop counts as unknown, ns."""
+"""Age of a partner's newest record from which its cell and the state of its emergency stop are no longer used, ns."""
+_SILENT_NS: Final = round(UNREAD_S * 1e9)
+"""Age of a partner's newest record from which its emergency stop counts as pressed and its enabling switch as released,
+ns."""
 _SCALARS = ("time_ns", "state", "flags", "step_motion", "step_phase", "step_brake_ns", "step_path_s", "step_cell")
 _VECTORS = ("commanded_position", "commanded_velocity", "acceleration_limit")
 _STATES = tuple(State)
@@ -67,6 +71,9 @@ class Partners(Part):
         self._shares_stop = cell.share.emergency_stop
         self.pressed = self.stopped = -1
         """First partner whose shared emergency stop is pressed, and first one not reset since; index or -1."""
+        self.unread = -1
+        """First partner whose shared emergency stop no loop reads, so that it counts as pressed; index or -1."""
+        self._has_button = [member.config.inputs.emergency_stop is not None for member in self.members]
         self.files = [blackboard_file(member.directory) for member in self.members]
         """Blackboard files of the partners."""
         self._inodes = [0] * len(self.members)
@@ -102,17 +109,22 @@ class Partners(Part):
 
     def read(self, now_ns: int) -> None:
         """Read the newest complete record of each partner."""
-        self.pressed = self.stopped = self.group.foreign = -1
+        self.pressed = self.stopped = self.unread = self.group.foreign = -1
         for index, partner in enumerate(self.group.members):
             view, values = self._views[index], self._values[index]
             if view is not None and view.read(values):
                 _take(partner, values, now_ns)
-            known = now_ns - partner.time_ns < _FORGOTTEN_NS
+            age_ns = now_ns - partner.time_ns
+            known, silent = age_ns < _FORGOTTEN_NS, age_ns > _SILENT_NS
             if known and partner.cell != self.group.cell and self.group.foreign < 0:
                 self.group.foreign = index
-            if partner.cell != self.group.cell:
+            if silent or partner.cell != self.group.cell:
                 partner.motion_allowed = False
-            if not (known and self._shares_stop):
+            if not self._shares_stop:
+                continue
+            if silent and self._has_button[index] and self.unread < 0:
+                self.unread = index
+            if not known:
                 continue
             if partner.emergency_stop and self.pressed < 0:
                 self.pressed = index

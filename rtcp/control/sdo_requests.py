@@ -52,7 +52,7 @@ class SdoRequests:
     def take_steps(self) -> None:
         """Advance the pending requests and start new ones; raises BusError from an explanation that failed."""
         until = time.monotonic() + _BUDGET_S
-        if self._answering is None and self._blackboard.words[SERVICE_STATE_AT] == _ASKED:
+        if self._answering is None and self._blackboard.words.acquire(SERVICE_STATE_AT) == _ASKED:
             self._answering, self._asked_at = self._answer(), time.monotonic()
         if self._answering is not None:
             if _follow(self._answering, until, self._reply):
@@ -104,8 +104,7 @@ class SdoRequests:
             text = json.dumps(_error("refused", sentence)).encode()
         memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(text)] = text
         words[SERVICE_LENGTH_AT] = len(text)
-        words.fence()
-        words[SERVICE_STATE_AT] = _ANSWERED
+        words.release(SERVICE_STATE_AT, _ANSWERED)
 
     def _serve(self, request: dict[str, Any]) -> Steps[dict[str, Any]]:
         position, index, subindex = int(request["slave"]), int(request["index"]), int(request["subindex"])

@@ -87,6 +87,12 @@ _FAULTS: dict[type[Message] | Signal, State] = {
     Shutdown: State.CLOSING,
 }
 _TORQUE: dict[type[Message] | Signal, State] = {**_FAULTS, Disable: State.DISABLING}
+_PERMITTED: dict[type[Message] | Signal, State] = {
+    **_TORQUE,
+    LeaseExpired: State.DISABLING,
+    PermissionWithdrawn: State.DISABLING,
+}
+"""Of states in which joints return to their range: with torque they would do so without permission too."""
 
 
 class MachineState:
@@ -176,7 +182,7 @@ class Enabling(MachineState):
 
     state = State.ENABLING
     drives = "drives advance to Operation Enabled; target = actual until each is there"
-    leads_to = {**_TORQUE, Enabled: State.HOLDING}
+    leads_to = {**_PERMITTED, Enabled: State.HOLDING}
 
     _REPORTED_RAD = 0.001
     """Distance from its range, rad, below which a joint returns without a report: it sagged at the edge."""
@@ -199,6 +205,8 @@ class Enabling(MachineState):
         if event is not None or not ctx.good:
             return event
         event = self._drive_problem(ctx) or joints.beyond_limits()
+        if event is None and joints.first_returning() >= 0:
+            event = ctx.permission_lost(ctx.lease)
         if event is not None:
             return event
         joints.advance(TargetState.ENABLED)
@@ -389,7 +397,7 @@ class HomingState(MachineState):
 
     state = State.HOMING
     drives = "one drive homes by itself (mode of operation 6), the others hold"
-    leads_to = {**_TORQUE, Homed: State.HOLDING, HomingFailed: State.HOLDING, Stopped: State.HOLDING}
+    leads_to = {**_PERMITTED, Homed: State.HOLDING, HomingFailed: State.HOLDING, Stopped: State.HOLDING}
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Start the homing of a joint."""
@@ -503,8 +511,6 @@ class FaultReaction:
     def __init__(self, ctx: Context) -> None:
         self.standstill = Standstill(ctx)
         self._estop_cycles = ctx.cycles(self._ESTOP_S)
-        self._unobservable = 0
-        """Consecutive cycles in which the emergency stop could not be read."""
         self.torque_off = False
         """Whether the torque is removed: by a command, the reaction, or an emergency stop."""
         self.off_at_rest = False
@@ -534,7 +540,6 @@ class FaultReaction:
         ctx.homing.abandon()
         ctx.joints.hold()
         self.standstill.begin()
-        self._unobservable = 0
 
     def update(self, ctx: Context) -> None:
         """Command the drives even without returned frames: slaves that receive must not keep their speed or torque."""
@@ -565,11 +570,8 @@ class FaultReaction:
 
     def _estop_unobservable(self, ctx: Context) -> bool:
         """Return whether the emergency stop could not be read for too long; like a broken wire it counts as pressed."""
-        if ctx.good or not ctx.operator.has_button or ctx.stop_box_in_op:
-            self._unobservable = 0
-            return False
-        self._unobservable += 1
-        if self._unobservable <= self._estop_cycles:
+        operator = ctx.operator
+        if not operator.has_button or operator.unread_cycles <= self._estop_cycles:
             return False
         ctx.publish(EstopUnobservable(self._ESTOP_S))
         return True

@@ -153,7 +153,7 @@ class Blackboard:
         self._pack_record(self._map, at + 8, *values, number)
         fence()
         words[at >> 3] = number
-        words[RECORDS_HEAD_AT >> 3] = number
+        self._words.release(RECORDS_HEAD_AT, number)
         self._records = number
 
     def event(self, event: Event) -> None:
@@ -161,10 +161,13 @@ class Blackboard:
         with self._event_lock:
             number = self._events + 1
             at = EVENTS_AT + (number % EVENTS) * EVENT_SIZE
-            EVENT.pack_into(self._map, at, number, time.time_ns(), time.monotonic_ns(), event.number)
-            event.pack_into(self._map, at + EVENT.size)
+            # Its number comes last: a reader of the event that was here finds another number afterwards.
+            self._words[at] = 0
             self._words.fence()
-            self._words[EVENTS_HEAD_AT] = number
+            EVENT.pack_into(self._map, at, 0, time.time_ns(), time.monotonic_ns(), event.number)
+            event.pack_into(self._map, at + EVENT.size)
+            self._words.release(at, number)
+            self._words.release(EVENTS_HEAD_AT, number)
             self._events = number
 
     def slave(self, position: int, al_status: int, al_status_code: int) -> None:
@@ -196,7 +199,11 @@ class Blackboard:
     def lease(self) -> tuple[int, int, int]:
         """Return the lease's id (0: free), the instant it was renewed (ns) and its duration (ns)."""
         words = self._words
-        return words[LEASE_ID_AT], words[LEASE_RENEWED_AT], words[LEASE_DURATION_AT]
+        lease = words.acquire(LEASE_ID_AT)
+        renewed, duration = words[LEASE_RENEWED_AT], words[LEASE_DURATION_AT]
+        words.fence()
+        # Another commander that acquires the lease meanwhile writes an id of 0 first.
+        return lease if words[LEASE_ID_AT] == lease else 0, renewed, duration
 
     def command_waits(self) -> bool:
         """Whether the ring holds a command that was not read."""
@@ -205,13 +212,17 @@ class Blackboard:
     def take_command(self) -> tuple[int, int, Command | Malformed]:
         """Read the next command: its number in the ring, the lease id, the command. Only when `command_waits`."""
         at = COMMANDS_AT + ((self._taken + 1) % COMMANDS) * COMMAND_SIZE
+        self._words.acquire(COMMAND_HEAD_AT)
         number, lease, kind = COMMAND.unpack_from(self._map, at)
-        self._taken += 1
-        self._words[COMMAND_TAKEN_AT] = self._taken
+        command: Command | Malformed
         try:
-            return number, lease, COMMAND_KINDS.unpack_from(kind, self._map, at + COMMAND.size)
+            command = COMMAND_KINDS.unpack_from(kind, self._map, at + COMMAND.size)
         except MalformedMessage:
-            return number, lease, Malformed(kind & _I63)
+            command = Malformed(kind & _I63)
+        self._taken += 1
+        # From here on the commander may overwrite the entry.
+        self._words.release(COMMAND_TAKEN_AT, self._taken)
+        return number, lease, command
 
     def setpoint_waits(self) -> bool:
         """Whether the ring holds a setpoint that was not read."""
@@ -221,8 +232,9 @@ class Blackboard:
         """Read the next setpoint: its stream, `SETPOINT_...` bits, stamp, s, and 3 x `MOST_AXES` numbers."""
         self._setpoints_taken += 1
         at = SETPOINTS_AT + (self._setpoints_taken % SETPOINTS) * SETPOINT.size
+        self._words.acquire(SETPOINT_HEAD_AT)
         _, stream, bits, stamp_s, *numbers = SETPOINT.unpack_from(self._map, at)
-        self._words[SETPOINT_TAKEN_AT] = self._setpoints_taken
+        self._words.release(SETPOINT_TAKEN_AT, self._setpoints_taken)
         return stream, bits, stamp_s, tuple(numbers)
 
     def open_stream(self, stream: int) -> None:
@@ -238,8 +250,7 @@ class Blackboard:
             ANSWER.pack_into(self._map, ANSWER_AT, refusal.number)
             refusal.pack_into(self._map, ANSWER_AT + ANSWER.size)
         # The number is written last: a reader that sees its own number sees the whole answer.
-        self._words.fence()
-        self._words[ANSWER_NUMBER_AT] = number
+        self._words.release(ANSWER_NUMBER_AT, number)
 
     @property
     def memory(self) -> mmap.mmap:

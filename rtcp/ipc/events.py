@@ -583,6 +583,14 @@ class PartnerEmergencyStop(EmergencyStop, number=52):
     partner: int
 
 
+class PartnerStopUnread(EmergencyStop, number=151):
+    """{partner_name} publishes no records any more, so that its emergency stop, which the cell shares, is not read and
+    counts as pressed: {reaction}; start {partner_name} again (`rtcp cell start`), then `rtcp reset`"""
+
+    stop_key = "emergency_stop"
+    partner: int
+
+
 class OverSpeed(EmergencyStop, number=24):
     """{joint}: measured speed {value:.6g} rad/s exceeded {limit:.6g} rad/s for {supervision}: {reaction}; then `rtcp
     reset`"""

@@ -145,8 +145,19 @@ class AtomicWords:
     def __setitem__(self, at: int, value: int) -> None:
         self.plain[at >> 3] = value
 
+    def acquire(self, at: int) -> int:
+        """Return a word; what is read afterwards is at least as new, also on weakly ordered CPUs (aarch64)."""
+        value = self.plain[at >> 3]
+        self.fence()
+        return value
+
+    def release(self, at: int, value: int) -> None:
+        """Write a word; who acquires the value sees all that was written before, and all reads before are done."""
+        self.fence()
+        self.plain[at >> 3] = value
+
     def fence(self) -> None:
-        """Order the stores before against those after, also on weakly ordered CPUs (aarch64), by locking twice."""
+        """Order the reads and writes before against those after, also on weakly ordered CPUs, by locking twice."""
         lock = self._lock
         lock.acquire()
         lock.release()

@@ -196,7 +196,7 @@ class Observer:
     @property
     def head(self) -> int:
         """Number of the last record published; 0 before the first."""
-        return self._words[RECORDS_HEAD_AT]
+        return self._words.acquire(RECORDS_HEAD_AT)
 
     def latest(self) -> npt.NDArray[np.void] | None:
         """Return the last record, shape (1,), or None before the first."""
@@ -220,6 +220,7 @@ class Observer:
         numbers = np.arange(first, head + 1, dtype=np.uint64)
         copied = self._ring[(numbers % np.uint64(self.records)).astype(np.intp)]
         # Records that the writer has reached meanwhile may be torn although both numbers agree: they are dropped.
+        self._words.fence()
         overtaken = self.head - self.records + 1
         whole = (copied["number"] == numbers) & (copied[NUMBER_AGAIN] == numbers) & (numbers > max(overtaken, 0))
         kept = copied[whole]
@@ -234,18 +235,20 @@ class Observer:
 
     def events_since(self, number: int) -> list[EventRecord]:
         """Return the events after `number`, oldest first."""
-        head = self._words[EVENTS_HEAD_AT]
+        words = self._words
+        head = words.acquire(EVENTS_HEAD_AT)
         events = []
         for wanted in range(max(number + 1, head - EVENTS + 1, 1), head + 1):
             at = EVENTS_AT + (wanted % EVENTS) * EVENT_SIZE
-            published, when, monotonic, kind = EVENT.unpack_from(self._map, at)
-            if published != wanted:
+            if words.acquire(at) != wanted:
                 continue
+            _, when, monotonic, kind = EVENT.unpack_from(self._map, at)
             # An event may be overwritten while it is read, or be of a kind that this process lacks.
             with contextlib.suppress(MalformedMessage):
-                events.append(
-                    EventRecord(published, when, monotonic, EVENT_KINDS.unpack_from(kind, self._map, at + EVENT.size))
-                )
+                event = EVENT_KINDS.unpack_from(kind, self._map, at + EVENT.size)
+                words.fence()
+                if words[at] == wanted:
+                    events.append(EventRecord(wanted, when, monotonic, event))
         return events
 
     def slaves(self, count: int) -> list[tuple[int, int]]:
@@ -304,12 +307,12 @@ class Observer:
                 raise LeaseRefused(holder)
             words, now = self._words, time.monotonic_ns()
             words[LEASE_ID_AT] = 0
+            words.fence()
             encoded = name.encode()[:LEASE_HOLDER_SIZE].ljust(LEASE_HOLDER_SIZE, b"\0")
             self._map[LEASE_HOLDER_AT : LEASE_HOLDER_AT + LEASE_HOLDER_SIZE] = encoded
             words[LEASE_DURATION_AT] = int(duration_s * 1e9)
             words[LEASE_RENEWED_AT] = now
-            words.fence()
-            words[LEASE_ID_AT] = now
+            words.release(LEASE_ID_AT, now)
             return now
 
     def renew(self, lease: int) -> bool:
@@ -345,13 +348,12 @@ class Observer:
             BlackboardError: the ring is full: the loop takes no commands any more.
         """
         number = self._words[COMMAND_HEAD_AT] + 1
-        if number - self._words[COMMAND_TAKEN_AT] > COMMANDS:
+        if number - self._words.acquire(COMMAND_TAKEN_AT) > COMMANDS:
             raise BlackboardError("the loop takes no commands: its process hangs or is gone")
         at = COMMANDS_AT + (number % COMMANDS) * COMMAND_SIZE
         COMMAND.pack_into(self._map, at, number, lease, command.number)
         command.pack_into(self._map, at + COMMAND.size)
-        self._words.fence()
-        self._words[COMMAND_HEAD_AT] = number
+        self._words.release(COMMAND_HEAD_AT, number)
         return number
 
     def setpoint(self, stream: int, bits: int, stamp_s: float, numbers: Sequence[float]) -> bool:
@@ -371,12 +373,11 @@ class Observer:
         if words[STREAM_AT] != stream:
             return False
         number = words[SETPOINT_HEAD_AT] + 1
-        if number - words[SETPOINT_TAKEN_AT] > SETPOINTS:
+        if number - words.acquire(SETPOINT_TAKEN_AT) > SETPOINTS:
             raise BlackboardError(f"{SETPOINTS} setpoints wait: they come faster than the loop takes them, or it hangs")
         at = SETPOINTS_AT + (number % SETPOINTS) * SETPOINT.size
         SETPOINT.pack_into(self._map, at, number, stream, bits, stamp_s, *numbers)
-        words.fence()
-        words[SETPOINT_HEAD_AT] = number
+        words.release(SETPOINT_HEAD_AT, number)
         return True
 
     @property
@@ -403,7 +404,7 @@ class Observer:
 
     def answer(self, number: int) -> Answer | None:
         """Return the loop's answer to the command `number`, or None while there is none."""
-        if self._words[ANSWER_NUMBER_AT] != number:
+        if self._words.acquire(ANSWER_NUMBER_AT) != number:
             return None
         (kind,) = ANSWER.unpack_from(self._map, ANSWER_AT)
         return Answer(REFUSALS.unpack_from(kind, self._map, ANSWER_AT + ANSWER.size) if kind else None)
@@ -417,14 +418,13 @@ class Observer:
             raise BlackboardError(f"the request is {len(text)} bytes long, at most {SERVICE_TEXT_SIZE} fit")
         self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(text)] = text
         self._words[SERVICE_LENGTH_AT] = len(text)
-        self._words.fence()
-        self._words[SERVICE_STATE_AT] = 1
+        self._words.release(SERVICE_STATE_AT, 1)
 
     def service_answer(self) -> dict[str, Any] | None:
         """Return the service thread's answer, or None while there is none."""
-        if self._words[SERVICE_STATE_AT] != 2:
+        if self._words.acquire(SERVICE_STATE_AT) != 2:
             return None
         length = self._words[SERVICE_LENGTH_AT]
         answer: dict[str, Any] = json.loads(bytes(self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length]))
-        self._words[SERVICE_STATE_AT] = 0
+        self._words.release(SERVICE_STATE_AT, 0)
         return answer

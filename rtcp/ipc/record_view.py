@@ -9,7 +9,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rtcp.ipc.layout import HEADER, MAGIC, RECORDS_AT, RECORDS_HEAD_AT, SCHEMA_AT, SCHEMA_SIZE, file_size, records_for
+from rtcp.ipc.layout import (
+    HEADER,
+    MAGIC,
+    RECORDS_AT,
+    RECORDS_HEAD_AT,
+    SCHEMA_AT,
+    SCHEMA_SIZE,
+    AtomicWords,
+    file_size,
+    records_for,
+)
 from rtcp.ipc.schema import RecordSchema, SchemaError
 
 
@@ -53,7 +63,7 @@ class RecordView:
         self.count = sum(count for _, count, _ in self._fields)
         """How many numbers `read` writes."""
         self._size, self._mask = size, records - 1
-        self._words = memoryview(self._map).cast("Q")
+        self._words = AtomicWords(self._map)
         # Every page is touched now, none in the cycle.
         for page in range(0, status.st_size, mmap.PAGESIZE):
             self._map[page]
@@ -62,16 +72,16 @@ class RecordView:
         """Write the numbers of the fields into `values`, one after the other; return whether the record is whole."""
         del values[self.count :]
         words = self._words
-        number = words[RECORDS_HEAD_AT >> 3]
+        number = words.acquire(RECORDS_HEAD_AT)
         at = RECORDS_AT + (number & self._mask) * self._size
-        if not number or words[at >> 3] != number:
+        if not number or words.acquire(at) != number:
             return False
         to = 0
         for offset, count, unpack in self._fields:
             values[to : to + count] = unpack(self._map, at + offset)
             to += count
-        whole: bool = words[at >> 3] == number
-        return whole
+        words.fence()
+        return words[at] == number
 
 
 def replace_view(views: list[RecordView | None], index: int, view: RecordView | None) -> None:

@@ -69,7 +69,7 @@ class NotPermitted(Refusal):
 
 
 class NotAtStandstill(Refusal):
-    """{joint} turns at {velocity:.6g} rad/s: drives are enabled at standstill only"""
+    """{joint} turns at {velocity:.6g} rad/s: wait until the joint stands still"""
 
     axis: int
     velocity: float
@@ -417,6 +417,14 @@ class BrakesOutOfRange(Refusal):
     most_s: float
 
 
+class BrakeStepOutOfRange(Refusal):
+    """the table of the brakes has an entry every {step_s:.3g} s of the path, allowed is {least_s:g} to {most_s:g} s"""
+
+    step_s: float
+    least_s: float
+    most_s: float
+
+
 class PartnerMissing(Refusal):
     """{partner_name} does not run, or publishes no records: a motion in step needs all its arms"""
 
@@ -433,6 +441,13 @@ class PartnerOfAnotherCell(Refusal):
 class PartnerStopPressed(Refusal):
     """{partner_name}, whose emergency stop the cell shares, is in its emergency stop, or has its button pressed:
     release it and reset that arm first"""
+
+    partner: int
+
+
+class PartnerStopUnread(Refusal):
+    """{partner_name} publishes no records, so that its emergency stop, which the cell shares, is not read and counts as
+    pressed: start {partner_name} first (`rtcp cell start`)"""
 
     partner: int
 
@@ -479,6 +494,19 @@ class LimitsExcludeArm(Refusal):
     """the arm would cross the new bounds of {box_name}: nothing was changed"""
 
     box: int
+
+
+class LimitsTooNearPartner(Refusal):
+    """under the new acceleration limits the arm would not stop in time: it would come to {distance:.3g} m from
+    {partner_name}; nothing was changed, repeat the change when the arm is slower or stands"""
+
+    partner: int
+    distance: float
+
+
+class LimitsInStep(Refusal):
+    """the arm is in a motion in step, whose arms brake together under the limits that it was planned with: nothing was
+    changed, repeat the change when the motion has ended"""
 
 
 class ImpossibleLimit(Refusal):

@@ -254,7 +254,7 @@ FLAG_ALL_OP = 2
 FLAG_ENABLED = 4
 FLAG_SWITCHING = 8
 FLAG_EMERGENCY_STOP = 16
-"""The emergency stop's input is pressed."""
+"""The emergency stop is pressed, or was not read for 0.5 s."""
 FLAG_MOTION_ALLOWED = 32
 """The enabling switch is pressed, or there is none."""
 FLAG_ARM_HAS_JOYSTICK = 64

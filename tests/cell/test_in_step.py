@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
 from rtcp.config.model import MOST_AXES
-from rtcp.ipc.commands import Disable, Enable, MoveGripper, MoveJoints, OpenStream, Reset, RunInStep
+from rtcp.control.operator import UNREAD_S
+from rtcp.ipc.commands import Disable, Enable, MoveGripper, MoveJoints, OpenStream, Reset, RunInStep, SetLimits
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import State
+from rtcp.motion.guards.neighbours import certain
+from rtcp.motion.limits import rows
 from rtcp.testing.simulation import Simulation
 from tests.cell.random_steps import Pair, run_mishaps, run_motions, run_near
 
@@ -120,8 +124,10 @@ def test_the_guard_knows_the_acceleration_limits_in_force_at_a_partner() -> None
         ({"rows": 0}, "wrong_row_count"),
         ({"rows": 1 << 60}, "wrong_row_count"),
         ({"slot": 9}, "wrong_row_count"),
-        ({"brake_step_s": float("nan")}, "wrong_row_count"),
-        ({"brake_step_s": -1.0}, "wrong_row_count"),
+        ({"brake_step_s": float("nan")}, "brake_step_out_of_range"),
+        ({"brake_step_s": -1.0}, "brake_step_out_of_range"),
+        ({"brake_step_s": 5e-324}, "brake_step_out_of_range"),
+        ({"brake_step_s": 1e308}, "brake_step_out_of_range"),
     ],
 )
 def test_a_command_that_cannot_be_is_refused(change: dict[str, float], reason: str) -> None:
@@ -299,4 +305,66 @@ def test_a_stream_whose_partner_gets_no_setpoint_ends_where_it_began() -> None:
     assert pair.last_end("left") == "PartnerNotReady"
     assert pair.commanded("left") == begin
     assert pair.simulation.until(lambda: pair.simulation.all_in(State.HOLDING), 1.0)
+    pair.close()
+
+
+@pytest.mark.parametrize(
+    ("mishap", "event"), [("loop hangs", "PartnerStopUnread"), ("frames lost", "PartnerEmergencyStop")]
+)
+def test_a_shared_emergency_stop_that_nobody_reads_counts_as_pressed(mishap: str, event: str) -> None:
+    pair = Pair(16)
+    right = pair.arm("right")
+    goal = [q + 0.3 for q in pair.commanded("right")]
+    assert pair.simulation.send("right", MoveJoints(tuple(goal), 0.1, True)).refusal is None
+    pair.mishaps[mishap]("left")
+    if mishap == "frames lost":
+        pair.arm("left").data.lose(3000)
+    assert pair.simulation.until(lambda: right.state is State.EMERGENCY_STOP, UNREAD_S + 0.02)
+    assert event in pair.events("right")
+    pair.simulation.run(1.0)
+    assert pair.simulation.send("right", Reset()).refusal is None
+    assert pair.simulation.until(lambda: right.state is State.READY, 5.0)
+    for command in (Enable(), MoveGripper(open=True)):
+        refusal = pair.simulation.send("right", command).refusal
+        assert refusal is not None
+        assert refusal.name == ("partner_stop_unread" if mishap == "loop hangs" else "partner_stop_pressed")
+    pair.close()
+
+
+def slower_limits(arm: Simulation, share: float) -> SetLimits:
+    """Write the limits in force with a share of the accelerations to the plan area; return the command for them."""
+    widest = arm.loop.arm.limits.widest
+    plan = rows(replace(widest, acceleration=tuple(share * rate for rate in widest.acceleration)))
+    return SetLimits(arm.observer.write_plan(plan), len(plan))
+
+
+def test_limits_under_which_the_stop_would_end_too_near_the_partner_are_refused_under_way() -> None:
+    pair = Pair(17)
+    left, guard = pair.arm("left"), pair.arm("left").loop.arm.trajectory_guard
+    goal = [q + 0.3 for q in pair.commanded("left")]
+    assert pair.simulation.send("left", MoveJoints(tuple(goal), 0.4, True)).refusal is None
+    assert pair.simulation.until(lambda: pair.speed("left") > 0.2, 2.0)
+    own, (other,) = guard.neighbours._own, guard.neighbours._partners
+    assert other is not None
+    state, partner = left.loop.arm.state, pair.simulation.partners["left"].group.members[0]
+    args = state.commanded, state.commanded_velocity, other, partner.position, partner.velocity
+    # With this clearance the arm can stop in time under the limits in force, and not much later.
+    guard.neighbours._clearance = certain(own, *args, (0.005, 0.1))[0]
+    before = list(left.loop.arm.limits.acceleration)
+    refusal = pair.simulation.send("left", slower_limits(left, 0.2)).refusal
+    assert refusal is not None
+    assert refusal.name == "limits_too_near_partner"
+    assert left.loop.arm.limits.acceleration == before
+    assert pair.simulation.until(lambda: left.state in (State.HOLDING, State.STOPPED_BY_LIMIT), 5.0)
+    assert pair.simulation.send("left", slower_limits(left, 0.2)).refusal is None
+    pair.close()
+
+
+def test_limits_do_not_change_in_a_motion_in_step() -> None:
+    pair = Pair(18)
+    motion = pair.begin()
+    pair.follow(motion, lambda: pair.speed("left") > 0.01)
+    refusal = pair.simulation.send("left", slower_limits(pair.arm("left"), 0.9)).refusal
+    assert refusal is not None
+    assert refusal.name == "limits_in_step"
     pair.close()

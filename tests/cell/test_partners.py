@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,26 @@ def test_a_record_of_a_second_ago_says_nothing_of_the_button_or_the_cell(
     assert (partners.pressed, partners.stopped) == ((0, 0) if known else (-1, -1))
     partners = beside.reads(now=NOW + age_ns, step_cell=OF_ANOTHER_CELL)
     assert partners.group.foreign == (0 if known else -1)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_silent_partner_counts_as_pressed_and_permits_no_motion(path: Path, shared: bool) -> None:
+    beside = Beside(path, cell_of(share=Share(emergency_stop=shared)))
+    for age_ns, silent in ((500_000_000, False), (500_000_001, True), (1 << 62, True)):
+        partners = beside.reads(now=NOW + age_ns, flags=FLAG_MOTION_ALLOWED)
+        assert (partners.unread, beside.record.motion_allowed) == (0 if silent and shared else -1, not silent)
+    beside.close()
+
+
+def test_a_partner_that_has_not_run_yet_counts_as_pressed_if_it_has_a_button() -> None:
+    for button, unread in ((True, 0), (False, -1)):
+        cell = cell_of()
+        inputs = cell.arms[1].config.inputs
+        config = replace(cell.arms[1].config, inputs=inputs if button else replace(inputs, emergency_stop=None))
+        cell = replace(cell, arms=(cell.arms[0], replace(cell.arms[1], config=config)))
+        partners = Partners(cell, "left")
+        partners.read(NOW)
+        assert partners.unread == unread
 
 
 def test_a_record_of_the_far_future_is_not_taken(beside: Beside) -> None:

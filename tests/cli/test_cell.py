@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rtcp.cli.cell import _to_start
+from rtcp.cli.output import CommandError
+from rtcp.config.cell_file import load_cell
 from rtcp.config.find import default_config
 from rtcp.config.zero import state_directory
-from rtcp.ipc.runtime_directory import runtime_directory
+from rtcp.ipc.runtime_directory import control_socket, runtime_directory
+from rtcp.ipc.session import Processes, identify
 
 CELL = str(default_config().with_name("cell.yaml"))
 Rtcp = Callable[..., Any]
@@ -56,6 +62,21 @@ def test_what_cannot_be_is_said_in_a_sentence(rtcp: Rtcp, arguments: tuple[str, 
     ended = rtcp(*arguments)
     assert ended.code == 2
     assert sentence in ended.err
+
+
+def test_an_arm_whose_loop_was_killed_is_started_again_although_its_gateway_still_listens(nowhere: Path) -> None:
+    cell = load_cell(Path(CELL))
+    loop = subprocess.Popen(["sleep", "60"])
+    for name, pid in (("left", identify(loop.pid)), ("right", identify(os.getpid()))):
+        directory = nowhere / name
+        directory.mkdir()
+        control_socket(directory).touch()
+        Processes(loop=pid).write(directory)
+    with pytest.raises(CommandError, match="runs already"):
+        _to_start(cell)
+    loop.kill()
+    loop.wait()
+    assert _to_start(cell) == ["left"]
 
 
 @pytest.mark.parametrize("verb", ["status", "enable", "halt", "stop", "reset", "disable"])

@@ -169,6 +169,8 @@ class LoopRig(Simulation):
         self.discipline = self.loop._discipline = self.context._discipline = Followed(self.period_ns, 0)
         self.discipline.locked = True
         self.log: list[CycleFrame] = []
+        if config.inputs.enabling_switch is not None:
+            self.put(SWITCH_INPUT, True)
         self.acquire()
 
     def _send_altered(self) -> None:

@@ -61,6 +61,8 @@ class Hand(Simulation):
         self.object_at: float | None = None
         """Position of a hard object between the fingers, rad; None: there is none."""
         self.on_frame = self._see
+        if config.inputs.enabling_switch is not None:
+            self.inputs(put=ENABLING_SWITCH)
         self.hold()
         self.setpoints.clear()
 
@@ -226,6 +228,8 @@ def stopped_on_its_way(hand: Hand) -> None:
 
 
 def hold_switch(hand: Hand) -> None:
+    hand.inputs(clear=ENABLING_SWITCH)
+    hand.run(0.05)
     assert hand.send(MoveGripper(False)).refusal == NotPermitted()
     hand.inputs(put=ENABLING_SWITCH)
     hand.run(0.05)

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from rtcp.control.operator import UNREAD_S
 from rtcp.ipc import events
 from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
 from rtcp.ipc.refusals import WrongState
@@ -22,6 +23,7 @@ from .rig import (
     PERIOD_S,
     QUICK_STOP,
     SPEED,
+    SWITCH_INPUT,
     LoopRig,
     Step,
     move_to,
@@ -282,9 +284,40 @@ def test_a_drive_that_reads_a_place_outside_its_range_after_homing_is_a_fault(ri
 
 def test_without_the_enabling_switch_no_motion_begins(new_rig: Callable[..., LoopRig]) -> None:
     rig = new_rig(with_switch()).hold()
+    rig.put(SWITCH_INPUT, False)
+    rig.run(0.02)
     answer = rig.send(move_to(0.1, 0.1))
     assert rig.refused(answer) == "the enabling switch is not pressed (inputs.enabling_switch in assistive_arm.yaml)"
     assert rig.state is State.HOLDING
+
+
+@pytest.mark.parametrize("cause", ["enabling_switch", "lease_ended"])
+def test_without_permission_no_joint_returns_to_its_range_after_its_homing(
+    new_rig: Callable[..., LoopRig], cause: str
+) -> None:
+    rig = new_rig(with_switch()).hold()
+    edge = rig.arm.limits.high[0]
+    rig.models[0].objects[0x6098, 0].value = 37
+    rig.models[0].objects[0x607C, 0].value = round((edge + 0.018) * COUNTS)
+    rig.do(Home(0))
+    rig.wait(lambda: rig.context.homing.ended)
+    rig.run(0.1)
+    CAUSES[cause][0](rig)
+    rig.bring_to(State.DISABLING, 0.02)
+    rig.bring_to(State.READY)
+    assert edge + 0.01 < rig.arm.drives[0].position < edge + 0.018
+
+
+def test_an_enabling_switch_that_nobody_reads_counts_as_released(new_rig: Callable[..., LoopRig]) -> None:
+    rig = new_rig(with_switch()).hold()
+    rig.away.add(0)
+    rig.run(UNREAD_S - 0.05)
+    assert rig.operator.permitted
+    rig.run(0.1)
+    assert not rig.operator.permitted
+    rig.away.clear()
+    rig.run(0.02)
+    assert rig.operator.permitted
 
 
 # -- lamps and the gripper ------------------------------------------------------------------------------------------

@@ -8,12 +8,13 @@ from itertools import pairwise
 
 import pytest
 
-from rtcp.ipc.commands import Disable, Enable, Reset
+from rtcp.ipc.commands import Disable, Enable, MoveGripper, Reset
 from rtcp.ipc.events import DriveLeftEnabled, Enabled, OverSpeed, PositionJumped, ReturningToRange
-from rtcp.ipc.refusals import WrongState
+from rtcp.ipc.refusals import NotPermitted, WrongState
 from rtcp.ipc.states import State
 
 from .rig import (
+    CAUSES,
     CONFIG,
     CONTROLWORD,
     COUNTS,
@@ -22,11 +23,13 @@ from .rig import (
     LONGEST_STEP,
     PERIOD_S,
     QUICK_STOP,
+    SWITCH_INPUT,
     SWITCH_ON,
     UNDER_VOLTAGE,
     LoopRig,
     about,
     move_to,
+    with_switch,
 )
 
 _INPUTS = struct.Struct("<Hiiib")
@@ -204,6 +207,31 @@ def test_a_joint_that_is_brought_back_stands_when_it_is_disabled_and_begins_anew
     assert abs(frames[0].target - frames[0].position) <= 1
     assert rig.log[-1].drives[1].target == 20000
     assert rig.kinds.count(ReturningToRange) == 2
+
+
+@pytest.mark.parametrize("cause", ["enabling_switch", "lease_ended"])
+def test_without_permission_no_joint_is_brought_back(new_rig: Callable[..., LoopRig], cause: str) -> None:
+    rig = enable_beyond(new_rig(with_switch()))
+    rig.run(0.1)
+    CAUSES[cause][0](rig)
+    rig.bring_to(State.DISABLING, 0.02)
+    before = len(rig.log)
+    rig.bring_to(State.READY)
+    assert not [cycle for cycle in rig.log[before + 1 :] if cycle.drives[1].obeys_target]
+    assert rig.arm.drives[1].position > 2.01
+    CAUSES[cause][1](rig)
+    rig.run(0.5)
+    assert rig.state is State.READY
+    rig.enable()
+
+
+def test_without_the_enabling_switch_nothing_is_enabled(new_rig: Callable[..., LoopRig]) -> None:
+    rig = new_rig(with_switch()).start()
+    rig.put(SWITCH_INPUT, False)
+    rig.run(0.02)
+    assert rig.send(Enable()).refusal == NotPermitted()
+    assert rig.send(MoveGripper(open=True)).refusal == NotPermitted()
+    assert rig.state is State.READY
 
 
 def test_a_drive_that_leaves_while_its_joint_is_brought_back_is_a_fault(rig: LoopRig) -> None:

@@ -52,6 +52,18 @@ def test_narrower_limits_are_taken_and_reported(rig: LoopRig, state: State) -> N
     assert rig.state is state
 
 
+def test_no_limit_changes_while_drives_brake_by_themselves(rig: LoopRig) -> None:
+    rig.set_in_motion()
+    rig.service.lost_slave = 3
+    rig.cycle()
+    assert rig.state is State.FAULT
+    refusal = send_limits(rig, of_first("acceleration", 1.0)).refusal
+    assert isinstance(refusal, refusals.NotAtStandstill)
+    assert in_force(rig) == WIDEST
+    rig.run(1.0)
+    assert send_limits(rig, of_first("acceleration", 1.0)).refusal is None
+
+
 def test_the_next_move_keeps_to_the_new_limits(rig: LoopRig) -> None:
     rig.hold()
     send_limits(rig, replace(of_first("high", 0.5), velocity=(0.1, 0.1)))

@@ -35,7 +35,7 @@ from tests.cell.running import (
     shipped_cell,
     starts,
 )
-from tests.e2e.conftest import Platform
+from tests.e2e.conftest import Platform, lives
 from tests.leftovers import Leftovers
 from tests.waiting import until
 
@@ -139,6 +139,17 @@ def test_a_motion_that_one_arm_cannot_carry_out_moves_no_arm(irbs: RunningCell, 
         cell.move_joints(near(cell), 0.3)
     assert refused.value.message.startswith("right: ")
     assert [np.abs(rows["commanded_velocity"]).max() for rows in records.read().values()] == [0.0, 0.0]
+
+
+def test_an_arm_whose_loop_was_killed_is_brought_back_by_the_start_of_the_cell(irbs: RunningCell, cell: Cell) -> None:
+    loops = {name: read_processes(irbs.of(name)).loop for name in cell.arms}
+    os.kill(loops["right"], signal.SIGKILL)
+    until(lambda: not lives(loops["right"]), "the end of the loop")
+    irbs.platform.rtcp("cell", "start", "--detach", "--config", str(irbs.file))
+    assert read_processes(irbs.of("left")).loop == loops["left"]
+    assert read_processes(irbs.of("right")).loop != loops["right"]
+    with Robot(path=control_socket(irbs.of("right"))) as right:
+        until(lambda: right.state is State.READY, "the right arm is ready")
 
 
 def test_a_loop_that_hangs_stops_the_other(irbs: RunningCell, cell: Cell) -> None:

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from rtcp.ipc.blackboard import Blackboard, BlackboardTooLarge
-from rtcp.ipc.commands import Enable, MoveJoints, SetDriveMode
+from rtcp.ipc.commands import COMMANDS, Enable, MoveJoints, SetDriveMode
+from rtcp.ipc.events import EVENTS as EVENT_KINDS
 from rtcp.ipc.events import ErrorReported, OverSpeed
 from rtcp.ipc.layout import COMMAND, COMMAND_SIZE, COMMANDS_AT, EVENTS, RECORDS, records_for
 from rtcp.ipc.observer import BlackboardError, EventRecord, LeaseRefused, Observer
@@ -168,6 +169,25 @@ def test_an_event_has_its_instant_on_both_clocks(board: Blackboard, observer: Ob
     assert (event.number, event.event) == (1, OverSpeed(3, 0.25, 1.5))
 
 
+def test_an_event_that_is_overwritten_while_it_is_read_is_left_out(
+    board: Blackboard, observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(2):
+        board.event(OverSpeed(0, number, 1.0))
+    read = EVENT_KINDS.unpack_from
+    overtakes = iter([True])
+
+    def overtaken(kind: int, memory: Any, at: int) -> Any:
+        if next(overtakes, False):
+            for number in range(EVENTS):
+                board.event(OverSpeed(0, 100.0 + number, 1.0))
+        return read(kind, memory, at)
+
+    monkeypatch.setattr(EVENT_KINDS, "unpack_from", overtaken)
+    assert values(observer.events_since(0)) == []
+    assert values(observer.events_since(EVENTS))[-1] == 100.0 + EVENTS - 1
+
+
 def test_a_long_text_is_cut_and_not_lost(board: Blackboard, observer: Observer) -> None:
     board.event(ErrorReported("ä" * 1000))
     assert observer.events_since(0)[0].event == ErrorReported("ä" * 248)
@@ -237,6 +257,21 @@ def test_commands_are_taken_in_order_and_answered(board: Blackboard, observer: O
     assert observer.answer(second) is None
     assert board.take_command()[2] == Enable()
     assert not board.command_waits()
+
+
+def test_the_place_of_a_command_is_free_only_when_the_command_was_read(
+    board: Blackboard, observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, taken = COMMANDS.unpack_from, []
+
+    def watched(kind: int, memory: Any, at: int) -> Any:
+        taken.append(observer.commands_taken)
+        return read(kind, memory, at)
+
+    monkeypatch.setattr(COMMANDS, "unpack_from", watched)
+    observer.command(1, Enable())
+    assert board.take_command() == (1, 1, Enable())
+    assert (taken, observer.commands_taken) == ([0], 1)
 
 
 def test_a_command_that_cannot_be_read_is_malformed(board: Blackboard, observer: Observer) -> None:

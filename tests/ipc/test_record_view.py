@@ -51,6 +51,23 @@ def test_a_record_that_is_being_written_is_none(board: Blackboard) -> None:
     assert view.read(read)
 
 
+def test_a_record_that_is_overwritten_while_it_is_read_is_none(board: Blackboard) -> None:
+    view, read = RecordView(board.path, ("state",)), [0]
+    board.publish(values(board, state=5))
+    ((offset, count, unpack),) = view._fields
+
+    def overtaken(memory: Any, at: int) -> Any:
+        for _ in range(view._mask + 1):
+            board.publish(values(board, state=6))
+        return unpack(memory, at)
+
+    view._fields = [(offset, count, overtaken)]
+    assert not view.read(read)
+    view._fields = [(offset, count, unpack)]
+    assert view.read(read)
+    assert read == [6]
+
+
 @pytest.mark.parametrize("damage", ["missing", "short", "magic", "field"])
 def test_what_is_no_blackboard_of_a_cell_is_refused(board: Blackboard, damage: str) -> None:
     path, name = board.path, "state"

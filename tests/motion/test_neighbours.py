@@ -11,7 +11,8 @@ import pytest
 from kinematics.capsules import distance
 from rtcp.config.cell import Base, Member
 from rtcp.ipc.events import MotionEnded, PartnerForeign, PartnerNear
-from rtcp.motion.guards.neighbours import Body, Neighbours, body_of, certain
+from rtcp.ipc.refusals import LimitsTooNearPartner
+from rtcp.motion.guards.neighbours import Body, Neighbours, body_of, certain, parting
 from rtcp.motion.step_group import Partner, StepGroup
 
 from .guard_checker import ARM
@@ -112,8 +113,8 @@ def decision(q: Sequence[float], v: Sequence[float], p: Sequence[float], w: Sequ
     """Return what a guard without a memory says: this arm brakes after a cycle, its partner after the delay."""
     own, other = body(0.3), body(-0.3)
     least, here, then = certain(own, q, v, other, p, w, (DT, DELAY))
-    parting = then > here and own.travel(v, DT) + other.travel(w, DELAY) < 0.02
-    return None if least > CLEARANCE or parting else PartnerNear(0, max(min(here, then), 0.0))
+    parts = parting(own, q, v, other, p, w, (DT, DELAY), CLEARANCE)
+    return None if least > CLEARANCE or parts else PartnerNear(0, max(min(here, then), 0.0))
 
 
 class Waving:
@@ -161,15 +162,53 @@ def test_a_distance_from_before_either_arm_came_near_is_not_used(
     two, (q, p) = Two(body(-0.3)), both
     for _ in range(2):
         assert two.ahead(far if own else q, first(1e-3), (p if own else far, STILL)) is None
-        assert isinstance(two.ahead(q, [0.1] * 6, (p, STILL)), PartnerNear)
+        nearer = 0.1 if q is NEAR else -0.1
+        assert isinstance(two.ahead(q, [nearer] * 6, (p, STILL)), PartnerNear)
 
 
-@pytest.mark.parametrize(("speed", "may"), [(0.0, True), (-0.05, True), (0.01, False), (-0.4, False), (0.4, False)])
-def test_arms_that_are_too_near_may_rest_and_part_slowly_and_nothing_else(speed: float, may: bool) -> None:
+@pytest.mark.parametrize(("speed", "may"), [(0.0, True), (-0.05, True), (0.01, False), (-0.5, True), (0.4, False)])
+def test_arms_that_are_too_near_may_rest_and_part_and_nothing_else(speed: float, may: bool) -> None:
     two = Two(body(-0.3))
     two.ahead(NEAR, first(-1.0), UPRIGHT)  # where that stop would have ended does not count
     answer = two.ahead(NEAR, first(speed), UPRIGHT)
     assert answer is None if may else isinstance(answer, PartnerNear)
+
+
+def test_one_body_that_comes_nearer_forbids_the_parting_of_all_others() -> None:
+    own, other = body(0.3), body(-0.3)
+    pairs = [((i, j),) for i in range(len(own.placed.radii)) for j in range(len(other.placed.radii))]
+    chance, allowed, refused = Random(5), 0, 0
+    for _ in range(150):
+        q, v = [a + 0.3 * b for a, b in zip(NEAR, drawn(chance, 1.0), strict=True)], drawn(chance, 0.3)
+        own.place(q)
+        other.place(STILL)
+        before = [distance(own.placed, other.placed, pair)[0] for pair in pairs]
+        parts = parting(own, q, v, other, STILL, STILL, (DT, DELAY), CLEARANCE)
+        nearer = 0.0
+        for n in range(1, 41):
+            own.stop(q, v, DT, 0.01 * n)
+            after = [distance(own.placed, other.placed, pair)[0] for pair in pairs]
+            nearer = max(nearer, *(min(b, CLEARANCE) - a for a, b in zip(after, before, strict=True)))
+        if parts:
+            allowed += 1
+            assert nearer < 1e-4
+        elif nearer > 0.0:
+            refused += 1
+    assert allowed > 10
+    assert refused > 10
+
+
+@pytest.mark.parametrize(("share", "may"), [(1.0, True), (0.8, True), (0.2, False)])
+def test_limits_under_which_the_arm_would_not_stop_before_its_partner_are_refused(share: float, may: bool) -> None:
+    two, velocity = Two(body(-0.3)), first(0.3)
+    q = [NEAR[0] - 0.15, *NEAR[1:]]
+    assert two.ahead(q, velocity, UPRIGHT) is None
+    slower = [share * rate for rate in ACCELERATION]
+    refusal = two.guard.refusal_of(q, velocity, slower)
+    assert refusal is None if may else isinstance(refusal, LimitsTooNearPartner)
+    assert two.guard.refusal_of(q, STILL, slower) is None
+    # The limits in force have not changed.
+    assert two.ahead(q, velocity, UPRIGHT) is None
 
 
 def test_every_partner_counts_whose_geometry_and_record_are_known_and_the_near_one_is_named() -> None:

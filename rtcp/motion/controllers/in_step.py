@@ -16,6 +16,7 @@ from rtcp.ipc.events import MotionEnded, OutOfStep, PartnerLeft, PartnerNotReady
 from rtcp.ipc.layout import PLAN_ROWS
 from rtcp.ipc.refusals import (
     BrakesOutOfRange,
+    BrakeStepOutOfRange,
     DamagedRow,
     Refusal,
     SpeedOverridden,
@@ -26,7 +27,7 @@ from rtcp.ipc.refusals import (
 from rtcp.ipc.states import State
 from rtcp.motion.controllers.controller import ControllerSetup
 from rtcp.motion.controllers.trajectory import TrajectoryController
-from rtcp.motion.planning.plan import COLUMNS
+from rtcp.motion.planning.plan import COLUMNS, LONGEST_S
 from rtcp.motion.state import ArmState, Phase, Setpoint
 from rtcp.motion.step_group import StepPhase
 
@@ -34,6 +35,8 @@ LONGEST_WAIT_S: Final = 10.0
 """Upper bound on the time between the command and the common instant, s."""
 LONGEST_BRAKE_S: Final = 3.0
 """Upper bound on the braking time of a group, s: its operator must see that it stops."""
+SHORTEST_BRAKE_STEP_S: Final = 0.001
+"""Lower bound on the interval of the table of braking times, s: a table has at most some thousand entries."""
 _GAIN: Final = 10.0
 """Gain of the correction towards the clock, 1/s."""
 _CORRECTION: Final = 0.05
@@ -75,8 +78,10 @@ class InStepController(TrajectoryController):
         if not 0.0 < ahead_s <= LONGEST_WAIT_S:
             return StartOutOfReach(ahead_s, LONGEST_WAIT_S)
         rows = -(-command.brakes // COLUMNS)
-        if command.brakes < 1 or not isfinite(command.brake_step_s) or command.brake_step_s <= 0.0:
+        if command.brakes < 1:
             return WrongRowCount(command.brakes, PLAN_ROWS)
+        if not SHORTEST_BRAKE_STEP_S <= command.brake_step_s <= LONGEST_S:
+            return BrakeStepOutOfRange(command.brake_step_s, SHORTEST_BRAKE_STEP_S, LONGEST_S)
         if command.rows + rows > PLAN_ROWS:
             return WrongRowCount(command.rows + rows, PLAN_ROWS)
         plan = self.rows_of(command.slot, command.rows, PLAN_ROWS)

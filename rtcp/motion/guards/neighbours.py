@@ -8,7 +8,7 @@ computed again only when the travel since may have used it up.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot
+from math import hypot, inf
 from typing import Final
 
 from kinematics.capsules import Placed, capsules, distance, with_every_tool
@@ -17,10 +17,14 @@ from kinematics.model import JOINTS, ArmModel
 from kinematics.pose import Pose
 from rtcp.config.cell import Member
 from rtcp.ipc.events import MotionEnded, PartnerForeign, PartnerNear
+from rtcp.ipc.refusals import LimitsTooNearPartner, Refusal
 from rtcp.motion.step_group import StepGroup
 
 _SLOW_M: Final = 0.02
-"""Arms that are too near may move apart with stops up to this length, m."""
+"""Largest travel between two samples of the stops with which arms that are too near move apart, m."""
+_MOST_SAMPLES: Final = 24
+"""Upper bound on these samples, for lack of time in a cycle; arms that need more have to move apart more slowly."""
+_ROUNDING_M: Final = 1e-9
 
 
 def reach_of(model: ArmModel) -> list[float]:
@@ -60,12 +64,22 @@ class Body:
             distance += reach * speed * (delay_s + 0.5 * speed / self.acceleration[i])
         return distance
 
-    def stop(self, q: Sequence[float], velocity: Sequence[float], delay_s: float) -> None:
-        """Place the bodies where the arm comes to rest."""
-        for i in range(JOINTS):
+    def stop(self, q: Sequence[float], velocity: Sequence[float], delay_s: float, time_s: float = inf) -> float:
+        """Place the bodies where the arm is at `time_s`, or at rest; return the bound on a point's speed then, m/s."""
+        fastest = 0.0
+        for i, reach in enumerate(self.reach):
+            rate = self.acceleration[i]
             speed = velocity[i] if velocity[i] >= 0.0 else -velocity[i]
-            self.end[i] = q[i] + velocity[i] * (delay_s + 0.5 * speed / self.acceleration[i])
+            before_s = delay_s if time_s > delay_s else time_s
+            ramp_s = time_s - before_s
+            slower = speed - rate * ramp_s
+            if slower <= 0.0:
+                ramp_s, slower = speed / rate, 0.0
+            angle = speed * before_s + 0.5 * (speed + slower) * ramp_s
+            self.end[i] = q[i] + angle if velocity[i] >= 0.0 else q[i] - angle
+            fastest += reach * slower
         self.place(self.end)
+        return fastest
 
     def moved(self, before: Sequence[float], q: Sequence[float]) -> float:
         """Return the upper bound on a point's motion between two configurations, m."""
@@ -116,6 +130,55 @@ def certain(
     return max(here - whole, min(here, then) - 0.5 * whole), here, then
 
 
+def parting(
+    a: Body,
+    q: Sequence[float],
+    v: Sequence[float],
+    b: Body,
+    p: Sequence[float],
+    w: Sequence[float],
+    delays_s: tuple[float, float],
+    clearance: float,
+) -> bool:
+    """Return whether no two bodies that are too near, or could become so, come nearer until both arms stand.
+
+    Between two samples no point travels further than `_SLOW_M`. The arguments are those of `certain`; clearance:
+    required distance, m.
+    """
+    remaining = a.travel(v, delays_s[0]) + b.travel(w, delays_s[1])
+    fastest = a.stop(q, v, delays_s[0], 0.0)
+    others = b.stop(p, w, delays_s[1], 0.0)
+    moves = others > 0.0
+    near = []
+    for i in range(len(a.placed.radii)):
+        for j in range(len(b.placed.radii)):
+            pair = ((i, j),)
+            apart = distance(a.placed, b.placed, pair)[0]
+            if apart <= clearance + remaining:
+                near.append((pair, apart))
+    own, other, time_s = list(q), list(p), 0.0
+    for _ in range(_MOST_SAMPLES):
+        if fastest + others <= 0.0:
+            return True
+        time_s = time_s + _SLOW_M / (fastest + others) if remaining > _SLOW_M else inf
+        fastest = a.stop(q, v, delays_s[0], time_s)
+        others = b.stop(p, w, delays_s[1], time_s) if moves else 0.0
+        travelled = a.moved(own, a.end) + (b.moved(other, b.end) if moves else 0.0)
+        remaining -= travelled
+        own[:], other[:] = a.end, b.end
+        is_clear = True
+        for at, (pair, before) in enumerate(near):
+            apart = distance(a.placed, b.placed, pair)[0]
+            is_certain = apart - remaining - 0.5 * travelled > clearance
+            if apart < before - _ROUNDING_M and not is_certain:
+                return False
+            is_clear = is_clear and is_certain
+            near[at] = pair, apart
+        if is_clear:
+            return True
+    return False
+
+
 class Neighbours:
     """Guards the distance of an arm to its partners.
 
@@ -153,6 +216,20 @@ class Neighbours:
             return None
         if self._group.foreign >= 0:
             return PartnerForeign(self._group.foreign)
+        return self._near(q, velocity)
+
+    def refusal_of(
+        self, q: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]
+    ) -> Refusal | None:
+        """Return a refusal if the stop from `q`, rad, at these rates, rad/s^2, comes too near a partner; or None."""
+        own = self._own
+        in_force, own.acceleration = own.acceleration, acceleration
+        near = self._near(q, velocity)
+        own.acceleration = in_force
+        return None if near is None else LimitsTooNearPartner(near.partner, near.distance)
+
+    def _near(self, q: Sequence[float], velocity: Sequence[float]) -> PartnerNear | None:
+        """Return the partner that this arm could come too near to before both stand, or None."""
         own, dt = self._own, self._period_s
         own_travel = own.travel(velocity, dt)
         for index, body in enumerate(self._partners):
@@ -167,7 +244,8 @@ class Neighbours:
             least, here, then = certain(own, q, velocity, body, there, theirs, (dt, self._delay_s))
             self._room[index] = here
             self._here[index][:], self._there[index][:] = q, there
-            if least > self._clearance or (then > here and whole < _SLOW_M):
+            delays_s = (dt, self._delay_s)
+            if least > self._clearance or parting(own, q, velocity, body, there, theirs, delays_s, self._clearance):
                 continue
             return PartnerNear(index, max(min(here, then), 0.0))
         return None

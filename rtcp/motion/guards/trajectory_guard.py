@@ -152,15 +152,23 @@ class TrajectoryGuard:
         return CollisionAhead(*self.zones.links(zone), max(ahead, 0.0))
 
     def refusal_of(self, state: ArmState, new: Values) -> Refusal | None:
-        """Return a refusal of `new` limits if the arm is, or would come to rest, outside them; or None."""
+        """Return a refusal of `new` limits if the arm, or its stop under them, is outside them or too near a partner.
+
+        The refusal is None if the arm can still stop in time. Every change of the limits under way asks this method.
+        """
         refused = self._limits.check(new, state.commanded, self._mean)
         if refused is not None or self._model is None:
             return refused
         limits, mean = self._limits, self._mean
         same_boxes = new.box == limits.box and new.keep_out == limits.keep_out
         slower = any(rate < now for rate, now in zip(new.acceleration, limits.acceleration, strict=True))
+        longer_stop = slower and any(mean)
+        if longer_stop and self.neighbours is not None:
+            refused = self.neighbours.refusal_of(state.commanded, mean, new.acceleration)
+            if refused is not None:
+                return refused
         # Accepted even if the arm already violates a box: the new limits make that no worse.
-        if same_boxes and not (slower and any(mean)):
+        if same_boxes and not longer_stop:
             return None
         zones, poses = Zones(self._model, new, self._clearance), frames(self._model, state.commanded)
         distance, zone = zones.box_distance(poses)
