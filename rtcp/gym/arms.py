@@ -22,6 +22,7 @@ from rtcp.testing import Simulation
 from rtcp.testing.inputs import Inputs
 
 _STREAM = 1
+_AT_REST_RAD_S = 0.005
 
 
 class Arm(Protocol):
@@ -118,6 +119,8 @@ class SimulatedArm:
             simulation.hold()
             simulation.until(lambda: not simulation.loop.machine.changing_mode, 1.0)
             simulation.bring_to(State.HOLDING, 0.0)
+            # A torque motion begins at rest; under its weight the arm sags a little where the drives hold it by torque.
+            simulation.until(lambda: max(map(abs, simulation.loop.arm.state.actual_velocity)) < _AT_REST_RAD_S, 5.0)
         except RuntimeError as error:
             raise RtcpError("fault", f"the simulated arm cannot be brought to holding: {error}") from error
         if self._kind.command is None:

@@ -282,7 +282,7 @@ def standstill(axis: int, velocity: float) -> refusals.Refusal:
 )
 def test_nothing_is_enabled_while(rig: LoopRig, prevent: Step, refusal: refusals.Refusal) -> None:
     prevent(rig.start())
-    rig.run(0.003)
+    rig.run(0.01)
     assert rig.send(Enable()).refusal == refusal
     assert rig.state is State.READY
 
