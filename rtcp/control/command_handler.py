@@ -111,9 +111,9 @@ class CommandHandler:
         moves = self._stream.stream and self._arm.active is self._stream and self._machine.state is State.MOVING
         return self._stream.stream if moves else 0
 
-    def _refusal(self, command: commands.Command | refusals.Malformed, lease: int) -> refusals.Refusal | None:
+    def _refusal(self, command: commands.Command | refusals.Refusal, lease: int) -> refusals.Refusal | None:
         """Carry out a command, or return its refusal."""
-        if isinstance(command, refusals.Malformed):
+        if isinstance(command, refusals.Refusal):
             return command
         if command.needs_lease and not (lease and self._context.lease_held(lease)):
             return refusals.NoLease()
