@@ -156,8 +156,8 @@ class CommandHandler:
             return refusals.MotionPaused()
         if isinstance(command, _PLANNED) and command.tool != arm.tool.number:
             return refusals.PlannedForAnotherTool(command.tool, arm.tool.number)
-        continues = machine.state is State.MOVING and arm.active is controller
-        refusal = controller.accept(command, arm.state, continues)
+        continues = machine.state is State.MOVING and arm.active is controller and not arm.still
+        refusal = arm.accept_motion(controller, command, continues)
         if refusal is not None:
             return refusal
         if isinstance(command, _PLANNED):

@@ -64,6 +64,16 @@ class ResetDone(Event, number=13):
     """reset: the fault is cleared, drives are disabled"""
 
 
+class PluginSlow(Event, number=153):
+    """{plugin} took {took_us:.0f} us in one cycle, allowed are {allowed_us:.0f} us: later cycles come late"""
+
+    is_warning = True
+    plugin: str
+    """Slave, process or controller of another package."""
+    took_us: float
+    allowed_us: float
+
+
 class Arrived(Event, number=14):
     """the motion is complete"""
 
@@ -492,6 +502,13 @@ class ProcessFailed(FaultEvent, number=126):
 
     process: int
     """Its place in the configuration, from 0."""
+
+
+class ControllerRaised(FaultEvent, number=152):
+    """the controller {controller} raised an error or returned wrong setpoints, which the log names: {reaction}; then
+    `rtcp reset`"""
+
+    controller: str
 
 
 class GeneratorFailed(FaultEvent, number=7):

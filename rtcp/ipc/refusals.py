@@ -521,6 +521,12 @@ class DriverRaised(Refusal):
     """Position on the cable, from 1."""
 
 
+class ControllerRaised(Refusal):
+    """the controller {controller} raised an error, which the log names"""
+
+    controller: str
+
+
 class ProcessRaised(Refusal):
     """the process {process_name} raised an error, which the log names"""
 
