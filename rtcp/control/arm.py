@@ -53,6 +53,7 @@ class Arm(JointGroup):
         self.speed_override = SpeedOverride()
         self.tool = ToolInUse()
         self._publishes_load = False
+        self._settle_tolerance = config.settle.tolerance
         self.gravity = Gravity(config, self.tool)
         self.controllers: dict[type[Command], Controller] = load_controllers(
             ControllerSetup(
@@ -67,13 +68,13 @@ class Arm(JointGroup):
             )
         )
         """Command class -> controller that accepts it."""
-        self._holder = self.controllers[MoveJoints]
         self.raised: BaseException | None = None
         """Exception of a controller that the machine has not handled."""
         self.raised_by = ""
         """Name of the controller that raised it."""
         self._progress = (0, 0.0, 0.0)
         """What the active controller publishes: its `held`, `elapsed_s` and `duration_s`."""
+        self._holder = self.controllers[MoveJoints]
         jog = self.controllers.get(Jog)
         self.jog = jog if isinstance(jog, JogController) and jog.has_geometry else None
         """Controller of the joystick; None where the geometry is unknown."""
@@ -217,6 +218,14 @@ class Arm(JointGroup):
     def first_without(self, mode: DriveMode) -> int:
         """Return the first joint whose drive does not map what `mode` needs, or -1."""
         return next((axis for axis, drive in enumerate(self.drives) if not drive.supports(mode)), -1)
+
+    def first_unsettled(self) -> int:
+        """Return the first joint that is not within `settle.tolerance` of its setpoint, or -1."""
+        state, tolerance = self.state, self._settle_tolerance
+        for axis in range(len(self.drives)):
+            if not abs(state.actual[axis] - state.commanded[axis]) <= tolerance:
+                return axis
+        return -1
 
     @property
     def still(self) -> bool:

@@ -75,7 +75,7 @@ class PluginSlow(Event, number=153):
 
 
 class Arrived(Event, number=14):
-    """the motion is complete"""
+    """the motion is complete: a motion with a target has its measured joints there"""
 
 
 class Stopped(Event, number=15):
@@ -648,6 +648,18 @@ class StreamEnded(MotionEnded, number=101):
     """the stream of targets ended: controlled stop"""
 
     by_limit = False
+
+
+class NotSettled(MotionEnded, number=151):
+    """{joint} is {distance:.4g} rad from its target {time_s:g} s after the end of the setpoints, allowed is {limit:g}
+    rad (settle in {file}): the motion has failed and the arm holds; look for an obstacle, a load or friction"""
+
+    by_limit = False
+    is_warning = True
+    axis: int
+    distance: float
+    limit: float
+    time_s: float
 
 
 class OutOfPoints(MotionEnded, number=117):
