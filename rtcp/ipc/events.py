@@ -75,7 +75,7 @@ class PluginSlow(Event, number=153):
 
 
 class Arrived(Event, number=14):
-    """the motion is complete: a motion with a target has its measured joints there"""
+    """the motion is complete"""
 
 
 class Stopped(Event, number=15):
