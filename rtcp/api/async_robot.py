@@ -17,6 +17,7 @@ from rtcp.ipc.client import ANSWER_TIMEOUT_S, client_name, connection_error
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
 from rtcp.ipc.states import State
+from rtcp.ipc.stops import StopWriter
 
 T = TypeVar("T")
 _REPLY_LIMIT = 1 << 24
@@ -43,6 +44,7 @@ class AsyncRobot(Methods):
         self._pending: dict[int, _Pending] = {}
         self._writer: asyncio.StreamWriter | None = None
         self._receiving: asyncio.Task[None] | None = None
+        self._stops: StopWriter | None = None
 
     async def __aenter__(self) -> AsyncRobot:
         """Connect.
@@ -56,6 +58,7 @@ class AsyncRobot(Methods):
         except OSError as error:
             raise connection_error(self._path, error) from error
         self._writer.write(jsonrpc.line({"method": "identify", "params": self._identity}))
+        self._stops = StopWriter(self._path.parent)
         self._receiving = asyncio.create_task(self._receive(reader))
         return self
 
@@ -66,6 +69,8 @@ class AsyncRobot(Methods):
         """Close the connection; a second time is harmless."""
         if self._receiving is not None:
             self._receiving.cancel()
+        if self._stops is not None:
+            self._stops.close()
         if self._writer is not None:
             if not self._writer.is_closing():
                 identity = {**self._identity, "disable_when_lost": False}
@@ -115,7 +120,8 @@ class AsyncRobot(Methods):
             raise RtcpError("lost", f"the connection is closed: {call.method!r} was not sent")
         pending = self._pending[number] = _Pending(call)
         try:
-            writer.write(jsonrpc.request(number, call.method, call.params))
+            params = call.params if self._stops is None else self._stops.request_of(call.method, call.params)
+            writer.write(jsonrpc.request(number, call.method, params))
             return call.result(jsonrpc.result(await pending.reply(), call.method))
         except BaseException:
             if pending.is_open:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from rtcp.config.find import load_messages
 from rtcp.config.model import PluginError
+from rtcp.ipc.commands import Halt
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.events import ServiceEvent
 from rtcp.ipc.names import Names
@@ -75,6 +76,17 @@ class Feed:
         self._at, self._event = self._observer.head, self._observer.last_event
         self._gaps: list[LogLine] = []
         self._due_ns = 0
+
+    def halt(self) -> int:
+        """Request that every motion stops; return the instant of the request, ns.
+
+        The request goes through shared memory: it passes the gateway, and needs neither a lease nor a file descriptor.
+        """
+        return self._observer.stop(Halt)
+
+    def has_taken(self, requested_ns: int) -> bool:
+        """Return whether the loop has taken a halt."""
+        return self._observer.stop_answer(Halt, requested_ns) is not None
 
     def close(self) -> None:
         """Release the shared memory."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import traceback
+from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
@@ -142,6 +145,30 @@ def load_messages() -> None:
         for entry in installed(group):
             if not entry.value.startswith("rtcp."):
                 load_class(entry, object)
+
+
+def is_foreign(made: object) -> bool:
+    """Return whether an object is of a class of another package."""
+    return not type(made).__module__.startswith("rtcp.")
+
+
+@contextlib.contextmanager
+def made_by(entry: EntryPoint) -> Iterator[None]:
+    """Make an object of a plug-in's class: what it raises is a finding about the plug-in, with file and line.
+
+    Raises:
+        PluginError: it raised another exception than a ValueError on its configuration.
+    """
+    try:
+        yield
+    except (KeyboardInterrupt, ConfigError):
+        raise
+    except BaseException as error:  # whatever it raises, sys.exit() too
+        if isinstance(error, ValueError) and type(error) is not ValueError:
+            raise  # a finding of its own kind, as DeviceError and SchemaError
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{frame.filename}, line {frame.lineno}"
+        raise PluginError(entry, f"cannot be used: {type(error).__name__}: {error} ({where})") from error
 
 
 def load_class(entry: EntryPoint, base: type[T]) -> type[T]:

@@ -622,6 +622,17 @@ class SupervisionConfig:
 
 
 @dataclass(frozen=True)
+class SettleConfig:
+    """When a motion with a target is complete: the measured joints are where the joints are commanded."""
+
+    tolerance: Annotated[float, Gt(0), Le(1)] = 0.002
+    """Largest distance of each measured joint from its target at the end of a motion, rad."""
+    time_s: Annotated[float, Gt(0), Le(60)] = 3.0
+    """Longest time from the end of the setpoints until all joints are within the tolerance, s; else the motion fails
+    with the event `not_settled`."""
+
+
+@dataclass(frozen=True)
 class StopsConfig:
     """The stop reaction to each event. Stop categories are those of IEC 60204-1."""
 
@@ -978,6 +989,7 @@ class ArmSettings:
     jog: JogConfig = field(default_factory=JogConfig)
     guiding: GuidingConfig = field(default_factory=GuidingConfig)
     supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
+    settle: SettleConfig = field(default_factory=SettleConfig)
     stops: StopsConfig = field(default_factory=StopsConfig)
     inputs: InputsConfig = field(default_factory=InputsConfig)
     outputs: OutputsConfig = field(default_factory=OutputsConfig)

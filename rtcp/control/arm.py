@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import isfinite
 from typing import Any
 
 from kinematics.model import LinkMass
 from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
+from rtcp.control.part import checked_refusal
 from rtcp.devices.drive import Drive
 from rtcp.ipc.commands import Command, Jog, MoveJoints
-from rtcp.ipc.events import PushedNear
+from rtcp.ipc.events import MotionEnded, PushedNear
+from rtcp.ipc.refusals import ControllerRaised, Refusal
 from rtcp.ipc.schema import ARM_MODES, LOAD_FIELDS, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
@@ -25,10 +28,11 @@ from rtcp.motion.guards.compliance import (
 )
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.speed_override import SpeedOverride
-from rtcp.motion.state import Phase
+from rtcp.motion.state import Phase, Setpoint
 from rtcp.motion.step_group import StepGroup
 from rtcp.motion.tool_in_use import Gravity, ToolInUse
 
+_LARGEST_HELD = 0xFFFF_FFFF
 _NOTHING = LinkMass(0.0, (0.0, 0.0, 0.0))
 
 
@@ -62,6 +66,7 @@ class Arm(JointGroup):
         self.speed_override = SpeedOverride()
         self.tool = ToolInUse()
         self._publishes_load = False
+        self._settle_tolerance = config.settle.tolerance
         self.gravity = self.output_limiter.gravity = Gravity(config, self.tool)
         self.controllers: dict[type[Command], Controller] = load_controllers(
             ControllerSetup(
@@ -76,6 +81,12 @@ class Arm(JointGroup):
             )
         )
         """Command class -> controller that accepts it."""
+        self.raised: BaseException | None = None
+        """Exception of a controller that the machine has not handled."""
+        self.raised_by = ""
+        """Name of the controller that raised it."""
+        self._progress = (0, 0.0, 0.0)
+        """What the active controller publishes: its `held`, `elapsed_s` and `duration_s`."""
         self._holder = self.controllers[MoveJoints]
         jog = self.controllers.get(Jog)
         self.jog = jog if isinstance(jog, JogController) and jog.has_geometry else None
@@ -127,7 +138,10 @@ class Arm(JointGroup):
         self._compliance.use_tool(number)
         self._pushes.use_tool(number)
         for controller in self.controllers.values():
-            controller.use_tool(number)
+            try:
+                controller.use_tool(number)
+            except (Exception, SystemExit) as error:
+                self._note(controller, error)
         self._publishes_load = True
 
     def carry(self, payload: LinkMass) -> None:
@@ -137,13 +151,13 @@ class Arm(JointGroup):
 
     def publish(self, values: list[Any]) -> None:
         """Write modes, progress, and actual and commanded values of the joints."""
-        state, controller, at = self.state, self.active, self.at
+        state, (held, elapsed_s, duration_s), at = self.state, self._progress, self.at
         values[at : at + len(ARM_MODES)] = (
             self.mode,
             self.control_mode,
-            self.output_limiter.held | self.trajectory_guard.held | controller.held,
-            controller.elapsed_s,
-            controller.duration_s,
+            self.output_limiter.held | self.trajectory_guard.held | held,
+            elapsed_s,
+            duration_s,
             self.speed_override.fraction,
         )
         n, at = len(self.drives), at + len(ARM_MODES)
@@ -163,14 +177,33 @@ class Arm(JointGroup):
 
     def stop(self) -> None:
         """Let the active controller come to rest."""
-        if self.active.phase is Phase.MOVE:
-            self.active.stop(self.state)
+        controller = self.active
+        try:
+            if controller.phase is Phase.MOVE:
+                controller.stop(self.state)
+        except (Exception, SystemExit) as error:
+            self._note(controller, error)
+
+    def accept_motion(self, controller: Controller, command: Command, continues: bool) -> Refusal | None:
+        """Let a controller accept a command; its exception is a fault of the next cycle with torque."""
+        try:
+            return checked_refusal(controller.accept(command, self.state, continues))
+        except (Exception, SystemExit) as error:
+            self._note(controller, error)
+            return ControllerRaised(self.raised_by)
+
+    def _note(self, controller: Controller, error: BaseException) -> None:
+        self.raised, self.raised_by = error, str(controller.name)
 
     def rest(self) -> None:
         """Hold at the setpoints; only at standstill."""
         for controller in self.controllers.values():
-            controller.hold()
-        self.active = self._holder
+            try:
+                controller.hold()
+            except (Exception, SystemExit) as error:
+                self._note(controller, error)
+        holder = self.active = self._holder
+        self._progress = (holder.held, holder.elapsed_s, holder.duration_s)
 
     def hold(self) -> None:
         """Hold at the last setpoint, at rest from now on."""
@@ -182,18 +215,43 @@ class Arm(JointGroup):
         self.trajectory_guard.latch(self.state)
 
     def command(self) -> GuardResult:
-        """Write the targets of this cycle: controller -> guard -> writer of the drive mode -> limiter."""
+        """Write the targets of this cycle: controller -> guard -> writer of the drive mode -> limiter.
+
+        What the controller returns is checked here. Where it raises, the last targets stay, and `raised` says so.
+        """
         state, drives, controller = self.state, self.drives, self.active
-        setpoint = controller.update(state)
-        if setpoint.direct and controller.follows_joints:
-            self._look_ahead()
-        result = self.trajectory_guard.apply(state, setpoint, controller.tolerates_saturation)
+        try:
+            setpoint = controller.update(state)
+            if len(setpoint.position) != len(drives) or len(setpoint.velocity) != len(drives):
+                found = f"{len(setpoint.position)} positions and {len(setpoint.velocity)} velocities"
+                raise ValueError(f"the setpoint has {found}, allowed are {len(drives)}")
+            if setpoint.direct:
+                self._check_torques(setpoint)
+            if controller.ended is not None and not isinstance(controller.ended, MotionEnded):
+                raise TypeError(f"ended is {controller.ended!r:.80}, allowed is an event that ends a motion, or None")
+            held = controller.held & _LARGEST_HELD
+            self._progress = (held, float(controller.elapsed_s), float(controller.duration_s))
+            if setpoint.direct and controller.follows_joints:
+                self._look_ahead()
+            result = self.trajectory_guard.apply(state, setpoint, controller.tolerates_saturation)
+        except (Exception, SystemExit) as error:
+            self._note(controller, error)
+            return GuardResult.PASS
         if setpoint.direct and not self.trajectory_guard.stopping and result is not GuardResult.STOPPED:
             self._cst.pass_on(state.commanded, setpoint.torque, setpoint.weight, drives)
         else:
             self._writer.update(state.commanded, state.commanded_velocity, drives)
         self.output_limiter.check(drives)
         return result
+
+    def _check_torques(self, setpoint: Setpoint) -> None:
+        count, torque, weight = len(self.drives), setpoint.torque, setpoint.weight
+        if len(torque) != count or len(weight) != count:
+            found = f"{len(torque)} torques and {len(weight)} weights"
+            raise ValueError(f"the setpoint has {found}, allowed are {count}")
+        for i in range(count):
+            if not isfinite(torque[i]) or not isfinite(weight[i]):
+                raise ValueError(f"axis {i}: found torque {torque[i]} and weight {weight[i]}, allowed are finite ones")
 
     def _look_ahead(self) -> None:
         """Stop a torque motion before the measured joints come too near to a box, a partner or the arm itself."""
@@ -220,6 +278,19 @@ class Arm(JointGroup):
     def first_without(self, mode: DriveMode) -> int:
         """Return the first joint whose drive does not map what `mode` needs, or -1."""
         return next((axis for axis, drive in enumerate(self.drives) if not drive.supports(mode)), -1)
+
+    def first_unsettled(self) -> int:
+        """Return the first joint that is not within `settle.tolerance` of its setpoint, or -1.
+
+        Where a false sample of a drive is replaced, neither value alone proves that the joint is there.
+        """
+        actual, sample, commanded = self.state.actual, self.samples.actual, self.state.commanded
+        tolerance = self._settle_tolerance
+        for axis in range(len(self.drives)):
+            wanted = commanded[axis]
+            if not (abs(actual[axis] - wanted) <= tolerance and abs(sample[axis] - wanted) <= tolerance):
+                return axis
+        return -1
 
     @property
     def still(self) -> bool:

@@ -88,7 +88,7 @@ class BusService(threading.Thread):
         self._asked = 0
         """Number of the cycle's last request: odd to park, even to recover."""
         self._done = 0
-        self._errors: deque[tuple[str, Exception]] = deque(maxlen=_MOST_COMPLAINTS)
+        self._errors: deque[tuple[str, BaseException]] = deque(maxlen=_MOST_COMPLAINTS)
         self._explain = [False] * len(drive_addresses)
         self._complaints = LogThrottle(blackboard.event, _MOST_COMPLAINTS)
         self._emergencies: dict[tuple[int, bool], LogThrottle] = {}
@@ -130,7 +130,7 @@ class BusService(threading.Thread):
         """Request a report of the drive's error code; several drives may fail at once."""
         self._explain[axis] = True
 
-    def explain_error(self, subject: str, error: Exception) -> None:
+    def explain_error(self, subject: str, error: BaseException) -> None:
         """Request a report of an exception raised in the cycle by `subject`."""
         self._errors.append((subject, error))
 
@@ -180,7 +180,11 @@ class BusService(threading.Thread):
             subject, error = self._errors.popleft()
             frames = traceback.extract_tb(error.__traceback__)
             where = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-            self._blackboard.event(ErrorReported(f"{subject}: {type(error).__name__}: {error}{where}"))
+            try:
+                message = str(error)
+            except Exception:  # that of another package
+                message = "(it has no text)"
+            self._blackboard.event(ErrorReported(f"{subject}: {type(error).__name__}: {message}{where}"))
 
     def _complain(self, error: BusError) -> None:
         """Report a failure, throttled: without the interface every poll fails."""

@@ -112,9 +112,9 @@ class CommandHandler:
         moves = self._stream.stream and self._arm.active is self._stream and self._machine.state is State.MOVING
         return self._stream.stream if moves else 0
 
-    def _refusal(self, command: commands.Command | refusals.Malformed, lease: int) -> refusals.Refusal | None:
+    def _refusal(self, command: commands.Command | refusals.Refusal, lease: int) -> refusals.Refusal | None:
         """Carry out a command, or return its refusal."""
-        if isinstance(command, refusals.Malformed):
+        if isinstance(command, refusals.Refusal):
             return command
         if command.needs_lease and not (lease and self._context.lease_held(lease)):
             return refusals.NoLease()
@@ -157,8 +157,8 @@ class CommandHandler:
             return refusals.MotionPaused()
         if isinstance(command, _PLANNED) and command.tool != arm.tool.number:
             return refusals.PlannedForAnotherTool(command.tool, arm.tool.number)
-        continues = machine.state is State.MOVING and arm.active is controller
-        refusal = controller.accept(command, arm.state, continues)
+        continues = machine.state is State.MOVING and arm.active is controller and not arm.still
+        refusal = arm.accept_motion(controller, command, continues)
         if refusal is not None:
             return refusal
         if isinstance(command, _PLANNED):

@@ -19,6 +19,7 @@ from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import (
     ClockLost,
     ControllerFailed,
+    ControllerRaised,
     DriveFault,
     DriveLeftEnabled,
     DriveModeTimeout,
@@ -140,7 +141,7 @@ class Context(PartContext):
         """Report an event that changes no state."""
         self.blackboard.event(event)
 
-    def explain(self, subject: str, error: Exception) -> None:
+    def explain(self, subject: str, error: BaseException) -> None:
         """Let the thread beside the cycle report an exception raised by `subject`."""
         self.service.explain_error(subject, error)
 
@@ -231,6 +232,10 @@ class Context(PartContext):
         if event is not None:
             return event
         result = joints.command()
+        if (error := arm.raised) is not None:
+            arm.raised = None
+            self.explain(f"controller {arm.raised_by}", error)
+            return ControllerRaised(arm.raised_by)
         if result is GuardResult.PASS and arm.active.ended is None:
             return None
         return self._motion_end(result)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from time import monotonic_ns
 from typing import Any, Final
 
+from rtcp.config.find import is_foreign
 from rtcp.config.model import ArmConfig, Joint
 from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
@@ -19,7 +20,7 @@ from rtcp.control.context import Context
 from rtcp.control.gripper import make_gripper
 from rtcp.control.machine import StateMachine
 from rtcp.control.operator import Operator
-from rtcp.control.part import make_devices
+from rtcp.control.part import Part, make_devices
 from rtcp.control.partners import Partners
 from rtcp.control.processes import make_processes
 from rtcp.devices.drive import Drive, drive_of
@@ -27,7 +28,7 @@ from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.master import PacedData
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.events import ClockLocked, ClockUnlocked
+from rtcp.ipc.events import ClockLocked, ClockUnlocked, PluginSlow
 from rtcp.ipc.schema import (
     CYCLE_FIELDS,
     FLAG_ALL_OP,
@@ -49,6 +50,7 @@ from rtcp.realtime.scheduling import Sleeper
 _LARGEST_COUNTER = 0x7FFF
 """Largest working counter in a record: a damaged frame may have a larger one than any segment."""
 _LONGEST_NS: Final = 2_000_000_000
+_SLOW_AGAIN_NS: Final = 10_000_000_000
 _TRANSIT_DIVISOR: Final = 20
 """Longest transit time of a frame: the period divided by this."""
 
@@ -116,6 +118,9 @@ class Cycle:
         # After a frame that misses its SYNC0, the next tick's frame would precede the same SYNC0 as that frame.
         self._apart_ns = max(self._period_ns // 2, self._period_ns - ahead_ns + self._period_ns // _TRANSIT_DIVISOR)
         self._spin_ns = round(config.cycle.spin_us * 1000)
+        self._slow_again = 0
+        """Instant from which on a slow plug-in is reported again, ns."""
+        self._controllers_timed = any(map(is_foreign, self.arm.controllers.values()))
         self._locked = False
         self._shutdown = False
         self.missed = 0
@@ -198,7 +203,10 @@ class Cycle:
         self.operator.unread_cycles += 1
         if good:
             for part in parts:
-                part.decode(data)
+                if part.is_timed:
+                    self._timed(part, part.decode, data)
+                else:
+                    part.decode(data)
         elif wkc > 0 and self._stop_device is not None and context.stop_box_in_op:
             # A slave is missing, and which ones were in the frame is unknown. SOEM returns bytes that no slave wrote
             # unchanged, so these inputs of the box are new or old, but valid.
@@ -213,12 +221,34 @@ class Cycle:
             commands.take_setpoints()
         if self._shutdown:
             machine.close()
-        machine.update(good)
+        if self._controllers_timed:
+            began = self._now()
+            machine.update(good)
+            if is_foreign(self.arm.active):
+                self._check_time(f"controller {self.arm.active.name}", began)
+        else:
+            machine.update(good)
         if board.stream and not commands.open_stream:
             board.open_stream(0)
         for part in parts:
-            part.update(context)
-            part.encode(data)
+            if part.is_timed:
+                self._timed(part, part.update, context)
+                self._timed(part, part.encode, data)
+            else:
+                part.update(context)
+                part.encode(data)
+
+    def _timed(self, part: Part, call: Callable[[Any], None], argument: object) -> None:
+        began = self._now()
+        call(argument)
+        self._check_time(part.name, began)
+
+    def _check_time(self, plugin: str, began: int) -> None:
+        """Report a plug-in that has taken more than half a period since `began`, at most every `_SLOW_AGAIN_NS`."""
+        now = self._now()
+        if now - began > self._period_ns // 2 and now >= self._slow_again:
+            self._slow_again = now + _SLOW_AGAIN_NS
+            self._blackboard.event(PluginSlow(plugin, (now - began) * 1e-3, self._period_ns * 0.5e-3))
 
     def _publish(self, woken: int, planned: int, received: int, wkc: int) -> None:
         """Publish the record of the cycle."""

@@ -7,20 +7,80 @@ when their outputs have to be safe.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 from mypy_extensions import mypyc_attr
 
+from rtcp.config.find import is_foreign
 from rtcp.config.model import ArmConfig
 from rtcp.devices.drive import Drive
 from rtcp.devices.driver import Driver, make_driver
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.commands import Command
 from rtcp.ipc.events import DriverFailed, Event, MotionEnded
+from rtcp.ipc.message import PAYLOAD_SIZE
 from rtcp.ipc.refusals import DriverRaised, Refusal
 from rtcp.ipc.schema import Field, device_field
 from rtcp.ipc.states import State
+
+_PAYLOAD: Final = bytearray(PAYLOAD_SIZE)
+"""Where messages of plug-ins are packed before the cycle uses them."""
+
+
+def checked_refusal(refusal: object) -> Refusal | None:
+    """Return what `accept` of a plug-in has returned.
+
+    Raises:
+        TypeError: it is neither a refusal nor None; or another exception, where a field is not of its type.
+    """
+    if refusal is None:
+        return None
+    if not isinstance(refusal, Refusal):
+        raise TypeError(f"accept returned {refusal!r:.80}, allowed is a Refusal or None")
+    try:
+        refusal.pack_into(_PAYLOAD, 0)
+    except struct.error:
+        pass  # it repeats a number of the command that is too large: the command is malformed
+    return refusal
+
+
+def checked_event(event: object) -> Event:
+    """Return an event of a plug-in.
+
+    Raises:
+        TypeError: it is no event, or one that ends a motion; or another exception, where a field is not of its type.
+    """
+    if not isinstance(event, Event):
+        raise TypeError(f"found {event!r:.80}, allowed is an event or None")
+    if isinstance(event, MotionEnded):
+        raise TypeError(f"a part ends no motion: {event.name}")
+    event.pack_into(_PAYLOAD, 0)
+    return event
+
+
+class PublishedValues:
+    """The values that a plug-in publishes, checked before they enter the record.
+
+    Args:
+        fields: of the plug-in.
+    """
+
+    def __init__(self, fields: Sequence[Field]) -> None:
+        form = struct.Struct("<" + "".join(field.code for field in fields))
+        self._pack, self._memory = form.pack_into, bytearray(form.size)
+        self.count = sum(field.count for field in fields)
+        self.values: list[Any] = [0] * self.count
+        """Written by `publish` of the plug-in, from index 0 on."""
+
+    def check(self) -> None:
+        """Raise an exception unless the record can hold the values."""
+        if len(self.values) != self.count:
+            found = len(self.values)
+            self.values[:] = [0] * self.count
+            raise ValueError(f"publish wrote {found} values, its fields are {self.count}")
+        self._pack(self._memory, 0, *self.values)
 
 
 class PartContext:
@@ -53,12 +113,17 @@ class PartContext:
         """Return whether `lease` is current and not expired."""
         raise NotImplementedError
 
-    def explain(self, subject: str, error: Exception) -> None:
+    def explain(self, subject: str, error: BaseException) -> None:
         """Let the thread beside the cycle report an exception raised by `subject`."""
         raise NotImplementedError
 
     def report(self, event: Event) -> None:
-        """Report an event of a part; a fault stops the arm in the next cycle, of several faults the hardest."""
+        """Report an event of a part; a fault stops the arm in the next cycle, of several faults the hardest.
+
+        Raises:
+            TypeError: it is no event that a part may report (`checked_event`).
+        """
+        checked_event(event)
         if not event.is_fault:
             self.publish(event)
         elif self.reported is None:
@@ -96,6 +161,8 @@ class Part:
         self.commands = tuple(commands)
         self.at = 0
         """Index of its first value in a record; set with the layout of the record."""
+        self.is_timed = False
+        """Whether the cycle measures its time: code of another package runs in it."""
 
     def decode(self, data: ProcessData) -> None:
         """Read the inputs of a cycle in which every slave took part."""
@@ -120,8 +187,8 @@ class Part:
 class Device(Part):
     """A slave that is no drive, with its driver, possibly of another package.
 
-    An exception of the driver is a fault of that slave and does not end the cycle: the driver is not called any more,
-    and its outputs are safe, until the machine is ready again.
+    An exception of the driver, or a wrong result, is a fault of that slave and does not end the cycle: the driver is
+    not called any more, and its outputs are safe, until the machine is ready again.
 
     Args:
         slot: index of the slave.
@@ -134,9 +201,12 @@ class Device(Part):
         self.driver = driver
         self._stays_safe = False
         self._failed = False
-        self._error: Exception | None = None
+        self._error: BaseException | None = None
+        self._published = PublishedValues(self.fields)
+        self._size = len(driver.safe_outputs)
+        self.is_timed = is_foreign(driver)
 
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, error: BaseException) -> None:
         self._failed, self._error = True, error
 
     def decode(self, data: ProcessData) -> None:
@@ -144,14 +214,14 @@ class Device(Part):
         try:
             if not self._failed:
                 self.driver.decode(data.input(self.slot))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self._fail(error)
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
         """Let the driver carry out the command."""
         try:
-            return DriverRaised(self.slot + 1) if self._failed else self.driver.accept(command)
-        except Exception as error:
+            return DriverRaised(self.slot + 1) if self._failed else checked_refusal(self.driver.accept(command))
+        except (Exception, SystemExit) as error:
             self._fail(error)
             return DriverRaised(self.slot + 1)
 
@@ -168,15 +238,15 @@ class Device(Part):
         try:
             if not self._failed:
                 event = self.driver.update(context.state, context.now_ns)
-                if isinstance(event, MotionEnded):
-                    raise TypeError(f"a driver ends no motion: {event.name}")
+                if event is not None:
+                    checked_event(event)
             if self._stays_safe:
                 # From the fault to the end of the reset, whatever the driver does meanwhile.
                 self._stays_safe = context.state is not State.READY
                 self._failed = self._failed and self._stays_safe
                 if not self._failed:
                     self.driver.safe()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self._fail(error)
         else:
             if event is not None:
@@ -191,7 +261,9 @@ class Device(Part):
         """Write the outputs of the slave."""
         try:
             outputs = self.driver.safe_outputs if self._failed else self.driver.encode()
-        except Exception as error:
+            if not isinstance(outputs, bytes) or len(outputs) != self._size:
+                raise ValueError(f"encode returned {outputs!r:.80}, allowed are {self._size} bytes")
+        except (Exception, SystemExit) as error:
             self._fail(error)
             outputs = self.driver.safe_outputs
         data.set_output(self.slot, outputs)
@@ -200,8 +272,11 @@ class Device(Part):
         """Write the driver's values."""
         try:
             if not self._failed:
-                self.driver.publish(values, self.at)
-        except Exception as error:
+                published = self._published
+                self.driver.publish(published.values, 0)
+                published.check()
+                values[self.at : self.at + published.count] = published.values
+        except (Exception, SystemExit) as error:
             self._fail(error)
 
     def safe(self) -> None:
@@ -209,7 +284,7 @@ class Device(Part):
         self._stays_safe = True
         try:
             self.driver.safe()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self._fail(error)
 
 

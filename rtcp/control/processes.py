@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib.metadata import EntryPoint
+from math import isfinite
 from typing import Any
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.find import load_class
+from rtcp.config.find import is_foreign, load_class, made_by
 from rtcp.config.model import ArmConfig, ProcessConfig
-from rtcp.control.part import Device, Part, PartContext
+from rtcp.control.part import Device, Part, PartContext, PublishedValues, checked_refusal
 from rtcp.control.partners import Partners
 from rtcp.ipc.commands import Command
-from rtcp.ipc.events import MotionEnded, ProcessFailed
+from rtcp.ipc.events import ProcessFailed
 from rtcp.ipc.refusals import ProcessRaised, Refusal
 from rtcp.ipc.schema import Field, device_field
 from rtcp.ipc.states import State
@@ -31,6 +32,11 @@ class Signal:
         self._values = values
         self._name = name
         self.safe = safe
+
+    def check(self) -> None:
+        """Raise ValueError unless the value is a finite number; the driver limits it to the range of the channel."""
+        if not isfinite(self.value):
+            raise ValueError(f"{self._name}: found {self.value}, allowed is a finite number")
 
     @property
     def value(self) -> float:
@@ -110,16 +116,18 @@ class ProcessPart(Part):
         self._number = number
         self._outputs = tuple(outputs)
         self._failed = self._reported = False
-        self._error: Exception | None = None
+        self._error: BaseException | None = None
+        self._published = PublishedValues(self.fields)
+        self.is_timed = is_foreign(process)
 
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, error: BaseException) -> None:
         self._failed, self._error = True, error
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
         """Let the process carry out the command."""
         try:
-            return ProcessRaised(self._number) if self._failed else self.process.accept(command, lease)
-        except Exception as error:
+            return ProcessRaised(self._number) if self._failed else checked_refusal(self.process.accept(command, lease))
+        except (Exception, SystemExit) as error:
             self._fail(error)
             return ProcessRaised(self._number)
 
@@ -131,9 +139,9 @@ class ProcessPart(Part):
         try:
             if not self._failed:
                 self.process.update(context)
-                if isinstance(context.reported, MotionEnded):
-                    raise TypeError(f"a process ends no motion: {context.reported.name}")
-        except Exception as error:
+                for output in self._outputs:
+                    output.check()
+        except (Exception, SystemExit) as error:
             self._fail(error)
         if self._error is not None:
             context.explain(f"process {self.name}", self._error)
@@ -149,8 +157,11 @@ class ProcessPart(Part):
         """Write the process's values."""
         try:
             if not self._failed:
-                self.process.publish(values, self.at)
-        except Exception as error:
+                published = self._published
+                self.process.publish(published.values, 0)
+                published.check()
+                values[self.at : self.at + published.count] = published.values
+        except (Exception, SystemExit) as error:
             self._fail(error)
         if self._failed:
             # Zeros: not busy, and off.
@@ -163,7 +174,7 @@ class ProcessPart(Part):
         """Let the process set its outputs to their safe state."""
         try:
             self.process.safe()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self._fail(error)
 
 
@@ -186,7 +197,8 @@ def make_processes(config: ArmConfig, devices: Sequence[Device], partners: Partn
     parts = []
     for number, keys in enumerate(config.processes):
         entry = EntryPoint(keys.kind, keys.PROCESS, keys.ENTRY_POINTS)
-        process = load_class(entry, Process)(keys, setup)
         written = [outputs[text] for _, image, text in keys.channels() if image == "rpdo"]
-        parts.append(ProcessPart(number, process, written))
+        kind = load_class(entry, Process)
+        with made_by(entry):
+            parts.append(ProcessPart(number, kind(keys, setup), written))
     return parts

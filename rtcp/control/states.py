@@ -36,6 +36,7 @@ from rtcp.ipc.events import (
     LimitStopReset,
     MotionEnded,
     MovedSinceFault,
+    NotSettled,
     PermissionWithdrawn,
     ProcessDataLost,
     Ready,
@@ -330,6 +331,8 @@ class Moving(MachineState):
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Begin a motion."""
         ctx.limited = False
+        self._settling = 0
+        """Cycles since the setpoints came to rest."""
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Advance the motion by one cycle."""
@@ -338,10 +341,22 @@ class Moving(MachineState):
             return event
         if not ctx.lease:
             ctx.operator.jog_by_joystick(ctx.arm, ctx.blackboard)
-        event = ctx.track()
-        if event is not None or not ctx.arm.still:
+        event, arm = ctx.track(), ctx.arm
+        if event is not None or not arm.still:
+            self._settling = 0
             return event
-        return Arrived() if ctx.lease else Signal.JOYSTICK_AT_REST
+        if arm.active.tolerates_saturation:  # it has no target
+            return Arrived() if ctx.lease else Signal.JOYSTICK_AT_REST
+        if not ctx.good:
+            return None
+        axis, settle = arm.first_unsettled(), ctx.config.settle
+        if axis < 0:
+            return Arrived()
+        self._settling += 1
+        if self._settling <= ctx.cycles(settle.time_s):
+            return None
+        distance = abs(arm.state.actual[axis] - arm.state.commanded[axis])
+        return NotSettled(axis, distance, settle.tolerance, settle.time_s)
 
 
 class Stopping(MachineState):

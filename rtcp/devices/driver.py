@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.find import load_class, registered
+from rtcp.config.find import load_class, made_by, registered
 from rtcp.config.model import LARGEST, SlaveConfig
 from rtcp.fieldbus.pdo import STRUCT_CODES, Channel, ImageLayout, layout
 from rtcp.ipc.commands import Command
@@ -186,9 +186,15 @@ def make_driver(slave: SlaveConfig, period_s: float) -> Driver:
 
     Raises:
         DeviceError: no installed package has a driver for this kind, or it cannot use the description.
-        PluginError: the class registered for this kind is not a driver.
+        PluginError: the class registered for this kind is not a driver, or raises an exception.
     """
-    return driver_of(slave.device.kind, slave.device.name)(slave, period_s=period_s)
+    kind = driver_of(slave.device.kind, slave.device.name)
+    with made_by(registered(ENTRY_POINTS)[slave.device.kind]):
+        driver = kind(slave, period_s=period_s)
+        fields = driver.fields()
+        if not all(isinstance(field, Field) for field in fields):
+            raise TypeError(f"fields returned {fields!r:.80}, allowed are fields of the record")
+    return driver
 
 
 def driver_of(kind: str, device: str = "") -> type[Driver]:

@@ -8,18 +8,19 @@ import struct
 import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from rtcp.config.model import ArmConfig
 from rtcp.gateway.status_snapshot import StatusSnapshot
-from rtcp.ipc.commands import Command, Disable, ExtendTrajectory, Halt, MotionCommand, OpenStream
+from rtcp.ipc.commands import Command, ExtendTrajectory, MotionCommand, OpenStream
 from rtcp.ipc.errors import ErrorKind, RtcpError
 from rtcp.ipc.events import Event, LeaseExpired, MotionEnded, PermissionWithdrawn
-from rtcp.ipc.observer import BlackboardError, EventRecord, LeaseRefused, Observer
+from rtcp.ipc.observer import Answer, BlackboardError, EventRecord, LeaseRefused, Observer
 from rtcp.ipc.refusals import Refusal
 from rtcp.ipc.schema import FLAG_SWITCHING
 from rtcp.ipc.states import ControlMode, State
+from rtcp.ipc.stops import STOPS
 
 T = TypeVar("T")
 Json = dict[str, Any]
@@ -46,6 +47,13 @@ class Caller:
     report: Callable[[Json], None] = lambda progress: None
     is_stalled: Callable[[float], bool] = lambda seconds: False
     """Return whether the client has read no message for this time, s."""
+    received_ns: int = field(default_factory=lambda: time.monotonic_ns())  # noqa: PLW0108 a clock that tests replace
+    """When the request was received, CLOCK_MONOTONIC, ns; of a stop: the instant of the stop."""
+
+    @property
+    def without_lease(self) -> Lease:
+        """A lease of nobody, for commands that need none."""
+        return Lease.of(0, self)
 
 
 class _Waiter(Generic[T]):
@@ -85,8 +93,17 @@ class _Waiter(Generic[T]):
 class Lease(int):
     """The id of a lease, as held by one request."""
 
-    request: int
-    """Number of the request; one that is older than a stop cannot begin a motion."""
+    request: int | None
+    """Number of the request; one that is older than another motion cannot begin a motion. None: it is not planned."""
+    received_ns: int
+    """When the request was received: a stop that was requested later supersedes its commands."""
+
+    @classmethod
+    def of(cls, lease: int, caller: Caller, request: int | None = None) -> Lease:
+        """Return a lease as held by a request of `caller`."""
+        made = cls(lease)
+        made.request, made.received_ns = request, caller.received_ns
+        return made
 
 
 class CommandChannel:
@@ -108,7 +125,7 @@ class CommandChannel:
         self._ring = asyncio.Lock()
         self._answer_poll_s = min(0.2e-6 * config.cycle.period_us, _POLL_S)
         self._requests = self._barrier = 0
-        """Number of the last request, and of the last that a stop or a newer motion has superseded."""
+        """Number of the last request, and of the last that a newer motion has superseded."""
         self._shared: dict[int, tuple[int, int]] = {}
         """Lease, and number of calls that hold it, by connection."""
         self._waiters: list[_Waiter[Any]] = []
@@ -183,10 +200,9 @@ class CommandChannel:
             lease = self.acquire(caller)
         self._shared[caller.connection] = lease, users + 1
         renewing = asyncio.create_task(self._renew(lease, caller))
-        numbered = Lease(lease)
-        numbered.request = self._requests = self._requests + 1
+        self._requests += 1
         try:
-            yield numbered
+            yield Lease.of(lease, caller, self._requests)
         finally:
             renewing.cancel()
             _, users = self._shared.pop(caller.connection)
@@ -259,40 +275,43 @@ class CommandChannel:
     async def accept(self, lease: int, command: Command) -> int:
         """Send a command; return, when the loop has accepted it, the number of the last record before its effect.
 
-        A motion that was planned while a stop or a newer motion was sent is refused, reason `superseded`.
+        A stop passes the ring. A motion that was planned while a newer motion was sent is refused, as the loop refuses
+        one that was requested before a stop; reason `superseded`.
         """
+        received_ns = lease.received_ns if isinstance(lease, Lease) else 0
+        if type(command) in STOPS:
+            instant_ns = self.observer.stop(type(command), received_ns)
+            return await self._answered(lambda: self.observer.stop_answer(type(command), instant_ns), command)
         async with self._ring:
-            if isinstance(command, Halt | Disable | OpenStream):
+            if isinstance(command, OpenStream):
                 self._barrier = self._requests = self._requests + 1
-            elif isinstance(lease, Lease) and isinstance(command, MotionCommand):
+            elif isinstance(lease, Lease) and lease.request is not None and isinstance(command, MotionCommand):
                 if lease.request < self._barrier and not isinstance(command, ExtendTrajectory):
-                    message = f"{command.name}: a stop or another motion came while it was planned: nothing moves"
+                    message = f"{command.name}: another motion came while it was planned: nothing moves"
                     raise RtcpError("refused", message, "superseded")
                 self._barrier = max(self._barrier, lease.request)
             try:
-                number = self.observer.command(lease, command)
+                number = self.observer.command(lease, command, received_ns)
             except BlackboardError as error:
                 raise RtcpError("fault", str(error)) from None
             except (ValueError, OverflowError, struct.error) as error:
                 raise RtcpError("invalid", f"{command.name}: a field cannot be sent: {error}") from None
-            late = RtcpError("timeout", f"the loop did not answer {command.name} within {_ANSWER_S:g} s")
-            # The answer is written before the record of its cycle.
-            return await self.wait(lambda: self._accepted(number), _ANSWER_S, lambda: late, self._answer_poll_s)
+            return await self._answered(lambda: self.observer.answer(number), command)
 
-    def _accepted(self, number: int) -> int | None:
+    async def _answered(self, answer: Callable[[], Answer | None], command: Command) -> int:
+        """Return the number of the last record before the effect of a command, once the loop has accepted it."""
+        late = RtcpError("timeout", f"the loop did not answer {command.name} within {_ANSWER_S:g} s")
+        return await self.wait(lambda: self._accepted(answer()), _ANSWER_S, lambda: late, self._answer_poll_s)
+
+    def _accepted(self, answer: Answer | None) -> int | None:
+        # The answer is written before the record of its cycle.
         self.check_loop()
-        answer = self.observer.answer(number)
         if answer is None:
             return None
         if answer.refusal is None:
             return self.observer.head
         fault = self.snapshot.fault if self.state in BROKEN else ""
         raise self.error("refused", answer.refusal, after=f"; the fault: {fault}" if fault else "")
-
-    async def end_loop(self, command: Command) -> None:
-        """Send the command that ends the loop; the end of its process is the answer."""
-        async with self._ring:
-            self.observer.command(0, command)
 
     async def wait(
         self,
@@ -403,7 +422,7 @@ class StreamingCommands:
         channel = self._channel
         lease, since = self._lease(caller)
         try:
-            self._head = await channel.accept(lease, command)
+            self._head = await channel.accept(Lease.of(lease, caller), command)
         except RtcpError as error:
             ended = channel.early_end(since)
             if ended is not None and channel.state is not State.HOLDING:
@@ -415,7 +434,7 @@ class StreamingCommands:
         """Begin a stream of the client; return its number and lease, which the client renews, and the last event."""
         lease, since = self._lease(caller)
         stream = time.monotonic_ns()
-        self._head = await self._channel.accept(lease, OpenStream(stream, motion, partners))
+        self._head = await self._channel.accept(Lease.of(lease, caller), OpenStream(stream, motion, partners))
         return {"stream": stream, "lease": lease, "since": since}
 
     async def rest(self, caller: Caller) -> None:

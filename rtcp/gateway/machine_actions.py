@@ -68,19 +68,20 @@ class MachineActions:
                 await channel.run(lease, commands.Enable(), enabled, timeout_s, "enabling")
         return {}
 
-    @method(at_once=True)
-    async def disable(self, caller: Caller) -> Json:
+    @method(at_once=True, stops=commands.Disable)
+    async def disable(self, caller: Caller, requested_ns: Annotated[int, Ge(0)] = 0) -> Json:
         """Stop and remove the torque; returns when the drives show that it is gone. Needs no lease.
 
-        Returns `unconfirmed`: drives that no cycle record shows, a gripper's in a fault.
+        Returns `unconfirmed`: drives that no cycle record shows, a gripper's in a fault. `requested_ns` as of `halt`.
         """
         channel, config = self._channel, self._config
         broken = channel.state in _RESETTABLE
         if broken:
-            await channel.send(0, commands.Disable())
+            await channel.send(caller.without_lease, commands.Disable())
         else:
             disabled = channel.reaching(State.READY, _DISABLING, "disabling", channel.observer.last_event)
-            await channel.run(0, commands.Disable(), disabled, config.enable_timeout_s + _STOP_S, "disabling")
+            lease = caller.without_lease
+            await channel.run(lease, commands.Disable(), disabled, config.enable_timeout_s + _STOP_S, "disabling")
         confirmation = _Confirmation(channel)
         await channel.wait(
             confirmation.poll, longest_s(config) + _CONFIRM_S, lambda: RtcpError("fault", confirmation.missing())
@@ -104,16 +105,19 @@ class MachineActions:
                 await channel.run(lease, commands.Reset(), is_reset, _RESET_S, "reset")
         return {"from": before.name.lower()}
 
-    @method(at_once=True)
-    async def halt(self, caller: Caller) -> Json:
-        """Stop every motion; returns when the arm holds. Needs no lease."""
-        channel = self._channel
+    @method(at_once=True, stops=commands.Halt)
+    async def halt(self, caller: Caller, requested_ns: Annotated[int, Ge(0)] = 0) -> Json:
+        """Stop every motion; returns when the arm holds. Needs no lease.
+
+        `requested_ns`: instant, CLOCK_MONOTONIC, of the request that this client has already written to the blackboard.
+        """
+        channel, lease = self._channel, caller.without_lease
         if channel.state in (State.STOPPED_BY_LIMIT, State.READY):
             # Nothing moves, but in state ready a process may be active: it ends at once.
-            await channel.send(0, commands.Halt())
+            await channel.send(lease, commands.Halt())
         else:
             halted = channel.reaching(State.HOLDING, _HALTING, "stopping", channel.observer.last_event)
-            await channel.run(0, commands.Halt(), halted, _STOP_S, "stopping")
+            await channel.run(lease, commands.Halt(), halted, _STOP_S, "stopping")
         return {}
 
     @method()
@@ -291,9 +295,9 @@ class MachineActions:
             late = RtcpError("timeout", f"the loop's service thread did not answer within {_SERVICE_S:g} s")
             return await channel.wait(answered, _SERVICE_S, lambda: late)
 
-    async def end_loop(self) -> None:
+    def end_loop(self) -> None:
         """Let the loop stop, disable and end; the end of its process is the answer."""
-        await self._channel.end_loop(commands.Shutdown())
+        self._channel.observer.stop(commands.Shutdown)
 
 
 class _Confirmation:

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, TypeVar, get_type_hints
 import rtcp.config.rules  # noqa: F401 its rules hold for stops and points too
 from rtcp.config.validation import Checker
 from rtcp.gateway.command_channel import Caller, Json
+from rtcp.ipc.commands import Command
 from rtcp.ipc.errors import RtcpError
 
 HOLD_S = 0.25
@@ -34,6 +35,8 @@ class Method:
     """Whether it does not wait for its connection's other requests."""
     streams: bool = False
     """Whether it continues the motion of its connection; else it waits until that has come to rest."""
+    stops: type[Command] | None = None
+    """The stop that is requested as soon as the request is received, before those that wait (`rtcp.ipc.stops`)."""
 
     async def __call__(self, caller: Caller, params: Json) -> Json:
         """Check the parameters and carry it out; raises RtcpError."""
@@ -43,11 +46,11 @@ class Method:
         return await self.call(caller, **vars(checked))
 
 
-def method(at_once: bool = False, streams: bool = False) -> Callable[[F], F]:
+def method(at_once: bool = False, streams: bool = False, stops: type[Command] | None = None) -> Callable[[F], F]:
     """Mark a function for `methods_of`: its arguments are `self` and the caller, then the parameters."""
 
     def mark(function: F) -> F:
-        function.method_flags = {"at_once": at_once, "streams": streams}  # type: ignore[attr-defined]
+        function.method_flags = {"at_once": at_once, "streams": streams, "stops": stops}  # type: ignore[attr-defined]
         return function
 
     return mark

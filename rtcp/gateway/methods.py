@@ -155,7 +155,7 @@ class Methods:
             slave["state"] = now["state"]
         return {"slaves": slaves}
 
-    @method()
+    @method(at_once=True, stops=commands.Shutdown)
     async def stop(self, caller: Caller) -> Json:
         """End the platform. Returns `problems`: drives left enabled, and slaves not left in INIT."""
         return {"problems": await self._end_platform()}

@@ -7,7 +7,6 @@ import bisect
 import contextlib
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -43,7 +42,7 @@ _LARGEST = 100.0
 """Largest coordinate of a pose, m or rad: beyond any arm, and larger angles lose their precision."""
 _SAME_RAD, _SAME_PLANNED_RAD = 1e-6, 1e-4
 """Largest distance of the commanded end from the goal: of a move, less than a count; of a plan, by rounding."""
-_SETTLED_RAD, _SETTLE_S = 5e-4, 3.0
+_REST_S = 3.0
 _TIMEOUT_S = 20.0
 _REPORT_S = 0.5
 """Interval between progress reports of a long plan, s."""
@@ -428,7 +427,7 @@ class MotionActions:
         channel = self._channel
         rest = channel.reaching(State.HOLDING, IN_MOTION, "the stop", channel.observer.last_event)
         with contextlib.suppress(RtcpError):
-            await channel.run(0, commands.Halt(), rest, _SETTLE_S, "the stop")
+            await channel.run(0, commands.Halt(), rest, _REST_S, "the stop")
 
     # -- trajectories that are open at their end -----------------------------------------------------------------------
 
@@ -497,7 +496,7 @@ class MotionActions:
         except RtcpError as error:
             if error.reason in _GONE and opened.motion is not None:
                 # It ended while the points were checked: the answer is its reason.
-                await asyncio.wait([opened.motion], timeout=_SETTLE_S)
+                await asyncio.wait([opened.motion], timeout=_REST_S)
                 self._opened(caller)
             raise
         return self._buffered(opened)
@@ -841,25 +840,21 @@ class MotionActions:
     def _arrival(
         self, q: Sequence[float], same_rad: float, name: str, tracking: Tracking | None = None
     ) -> Callable[[], Json | None]:
-        """Return an outcome: the position of the arm, once the following error has settled or is within tolerances."""
-        channel, until = self._channel, 0.0
+        """Return an outcome: the position of the arm, which has settled, once it is within the motion's tolerances."""
+        channel, is_checked = self._channel, False
 
         def poll() -> Json | None:
-            nonlocal until
-            if not until:
-                until = time.monotonic() + _SETTLE_S
+            nonlocal is_checked
+            if not is_checked:
+                is_checked = True
                 commanded = channel.joints("commanded_position")
                 if max(abs(a - b) for a, b in zip(commanded, q, strict=True)) > same_rad:
                     events = [entry.event for entry in channel.events(0) if not isinstance(entry.event, ServiceEvent)]
                     raise channel.ended(events[-1] if events else None, f"{name} ended before it arrived")
             positions = channel.joints("actual_position")
-            error = max(abs(a - b) for a, b in zip(positions, q, strict=True))
-            if tracking is not None:
-                if not tracking.arrived(positions):
-                    return None  # `Tracking.check` ends it
-            elif error > _SETTLED_RAD and time.monotonic() < until:
-                return None
-            return {"positions": positions, "error": error}
+            if tracking is not None and not tracking.arrived(positions):
+                return None  # `Tracking.check` ends it
+            return {"positions": positions, "error": max(abs(a - b) for a, b in zip(positions, q, strict=True))}
 
         return poll
 

@@ -56,6 +56,8 @@ from rtcp.ipc.layout import (
     SETPOINTS_AT,
     SLAVES_AT,
     SLAVES_MAX,
+    STOP_SIZE,
+    STOPS_AT,
     STREAM_AT,
     TEMPERATURE,
     AtomicWords,
@@ -64,8 +66,9 @@ from rtcp.ipc.layout import (
     records_for,
 )
 from rtcp.ipc.message import MalformedMessage
-from rtcp.ipc.refusals import Malformed, Refusal
+from rtcp.ipc.refusals import Malformed, Refusal, Superseded, WrongState
 from rtcp.ipc.schema import RecordSchema, SchemaError
+from rtcp.ipc.stops import STOPS
 
 _OP: Final = 8
 """AL state OP (ETG.1000.6, table 9)."""
@@ -133,6 +136,10 @@ class Blackboard:
         self._records = 0
         self._events = 0
         self._taken = self._setpoints_taken = 0
+        self._stops = [0] * len(STOPS)
+        """Instant of the last request of each kind of stop that was taken, ns."""
+        self._stopped_ns = 0
+        """Instant of the last stop of any kind, ns."""
         self.stream = 0
         """Number of the open stream; 0: none."""
         self._event_lock = threading.Lock()
@@ -206,17 +213,35 @@ class Blackboard:
         return lease if words[LEASE_ID_AT] == lease else 0, renewed, duration
 
     def command_waits(self) -> bool:
-        """Whether the ring holds a command that was not read."""
-        return self._words[COMMAND_HEAD_AT] != self._taken
+        """Whether there is a stop, or a command in the ring, that was not read."""
+        words, stops, at = self._words.plain, self._stops, STOPS_AT >> 3
+        return (
+            words[COMMAND_HEAD_AT >> 3] != self._taken
+            or words[at] != stops[0]
+            or words[at + 3] != stops[1]
+            or words[at + 6] != stops[2]
+        )
 
-    def take_command(self) -> tuple[int, int, Command | Malformed]:
-        """Read the next command: its number in the ring, the lease id, the command. Only when `command_waits`."""
+    def take_command(self) -> tuple[int, int, Command | Malformed | Superseded]:
+        """Read the next command: its number for `answer`, the lease id, the command. Only when `command_waits`.
+
+        A stop overtakes the ring; its number is negative. Instead of a command that cannot be read, or that was
+        requested before a stop, return its refusal.
+        """
+        for index, kind in enumerate(STOPS):
+            requested_ns = self._words[STOPS_AT + index * STOP_SIZE]
+            if requested_ns != self._stops[index]:
+                self._stops[index] = requested_ns
+                self._stopped_ns = max(self._stopped_ns, requested_ns)
+                return -1 - index, 0, kind()
         at = COMMANDS_AT + ((self._taken + 1) % COMMANDS) * COMMAND_SIZE
         self._words.acquire(COMMAND_HEAD_AT)
-        number, lease, kind = COMMAND.unpack_from(self._map, at)
-        command: Command | Malformed
+        number, lease, requested_ns, kind = COMMAND.unpack_from(self._map, at)
+        command: Command | Malformed | Superseded
         try:
             command = COMMAND_KINDS.unpack_from(kind, self._map, at + COMMAND.size)
+            if requested_ns <= self._stopped_ns and command.superseded_by_stop:
+                command = Superseded(command.number)
         except MalformedMessage:
             command = Malformed(kind & _I63)
         self._taken += 1
@@ -244,6 +269,12 @@ class Blackboard:
 
     def answer(self, number: int, refusal: Refusal | None = None) -> None:
         """Answer the command `number`; None: accepted."""
+        if number < 0:
+            index, words = -1 - number, self._words
+            at = STOPS_AT + index * STOP_SIZE
+            words[at + 16] = 1 + refusal.state if isinstance(refusal, WrongState) else 0
+            words.release(at + 8, self._stops[index])
+            return
         if refusal is None:
             ANSWER.pack_into(self._map, ANSWER_AT, 0)
         else:

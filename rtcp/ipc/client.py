@@ -16,6 +16,7 @@ from rtcp.ipc.closing import Closing
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
 from rtcp.ipc.session import is_running, read_processes
+from rtcp.ipc.stops import StopWriter
 
 Progress = Callable[[Mapping[str, Any]], object]
 
@@ -52,10 +53,12 @@ class ControlClient(Closing):
         self._request = 0
         self._received = bytearray()
         self._socket = _connect(self._path)
+        self._stops = StopWriter(self._path.parent)
 
     def close(self) -> None:
         """Close the connection; a second time is harmless."""
         self._socket.close()
+        self._stops.close()
 
     def call(
         self,
@@ -80,7 +83,8 @@ class ControlClient(Closing):
         """
         self._request = number = self._request + 1
         self._socket.settimeout(timeout_s)
-        self._send(method, self._greeting + jsonrpc.request(number, method, params or {}))
+        params = self._stops.request_of(method, params or {})
+        self._send(method, self._greeting + jsonrpc.request(number, method, params))
         self._greeting = b""
         try:
             reply = self._reply(number, method, progress, timeout_s)

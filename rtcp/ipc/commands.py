@@ -28,6 +28,8 @@ class Command(Message, abstract=True):
     """False for commands that only make the arm safer: anyone may send them at any time."""
     waits_for_drive_mode: ClassVar[bool] = False
     """Whether it is refused while the drives change their mode."""
+    superseded_by_stop: ClassVar[bool] = True
+    """Whether it is refused when a stop was requested after it. False for commands that set nothing in motion."""
 
 
 class MotionCommand(Command, abstract=True):
@@ -64,6 +66,7 @@ class Disable(Command):
     """Stop, then take the torque off. In a fault: take the torque off at once."""
 
     states = ANYWHERE - {State.STARTING, State.CLOSING}
+    superseded_by_stop = False
     needs_lease = False
 
 
@@ -71,12 +74,14 @@ class Reset(Command):
     """Leave a fault, an emergency stop, or a stop by a limit."""
 
     states = frozenset({State.STOPPED_BY_LIMIT, State.FAULT, State.EMERGENCY_STOP})
+    superseded_by_stop = False
 
 
 class SetDriveMode(Command):
     """Change the cyclic synchronous mode of the drives."""
 
     states = AT_REST
+    superseded_by_stop = False
     waits_for_drive_mode = True
     mode: DriveMode
 
@@ -85,6 +90,7 @@ class SetControlMode(Command):
     """Change which motion commands the arm accepts."""
 
     states = AT_REST
+    superseded_by_stop = False
     waits_for_drive_mode = True
     mode: ControlMode
 
@@ -96,6 +102,7 @@ class Halt(Command):
     """
 
     states = frozenset({State.READY, State.HOLDING, State.MOVING, State.STOPPING, State.STOPPED_BY_LIMIT, State.HOMING})
+    superseded_by_stop = False
     needs_lease = False
 
 
@@ -103,6 +110,7 @@ class Shutdown(Command):
     """Stop, disable and end the loop; the end of its process is the answer."""
 
     states = ANYWHERE
+    superseded_by_stop = False
     needs_lease = False
 
 
@@ -140,6 +148,7 @@ class SetLimits(Command):
     """Replace the limits by those of a slot of the plan area, all or none."""
 
     states = CALM | {State.FAULT, State.EMERGENCY_STOP}
+    superseded_by_stop = False
     slot: int
     rows: int
 
@@ -148,6 +157,7 @@ class SetSpeedOverride(Command):
     """Move at a fraction of the speed from now on, 0.01 to 1. Anyone may lower it; raising it takes the lease."""
 
     states = ANYWHERE
+    superseded_by_stop = False
     needs_lease = False
     fraction: float
 
@@ -156,6 +166,7 @@ class Pause(Command):
     """Bring the motion under way to rest on its path; all that ends a motion also ends a paused one."""
 
     states = frozenset({State.MOVING})
+    superseded_by_stop = False
     needs_lease = False
 
 
@@ -169,6 +180,7 @@ class SetTool(Command):
     """Use another tool, without a payload."""
 
     states = AT_REST
+    superseded_by_stop = False
     waits_for_drive_mode = True
     tool: int
     """Its number, from 0, in the order of `kinematics.tools`."""
@@ -178,6 +190,7 @@ class SetPayload(Command):
     """Set the payload, whose weight the arm carries: its mass, kg, and its centre in the frame of the tool, m."""
 
     states = AT_REST
+    superseded_by_stop = False
     waits_for_drive_mode = True
     mass: float
     x: float = 0.0
@@ -189,6 +202,7 @@ class SetZero(Command):
     """Set the zero offset of an axis: the position of its drive at the axis' zero."""
 
     states = frozenset({State.READY})
+    superseded_by_stop = False
     axis: int
     offset: float
     """rad"""

@@ -64,6 +64,16 @@ class ResetDone(Event, number=13):
     """reset: the fault is cleared, drives are disabled"""
 
 
+class PluginSlow(Event, number=153):
+    """{plugin} took {took_us:.0f} us in one cycle, allowed are {allowed_us:.0f} us: later cycles come late"""
+
+    is_warning = True
+    plugin: str
+    """Slave, process or controller of another package."""
+    took_us: float
+    allowed_us: float
+
+
 class Arrived(Event, number=14):
     """the motion is complete"""
 
@@ -494,6 +504,13 @@ class ProcessFailed(FaultEvent, number=126):
     """Its place in the configuration, from 0."""
 
 
+class ControllerRaised(FaultEvent, number=152):
+    """the controller {controller} raised an error or returned wrong setpoints, which the log names: {reaction}; then
+    `rtcp reset`"""
+
+    controller: str
+
+
 class GeneratorFailed(FaultEvent, number=7):
     """the trajectory generator refused its input: {reaction}; then `rtcp reset`"""
 
@@ -657,6 +674,18 @@ class StreamEnded(MotionEnded, number=101):
     """the stream of targets ended: controlled stop"""
 
     by_limit = False
+
+
+class NotSettled(MotionEnded, number=154):
+    """{joint} is {distance:.4g} rad from its target {time_s:g} s after the end of the setpoints, allowed is {limit:g}
+    rad (settle in {file}): the motion has failed and the arm holds; look for an obstacle, a load or friction"""
+
+    by_limit = False
+    is_warning = True
+    axis: int
+    distance: float
+    limit: float
+    time_s: float
 
 
 class OutOfPoints(MotionEnded, number=117):

@@ -6,6 +6,7 @@
 | 128 | lease: id, renewed at, duration, holder's name | commanders, under a file lock |
 | 256 | command head; 264: commands taken; 272: number of the last answer | commander; loop; loop |
 | 280 | setpoint head; 288: setpoints taken; 296: open stream | commander; loop; loop |
+| 304 | stops: requested at, handled, answer of each kind | any process; loop; loop |
 | 384 | published records; published events | loop |
 | 512 | request and answer of the service thread | commander; service thread |
 | 1024 | slave states | service thread |
@@ -28,7 +29,7 @@ from typing import Final
 from rtcp.config.model import MOST_AXES
 from rtcp.ipc.message import PAYLOAD_SIZE
 
-MAGIC = 0x5254_4350_0000_000B
+MAGIC = 0x5254_4350_0000_000C
 HEADER = struct.Struct("<QIIIIIiQIi")
 """magic, length of the schema, record size, records, commands, events, reserved, period ns, loop pid, reserved"""
 
@@ -49,6 +50,10 @@ SETPOINT_HEAD_AT: Final = 280
 SETPOINT_TAKEN_AT: Final = 288
 STREAM_AT: Final = 296
 """Number of the stream whose setpoints the loop tracks; 0: none, or it has ended."""
+STOPS_AT: Final = 304
+"""Three words for each kind of stop (`rtcp.ipc.stops`): CLOCK_MONOTONIC, ns, of the last request; of the last request
+that the loop has handled; the answer to it (0: accepted, else 1 + the state that refuses it)."""
+STOP_SIZE: Final = 24
 ANSWER_AT: Final = 15360
 ANSWER = struct.Struct("<Q")
 """number of the refusal's kind (0: accepted); its fields follow (`rtcp.ipc.message`)"""
@@ -84,8 +89,8 @@ EVENTS: Final = 2048
 """Slaves whose emergencies change all the time, seven of them, fill it in 9 minutes: until then a fault stays in it."""
 
 COMMANDS_AT = EVENTS_AT + EVENTS * EVENT_SIZE
-COMMAND = struct.Struct("<QQQ")
-"""number, lease id, number of the command's kind; its fields follow (`rtcp.ipc.message`)"""
+COMMAND = struct.Struct("<QQQQ")
+"""number, lease id, CLOCK_MONOTONIC ns of its request, number of its kind; its fields follow (`rtcp.ipc.message`)"""
 COMMAND_SIZE = COMMAND.size + PAYLOAD_SIZE
 COMMANDS: Final = 64
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rtcp.ipc import stops
 from rtcp.ipc.commands import Command
 from rtcp.ipc.events import EVENTS as EVENT_KINDS
 from rtcp.ipc.events import Event
@@ -341,8 +342,22 @@ class Observer:
         """Number of the last command that the loop has taken out of the ring."""
         return self._words[COMMAND_TAKEN_AT]
 
-    def command(self, lease: int, command: Command) -> int:
+    def stop(self, kind: type[Command], requested_ns: int = 0) -> int:
+        """Request a stop; return its instant. Any process may do this at any time (`rtcp.ipc.stops.request`)."""
+        return stops.request(self._words, kind, requested_ns)
+
+    def stop_answer(self, kind: type[Command], requested_ns: int) -> Answer | None:
+        """Return the loop's answer to a stop, or None while there is none."""
+        refusal = stops.refusal(self._words, kind, requested_ns)
+        return (Answer(None) if refusal else None) if isinstance(refusal, bool) else Answer(refusal)
+
+    def command(self, lease: int, command: Command, requested_ns: int = 0) -> int:
         """Put a command into the ring; return its number. The lease's holder is the only writer.
+
+        Args:
+            lease: of the commander.
+            command: the command.
+            requested_ns: when it was requested, CLOCK_MONOTONIC, ns; 0: now. The loop refuses it after a later stop.
 
         Raises:
             BlackboardError: the ring is full: the loop takes no commands any more.
@@ -351,7 +366,7 @@ class Observer:
         if number - self._words.acquire(COMMAND_TAKEN_AT) > COMMANDS:
             raise BlackboardError("the loop takes no commands: its process hangs or is gone")
         at = COMMANDS_AT + (number % COMMANDS) * COMMAND_SIZE
-        COMMAND.pack_into(self._map, at, number, lease, command.number)
+        COMMAND.pack_into(self._map, at, number, lease, requested_ns or time.monotonic_ns(), command.number)
         command.pack_into(self._map, at + COMMAND.size)
         self._words.release(COMMAND_HEAD_AT, number)
         return number

@@ -27,6 +27,13 @@ class NoLease(Refusal):
     """the lease expired or belongs to another commander: nothing moved"""
 
 
+class Superseded(Refusal):
+    """{command_name} was requested before a stop: nothing moved"""
+
+    command: int
+    """Number of the command's kind."""
+
+
 class WrongState(Refusal):
     """{command_name} is not accepted in state {state}, only in: {accepting_states}{way_out}"""
 
@@ -540,6 +547,12 @@ class DriverRaised(Refusal):
 
     slave: int
     """Position on the cable, from 1."""
+
+
+class ControllerRaised(Refusal):
+    """the controller {controller} raised an error, which the log names"""
+
+    controller: str
 
 
 class ProcessRaised(Refusal):

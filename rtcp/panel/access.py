@@ -2,13 +2,14 @@
 
 Without a password file every visitor is an operator, and it listens at loopback only. A request is refused
 where its Host is no name of this machine (DNS rebinding), where its Origin is another site's, where its cookie names no
-session, and where one visitor sends too many.
+session, and where one visitor sends too many. STOP is refused for the first two reasons only.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import hashlib
 import hmac
 import html
@@ -20,9 +21,10 @@ import secrets
 import socket
 import stat
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Final, Literal, get_args
 from urllib.parse import parse_qs, urlsplit
 
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
@@ -238,18 +240,93 @@ class Sessions:
 # -- requests -------------------------------------------------------------------------------------------------------
 
 
+class Listener(socket.socket):
+    """The socket that listens for browsers: connections without a session are few and short, so that STOP gets one.
+
+    Args:
+        family: AF_INET or AF_INET6.
+    """
+
+    MOST_STRANGERS: Final = 64
+    """Most connections without a session; beyond, the oldest is closed."""
+    STRANGER_S: Final = 10.0
+    """Longest time of a connection without a session, s."""
+    RESERVE: Final = 16
+    """File descriptors that are kept for new connections while the process has no other ones left."""
+
+    def __init__(self, family: int) -> None:
+        super().__init__(family, socket.SOCK_STREAM)
+        self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._strangers: dict[tuple[Any, ...], tuple[socket.socket, float]] = {}
+        """Connection and instant of its beginning, s, by address, oldest first."""
+        self._reserve: list[int] = []
+        self.look_after()
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept a connection; it is a stranger's until `admit`."""
+        try:
+            connection, address = super().accept()
+        except OSError as error:
+            if error.errno not in (errno.EMFILE, errno.ENFILE) or not self._reserve:
+                raise
+            os.close(self._reserve.pop())
+            self._close_oldest()
+            connection, address = super().accept()
+        self._strangers[tuple(address[:2])] = connection, time.monotonic()
+        if len(self._strangers) > self.MOST_STRANGERS:
+            self._forget_closed()
+        if len(self._strangers) > self.MOST_STRANGERS:
+            self._close_oldest()
+        return connection, address
+
+    def admit(self, address: Sequence[Any]) -> None:
+        """Note that a connection has sent a request of a session."""
+        self._strangers.pop(tuple(address[:2]), None)
+
+    def look_after(self) -> None:
+        """Close the strangers whose time is over and fill the reserve; called repeatedly."""
+        self._forget_closed()
+        since = time.monotonic() - self.STRANGER_S
+        while self._strangers and next(iter(self._strangers.values()))[1] < since:
+            self._close_oldest()
+        with contextlib.suppress(OSError):
+            while len(self._reserve) < self.RESERVE:
+                self._reserve.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+
+    def _forget_closed(self) -> None:
+        for address in [address for address, (stranger, _) in self._strangers.items() if stranger.fileno() < 0]:
+            del self._strangers[address]
+
+    def _close_oldest(self) -> None:
+        if self._strangers:
+            stranger, _ = self._strangers.pop(next(iter(self._strangers)))
+            with contextlib.suppress(OSError):
+                stranger.shutdown(socket.SHUT_RDWR)  # the event loop then closes it
+
+
 class Access:
     """ASGI middleware: lets a request through that has a session, as `scope["visitor"]` and `scope["secret"]`.
+
+    STOP needs no session: a page whose session has expired must still stop the arm.
 
     Args:
         app: behind it.
         sessions: kept here.
         host: the address that the panel listens at.
         secure: it is reached over TLS.
+        admit: called with the client's address of a request that has a session.
     """
 
-    def __init__(self, app: ASGIApp, sessions: Sessions, host: str, secure: bool) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        sessions: Sessions,
+        host: str,
+        secure: bool,
+        admit: Callable[[Sequence[Any]], None] = lambda address: None,
+    ) -> None:
         self._app = app
+        self._admit = admit
         self._sessions = sessions
         self._only_loopback = is_loopback(host)
         self._names = {"localhost"}
@@ -267,7 +344,7 @@ class Access:
         address = scope["client"][0] if scope.get("client") else "unknown"
         secret = _cookie(headers.get(b"cookie", ""))
         visitor = self._sessions.find(secret)
-        is_stop = visitor is not None and scope["path"] == "/stop"
+        is_stop = scope["type"] == "http" and scope["path"] == "/stop" and scope["method"] == "POST"
         if not is_stop and not self._may_send(secret if visitor else address):
             await self._refuse(scope, receive, send, 429, "too many requests: wait a second")
             return
@@ -275,12 +352,14 @@ class Access:
             await self._refuse(scope, receive, send, 403, why)
             return
         if scope["type"] == "http":
-            response = await self._respond(scope, receive, headers, address, visitor, secret)
+            response = await self._respond(scope, receive, headers, address, visitor, secret, is_stop)
             if response is not None:
                 await response(scope, receive, _with_headers(send))
                 return
         visitor = visitor or scope.get("visitor")
-        if visitor is None:
+        if visitor is not None and scope.get("client"):
+            self._admit(scope["client"])
+        if visitor is None and not is_stop:
             await self._refuse(scope, receive, send, 401, "no session: open the panel's first page")
             return
         scope["visitor"], scope["secret"] = visitor, secret
@@ -318,6 +397,7 @@ class Access:
         address: str,
         visitor: Visitor | None,
         secret: str,
+        is_stop: bool,
     ) -> Response | None:
         """Return the response to a request that needs no page; None: a page answers it."""
         path, method = scope["path"], scope["method"]
@@ -331,7 +411,7 @@ class Access:
             return RedirectResponse("/login", 303)
         if path == "/login" and self._sessions.asks:
             return await self._log_in(receive, address) if method == "POST" else _login_page("")
-        if visitor is not None:
+        if visitor is not None or is_stop:
             return None
         if path == "/metrics" and method == "GET" and not self._sessions.asks:
             # Prometheus keeps no cookies; its client could open the page as well.

@@ -66,9 +66,9 @@ _EVENT_UPDATES = 10
 """New events are read in every tenth."""
 _MOST_EVENTS = 1000
 _MOST_ALARMS = 200
-_MOST_HALTS = 16
-"""Limit of STOPs from the sockets of pages that wait for an answer; `/stop` takes them too."""
 _STOP = "panel: stop"
+_TAKEN_S, _POLL_S = 0.1, 0.005
+"""Time for a loop to take a stop, s, and interval of looking whether it has, s."""
 NEXT = {
     "off": "Start a platform on the tab Start",
     "starting": "Wait until it runs",
@@ -131,6 +131,8 @@ class Page:
     secret: str = ""
     """Secret of its session."""
     socket: WebSocket | None = None
+    has_expired: bool = False
+    """Whether its session has ended: it is shown nothing more and commands nothing, and its STOP is carried out."""
     sent_ns: int = 0
     """Token of the last message to it."""
     seen_ns: int = 0
@@ -298,7 +300,8 @@ class Live:
         self._updates = 0
         self._scoped = False
         self._last_event = 0
-        self._halting: set[asyncio.Task[str]] = set()
+        self._halting: asyncio.Task[str] | None = None
+        self._leaving: set[asyncio.Task[None]] = set()
         self._halted_ns = 0
         """When STOP was pressed last."""
         self._asking = False
@@ -351,14 +354,13 @@ class Live:
         token_ns = message["seen"]
         if type(token_ns) is not int or not 0 <= token_ns <= page.sent_ns:
             raise ValueError("a token that was never sent")
+        if message.get("stop"):
+            self._begin_halt()
+        if page.has_expired:
+            return
         if message.get("visible") is True:
             page.seen_ns = max(page.seen_ns, token_ns)
-        if message.get("stop"):
-            if len(self._halting) < _MOST_HALTS:
-                halting = asyncio.create_task(self.halt())
-                self._halting.add(halting)
-                halting.add_done_callback(self._halting.discard)
-        elif "jog" in message:
+        if "jog" in message:
             self._jog(page, message, token_ns)
 
     def _jog(self, page: Page, message: Json, token_ns: int) -> None:
@@ -477,26 +479,50 @@ class Live:
     async def halt(self) -> str:
         """Stop all motions and waiting commands of all arms of the cell, for any visitor; return what failed and why.
 
-        The arms are reached at once and each by itself.
+        The loops are reached at once and each by itself. A STOP while another one waits for its end has the same
+        outcome.
         """
+        return await asyncio.shield(self._begin_halt())
+
+    def _begin_halt(self) -> asyncio.Task[str]:
+        """Request the stop of each loop now; return the task that waits for the end of all motions."""
+        requested = [(feed, feed.halt()) for feed in (self.feed, *self.partners.feeds) if feed is not None]
         self._halted_ns = time.monotonic_ns()
         for page in self.pages.values():
             page.ended = page.press
-        ending = None if self.operator is None else asyncio.create_task(self.leave(self.operator.page))
+        if self.operator is not None:
+            leaving = asyncio.create_task(self.leave(self.operator.page))
+            self._leaving.add(leaving)
+            leaving.add_done_callback(self._leaving.discard)
+        if self._halting is None or self._halting.done():
+            self._halting = asyncio.create_task(self._halt(requested))
+        return self._halting
+
+    async def _halt(self, requested: Sequence[tuple[Feed, int]]) -> str:
         try:
             if self.partners.cell is not None:
                 failed = await AsyncCell(self.partners.cell, _STOP).halt()
                 # Arms without torque have nothing to stop.
                 errors = {name: e for name, e in failed.items() if getattr(e, "reason", "") != "wrong_state"}
-                return "; ".join(f"{name}: {error}" for name, error in errors.items())
+                message = "; ".join(f"{name}: {error}" for name, error in errors.items())
+                has_reason = any(getattr(error, "reason", "") for error in errors.values())
+                return message if has_reason or not errors or not await self._all_stopped(requested) else ""
             async with AsyncRobot(_STOP) as robot:
                 await robot.halt()
-        except RtcpError as error:
-            return error.message
+        except (RtcpError, OSError) as error:
+            # Without a reason of the loop only the way to the gateway is missing.
+            return str(error) if getattr(error, "reason", "") or not await self._all_stopped(requested) else ""
         finally:
-            if ending is not None:
-                await ending
+            await asyncio.gather(*self._leaving)
         return ""
+
+    async def _all_stopped(self, requested: Sequence[tuple[Feed, int]]) -> bool:
+        """Return whether every loop has taken its stop, within `_TAKEN_S`."""
+        for _ in range(round(_TAKEN_S / _POLL_S)):
+            if all(feed.has_taken(requested_ns) for feed, requested_ns in requested):
+                return bool(requested)
+            await asyncio.sleep(_POLL_S)
+        return False
 
     async def set_speed_override(self, page: Page, fraction: float) -> None:
         """Set it, also while this page moves the arm; anyone who may command lowers it.
@@ -577,9 +603,9 @@ class Live:
 
     async def _end_sessions(self) -> None:
         for page in list(self.pages.values()):
-            if page.socket is not None and not self._is_session(page.secret):
+            if not page.has_expired and not self._is_session(page.secret):
+                page.has_expired = True
                 await self.leave(page)
-                await page.socket.close(1008, "the session has ended")
 
     async def _read_status(self) -> None:
         try:
@@ -670,7 +696,8 @@ class Live:
             self._read_scopes()
         for page in list(self.pages.values()):
             # A page that is slow to receive gets the newest message when it is ready.
-            if page.socket is not None and (page.sending is None or page.sending.done()):
+            is_ready = page.sending is None or page.sending.done()
+            if page.socket is not None and not page.has_expired and is_ready:
                 page.sending = asyncio.create_task(self._send(page, page.socket, state))
 
     def _read_scopes(self) -> None:

@@ -45,6 +45,11 @@ class Partners:
         """The others, in the order of the cell."""
         return () if self.cell is None else tuple(arm for arm in self.cell.arms if arm is not self.own)
 
+    @property
+    def feeds(self) -> tuple[Feed, ...]:
+        """Feeds of the others that run."""
+        return tuple(self._feeds.values())
+
     def find_cell(self) -> None:
         """Look up the cell: it is known while an arm of it runs."""
         cell, own = cell_of_this_arm() or (None, None)

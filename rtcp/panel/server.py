@@ -21,7 +21,7 @@ from starlette.staticfiles import StaticFiles
 
 from rtcp.api import RtcpError
 from rtcp.config.zero import state_directory
-from rtcp.panel.access import Access, Sessions, Visitor, password_file, passwords_for
+from rtcp.panel.access import Access, Listener, Sessions, Visitor, password_file, passwords_for
 from rtcp.panel.frame import Frame, Tab
 from rtcp.panel.live import Live
 from rtcp.panel.metrics import exposition
@@ -44,6 +44,7 @@ from rtcp.panel.pages import (
 )
 
 _STATIC = Path(__file__).parent / "static"
+_LOOK_AFTER_S = 0.5
 PAGES: dict[str, Tab] = {
     "/": Tab("Start", start.build),
     "/jog": Tab("Jog", jog.build),
@@ -91,8 +92,7 @@ class Panel:
         self._live = Live(lambda secret: self._sessions.find(secret) is not None)
         self._options = options
         family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
-        self._socket = socket.socket(family, socket.SOCK_STREAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._socket = Listener(family)
         try:
             self._socket.bind((options.host, options.port))
             self._socket.listen()  # a client that is quicker than the start waits
@@ -108,7 +108,11 @@ class Panel:
         """Serve until SIGINT or SIGTERM."""
         server = FastAPI(lifespan=self._lifespan, docs_url=None, redoc_url=None, openapi_url=None)
         server.add_middleware(
-            Access, sessions=self._sessions, host=self._options.host, secure=self._options.certificate is not None
+            Access,
+            sessions=self._sessions,
+            host=self._options.host,
+            secure=self._options.certificate is not None,
+            admit=self._socket.admit,
         )
         self._add_routes(server)
         for path in PAGES:
@@ -120,13 +124,13 @@ class Panel:
         config = uvicorn.Config(
             server, log_level="warning", ws_max_size=1 << 16, access_log=False, server_header=False,
             ssl_certfile=options.certificate, ssl_keyfile=options.key, timeout_graceful_shutdown=1,
-            proxy_headers=False,
+            proxy_headers=False, loop="asyncio",  # which accepts by the method of the listener
         )  # fmt: skip
         uvicorn.Server(config).run(sockets=[self._socket])
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, server: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(self._live.follow()), asyncio.create_task(self._live.watch())]
+        tasks = [asyncio.create_task(work) for work in (self._live.follow(), self._live.watch(), self._look_after())]
         if self._options.open:
             # Not in the event loop: for a text browser `webbrowser.open` waits until it ends.
             opening = threading.Timer(0.5, webbrowser.open, (self.url,))
@@ -139,6 +143,11 @@ class Panel:
                 task.cancel()
             if self._live.operator is not None:
                 await self._live.operator.end()
+
+    async def _look_after(self) -> None:
+        while True:
+            self._socket.look_after()
+            await asyncio.sleep(_LOOK_AFTER_S)
 
     def _add_routes(self, server: FastAPI) -> None:
         server.mount("/static", StaticFiles(directory=_STATIC))

@@ -87,6 +87,7 @@ _CODES = {
     "old_stamp": FollowCode.OLD_HEADER_TIMESTAMP,
     "path_tolerance_violated": FollowCode.PATH_TOLERANCE_VIOLATED,
     "goal_tolerance_violated": FollowCode.GOAL_TOLERANCE_VIOLATED,
+    "not_settled": FollowCode.GOAL_TOLERANCE_VIOLATED,
     "goal_time_exceeded": FollowCode.GOAL_TOLERANCE_VIOLATED,
 }
 """Reason of an RtcpError -> code; any other reason is an invalid goal if the motion had not begun."""

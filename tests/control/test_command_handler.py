@@ -43,6 +43,7 @@ from rtcp.ipc.commands import (
     StreamPosition,
 )
 from rtcp.ipc.events import Paused, Resumed, SpeedOverrideChanged
+from rtcp.ipc.observer import Answer
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 from .rig import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, LoopRig, Step, about, move_to, turn
@@ -366,3 +367,24 @@ def test_at_most_one_command_is_taken_a_cycle(rig: LoopRig) -> None:
     rig.cycle()
     assert rig.observer.answer(second) is not None
     assert rig.state is State.STOPPING
+
+
+def test_a_stop_is_carried_out_in_the_next_cycle_whatever_waits_in_the_ring(rig: LoopRig) -> None:
+    rig.hold()
+    rig.do(move_to(0.1, 0.1))
+    for _ in range(60):
+        rig.observer.command(rig.lease, SetSpeedOverride(1.0))
+    rig.observer.command(rig.lease, move_to(-0.1, -0.1))
+    stop = rig.observer.stop(Halt)
+    rig.cycle()
+    assert rig.state is State.STOPPING
+    assert rig.observer.stop_answer(Halt, stop) == Answer(None)
+    rig.run(1.0)
+    assert rig.state is State.HOLDING
+
+
+def test_a_refused_stop_says_in_which_state(rig: LoopRig) -> None:
+    rig.lead_to(State.FAULT)
+    stop = rig.observer.stop(Halt)
+    rig.cycle()
+    assert rig.observer.stop_answer(Halt, stop) == Answer(refusals.WrongState(Halt.number, State.FAULT))

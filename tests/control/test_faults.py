@@ -241,12 +241,13 @@ def test_every_fault_and_every_key_has_a_case() -> None:
     own = {kind for kind in events.Event.kinds if kind.__module__ == "rtcp.ipc.events"}
     faults = {kind for kind in own if kind.is_fault and not kind.is_emergency}
     # A reset without frames: test_clock_lost.py; without a robot controller: tests/faults/egm.py; a process:
-    # test_processes.py; a push towards a box: test_torque_in_boxes.py.
+    # test_processes.py; a push towards a box: test_torque_in_boxes.py; a controller: test_wrong_plugins.py.
     assert faults <= {case.kind for case in CASES} | {
         events.ResetWithoutFrames,
         events.ResetWithoutController,
         events.ProcessFailed,
         events.PushedNear,
+        events.ControllerRaised,
     }
     assert {entry.name for entry in fields(StopsConfig)} == {kind.stop_key for kind in own} - {""} == set(STOPS)
 

@@ -47,7 +47,7 @@ def recording_context() -> Any:
         def publish(self, event: Event) -> None:
             self.published.append(event)
 
-        def explain(self, what: str, error: Exception) -> None:
+        def explain(self, what: str, error: BaseException) -> None:
             self.explained.append((what, str(error)))
 
     return RecordingContext()

@@ -111,6 +111,9 @@ class FakeLoop:
     def _handle(self) -> None:
         number, lease, command = self.board.take_command()
         assert not isinstance(command, Malformed)
+        self.board.answer(number, command if isinstance(command, Refusal) else self._carry_out(command, lease))
+
+    def _carry_out(self, command: Command, lease: int) -> Refusal | None:
         self.commands.append(command)
         if isinstance(command, RunLines | RunTrajectory | SetLimits):
             rows = list(self.board.plan(command.slot))
@@ -124,7 +127,7 @@ class FakeLoop:
                 self.board.event(event)
             if isinstance(command, MotionCommand):
                 self._begin(command, lease)
-        self.board.answer(number, refusal)
+        return refusal
 
     def _begin(self, command: MotionCommand, lease: int) -> None:
         leads: Sequence[float] = self.q

@@ -18,7 +18,7 @@ from rtcp.gateway.command_channel import Caller
 from rtcp.gateway.motion_actions import Planner
 from rtcp.ipc.commands import MoveJoints, RunLines, RunTrajectory
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.events import BoxReached, PermissionWithdrawn, SlaveLost, Stopped
+from rtcp.ipc.events import BoxReached, NotSettled, PermissionWithdrawn, SlaveLost, Stopped
 from rtcp.ipc.refusals import EmergencyStopPressed
 from rtcp.ipc.states import ControlMode, State
 from rtcp.motion.limits import Limits
@@ -276,6 +276,11 @@ ENDS = {
     "permission withdrawn": (State.HOLDING, PermissionWithdrawn(), "the move ended before it arrived: the enabling"),
     "stop by a limit": (State.STOPPED_BY_LIMIT, BoxReached(0, 0.01), "the move was stopped by a limit: the arm stopp"),
     "fault": (State.FAULT, SlaveLost(3), "slave 3"),
+    "not settled": (
+        State.HOLDING,
+        NotSettled(1, 0.01, 0.002, 3.0),
+        "the move ended before it arrived: joint2 is",
+    ),
     "halt": (State.HOLDING, Stopped(), "the move ended before it arrived: the arm has stopped and holds"),
 }
 

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.commands import Halt, MoveJoints
+from rtcp.ipc.commands import Command, Disable, Halt, MoveJoints
 from rtcp.ipc.errors import Invalid, Refused
 from rtcp.ipc.events import ErrorReported, SlaveLost
 from rtcp.ipc.jsonrpc import LINE_LIMIT
@@ -185,6 +186,52 @@ def test_halt_does_not_wait_for_the_move_of_its_own_connection_and_other_request
     until(lambda: loop.kinds == [MoveJoints, Halt], "the halt")
     loop.state = State.HOLDING
     assert sorted(raw.receive()["id"] for _ in range(3)) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("kind", [Halt, Disable])
+def test_a_stop_overtakes_the_requests_of_a_hundred_clients(
+    directory: Path, loop: FakeLoop, kind: type[Command]
+) -> None:
+    lowered = {"method": "set_speed_override", "params": {"fraction": 1.0}}
+    clients = [Raw(directory) for _ in range(100)]
+    try:
+        for client in clients:
+            client.send(*({"id": number, **lowered} for number in range(100)))
+        until(lambda: len(loop.commands) > 10, "the first commands")
+        before = len(loop.commands)
+        clients[-1].send({"id": 100, "method": kind.name})  # behind 100 requests of its own connection
+        until(lambda: kind in loop.kinds, "the stop")
+        assert len(loop.commands) - before < 5_000
+    finally:
+        for client in clients:
+            client.close()
+        until(lambda: is_quiet(loop), "the end of all requests")
+
+
+def is_quiet(loop: FakeLoop) -> bool:
+    """Return whether the gateway sends nothing more for the clients that have gone."""
+    before = len(loop.commands)
+    time.sleep(0.3)
+    return len(loop.commands) == before
+
+
+def test_a_motion_that_was_requested_before_a_stop_does_not_begin_after_it(raw: Raw, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+    move = {"method": "move_joints", "params": MOVE}
+    raw.send({"id": 1, **move}, {"id": 2, **move})
+    until(lambda: loop.state is State.MOVING, "moving")
+    raw.send({"id": 3, "method": "halt"})
+    until(lambda: Halt in loop.kinds, "the halt")
+    loop.state = State.HOLDING
+    errors = {answer["id"]: answer.get("error") for answer in (raw.receive() for _ in range(3))}
+    assert errors[2]["data"]["reason"] == "superseded"
+    assert loop.kinds == [MoveJoints, Halt]
+
+
+def test_a_stop_without_an_answer_stops_all_the_same(raw: Raw, loop: FakeLoop) -> None:
+    raw.send({"method": "halt"})
+    assert raw.receive()["error"]["data"]["kind"] == "invalid"
+    until(lambda: loop.kinds == [Halt], "the halt")
 
 
 def test_a_client_stopped_by_sigstop_during_a_move_loses_its_lease(

@@ -9,6 +9,7 @@ import http.client
 import json
 import os
 import re
+import resource
 import shutil
 import signal
 import socket
@@ -29,6 +30,7 @@ from websockets.sync.client import connect
 
 from rtcp.api import Invalid
 from rtcp.panel import access
+from rtcp.panel.access import Listener
 from tests.e2e.conftest import Platform
 from tests.panel.conftest import begun
 from tests.simulated_time import Clock
@@ -360,3 +362,99 @@ def test_the_file_is_readable_by_its_owner_alone_and_a_damaged_one_is_said(tmp_p
         file.write_text(text)
         with pytest.raises(Invalid, match="damaged"):
             access.read_passwords(file)
+
+
+# -- connections ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def listener() -> Iterator[Listener]:
+    with Listener(socket.AF_INET) as made:
+        made.bind(("127.0.0.1", 0))
+        made.listen(2048)
+        yield made
+
+
+def is_ended(browser: socket.socket) -> bool:
+    """Return whether the panel has ended a connection."""
+    browser.setblocking(False)
+    try:
+        return browser.recv(1) == b""
+    except BlockingIOError:
+        return False
+
+
+def test_connections_without_a_session_are_few_and_those_with_one_stay(listener: Listener) -> None:
+    browsers, accepted = [], []
+    for number in range(listener.MOST_STRANGERS + 10):
+        browsers.append(socket.create_connection(listener.getsockname()))
+        connection, address = listener.accept()
+        accepted.append(connection)
+        if number < 5:
+            listener.admit(address)
+    assert [is_ended(browser) for browser in browsers] == [False] * 5 + [True] * 5 + [False] * listener.MOST_STRANGERS
+    for each in (*browsers, *accepted):
+        each.close()
+
+
+def test_a_connection_without_a_session_is_closed_after_a_time(
+    listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Clock().shown() as clock, socket.create_connection(listener.getsockname()) as browser:
+        connection, _ = listener.accept()
+        clock.advance(listener.STRANGER_S - 0.1)
+        listener.look_after()
+        assert not is_ended(browser)
+        clock.advance(0.2)
+        listener.look_after()
+        assert is_ended(browser)
+        connection.close()
+
+
+def test_a_connection_is_accepted_while_all_file_descriptors_are_used(listener: Listener) -> None:
+    limit, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    browsers = [socket.create_connection(listener.getsockname()) for _ in range(3)]
+    taken: list[int] = []
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(limit, 256), hard))
+        with contextlib.suppress(OSError):
+            while True:
+                taken.append(os.open(os.devnull, os.O_RDONLY))
+        accepted = [listener.accept()[0] for _ in browsers]
+        assert [each.fileno() > 0 for each in accepted] == [True] * 3
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+        for descriptor in taken:
+            os.close(descriptor)
+        for browser in browsers:
+            browser.close()
+
+
+def test_stop_needs_no_session_and_commands_do(tmp_path: Path) -> None:
+    sessions = access.Sessions(tmp_path / "none")
+    reached = []
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        reached.append((scope["method"], scope["path"], scope["visitor"]))
+        await PlainTextResponse("")(scope, receive, send)
+
+    guarded = access.Access(app, sessions, "127.0.0.1", False)
+
+    async def ask(method: str, path: str, origin: str) -> None:
+        headers = [(b"host", b"127.0.0.1:8080"), (b"origin", origin.encode())]
+        scope = {"type": "http", "method": method, "path": path, "headers": headers, "client": ("10.0.0.1", 1)}
+
+        async def receive() -> Any:
+            return {"type": "http.request", "body": b""}
+
+        async def send(message: Any) -> None:
+            pass
+
+        await guarded(scope, receive, send)
+
+    for _ in range(1000):  # no limit of requests holds it back
+        asyncio.run(ask("POST", "/stop", "http://127.0.0.1:8080"))
+    asyncio.run(ask("POST", "/stop", "http://evil.example"))
+    asyncio.run(ask("GET", "/stop", "http://127.0.0.1:8080"))
+    asyncio.run(ask("POST", "/other", "http://127.0.0.1:8080"))
+    assert reached == [("POST", "/stop", None)] * 1000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import time
 from collections.abc import Awaitable, Callable
 from types import SimpleNamespace
@@ -246,6 +247,60 @@ def test_a_viewer_has_no_arm_and_stops_all_the_same(monkeypatch: pytest.MonkeyPa
         await asyncio.sleep(0.001)
 
     assert [robot.halts for robot in run(test, monkeypatch)] == [1]
+
+
+class FakeFeed:
+    """Shared memory of a platform whose loop takes every halt."""
+
+    def __init__(self) -> None:
+        self.halts = 0
+
+    def halt(self) -> int:
+        self.halts += 1
+        return self.halts
+
+    def has_taken(self, requested_ns: int) -> bool:
+        return requested_ns <= self.halts
+
+
+def test_stop_needs_no_new_connection_and_waits_for_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test(panel: Panel) -> None:
+        async def no_descriptor(robot: FakeRobot) -> FakeRobot:
+            raise OSError(errno.EMFILE, "Too many open files")
+
+        monkeypatch.setattr(FakeRobot, "__aenter__", no_descriptor)
+        own, partner = FakeFeed(), FakeFeed()
+        panel.live.feed, panel.live.partners._feeds["left"] = cast(Any, own), cast(Any, partner)
+        panel.answer(panel.page(), stop=True)
+        assert (own.halts, partner.halts) == (1, 1)  # before anything else runs
+        assert await panel.live.halt() == ""
+        panel.live.feed = None
+        panel.live.partners._feeds.clear()
+        assert "Too many open files" in await panel.live.halt()
+
+    run(test, monkeypatch)
+
+
+def test_a_page_whose_session_has_expired_shows_nothing_moves_nothing_and_stops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def test(panel: Panel) -> None:
+        page, feed = panel.page(), FakeFeed()
+        panel.live.feed = cast(Any, feed)
+        moving = await panel.begin_move(page)
+        panel.live._is_session = lambda secret: False
+        await panel.live._end_sessions()
+        with pytest.raises(EndedOnPurpose):
+            await moving
+        panel.live._send_all()
+        assert page.sending is None
+        await panel.jog(page, 1)
+        assert panel.live.operator is None
+        panel.answer(page, stop=True)
+        assert feed.halts == 1
+        await asyncio.sleep(0.001)
+
+    run(test, monkeypatch)
 
 
 @pytest.mark.parametrize("answer", [True, False, None])

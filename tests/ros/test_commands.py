@@ -519,6 +519,7 @@ def test_a_tolerance_that_cannot_be_honoured_refuses_the_goal(
     [
         ("path_tolerance_violated", FollowCode.PATH_TOLERANCE_VIOLATED),
         ("goal_tolerance_violated", FollowCode.GOAL_TOLERANCE_VIOLATED),
+        ("not_settled", FollowCode.GOAL_TOLERANCE_VIOLATED),
     ],
 )
 def test_a_violated_tolerance_has_its_code_and_says_why(arm: FakeArm, reason: str, code: FollowCode) -> None:

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.metadata import EntryPoint
 from math import isfinite
 from typing import ClassVar, Final
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.find import load_class, registered
+from rtcp.config.find import load_class, made_by, registered
 from rtcp.config.model import ArmConfig, ConfigError
 from rtcp.ipc.commands import Command
 from rtcp.ipc.events import ControllerFailed, MotionEnded
@@ -212,13 +213,13 @@ class Controller:
 
 
 @cache
-def installed() -> tuple[type[Controller], ...]:
-    """Return the classes of all installed controllers.
+def installed() -> tuple[tuple[EntryPoint, type[Controller]], ...]:
+    """Return the classes of all installed controllers, with their entry points.
 
     Raises:
         PluginError: an entry point is not a controller.
     """
-    return tuple(load_class(entry, Controller) for entry in registered(ENTRY_POINTS).values())
+    return tuple((entry, load_class(entry, Controller)) for entry in registered(ENTRY_POINTS).values())
 
 
 def load_controllers(setup: ControllerSetup) -> dict[type[Command], Controller]:
@@ -231,10 +232,11 @@ def load_controllers(setup: ControllerSetup) -> dict[type[Command], Controller]:
         ConfigError: two controllers accept the same command, or `installed` raises it.
     """
     controllers: dict[type[Command], Controller] = {}
-    for kind in installed():
+    for entry, kind in installed():
         if kind.needs_geometry and setup.config.arm is None:
             continue
-        controller = kind(setup)
+        with made_by(entry):
+            controller = kind(setup)
         for command in kind.commands:
             if command in controllers:
                 other = controllers[command].name
