@@ -13,11 +13,12 @@ from rtcp.config.loader import with_control_mode
 from rtcp.config.model import MOST_AXES, ArmConfig
 from rtcp.control.cycle import record_schema
 from rtcp.gym.actions import ActionKind
-from rtcp.ipc.commands import OpenStream
+from rtcp.ipc.commands import OpenStream, SetControlMode
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.session import SessionError, read_session
+from rtcp.ipc.states import ControlMode
 from rtcp.testing import Simulation
 from rtcp.testing.inputs import Inputs
 
@@ -110,17 +111,22 @@ class SimulatedArm:
         """Power another arm up, and bring it to holding."""
         self.close()
         self._simulation = simulation = Simulation(
-            self.config, seed, positions=positions, segment=self._segment, follow_clock=False
+            with_control_mode(self.config, "joint"),
+            seed,
+            positions=positions,
+            segment=self._segment,
+            follow_clock=False,
         )
         simulation.unlink()
         self.observer, self._cycles_run = simulation.observer, 0
         Inputs(simulation)
         try:
+            # The mode of the actions comes last: an arm that rests in joint mode does not sag when torques hold it.
             simulation.hold()
+            simulation.until(lambda: max(map(abs, simulation.loop.arm.state.actual_velocity)) < _AT_REST_RAD_S, 5.0)
+            simulation.do(SetControlMode(ControlMode[self.config.control_mode.upper()]))
             simulation.until(lambda: not simulation.loop.machine.changing_mode, 1.0)
             simulation.bring_to(State.HOLDING, 0.0)
-            # A torque motion begins at rest; under its weight the arm sags a little where the drives hold it by torque.
-            simulation.until(lambda: max(map(abs, simulation.loop.arm.state.actual_velocity)) < _AT_REST_RAD_S, 5.0)
         except RuntimeError as error:
             raise RtcpError("fault", f"the simulated arm cannot be brought to holding: {error}") from error
         if self._kind.command is None:
