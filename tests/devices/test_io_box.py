@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import struct
+from typing import Literal
 
 import pytest
 
@@ -62,9 +63,9 @@ def test_inputs_as_single_bits_are_refused() -> None:
 
 
 @pytest.mark.parametrize("active", ["high", "low"])
-def test_reading_for_activity_never_clears_an_active_input(active: str) -> None:
+def test_reading_for_activity_never_clears_an_active_input(active: Literal["high", "low"]) -> None:
     pressed, released = (0b100, 0) if active == "high" else (0, 0b100)
-    switch = Switch(InputConfig(3, active, debounce_ms=3), False, 1e-3)  # type: ignore[arg-type]
+    switch = Switch(InputConfig(3, active, debounce_ms=3), False, 1e-3)
     for _ in range(10):
         switch.read_active(pressed)
     assert switch.active
