@@ -108,9 +108,9 @@ from tests.leftovers import FoundAtTheEnd
 def table():
     yield
     ran = Path(__file__ + '.ran')
-    found = not ran.exists()
+    is_first = not ran.exists()
     ran.touch()
-    if found:
+    if is_first:
         raise FoundAtTheEnd()
 @pytest.mark.platform
 def test_it(table): pass

@@ -38,7 +38,6 @@ class Verdicts:
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
         self._not_selected: Counter[str] = Counter()
-        self._was_repeated = False
         self._resources = contextlib.ExitStack()
         self._host: Host | None = None
         self.problems: list[str] = []
@@ -92,16 +91,14 @@ class Verdicts:
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
         """Give the counts to the controller of a distributed run. Let a flaky test fail the run where that is asked."""
         self._resources.close()
-        if self._was_repeated and self._config.getoption("fail_on_flaky", False) and session.exitstatus == 0:
+        reporter = self._config.pluginmanager.get_plugin("terminalreporter")
+        fails = self._config.getoption("fail_on_flaky", False) and session.exitstatus == 0
+        if fails and reporter is not None and reporter.stats.get("rerun"):
             session.exitstatus = _FLAKY_STATUS
         if output := getattr(self._config, "workeroutput", None):
             output["not_selected"] = dict(self._not_selected)
 
     # -- in the process that prints -------------------------------------------------------------------------------
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note that a test was repeated."""
-        self._was_repeated = self._was_repeated or report.outcome == "rerun"
 
     def pytest_testnodedown(self, node: Any) -> None:
         """Take the counts of a worker: every worker collects all tests."""

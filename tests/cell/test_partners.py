@@ -149,12 +149,12 @@ def test_the_guard_brakes_a_partner_by_its_acceleration_in_force_and_after_its_s
 
 
 def test_the_new_records_of_a_partner_are_in_place_before_the_old_ones_are_released(beside: Beside, path: Path) -> None:
-    partners, found = beside.partners, []
+    partners, in_place = beside.partners, []
 
     class Old:
         def __del__(self) -> None:
             # In the loop another thread reads here, while the mapping of the old records is released.
-            found.append(partners._views[0])
+            in_place.append(partners._views[0])
 
     views: list[Any] = partners._views
     views[0] = Old()
@@ -162,4 +162,4 @@ def test_the_new_records_of_a_partner_are_in_place_before_the_old_ones_are_relea
     Beside(path).close()
     partners.open()
     path.with_name(f"{path.name}.old").unlink()
-    assert [type(view).__name__ for view in found] == ["RecordView"]
+    assert [type(view).__name__ for view in in_place] == ["RecordView"]

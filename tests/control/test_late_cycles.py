@@ -119,3 +119,37 @@ def test_frames_are_sent_at_their_phase_after_the_first_sync0(phase: float, shif
         assert discipline.raw_ns == late_ns
     none = tuple(replace(slave, device=replace(slave.device, assign_activate=0)) for slave in slaves)
     assert make_discipline(replace(config, slaves=none)) is None
+
+
+class Paced:
+    """Stands for a robot's controller, which sets the pace: a mock, as only the real one can be early or late."""
+
+    def __init__(self, rig: LoopRig) -> None:
+        self._rig = rig
+        self.deadline = self.sent = 0
+        self.arrives_after = 0.0
+        """Time from the plan to the message, periods; greater than 0.5: it is lost."""
+
+    def receive_until(self, deadline_ns: int) -> int:
+        self.deadline = deadline_ns
+        planned = deadline_ns - PERIOD_NS // 2
+        self._rig.now_ns = planned + round(self.arrives_after * PERIOD_NS)
+        return self._rig.data.receive() if self.arrives_after <= 0.5 else -1
+
+    def send(self) -> None:
+        self.sent += 1
+
+
+@pytest.mark.parametrize(("arrives_after", "next_after"), [(0.0, 1.0), (0.25, 1.25), (0.6, 1.0), (2.5, 2.5)])
+def test_the_next_message_of_a_bus_that_sets_the_pace_is_due_a_period_after_the_last_or_after_its_plan(
+    rig: LoopRig, arrives_after: float, next_after: float
+) -> None:
+    paced, planned = Paced(rig.start()), rig.now_ns
+    paced.arrives_after = arrives_after
+    records = rig.observer.head
+    rig.data.send()
+    due = rig.loop.answer(paced, planned)  # type: ignore[arg-type]
+    assert (paced.deadline, due) == (planned + PERIOD_NS // 2, planned + round(next_after * PERIOD_NS))
+    assert (paced.sent, rig.observer.head) == (1, records + 1)
+    assert rig.arm.state.now_ns == rig.now_ns
+    assert rig.context.lost == (0 if arrives_after <= 0.5 else 1)

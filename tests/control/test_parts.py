@@ -147,6 +147,19 @@ def test_a_driver_that_raises_is_a_fault_with_outputs_of_zero_and_is_tried_again
     assert cycle(State.READY) == 7
 
 
+@pytest.mark.interpreted
+def test_the_event_of_a_driver_is_reported() -> None:
+    event = OverSpeed(0, 2.0, 1.0)
+
+    class Supervising(Driver):
+        def update(self, state: State, now_ns: int) -> Event | None:
+            return event
+
+    context = recording_context()
+    Device(0, Supervising(HEATER, 0.001)).update(context)
+    assert context.reported == event
+
+
 def test_a_value_that_a_driver_adds_is_not_in_the_record_and_moves_nothing() -> None:
     driver = Driver(HEATER, 0.001)
     driver.values["mean"] = 1.0

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import struct
+from typing import Literal
 
 import pytest
 
-from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
+from rtcp.config.model import DeviceDescription, InputConfig, Pdo, PdoEntry, SlaveConfig
 from rtcp.devices import DeviceError, IoBox
+from rtcp.devices.io_box import Switch
 
 OUTPUTS = (PdoEntry(0x7000, 1, "uint16", "outputs"),)
 INPUTS = (PdoEntry(0x6000, 1, "uint16", "inputs"), PdoEntry(0x6010, 1, "int32", "counter"))
@@ -58,3 +60,18 @@ def test_a_box_without_inputs_is_refused() -> None:
 def test_inputs_as_single_bits_are_refused() -> None:
     with pytest.raises(DeviceError, match="channel inputs is bool"):
         make_box(inputs=(PdoEntry(0x6000, 1, "bool", "inputs"), INPUTS[1]))
+
+
+@pytest.mark.parametrize("active", ["high", "low"])
+def test_reading_for_activity_never_clears_an_active_input(active: Literal["high", "low"]) -> None:
+    pressed, released = (0b100, 0) if active == "high" else (0, 0b100)
+    switch = Switch(InputConfig(3, active, debounce_ms=3), False, 1e-3)
+    for _ in range(10):
+        switch.read_active(pressed)
+    assert switch.active
+    for _ in range(10):
+        switch.read_active(released)
+    assert switch.active
+    for _ in range(10):
+        switch.read(released)
+    assert not switch.active

@@ -22,7 +22,7 @@ from rtcp.api.cell import Cell
 from rtcp.ipc.runtime_directory import control_socket, irc5_control
 from rtcp.ipc.session import read_processes, read_session
 from rtcp.virtual.request_socket import RequestClient
-from tests.cell.running import ABB_HOME, RunningCell, put_in_order, restore, shipped_cell
+from tests.cell.running import ABB_HOME, RunningCell, leftovers_of, put_in_order, restore, shipped_cell
 from tests.leftovers import Leftovers
 from tests.panel.conftest import barriers, begun, show, visitor
 from tests.waiting import until
@@ -36,13 +36,10 @@ FAR = {"left": "0.9, 0.2, 0.1, 0, 0.5, 0.3", "right": "-0.9, 0.1, -0.1, 0.1, 0.6
 def running(leftovers: Leftovers) -> Iterator[RunningCell]:
     """Two virtual IRB 120; their loops may be later than shipped, as a browser draws beside them."""
     pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
-    cell = RunningCell(shipped_cell())
-    cell.platform.environment["RTCP_NAME"] = "left"
-    directories = {str(directory) for directory in (cell.directory, cell.of("left"), cell.of("right"))}
-    leftovers.shared |= directories
-    yield cell
-    cell.end()
-    leftovers.shared -= directories
+    with leftovers_of(leftovers, "left", "right") as platform:
+        cell = RunningCell(shipped_cell(), platform)
+        platform.environment["RTCP_NAME"] = "left"
+        yield cell
 
 
 @pytest.fixture(scope="module")

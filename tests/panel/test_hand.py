@@ -300,12 +300,18 @@ def test_a_click_that_comes_after_a_later_stop_does_nothing(page: Page, holding:
     assert holding.status()["state"] == "holding"
 
 
+def recordings(platform: Platform) -> list[list[str]]:
+    """Return the files of each recording since the start of the platform, also of those that tests before have made."""
+    return [recording["files"] for recording in platform.call("record_status")["recordings"]]
+
+
 def test_a_viewer_looks_and_stops_and_commands_nothing(browser: Browser, holding: Platform) -> None:
     passwords = Path(holding.environment["RTCP_STATE_DIR"], "panel.json")
     access.set_password(passwords, "operator", PASSWORD)
     access.set_password(passwords, "viewer", VIEWERS_PASSWORD)
     holding.call("move_gripper", open=True)
     since, limits = holding.last_event(), holding.call("limits")
+    recorded = recordings(holding)
     rest = holding.status()["joints"]["commanded_position"]
     try:
         with begun(holding) as (_, url), visitor(browser, url) as page:
@@ -343,7 +349,7 @@ def test_a_viewer_looks_and_stops_and_commands_nothing(browser: Browser, holding
             assert (status["state"], status["drive_mode"], status["lease"]["holder"]) == ("holding", "csp", "")
             assert holding.events(since) == []
             assert holding.call("limits") == limits
-            assert holding.call("record_status")["recordings"] == []
+            assert recordings(holding) == recorded
             assert not status["devices"]["io"]["outputs"]["value"] & GRIPPER
             assert status["joints"]["commanded_position"] == rest
             holding.background("move", "1.5", *map(str, BENT[1:]), "--speed", "0.02")
