@@ -62,7 +62,7 @@ class Kind(str, Enum):
     STEP = "step"
     """A step of the target in one cycle, rad."""
     MODE_STEP = "mode_step"
-    """A step of the target when the drive mode changes, rad."""
+    """A step of the target when the drive mode changes, rad; after CST: its distance from the joint."""
     RECEIVED_STEP = "received_step"
     """A step between two targets that a drive received, with lost frames between them, rad."""
     ACCELERATION = "acceleration"
@@ -362,7 +362,7 @@ class FrameChecker:
             if mode != sample.shown_mode:
                 # Commanded to change its mode and has not yet.
                 if commands.mode:
-                    self._check_continued(axis, commands, position, mode, frame.now_ns)
+                    self._check_continued(axis, commands, position, sample.actual - self.zero[axis], mode, frame.now_ns)
                     commands.mode = CHANGING
             elif mode != commands.mode:
                 self._check_entry(axis, commands, position, sample.actual - self.zero[axis], mode, frame.now_ns)
@@ -404,7 +404,7 @@ class FrameChecker:
 
     def _check_entry(self, axis: int, commands: _Commands, position: float, actual: float, mode: int, now: int) -> None:
         """The first target after enabling is where the joint is; the first in another mode continues the last."""
-        self._check_continued(axis, commands, position, mode, now)
+        self._check_continued(axis, commands, position, actual, mode, now)
         if mode != CSP:
             return
         if not commands.mode and abs(position - actual) > LATCHED_RAD + NUMERIC_RAD:
@@ -413,9 +413,16 @@ class FrameChecker:
         if not low - MARGIN_RAD <= position <= high + MARGIN_RAD:
             self._violate(Kind.RANGE, now, axis, position, low - MARGIN_RAD, high + MARGIN_RAD)
 
-    def _check_continued(self, axis: int, commands: _Commands, position: float, mode: int, now: int) -> None:
-        step = position - commands.last
-        if commands.mode and mode == CSP and abs(step) > (allowed := self._step(axis)):
+    def _check_continued(
+        self, axis: int, commands: _Commands, position: float, actual: float, mode: int, now: int
+    ) -> None:
+        """A target continues the last one; after CST, where a joint need not be at its target, the joint's position."""
+        allowed = self._step(axis)
+        if commands.mode == CST:
+            step, allowed = position - actual, allowed + LATCHED_RAD
+        else:
+            step = position - commands.last
+        if commands.mode and mode == CSP and abs(step) > allowed:
             self._violate(Kind.MODE_STEP, now, axis, step, -allowed, allowed)
 
     def _check_position(self, axis: int, commands: _Commands, position: float, answered: bool, now: int) -> None:
