@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import ApplyTorque, MoveJoints, SetDriveMode, SetLimits
+from rtcp.ipc.commands import ApplyTorque, Command, MoveJoints, SetControlMode, SetDriveMode, SetLimits
 from rtcp.ipc.refusals import WeightUnknown
-from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.limits import rows
 from rtcp.testing import Simulation
 
@@ -61,6 +61,20 @@ def test_the_torque_that_holds_a_joint_at_the_end_of_its_range_is_continuous(arm
     assert min(torques[arrived:]) > 10.0
     assert max(positions) < high + 0.01
     assert min(positions[arrived:]) > high - 0.005
+
+
+@in_mode(drive_mode="cst")
+@pytest.mark.parametrize("command", [SetControlMode(ControlMode.CARTESIAN), SetDriveMode(DriveMode.CST)], ids=str)
+def test_the_torque_against_a_hand_is_continuous_when_the_drives_stay_in_cst(arm: Simulation, command: Command) -> None:
+    joint = arm.models[1].mechanics
+    joint.external_torque += 15.0
+    arm.run(0.2)
+    torques: list[float] = []
+    arm.on_frame = lambda frame: torques.append(_OUTPUTS.unpack(frame.sent[2])[3] / ONE_NM)
+    arm.run(0.02)
+    arm.do(command)
+    arm.run(0.1)
+    assert max(abs(b - a) for a, b in pairwise(torques)) < 1.0
 
 
 @in_mode(drive_mode="cst")
