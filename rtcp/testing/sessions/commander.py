@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from math import inf
 from random import Random
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from rtcp.config.model import ArmConfig
@@ -20,6 +21,7 @@ from rtcp.motion.limits import Values, rows
 from rtcp.testing.inputs import Inputs
 from rtcp.testing.sessions.actions import NONSENSE
 from rtcp.testing.sessions.checker import Bounds, FrameChecker, Reading
+from rtcp.testing.sessions.mechanics import MechanicsChecker, Surroundings
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models.servo import ServoAxis
 
@@ -128,7 +130,9 @@ class Commander:
         self.states: Counter[State] = Counter()
         self.log: list[Entry] = []
         self.inputs = Inputs(self.simulation)
+        self.mechanics = MechanicsChecker(self.checker, config, self.servos)
         self._pushes: dict[int, float] = {}
+        self.environment: Surroundings = SimpleNamespace(pushed=self._pushes, payload_kg=0.0, permitted=True)
         self._stop_ns = round(
             1e9 * (STOP_S + max(j.velocity / j.acceleration + j.acceleration / j.jerk for j in config.joints))
         )
@@ -144,11 +148,13 @@ class Commander:
         state = self.simulation.state
         self.states[state] += 1
         self.checker.check(frame, state)
+        self.mechanics.check(frame, state, self.environment)
         head = self.simulation.board.words[EVENTS_HEAD_AT]
         if head != self._event:
             # An event has the time of the host.
             for record in self.simulation.observer.events_since(self._event):
                 self.log.append(Entry(frame.now_ns, self.simulation.names.message(record.event)))
+                self.mechanics.event(record.event, frame.now_ns)
             self._event = head
 
     def close(self) -> None:
@@ -204,6 +210,7 @@ class Commander:
     def _tell_checker(self, command: Command) -> None:
         """Tell what an accepted command changes for the checks."""
         checker = self.checker
+        self.mechanics.accepted(command)
         if isinstance(command, SetZero) and command.axis < len(checker.zero):
             checker.zero[command.axis] = command.offset
         elif isinstance(command, SetTool):
