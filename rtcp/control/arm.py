@@ -122,17 +122,32 @@ class Arm(JointGroup):
     def change_mode(self, mode: DriveMode) -> None:
         """Command enabled drives to change to `mode`; only at standstill of the setpoints.
 
-        A hand may have moved a joint away from its setpoint in CST and in CSV, and may still move it. A writer that is
-        already active continues.
+        A hand may have moved a joint away from its setpoint in CST and in CSV, and may still move it: the arm then
+        holds where its joints come to rest. Nobody commanded a return. A writer that is already active continues.
         """
         if mode is self.mode:
             return
         compliant = self.mode is DriveMode.CST or (self.mode is DriveMode.CSV and mode is DriveMode.CSP)
+        if not compliant:
+            self.set_mode(mode)
+            return
+        limits, commanded = self.limits, self.state.commanded
+        for i, drive in enumerate(self.drives):
+            speed = drive.velocity
+            # The targets of this cycle arrive a cycle later than the positions were read.
+            drive.target_position = drive.position + speed * self.period_s
+            rest = drive.target_position + 0.5 * speed * abs(speed) / limits.acceleration[i]
+            commanded[i] = min(max(rest, limits.low[i]), limits.high[i])
+            self.output_limiter.latch(i, drive.target_position, speed)
+        self.hold()
         self.set_mode(mode)
-        if compliant:
-            self._csp.take_over(self.drives)
-            for i, drive in enumerate(self.drives):
-                self.output_limiter.latch(i, drive.position + drive.velocity * self.period_s, drive.velocity)
+        if mode is DriveMode.CSP:
+            self._csp.take_over(commanded, self.drives)
+
+    @property
+    def is_braking(self) -> bool:
+        """Whether joints that a hand moved still brake after the change of the drive mode."""
+        return self.mode is DriveMode.CSP and self._csp.is_braking
 
     def use_tool(self, number: int) -> None:
         """Use another tool, without a payload; only at rest."""
