@@ -12,7 +12,7 @@ from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import checked_refusal
 from rtcp.devices.drive import Drive
 from rtcp.ipc.commands import Command, Jog, MoveJoints
-from rtcp.ipc.events import MotionEnded, PushedNear
+from rtcp.ipc.events import FaultEvent, MotionEnded, PushedNear, PushedNearPartner
 from rtcp.ipc.refusals import ControllerRaised, Refusal
 from rtcp.ipc.schema import ARM_MODES, LOAD_FIELDS, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
@@ -282,11 +282,14 @@ class Arm(JointGroup):
         if near is not None:
             guard.stop_for(near)
 
-    def pushed(self) -> PushedNear | None:
-        """Return the event of joints in CST that are about to come too near to a box or the arm itself, or None."""
+    def pushed(self) -> FaultEvent | None:
+        """Return the event of joints in CST that are about to come too near to a box, a partner or each other."""
         if self.mode is not DriveMode.CST:
             return None
-        state = self.state
+        state, neighbours = self.state, self.trajectory_guard.neighbours
+        near = self._pushes.partner_ahead(neighbours, state.actual, state.actual_velocity, PUSHED_CLEARANCE)
+        if near is not None:
+            return PushedNearPartner(near.partner, near.distance)
         contact = self._pushes.ahead(state.actual, state.actual_velocity)
         # Joints that stand there already are led out by their commander.
         if contact is None or self._pushes.is_inside:
