@@ -114,7 +114,7 @@ class EgmBus(ControllerBus):
     segment: str = "irc5.yaml"
     """File of the virtual controller, relative to the arm's file."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 10
-    """Number of missing messages that is a fault: in a row, or in excess of those received."""
+    """Count of missing messages that is a fault: each counts 1, each received one takes off 1/10."""
     timeout_scale: Annotated[float, Ge(1), Le(100)] = 4.5
     """Factor on time limits on the virtual bus, where the host may be slow: [real time](realtime.md)."""
     port: Annotated[int, Ge(1), Le(65535)] = 6511

@@ -467,7 +467,7 @@ class BusConfig:
     segment: str = "segment.yaml"
     """File of the virtual segment, relative to the arm's file."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
-    """Lost cycles (wrong working counter) that are a fault: in a row, or more than a quarter of the good ones."""
+    """Count of lost cycles (wrong working counter) that is a fault: each counts 1, each good one takes off 1/10."""
     timeout_scale: Annotated[float, Ge(1), Le(100)] = 100.0
     """Factor on time limits on the virtual bus, where the host may be slow: [real time](realtime.md)."""
     op_timeout_s: Positive = 5.0
@@ -637,7 +637,7 @@ class StopsConfig:
     """The stop reaction to each event. Stop categories are those of IEC 60204-1."""
 
     lost_frames: HardStop = "quick_stop"
-    """`bus.lost_cycles` lost cycles in a row, or as many more than a quarter of the good ones."""
+    """The count of lost cycles has reached `bus.lost_cycles`."""
     slave_lost: HardStop = "quick_stop"
     """A slave has left OP or does not answer."""
     drive_fault: HardStop = "quick_stop"

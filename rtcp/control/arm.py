@@ -115,7 +115,7 @@ class Arm(JointGroup):
         """Command the drives to change to `mode`; only at standstill."""
         self.mode = mode
         self._writer = self._writers[mode]
-        self._writer.start(self.drives)
+        self._writer.start(self.drives, [self.state.proven_torque(i) for i in range(len(self.drives))])
         for drive in self.drives:
             drive.mode = mode
 

@@ -39,7 +39,7 @@ from rtcp.ipc.stop_reactions import StopReaction, reactions
 from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.realtime.discipline import Discipline
 
-_GOOD_FOR_LOST: Final = 4
+_GOOD_FOR_LOST: Final = 10
 """Good cycles that make up for a lost one."""
 _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 

@@ -82,6 +82,7 @@ class JointGroup(Part):
             actual[axis] = drive.position
             speed[axis] = drive.velocity
             torque[axis] = drive.torque
+        state.keep_torques()
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the drives."""

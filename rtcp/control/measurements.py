@@ -2,8 +2,8 @@
 
 A sample is false if the joint cannot have come there since the last accepted sample. A false sample is not used: the
 position continues at the joint's velocity, and a velocity, a torque or a mode display stays as it was. After
-`supervision.cycles` false samples in a row the next one is accepted. A false position, velocity or mode display is then
-a fault; a torque can really change that fast.
+`supervision.cycles` false samples in a row the next one is accepted. A false position or velocity is then a fault, and
+so is a mode that nobody commanded; a torque can really change that fast.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Measurements:
         """Consecutive false samples of each joint."""
         self._position_s, self._velocity_s = [0.0] * n, [0.0] * n
         """Time from the last accepted sample of each joint to the last sample, s."""
-        self._shown = [0] * n
-        """Last accepted mode display of each joint."""
+        self._shown, self._new = [0] * n, [0] * n
+        """Last accepted mode display of each joint, and the one of its last sample."""
         self._now_ns = 0
         self._elapsed_s = 0.0
         self.event: FaultEvent | None = None
@@ -99,13 +99,23 @@ class Measurements:
             self._torques[i] = 0
         else:
             drive.torque = torque
-        shown, wanted = drive.mode_display, drive.mode
-        if shown == wanted or self._shown[i] != wanted or drive.state is not DriveState.OPERATION_ENABLED:
-            self._shown[i], self._modes[i] = shown, 0
-        elif not self._accepts(self._modes, i):
-            drive.mode_display = wanted
-        else:
-            self.event = DriveModeTimeout(self._first + i, shown, DriveMode(wanted))
+        self._check_mode(i, drive)
+
+    def _check_mode(self, i: int, drive: Drive) -> None:
+        """A mode counts as shown after as many equal samples; a drive that leaves its mode uncommanded is a fault."""
+        shown, accepted = drive.mode_display, self._shown[i]
+        if shown == accepted:
+            self._modes[i] = 0
+            return
+        if drive.state is DriveState.OPERATION_ENABLED:
+            if shown != self._new[i]:
+                self._new[i], self._modes[i] = shown, 0
+            if not self._accepts(self._modes, i):
+                drive.mode_display = accepted
+                return
+            if accepted == drive.mode:
+                self.event = DriveModeTimeout(self._first + i, shown, DriveMode(accepted))
+        self._shown[i], self._modes[i] = shown, 0
 
     def _accepts(self, counts: list[int], i: int) -> bool:
         """Count a false sample; return whether it is accepted."""

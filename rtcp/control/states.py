@@ -187,6 +187,9 @@ class Enabling(MachineState):
     drives = "drives advance to Operation Enabled; target = actual until each is there"
     leads_to = {**_PERMITTED, Enabled: State.HOLDING}
 
+    _CARRY_S = 0.1
+    """Time in which the drives take the weight of the arm after their brakes have opened, s: a torque motion and CST
+    begin with the torque that holds it."""
     _REPORTED_RAD = 0.001
     """Distance from its range, rad, below which a joint returns without a report: it sagged at the edge."""
 
@@ -199,6 +202,8 @@ class Enabling(MachineState):
         """Bit mask of the drives that have been enabled."""
         self._returning = False
         """Whether all drives are enabled and joints outside their range return to it."""
+        self._enabled = ctx.cycle
+        """Cycle in which all drives were enabled."""
         ctx.joints.reset_supervision()
 
     def update(self, ctx: Context) -> Event | Signal | None:
@@ -245,12 +250,15 @@ class Enabling(MachineState):
         joints = ctx.joints
         if not self._returning:
             self._returning = True
+            self._enabled = ctx.cycle
             for group in joints.groups:
                 for i, fastest in enumerate(group.limits.velocity):
                     beyond = group.beyond_range(i)
                     if beyond > self._REPORTED_RAD:
                         ctx.publish(ReturningToRange(group.first + i, beyond, min(BACK_RAD_S, fastest)))
         if joints.first_returning() >= 0:
+            return None
+        if ctx.cycle - self._enabled < ctx.cycles(self._CARRY_S):
             return None
         joints.reset_supervision()
         return Enabled()

@@ -39,7 +39,7 @@ class DriveWriter(Protocol):
 
     mode: DriveMode
 
-    def start(self, drives: Sequence[Commanded]) -> None:
+    def start(self, drives: Sequence[Commanded], torque: Sequence[float]) -> None:
         """Reset, at standstill."""
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
@@ -69,7 +69,7 @@ class CspWriter:
         self.is_braking = False
         """Whether a target is not at its setpoint yet."""
 
-    def start(self, drives: Sequence[Commanded]) -> None:
+    def start(self, drives: Sequence[Commanded], torque: Sequence[float]) -> None:
         """Start at the setpoints."""
         self.is_braking = False
 
@@ -116,7 +116,7 @@ class CsvWriter:
         self._keep = exp(-period_s / _FADE_S)
         self._bias = [0.0] * len(self._gain)
 
-    def start(self, drives: Sequence[Commanded]) -> None:
+    def start(self, drives: Sequence[Commanded], torque: Sequence[float]) -> None:
         """Start without a correction: the present following error is removed gradually."""
         for i, drive in enumerate(drives):
             self._bias[i] = drive.target_position - drive.position
@@ -147,7 +147,7 @@ class CstWriter:
         """Rest of the last passed torque beyond the weight and the position loop, Nm."""
         self._passed = False
 
-    def start(self, drives: Sequence[Commanded]) -> None:
+    def start(self, drives: Sequence[Commanded], torque: Sequence[float]) -> None:
         """Start with the present holding torque, so that the arm does not sag.
 
         `update` continues it without a step also where a joint is away from its setpoint, as in CSV.
@@ -155,7 +155,7 @@ class CstWriter:
         self._passed = True
         for i, drive in enumerate(drives):
             bound = self._bound[i]
-            self._integral[i] = drive.target_torque = min(max(drive.torque, -bound), bound)
+            self._integral[i] = drive.target_torque = min(max(torque[i], -bound), bound)
 
     def pass_on(
         self,

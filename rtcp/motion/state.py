@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Final
+
+_FALSE: Final = 4
+"""Number of torque samples in a row that may be false."""
+_SAMPLES: Final = 2 * _FALSE + 1
+_TREND: Final = 2.0
+"""How far a torque may have continued beyond the samples before it, as a multiple of their range."""
 
 
 class Phase(IntEnum):
@@ -31,6 +38,8 @@ class ArmState:
         "commanded_acceleration",
         "commanded_velocity",
         "now_ns",
+        "_samples",
+        "_taken",
     )
 
     def __init__(self, joints: int) -> None:
@@ -42,6 +51,28 @@ class ArmState:
         self.actual_torque = [0.0] * joints
         self.now_ns = 0
         """Instant of the cycle, CLOCK_MONOTONIC or simulated time."""
+        self._samples = [[0.0] * joints for _ in range(_SAMPLES)]
+        self._taken = 0
+
+    def keep_torques(self) -> None:
+        """Keep the measured torques of this cycle for `proven_torque`."""
+        kept = self._samples[self._taken % _SAMPLES]
+        self._taken += 1
+        for i, torque in enumerate(self.actual_torque):
+            kept[i] = torque
+
+    def proven_torque(self, i: int) -> float:
+        """Return a joint's measured torque, Nm, no further from the samples before it than their course explains.
+
+        It allocates, and is for the begin of a motion or of a drive mode: a false sample would stay in its torque.
+        """
+        torque, taken = self.actual_torque[i], self._taken
+        if taken < _SAMPLES:
+            return torque
+        before = [self._samples[at % _SAMPLES][i] for at in range(taken - _SAMPLES, taken - _FALSE)]
+        low, high = min(before), max(before)
+        slack = _TREND * (high - low)
+        return min(max(torque, low - slack), high + slack)
 
 
 class Setpoint:

@@ -8,15 +8,18 @@ from dataclasses import replace
 
 import pytest
 
+from kinematics.capsules import distance
 from rtcp.config.model import MOST_AXES
 from rtcp.control.operator import UNREAD_S
 from rtcp.ipc.commands import Disable, Enable, MoveGripper, MoveJoints, OpenStream, Reset, RunInStep, SetLimits
+from rtcp.ipc.events import PushedNearPartner
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import State
+from rtcp.motion.guards.compliance import PUSHED_CLEARANCE
 from rtcp.motion.guards.neighbours import certain
 from rtcp.motion.limits import rows
 from rtcp.testing.simulation import Simulation
-from tests.cell.random_steps import Pair, run_mishaps, run_motions, run_near
+from tests.cell.random_steps import Pair, cell_of, run_mishaps, run_motions, run_near
 
 SLOWEST_NS = 2_000_000
 
@@ -357,6 +360,32 @@ def test_limits_under_which_the_stop_would_end_too_near_the_partner_are_refused_
     assert left.loop.arm.limits.acceleration == before
     assert pair.simulation.until(lambda: left.state in (State.HOLDING, State.STOPPED_BY_LIMIT), 5.0)
     assert pair.simulation.send("left", slower_limits(left, 0.2)).refusal is None
+    pair.close()
+
+
+def test_an_arm_in_cst_that_is_pushed_towards_its_partner_is_stopped_by_its_drives() -> None:
+    cell = cell_of(apart_m=0.55)
+    pair = Pair(17, replace(cell, arms=tuple(replace(m, config=replace(m.config, drive_mode="cst")) for m in cell.arms)))
+    pair.simulation.run(0.5)
+    left, guard = pair.arm("left"), pair.arm("left").loop.arm.trajectory_guard
+    own, (other,) = guard.neighbours._own, guard.neighbours._partners
+    assert other is not None
+
+    def apart(turn: float) -> float:
+        own.place([turn + left.loop.arm.state.actual[0], *left.loop.arm.state.actual[1:]])
+        other.place(pair.commanded("right"))
+        return distance(own.placed, other.placed)[0]
+
+    far, towards = apart(0.0), 1.0 if apart(0.1) < apart(-0.1) else -1.0
+    least = guard.neighbours._clearance = far - 0.02
+    guard.neighbours._clearance /= PUSHED_CLEARANCE
+    left.models[0].mechanics.external_torque = 60.0 * towards
+    assert pair.simulation.until(lambda: left.state is State.FAULT, 1.0)
+    (pushed,) = [record.event for record in left.events if isinstance(record.event, PushedNearPartner)]
+    left.models[0].mechanics.external_torque = 0.0
+    pair.simulation.run(0.5)
+    assert pushed.partner == 0
+    assert least < apart(0.0) < far
     pair.close()
 
 

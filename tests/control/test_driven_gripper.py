@@ -60,6 +60,8 @@ class Hand(Simulation):
         self.sent: list[bytes] = []
         self.object_at: float | None = None
         """Position of a hard object between the fingers, rad; None: there is none."""
+        self.object_stiffness, self.object_damping = 2000.0, 20.0
+        """Of the object, Nm/rad and Nm s/rad."""
         self.on_frame = self._see
         if config.inputs.enabling_switch is not None:
             self.inputs(put=ENABLING_SWITCH)
@@ -72,7 +74,8 @@ class Hand(Simulation):
         if self.object_at is not None:
             mechanics = self.model.mechanics
             inside = max(0.0, self.object_at - mechanics.position)
-            mechanics.external_torque = 2000.0 * inside - (20.0 * mechanics.velocity if inside else 0.0)
+            damping = self.object_damping * mechanics.velocity if inside else 0.0
+            mechanics.external_torque = self.object_stiffness * inside - damping
 
     @property
     def moving(self) -> bool:
@@ -193,6 +196,14 @@ def test_it_goes_on_and_ends_well_while_a_joint_homes(hand: Hand) -> None:
     hand.bring_to(State.HOLDING)
     assert hand.reports_of(events.Homed)
     assert kept_to_its_limits(hand.setpoints)
+
+
+def test_a_stiff_object_that_stops_the_fingers_at_once_is_gripped(hand: Hand) -> None:
+    hand.object_at, hand.object_stiffness, hand.object_damping = 0.5, 20000.0, 60.0
+    hand.shut()
+    hand.rest()
+    assert hand.state is State.HOLDING
+    assert [rest.holds for rest in hand.reports_of(events.GripperAtRest)] == [True]
 
 
 def test_what_it_grips_ends_its_way_and_is_no_emergency(hand: Hand) -> None:

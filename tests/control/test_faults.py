@@ -205,7 +205,7 @@ STOPS: dict[str, tuple[type[events.Event], int, tuple[str, ...]]] = {
     "lost_frames": (
         events.ProcessDataLost,
         -1,
-        ("process data lost", "40 cycles", "bus.lost_cycles in assistive_arm.yaml"),
+        ("process data lost", "reached 40", "bus.lost_cycles in assistive_arm.yaml"),
     ),
     "slave_lost": (events.SlaveLost, 3, ("slave 3 (drive2)", "left OP")),
     "drive_fault": (events.DriveFault, 1, ("joint2", "in fault", "statusword {word}")),

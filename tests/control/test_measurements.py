@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from rtcp.ipc.commands import SetDriveMode
 from rtcp.ipc.events import DriveModeTimeout, PositionJumped, VelocityJumped
 from rtcp.ipc.states import DriveMode, State
 
@@ -74,6 +75,42 @@ def test_false_samples_change_no_target_beyond_what_a_joint_notices(mode: int, f
         assert position == a
         assert abs(velocity - b) <= speed
         assert abs(effort - c) <= torque
+
+
+@pytest.mark.parametrize("cycles", [1, CYCLES - 1])
+def test_a_false_torque_in_the_cycle_of_a_mode_change_does_not_become_the_holding_torque(
+    rig: LoopRig, cycles: int
+) -> None:
+    rig.hold(CSP)
+    rig.run(0.1)
+    before = rig.models[0].mechanics.position
+    end = falsify(rig, TORQUE, lambda counts: counts + 10 * COUNTS)
+    rig.run((cycles - 1) * PERIOD_S)
+    rig.do(SetDriveMode(DriveMode.CST))
+    end()
+    rig.run(0.3)
+    assert max(abs(cycle.drives[0].effort) for cycle in rig.log[-300:]) < 0.1 * COUNTS
+    assert rig.models[0].mechanics.position == about(before, abs=1e-4)
+
+
+@pytest.mark.parametrize("false", [CSP, CST])
+@pytest.mark.parametrize("cycles", [1, CYCLES - 1])
+def test_a_false_mode_display_while_a_drive_changes_its_mode_sends_it_no_target_of_that_mode(
+    rig: LoopRig, false: int, cycles: int
+) -> None:
+    rig.hold(CSV)
+    rig.misunderstood[0, 0x6060] = {CSP: CSV}
+    rig.do(SetDriveMode(DriveMode.CSP))
+    rig.run(5 * PERIOD_S)
+    begun = len(rig.log)
+    end = falsify(rig, MODE, lambda counts: false)
+    rig.run(cycles * PERIOD_S)
+    end()
+    rig.run(10 * PERIOD_S)
+    assert {(cycle.drives[0].speed, cycle.drives[0].effort) for cycle in rig.log[begun:]} == {(0, 0)}
+    rig.misunderstood.clear()
+    rig.run(0.1)
+    assert rig.state is State.HOLDING
 
 
 @pytest.mark.parametrize(

@@ -87,21 +87,21 @@ def test_an_input_that_bounces_is_no_press_while_a_slave_is_missing(rig: LoopRig
 
 
 @pytest.mark.parametrize("mode", [CSP, CSV, CST])
-@pytest.mark.parametrize(("bad", "good"), [(39, 1), (9, 1), (3, 1), (3, 2), (39, 39), (10, 10), (1, 1)])
-def test_more_lost_cycles_than_a_quarter_of_the_good_ones_stop_the_arm_although_never_so_many_in_a_row(
+@pytest.mark.parametrize(("bad", "good"), [(39, 1), (9, 1), (3, 2), (39, 39), (1, 1), (9, 40), (1, 8)])
+def test_more_lost_cycles_than_a_tenth_of_the_good_ones_stop_the_arm_although_never_so_many_in_a_row(
     rig: LoopRig, mode: int, bad: int, good: int
 ) -> None:
     rig.set_in_motion(mode)
     lose_cycles(rig, "-" * bad + "+" * good)
     took_s = rig.wait(lambda: rig.state is State.FAULT)
-    share = (bad - 0.25 * good) / (bad + good)
+    share = (bad - 0.1 * good) / (bad + good)
     assert took_s <= (LOST_CYCLES / share + bad + good) * PERIOD_S
     assert rig.kinds[-1] == ProcessDataLost
     assert rig.last_of(ProcessDataLost).allowed == LOST_CYCLES
 
 
-@pytest.mark.parametrize(("bad", "good"), [(1, 4), (9, 40), (1, 9)])
-def test_lost_cycles_that_are_less_than_a_quarter_of_the_good_ones_are_no_fault(
+@pytest.mark.parametrize(("bad", "good"), [(1, 10), (9, 90), (1, 40)])
+def test_lost_cycles_that_are_less_than_a_tenth_of_the_good_ones_are_no_fault(
     rig: LoopRig, bad: int, good: int
 ) -> None:
     rig.set_in_motion()

@@ -236,7 +236,7 @@ def test_set_points_go_on_after_held_cycles_without_a_jump(switch_rig: Make, mod
         rig.away.add(2)
         rig.run((LOST_CYCLES - 1) * PERIOD_S)
         rig.away.clear()
-        rig.run(0.2)
+        rig.run(10 * LOST_CYCLES * PERIOD_S)
     assert rig.state is State.MOVING
     assert max(abs(drive.velocity) for cycle in rig.log[at:] for drive in cycle.drives) < 5000
     assert [rig.longest_step(axis) <= LONGEST_STEP for axis in range(2)] == [True, True]

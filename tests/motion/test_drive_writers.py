@@ -27,7 +27,7 @@ def test_in_csv_each_start_forgets_the_following_error_of_the_drive_and_removes_
     for factor in (1.0, -3.0):
         errors = [sign * factor * error for error in (0.01, -0.02, 0.03)]
         joints = drives(*errors)
-        writer.start(joints)
+        writer.start(joints, [joint.torque for joint in joints])
         kept = 1.0
         for _ in range(500):
             writer.update([0.1] * 3, [0.2] * 3, joints)
@@ -46,7 +46,7 @@ def test_in_cst_each_start_holds_with_the_present_torque_inside_its_bound(sign: 
         for joint, share in zip(joints, (0.5, -0.8, 9.0), strict=True):
             joint.torque = sign * factor * share * JOINTS[0].torque
         writer.pass_on([0.2] * 3, [1.0] * 3, [1.0] * 3, joints)  # what came before is forgotten
-        writer.start(joints)
+        writer.start(joints, [joint.torque for joint in joints])
         writer.update([0.1] * 3, [0.0] * 3, joints)
         for drive, config in zip(joints, JOINTS, strict=True):
             most = config.torque
@@ -80,7 +80,7 @@ def test_in_cst_a_passed_torque_and_the_integral_stay_inside_their_bound(sign: f
     bound = JOINTS[0].torque
     writer.pass_on([0.1] * 3, [sign * 1e4, -sign * 1e4, 0.0], [0.0] * 3, joints)
     assert [drive.target_torque for drive in joints] == [sign * bound, -sign * bound, 0.0]
-    writer.start(joints)
+    writer.start(joints, [joint.torque for joint in joints])
     for _ in range(5000):
         writer.update([0.1] * 3, [0.0] * 3, joints)
     most = sign * (bound + JOINTS[0].cst_stiffness * 0.02)

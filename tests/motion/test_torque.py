@@ -60,7 +60,7 @@ class Plant:
         self.guard = TrajectoryGuard(replace(arm, arm=None), self.limits, PERIOD)
         self.guard.latch(self.state)
         self.law = CstWriter(arm.joints, PERIOD)
-        self.law.start(self.joints)
+        self.law.start(self.joints, [joint.torque for joint in self.joints])
         setup = ControllerSetup(replace(arm, arm=model), self.limits, self.guard, PERIOD, no_plan)
         self.mode = TorqueController(setup)
         self.outside = [0.0] * 6

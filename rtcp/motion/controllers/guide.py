@@ -120,11 +120,12 @@ class GuideController(Controller):
             return MassesUnknown()
         carried, limits = self._gravity.torques(state.actual), self.limits
         for i in self._joints:
-            if not abs(state.actual_torque[i] - carried[i]) <= self._error[i]:
-                return WeightDiffers(i, state.actual_torque[i], carried[i], self._error[i])
+            held = state.proven_torque(i)
+            if not abs(held - carried[i]) <= self._error[i]:
+                return WeightDiffers(i, held, carried[i], self._error[i])
         for i in self._joints:
             q = state.actual[i]
-            self._bias[i] = state.actual_torque[i] - carried[i]
+            self._bias[i] = state.proven_torque(i) - carried[i]
             self._anchor[i], self._anchor_speed[i] = q, 0.0
             self._extra_low[i] = max(0.0, limits.low[i] + _MARGIN_RAD - q)
             self._extra_high[i] = max(0.0, q - limits.high[i] + _MARGIN_RAD)

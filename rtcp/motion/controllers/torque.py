@@ -89,7 +89,7 @@ class TorqueController(Controller):
         """Begin with the torques that hold the arm now, at rest, so that it does not sag."""
         carried = self._gravity.torques(state.actual)
         for i in self._joints:
-            self._bias[i] = state.actual_torque[i] - carried[i]
+            self._bias[i] = state.proven_torque(i) - carried[i]
             self._applied[i] = 0.0
             q, limits = state.actual[i], self.limits
             self._extra_low[i] = max(0.0, limits.low[i] + _MARGIN_RAD - q)

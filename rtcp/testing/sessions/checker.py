@@ -85,7 +85,7 @@ class Kind(str, Enum):
     NO_TORQUE_IN_STATE = "no_torque_in_state"
     """A drive has none while the arm is held; `found`: the state."""
     LOST_FRAMES = "lost_frames"
-    """Lost frames, less a quarter of the good ones, with drives that are still commanded."""
+    """Lost frames, less a tenth of the good ones, with drives that are still commanded."""
     TORQUE_STEP = "torque_step"
     """A step of the target torque in one cycle, Nm."""
     TRUE_SPEED = "true_speed"
