@@ -30,11 +30,12 @@ from rtcp.config.model import VIRTUAL
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from rtcp.config.cell import CellConfig
     from rtcp.config.model import ArmConfig
     from rtcp.config.segment import SegmentConfig
     from rtcp.telemetry.soak import Summary
     from rtcp.testing.sessions.cluster import SessionSummary
-    from rtcp.testing.sessions.session import Result
+    from rtcp.testing.sessions.session import Result, Segment
 
 LONGEST_MIN = 10_080.0
 LONGEST_SESSION_S = 3600.0
@@ -173,7 +174,7 @@ def _run_sessions(
     if not 1 <= count <= MOST_SESSIONS:
         raise CommandError(f"--sessions {count} is not allowed: 1 to {MOST_SESSIONS}")
     positive("--seconds", seconds, "s", LONGEST_SESSION_S)
-    arm, segment = _simulated_arm(config)
+    arm, segment = _simulated(config)
     duration = 2.0 if seconds is None else seconds
     if keep is not None:
         if count != 1 or scheduler is not None or out is not None:
@@ -210,15 +211,26 @@ def _run_sessions(
         raise CommandError(message, ExitCode.FAULT)
 
 
-def _simulated_arm(config: Path | None) -> tuple[ArmConfig, SegmentConfig]:
-    """Load the arm and its segment; raises CommandError where its frames cannot be read."""
+def _simulated(config: Path | None) -> tuple[ArmConfig | CellConfig, Segment]:
+    """Load the arm, or the cell, and its segments; raises CommandError where their frames cannot be read."""
+    from rtcp.config.cell_file import is_cell_file, load_cell
+    from rtcp.config.find import find_config
+    from rtcp.config.loader import load
+
+    path = find_config(config)
+    if not is_cell_file(path):
+        arm = load(path)
+        return arm, _segment_of(arm)
+    cell = load_cell(path)
+    return cell, {member.name: _segment_of(member.config) for member in cell.arms}
+
+
+def _segment_of(arm: ArmConfig) -> SegmentConfig:
     from rtcp.config.segment import load_segment
     from rtcp.fieldbus.errors import BusError
-    from rtcp.launch.offline import configuration
     from rtcp.testing import Simulation
     from rtcp.testing.sessions.checker import reading_of
 
-    arm = configuration(config)
     try:
         reading_of(arm)
     except ValueError as error:
@@ -228,10 +240,12 @@ def _simulated_arm(config: Path | None) -> tuple[ArmConfig, SegmentConfig]:
         Simulation(arm, segment=segment).close()
     except BusError as error:
         raise CommandError(str(error)) from error
-    return arm, segment
+    return segment
 
 
-def _replay(arm: ArmConfig, segment: SegmentConfig, seed: int, seconds: float, file: Path, as_json: bool) -> None:
+def _replay(
+    arm: ArmConfig | CellConfig, segment: Segment, seed: int, seconds: float, file: Path, as_json: bool
+) -> None:
     from rtcp.ipc.recording import RecordingError
     from rtcp.testing.sessions.black_box import replay
 
@@ -248,7 +262,7 @@ def _replay(arm: ArmConfig, segment: SegmentConfig, seed: int, seconds: float, f
         raise typer.Exit(ExitCode.FAULT)
 
 
-def _keep_failures(arm: ArmConfig, segment: SegmentConfig, summary: SessionSummary, folder: Path) -> None:
+def _keep_failures(arm: ArmConfig | CellConfig, segment: Segment, summary: SessionSummary, folder: Path) -> None:
     """Run the first failed sessions again in this process and write their black boxes."""
     from rtcp.ipc.recording import RecordingError
     from rtcp.testing.sessions.black_box import replay

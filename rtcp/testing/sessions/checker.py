@@ -83,6 +83,10 @@ class Kind(str, Enum):
     """A drive has torque in a state without; `found`: the state."""
     NO_TORQUE_IN_STATE = "no_torque_in_state"
     """A drive has none while the arm is held; `found`: the state."""
+    PARTNER = "partner"
+    """Distance of two arms of a cell that came too near to each other, m."""
+    NOT_LED_APART = "not_led_apart"
+    """Distance of two arms, m, of which one was stopped on a way on which all its bodies move away from the other."""
 
 
 @dataclass(frozen=True)

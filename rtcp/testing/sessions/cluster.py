@@ -33,10 +33,11 @@ from distributed import Client, Future, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 
 import rtcp
+from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.config.serialization import to_json
-from rtcp.testing.sessions.session import Result, run_session
+from rtcp.testing.sessions.session import Result, Segment, run_session
 
 PART = 1000
 """Sessions of a part of the results: the seeds of a file are the same wherever and in whatever order they ran."""
@@ -85,8 +86,8 @@ class SoakError(Exception):
 class SessionPlan:
     """What is run: the sessions of consecutive seeds."""
 
-    config: ArmConfig
-    segment: SegmentConfig
+    config: ArmConfig | CellConfig
+    segment: Segment
     first: int
     count: int
     seconds: float
@@ -95,10 +96,13 @@ class SessionPlan:
     @property
     def digest(self) -> str:
         """Digest of the configuration and of the segment, whatever the place of their files."""
-        slaves = tuple(replace(slave, file="") for slave in self.config.slaves)
-        config = to_json(replace(self.config, source=Path(), slaves=slaves))
-        segment = to_json(self.segment.slaves)
-        text = json.dumps([config, segment], sort_keys=True, default=str)
+        if isinstance(self.config, CellConfig):
+            config: Any = self.config.digest
+        else:
+            slaves = tuple(replace(slave, file="") for slave in self.config.slaves)
+            config = to_json(replace(self.config, source=Path(), slaves=slaves))
+        segments = [self.segment] if isinstance(self.segment, SegmentConfig) else self.segment.values()
+        text = json.dumps([config, *(to_json(segment.slaves) for segment in segments)], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -101,6 +101,7 @@ class Commander:
         positions: of the joints at power-on, rad.
         reading: how its frames are read.
         segment: the slaves; None: the configured segment.
+        simulation: the arm of a cell that it commands; None: an arm of its own.
     """
 
     def __init__(
@@ -110,10 +111,13 @@ class Commander:
         positions: Sequence[float],
         reading: Reading,
         segment: SegmentConfig | None = None,
+        simulation: Simulation | None = None,
     ) -> None:
         self.bounds = Bounds.configured(config)
         self.limits = Values.configured(config)
-        self.simulation = Simulation(config, seed, positions=positions, segment=segment, follow_clock=False)
+        if simulation is None:
+            simulation = Simulation(config, seed, positions=positions, segment=segment, follow_clock=False)
+        self.simulation = simulation
         self.simulation.unlink()
         count = len(config.joints)
         self.checker = FrameChecker(
@@ -132,8 +136,8 @@ class Commander:
         self._stop_ns = round(
             1e9 * (STOP_S + max(j.velocity / j.acceleration + j.acceleration / j.jerk for j in config.joints))
         )
-        self._pressed = self._silent = False
-        """Whether the emergency stop is pressed, and whether the lease is not renewed."""
+        self.pressed = self._silent = False
+        """Whether an emergency stop is pressed that concerns the arm, and whether the lease is not renewed."""
         self._event = 0
         """Number of the last event in the log."""
         self.simulation.on_frame = self._see
@@ -171,7 +175,7 @@ class Commander:
         return list(self.checker.targets)
 
     @property
-    def _stopped_ns(self) -> int:
+    def stopped_ns(self) -> int:
         """When the arm rests if a stop begins now, simulated time."""
         return self.simulation.now_ns + self._stop_ns
 
@@ -208,10 +212,10 @@ class Commander:
             checker.zero[command.axis] = command.offset
         elif isinstance(command, SetTool):
             checker.use(command.tool)
-        elif isinstance(command, Reset | Enable) and not self._pressed:
+        elif isinstance(command, Reset | Enable) and not self.pressed:
             checker.torque_off_from_ns = inf
         if not self._silent:
-            checker.rest_from_ns = self._stopped_ns if isinstance(command, Halt) else inf
+            checker.rest_from_ns = self.stopped_ns if isinstance(command, Halt) else inf
 
     def send_raw(self, number: int, numbers: Sequence[float]) -> bool:
         """Send bytes that may be no command; return whether they were accepted as one."""
@@ -267,7 +271,7 @@ class Commander:
         # The joystick moves the arm without a lease.
         if record is not None and int(record["control_mode"][0]) != ControlMode.JOYSTICK:
             lease_ns = round(1e9 * self.simulation.config.lease_s)
-            self.checker.rest_from_ns = self._stopped_ns + lease_ns
+            self.checker.rest_from_ns = self.stopped_ns + lease_ns
 
     def acquire(self) -> None:
         """Acquire a lease again."""
@@ -293,10 +297,10 @@ class Commander:
         """Press or release the emergency stop."""
         if self.inputs.present:
             self.count_fault("emergency stop" if pressed else "emergency stop released")
-            contact, self._pressed = self.simulation.config.inputs.emergency_stop, pressed
+            contact, self.pressed = self.simulation.config.inputs.emergency_stop, pressed
             self.inputs.set(contact, pressed)
             if contact is not None and pressed:
-                self.checker.torque_off_from_ns = self._stopped_ns
+                self.checker.torque_off_from_ns = self.stopped_ns
 
     def toggle(self, arm: bool) -> None:
         """Switch the joystick to the arm or to the chair."""

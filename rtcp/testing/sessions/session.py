@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import isfinite, sqrt
 from random import Random
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import rtcp
 from kinematics import forward
+from rtcp.config.cell import CellConfig
 from rtcp.config.model import MODE_CHANNELS, MOST_AXES, ArmConfig, ControlModeName, DriveModeName
 from rtcp.config.segment import SegmentConfig
 from rtcp.ipc import commands
@@ -23,6 +24,7 @@ from rtcp.motion.planning.plan import COLUMNS, CUBIC, KIND, LINE, POSITIONS, QUI
 from rtcp.testing.sessions.actions import CONTROL_MODES, NONSENSE, SHARES, RandomActions
 from rtcp.testing.sessions.checker import Bounds, Reading, Violation, reading_of
 from rtcp.testing.sessions.commander import FAULTS, KINDS, ODD_INTEGERS, Commander, random_command
+from rtcp.testing.simulation import Simulation
 
 LONGEST_WAIT_S = 0.3
 MOVABLE = (State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING, State.CLOSING)
@@ -66,6 +68,7 @@ class Session(RandomActions):
         reading: how its frames are read; None: by the configuration.
         segment: the slaves; None: the configured segment.
         periods_us: cycles to choose from, us; empty: the configured one.
+        simulation: an arm of a cell, whose modes and positions are chosen already; None: an arm of its own.
     """
 
     def __init__(
@@ -75,22 +78,19 @@ class Session(RandomActions):
         reading: Reading | None = None,
         segment: SegmentConfig | None = None,
         periods_us: Sequence[float] = (),
+        simulation: Simulation | None = None,
     ) -> None:
         super().__init__(random)
         self.reading = reading = reading_of(config) if reading is None else reading
         self.bounds = Bounds.configured(config)
         self.joints = len(config.joints)
-        modes: list[tuple[ControlModeName, int]] = [*zip(CONTROL_MODES, SHARES, strict=True)]
-        if config.arm is None:
-            modes = [(mode, share) for mode, share in modes if mode not in ("cartesian", "joystick")]
-        (mode,) = random.choices([name for name, _ in modes], [share for _, share in modes])
-        cycle = replace(config.cycle, period_us=random.choice(periods_us)) if periods_us else config.cycle
-        drive_mode = random.choice(drive_modes(config))
-        chosen = replace(config, cycle=cycle, drive_mode=drive_mode, control_mode=mode)
-        positions = self._place(random.random() < 0.9)
-        self.commander = commander = Commander(chosen, random.randrange(1 << 30), positions, reading, segment)
+        chosen = config if simulation is not None else with_random_modes(random, config, periods_us)
+        positions = random_place(random, config, reading, random.random() < 0.9) if simulation is None else ()
+        self.commander = commander = Commander(
+            chosen, random.randrange(1 << 30), positions, reading, segment, simulation
+        )
         self.period_s = chosen.cycle.period_us * 1e-6
-        self.mode = ControlMode[mode.upper()]
+        self.mode = ControlMode[chosen.control_mode.upper()]
         self.actions: list[tuple[int, Callable[[], object]]] = [
             (4, self.enable),
             (24, self._begin_motion),
@@ -136,21 +136,9 @@ class Session(RandomActions):
         """Return the integer, or now and then one that nobody should send."""
         return self.random.choice(ODD_INTEGERS) if self.random.random() < 0.03 else number
 
-    def is_free(self, bounds: Bounds, q: Sequence[float], clearance: float = 0.0, tool: int = 0) -> bool:
-        """Whether the arm keeps clear of boxes and of itself, by `clearance` m more than it must."""
-        workspace = self.reading.workspaces[tool]
-        return workspace is None or workspace.deepest(bounds, q) < -clearance
-
-    def _place(self, free: bool) -> list[float]:
-        bounds, random = self.bounds, self.random
-        for _ in range(_PLACES):
-            place = [random.uniform(low, high) for low, high in zip(bounds.low, bounds.high, strict=True)]
-            if random.random() < 0.1:
-                axis = random.randrange(self.joints)
-                place[axis] = random.choice((bounds.low[axis] - 0.01, bounds.high[axis] + 0.01))
-            if not free or self.is_free(bounds, place, 0.01):
-                break
-        return place
+    def is_free(self, bounds: Bounds, q: Sequence[float], tool: int = 0) -> bool:
+        """Whether the arm keeps clear of boxes and of itself."""
+        return is_free(self.reading, bounds, q, 0.0, tool)
 
     def _kind(self) -> int:
         return self.random.choice((self.random.randrange(1 << 32), self.random.choice(KINDS).number))
@@ -385,6 +373,10 @@ class Session(RandomActions):
             commander.send(commands.Shutdown())
             commander.wait(int(_CLOSE_S / self.period_s))
 
+    def close(self) -> None:
+        """Free the memory."""
+        self.commander.close()
+
     def result(self, seed: int, error: Exception | None = None) -> Result:
         """Return the result of the session as it is now."""
         commander, checker = self.commander, self.commander.checker
@@ -403,30 +395,49 @@ class Session(RandomActions):
         )
 
 
-Inspect = Callable[[Session, Exception | None], None]
+class AnySession(Protocol):
+    """A session of an arm, or of a cell."""
+
+    @property
+    def commander(self) -> Commander:
+        """The commander of the arm, or of one of the arms."""
+
+    def run(self, seconds: float) -> None:
+        """Run for this simulated time, s, or to the first violation."""
+
+    def result(self, seed: int, error: Exception | None = None) -> Result:
+        """Return the result of the session as it is now."""
+
+    def close(self) -> None:
+        """Free the memory."""
+
+
+Segment = SegmentConfig | Mapping[str, SegmentConfig]
+"""The slaves of an arm, or of each arm of a cell by its name."""
+Inspect = Callable[[AnySession, Exception | None], None]
 
 
 def run_session(
     seed: int,
-    config: ArmConfig,
+    config: ArmConfig | CellConfig,
     seconds: float,
-    segment: SegmentConfig | None = None,
+    segment: Segment | None = None,
     inspect: Inspect | None = None,
 ) -> Result:
     """Run the session of a seed; an error of the session is its result.
 
     Args:
         seed: of everything in it.
-        config: the arm.
+        config: the arm, or the cell.
         seconds: simulated time, s.
-        segment: the slaves; None: the configured segment.
+        segment: the slaves, in a cell those of each arm by its name; None: the configured segment.
         inspect: called with the session before it is closed, and with its error.
     """
     began = time.thread_time(), time.perf_counter()
-    session: Session | None = None
+    session: AnySession | None = None
     failure: Exception | None = None
     try:
-        session = Session(Random(seed), config, segment=segment)
+        session = session_of(Random(seed), config, segment)
         session.run(seconds)
     except Exception as error:
         failure = error
@@ -439,7 +450,47 @@ def run_session(
         return replace(session.result(seed, failure), cpu_s=cpu_s, wall_s=wall_s)
     finally:
         if session is not None:
-            session.commander.close()
+            session.close()
+
+
+def session_of(random: Random, config: ArmConfig | CellConfig, segment: Segment | None = None) -> AnySession:
+    """Return a session of an arm or of a cell, with the slaves of `segment`."""
+    if isinstance(config, ArmConfig):
+        assert not isinstance(segment, Mapping)
+        return Session(random, config, segment=segment)
+    from rtcp.testing.sessions.cell_session import CellSession
+
+    assert not isinstance(segment, SegmentConfig)
+    return CellSession(random, config, segment)
+
+
+def with_random_modes(random: Random, config: ArmConfig, periods_us: Sequence[float] = ()) -> ArmConfig:
+    """Return the configuration with a random control mode and drive mode, and one of these cycles, us."""
+    modes: list[tuple[ControlModeName, int]] = [*zip(CONTROL_MODES, SHARES, strict=True)]
+    if config.arm is None:
+        modes = [(mode, share) for mode, share in modes if mode not in ("cartesian", "joystick")]
+    (mode,) = random.choices([name for name, _ in modes], [share for _, share in modes])
+    cycle = replace(config.cycle, period_us=random.choice(periods_us)) if periods_us else config.cycle
+    return replace(config, cycle=cycle, drive_mode=random.choice(drive_modes(config)), control_mode=mode)
+
+
+def is_free(reading: Reading, bounds: Bounds, q: Sequence[float], clearance: float = 0.0, tool: int = 0) -> bool:
+    """Whether the arm keeps clear of boxes and of itself, by `clearance` m more than it must."""
+    workspace = reading.workspaces[tool]
+    return workspace is None or workspace.deepest(bounds, q) < -clearance
+
+
+def random_place(random: Random, config: ArmConfig, reading: Reading, free: bool = True) -> list[float]:
+    """Return random joint positions, rad; `free`: at which the arm touches nothing, if there are any."""
+    bounds = Bounds.configured(config)
+    for _ in range(_PLACES):
+        place = [random.uniform(low, high) for low, high in zip(bounds.low, bounds.high, strict=True)]
+        if random.random() < 0.1:
+            axis = random.randrange(len(place))
+            place[axis] = random.choice((bounds.low[axis] - 0.01, bounds.high[axis] + 0.01))
+        if not free or is_free(reading, bounds, place, 0.01):
+            break
+    return place
 
 
 def drive_modes(config: ArmConfig) -> list[DriveModeName]:
