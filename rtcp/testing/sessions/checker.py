@@ -1,27 +1,24 @@
 """A checker of what goes over the bus: each frame is decoded and compared with the limits in force at that time.
 
 It knows nothing of the loop. How a frame is read and where the arm's bodies are is a `Reading`: `reading_of` follows
-the device descriptions and the arm's geometry; a test that wants nothing of ours in its oracle brings its own.
+the numbers of the device descriptions and of the arm's geometry, with the code of `oracle` alone.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from math import inf
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from kinematics.forward import frames
-from kinematics.model import JOINTS, ArmModel
-from rtcp.config.model import ArmConfig, Joint, Pdo
-from rtcp.fieldbus.pdo import STRUCT_CODES, layout
+from rtcp.config.model import JOINTS, ArmConfig, Joint
 from rtcp.ipc.states import State
-from rtcp.motion.guards.neighbours import reach_of
-from rtcp.motion.guards.zones import Zones
-from rtcp.motion.limits import Corners, Values
+from rtcp.testing.sessions.oracle import Shape, unpacker
 from rtcp.testing.simulation import Frame
+
+if TYPE_CHECKING:
+    from rtcp.motion.limits import Corners, Values
 
 CSP, CSV, CST = 8, 9, 10
 HOMING = 6
@@ -36,6 +33,8 @@ ROUNDING = 2
 """Counts by which the rounding of three positions bends a straight line at most: 1/2 + 2 * 1/2 + 1/2."""
 NUMERIC_RAD = 1e-8
 """Rounding of the calculation itself, which counts where the encoder is finer, rad."""
+EXACT_COUNTS, EXACT_RAD = 1e-6, 1e-12
+"""Rounding of the ends of a range, of which the targets in counts stay inside: counts, and rad where they are finer."""
 MARGIN_RAD = 0.02
 """Distance outside its range at which a joint may still be enabled, to be led back, rad."""
 LATCHED_RAD = 5e-4
@@ -83,6 +82,24 @@ class Kind(str, Enum):
     """A drive has torque in a state without; `found`: the state."""
     NO_TORQUE_IN_STATE = "no_torque_in_state"
     """A drive has none while the arm is held; `found`: the state."""
+    LOST_FRAMES = "lost_frames"
+    """Lost frames, less a quarter of the good ones, with drives that are still commanded."""
+    TORQUE_STEP = "torque_step"
+    """A step of the target torque in one cycle, Nm."""
+    TRUE_SPEED = "true_speed"
+    """The speed of a joint itself, rad/s."""
+    TRUE_ACCELERATION = "true_acceleration"
+    """The acceleration of a joint itself, rad/s^2."""
+    ENERGY = "energy"
+    """Kinetic energy that a joint gains without a command and without a hand, J."""
+    MOVED = "moved"
+    """The way of a joint itself without a command and without a hand, rad."""
+    NOT_AT_REST = "not_at_rest"
+    """The speed of a joint itself long after an emergency stop, a halt or the end of the lease, rad/s."""
+    NOT_ARRIVED = "not_arrived"
+    """The distance of a joint itself from its target when the loop says that the motion is complete, rad."""
+    BODY = "body"
+    """Depth of a body itself in a keep-out box or another body, or of the tool outside its box, m."""
     PARTNER = "partner"
     """Distance of two arms of a cell that came too near to each other, m."""
     NOT_LED_APART = "not_led_apart"
@@ -124,15 +141,27 @@ class Bounds:
     @classmethod
     def configured(cls, config: ArmConfig) -> Bounds:
         """Return the limits of a configuration."""
-        all_of = Values.configured(config)
-        joints = (list(all_of.low), list(all_of.high), list(all_of.velocity), list(all_of.acceleration))
-        return cls(*joints, list(all_of.torque), all_of.box, all_of.keep_out)
+        joints, cartesian = config.joints, config.cartesian
+        return cls(
+            [joint.position.min for joint in joints],
+            [joint.position.max for joint in joints],
+            [joint.velocity for joint in joints],
+            [joint.acceleration for joint in joints],
+            [joint.torque for joint in joints],
+            None if cartesian.box is None else _corners(cartesian.box.min, cartesian.box.max),
+            tuple(_corners(box.min, box.max) for box in cartesian.keep_out),
+        )
 
     def put(self, new: Values) -> None:
         """Change all of them in place."""
         self.low[:], self.high[:] = new.low, new.high
         self.velocity[:], self.acceleration[:], self.torque[:] = new.velocity, new.acceleration, new.torque
         self.box, self.keep_out = new.box, new.keep_out
+
+
+def _corners(low: Sequence[float], high: Sequence[float]) -> Corners:
+    (a, b, c), (d, e, f) = low, high
+    return a, b, c, d, e, f
 
 
 # -- how a frame is read --------------------------------------------------------------------------------------------
@@ -195,27 +224,27 @@ def reading_of(config: ArmConfig) -> Reading:
         raise ValueError("it has no joints")
     slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
     joints = [_joint_reading(config, joint, slots[joint.slave]) for joint in config.joints]
-    return Reading(joints, [_workspace(config, model) for model in config.models] or (None,))
+    return Reading(joints, [_workspace(config, tool) for tool in range(len(config.models))] or (None,))
 
 
-def _workspace(config: ArmConfig, model: ArmModel) -> Workspace | None:
-    bounds = Bounds.configured(config)
-    zones = Zones(model, bounds, config.cartesian.clearance)
+def _workspace(config: ArmConfig, tool: int) -> Workspace | None:
+    shape, cartesian = Shape(config.models, tool, config.cartesian.clearance), config.cartesian
 
     def deepest(limits: Bounds, q: Sequence[float]) -> float:
-        bounds.box, bounds.keep_out = limits.box, limits.keep_out
-        return -zones.distance(frames(model, q[:JOINTS]))[0]
+        return -shape.distance(q[:JOINTS], limits.box, limits.keep_out)
 
-    return Workspace(deepest, reach_of(model)) if zones.any else None
+    is_guarded = shape.is_guarded or cartesian.box is not None or bool(cartesian.keep_out)
+    return Workspace(deepest, shape.reach) if is_guarded else None
 
 
 def _joint_reading(config: ArmConfig, joint: Joint, slot: int) -> JointReading:
-    device = config.slaves[slot].device.of_axis(joint.axis)
-    unpack_sent, sent, factors = _unpacker(
-        device.rpdo, ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
-    )
-    unpack_received, received, actual_factors = _unpacker(
-        device.tpdo, ("statusword", "position", "modes_of_operation_display")
+    device = config.slaves[slot].device
+    unpack_sent, sent, factors = unpacker(
+        device.rpdo, joint.axis,
+        ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation"),
+    )  # fmt: skip
+    unpack_received, received, actual_factors = unpacker(
+        device.tpdo, joint.axis, ("statusword", "position", "modes_of_operation_display")
     )
     if sent[0] < 0 or sent[1] < 0 or min(received[:2]) < 0:
         raise ValueError(f"slave {joint.slave}: its process data are not those of a CiA 402 drive")
@@ -239,23 +268,6 @@ def _joint_reading(config: ArmConfig, joint: Joint, slot: int) -> JointReading:
         )
 
     return JointReading(slot, decode, (abs(by_position), abs(by_velocity), abs(by_torque)))
-
-
-def _unpacker(
-    pdos: Sequence[Pdo], names: Sequence[str]
-) -> tuple[Callable[[bytes], tuple[int, ...]], list[int], list[float]]:
-    """Return the function that unpacks the channels, the index of each in its result (-1: none), and their factors."""
-    channels = {channel.name: channel for channel in layout(pdos).channels if channel.index and channel.name in names}
-    order = sorted(channels.values(), key=lambda channel: channel.bit_offset)
-    form, end = "<", 0
-    for channel in order:
-        if channel.bit_offset % 8 or channel.type not in STRUCT_CODES:
-            raise ValueError(f"the channel {channel.name} is not of whole bytes")
-        form += f"{channel.bit_offset // 8 - end}x{STRUCT_CODES[channel.type]}"
-        end = (channel.bit_offset + channel.bits) // 8
-    places = [order.index(channels[name]) if name in channels else -1 for name in names]
-    factors = [channels[name].factor if name in channels else 0.0 for name in names]
-    return struct.Struct(form).unpack_from, places, factors
 
 
 # -- the checker ----------------------------------------------------------------------------------------------------
@@ -321,11 +333,19 @@ class FrameChecker:
         """Number of the tool that the arm has."""
         self._expected = expected_wkc
         self._commands = [_Commands() for _ in reading.joints]
-        self._answered = True
+        self.samples: list[Sample] = []
+        """Process data of the last frame."""
+        self.is_answered = True
+        """Whether every slave took part in the last exchange."""
         self._check_zones_in = 0
-        self._excused = True
+        self.is_excused = True
         """Whether the arm was enabled inside a zone and has not come out of it yet."""
         self._inconsistent = 0
+
+    @property
+    def workspace(self) -> Workspace | None:
+        """Where the bodies of the arm with its tool are."""
+        return self._workspaces[self.tool]
 
     def use(self, tool: int) -> None:
         """Take note that the arm has another tool."""
@@ -348,10 +368,10 @@ class FrameChecker:
             state: of the machine after this cycle; None: it is not compared with the drives.
         """
         self.frames += 1
-        answered, self._answered = self._answered, frame.wkc == self._expected
+        answered, self.is_answered = self.is_answered, frame.wkc == self._expected
         obeying = enabled = 0
-        for axis, joint in enumerate(self._joints):
-            sample = joint.decode(frame.sent[joint.slot], frame.received[joint.slot])
+        self.samples = [joint.decode(frame.sent[joint.slot], frame.received[joint.slot]) for joint in self._joints]
+        for axis, sample in enumerate(self.samples):
             commands, mode = self._commands[axis], sample.mode
             position = self.targets[axis] = sample.position - self.zero[axis]
             enabled += sample.enabled
@@ -359,7 +379,7 @@ class FrameChecker:
             obeying += obeys
             if not obeys or mode not in (CSP, CSV, CST):
                 if obeys and mode != HOMING:
-                    self._violate(Kind.MODE, frame.now_ns, axis, float(mode), CSP, CST)
+                    self.violate(Kind.MODE, frame.now_ns, axis, float(mode), CSP, CST)
                 if commands.mode:
                     self._commands[axis] = _Commands()
                 continue
@@ -385,23 +405,24 @@ class FrameChecker:
         if obeying:
             self.obeyed += 1
         self._check_stopped(obeying, frame.now_ns)
-        workspace = self._workspaces[self.tool]
+        workspace = self.workspace
         if workspace is not None:
             if obeying < len(self._joints):
                 self._check_zones_in = 0
-                self._excused = True
+                self.is_excused = True
             elif all(commands.positions for commands in self._commands):
                 self._check_zones(workspace, frame.now_ns)
-        if state is not None and self._answered:
+        if state is not None and self.is_answered:
             self._check_state(state, enabled, frame.now_ns)
 
-    def _violate(self, kind: Kind, now_ns: int, axis: int, found: float, low: float, high: float) -> None:
+    def violate(self, kind: Kind, now_ns: int, axis: int, found: float, low: float, high: float) -> None:
+        """Add a violation: joint from 0 or -1, value, and what is allowed."""
         if len(self.violations) < MOST_VIOLATIONS:
             self.violations.append(Violation(kind, now_ns, axis + 1, found, low, high))
 
     def _range(self, axis: int) -> tuple[float, float]:
-        count = self._joints[axis].resolution[0]
-        return self.bounds.low[axis] - count - NUMERIC_RAD, self.bounds.high[axis] + count + NUMERIC_RAD
+        rounding = EXACT_COUNTS * self._joints[axis].resolution[0] + EXACT_RAD
+        return self.bounds.low[axis] - rounding, self.bounds.high[axis] + rounding
 
     def _step(self, axis: int) -> float:
         return self.bounds.velocity[axis] * self._dt + self._joints[axis].resolution[0] + NUMERIC_RAD
@@ -412,26 +433,26 @@ class FrameChecker:
         if mode != CSP:
             return
         if not commands.mode and abs(position - actual) > LATCHED_RAD + NUMERIC_RAD:
-            self._violate(Kind.FIRST_TARGET, now, axis, position, actual - LATCHED_RAD, actual + LATCHED_RAD)
+            self.violate(Kind.FIRST_TARGET, now, axis, position, actual - LATCHED_RAD, actual + LATCHED_RAD)
         low, high = self._range(axis)
         if not low - MARGIN_RAD <= position <= high + MARGIN_RAD:
-            self._violate(Kind.RANGE, now, axis, position, low - MARGIN_RAD, high + MARGIN_RAD)
+            self.violate(Kind.RANGE, now, axis, position, low - MARGIN_RAD, high + MARGIN_RAD)
 
     def _check_continued(self, axis: int, commands: _Commands, position: float, mode: int, now: int) -> None:
         step = position - commands.last
         if commands.mode and mode == CSP and abs(step) > (allowed := self._step(axis)):
-            self._violate(Kind.MODE_STEP, now, axis, step, -allowed, allowed)
+            self.violate(Kind.MODE_STEP, now, axis, step, -allowed, allowed)
 
     def _check_position(self, axis: int, commands: _Commands, position: float, answered: bool, now: int) -> None:
         past = commands.positions
         low, high = self._range(axis)
         last = past[-1]
         if not min(low, last) <= position <= max(high, last):
-            self._violate(Kind.RANGE, now, axis, position, min(low, last), max(high, last))
+            self.violate(Kind.RANGE, now, axis, position, min(low, last), max(high, last))
         step, allowed = abs(position - last), self._step(axis)
         self.largest_step = max(self.largest_step, step / allowed)
         if step > allowed:
-            self._violate(Kind.STEP, now, axis, position - last, -allowed, allowed)
+            self.violate(Kind.STEP, now, axis, position - last, -allowed, allowed)
         if not step:
             # Nobody received the last targets: the set-points wait, and no sample is added.
             if not answered:
@@ -456,7 +477,7 @@ class FrameChecker:
                 speed = (abs(past[newest] - past[newest - n]) - count - NUMERIC_RAD) / (n * self._dt)
                 self.largest_speed = max(self.largest_speed, speed)
                 if speed > fastest:
-                    self._violate(Kind.VELOCITY, now, axis, speed, -fastest, fastest)
+                    self.violate(Kind.VELOCITY, now, axis, speed, -fastest, fastest)
             if newest < 2 * n:
                 continue
             bend = abs(past[newest] - 2 * past[newest - n] + past[newest - 2 * n])
@@ -465,13 +486,13 @@ class FrameChecker:
                 self.largest_acceleration = bend / allowed
                 if bend > allowed:
                     scale = 1.0 / (n * self._dt) ** 2
-                    self._violate(Kind.ACCELERATION, now, axis, bend * scale, 0.0, allowed * scale)
+                    self.violate(Kind.ACCELERATION, now, axis, bend * scale, 0.0, allowed * scale)
 
     def _check_received(self, axis: int, commands: _Commands, position: float, now: int) -> None:
         """A drive that missed frames must not be far behind when the next one reaches it."""
         allowed, last = self._step(axis), commands.received
         if last is not None and abs(position - last) > allowed:
-            self._violate(Kind.RECEIVED_STEP, now, axis, position - last, -allowed, allowed)
+            self.violate(Kind.RECEIVED_STEP, now, axis, position - last, -allowed, allowed)
         commands.received = position
 
     def _check_velocity(self, axis: int, commands: _Commands, velocity: float, answered: bool, now: int) -> None:
@@ -480,7 +501,7 @@ class FrameChecker:
         allowed = self.bounds.velocity[axis] + count
         self.largest_speed = max(self.largest_speed, abs(velocity))
         if abs(velocity) > allowed:
-            self._violate(Kind.VELOCITY, now, axis, velocity, -allowed, allowed)
+            self.violate(Kind.VELOCITY, now, axis, velocity, -allowed, allowed)
         if not answered:
             return
         past.append(velocity)
@@ -495,12 +516,12 @@ class FrameChecker:
             self.largest_acceleration = max(self.largest_acceleration, change / allowed)
             if change > allowed:
                 scale = 1.0 / (n * self._dt)
-                self._violate(Kind.VELOCITY_STEP, now, axis, change * scale, 0.0, allowed * scale)
+                self.violate(Kind.VELOCITY_STEP, now, axis, change * scale, 0.0, allowed * scale)
 
     def _check_torque(self, axis: int, torque: float, now: int) -> None:
         allowed = self.bounds.torque[axis] + self._joints[axis].resolution[2]
         if abs(torque) > allowed:
-            self._violate(Kind.TORQUE, now, axis, torque, -allowed, allowed)
+            self.violate(Kind.TORQUE, now, axis, torque, -allowed, allowed)
 
     def _check_zones(self, workspace: Workspace, now: int) -> None:
         self._check_zones_in -= 1
@@ -508,13 +529,13 @@ class FrameChecker:
             return
         bounds = self.bounds
         deepest = workspace.deepest(bounds, [commands.positions[-1] for commands in self._commands])
-        if deepest > ZONE_TOLERANCE_M and self._excused:
+        if deepest > ZONE_TOLERANCE_M and self.is_excused:
             # The arm was enabled in there: it is checked once it is out.
             self._check_zones_in = 1
             return
-        self._excused = False
+        self.is_excused = False
         if deepest > ZONE_TOLERANCE_M:
-            self._violate(Kind.ZONE, now, -1, deepest, -inf, ZONE_TOLERANCE_M)
+            self.violate(Kind.ZONE, now, -1, deepest, -inf, ZONE_TOLERANCE_M)
             self._check_zones_in = 50
             return
         # No body is nearer than -deepest: the next check is due when one may have moved that far.
@@ -523,7 +544,7 @@ class FrameChecker:
 
     def _check_stopped(self, obeying: int, now: int) -> None:
         if obeying and now > self.torque_off_from_ns:
-            self._violate(Kind.NOT_STOPPED, now, -1, float(obeying), 0.0, 0.0)
+            self.violate(Kind.NOT_STOPPED, now, -1, float(obeying), 0.0, 0.0)
         if now <= self.rest_from_ns:
             self._resting = None
         elif self._resting is None:
@@ -534,7 +555,7 @@ class FrameChecker:
                 for commands, target, rest in zip(self._commands, self.targets, self._resting, strict=True)
             )
             if moved:
-                self._violate(Kind.NOT_STOPPED, now, -1, float(moved), 0.0, 0.0)
+                self.violate(Kind.NOT_STOPPED, now, -1, float(moved), 0.0, 0.0)
 
     def _check_state(self, state: State, enabled: int, now: int) -> None:
         """The machine must know which drives have torque; it may take a moment to notice a change."""
@@ -543,4 +564,4 @@ class FrameChecker:
         if self._inconsistent * self._dt > INCONSISTENT_S:
             self._inconsistent = 0
             kind = Kind.TORQUE_IN_STATE if enabled and state in _WITHOUT_TORQUE else Kind.NO_TORQUE_IN_STATE
-            self._violate(kind, now, -1, float(state), -inf, inf)
+            self.violate(kind, now, -1, float(state), -inf, inf)
