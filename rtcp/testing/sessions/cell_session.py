@@ -36,8 +36,10 @@ TOLERANCE_M = 0.005
 """By how much joints that follow their targets may bring two arms nearer than the clearance, m."""
 NEAR_M = 0.25
 """Distance beyond the clearance at which the arms begin at most, m."""
-_MOST_PLACES = 400
+_MOST_PLACES = 1500
 """Places of the arms that are tried before any is taken."""
+_HALVINGS = 12
+"""Halvings of the way between places that are too far from and too near to each other."""
 _GOALS = 6
 """Goals of which the one nearest to the partner is taken."""
 _LEAD_NS = 60_000_000
@@ -91,8 +93,6 @@ class CellSession:
         self.random = random
         members = tuple(replace(arm, config=with_random_modes(random, arm.config)) for arm in cell.arms)
         self.cell = cell = replace(cell, arms=members)
-        self._begins_near = random.random() < 0.2
-        """Whether the arms begin nearer to each other than the clearance."""
         readings = {arm.name: reading_of(arm.config) for arm in members}
         self.simulation = CellSimulation(
             cell, random.randrange(1 << 30), positions=self._places(readings), segments=segments
@@ -163,22 +163,35 @@ class CellSession:
     # -- places -------------------------------------------------------------------------------------------------------
 
     def _places(self, readings: Mapping[str, Reading]) -> dict[str, list[float]]:
-        """Return joint positions at which the arms touch nothing and are near each other, rad."""
+        """Return joint positions, rad, at which the arms touch nothing and are as near each other as is wanted."""
         random, clearance, arms = self.random, self.cell.clearance, self.cell.arms
-        low, high = (0.25 * clearance, clearance) if self._begins_near else (clearance + 0.01, clearance + NEAR_M)
-        shapes = {arm.name: Shape(arm.config.models, None, 0.0) for arm in arms}
+        shapes = [Shape(arm.config.models, None, 0.0) for arm in arms]
+        begins_near = random.random() < 0.2
+        wanted = clearance * random.uniform(0.3, 0.9) if begins_near else clearance + random.uniform(0.01, NEAR_M)
+
+        def near(all_q: Sequence[Sequence[float]]) -> float:
+            bodies = [placed(*each) for each in zip(shapes, (arm.base for arm in arms), all_q, strict=True)]
+            return min(apart(a, b) for a, b in combinations(bodies, 2))
+
+        def are_free(all_q: Sequence[Sequence[float]]) -> bool:
+            ends = zip(arms, all_q, strict=True)
+            return all(is_free(readings[arm.name], Bounds.configured(arm.config), q, 0.01) for arm, q in ends)
+
+        far: list[list[float]] = []
         for _ in range(_MOST_PLACES):
-            places, bodies = {}, []
-            for arm in arms:
-                joints = arm.config.joints
-                q = places[arm.name] = [random.uniform(j.position.min, j.position.max) for j in joints]
-                bodies.append(placed(shapes[arm.name], arm.base, q))
-            near = min(apart(a, b) for a, b in combinations(bodies, 2))
-            if low < near < high and all(
-                is_free(readings[arm.name], Bounds.configured(arm.config), places[arm.name], 0.01) for arm in arms
-            ):
+            drawn = [[random.uniform(j.position.min, j.position.max) for j in arm.config.joints] for arm in arms]
+            if near(drawn) > wanted:
+                far = drawn
+                continue
+            # Somewhere between these places the arms are as near as is wanted.
+            there, close = far or drawn, drawn
+            for _ in range(_HALVINGS):
+                drawn = [[0.5 * (a + b) for a, b in zip(*pair, strict=True)] for pair in zip(there, close, strict=True)]
+                there, close = (drawn, close) if near(drawn) > wanted else (there, drawn)
+            if far and are_free(there):
+                far = there
                 break
-        return places
+        return {arm.name: q for arm, q in zip(arms, far or drawn, strict=True)}
 
     def _near_goal(self, arm: Arm) -> list[float]:
         """Return a place of an arm that is nearer to its partners than most, rad."""
@@ -206,7 +219,7 @@ class CellSession:
 
     # -- actions ------------------------------------------------------------------------------------------------------
 
-    def _enable(self) -> None:
+    def enable(self) -> None:
         """Enable all arms; first each is reset that needs it."""
         for arm in self.live:
             if arm.state not in MOVABLE:
@@ -217,7 +230,7 @@ class CellSession:
     def _approach(self) -> None:
         """Let the arms move at once, mostly towards each other."""
         random = self.random
-        self._enable()
+        self.enable()
         for arm in random.sample(self.live, len(self.live)):
             if random.random() < 0.2:
                 continue
@@ -264,7 +277,7 @@ class CellSession:
         arm.session.send(commands.Halt())
 
     def _set_joint_mode(self, arms: Sequence[Arm]) -> None:
-        self._enable()
+        self.enable()
         for arm in arms:
             if arm.session.send(commands.SetControlMode(ControlMode.JOINT)):
                 arm.session.mode = ControlMode.JOINT
@@ -300,13 +313,15 @@ class CellSession:
         self._off_ns = inf if len(self.live) == len(self.arms) else self._off_ns
         arm.session.seconds(0.0, 0.1)
         if random.random() < 0.8:
-            self._enable()
+            self.enable()
 
     def _kill(self) -> None:
+        """Now and then kill the loop of an arm while others move."""
+        if len(self.live) == len(self.arms) and self.random.random() < 0.5:
+            self.kill(self.random.choice(self.live))
+
+    def kill(self, arm: Arm) -> None:
         """End the loop of an arm for the rest of the session."""
-        if len(self.live) < len(self.arms) or self.random.random() < 0.5:
-            return
-        arm = self.random.choice(self.live)
         arm.commander.count_fault("loop killed", arm.name)
         self.live.remove(arm)
         self.simulation.silent.add(arm.name)
@@ -410,7 +425,7 @@ class CellSession:
         weights = [weight for weight, _ in self.actions]
         while self.live[0].commander.seconds < seconds and not self.violated:
             if any(arm.state not in MOVABLE for arm in self.live) and self.random.random() < 0.7:
-                self._enable()
+                self.enable()
             self.random.choices(self.actions, weights)[0][1]()
             self.random.choice(self.live).session.seconds(0.0, 0.4)
         for arm in self.arms:
