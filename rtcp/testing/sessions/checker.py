@@ -346,6 +346,7 @@ class FrameChecker:
         self.frames += 1
         answered, self._answered = self._answered, frame.wkc == self._expected
         obeying = enabled = 0
+        homing = False
         for axis, joint in enumerate(self._joints):
             sample = joint.decode(frame.sent[joint.slot], frame.received[joint.slot])
             commands, mode = self._commands[axis], sample.mode
@@ -354,6 +355,7 @@ class FrameChecker:
             obeys = sample.commanded and sample.enabled
             obeying += obeys
             if not obeys or mode not in (CSP, CSV, CST):
+                homing |= obeys and mode == HOMING
                 if obeys and mode != HOMING:
                     self._violate(Kind.MODE, frame.now_ns, axis, float(mode), CSP, CST)
                 if commands.mode:
@@ -383,7 +385,8 @@ class FrameChecker:
         self._check_stopped(obeying, frame.now_ns)
         workspace = self._workspaces[self.tool]
         if workspace is not None:
-            if obeying < len(self._joints):
+            # By its new zero a homed joint may be anywhere.
+            if obeying < len(self._joints) or homing:
                 self._check_zones_in = 0
                 self._excused = True
             elif all(commands.positions for commands in self._commands):
