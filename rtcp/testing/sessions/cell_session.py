@@ -15,6 +15,7 @@ from random import Random
 from typing import Any
 
 from rtcp.config.cell import Base, CellConfig, Member
+from rtcp.config.model import ArmConfig, ControlModeName
 from rtcp.config.segment import SegmentConfig
 from rtcp.ipc import commands
 from rtcp.ipc.events import ControllerRaised, PartnerNear
@@ -24,10 +25,12 @@ from rtcp.motion.planning.in_step import Curve, Way, plan_brakes, plan_moves
 from rtcp.motion.planning.plan import COLUMNS, PlanRefused
 from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.testing.cell import CellSimulation
+from rtcp.testing.sessions.actions import SHARES
 from rtcp.testing.sessions.checker import Bounds, Kind, Reading, Violation, reading_of
 from rtcp.testing.sessions.commander import Commander
+from rtcp.testing.sessions.coverage import Coverage
 from rtcp.testing.sessions.oracle import Placed, Shape, apart, in_world
-from rtcp.testing.sessions.session import MOVABLE, Result, Session, is_free, with_random_modes
+from rtcp.testing.sessions.session import MOVABLE, Result, Session, drive_modes
 from rtcp.testing.simulation import Frame, Simulation
 
 UNREAD_S = 0.5
@@ -61,6 +64,7 @@ class Arm:
         self.name = member.name
         self.session = Session(random, member.config, reading, simulation=simulation)
         self.commander = self.session.commander
+        self.commander.start()
         self.shape = Shape(member.config.models, None, 0.0)
         self._base = member.base
 
@@ -91,7 +95,7 @@ class CellSession:
 
     def __init__(self, random: Random, cell: CellConfig, segments: Mapping[str, SegmentConfig] | None = None) -> None:
         self.random = random
-        members = tuple(replace(arm, config=with_random_modes(random, arm.config)) for arm in cell.arms)
+        members = tuple(replace(arm, config=with_random_modes(arm.config, random)) for arm in cell.arms)
         self.cell = cell = replace(cell, arms=members)
         readings = {arm.name: reading_of(arm.config) for arm in members}
         self.simulation = CellSimulation(
@@ -111,6 +115,7 @@ class CellSession:
             simulation = arm.commander.simulation
             for joint, reach in zip(simulation.config.joints, arm.shape.reach, strict=False):
                 self._fastest += joint.velocity * reach * simulation.period_ns * 1e-9
+            assert simulation.on_frame is not None
             simulation.on_frame = partial(self._see, arm, simulation.on_frame)
         self.actions: list[tuple[int, Callable[[], object]]] = [
             (10, self._approach),
@@ -174,8 +179,11 @@ class CellSession:
             return min(apart(a, b) for a, b in combinations(bodies, 2))
 
         def are_free(all_q: Sequence[Sequence[float]]) -> bool:
-            ends = zip(arms, all_q, strict=True)
-            return all(is_free(readings[arm.name], Bounds.configured(arm.config), q, 0.01) for arm, q in ends)
+            for arm, q in zip(arms, all_q, strict=True):
+                workspace = readings[arm.name].workspaces[0]
+                if workspace is not None and workspace.deepest(Bounds.configured(arm.config), q) > -0.01:
+                    return False
+            return True
 
         far: list[list[float]] = []
         for _ in range(_MOST_PLACES):
@@ -444,9 +452,20 @@ class CellSession:
             sums[name] = sum(getattr(result, name) for result in results)
         for name in ("simulated_s", "largest_step", "largest_acceleration", "largest_speed"):
             sums[name] = max(getattr(result, name) for result in results)
-        return replace(worst, **sums)
+        coverage = Coverage()
+        for arm in self.arms:
+            coverage.add(arm.commander.coverage)
+        return replace(worst, coverage=coverage.as_json(), **sums)
+
+
+def with_random_modes(config: ArmConfig, random: Random) -> ArmConfig:
+    """Return the configuration with a random control mode and drive mode."""
+    names: list[ControlModeName] = ["joint", "cartesian", "joystick", "velocity", "torque"]
+    (mode,) = random.choices(names, SHARES)
+    return replace(config, control_mode=mode, drive_mode=random.choice(drive_modes(config)))
 
 
 def placed(shape: Shape, base: Base, q: Sequence[float]) -> list[Placed]:
     """Return the bodies of an arm in the world at these joint positions, rad."""
-    return in_world(shape.placed(q), base.position, base.rpy)
+    (x, y, z), (rx, ry, rz) = base.position, base.rpy
+    return in_world(shape.placed(q), (x, y, z), (rx, ry, rz))

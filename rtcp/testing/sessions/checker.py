@@ -370,6 +370,7 @@ class FrameChecker:
         self.frames += 1
         answered, self.is_answered = self.is_answered, frame.wkc == self._expected
         obeying = enabled = 0
+        homing = False
         self.samples = [joint.decode(frame.sent[joint.slot], frame.received[joint.slot]) for joint in self._joints]
         for axis, sample in enumerate(self.samples):
             commands, mode = self._commands[axis], sample.mode
@@ -378,6 +379,7 @@ class FrameChecker:
             obeys = sample.commanded and sample.enabled
             obeying += obeys
             if not obeys or mode not in (CSP, CSV, CST):
+                homing |= obeys and mode == HOMING
                 if obeys and mode != HOMING:
                     self.violate(Kind.MODE, frame.now_ns, axis, float(mode), CSP, CST)
                 if commands.mode:
@@ -407,7 +409,8 @@ class FrameChecker:
         self._check_stopped(obeying, frame.now_ns)
         workspace = self.workspace
         if workspace is not None:
-            if obeying < len(self._joints):
+            # By its new zero a homed joint may be anywhere.
+            if obeying < len(self._joints) or homing:
                 self._check_zones_in = 0
                 self.is_excused = True
             elif all(commands.positions for commands in self._commands):

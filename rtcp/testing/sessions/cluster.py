@@ -37,6 +37,7 @@ from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.config.serialization import to_json
+from rtcp.testing.sessions.coverage import Coverage
 from rtcp.testing.sessions.session import Result, Segment, run_session
 
 PART = 1000
@@ -47,6 +48,8 @@ UPDATES = 20
 """Least number of tasks of each thread, where sessions are enough: progress shows, an interruption loses less."""
 TASKS_PER_THREAD = 3
 """Tasks under way for each thread of the workers."""
+COVERAGE_FILE = "coverage.json"
+"""File of the coverage table in the folder of the results."""
 SHOWN_FAILURES = 10
 """Failures that a summary has; the files have all."""
 HANG_S, HANG_RATIO = 60.0, 200.0
@@ -157,6 +160,7 @@ class SessionSummary:
     largest_step: float = 0.0
     largest_acceleration: float = 0.0
     largest_speed: float = 0.0
+    coverage: Coverage = field(default_factory=Coverage)
     failures: list[Result] = field(default_factory=list)
     """The first failed sessions, by their seeds."""
     workers: dict[str, Memory] = field(default_factory=dict)
@@ -180,6 +184,7 @@ class SessionSummary:
         self.simulated_s += result.simulated_s
         self.cycles += result.cycles
         self.cpu_s += result.cpu_s
+        self.coverage.add(Coverage.from_json(result.coverage))
         for name in ("largest_step", "largest_acceleration", "largest_speed"):
             setattr(self, name, max(getattr(self, name), getattr(result, name)))
         if result.outcome != "passed":
@@ -221,7 +226,7 @@ class Parts:
         plan = self._plan
         mine, seeds = (self._digest, plan.seconds, rtcp.__version__), range(plan.first, plan.first + plan.count)
         for file in sorted(self._folder.iterdir()):
-            if file.suffix == ".mcap" or file.name.endswith(".new"):
+            if file.suffix == ".mcap" or file.name == COVERAGE_FILE or file.name.endswith(".new"):
                 continue
             why, rows = "sessions of another configuration, length, version or seed", []
             try:
@@ -265,6 +270,13 @@ class Parts:
         """Write the parts that are not complete."""
         for number in sorted(self._results):
             self._write(number)
+
+    def write_coverage(self, coverage: Coverage, rows: Coverage) -> Path:
+        """Write the whole coverage table and its empty rows; return the file."""
+        path = self._folder / COVERAGE_FILE
+        with self._writes():
+            path.write_text(json.dumps({**coverage.as_dict(), "empty": coverage.empty(rows)}, indent=1))
+        return path
 
     def _write(self, number: int) -> None:
         rows = sorted(self._results.pop(number), key=lambda result: result.seed)

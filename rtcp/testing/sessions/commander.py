@@ -20,11 +20,11 @@ from rtcp.motion.limits import Values, rows
 from rtcp.testing.inputs import Inputs
 from rtcp.testing.sessions.actions import NONSENSE
 from rtcp.testing.sessions.checker import Bounds, FrameChecker, Reading
+from rtcp.testing.sessions.coverage import Coverage, Place, commands_of
+from rtcp.testing.sessions.environment import Environment
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models.servo import ServoAxis
 
-KINDS = sorted((kind for kind in COMMANDS if kind.__module__ == Command.__module__), key=lambda kind: kind.name)
-"""All commands of the platform; a package may have registered its own."""
 ODD_INTEGERS = (-1, 0, 7, 99, 1 << 40, -(1 << 63), (1 << 63) - 1)
 FAULTS = (0x2310, 0x3210, 0x3220, 0x4310, 0x8130, 0x8400, 0x8611, 0x8612, 0x7305)
 START_S = 3.0
@@ -59,12 +59,8 @@ class Raw:
         memory[at : at + PAYLOAD_SIZE] = self.payload
 
 
-def random_command(random: Random, joints: int) -> Command:
-    """Return a command of any kind, with fields that are of the right types and of any value.
-
-    Not SetLimits: it would put limits of an old plan in force, of which the checker is not told.
-    """
-    kind = random.choice([kind for kind in KINDS if kind is not SetLimits])
+def random_command(kind: type[Command], random: Random, joints: int) -> Command:
+    """Return a command of a kind, with fields that are of the right types and of any value."""
     return kind(*(_random_field(field, random, joints) for field in kind.field_types.values()))
 
 
@@ -75,6 +71,8 @@ def _random_field(kind: Any, random: Random, joints: int) -> Any:
         return _random_number(random)
     if kind is int:
         return random.choice((random.randrange(8), random.choice(ODD_INTEGERS)))
+    if kind is str:
+        return "".join(chr(random.randrange(32, 0x300)) for _ in range(random.choice((0, 1, 8, 300))))
     return random.choice((False, True) if kind is bool else list(kind))
 
 
@@ -97,11 +95,15 @@ class Commander:
 
     Args:
         config: the arm.
-        seed: of the bus.
+        seed: of the bus and of the environment.
         positions: of the joints at power-on, rad.
         reading: how its frames are read.
         segment: the slaves; None: the configured segment.
-        simulation: the arm of a cell that it commands; None: an arm of its own.
+        simulation: the arm's simulation, which the caller starts; None: one is made here and started.
+
+    Attributes:
+        coverage: counts of commands by where they were sent, of events and of refusals.
+        environment: hands, loads, and measurements that are false.
     """
 
     def __init__(
@@ -115,10 +117,13 @@ class Commander:
     ) -> None:
         self.bounds = Bounds.configured(config)
         self.limits = Values.configured(config)
+        starts = simulation is None
         if simulation is None:
             simulation = Simulation(config, seed, positions=positions, segment=segment, follow_clock=False)
+            simulation.unlink()
         self.simulation = simulation
-        self.simulation.unlink()
+        self.kinds = commands_of(simulation)
+        """All commands of the arm."""
         count = len(config.joints)
         self.checker = FrameChecker(
             self.bounds, config.cycle.period_us * 1e-6, reading, self.simulation.data.expected_wkc,
@@ -131,8 +136,9 @@ class Commander:
         self.faults: Counter[str] = Counter()
         self.states: Counter[State] = Counter()
         self.log: list[Entry] = []
-        self.inputs = Inputs(self.simulation)
-        self._pushes: dict[int, float] = {}
+        self.coverage = Coverage()
+        self.inputs = Inputs(simulation)
+        self.environment = Environment(Random(seed), simulation, self.servos, self.inputs, self.count_fault)
         self._stop_ns = round(
             1e9 * (STOP_S + max(j.velocity / j.acceleration + j.acceleration / j.jerk for j in config.joints))
         )
@@ -140,19 +146,26 @@ class Commander:
         """Whether an emergency stop is pressed that concerns the arm, and whether the lease is not renewed."""
         self._event = 0
         """Number of the last event in the log."""
-        self.simulation.on_frame = self._see
+        simulation.on_frame = self._see
+        if starts:
+            self.start()
+
+    def start(self) -> None:
+        """Acquire a lease and wait until the machine is ready."""
         self.simulation.acquire()
-        self.simulation.until(lambda: self.state is State.READY, START_S)
+        self.simulation.until(lambda: self.state is State.READY or self.simulation.done, START_S)
 
     def _see(self, frame: Frame) -> None:
         state = self.simulation.state
         self.states[state] += 1
         self.checker.check(frame, state)
+        self.environment.step(frame.now_ns)
         head = self.simulation.board.words[EVENTS_HEAD_AT]
         if head != self._event:
             # An event has the time of the host.
             for record in self.simulation.observer.events_since(self._event):
                 self.log.append(Entry(frame.now_ns, self.simulation.names.message(record.event)))
+                self.coverage.events[record.event.name] += 1
             self._event = head
 
     def close(self) -> None:
@@ -173,6 +186,12 @@ class Commander:
     def commanded(self) -> list[float]:
         """The last targets on the bus, rad."""
         return list(self.checker.targets)
+
+    @property
+    def place(self) -> Place:
+        """Where a command arrives now."""
+        arm = self.simulation.loop.arm
+        return Place(self.state, arm.control_mode, arm.wanted_mode)
 
     @property
     def stopped_ns(self) -> int:
@@ -197,7 +216,10 @@ class Commander:
             return False
         self._note(f"{command}")
         at = len(self.log) - 1
+        place = self.place
+        under_way = self.simulation.loop.arm.active.name if place.state is State.MOVING else ""
         refusal = self.simulation.send(command, lease).refusal
+        self.coverage.command(command.name, place, under_way, refusal)
         (self.taken if refusal is None else self.refused)[command.name] += 1
         answer = "accepted" if refusal is None else self.simulation.names.message(refusal)
         self.log[at] = self.log[at]._replace(text=f"{self.log[at].text} -> {answer}")
@@ -281,9 +303,7 @@ class Commander:
     def push(self, axis: int, torque: float) -> None:
         """Push a joint, Nm."""
         self.count_fault("push", f"{axis} {torque:.1f}")
-        # Beside the weight of the arm, which the segment puts there.
-        self.servos[axis].mechanics.external_torque += torque - self._pushes.get(axis, 0.0)
-        self._pushes[axis] = torque
+        self.environment.push(axis, torque)
 
     def joystick(self, pressed: int) -> None:
         """Press directions and paddles of the joystick, as `Inputs.joystick`."""
@@ -301,6 +321,11 @@ class Commander:
             self.inputs.set(contact, pressed)
             if contact is not None and pressed:
                 self.checker.torque_off_from_ns = self.stopped_ns
+
+    def switch(self, pressed: bool) -> None:
+        """Press or release the enabling switch."""
+        if self.environment.switch(pressed):
+            self.checker.rest_from_ns = inf if pressed else self.stopped_ns
 
     def toggle(self, arm: bool) -> None:
         """Switch the joystick to the arm or to the chair."""

@@ -8,25 +8,29 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import isfinite, sqrt
 from random import Random
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast
 
 import rtcp
 from kinematics import forward
 from rtcp.config.cell import CellConfig
-from rtcp.config.model import MODE_CHANNELS, MOST_AXES, ArmConfig, ControlModeName, DriveModeName
+from rtcp.config.model import MODE_CHANNELS, MOST_AXES, ArmConfig, ControlModeName, DriveModeName, InputConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.ipc import commands
 from rtcp.ipc.message import PAYLOAD_SIZE
-from rtcp.ipc.states import ControlMode, State
+from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 from rtcp.motion.limits import Values
 from rtcp.motion.planning.interpolation import quaternion
 from rtcp.motion.planning.plan import COLUMNS, CUBIC, KIND, LINE, POSITIONS, QUINTIC, VELOCITIES
-from rtcp.testing.sessions.actions import CONTROL_MODES, NONSENSE, SHARES, RandomActions
+from rtcp.testing.sessions.actions import NONSENSE, SHARES, RandomActions
 from rtcp.testing.sessions.checker import Bounds, Reading, Violation, reading_of
-from rtcp.testing.sessions.commander import FAULTS, KINDS, ODD_INTEGERS, Commander, random_command
+from rtcp.testing.sessions.commander import FAULTS, ODD_INTEGERS, Commander, random_command
+from rtcp.testing.sessions.coverage import places_of
+from rtcp.testing.sessions.visits import Visit
 from rtcp.testing.simulation import Simulation
 
 LONGEST_WAIT_S = 0.3
+SWITCHES = 0.2
+"""Part of the sessions whose arm has an enabling switch, though none is configured."""
 MOVABLE = (State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING, State.CLOSING)
 _CLOSE_S = 2.5
 _PLACES = 1000
@@ -55,6 +59,8 @@ class Result:
     """Largest speed of a target, rad/s."""
     violation: str = ""
     """The first violation (fields of `rtcp.testing.sessions.checker.Violation`) or the error, as JSON."""
+    coverage: str = ""
+    """Counts of commands, events and refusals (fields of `rtcp.testing.sessions.coverage.Coverage`), as JSON."""
     cpu_s: float = 0.0
     wall_s: float = 0.0
 
@@ -68,7 +74,8 @@ class Session(RandomActions):
         reading: how its frames are read; None: by the configuration.
         segment: the slaves; None: the configured segment.
         periods_us: cycles to choose from, us; empty: the configured one.
-        simulation: an arm of a cell, whose modes and positions are chosen already; None: an arm of its own.
+        number: of the session: consecutive numbers visit different places; None: a random one.
+        simulation: an arm of a cell, which has its modes already and which the caller starts; None: an arm of its own.
     """
 
     def __init__(
@@ -78,26 +85,67 @@ class Session(RandomActions):
         reading: Reading | None = None,
         segment: SegmentConfig | None = None,
         periods_us: Sequence[float] = (),
+        number: int | None = None,
         simulation: Simulation | None = None,
     ) -> None:
         super().__init__(random)
         self.reading = reading = reading_of(config) if reading is None else reading
         self.bounds = Bounds.configured(config)
         self.joints = len(config.joints)
-        chosen = config if simulation is not None else with_random_modes(random, config, periods_us)
-        positions = random_place(random, config, reading, random.random() < 0.9) if simulation is None else ()
-        self.commander = commander = Commander(
-            chosen, random.randrange(1 << 30), positions, reading, segment, simulation
-        )
+        modes = drive_modes(config)
+        places = places_of(config, modes)
+        # Neighbours in this list differ little: consecutive sessions are to differ much.
+        Random(0).shuffle(places)
+        round_, at = divmod(random.randrange(1 << 16) if number is None else number, len(places))
+        place = places[at]
+        cycle = replace(config.cycle, period_us=random.choice(periods_us)) if periods_us else config.cycle
+        control_mode, drive_mode = place.control_mode, place.drive_mode
+        chosen = replace(
+            with_enabling_switch(config) if random.random() < SWITCHES else config,
+            cycle=cycle, drive_mode=cast(DriveModeName, drive_mode.name.lower()),
+            control_mode=cast(ControlModeName, control_mode.name.lower()),
+        )  # fmt: skip
+        positions = self._place(random.random() < 0.9)
+        seed = random.randrange(1 << 30)
+        if simulation is None:
+            simulation = Simulation(chosen, seed, positions=positions, segment=segment, follow_clock=False)
+        else:
+            chosen, control_mode = simulation.config, simulation.loop.arm.control_mode
+        simulation.unlink()
+        self.commander = commander = Commander(chosen, seed, positions, reading, segment, simulation)
+        environment = commander.environment
+        self.visit = Visit(self, place, round_)
         self.period_s = chosen.cycle.period_us * 1e-6
-        self.mode = ControlMode[chosen.control_mode.upper()]
+        self.mode = control_mode
+        self._makers: dict[type[commands.Command], Callable[[], commands.Command]] = {
+            commands.SetDriveMode: lambda: commands.SetDriveMode(random.choice(list(DriveMode))),
+            commands.SetControlMode: lambda: commands.SetControlMode(random.choice(list(ControlMode))),
+            commands.SetOutput: lambda: commands.SetOutput(random.randrange(1, 17), random.random() < 0.5),
+            commands.SetSpeedOverride: lambda: commands.SetSpeedOverride(random.choice((1.0, 1.0, 0.5, 0.1))),
+            commands.SetTool: lambda: commands.SetTool(random.randrange(max(1, len(config.models)))),
+            commands.SetPayload: self._payload,
+            commands.SetZero: self._same_zero,
+            commands.Home: lambda: commands.Home(random.randrange(self.joints)),
+            commands.MoveJoints: self._long_move,
+            commands.RunTrajectory: self._short_trajectory,
+            commands.ExtendTrajectory: lambda: commands.ExtendTrajectory(random.randrange(1, 8), random.random() < 0.5),
+            commands.RunInStep: self._in_step,
+            commands.StreamPosition: self._next_position,
+            commands.OpenStream: lambda: commands.OpenStream(commander.simulation.now_ns),
+            commands.Jog: self._short_jog,
+            commands.MoveAtVelocity: lambda: commands.MoveAtVelocity(tuple(self._small(0.2)), 0.5),
+            commands.ApplyTorque: lambda: commands.ApplyTorque(tuple(self._small(5.0)), 0.0, 1.0, 0.5),
+            commands.Guide: lambda: commands.Guide(1.0),
+        }
+        """Commands that the arm accepts in the right place; commands without an entry get random fields."""
         self.actions: list[tuple[int, Callable[[], object]]] = [
             (4, self.enable),
             (24, self._begin_motion),
             (12, self.command),
             (4, self._change_mode),
             (2, lambda: self.send(commands.SetOutput(self.or_odd(random.randrange(0, 18)), random.random() < 0.5))),
-            (1, lambda: commander.send(random_command(random, self.joints))),
+            (1, lambda: self._send_random(random.choice(commander.kinds))),
+            (4, lambda: self.send_likely(random.choice(commander.kinds))),
             (1, lambda: commander.send_raw(self._kind(), [self._number() for _ in range(PAYLOAD_SIZE // 8)])),
             (1, lambda: commander.send(self._random_move(), lease=random.randrange(3))),
             (1, lambda: commander.fault(random.randrange(self.joints), random.choice(FAULTS))),
@@ -106,6 +154,14 @@ class Session(RandomActions):
             (3, self._silence),
             (2, self._halt),
             (2, self._push),
+            (4, environment.hand),
+            (2, environment.load),
+            (3, environment.falsify),
+            (1, environment.freeze),
+            (1, environment.delay),
+            (1, environment.burst),
+            (1, environment.lasting_fault),
+            (1, self._release),
             (2, self.joystick),
             (1, self.toggle),
             (1, self.emergency),
@@ -125,7 +181,11 @@ class Session(RandomActions):
 
     def seconds(self, least: float, most: float) -> None:
         """Let time pass."""
-        self.commander.wait(max(1, int(self.random.uniform(least, most) / self.period_s)))
+        self.commander.wait(self.cycles(self.random.uniform(least, most)))
+
+    def cycles(self, seconds: float) -> int:
+        """Return the number of cycles in this time, at least 1."""
+        return max(1, int(seconds / self.period_s))
 
     def show(self, code: int, seconds: float) -> None:
         """Show a byte at the joystick's inputs for a random time, at most `seconds`."""
@@ -136,12 +196,24 @@ class Session(RandomActions):
         """Return the integer, or now and then one that nobody should send."""
         return self.random.choice(ODD_INTEGERS) if self.random.random() < 0.03 else number
 
-    def is_free(self, bounds: Bounds, q: Sequence[float], tool: int = 0) -> bool:
-        """Whether the arm keeps clear of boxes and of itself."""
-        return is_free(self.reading, bounds, q, 0.0, tool)
+    def is_free(self, bounds: Bounds, q: Sequence[float], clearance: float = 0.0, tool: int = 0) -> bool:
+        """Whether the arm keeps clear of boxes and of itself, by `clearance` m more than it must."""
+        workspace = self.reading.workspaces[tool]
+        return workspace is None or workspace.deepest(bounds, q) < -clearance
+
+    def _place(self, free: bool) -> list[float]:
+        bounds, random = self.bounds, self.random
+        for _ in range(_PLACES):
+            place = [random.uniform(low, high) for low, high in zip(bounds.low, bounds.high, strict=True)]
+            if random.random() < 0.1:
+                axis = random.randrange(self.joints)
+                place[axis] = random.choice((bounds.low[axis] - 0.01, bounds.high[axis] + 0.01))
+            if not free or self.is_free(bounds, place, 0.01):
+                break
+        return place
 
     def _kind(self) -> int:
-        return self.random.choice((self.random.randrange(1 << 32), self.random.choice(KINDS).number))
+        return self.random.choice((self.random.randrange(1 << 32), self.random.choice(self.commander.kinds).number))
 
     def _number(self) -> float:
         return self.or_nonsense(self.random.uniform(-3.0, 3.0))
@@ -202,15 +274,81 @@ class Session(RandomActions):
     def _begin_long_motion(self) -> None:
         """Mostly begin one that only a stop ends soon."""
         if self.random.random() < 0.7:
-            bounds = self.bounds
-            there = [max(a, min(b, q)) for q, a, b in zip(self.near(0.5), bounds.low, bounds.high, strict=True)]
-            self.send(commands.MoveJoints(tuple(there), 0.1, True))
+            self.send(self._long_move())
+
+    def _long_move(self) -> commands.MoveJoints:
+        bounds = self.bounds
+        there = [max(a, min(b, q)) for q, a, b in zip(self.near(0.5), bounds.low, bounds.high, strict=True)]
+        return commands.MoveJoints(tuple(there), 0.1, True)
 
     def _push(self) -> None:
         axis = self.random.randrange(self.joints)
         self.commander.push(axis, self.random.uniform(-15.0, 15.0))
         self.seconds(0.0, 0.2)
         self.commander.push(axis, 0.0)
+
+    def _release(self) -> None:
+        """Release the enabling switch for a while, mostly during a motion."""
+        self._begin_long_motion()
+        self.seconds(0.0, 0.2)
+        self.commander.switch(False)
+        self.seconds(0.0, 0.6)
+        self.commander.switch(True)
+
+    # -- one command of a kind --------------------------------------------------------------------------------------
+
+    def send_likely(self, kind: type[commands.Command]) -> None:
+        """Send a command of a kind, mostly one that the arm accepts in the right place."""
+        if kind is commands.SetLimits:
+            self.limits()
+        elif kind in self._makers and self.random.random() < 0.85:
+            self.send(self._makers[kind]())
+        else:
+            self._send_random(kind)
+
+    def _send_random(self, kind: type[commands.Command]) -> None:
+        """Send a command of a kind with random fields.
+
+        Not SetLimits: it would put limits of an old plan in force, of which the checker is not told.
+        """
+        if kind is not commands.SetLimits:
+            self.send(random_command(kind, self.random, self.joints))
+
+    def _small(self, most: float) -> list[float]:
+        return [self.random.choice((0.0, self.random.uniform(-most, most))) for _ in range(self.joints)]
+
+    def _payload(self) -> commands.SetPayload:
+        random = self.random
+        return commands.SetPayload(
+            random.choice((0.0, random.uniform(0.0, 1.5))), *(random.uniform(-0.1, 0.1) for _ in range(3))
+        )
+
+    def _same_zero(self) -> commands.SetZero:
+        axis = self.random.randrange(self.joints)
+        return commands.SetZero(axis, self.commander.checker.zero[axis])
+
+    def _short_trajectory(self) -> commands.RunTrajectory:
+        rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (1.0, self.near(0.1)))]
+        slot = self.commander.simulation.observer.write_plan(rows)
+        return commands.RunTrajectory(slot, len(rows), open=self.random.random() < 0.5)
+
+    def _in_step(self) -> commands.RunInStep:
+        """A motion in step of this arm alone, with a table of five brakes after its rows."""
+        simulation = self.commander.simulation
+        rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (2.0, self.near(0.1)))]
+        slot = simulation.observer.write_plan([*rows, [1.0] * COLUMNS])
+        start_ns = simulation.now_ns + 20_000_000
+        return commands.RunInStep(slot, len(rows), simulation.now_ns, 0, start_ns, 5, 0.5)
+
+    def _next_position(self) -> commands.StreamPosition:
+        self.stamp += 0.01
+        return commands.StreamPosition(tuple(self.near(0.002)), self.stamp)
+
+    def _short_jog(self) -> commands.Jog:
+        frame = self.random.choice(list(JogFrame))
+        return commands.Jog(tuple(self._small(0.2 if frame is JogFrame.JOINTS else 0.1)), frame, 0.25)
+
+    # -- motions ----------------------------------------------------------------------------------------------------
 
     def trajectory(self) -> None:
         """A trajectory that nobody has planned: its pieces may be far too quick, or none at all."""
@@ -312,13 +450,24 @@ class Session(RandomActions):
 
     # -- limits -----------------------------------------------------------------------------------------------------
 
+    def narrow(self, room: float) -> None:
+        """Leave each joint this way in both directions, rad."""
+        old, here = self.commander.limits, self.commanded
+        low = tuple(max(a, q - room) for a, q in zip(old.low, here, strict=True))
+        high = tuple(min(b, q + room) for b, q in zip(old.high, here, strict=True))
+        self.commander.set_limits(replace(old, low=low, high=high))
+
+    def widen(self) -> None:
+        """Put the configured limits in force."""
+        self.commander.set_limits(Values.configured(self.commander.simulation.config))
+
     def limits(self) -> None:
         """Narrower ones, now and then too narrow for the arm, too wide, or none at all; or those of the start again."""
         random, commander = self.random, self.commander
         old = commander.limits
         widest = Values.configured(commander.simulation.config)
         if random.random() < 0.2:
-            commander.set_limits(widest)
+            self.widen()
             return
         here = self.commanded
         share = random.choice((0.2, 0.6, 0.6, 0.9, 0.9, 1.1))
@@ -361,6 +510,7 @@ class Session(RandomActions):
         """Run for this simulated time, s, or to the first violation."""
         commander, random = self.commander, self.random
         weights = [weight for weight, _ in self.actions]
+        self.visit.run(seconds)
         while commander.seconds < seconds and not (commander.simulation.done or commander.checker.violations):
             if commander.state not in MOVABLE and random.random() < 0.7:
                 commander.enable()
@@ -392,6 +542,7 @@ class Session(RandomActions):
             largest_acceleration=checker.largest_acceleration,
             largest_speed=checker.largest_speed,
             violation=error_json(error) if error is not None else "" if first is None else violation_json(first),
+            coverage=commander.coverage.as_json(),
         )
 
 
@@ -437,7 +588,7 @@ def run_session(
     session: AnySession | None = None
     failure: Exception | None = None
     try:
-        session = session_of(Random(seed), config, segment)
+        session = session_of(seed, config, segment)
         session.run(seconds)
     except Exception as error:
         failure = error
@@ -453,44 +604,37 @@ def run_session(
             session.close()
 
 
-def session_of(random: Random, config: ArmConfig | CellConfig, segment: Segment | None = None) -> AnySession:
-    """Return a session of an arm or of a cell, with the slaves of `segment`."""
+def session_of(seed: int, config: ArmConfig | CellConfig, segment: Segment | None = None) -> AnySession:
+    """Return the session of a seed: that of an arm, or of a cell."""
     if isinstance(config, ArmConfig):
         assert not isinstance(segment, Mapping)
-        return Session(random, config, segment=segment)
+        return Session(Random(seed), config, segment=segment, number=seed)
     from rtcp.testing.sessions.cell_session import CellSession
 
     assert not isinstance(segment, SegmentConfig)
-    return CellSession(random, config, segment)
+    return CellSession(Random(seed), config, segment)
 
 
-def with_random_modes(random: Random, config: ArmConfig, periods_us: Sequence[float] = ()) -> ArmConfig:
-    """Return the configuration with a random control mode and drive mode, and one of these cycles, us."""
-    modes: list[tuple[ControlModeName, int]] = [*zip(CONTROL_MODES, SHARES, strict=True)]
-    if config.arm is None:
-        modes = [(mode, share) for mode, share in modes if mode not in ("cartesian", "joystick")]
-    (mode,) = random.choices([name for name, _ in modes], [share for _, share in modes])
-    cycle = replace(config.cycle, period_us=random.choice(periods_us)) if periods_us else config.cycle
-    return replace(config, cycle=cycle, drive_mode=random.choice(drive_modes(config)), control_mode=mode)
-
-
-def is_free(reading: Reading, bounds: Bounds, q: Sequence[float], clearance: float = 0.0, tool: int = 0) -> bool:
-    """Whether the arm keeps clear of boxes and of itself, by `clearance` m more than it must."""
-    workspace = reading.workspaces[tool]
-    return workspace is None or workspace.deepest(bounds, q) < -clearance
-
-
-def random_place(random: Random, config: ArmConfig, reading: Reading, free: bool = True) -> list[float]:
-    """Return random joint positions, rad; `free`: at which the arm touches nothing, if there are any."""
-    bounds = Bounds.configured(config)
-    for _ in range(_PLACES):
-        place = [random.uniform(low, high) for low, high in zip(bounds.low, bounds.high, strict=True)]
-        if random.random() < 0.1:
-            axis = random.randrange(len(place))
-            place[axis] = random.choice((bounds.low[axis] - 0.01, bounds.high[axis] + 0.01))
-        if not free or is_free(reading, bounds, place, 0.01):
-            break
-    return place
+def with_enabling_switch(config: ArmConfig) -> ArmConfig:
+    """Return the configuration with an enabling switch at a free terminal; without an IO box the same configuration."""
+    inputs = config.inputs
+    if inputs.emergency_stop is None or inputs.enabling_switch is not None:
+        return config
+    contacts = [contact for contact in (inputs.emergency_stop, inputs.arm_toggle) if contact is not None]
+    joystick = inputs.joystick
+    used = {contact.number for contact in contacts}
+    if joystick is not None:
+        used |= {
+            joystick.forward,
+            joystick.backward,
+            joystick.left,
+            joystick.right,
+            joystick.mode_up,
+            joystick.mode_down,
+        }
+    free = next(number for number in range(1, 17) if number not in used)
+    switch = InputConfig(free, box=inputs.emergency_stop.box)
+    return replace(config, inputs=replace(inputs, enabling_switch=switch))
 
 
 def drive_modes(config: ArmConfig) -> list[DriveModeName]:
