@@ -35,8 +35,8 @@ from rtcp.testing.simulation import Frame, Simulation
 
 UNREAD_S = 0.5
 """Time after which an emergency stop that nobody reads counts as pressed, s (docs/cell.md)."""
-TOLERANCE_M = 0.005
-"""By how much joints that follow their targets may bring two arms nearer than the clearance, m."""
+TOLERANCE_M = 0.01
+"""By how much joints that follow their targets, in CST by the position loop, may come nearer than the clearance, m."""
 NEAR_M = 0.25
 """Distance beyond the clearance at which the arms begin at most, m."""
 _MOST_PLACES = 1500
