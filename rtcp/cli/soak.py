@@ -264,10 +264,9 @@ def _coverage_rows(arm: ArmConfig, segment: SegmentConfig) -> Coverage:
     """Return the rows that the sessions have to fill."""
     from rtcp.testing import Simulation
     from rtcp.testing.sessions.coverage import rows_of
-    from rtcp.testing.sessions.session import drive_modes
 
     with contextlib.closing(Simulation(arm, segment=segment)) as simulation:
-        return rows_of(arm, simulation, drive_modes(arm))
+        return rows_of(simulation)
 
 
 def _replay(arm: ArmConfig, segment: SegmentConfig, seed: int, seconds: float, file: Path, as_json: bool) -> None:

@@ -266,7 +266,7 @@ class _Commands:
     velocities: list[float] = field(default_factory=list)
     resting: int = 0
     last: float = 0.0
-    """Target position of the last frame, in whatever mode."""
+    """Target position of the last frame; in CST the position of the joint."""
     received: float | None = None
     """The last target that reached the drive."""
 
@@ -379,7 +379,8 @@ class FrameChecker:
                     self._check_velocity(axis, commands, sample.velocity, answered, frame.now_ns)
             if mode != CST and commands.mode == mode and not commands.positions:
                 commands.positions.append(position)
-            commands.last = position
+            # In CST the joint need not be at its target: the next mode continues from the joint.
+            commands.last = sample.actual - self.zero[axis] if mode == CST else position
         if obeying:
             self.obeyed += 1
         self._check_stopped(obeying, frame.now_ns)
