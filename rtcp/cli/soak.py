@@ -278,12 +278,11 @@ def _coverage_rows(arm: ArmConfig | CellConfig, segment: Segment) -> Coverage:
     from rtcp.config.segment import SegmentConfig
     from rtcp.testing import Simulation
     from rtcp.testing.sessions.coverage import Coverage, rows_of
-    from rtcp.testing.sessions.session import drive_modes
 
     if not (isinstance(arm, ArmConfig) and isinstance(segment, SegmentConfig)):
         return Coverage()
     with contextlib.closing(Simulation(arm, segment=segment)) as simulation:
-        return rows_of(arm, simulation, drive_modes(arm))
+        return rows_of(simulation)
 
 
 def _replay(

@@ -122,14 +122,16 @@ class Arm(JointGroup):
     def change_mode(self, mode: DriveMode) -> None:
         """Command enabled drives to change to `mode`; only at standstill of the setpoints.
 
-        A hand may have moved a joint away from its setpoint in CST, and may still move it.
+        A hand may have moved a joint away from its setpoint in CST, and may still move it. A target position that the
+        drives do not obey stays at the setpoint.
         """
         compliant = self.mode is DriveMode.CST and mode is not DriveMode.CST
         self.set_mode(mode)
         if compliant:
             self._csp.take_over(self.drives)
             for i, drive in enumerate(self.drives):
-                self.output_limiter.latch(i, drive.position + drive.velocity * self.period_s, drive.velocity)
+                joint = drive.position + drive.velocity * self.period_s
+                self.output_limiter.latch(i, joint if mode is DriveMode.CSP else drive.target_position, drive.velocity)
 
     def use_tool(self, number: int) -> None:
         """Use another tool, without a payload; only at rest."""

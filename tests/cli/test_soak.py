@@ -61,6 +61,7 @@ def soak(rtcp: Callable[..., Any], workers: Any, tmp_path: Path, monkeypatch: py
         (("--keep", "/nowhere/box.mcap", "--seconds", "0.1"), "--keep /nowhere/box.mcap: no recording can be written"),
         (("--config", str(default_config().parent / "abb_irb120.yaml")), "for arms of CiA 402 drives: slave joint_1"),
         (("--config", str(default_config().parent / "heater.yaml")), "it has no joints"),
+        (("--config", str(default_config().parent / "cell.yaml")), "for arms of CiA 402 drives: slave joint_1"),
         pytest.param(("--out", "/proc/nowhere"), "/proc/nowhere: results cannot be written there", marks=needs_cluster),
         pytest.param(("--scheduler", "no://x"), "--scheduler no://x: no Dask scheduler answers", marks=needs_cluster),
     ],
@@ -120,6 +121,25 @@ def test_sessions_on_a_local_cluster_end_with_a_table_and_its_files(rtcp: Callab
     assert [file.name for file in out.iterdir()] == ["part-000000.parquet"]
     again = rtcp("soak", "--simulated", "--sessions", "3", "--out", str(out))
     assert (again.code, "give another folder" in again.err, again.out) == (2, True, "")
+
+
+@needs_cluster
+def test_the_file_of_a_cell_runs_sessions_of_its_arms_together(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    shutil.copytree(default_config().parent, tmp_path / "config")
+    file, out = tmp_path / "config" / "two.yaml", tmp_path / "results"
+    file.write_text("""
+        name: two
+        arms:
+          - {name: left, config: assistive_arm.yaml}
+          - {name: right, config: assistive_arm.yaml, base: {position: [-1.5, 0, 0], rpy: [0, 0, pi]}}
+        """)
+    soak = ("soak", "--simulated", "--config", str(file), "--seconds", "0.1", "--json")
+    ended = rtcp(*soak, "--sessions", "2", "--out", str(out))
+    assert ended.code == 0, ended.err
+    summary = json.loads(ended.out)
+    assert (summary["outcomes"], summary["coverage"]["empty"]) == ({"passed": 2}, [])
+    assert summary["coverage"]["commands"]
+    assert rtcp(*soak, "--keep", str(tmp_path / "box.mcap")).code == 0
 
 
 @needs_cluster

@@ -39,11 +39,10 @@ def test_a_session_of_a_cell_passes_and_is_the_same_again(seed: int) -> None:
 
 
 def test_arms_that_come_nearer_than_the_clearance_are_a_violation(session: CellSession) -> None:
-    left, right = session.arms
-    for servo, q in zip(right.commander.servos, (0.0, 0.5, 0.5, 0.0, 0.5, 0.0), strict=True):
-        servo.mechanics.position = q
+    left, _ = session.arms
     while session.distance() > 0.0:
-        left.commander.servos[1].mechanics.position -= 0.01
+        for servo, sign in zip(left.commander.servos, session.towards(left), strict=True):
+            servo.mechanics.position += 0.01 * sign
     session.simulation.run(0.5)
     assert Kind.PARTNER in kinds(session)
 

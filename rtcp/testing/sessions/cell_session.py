@@ -12,10 +12,10 @@ from functools import partial
 from itertools import combinations
 from math import inf
 from random import Random
-from typing import Any
+from typing import Any, cast
 
 from rtcp.config.cell import Base, CellConfig, Member
-from rtcp.config.model import ArmConfig, ControlModeName
+from rtcp.config.model import ArmConfig, ControlModeName, DriveModeName
 from rtcp.config.segment import SegmentConfig
 from rtcp.ipc import commands
 from rtcp.ipc.events import ControllerRaised, PartnerNear
@@ -28,9 +28,9 @@ from rtcp.testing.cell import CellSimulation
 from rtcp.testing.sessions.actions import SHARES
 from rtcp.testing.sessions.checker import Bounds, Kind, Reading, Violation, reading_of
 from rtcp.testing.sessions.commander import Commander
-from rtcp.testing.sessions.coverage import Coverage
+from rtcp.testing.sessions.coverage import Coverage, drive_modes
 from rtcp.testing.sessions.oracle import Placed, Shape, apart, in_world
-from rtcp.testing.sessions.session import MOVABLE, Result, Session, drive_modes
+from rtcp.testing.sessions.session import MOVABLE, Result, Session
 from rtcp.testing.simulation import Frame, Simulation
 
 UNREAD_S = 0.5
@@ -210,7 +210,7 @@ class CellSession:
             goals.append([max(low, min(high, q)) for q, low, high in ends])
         return min(goals, key=lambda q: min(apart(arm.placed(q), bodies) for bodies in others))
 
-    def _towards(self, arm: Arm) -> list[float]:
+    def towards(self, arm: Arm) -> list[float]:
         """Return for each joint the direction, 1 or -1, in which the arm comes nearer to its partners."""
         others = [other.placed(other.joints) for other in self.arms if other is not arm]
         here = arm.joints
@@ -244,11 +244,11 @@ class CellSession:
                 continue
             mode = arm.session.mode
             if mode is ControlMode.TORQUE:
-                pushed = zip(self._towards(arm), arm.commander.bounds.torque, strict=True)
+                pushed = zip(self.towards(arm), arm.commander.bounds.torque, strict=True)
                 torque = [sign * random.choice((0.1, 0.3)) * most for sign, most in pushed]
                 arm.session.send(commands.ApplyTorque(tuple(torque), 0.0, random.choice((0.0, 1.0)), 0.5))
             elif mode is ControlMode.VELOCITY:
-                speeds = [sign * random.uniform(0.0, 0.4) for sign in self._towards(arm)]
+                speeds = [sign * random.uniform(0.0, 0.4) for sign in self.towards(arm)]
                 arm.session.send(commands.MoveAtVelocity(tuple(speeds), 1.0))
             elif mode is ControlMode.JOYSTICK:
                 arm.session.joystick()
@@ -337,18 +337,15 @@ class CellSession:
         self._insist()
 
     def _lose_box(self) -> None:
-        """Let the IO box of an arm leave OP for good, or its frames be lost, and let it return after a while."""
+        """Let the IO box of an arm leave OP, and return after a while: until then nobody reads its emergency stop."""
         arm = self.random.choice(self.live)
         simulation = arm.commander.simulation
         config = simulation.config
         names = [slave.name for slave in config.slaves]
         if config.inputs.emergency_stop is None:
             return
-        if self.random.random() < 0.5:
-            simulation.service.comes_back = False
-            arm.commander.drop(names.index(config.box_of(config.inputs.emergency_stop)) + 1)
-        else:
-            arm.commander.lose(round(2e9 / simulation.period_ns), False)
+        simulation.service.comes_back = False
+        arm.commander.drop(names.index(config.box_of(config.inputs.emergency_stop)) + 1)
         self._stop_all(arm.commander.stopped_ns + round(1e9 * UNREAD_S))
         self._insist()
         simulation.service.comes_back = True
@@ -460,9 +457,12 @@ class CellSession:
 
 def with_random_modes(config: ArmConfig, random: Random) -> ArmConfig:
     """Return the configuration with a random control mode and drive mode."""
-    names: list[ControlModeName] = ["joint", "cartesian", "joystick", "velocity", "torque"]
-    (mode,) = random.choices(names, SHARES)
-    return replace(config, control_mode=mode, drive_mode=random.choice(drive_modes(config)))
+    (control_mode,) = random.choices(list(ControlMode), SHARES)
+    drive_mode = random.choice(drive_modes(config))
+    return replace(
+        config, control_mode=cast(ControlModeName, control_mode.name.lower()),
+        drive_mode=cast(DriveModeName, drive_mode.name.lower()),
+    )  # fmt: skip
 
 
 def placed(shape: Shape, base: Base, q: Sequence[float]) -> list[Placed]:

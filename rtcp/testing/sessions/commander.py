@@ -10,7 +10,7 @@ from math import inf
 from random import Random
 from typing import Any, NamedTuple
 
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import MOST_AXES, ArmConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.ipc.commands import COMMANDS, Command, Enable, Halt, Reset, SetLimits, SetTool, SetZero
 from rtcp.ipc.layout import EVENTS_HEAD_AT
@@ -66,7 +66,7 @@ def random_command(kind: type[Command], random: Random, joints: int) -> Command:
 
 def _random_field(kind: Any, random: Random, joints: int) -> Any:
     if kind == Joints:
-        return tuple(_random_number(random) for _ in range(random.choice((0, 2, joints, joints, joints, joints + 2))))
+        return tuple(_random_number(random) for _ in range(random.choice((0, 2, joints, joints, joints, MOST_AXES))))
     if kind is float:
         return _random_number(random)
     if kind is int:
@@ -238,6 +238,26 @@ class Commander:
             checker.torque_off_from_ns = inf
         if not self._silent:
             checker.rest_from_ns = self.stopped_ns if isinstance(command, Halt) else inf
+
+    def overtake(self, command: Command, stop: type[Command]) -> None:
+        """Send a command, and request a stop before the loop has taken the command: the stop overtakes it."""
+        simulation = self.simulation
+        if simulation.done:
+            return
+        observer, place = simulation.observer, self.place
+        self._note(f"{command}, overtaken by {stop.name}")
+        number = observer.command(simulation.lease, command)
+        requested_ns = observer.stop(stop)
+        self.wait(2)
+        for name, answer in (
+            (command.name, observer.answer(number)),
+            (stop.name, observer.stop_answer(stop, requested_ns)),
+        ):
+            if answer is not None:
+                self.coverage.command(name, place, "", answer.refusal)
+                (self.taken if answer.refusal is None else self.refused)[name] += 1
+                if answer.refusal is None:
+                    self._tell_checker(command if name == command.name else stop())
 
     def send_raw(self, number: int, numbers: Sequence[float]) -> bool:
         """Send bytes that may be no command; return whether they were accepted as one."""

@@ -23,8 +23,8 @@ HEAVIEST_KG = 1.5
 """Heaviest load that the arm's model does not know, kg."""
 MEASURED = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
 """Channels that can be false."""
-FALSE_CYCLES = (1, 1, 2, 4)
-"""Cycles of a false sample; the longest ones end before the loop calls it a fault."""
+FALSE_CYCLES = (1, 1, 2, 4, 4, 8)
+"""Cycles of a false sample: the loop bridges up to 4 of them, and calls more a fault."""
 LATE_CYCLES = (1, 2, 4, 8)
 """Cycles by which a drive's answer is late."""
 BURSTS = ((39, 39), (1, 1), (1, 3), (10, 10), (3, 30))

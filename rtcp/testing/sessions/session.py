@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, cast
 import rtcp
 from kinematics import forward
 from rtcp.config.cell import CellConfig
-from rtcp.config.model import MODE_CHANNELS, MOST_AXES, ArmConfig, ControlModeName, DriveModeName, InputConfig
+from rtcp.config.model import MOST_AXES, ArmConfig, ControlModeName, DriveModeName, InputConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.ipc import commands
 from rtcp.ipc.message import PAYLOAD_SIZE
@@ -25,7 +25,7 @@ from rtcp.testing.sessions.actions import NONSENSE, SHARES, RandomActions
 from rtcp.testing.sessions.checker import Bounds, Reading, Violation, reading_of
 from rtcp.testing.sessions.commander import FAULTS, ODD_INTEGERS, Commander, random_command
 from rtcp.testing.sessions.coverage import places_of
-from rtcp.testing.sessions.visits import Visit
+from rtcp.testing.sessions.visits import Visit, place_of
 from rtcp.testing.simulation import Simulation
 
 LONGEST_WAIT_S = 0.3
@@ -92,12 +92,7 @@ class Session(RandomActions):
         self.reading = reading = reading_of(config) if reading is None else reading
         self.bounds = Bounds.configured(config)
         self.joints = len(config.joints)
-        modes = drive_modes(config)
-        places = places_of(config, modes)
-        # Neighbours in this list differ little: consecutive sessions are to differ much.
-        Random(0).shuffle(places)
-        round_, at = divmod(random.randrange(1 << 16) if number is None else number, len(places))
-        place = places[at]
+        place, round_ = place_of(random.randrange(1 << 16) if number is None else number, places_of(config))
         cycle = replace(config.cycle, period_us=random.choice(periods_us)) if periods_us else config.cycle
         control_mode, drive_mode = place.control_mode, place.drive_mode
         chosen = replace(
@@ -162,6 +157,7 @@ class Session(RandomActions):
             (1, environment.burst),
             (1, environment.lasting_fault),
             (1, self._release),
+            (1, lambda: commander.overtake(self._random_move(), random.choice((commands.Halt, commands.Disable)))),
             (2, self.joystick),
             (1, self.toggle),
             (1, self.emergency),
@@ -302,7 +298,8 @@ class Session(RandomActions):
         if kind is commands.SetLimits:
             self.limits()
         elif kind in self._makers and self.random.random() < 0.85:
-            self.send(self._makers[kind]())
+            lease = self.random.randrange(3) if self.random.random() < 0.03 else None
+            self.commander.send(self._makers[kind](), lease)
         else:
             self._send_random(kind)
 
@@ -336,9 +333,10 @@ class Session(RandomActions):
         """A motion in step of this arm alone, with a table of five brakes after its rows."""
         simulation = self.commander.simulation
         rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (2.0, self.near(0.1)))]
-        slot = simulation.observer.write_plan([*rows, [1.0] * COLUMNS])
-        start_ns = simulation.now_ns + 20_000_000
-        return commands.RunInStep(slot, len(rows), simulation.now_ns, 0, start_ns, 5, 0.5)
+        slot = simulation.observer.write_plan([*rows, [self.or_nonsense(1.0, 0.1), *[1.0] * (COLUMNS - 1)]])
+        now_ns, step_s = simulation.now_ns, self.or_nonsense(0.5, 0.1)
+        start_ns, motion = now_ns + 20_000_000, self.random.choice((now_ns, now_ns, now_ns, 1, 1 << 60))
+        return commands.RunInStep(slot, len(rows), motion, self.or_odd(0), start_ns, 5, step_s)
 
     def _next_position(self) -> commands.StreamPosition:
         self.stamp += 0.01
@@ -360,6 +358,13 @@ class Session(RandomActions):
             rows.append(_waypoint(t, q, kind, speed))
         rows[-1][VELOCITIES : VELOCITIES + self.joints] = [0.0] * self.joints
         self._run(commands.RunTrajectory, rows)
+
+    def hurry(self) -> None:
+        """Run a trajectory that is far too quick for the limits of the joints."""
+        there = [q + self.random.choice((-0.3, 0.3)) for q in self.commanded]
+        rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (0.1, there))]
+        slot = self.commander.simulation.observer.write_plan(rows)
+        self.send(commands.RunTrajectory(slot, len(rows), tool=self.commander.checker.tool))
 
     def open_trajectory(self) -> None:
         """A trajectory to which rows are appended that nobody has planned; in time, too late, or never."""
@@ -450,13 +455,6 @@ class Session(RandomActions):
 
     # -- limits -----------------------------------------------------------------------------------------------------
 
-    def narrow(self, room: float) -> None:
-        """Leave each joint this way in both directions, rad."""
-        old, here = self.commander.limits, self.commanded
-        low = tuple(max(a, q - room) for a, q in zip(old.low, here, strict=True))
-        high = tuple(min(b, q + room) for b, q in zip(old.high, here, strict=True))
-        self.commander.set_limits(replace(old, low=low, high=high))
-
     def widen(self) -> None:
         """Put the configured limits in force."""
         self.commander.set_limits(Values.configured(self.commander.simulation.config))
@@ -519,8 +517,8 @@ class Session(RandomActions):
             commander.wait(int(random.expovariate(8.0 / LONGEST_WAIT_S) / self.period_s) + 1)
             if random.random() < 0.3:
                 commander.wait(int(random.uniform(0.0, LONGEST_WAIT_S) / self.period_s))
-        if random.random() < 0.15:
-            commander.send(commands.Shutdown())
+        self.visit.end()
+        if commander.state is State.CLOSING:
             commander.wait(int(_CLOSE_S / self.period_s))
 
     def close(self) -> None:
@@ -635,18 +633,6 @@ def with_enabling_switch(config: ArmConfig) -> ArmConfig:
     free = next(number for number in range(1, 17) if number not in used)
     switch = InputConfig(free, box=inputs.emergency_stop.box)
     return replace(config, inputs=replace(inputs, enabling_switch=switch))
-
-
-def drive_modes(config: ArmConfig) -> list[DriveModeName]:
-    """Return the drive modes that the process data of all joints have; CSP, the usual one, twice."""
-    devices = {slave.name: slave.device for slave in config.slaves}
-    modes: list[DriveModeName] = ["csp"]
-    for mode, needed in MODE_CHANNELS.items():
-        images = [devices[joint.slave].of_axis(joint.axis) for joint in config.joints]
-        mapped = [({c.name for c in image.outputs}, {c.name for c in image.inputs}) for image in images]
-        if all(outputs.issuperset(needed[0]) and inputs.issuperset(needed[1]) for outputs, inputs in mapped):
-            modes.append(mode)
-    return modes
 
 
 def violation_json(violation: Violation) -> str:

@@ -5,24 +5,25 @@ The places and the commands follow from the number of the session, so that conse
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
-from typing import TYPE_CHECKING
+from random import Random
+from typing import Protocol
 
 from rtcp.ipc import commands
 from rtcp.ipc.commands import Command
 from rtcp.ipc.states import ControlMode, State
+from rtcp.testing.sessions.commander import Commander
 from rtcp.testing.sessions.coverage import Place
-
-if TYPE_CHECKING:
-    from rtcp.testing.sessions.session import Session
 
 COMMANDS_STRIDE = 7
 """Distance between the first commands of two visits of the same place, in the list of all commands."""
 MOST_COMMANDS, MOST_APPROACHES = 12, 4
 """Commands of a visit, and times that the arm is brought to the place again after it left."""
-_ROOM_RAD = 0.02
-"""Way that is left to a joint's limit when a visit leads there."""
+_LASTING = frozenset({
+    State.READY, State.HOLDING, State.MOVING, State.STOPPED_BY_LIMIT, State.FAULT, State.EMERGENCY_STOP, State.HOMING
+})  # fmt: skip
+"""States that the machine does not leave by itself, or not soon."""
 _ALL_BUTTONS = (1, 2, 4, 8)
 _MOTIONS: dict[ControlMode, tuple[type[Command], ...]] = {
     ControlMode.JOINT: (
@@ -35,6 +36,32 @@ _MOTIONS: dict[ControlMode, tuple[type[Command], ...]] = {
 _MOTIONS[ControlMode.CARTESIAN] = _MOTIONS[ControlMode.JOINT]
 
 
+def place_of(number: int, places: Sequence[Place]) -> tuple[Place, int]:
+    """Return the place that the session of a number visits, and how many sessions visited it before."""
+    # Neighbours in the list differ little: consecutive sessions are to differ much.
+    mixed = list(places)
+    Random(0).shuffle(mixed)
+    round_, at = divmod(number, len(mixed))
+    return mixed[at], round_
+
+
+class Visitor(Protocol):
+    """What a visit needs of its session."""
+
+    commander: Commander
+    random: Random
+    joints: int
+
+    def cycles(self, seconds: float) -> int:
+        """Return the number of cycles in this time."""
+
+    def send_likely(self, kind: type[Command]) -> None:
+        """Send a command of a kind."""
+
+    def hurry(self) -> None:
+        """Run a trajectory that is far too quick for the limits of the joints."""
+
+
 class Visit:
     """One visit of a session.
 
@@ -44,11 +71,13 @@ class Visit:
         round_: how many sessions visited the place before.
     """
 
-    def __init__(self, session: Session, place: Place, round_: int) -> None:
+    def __init__(self, session: Visitor, place: Place, round_: int) -> None:
         self._session, self._place, self._round = session, place, round_
         self._commander = session.commander
         self._next, self._left = round_ * COMMANDS_STRIDE, MOST_COMMANDS
         """Number of the next command, and how many are left to send."""
+        self._shuts_down = False
+        """Whether it is the turn of a shutdown, which is sent at the end of the session."""
         self._end_s = inf
         self._approaches: dict[State, Callable[[], object]] = {
             State.READY: self._to_ready,
@@ -75,6 +104,8 @@ class Visit:
             commander.start()
             return
         commander.start()
+        if state is State.CLOSING:
+            return
         for _ in range(MOST_APPROACHES):
             self._approaches[state]()
             self._send_here()
@@ -82,14 +113,30 @@ class Visit:
                 break
         if state is State.EMERGENCY_STOP:
             commander.press(False)
-        elif state is State.STOPPED_BY_LIMIT and not self._over:
-            self._session.widen()
+
+    def end(self) -> None:
+        """End the session if the visit has to: by a shutdown at the place, or by one that leads to it."""
+        commander, state = self._commander, self._place.state
+        self._end_s = inf
+        if self._over or not (self._shuts_down or state is State.CLOSING):
+            return
+        if state is State.FAULT or state is State.READY:
+            self._to_holding()  # in its modes
+        self._approaches[state]()
+        if state is State.CLOSING:
+            self._send_here()
+        elif commander.place == self._place:
+            commander.send(commands.Shutdown())
 
     def _send_here(self) -> None:
         """Send the next commands while the arm is at the place."""
         commander, kinds = self._commander, self._commander.kinds
         while self._left and commander.place == self._place and not self._over:
-            self._session.send_likely(kinds[self._next % len(kinds)])
+            kind = kinds[self._next % len(kinds)]
+            if kind is commands.Shutdown and self._place.state not in (State.STARTING, State.CLOSING):
+                self._shuts_down = True
+            else:
+                self._session.send_likely(kind)
             self._next += 1
             self._left -= 1
 
@@ -117,6 +164,7 @@ class Visit:
 
     def _to_holding(self) -> None:
         commander, place = self._commander, self._place
+        commander.simulation.until(lambda: commander.state in _LASTING or self._over, 0.5)
         commander.enable()
         self._until(State.HOLDING, 1.0)
         if commander.place.control_mode is not place.control_mode:
@@ -153,15 +201,9 @@ class Visit:
         self._commander.send(command)
 
     def _to_limit(self) -> None:
-        """Narrow the range about the joints, and move until one of them is at its end."""
         self._to_holding()
-        self._session.narrow(_ROOM_RAD)
-        for _ in range(3):
-            self._to_moving()
-            self._commander.simulation.until(lambda: self._commander.state is not State.MOVING or self._over, 0.4)
-            self._until(State.STOPPED_BY_LIMIT, 0.2)
-            if self._commander.state is State.STOPPED_BY_LIMIT:
-                break
+        self._session.hurry()
+        self._until(State.STOPPED_BY_LIMIT, 0.3)
 
     def _to_fault(self) -> None:
         session = self._session
