@@ -122,10 +122,12 @@ class Arm(JointGroup):
     def change_mode(self, mode: DriveMode) -> None:
         """Command enabled drives to change to `mode`; only at standstill of the setpoints.
 
-        A hand may have moved a joint away from its setpoint in CST, and may still move it. A target position that the
-        drives do not obey stays at the setpoint.
+        A hand may have moved a joint away from its setpoint in CST and in CSV, and may still move it. A target position
+        that the drives do not obey stays at the setpoint. A writer that is already active continues.
         """
-        compliant = self.mode is DriveMode.CST and mode is not DriveMode.CST
+        if mode is self.mode:
+            return
+        compliant = self.mode is DriveMode.CST or (self.mode is DriveMode.CSV and mode is DriveMode.CSP)
         self.set_mode(mode)
         if compliant:
             self._csp.take_over(self.drives)

@@ -276,8 +276,6 @@ class CommandHandler:
         self._blackboard.event(events.ControlModeChanged(mode))
         if drive_mode is not arm.mode or self._machine.state is not State.HOLDING:
             self._machine.change_drive_mode(drive_mode)
-        else:
-            arm.set_mode(drive_mode)
         return None
 
     def _set_limits(self, command: commands.SetLimits, lease: int) -> refusals.Refusal | None:

@@ -148,12 +148,14 @@ class CstWriter:
         self._passed = False
 
     def start(self, drives: Sequence[Commanded]) -> None:
-        """Start with the present holding torque, so that the arm does not sag."""
-        self._passed = False
+        """Start with the present holding torque, so that the arm does not sag.
+
+        `update` continues it without a step also where a joint is away from its setpoint, as in CSV.
+        """
+        self._passed = True
         for i, drive in enumerate(drives):
             bound = self._bound[i]
-            self._integral[i] = min(max(drive.torque, -bound), bound)
-            self._excess[i] = 0.0
+            self._integral[i] = drive.target_torque = min(max(drive.torque, -bound), bound)
 
     def pass_on(
         self,

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import ApplyTorque, MoveJoints, SetDriveMode, SetLimits
+from rtcp.ipc.commands import ApplyTorque, Command, MoveJoints, SetControlMode, SetDriveMode, SetLimits
 from rtcp.ipc.refusals import WeightUnknown
-from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.limits import rows
 from rtcp.testing import Simulation
 
@@ -64,6 +64,20 @@ def test_the_torque_that_holds_a_joint_at_the_end_of_its_range_is_continuous(arm
 
 
 @in_mode(drive_mode="cst")
+@pytest.mark.parametrize("command", [SetControlMode(ControlMode.CARTESIAN), SetDriveMode(DriveMode.CST)], ids=str)
+def test_the_torque_against_a_hand_is_continuous_when_the_drives_stay_in_cst(arm: Simulation, command: Command) -> None:
+    joint = arm.models[1].mechanics
+    joint.external_torque += 15.0
+    arm.run(0.2)
+    torques: list[float] = []
+    arm.on_frame = lambda frame: torques.append(_OUTPUTS.unpack(frame.sent[2])[3] / ONE_NM)
+    arm.run(0.02)
+    arm.do(command)
+    arm.run(0.1)
+    assert max(abs(b - a) for a, b in pairwise(torques)) < 1.0
+
+
+@in_mode(drive_mode="cst")
 @pytest.mark.parametrize("mode", [DriveMode.CSP, DriveMode.CSV])
 def test_a_joint_that_a_hand_moves_does_not_snap_when_its_drive_leaves_cst(arm: Simulation, mode: DriveMode) -> None:
     joint = arm.models[1].mechanics
@@ -82,6 +96,48 @@ def test_a_joint_that_a_hand_moves_does_not_snap_when_its_drive_leaves_cst(arm: 
     assert max(abs(b - a) for a, b in zip(speeds, speeds[4:], strict=False)) < 2.0 * limit * 4 * PERIOD_S
     assert arm.state is State.HOLDING
     assert joint.position == pytest.approx(-1.1, abs=2e-3)
+
+
+@in_mode(drive_mode="csv")
+@pytest.mark.parametrize("mode", [DriveMode.CSP, DriveMode.CST])
+def test_a_joint_that_a_hand_moved_does_not_snap_when_its_drive_leaves_csv(arm: Simulation, mode: DriveMode) -> None:
+    joint = arm.models[5].mechanics
+    joint.external_torque -= 10.0
+    arm.run(0.04)
+    joint.external_torque += 10.0
+    arm.run(0.12)
+    speeds: list[float] = []
+    torques: list[float] = []
+
+    def see(frame: Any) -> None:
+        speeds.append(joint.velocity)
+        *_, torque, sent = _OUTPUTS.unpack(frame.sent[6])
+        if sent == DriveMode.CST:
+            torques.append(torque / ONE_NM)
+
+    arm.on_frame = see
+    arm.do(SetDriveMode(mode))
+    arm.run(0.5)
+    limit = arm.config.joints[5].acceleration
+    assert max(abs(b - a) for a, b in zip(speeds, speeds[4:], strict=False)) < 2.0 * limit * 4 * PERIOD_S
+    assert max([abs(b - a) for a, b in pairwise(torques)], default=0.0) < 1.0
+    assert bool(torques) is (mode is DriveMode.CST)
+
+
+@in_mode(control_mode="torque")
+def test_a_stiffness_and_a_damping_that_change_under_way_change_the_torque_gradually(arm: Simulation) -> None:
+    arm.run(1.0)
+    arm.do(ApplyTorque((0.0, 8.0, 0.0, 0.0, 0.0, 0.0), 0.3, 1.0, 1.0))
+    arm.run(0.3)
+    torques: list[float] = []
+    arm.on_frame = lambda frame: torques.append(_OUTPUTS.unpack(frame.sent[2])[3] / ONE_NM)
+    arm.run(0.01)
+    arm.do(ApplyTorque((0.0, 8.0, 0.0, 0.0, 0.0, 0.0), 0.0, 0.0, 1.0))
+    arm.run(0.1)
+    arm.do(ApplyTorque((0.0, 8.0, 0.0, 0.0, 0.0, 0.0), 1.0, 1.0, 1.0))
+    arm.run(0.2)
+    assert max(torques) - min(torques) > 3.0
+    assert max(abs(b - a) for a, b in pairwise(torques)) < 1.5
 
 
 @in_mode(control_mode="torque")

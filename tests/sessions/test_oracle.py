@@ -19,7 +19,7 @@ from rtcp.config.loader import load
 from rtcp.config.model import ArmConfig
 from rtcp.motion.guards.neighbours import reach_of
 from rtcp.motion.guards.zones import Zones
-from rtcp.testing.sessions import oracle
+from rtcp.testing.sessions import mechanics, oracle
 from rtcp.testing.sessions.checker import Bounds, reading_of
 from rtcp.testing.sessions.oracle import Placed, Shape, apart, in_world
 from tests.sessions.oracle import configuration
@@ -30,7 +30,7 @@ POSES = 300
 TOLERANCE_M = 1e-4
 
 
-@pytest.mark.parametrize("module", [oracle])
+@pytest.mark.parametrize("module", [oracle, mechanics])
 def test_the_oracle_imports_nothing_of_the_product_that_it_checks(module: object) -> None:
     tree = ast.parse(Path(module.__file__).read_text())  # type: ignore[attr-defined]
     imported = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]

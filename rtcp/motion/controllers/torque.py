@@ -14,7 +14,7 @@ from rtcp.motion.state import ArmState, Phase, Setpoint
 from rtcp.motion.tool_in_use import Gravity
 
 _RATE_S: Final = 0.1
-"""Shortest time for a torque from 0 to the joint's limit, s."""
+"""Shortest time for a torque from 0 to the joint's limit, and for a stiffness or damping from 0 to 1, s."""
 _FADE: Final = 0.3
 """Last part of the allowed speed, as a share, over which the torque fades out."""
 _FREE = 1.0 - _FADE
@@ -59,6 +59,8 @@ class TorqueController(Controller):
         self._extra_low, self._extra_high = [0.0] * n, [0.0] * n
         """Margin given up for a joint that begins nearer to its range end, so that it is not pushed away, rad."""
         self._stiff = self._damped = 0.0
+        """Stiffness and damping that act, as fractions; they approach the commanded ones."""
+        self._wanted_stiff = self._wanted_damped = 0.0
         self._until_ns = 0
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
@@ -79,7 +81,7 @@ class TorqueController(Controller):
         self._wanted[:] = command.torque
         if command.stiffness > 0.0 and self._stiff == 0.0:
             self._about[:] = self._position
-        self._stiff, self._damped = command.stiffness, command.damping
+        self._wanted_stiff, self._wanted_damped = command.stiffness, command.damping
         self._until_ns = state.now_ns + round(command.hold_s * 1e9)
         return None
 
@@ -92,7 +94,7 @@ class TorqueController(Controller):
             q, limits = state.actual[i], self.limits
             self._extra_low[i] = max(0.0, limits.low[i] + _MARGIN_RAD - q)
             self._extra_high[i] = max(0.0, q - limits.high[i] + _MARGIN_RAD)
-        self._stiff = 0.0
+        self._stiff = self._damped = 0.0
         # A stiffness commanded before the first `advance` acts about this position.
         self._position[:] = state.commanded
         self.begin()
@@ -104,6 +106,9 @@ class TorqueController(Controller):
         target, dt = self._direct, self.period_s
         limits = self.limits
         low, high, fastest, slowing, most = limits.low, limits.high, limits.velocity, limits.acceleration, limits.torque
+        part = dt / _RATE_S
+        self._stiff += min(max(self._wanted_stiff - self._stiff, -part), part)
+        self._damped += min(max(self._wanted_damped - self._damped, -part), part)
         carried = self._gravity.torques(state.actual)
         position, applied = self._position, self._applied
         torque, follows, speeds = target.torque, target.position, target.velocity

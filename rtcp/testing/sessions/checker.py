@@ -39,6 +39,8 @@ MARGIN_RAD = 0.02
 """Distance outside its range at which a joint may still be enabled, to be led back, rad."""
 LATCHED_RAD = 5e-4
 """Largest distance between the first target after enabling and the joint, which may sag when the brake opens, rad."""
+MEASURED_STEPS = 3
+"""Cycles by which the measured place of a joint may be older than the target that begins there."""
 MOVED_RAD = 5e-3
 """Way of a target, rad, by which a joint that should rest has moved."""
 ZONE_TOLERANCE_M = 0.5e-3
@@ -338,7 +340,7 @@ class FrameChecker:
         self.is_answered = True
         """Whether every slave took part in the last exchange."""
         self._check_zones_in = 0
-        self.is_excused = True
+        self._excused = True
         """Whether the arm was enabled inside a zone and has not come out of it yet."""
         self._inconsistent = 0
 
@@ -388,7 +390,7 @@ class FrameChecker:
             if mode != sample.shown_mode:
                 # Commanded to change its mode and has not yet.
                 if commands.mode:
-                    self._check_continued(axis, commands, position, mode, frame.now_ns)
+                    self._check_continued(axis, commands, position, sample.actual - self.zero[axis], mode, frame.now_ns)
                     commands.mode = CHANGING
             elif mode != commands.mode:
                 self._check_entry(axis, commands, position, sample.actual - self.zero[axis], mode, frame.now_ns)
@@ -413,7 +415,7 @@ class FrameChecker:
             # By its new zero a homed joint may be anywhere.
             if obeying < len(self._joints) or homing:
                 self._check_zones_in = 0
-                self.is_excused = True
+                self._excused = True
             elif all(commands.positions for commands in self._commands):
                 self._check_zones(workspace, frame.now_ns)
         if state is not None and self.is_answered:
@@ -433,7 +435,7 @@ class FrameChecker:
 
     def _check_entry(self, axis: int, commands: _Commands, position: float, actual: float, mode: int, now: int) -> None:
         """The first target after enabling is where the joint is; the first in another mode continues the last."""
-        self._check_continued(axis, commands, position, mode, now)
+        self._check_continued(axis, commands, position, actual, mode, now)
         if mode != CSP:
             return
         if not commands.mode and abs(position - actual) > LATCHED_RAD + NUMERIC_RAD:
@@ -442,9 +444,13 @@ class FrameChecker:
         if not low - MARGIN_RAD <= position <= high + MARGIN_RAD:
             self.violate(Kind.RANGE, now, axis, position, low - MARGIN_RAD, high + MARGIN_RAD)
 
-    def _check_continued(self, axis: int, commands: _Commands, position: float, mode: int, now: int) -> None:
-        step = position - commands.last
-        if commands.mode and mode == CSP and abs(step) > (allowed := self._step(axis)):
+    def _check_continued(
+        self, axis: int, commands: _Commands, position: float, actual: float, mode: int, now: int
+    ) -> None:
+        """The first target in CSP continues the last one, or begins where a hand has moved the joint."""
+        step, allowed = position - commands.last, self._step(axis)
+        is_at_joint = abs(position - actual) <= LATCHED_RAD + MEASURED_STEPS * allowed
+        if commands.mode and mode == CSP and abs(step) > allowed and not is_at_joint:
             self.violate(Kind.MODE_STEP, now, axis, step, -allowed, allowed)
 
     def _check_position(self, axis: int, commands: _Commands, position: float, answered: bool, now: int) -> None:
@@ -533,11 +539,11 @@ class FrameChecker:
             return
         bounds = self.bounds
         deepest = workspace.deepest(bounds, [commands.positions[-1] for commands in self._commands])
-        if deepest > ZONE_TOLERANCE_M and self.is_excused:
+        if deepest > ZONE_TOLERANCE_M and self._excused:
             # The arm was enabled in there: it is checked once it is out.
             self._check_zones_in = 1
             return
-        self.is_excused = False
+        self._excused = False
         if deepest > ZONE_TOLERANCE_M:
             self.violate(Kind.ZONE, now, -1, deepest, -inf, ZONE_TOLERANCE_M)
             self._check_zones_in = 50

@@ -22,6 +22,7 @@ from rtcp.testing.sessions.actions import NONSENSE
 from rtcp.testing.sessions.checker import Bounds, FrameChecker, Reading
 from rtcp.testing.sessions.coverage import Coverage, Place, commands_of
 from rtcp.testing.sessions.environment import Environment
+from rtcp.testing.sessions.mechanics import MechanicsChecker
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models.servo import ServoAxis
 
@@ -139,6 +140,7 @@ class Commander:
         self.coverage = Coverage()
         self.inputs = Inputs(simulation)
         self.environment = Environment(Random(seed), simulation, self.servos, self.inputs, self.count_fault)
+        self.mechanics = MechanicsChecker(self.checker, config, self.servos)
         self._stop_ns = round(
             1e9 * (STOP_S + max(j.velocity / j.acceleration + j.acceleration / j.jerk for j in config.joints))
         )
@@ -160,12 +162,14 @@ class Commander:
         self.states[state] += 1
         self.checker.check(frame, state)
         self.environment.step(frame.now_ns)
+        self.mechanics.check(frame, state, self.environment)
         head = self.simulation.board.words[EVENTS_HEAD_AT]
         if head != self._event:
             # An event has the time of the host.
             for record in self.simulation.observer.events_since(self._event):
                 self.log.append(Entry(frame.now_ns, self.simulation.names.message(record.event)))
                 self.coverage.events[record.event.name] += 1
+                self.mechanics.event(record.event, frame.now_ns)
             self._event = head
 
     def close(self) -> None:
@@ -230,6 +234,7 @@ class Commander:
     def _tell_checker(self, command: Command) -> None:
         """Tell what an accepted command changes for the checks."""
         checker = self.checker
+        self.mechanics.accepted(command)
         if isinstance(command, SetZero) and command.axis < len(checker.zero):
             checker.zero[command.axis] = command.offset
         elif isinstance(command, SetTool):

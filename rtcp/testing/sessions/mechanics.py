@@ -1,0 +1,313 @@
+"""A checker of what the simulated joints really do, whatever the frames say: speed, acceleration, place, energy.
+
+It reads the mechanics of the drives' models once a cycle. A hand, a load, a drive that does not obey and lost frames
+explain a motion; a false measurement does not. Everything else has to be commanded.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from math import inf
+from typing import Protocol
+
+from rtcp.config.model import ArmConfig
+from rtcp.ipc.commands import ApplyTorque, Command, Guide, MotionCommand, MoveJoints
+from rtcp.ipc.events import Arrived, Event, FaultEvent, MotionEnded, Stopped
+from rtcp.ipc.states import State
+from rtcp.testing.sessions.checker import CSP, CST, CSV, FrameChecker, Kind
+from rtcp.testing.simulation import Frame
+from rtcp.virtual.models.servo import ServoAxis
+
+WINDOW_S = 0.01
+"""Time over which the acceleration of a joint is measured, s."""
+SETTLED_S = 0.15
+"""Time after which nothing remains of a change: a hand begins or ends to push, a drive obeys, frames return, s."""
+ACCELERATION, EXTRA_ACCELERATION = 1.5, 1.0
+"""Largest acceleration of a joint as a multiple of its limit, because the drive's loop overshoots, and what friction
+adds, which sticks and slips at slow speeds, rad/s^2."""
+SPEED, EXTRA_SPEED = 1.1, 0.02
+"""Largest speed of a joint as a multiple of its limit, or of the supervised speed in CST, and what the position loop
+adds, rad/s."""
+TORQUE_SHARE, EXTRA_TORQUE = 0.1, 1.0
+"""Largest step of a target torque in a cycle, as a fraction of the torque limit, and in addition, Nm: the joints of
+small inertia change their speed, and with it their damping, fast."""
+REST_S, REST_IN_CST_S = 0.5, 1.5
+"""Time without a command after which a joint rests, s: the integral of the position loop in CST is slow."""
+MOVED_RAD = 5e-3
+"""Way by which a joint that should rest has moved, rad."""
+STILL_RAD_S = 0.03
+"""Speed of a joint that should rest, rad/s."""
+ARRIVED_RAD = 1e-3
+"""Way of a joint between its measurement and the event that says that it is at its target, and rounding, rad."""
+ENERGY_J, ENERGY_IN_CST_J = 0.02, 0.1
+"""Kinetic energy of a joint that needs no explanation, J: in CST the position loop is a spring that has stored some."""
+DEEP_M = 3e-3
+"""Depth in what the arm keeps clear of that the following error of the joints explains, m."""
+GRASPED_NM = 0.3
+"""Step of a torque from outside in one cycle that only a hand or a load can be, Nm: the arm's weight changes slower."""
+GOOD_PER_LOST = 4
+"""Good cycles that make up for a lost one."""
+EXTRA_LOST = 2
+"""Lost frames that the loop may not have noticed yet."""
+GRAVITY = 9.81
+
+_RESTING = frozenset({State.READY, State.HOLDING, State.STOPPED_BY_LIMIT})
+_UNCOMMANDED = _RESTING | {
+    State.OFF, State.STARTING, State.STOPPING, State.DISABLING, State.FAULT, State.RESETTING, State.EMERGENCY_STOP,
+}  # fmt: skip
+_ENABLED = frozenset({State.HOLDING, State.MOVING, State.STOPPED_BY_LIMIT})
+_MOTION_ENDS = (Arrived, Stopped, MotionEnded, FaultEvent)
+
+
+class Surroundings(Protocol):
+    """What acts on the arm from outside."""
+
+    pushed: dict[int, float]
+    """Torque of a hand, Nm, by the joint's number from 0."""
+    payload_kg: float
+    """Mass at the tool that the arm's model does not know, kg."""
+    permitted: bool
+    """Whether the enabling switch is pressed, or there is none."""
+
+
+class MechanicsChecker:
+    """Checks the joints in every cycle; violations are added to those of the frames.
+
+    Args:
+        frames: the checker of the frames, which has checked the same cycle before.
+        config: the arm.
+        servos: the drives of its joints.
+    """
+
+    def __init__(self, frames: FrameChecker, config: ArmConfig, servos: Sequence[ServoAxis]) -> None:
+        self._frames = frames
+        self._bounds = frames.bounds
+        self._axes = [servo.axis for servo in servos]
+        self._mechanics = [servo.mechanics for servo in servos]
+        self._settle = config.settle.tolerance
+        self._clearance = config.cartesian.clearance
+        self._fastest_in_cst = config.supervision.speed
+        self._most_lost = config.bus.lost_cycles + EXTRA_LOST
+        self._stop_s = REST_S + max(j.velocity / j.acceleration + j.acceleration / j.jerk for j in config.joints)
+        self._dt = dt = config.cycle.period_us * 1e-6
+        count = len(servos)
+        self._window = max(1, round(WINDOW_S / dt))
+        self._speeds: deque[list[float]] = deque(maxlen=self._window + 1)
+        """Speeds of the joints in the last cycles, rad/s."""
+        self._outside = [mechanics.external_torque for mechanics in self._mechanics]
+        self._obeys = [False] * count
+        self._torques: list[float | None] = [None] * count
+        """Target torques of the last frame of drives in CST, Nm."""
+        self._cycles_calm = 0
+        """Cycles since the last change of what acts on the joints."""
+        self._cycles_uncommanded = self._cycles_resting = self._cycles_released = 0
+        """Cycles in a state without a command, in one in which the joints rest, and without the enabling switch."""
+        self._energy = [inf] * count
+        """Kinetic energy of each joint that is explained, J."""
+        self._begin: list[float] | None = None
+        """Where the joints were when the energy was first compared, rad."""
+        self._places: list[float] | None = None
+        """Where the joints came to rest, rad."""
+        self._stopped: list[float] | None = None
+        """Where they stood when they had to, rad."""
+        self._lost = 0.0
+        self._check_bodies_in = 0
+        self._is_excused = True
+        """Whether the arm was enabled where a body is too near and has not come away yet."""
+        self._target: Sequence[float] | None = None
+        """Where the last motion command leads, rad; None: to the last targets on the bus."""
+        self._pushing: Sequence[float] | None = None
+        """Torques of the present torque motion without a spring, Nm; None: there is none."""
+
+    # -- what happens -----------------------------------------------------------------------------------------------
+
+    def accepted(self, command: Command) -> None:
+        """Take note of a command that was accepted."""
+        if isinstance(command, MotionCommand):
+            self._target = command.q if isinstance(command, MoveJoints) else None
+            self._pushing = None
+            if isinstance(command, Guide):
+                self._pushing = [0.0] * len(self._mechanics)
+            elif isinstance(command, ApplyTorque) and command.stiffness == 0.0:
+                self._pushing = command.torque
+            self._cycles_uncommanded, self._begin = 0, None
+
+    def event(self, event: Event, now_ns: int) -> None:
+        """Check an event of the loop: a motion is only complete when the joints are at its target."""
+        if isinstance(event, Arrived):
+            targets = self._frames.targets if self._target is None else self._target
+            allowed = self._settle + ARRIVED_RAD
+            for axis, (target, q) in enumerate(zip(targets, self._positions(), strict=False)):
+                self._limit(Kind.NOT_ARRIVED, now_ns, axis, abs(target - q), allowed)
+        if isinstance(event, _MOTION_ENDS):
+            self._target = self._pushing = None
+
+    def _positions(self) -> list[float]:
+        """Return the joint positions, rad."""
+        return [axis.position - zero for axis, zero in zip(self._axes, self._frames.zero, strict=True)]
+
+    def _limit(self, kind: Kind, now_ns: int, axis: int, found: float, allowed: float) -> None:
+        if found > allowed:
+            self._frames.violate(kind, now_ns, axis, found, -inf, allowed)
+
+    # -- every cycle ------------------------------------------------------------------------------------------------
+
+    def check(self, frame: Frame, state: State, surroundings: Surroundings) -> None:
+        """Check a cycle.
+
+        Args:
+            frame: what was sent and received.
+            state: state of the machine after the cycle.
+            surroundings: what acts on the arm now.
+        """
+        now, speeds = frame.now_ns, [mechanics.velocity for mechanics in self._mechanics]
+        self._speeds.append(speeds)
+        self._find_changes()
+        self._check_lost(now, state)
+        calm = self._cycles_calm * self._dt > SETTLED_S
+        self._check_torques(now, calm)
+        pushed = any(surroundings.pushed.values())
+        if calm and all(self._obeys):
+            self._check_motion(now, speeds, surroundings)
+        self._check_uncommanded(now, state, speeds, surroundings, calm)
+        self._check_stop(now, speeds, surroundings, calm and not pushed)
+        self._check_bodies(now, pushed or not calm)
+
+    def _find_changes(self) -> None:
+        """Count the cycles since a hand, a load, a drive or lost frames last changed what acts on the joints."""
+        changed = not self._frames.is_answered
+        outside = [mechanics.external_torque for mechanics in self._mechanics]
+        for torque, before in zip(outside, self._outside, strict=True):
+            if not -GRASPED_NM <= torque - before <= GRASPED_NM:
+                changed = True
+        self._outside = outside
+        obeys = [s.commanded and s.enabled and s.mode in (CSP, CSV, CST) for s in self._frames.samples]
+        if obeys != self._obeys:
+            self._obeys, changed = obeys, True
+            self._torques = [None] * len(obeys)
+        self._cycles_calm = 0 if changed else self._cycles_calm + 1
+
+    def _check_lost(self, now: int, state: State) -> None:
+        """Frames that are lost again and again end in a fault."""
+        if state not in _ENABLED:
+            self._lost = 0.0
+        elif self._frames.is_answered:
+            self._lost = max(self._lost - 1.0 / GOOD_PER_LOST, 0.0)
+        else:
+            self._lost += 1.0
+            self._limit(Kind.LOST_FRAMES, now, -1, self._lost, self._most_lost)
+
+    def _check_torques(self, now: int, calm: bool) -> None:
+        """The target torque of a drive in CST is continuous, also when it continues the torque of another mode."""
+        for axis, sample in enumerate(self._frames.samples):
+            if not self._obeys[axis]:
+                continue
+            if sample.mode != CST:
+                # A torque that changes fast is measured too late.
+                self._torques[axis] = self._axes[axis].torque if calm else None
+                continue
+            last, self._torques[axis] = self._torques[axis], sample.torque
+            if last is not None and last != sample.torque:
+                allowed = TORQUE_SHARE * self._bounds.torque[axis] + EXTRA_TORQUE
+                self._limit(Kind.TORQUE_STEP, now, axis, abs(sample.torque - last), allowed)
+
+    def _check_motion(self, now: int, speeds: Sequence[float], surroundings: Surroundings) -> None:
+        past, velocity, acceleration = self._speeds[0], self._bounds.velocity, self._bounds.acceleration
+        pushed, window_s = surroundings.pushed, self._window * self._dt
+        for axis, speed in enumerate(speeds):
+            if pushed and abs(pushed.get(axis, 0.0)) > self._bounds.torque[axis]:
+                continue  # nothing holds against this hand
+            in_cst = self._frames.samples[axis].mode == CST
+            fastest = SPEED * velocity[axis] * (self._fastest_in_cst if in_cst else 1.0) + EXTRA_SPEED
+            if not -fastest <= speed <= fastest:
+                self._limit(Kind.TRUE_SPEED, now, axis, abs(speed), fastest)
+            if not in_cst:
+                change, allowed = speed - past[axis], ACCELERATION * acceleration[axis] + EXTRA_ACCELERATION
+                if not -allowed * window_s <= change <= allowed * window_s:
+                    self._limit(Kind.TRUE_ACCELERATION, now, axis, abs(change) / window_s, allowed)
+
+    def _check_uncommanded(
+        self, now: int, state: State, speeds: Sequence[float], surroundings: Surroundings, calm: bool
+    ) -> None:
+        """Without a command no joint gains energy, and soon none moves."""
+        pushed = any(surroundings.pushed.values())
+        is_torque = state is State.MOVING and self._pushing is not None
+        if not (state in _UNCOMMANDED or is_torque) or not calm or (pushed and not is_torque):
+            self._cycles_uncommanded = self._cycles_resting = 0
+            self._begin = None
+            return
+        self._cycles_uncommanded += 1
+        if self._cycles_uncommanded * self._dt > SETTLED_S or is_torque:
+            self._check_energy(now, speeds, surroundings, self._pushing if is_torque else None)
+        if state not in _RESTING:
+            self._cycles_resting = 0
+            return
+        self._cycles_resting += 1
+        in_cst = self._frames.samples[0].mode == CST
+        if self._cycles_resting * self._dt <= (REST_IN_CST_S if in_cst else REST_S):
+            self._places = None
+            return
+        places = [mechanics.position for mechanics in self._mechanics]
+        if self._places is None:
+            self._places = places
+        for axis, (q, place, rest) in enumerate(zip(self._positions(), places, self._places, strict=True)):
+            # A joint outside its range returns by itself.
+            if self._bounds.low[axis] <= q <= self._bounds.high[axis]:
+                self._limit(Kind.MOVED, now, axis, abs(place - rest), MOVED_RAD)
+
+    def _check_energy(
+        self, now: int, speeds: Sequence[float], surroundings: Surroundings, torques: Sequence[float] | None
+    ) -> None:
+        """No joint has more kinetic energy than it had, and than torques and hands have given it since.
+
+        An unknown load is carried by the torque that was needed where the motion began; elsewhere it pulls.
+        """
+        places = [mechanics.position for mechanics in self._mechanics]
+        if self._begin is None:
+            self._begin, self._energy = places, [inf] * len(places)
+        far = min(1.0, sum(abs(a - b) for a, b in zip(places, self._begin, strict=True)))
+        workspace = self._frames.workspace
+        for axis, (mechanics, speed) in enumerate(zip(self._mechanics, speeds, strict=True)):
+            energy = 0.5 * mechanics.inertia * speed * speed
+            if torques is None:
+                explained = min(self._energy[axis], energy)
+            else:
+                reach = workspace.reach[axis] if workspace is not None and axis < len(workspace.reach) else 1.0
+                pull = abs(torques[axis]) + abs(surroundings.pushed.get(axis, 0.0))
+                pull += surroundings.payload_kg * GRAVITY * reach * far
+                explained = energy if self._energy[axis] == inf else self._energy[axis] + pull * abs(speed) * self._dt
+            self._energy[axis] = explained
+            is_spring = torques is None and self._frames.samples[axis].mode == CST
+            self._limit(Kind.ENERGY, now, axis, energy - explained, ENERGY_IN_CST_J if is_spring else ENERGY_J)
+
+    def _check_stop(self, now: int, speeds: Sequence[float], surroundings: Surroundings, calm: bool) -> None:
+        """After a stop, and without the enabling switch, the joints rest in time, not only their targets."""
+        self._cycles_released = 0 if surroundings.permitted else self._cycles_released + 1
+        stopped_ns = min(self._frames.rest_from_ns, self._frames.torque_off_from_ns) + SETTLED_S * 1e9
+        if (now <= stopped_ns and self._cycles_released * self._dt <= self._stop_s) or not calm:
+            self._stopped = None
+            return
+        places = [mechanics.position for mechanics in self._mechanics]
+        if self._stopped is None:
+            self._stopped = places
+        for axis, (speed, place, rest) in enumerate(zip(speeds, places, self._stopped, strict=True)):
+            self._limit(Kind.NOT_AT_REST, now, axis, abs(speed), STILL_RAD_S)
+            self._limit(Kind.MOVED, now, axis, abs(place - rest), MOVED_RAD)
+
+    def _check_bodies(self, now: int, pushed: bool) -> None:
+        """In every mode the bodies stay off the boxes and each other; a hand may push them into the clearance."""
+        workspace = self._frames.workspace
+        if workspace is None or not all(self._obeys):
+            self._check_bodies_in, self._is_excused = 0, True
+            return
+        self._check_bodies_in -= 1
+        if self._check_bodies_in > 0:
+            return
+        deepest = workspace.deepest(self._bounds, self._positions())
+        if self._is_excused and deepest > 0.0:
+            return
+        self._is_excused = False
+        self._limit(Kind.BODY, now, -1, deepest, self._clearance if pushed else DEEP_M)
+        fastest = sum(v * reach for v, reach in zip(self._bounds.velocity, workspace.reach, strict=False)) * self._dt
+        self._check_bodies_in = int(max(-deepest, 0.01) / (self._fastest_in_cst * fastest))
