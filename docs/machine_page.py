@@ -47,9 +47,12 @@ def diagram() -> str:
     lines = ["stateDiagram-v2", "    [*] --> STARTING", "    OFF : off"]
     for state in STATES:
         lines.append(f"    {state.state.name} : {state.state.words}")
-        for cause, target in state.leads_to.items():
-            if cause not in _EVERYWHERE and target is not state.state:
-                lines.append(f"    {state.state.name} --> {target.name} : {_words(cause)}")
+        shown = {
+            cause: to for cause, to in state.leads_to.items() if cause not in _EVERYWHERE and to is not state.state
+        }
+        for target in dict.fromkeys(shown.values()):
+            causes = ", ".join(_words(cause) for cause, to in shown.items() if to is target)
+            lines.append(f"    {state.state.name} --> {target.name} : {causes}")
     return "\n".join(lines)
 
 

@@ -189,7 +189,7 @@ class CommandHandler:
         self._joints.stop_others()
         for process in self._processes:
             process.safe()
-        if self._machine.state is State.HOMING:
+        if self._machine.state is State.HOMING and not self._context.homing.ended:
             self._context.homing.stop()
         else:
             if self._machine.state is State.HOLDING:

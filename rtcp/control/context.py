@@ -185,11 +185,14 @@ class Context(PartContext):
         return None
 
     def lease_held(self, lease: int) -> bool:
-        """Return whether `lease` is current and not expired; 0: the joystick, which needs none."""
+        """Return whether `lease` is current and not expired; 0: the joystick, which needs none.
+
+        A renewal may be later than the begin of this cycle; one that lies far in the future is none.
+        """
         if not lease:
             return True
         current, renewed, duration = self.blackboard.lease()
-        return current == lease and self.now_ns - renewed <= duration
+        return current == lease and -duration <= self.now_ns - renewed <= duration
 
     def permission_lost(self, lease: int) -> Event | None:
         """Return the event that forbids motion for the commander of `lease`, or None."""

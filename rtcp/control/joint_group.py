@@ -70,14 +70,15 @@ class JointGroup(Part):
         """Read the inputs of the drives."""
         state, samples, measurements = self.state, self.samples, self.measurements
         actual, speed, torque = state.actual, state.actual_velocity, state.actual_torque
+        positions, velocities, torques = samples.actual, samples.actual_velocity, samples.actual_torque
         measurements.begin(state.now_ns)
         for axis, (slot, drive) in enumerate(self.pairs):
-            before = drive.position, drive.velocity, drive.torque
+            last_position, last_velocity, last_torque = drive.position, drive.velocity, drive.torque
             drive.decode(data.input(slot))
-            samples.actual[axis] = drive.position
-            samples.actual_velocity[axis] = drive.velocity
-            samples.actual_torque[axis] = drive.torque
-            measurements.check(axis, drive, *before)
+            positions[axis] = drive.position
+            velocities[axis] = drive.velocity
+            torques[axis] = drive.torque
+            measurements.check(axis, drive, last_position, last_velocity, last_torque)
             actual[axis] = drive.position
             speed[axis] = drive.velocity
             torque[axis] = drive.torque

@@ -90,10 +90,12 @@ _FAULTS: dict[type[Message] | Signal, State] = {
 _TORQUE: dict[type[Message] | Signal, State] = {**_FAULTS, Disable: State.DISABLING}
 _PERMITTED: dict[type[Message] | Signal, State] = {
     **_TORQUE,
+    Halt: State.DISABLING,
     LeaseExpired: State.DISABLING,
     PermissionWithdrawn: State.DISABLING,
 }
-"""Of states in which joints return to their range: with torque they would do so without permission too."""
+"""Of states in which joints return to their range: with torque they would do so without permission, and after a halt
+too."""
 
 
 class MachineState:

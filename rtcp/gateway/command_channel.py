@@ -342,21 +342,24 @@ class CommandChannel:
             if not self._waiters:
                 self._has_waiters.clear()
 
-    def reaching(self, wanted: State, through: frozenset[State], name: str, since: int) -> Callable[[], State | None]:
-        """Return an outcome: the state `wanted`, reached through the states `through` only.
+    def reaching(
+        self, wanted: State | frozenset[State], through: frozenset[State], name: str, since: int
+    ) -> Callable[[], State | None]:
+        """Return an outcome: a state of `wanted`, reached through the states `through` only.
 
         Args:
-            wanted: the state; while the drives change their mode it does not count.
+            wanted: the state or states; while the drives change their mode they do not count.
             through: states on the way; any other fails.
             name: of the command in messages.
             since: number of the last event before the command.
         """
+        ends = frozenset({wanted}) if isinstance(wanted, State) else wanted
 
         def poll() -> State | None:
             self.check_loop()
             record = self.record()
             state = State(int(record["state"]))
-            if state is wanted:
+            if state in ends:
                 return None if int(record["flags"]) & FLAG_SWITCHING else state
             if state in BROKEN:
                 raise self.fault_since(since)

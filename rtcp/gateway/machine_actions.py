@@ -25,7 +25,8 @@ _DISABLING = frozenset(
     {State.HOLDING, State.MOVING, State.STOPPING, State.STOPPED_BY_LIMIT, State.HOMING, State.ENABLING, State.DISABLING}
 )
 _RESETTING = frozenset({State.RESETTING})
-_HALTING = IN_MOTION | {State.HOMING}
+_HALTED = frozenset({State.HOLDING, State.READY})
+_HALTING = IN_MOTION | {State.ENABLING, State.HOMING, State.DISABLING}
 _HOMING = frozenset({State.HOMING})
 _RESETTABLE = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 _PARKED = (AlState.INIT, AlState.PREOP)
@@ -107,7 +108,7 @@ class MachineActions:
 
     @method(at_once=True, stops=commands.Halt)
     async def halt(self, caller: Caller, requested_ns: Annotated[int, Ge(0)] = 0) -> Json:
-        """Stop every motion; returns when the arm holds. Needs no lease.
+        """Stop every motion; returns when the arm holds, or has no torque if it was being enabled. Needs no lease.
 
         `requested_ns`: instant, CLOCK_MONOTONIC, of the request that this client has already written to the blackboard.
         """
@@ -116,7 +117,7 @@ class MachineActions:
             # Nothing moves, but in state ready a process may be active: it ends at once.
             await channel.send(lease, commands.Halt())
         else:
-            halted = channel.reaching(State.HOLDING, _HALTING, "stopping", channel.observer.last_event)
+            halted = channel.reaching(_HALTED, _HALTING, "stopping", channel.observer.last_event)
             await channel.run(lease, commands.Halt(), halted, _STOP_S, "stopping")
         return {}
 

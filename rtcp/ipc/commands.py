@@ -98,10 +98,22 @@ class SetControlMode(Command):
 class Halt(Command):
     """Bring all axes to rest and processes into their safe state; the drives stay enabled.
 
-    Without torque it is accepted too, and nothing moves.
+    While drives are enabled, and while a joint returns to its range after its homing, the drives are disabled: with
+    torque the joint would return. Without torque it is accepted too, and nothing moves.
     """
 
-    states = frozenset({State.READY, State.HOLDING, State.MOVING, State.STOPPING, State.STOPPED_BY_LIMIT, State.HOMING})
+    states = frozenset(
+        {
+            State.READY,
+            State.ENABLING,
+            State.HOLDING,
+            State.MOVING,
+            State.STOPPING,
+            State.STOPPED_BY_LIMIT,
+            State.HOMING,
+            State.DISABLING,
+        }
+    )
     superseded_by_stop = False
     needs_lease = False
 

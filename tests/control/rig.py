@@ -409,6 +409,7 @@ CAUSES: dict[str, tuple[Step, Step]] = {
     ),
     "supervision": (lambda rig: turn(rig, 1, 1e5, 0.9, 0.0), let_go),
     "lease_ended": (lambda rig: rig.observer.release(rig.lease), LoopRig.acquire),
+    "halt": (lambda rig: rig.do(Halt()), lambda rig: None),
     "enabling_switch": (lambda rig: rig.put(SWITCH_INPUT, False), lambda rig: rig.put(SWITCH_INPUT, True)),
 }
 """For each key of `stops` the cause of one of its events, and the end of the cause. A clock is lost after 1 s."""

@@ -43,6 +43,7 @@ from rtcp.ipc.commands import (
     StreamPosition,
 )
 from rtcp.ipc.events import Paused, Resumed, SpeedOverrideChanged
+from rtcp.ipc.layout import LEASE_RENEWED_AT
 from rtcp.ipc.observer import Answer
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
@@ -105,6 +106,13 @@ def test_a_command_without_its_lease_is_refused_and_changes_nothing(rig: LoopRig
         for command in WITH_LEASE[state]:
             assert isinstance(rig.send(command, lease=lease).refusal, refusals.NoLease), (command, lease)
             assert rig.state is state
+
+
+def test_a_renewal_that_lies_far_in_the_future_is_none_and_the_motion_stops(rig: LoopRig) -> None:
+    rig.lead_to(State.MOVING)
+    rig.fall_silent()
+    rig.board.words[LEASE_RENEWED_AT] = rig.now_ns + 60_000_000_000
+    rig.bring_to(State.STOPPING, 2 * PERIOD_S)
 
 
 @pytest.mark.parametrize("command", [Disable(), Halt(), Shutdown()], ids=name_of)

@@ -291,8 +291,8 @@ def test_without_the_enabling_switch_no_motion_begins(new_rig: Callable[..., Loo
     assert rig.state is State.HOLDING
 
 
-@pytest.mark.parametrize("cause", ["enabling_switch", "lease_ended"])
-def test_without_permission_no_joint_returns_to_its_range_after_its_homing(
+@pytest.mark.parametrize("cause", ["enabling_switch", "lease_ended", "halt"])
+def test_without_permission_and_after_a_halt_no_joint_returns_to_its_range_after_its_homing(
     new_rig: Callable[..., LoopRig], cause: str
 ) -> None:
     rig = new_rig(with_switch()).hold()

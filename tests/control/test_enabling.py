@@ -209,8 +209,10 @@ def test_a_joint_that_is_brought_back_stands_when_it_is_disabled_and_begins_anew
     assert rig.kinds.count(ReturningToRange) == 2
 
 
-@pytest.mark.parametrize("cause", ["enabling_switch", "lease_ended"])
-def test_without_permission_no_joint_is_brought_back(new_rig: Callable[..., LoopRig], cause: str) -> None:
+@pytest.mark.parametrize("cause", ["enabling_switch", "lease_ended", "halt"])
+def test_without_permission_and_after_a_halt_no_joint_is_brought_back(
+    new_rig: Callable[..., LoopRig], cause: str
+) -> None:
     rig = enable_beyond(new_rig(with_switch()))
     rig.run(0.1)
     CAUSES[cause][0](rig)

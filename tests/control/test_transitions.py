@@ -43,7 +43,7 @@ jog              .     .     .     move  =     .     .     .     .     .     .  
 move_at_velocity .     .     .     =     =     .     .     .     .     .     .     .     .
 apply_torque     .     .     .     =     =     .     .     .     .     .     .     .     .
 guide            .     .     .     =     .     .     .     .     .     .     .     .     .
-halt             .     =     .     =     stop  =     =     =     .     .     .     .     .
+halt             .     =     disab =     stop  =     =     =     =     .     .     .     .
 set_output       .     =     =     =     =     =     =     =     .     =     .     .     .
 set_channel      .     =     =     =     =     =     =     =     .     .     .     .     .
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from rtcp.config import default_config, load
+from rtcp.config import default_config, find, load
 from rtcp.config.find import made_by
 from rtcp.config.model import ArmConfig, InputsConfig, OutputsConfig, PluginError
 from rtcp.control.part import Device, PartContext
 from rtcp.control.processes import ProcessPart
-from rtcp.devices.driver import DeviceError, Driver
+from rtcp.devices.driver import ENTRY_POINTS, DeviceError, Driver
 from rtcp.ipc.commands import Command, MotionCommand, Reset
 from rtcp.ipc.events import ControllerRaised, DriverFailed, ErrorReported, Event, PluginSlow, ProcessFailed, Stopped
 from rtcp.ipc.events import StreamEnded as EndOfMotion
@@ -206,6 +206,14 @@ class Meter(Driver):
         values[at : at + 1] = misbehave(self.what) if self.method == "publish" else [7]
 
 
+def install_meter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every kind of device have the driver that misbehaves, as if a package had registered it."""
+    registered = find.installed(ENTRY_POINTS)
+    meters = EntryPoints(EntryPoint(entry.name, f"{__name__}:{Meter.__name__}", entry.group) for entry in registered)
+    installed = find.installed
+    monkeypatch.setattr(find, "installed", lambda group: meters if group == ENTRY_POINTS else installed(group))
+
+
 @cases(
     ("update", WRONG_EVENTS | EXCEPTIONS),
     ("encode", {"none": None, "a text": "on", "too short": b"", "too long": bytes(99), **EXCEPTIONS}),
@@ -215,7 +223,7 @@ class Meter(Driver):
 def test_a_driver_that_misbehaves_is_a_fault_of_its_slave(
     config: ArmConfig, monkeypatch: pytest.MonkeyPatch, method: str, what: Any
 ) -> None:
-    monkeypatch.setattr("rtcp.devices.driver.driver_of", lambda kind, device="": Meter)
+    install_meter(monkeypatch)
     with Simulation(replace(config, processes=())) as running:
         running.bring_to(State.READY)
         running.acquire()
@@ -351,7 +359,7 @@ def test_a_plug_in_that_cannot_be_made_is_refused_at_load_with_file_and_line(err
 
 
 def test_fields_that_are_none_are_refused_at_load(config: ArmConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rtcp.devices.driver.driver_of", lambda kind, device="": Meter)
+    install_meter(monkeypatch)
     monkeypatch.setattr(Meter, "fields", lambda meter: ["level"])
     with pytest.raises(PluginError, match="allowed are fields of the record"):
         Simulation(replace(config, processes=()))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunTrajectory, SetLimits, SetZero
+from rtcp.ipc.commands import Command, Halt, MotionCommand, MoveJoints, RunLines, RunTrajectory, SetLimits, SetZero
 from rtcp.ipc.events import Event, ZeroSet
 from rtcp.ipc.layout import PLAN_COLUMNS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
 from rtcp.ipc.refusals import Malformed, Refusal
@@ -127,6 +127,8 @@ class FakeLoop:
                 self.board.event(event)
             if isinstance(command, MotionCommand):
                 self._begin(command, lease)
+            elif isinstance(command, Halt) and self.state is State.ENABLING:
+                self.state = State.READY
         return refusal
 
     def _begin(self, command: MotionCommand, lease: int) -> None:

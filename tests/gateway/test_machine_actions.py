@@ -238,6 +238,11 @@ def test_a_halt_in_state_ready_reaches_the_loop_and_is_no_failure(arm: FakePlatf
     assert arm.loop.kinds == [commands.Halt]
 
 
+def test_a_halt_while_drives_are_enabled_ends_without_torque(arm: FakePlatform) -> None:
+    arm.show(state=State.ENABLING)
+    assert arm.ask("halt") == {}
+
+
 def test_disabling_that_another_command_ends_is_no_success(arm: FakePlatform) -> None:
     arm.show(state=State.RESETTING)
     arm.loop.refusals[commands.Disable] = WrongState(commands.Disable.number, State.RESETTING)

@@ -128,7 +128,18 @@ def services(bus: SoemBus, amount: int) -> dict[str, Any]:
             sentences[str(error).partition(":")[0]] += 1
     after = ask(INTERFACE, garble=0)
     mutated = int(str(after["mutated"])) - int(str(before["mutated"]))
-    return {"refused": sum(sentences.values()), "mutated": mutated, "name": bus.sdo(2).read(0x1008, 0).hex()}
+    return {"refused": sum(sentences.values()), "mutated": mutated, "name": name_of(bus).hex()}
+
+
+def name_of(bus: SoemBus) -> bytes:
+    """Return the name of the first drive; a busy machine may lose a frame of a transfer, which is then begun again."""
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            return bus.sdo(2).read(0x1008, 0)
+        except BusError:
+            if time.monotonic() > until:
+                raise
 
 
 def scans(bus: SoemBus, amount: int) -> dict[str, Any]:
