@@ -12,7 +12,7 @@ from math import inf
 from typing import Protocol
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.commands import ApplyTorque, Command, Guide, MotionCommand, MoveJoints
+from rtcp.ipc.commands import ApplyTorque, Command, Guide, MotionCommand, MoveJoints, SetControlMode, SetDriveMode
 from rtcp.ipc.events import Arrived, Event, FaultEvent, MotionEnded, Stopped
 from rtcp.ipc.states import State
 from rtcp.testing.sessions.checker import CSP, CST, CSV, FrameChecker, Kind
@@ -132,6 +132,10 @@ class MechanicsChecker:
             elif isinstance(command, ApplyTorque) and command.stiffness == 0.0:
                 self._pushing = command.torque
             self._cycles_uncommanded, self._begin = 0, None
+        elif isinstance(command, SetControlMode | SetDriveMode):
+            # The joints return to the setpoints, from which the position loop of CST may have let them sag.
+            self._cycles_uncommanded = self._cycles_resting = 0
+            self._begin = None
 
     def event(self, event: Event, now_ns: int) -> None:
         """Check an event of the loop: a motion is only complete when the joints are at its target."""
