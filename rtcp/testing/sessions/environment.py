@@ -195,11 +195,14 @@ class Environment:
     def delay(self) -> None:
         """Let all answers of a drive be late for a while."""
         axis, late = self._axis(), self._random.choice(LATE_CYCLES)
-        kept: deque[bytes] = deque()
+        simulation = self._simulation
+        kept: deque[tuple[int, bytes]] = deque(maxlen=late + 1)
+        """The last inputs and their instants."""
 
         def change(inputs: bytes) -> bytes:
-            kept.append(inputs)
-            return kept.popleft() if len(kept) > late else kept[0]
+            if not kept or kept[-1][0] != simulation.now_ns:
+                kept.append((simulation.now_ns, inputs))
+            return kept[0][1]
 
         self._lie_later(axis, self._cycles(0.02, 0.5), change, f"{self._config.joints[axis].name} {late} cycles late")
 
