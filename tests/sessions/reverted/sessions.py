@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from math import pi
@@ -29,7 +30,7 @@ def an_arm() -> tuple[ArmConfig, SegmentConfig]:
     return config, load_segment(config.source.parent / config.bus.segment)
 
 
-def a_cell() -> tuple[CellConfig, Segment]:
+def a_cell() -> tuple[CellConfig, Mapping[str, SegmentConfig]]:
     """Return two of the shipped arms that face each other, and their slaves."""
     config, segment = an_arm()
     left, right = Member("left", config, Base()), Member("right", config, Base((-1.5, 0.0, 0.0), (0.0, 0.0, pi)))
