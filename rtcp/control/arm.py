@@ -12,7 +12,7 @@ from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import checked_refusal
 from rtcp.devices.drive import Drive
 from rtcp.ipc.commands import Command, Jog, MoveJoints
-from rtcp.ipc.events import MotionEnded, PushedNear
+from rtcp.ipc.events import FaultEvent, MotionEnded, PushedNear, PushedNearPartner
 from rtcp.ipc.refusals import ControllerRaised, Refusal
 from rtcp.ipc.schema import ARM_MODES, LOAD_FIELDS, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
@@ -122,18 +122,32 @@ class Arm(JointGroup):
     def change_mode(self, mode: DriveMode) -> None:
         """Command enabled drives to change to `mode`; only at standstill of the setpoints.
 
-        A hand may have moved a joint away from its setpoint in CST and in CSV, and may still move it. A target position
-        that the drives do not obey stays at the setpoint. A writer that is already active continues.
+        A hand may have moved a joint away from its setpoint in CST and in CSV, and may still move it: the arm then
+        holds where its joints come to rest. Nobody commanded a return. A writer that is already active continues.
         """
         if mode is self.mode:
             return
         compliant = self.mode is DriveMode.CST or (self.mode is DriveMode.CSV and mode is DriveMode.CSP)
+        if not compliant:
+            self.set_mode(mode)
+            return
+        limits, commanded = self.limits, self.state.commanded
+        for i, drive in enumerate(self.drives):
+            speed = drive.velocity
+            # The targets of this cycle arrive a cycle later than the positions were read.
+            drive.target_position = drive.position + speed * self.period_s
+            rest = drive.target_position + 0.5 * speed * abs(speed) / limits.acceleration[i]
+            commanded[i] = min(max(rest, limits.low[i]), limits.high[i])
+            self.output_limiter.latch(i, drive.target_position, speed)
+        self.hold()
         self.set_mode(mode)
-        if compliant:
-            self._csp.take_over(self.drives)
-            for i, drive in enumerate(self.drives):
-                joint = drive.position + drive.velocity * self.period_s
-                self.output_limiter.latch(i, joint if mode is DriveMode.CSP else drive.target_position, drive.velocity)
+        if mode is DriveMode.CSP:
+            self._csp.take_over(commanded, self.drives)
+
+    @property
+    def is_braking(self) -> bool:
+        """Whether joints that a hand moved still brake after the change of the drive mode."""
+        return self.mode is DriveMode.CSP and self._csp.is_braking
 
     def use_tool(self, number: int) -> None:
         """Use another tool, without a payload; only at rest."""
@@ -268,11 +282,14 @@ class Arm(JointGroup):
         if near is not None:
             guard.stop_for(near)
 
-    def pushed(self) -> PushedNear | None:
-        """Return the event of joints in CST that are about to come too near to a box or the arm itself, or None."""
+    def pushed(self) -> FaultEvent | None:
+        """Return the event of joints in CST that are about to come too near to a box, a partner or each other."""
         if self.mode is not DriveMode.CST:
             return None
-        state = self.state
+        state, neighbours = self.state, self.trajectory_guard.neighbours
+        near = self._pushes.partner_ahead(neighbours, state.actual, state.actual_velocity, PUSHED_CLEARANCE)
+        if near is not None:
+            return PushedNearPartner(near.partner, near.distance)
         contact = self._pushes.ahead(state.actual, state.actual_velocity)
         # Joints that stand there already are led out by their commander.
         if contact is None or self._pushes.is_inside:

@@ -306,7 +306,7 @@ class Holding(MachineState):
             return event
         if self.changing_mode:
             axis = joints.first_in_another_mode()
-            self.changing_mode = axis >= 0
+            self.changing_mode = axis >= 0 or arm.is_braking
             if axis >= 0 and ctx.cycle - self._since > ctx.cycles(self._MODE_S):
                 return ctx.wrong_drive_mode(axis)
             return None

@@ -645,6 +645,14 @@ class PushedNear(FaultEvent, number=77):
     distance: float
 
 
+class PushedNearPartner(FaultEvent, number=78):
+    """the arm was pushed towards {partner_name}, to {distance:.3g} m before half the clearance: {reaction}; then
+    `rtcp reset`"""
+
+    partner: int
+    distance: float
+
+
 # -- why a motion ended before its goal -------------------------------------------------------------------------------
 
 

@@ -19,8 +19,8 @@ _FADE_S: Final = 0.3
 
 _PASSED_S: Final = 0.03
 """Time constant of the transition from a passed torque to the position loop, s."""
-_RETURN_RAD_S: Final = 0.05
-"""Speed of the uncommanded return to the setpoint after CST, rad/s."""
+_SLOW_RAD_S: Final = 0.05
+"""Speed, rad/s, at which a joint that would come to rest outside its range is led to the edge."""
 
 
 class Commanded(Protocol):
@@ -49,8 +49,8 @@ class DriveWriter(Protocol):
 class CspWriter:
     """CSP: writes the setpoint itself.
 
-    After CST, in which a hand can move a joint away from its setpoint, the targets begin where the joints are and at
-    their velocities. They return to the setpoints at the joints' acceleration.
+    After CST, in which a hand can move a joint, the targets begin where the joints are and at their velocities. They
+    brake to the setpoints at the joints' acceleration.
 
     Args:
         joints: the joints.
@@ -62,45 +62,45 @@ class CspWriter:
     def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
         self._period_s = period_s
         self._change = [joint.acceleration * period_s for joint in joints]
-        self._back = [min(_RETURN_RAD_S, joint.velocity) for joint in joints]
+        self._slow = [min(_SLOW_RAD_S, joint.velocity) for joint in joints]
         self._away = [0.0] * len(joints)
         """Distance of each target from its setpoint, rad."""
         self._pace = [0.0] * len(joints)
-        self._returning = False
+        self.is_braking = False
+        """Whether a target is not at its setpoint yet."""
 
     def start(self, drives: Sequence[Commanded]) -> None:
         """Start at the setpoints."""
-        self._returning = False
+        self.is_braking = False
 
-    def take_over(self, drives: Sequence[Commanded]) -> None:
-        """Start at the joints of drives that leave CST."""
-        self._returning = True
+    def take_over(self, position: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Start at the targets and velocities of the drives and brake to `position`, rad."""
+        self.is_braking = True
         for i, drive in enumerate(drives):
-            # The targets of this cycle arrive a cycle later than the positions were read.
-            self._away[i] = drive.position + drive.velocity * self._period_s - drive.target_position
+            self._away[i] = drive.target_position - position[i]
             self._pace[i] = drive.velocity
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write the positions; drives with a velocity field use it as their speed limit, which the driver fills in."""
-        if self._returning:
-            self._return()
-        returning, away = self._returning, self._away
+        if self.is_braking:
+            self._brake()
+        braking, away = self.is_braking, self._away
         for i, drive in enumerate(drives):
-            drive.target_position = position[i] + away[i] if returning else position[i]
+            drive.target_position = position[i] + away[i] if braking else position[i]
             drive.target_velocity = 0.0
             drive.target_torque = 0.0
 
-    def _return(self) -> None:
+    def _brake(self) -> None:
         away, pace, dt = self._away, self._pace, self._period_s
-        self._returning = False
+        self.is_braking = False
         for i, change in enumerate(self._change):
             distance, speed = away[i], pace[i]
             if abs(distance) <= change * dt and abs(speed) <= change:
                 away[i] = pace[i] = 0.0
                 continue
-            self._returning = True
-            back = min(self._back[i], fastest_stoppable(abs(distance), change, dt))
-            wanted = -back if distance > 0.0 else back
+            self.is_braking = True
+            slow = min(self._slow[i], fastest_stoppable(abs(distance), change, dt))
+            wanted = -slow if distance > 0.0 else slow
             speed = min(max(wanted, speed - change), speed + change)
             pace[i] = speed
             away[i] = distance + speed * dt

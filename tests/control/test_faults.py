@@ -247,6 +247,7 @@ def test_every_fault_and_every_key_has_a_case() -> None:
         events.ResetWithoutController,
         events.ProcessFailed,
         events.PushedNear,
+        events.PushedNearPartner,
         events.ControllerRaised,
     }
     assert {entry.name for entry in fields(StopsConfig)} == {kind.stop_key for kind in own} - {""} == set(STOPS)

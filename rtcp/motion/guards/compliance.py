@@ -12,7 +12,7 @@ from typing import Final
 
 from kinematics.forward import frames
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.events import MotionEnded
+from rtcp.ipc.events import PartnerNear
 from rtcp.motion.guards.braking import touched, travel
 from rtcp.motion.guards.neighbours import Neighbours
 from rtcp.motion.guards.zones import Zones
@@ -84,12 +84,7 @@ class ComplianceGuard:
 
     def ahead(self, q: Sequence[float], velocity: Sequence[float]) -> tuple[int, float] | None:
         """Return the box or pair (`zones`) that the joints at `q`, rad, would touch before they stand, or None."""
-        if not self._models:
-            return None
-        for speed in velocity:
-            if not -_STILL_RAD_S <= speed <= _STILL_RAD_S:
-                break
-        else:
+        if not self._models or _stands(velocity):
             return None
         limits, dt = self._limits, self._reaction_s
         zones, model = self._zones[self._number], self._models[self._number]
@@ -112,12 +107,19 @@ class ComplianceGuard:
         return touched(zones, poses, frames(model, there), there, velocity, limits.acceleration, dt)
 
     def partner_ahead(
-        self, neighbours: Neighbours | None, q: Sequence[float], velocity: Sequence[float]
-    ) -> MotionEnded | None:
-        """Return the event of a partner that the joints would come too near to before they stand, or None."""
-        if neighbours is None:
+        self, neighbours: Neighbours | None, q: Sequence[float], velocity: Sequence[float], part: float = 1.0
+    ) -> PartnerNear | None:
+        """Return the partner that the joints would come nearer to than a part of the clearance before they stand."""
+        if neighbours is None or _stands(velocity):
             return None
         there = self._next
         for i, speed in enumerate(velocity):
             there[i] = q[i] + speed * self._reaction_s
-        return neighbours.ahead(there, velocity)
+        return neighbours.near(there, velocity, part)
+
+
+def _stands(velocity: Sequence[float]) -> bool:
+    for speed in velocity:
+        if not -_STILL_RAD_S <= speed <= _STILL_RAD_S:
+            return False
+    return True

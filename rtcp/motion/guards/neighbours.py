@@ -216,7 +216,7 @@ class Neighbours:
             return None
         if self._group.foreign >= 0:
             return PartnerForeign(self._group.foreign)
-        return self._near(q, velocity)
+        return self.near(q, velocity)
 
     def refusal_of(
         self, q: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]
@@ -224,13 +224,13 @@ class Neighbours:
         """Return a refusal if the stop from `q`, rad, at these rates, rad/s^2, comes too near a partner; or None."""
         own = self._own
         in_force, own.acceleration = own.acceleration, acceleration
-        near = self._near(q, velocity)
+        near = self.near(q, velocity)
         own.acceleration = in_force
         return None if near is None else LimitsTooNearPartner(near.partner, near.distance)
 
-    def _near(self, q: Sequence[float], velocity: Sequence[float]) -> PartnerNear | None:
-        """Return the partner that this arm could come too near to before both stand, or None."""
-        own, dt = self._own, self._period_s
+    def near(self, q: Sequence[float], velocity: Sequence[float], part: float = 1.0) -> PartnerNear | None:
+        """Return the partner that this arm could come nearer to than a part of the clearance before both stand."""
+        own, dt, clearance = self._own, self._period_s, part * self._clearance
         own_travel = own.travel(velocity, dt)
         for index, body in enumerate(self._partners):
             partner = self._group.members[index]
@@ -239,13 +239,13 @@ class Neighbours:
             there, theirs = partner.position, partner.velocity
             whole = own_travel + body.travel(theirs, self._delay_s)
             used = own.moved(self._here[index], q) + body.moved(self._there[index], there)
-            if self._room[index] - used - whole > self._clearance:
+            if self._room[index] - used - whole > clearance:
                 continue
             least, here, then = certain(own, q, velocity, body, there, theirs, (dt, self._delay_s))
             self._room[index] = here
             self._here[index][:], self._there[index][:] = q, there
             delays_s = (dt, self._delay_s)
-            if least > self._clearance or parting(own, q, velocity, body, there, theirs, delays_s, self._clearance):
+            if least > clearance or parting(own, q, velocity, body, there, theirs, delays_s, clearance):
                 continue
             return PartnerNear(index, max(min(here, then), 0.0))
         return None
