@@ -20,6 +20,7 @@ COMMANDS_STRIDE = 7
 """Distance between the first commands of two visits of the same place, in the list of all commands."""
 MOST_COMMANDS, MOST_APPROACHES = 12, 4
 """Commands of a visit, and times that the arm is brought to the place again after it left."""
+_SAG_S = 0.3
 _LASTING = frozenset({
     State.READY, State.HOLDING, State.MOVING, State.STOPPED_BY_LIMIT, State.FAULT, State.EMERGENCY_STOP, State.HOMING
 })  # fmt: skip
@@ -120,8 +121,10 @@ class Visit:
         self._end_s = inf
         if self._over or not (self._shuts_down or state is State.CLOSING):
             return
-        if state is State.FAULT or state is State.READY:
-            self._to_holding()  # in its modes
+        # Random actions may have changed the modes.
+        commander.send(commands.Halt())
+        self._until(State.HOLDING, 0.5)
+        self._to_holding()
         self._approaches[state]()
         if state is State.CLOSING:
             self._send_here()
@@ -178,6 +181,9 @@ class Visit:
         session, mode = self._session, self._place.control_mode
         if self._commander.state is not State.MOVING:
             self._to_holding()
+        if mode is ControlMode.TORQUE:
+            # A torque motion begins only when the joints, which sag a little, stand still.
+            self._commander.wait(session.cycles(_SAG_S))
         if mode is ControlMode.JOYSTICK:
             for button in _ALL_BUTTONS:
                 self._commander.joystick(0)
