@@ -102,6 +102,8 @@ class Kind(str, Enum):
     """The distance of a joint itself from its target when the loop says that the motion is complete, rad."""
     BODY = "body"
     """Depth of a body itself in a keep-out box or another body, or of the tool outside its box, m."""
+    NOT_PERMITTED = "not_permitted"
+    """Time since the release of the enabling switch at which a command that lets something move was accepted, s."""
     PARTNER = "partner"
     """Distance of two arms of a cell that came too near to each other, m."""
     NOT_LED_APART = "not_led_apart"

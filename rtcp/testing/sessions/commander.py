@@ -234,7 +234,7 @@ class Commander:
     def _tell_checker(self, command: Command) -> None:
         """Tell what an accepted command changes for the checks."""
         checker = self.checker
-        self.mechanics.accepted(command)
+        self.mechanics.accepted(command, self.simulation.now_ns)
         if isinstance(command, SetZero) and command.axis < len(checker.zero):
             checker.zero[command.axis] = command.offset
         elif isinstance(command, SetTool):

@@ -289,6 +289,9 @@ class Session(RandomActions):
         self.seconds(0.0, 0.2)
         self.commander.switch(False)
         self.seconds(0.0, 0.6)
+        if self.random.random() < 0.5:
+            # As a client that knows nothing of the switch.
+            self.random.choice((self.enable, self._begin_motion, self.command))()
         self.commander.switch(True)
 
     # -- one command of a kind --------------------------------------------------------------------------------------

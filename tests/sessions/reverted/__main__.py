@@ -61,6 +61,16 @@ UNREACHABLE = (
         "tests/cli/test_cell.py::test_an_arm_whose_loop_was_killed_is_started_again_although_its_gateway_still_listens",
     ),
     Unreachable(
+        "an enabling switch that nobody reads counts as released",
+        "an IO box that is not read is a fault of its own arm at once; the switch counts for heating in a cell",
+        "tests/control/test_emergency_stop.py::test_an_enabling_switch_that_nobody_reads_counts_as_released",
+    ),
+    Unreachable(
+        "a silent partner permits no motion",
+        "only heating asks for that, and a session of a cell has arms alone",
+        "tests/cell/test_partners.py::test_a_silent_partner_counts_as_pressed_and_permits_no_motion",
+    ),
+    Unreachable(
         "readers of the blackboard check their copies",
         "in a session reader and writer take turns in one process",
         "tests/ipc/test_record_view.py::test_a_record_that_is_overwritten_while_it_is_read_is_none",
