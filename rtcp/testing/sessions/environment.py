@@ -73,7 +73,7 @@ class Environment:
         self._mechanics = [servo.mechanics for servo in servos]
         slots = {slave.name: slot for slot, slave in enumerate(self._config.slaves)}
         self._slots = [slots[joint.slave] for joint in self._config.joints]
-        self._due: list[tuple[int, int, Callable[[], None]]] = []
+        self._due: list[tuple[int, int, Callable[[], object]]] = []
         """Instant, number and action of what is still to come; the earliest is the last."""
         self._count = 0
         self._lies: dict[int, Transform] = {}
@@ -94,7 +94,7 @@ class Environment:
         if self.pushed or self._lies:
             self.last_disturbed_ns = now_ns
 
-    def _after(self, cycles: int, action: Callable[[], None]) -> None:
+    def _after(self, cycles: int, action: Callable[[], object]) -> None:
         at_ns = self._simulation.now_ns + cycles * self._simulation.period_ns
         self._count += 1
         self._due.append((at_ns, self._count, action))
@@ -102,6 +102,10 @@ class Environment:
 
     def _cycles(self, least_s: float, most_s: float) -> int:
         return max(1, int(self._random.uniform(least_s, most_s) * 1e9 / self._simulation.period_ns))
+
+    def later(self, action: Callable[[], object], seconds: float) -> None:
+        """Begin something within this time, s."""
+        self._after(self._cycles(0.0, seconds), action)
 
     # -- hands ------------------------------------------------------------------------------------------------------
 

@@ -507,10 +507,21 @@ class Session(RandomActions):
             self.send(commands.Reset())
             self.commander.simulation.until(lambda: self.commander.state is not State.RESETTING, 0.5)
 
+    def _disturb(self, seconds: float) -> None:
+        """Let something of the surroundings act at two random instants, mostly during the visit."""
+        environment = self.commander.environment
+        happens = (
+            environment.falsify, environment.falsify, environment.falsify, environment.hand, environment.hand,
+            environment.load, environment.burst, environment.freeze, environment.delay,
+        )  # fmt: skip
+        for action in self.random.choices(happens, k=2):
+            environment.later(action, seconds)
+
     def run(self, seconds: float) -> None:
         """Run for this simulated time, s, or to the first violation."""
         commander, random = self.commander, self.random
         weights = [weight for weight, _ in self.actions]
+        self._disturb(seconds)
         self.visit.run(seconds)
         while commander.seconds < seconds and not (commander.simulation.done or commander.checker.violations):
             if commander.state not in MOVABLE and random.random() < 0.7:
