@@ -161,6 +161,7 @@ NOT_REACHED: tuple[NotReached, ...] = (
         "no drive moves the gripper of this arm",
         lambda config: config.gripper is None or config.gripper.joint is None,
     ),
+    NotReached(events.ToolChanged, "this arm has one tool", lambda config: len(config.models) < 2),
     NotReached(refusals.ToolInBox, "this arm has one tool", lambda config: len(config.models) < 2),
     NotReached(refusals.NoOutputs, "this arm has an IO box", lambda config: _boxes(config) > 0),
     NotReached(refusals.UnknownBox, "this arm has no IO box", lambda config: _boxes(config) == 0),

@@ -129,7 +129,9 @@ class Session(RandomActions):
             commands.OpenStream: lambda: commands.OpenStream(commander.simulation.now_ns),
             commands.Jog: self._short_jog,
             commands.MoveAtVelocity: lambda: commands.MoveAtVelocity(tuple(self._small(0.2)), 0.5),
-            commands.ApplyTorque: lambda: commands.ApplyTorque(tuple(self._small(5.0)), 0.0, 1.0, 0.5),
+            commands.ApplyTorque: lambda: commands.ApplyTorque(
+                tuple(self._small(5.0)), self.or_nonsense(0.0, 0.1), 1.0, 0.5
+            ),
             commands.Guide: lambda: commands.Guide(1.0),
         }
         """Commands that the arm accepts in the right place; commands without an entry get random fields."""
@@ -157,6 +159,7 @@ class Session(RandomActions):
             (1, environment.burst),
             (1, environment.lasting_fault),
             (1, self._release),
+            (1, self._pause),
             (1, lambda: commander.overtake(self._random_move(), random.choice((commands.Halt, commands.Disable)))),
             (2, self.joystick),
             (1, self.toggle),
@@ -289,10 +292,20 @@ class Session(RandomActions):
         self.seconds(0.0, 0.2)
         self.commander.switch(False)
         self.seconds(0.0, 0.6)
-        if self.random.random() < 0.5:
-            # As a client that knows nothing of the switch.
-            self.random.choice((self.enable, self._begin_motion, self.command))()
+        kinds = (commands.Enable, commands.Jog, commands.MoveJoints, commands.Home, commands.MoveGripper)
+        self.send_likely(self.random.choice(kinds))
         self.commander.switch(True)
+
+    def _pause(self) -> None:
+        """Pause a motion, and mostly resume it; now and then begin another one in between."""
+        self._begin_long_motion()
+        self.seconds(0.05, 0.3)
+        self.send(commands.Pause())
+        self.seconds(0.0, 0.2)
+        if self.random.random() < 0.5:
+            self.send_likely(self.random.choice((commands.MoveJoints, commands.Jog, commands.RunTrajectory)))
+        if self.random.random() < 0.8:
+            self.send(commands.Resume())
 
     # -- one command of a kind --------------------------------------------------------------------------------------
 
@@ -300,8 +313,11 @@ class Session(RandomActions):
         """Send a command of a kind, mostly one that the arm accepts in the right place."""
         if kind is commands.SetLimits:
             self.limits()
+        elif kind is commands.RunLines and self.commander.simulation.config.arm is not None:
+            self.line()
         elif kind in self._makers and self.random.random() < 0.85:
-            lease = self.random.randrange(3) if self.random.random() < 0.03 else None
+            other = 0.03 if kind.needs_lease else 0.3
+            lease = self.random.randrange(3) if self.random.random() < other else None
             self.commander.send(self._makers[kind](), lease)
         else:
             self._send_random(kind)
@@ -320,12 +336,14 @@ class Session(RandomActions):
     def _payload(self) -> commands.SetPayload:
         random = self.random
         return commands.SetPayload(
-            random.choice((0.0, random.uniform(0.0, 1.5))), *(random.uniform(-0.1, 0.1) for _ in range(3))
+            random.choice((0.0, random.uniform(0.0, 1.5))),
+            *self.some([random.uniform(-0.1, 0.1) for _ in range(3)], 0.05),
         )
 
     def _same_zero(self) -> commands.SetZero:
         axis = self.random.randrange(self.joints)
-        return commands.SetZero(axis, self.commander.checker.zero[axis])
+        zero = self.commander.checker.zero[axis]
+        return commands.SetZero(axis, self.random.choice((zero, zero, zero, 1e3)))
 
     def _short_trajectory(self) -> commands.RunTrajectory:
         rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (1.0, self.near(0.1)))]
@@ -338,8 +356,10 @@ class Session(RandomActions):
         rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (2.0, self.near(0.1)))]
         slot = simulation.observer.write_plan([*rows, [self.or_nonsense(1.0, 0.1), *[1.0] * (COLUMNS - 1)]])
         now_ns, step_s = simulation.now_ns, self.or_nonsense(0.5, 0.1)
-        start_ns, motion = now_ns + 20_000_000, self.random.choice((now_ns, now_ns, now_ns, 1, 1 << 60))
-        return commands.RunInStep(slot, len(rows), motion, self.or_odd(0), start_ns, 5, step_s)
+        choice = self.random.choice
+        motion, partners = choice((now_ns, now_ns, now_ns, 1, 1 << 60)), choice((0, 0, 0, 0, 1))
+        start_ns = now_ns + choice((20_000_000, 20_000_000, 20_000_000, -1, 1 << 50))
+        return commands.RunInStep(slot, len(rows), motion, partners, start_ns, 5, step_s)
 
     def _next_position(self) -> commands.StreamPosition:
         self.stamp += 0.01
@@ -444,7 +464,8 @@ class Session(RandomActions):
             return
         pose = forward(arm, self.commanded[:6])
         orientation = quaternion(pose.rotation)
-        rows, at = [], list(pose.position)
+        rows, off = [], 0.05 if random.random() < 0.05 else 0.0
+        at = [x + off for x in pose.position]
         for _ in range(random.randrange(1, 4)):
             far = random.choice((0.02, 0.1, 0.3))
             to = [x + random.uniform(-far, far) for x in at]
@@ -516,6 +537,9 @@ class Session(RandomActions):
         )  # fmt: skip
         for action in self.random.choices(happens, k=2):
             environment.later(action, seconds)
+        if self.random.random() < 0.4:
+            environment.later(lambda: self.commander.switch(False), 0.5 * seconds)
+            environment.later(lambda: self.commander.switch(True), seconds)
 
     def run(self, seconds: float) -> None:
         """Run for this simulated time, s, or to the first violation."""
