@@ -206,8 +206,14 @@ class CellSession:
         others = [other.placed(other.joints) for other in self.arms if other is not arm]
         bounds, goals = arm.commander.bounds, []
         for _ in range(_GOALS):
-            ends = zip(arm.session.near(0.8), bounds.low, bounds.high, strict=True)
-            goals.append([max(low, min(high, q)) for q, low, high in ends])
+            goal, here = arm.session.near(self.random.choice((0.8, 2.0))), arm.session.commanded
+            if self.random.random() < 0.5:
+                # One joint alone is guarded least early.
+                moved = self.random.randrange(min(3, len(goal)))
+                goal = [
+                    q if joint == moved else before for joint, (q, before) in enumerate(zip(goal, here, strict=True))
+                ]
+            goals.append([max(a, min(b, q)) for q, a, b in zip(goal, bounds.low, bounds.high, strict=True)])
         return min(goals, key=lambda q: min(apart(arm.placed(q), bodies) for bodies in others))
 
     def towards(self, arm: Arm) -> list[float]:
@@ -299,17 +305,21 @@ class CellSession:
 
     def _limit_near_partner(self) -> None:
         """Lower an acceleration limit while the arms approach, or allow all of it again."""
-        arm = self.random.choice(self.live)
-        if self.random.random() < 0.2:
+        for arm in self.live:
             arm.commander.set_limits(Values.configured(arm.commander.simulation.config))
+        if self.random.random() < 0.2:
             return
         self._approach()
-        room = self.cell.clearance + self.random.uniform(0.02, 0.2)
-        for _ in range(20):
-            arm.session.seconds(0.02, 0.05)
-            if arm.state is not State.MOVING or self.distance() < room:
-                break
-        self._lower_acceleration(arm)
+        arm = self.random.choice(self.live)
+        arm.session.seconds(0.1, 0.3)
+        moving = [arm for arm in self.live if arm.state is State.MOVING]
+        if moving:
+            arm = self.random.choice(moving)
+            room = self.cell.clearance + self.random.uniform(0.05, 0.6)
+            while arm.state is State.MOVING and self.distance() > room and not self.violated:
+                arm.session.seconds(0.01, 0.03)
+            self._lower_acceleration(arm)
+            arm.session.seconds(0.2, 1.0)
 
     def _press(self) -> None:
         """Press the emergency stop of an arm while others move, and mostly reset the others before it is released."""
