@@ -26,7 +26,10 @@ PERIOD_US = 2000.0
 def an_arm() -> tuple[ArmConfig, SegmentConfig]:
     """Return the shipped arm and its slaves."""
     config = load(default_config())
-    config = replace(config, cycle=replace(config.cycle, period_us=PERIOD_US))
+    # The same time without answers is a fault.
+    lost = round(config.bus.lost_cycles * config.cycle.period_us / PERIOD_US)
+    cycle, bus = replace(config.cycle, period_us=PERIOD_US), replace(config.bus, lost_cycles=lost)
+    config = replace(config, cycle=cycle, bus=bus)
     return config, load_segment(config.source.parent / config.bus.segment)
 
 
