@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from rtcp.ipc.states import State
 from rtcp.processes.rod import Form, Kinetics, Rod, release, sample_equilibrium, set_fraction
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.heat_balance import ThermalProperties
 from rtcp.processes.shape_setting.interlocks import Mode, Row
 from rtcp.processes.shape_setting.messages import ArmHeater, HeaterState, StartHeating
 from rtcp.processes.shape_setting.profile import HeatProfile, Limits, heat_command, read_profile
@@ -228,6 +229,7 @@ def profile_of(rod: HeatedRod, factor: float, condition: Condition, wrong: Rando
     return HeatProfile(
         Alloy(alloy.resistivity_austenite, alpha, condition.alpha),
         ColdEnds(rod.length, length, condition.ends),
+        thermal_properties(rod),
         target_c=TARGET_C,
         hold_s=_HOLD_S,
         ramp_k_s=_RAMP_K_S,
@@ -236,6 +238,14 @@ def profile_of(rod: HeatedRod, factor: float, condition: Condition, wrong: Rando
         chuck_c=_ROOM_C,
         limits=Limits(current=300.0, power=5000.0),
     )
+
+
+def thermal_properties(rod: HeatedRod) -> ThermalProperties:
+    """Return heat capacity and losses of a rod, by truth; the convection is that of the target."""
+    alloy, rise = rod.alloy, TARGET_C - _ROOM_C
+    at_target = float(convection(np.array([TARGET_C]), _ROOM_C, rod.diameter)[0])
+    at_500_k = at_target * (500.0 / rise) ** 0.2
+    return ThermalProperties(rod.diameter, alloy.density * alloy.specific_heat, at_500_k, alloy.emissivity, 0.06)
 
 
 def steady_factor(rod: HeatedRod) -> float:

@@ -102,6 +102,10 @@ class CircuitData:
     """V."""
     current_offset: float = 0.0
     """A."""
+    voltage_gain: float = 1.0
+    """Reading of u by its true value."""
+    current_gain: float = 1.0
+    """Reading of i by its true value."""
     monitor_voltage: float = 5.0
     """Voltage of the insulation monitor between the floating circuit and the robot frame, V."""
     monitor_resistance: float = 100e3
@@ -244,11 +248,12 @@ class Circuit:
         alternating = self.sampling is Sampling.ALTERNATING
         if not alternating or self._steps % 2:
             voltage = 0.0 if CircuitFault.SENSE_WIRE_BROKEN in faults else self.voltage
-            voltage += data.voltage_offset + (_VOLTAGE_FAULT if CircuitFault.VOLTAGE_OFFSET in faults else 0.0)
+            voltage = voltage * data.voltage_gain + data.voltage_offset
+            voltage += _VOLTAGE_FAULT if CircuitFault.VOLTAGE_OFFSET in faults else 0.0
             self.voltage_count = self._count(voltage / data.voltage_range)
             self.voltage_step = self._steps
         if not alternating or not self._steps % 2:
-            current = self.current + data.current_offset
+            current = data.current_gain * self.current + data.current_offset
             current += _CURRENT_FAULT if CircuitFault.CURRENT_OFFSET in faults else 0.0
             self.current_count = self._count(current / data.current_range)
             self.current_step = self._steps

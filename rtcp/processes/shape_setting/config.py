@@ -28,8 +28,7 @@ _DIGITAL = (
     "gate", "relay", "lamp_green", "lamp_yellow",
 )  # fmt: skip
 _ORDERED = (
-    ("short_resistance", "open_resistance"), ("least_ratio", "greatest_ratio"),
-    ("least_chassis_voltage", "greatest_chassis_voltage"),
+    ("short_resistance", "open_resistance"), ("least_chassis_voltage", "greatest_chassis_voltage"),
 )  # fmt: skip
 _Short = Annotated[float, Gt(0), Le(1)]
 _Cycles = Annotated[int, Ge(1), Le(1000)]
@@ -137,10 +136,11 @@ class ShapeSettingConfig(ProcessConfig):
     """Resistance of an open circuit, ohm; greater than that of any rod."""
     short_resistance: Positive = 0.008
     """Resistance of a short circuit, ohm; smaller than that of any rod."""
-    least_ratio: Positive = 0.9
-    """Least plausible ratio of the resistance to the initial one."""
-    greatest_ratio: Positive = 1.25
-    """Greatest plausible ratio."""
+    temperature_tolerance: Positive = 25.0
+    """The mean temperature by the resistance may be this far outside the temperatures that the power allows, K."""
+    excess_temperature: Positive = 30.0
+    """The greatest temperature that the measured power allows may exceed the target by this, K. After the cooling it
+    may exceed `cool_c` by this."""
     greatest_gradient: Positive = 1.0
     """Greatest plausible change of the ratio, 1/s; full power heats a thin rod by some 0.15 1/s."""
     gradient_s: _Short = 0.005

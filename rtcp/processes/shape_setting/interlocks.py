@@ -42,11 +42,12 @@ class Row(IntEnum):
     OVER_VOLTAGE = 15
     OPEN_CIRCUIT = 16
     SHORT_CIRCUIT = 17
-    IMPLAUSIBLE_RATIO = 18
+    IMPLAUSIBLE_TEMPERATURE = 18
     STEEP_GRADIENT = 19
     INSULATION = 20
     LOST_CYCLE = 21
     STALE_INPUT = 22
+    EXCESS_HEAT = 23
     NONE = 31
     """No row: nothing has ended a heating."""
 
@@ -95,7 +96,12 @@ TABLE: Final = (
     Rule(Row.OVER_VOLTAGE, (_F, _F, _F), "rod or battery have more than `over_voltage`"),
     Rule(Row.OPEN_CIRCUIT, (_I, _F, _F), "the gate is on, and the resistance exceeds `open_resistance`"),
     Rule(Row.SHORT_CIRCUIT, (_I, _F, _F), "the gate is on, and the resistance is below `short_resistance`"),
-    Rule(Row.IMPLAUSIBLE_RATIO, (_I, _F, _F), "the ratio of resistances is outside `least_ratio` to `greatest_ratio`"),
+    Rule(
+        Row.IMPLAUSIBLE_TEMPERATURE,
+        (_I, _F, _F),
+        "the mean temperature by the resistance is outside the temperatures that the measured power allows, by more "
+        "than `temperature_tolerance`",
+    ),
     Rule(
         Row.STEEP_GRADIENT,
         (_I, _F, _F),
@@ -104,6 +110,11 @@ TABLE: Final = (
     Rule(Row.INSULATION, (_M, _M, _M), "the monitor between chucks and robot shows its voltage: they are insulated"),
     Rule(Row.LOST_CYCLE, (_I, _F, _F), "the inputs are missing for `lost_cycles`; the gate is off meanwhile"),
     Rule(Row.STALE_INPUT, (_I, _F, _F), "a slave's counter stands still for `stale_cycles`"),
+    Rule(
+        Row.EXCESS_HEAT,
+        (_I, _F, _F),
+        "by the measured power the middle of the rod may exceed the target by more than `excess_temperature`",
+    ),
 )
 """While the relay is open the column Off decides which rows latch; that of the mode decides whether it may close."""
 OPERATOR: Final = (1 << Row.KEY_DISCREPANCY) - 1

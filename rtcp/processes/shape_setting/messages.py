@@ -75,6 +75,10 @@ class ProfileKey(IntEnum):
     COOL_C = 8
     MAX_CURRENT = 9
     MAX_POWER = 10
+    HEAT_CAPACITY = 11
+    CONVECTED = 12
+    RADIATED = 13
+    TOLERANCE = 14
 
 
 PROFILE_RANGES: Final = MappingProxyType({
@@ -89,6 +93,10 @@ PROFILE_RANGES: Final = MappingProxyType({
     ProfileKey.COOL_C: (20.0, 400.0),
     ProfileKey.MAX_CURRENT: (0.1, 300.0),
     ProfileKey.MAX_POWER: (0.1, 5000.0),
+    ProfileKey.HEAT_CAPACITY: (0.01, 1000.0),
+    ProfileKey.CONVECTED: (0.1, 5000.0),
+    ProfileKey.RADIATED: (0.0, 5000.0),
+    ProfileKey.TOLERANCE: (0.0, 0.3),
 })  # fmt: skip
 """Least and greatest values of a profile's numbers; the configuration narrows target and hold further."""
 
@@ -118,6 +126,14 @@ class SetHeatProfile(Command):
     """Limit of the average current, A."""
     max_power: float
     """Limit of the average power, W."""
+    heat_capacity: float
+    """Heat capacity of the rod between the chucks, J/K."""
+    convected: float
+    """Power that the rod loses by convection if all of it has the target temperature, W."""
+    radiated: float
+    """Power that the rod loses by radiation then, W."""
+    tolerance: float
+    """Relative tolerance of the measured power against heat capacity and losses."""
 
 
 class StartHeating(ProcessCommand):
@@ -214,15 +230,6 @@ class CoolingOutOfRange(Refusal):
     target_c: float
 
 
-class ProfileOutOfRange(Refusal):
-    """the profile cannot be heated to: {target_c:.6g} C in the middle is a ratio of {ratio:.4g}, the limit is
-    {limit:.4g} (greatest_ratio): correct the profile"""
-
-    target_c: float
-    ratio: float
-    limit: float
-
-
 # -- events ------------------------------------------------------------------------------------------------------------
 
 
@@ -316,6 +323,15 @@ class TargetNotReached(ProcessEnded, number=137):
 
     middle_c: float
     longest_s: float
+
+
+class RodHotAgain(Event, number=141):
+    """by the measured power the middle of the rod may have {middle_c:.5g} C after it had cooled to {cool_c:g} C
+    (cool_c): gate and relay are commanded off; do not touch the rod, and disconnect the battery"""
+
+    is_warning = True
+    middle_c: float
+    cool_c: float
 
 
 class ArmedTooLong(ProcessEnded, number=138):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot
+from math import hypot, inf
 from typing import Any, Final
 
 from rtcp.control.part import PartContext
@@ -17,6 +17,7 @@ from rtcp.motion.step_group import Partner
 from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.control import CurrentControl, Ramp
+from rtcp.processes.shape_setting.heat_balance import HeatBalance
 from rtcp.processes.shape_setting.interlocks import Interlocks, Mode, Row, first_row
 from rtcp.processes.shape_setting.resistance import InitialResistance, ResistanceMeter
 from rtcp.processes.shape_setting.supervision import Inputs, Supervision
@@ -58,6 +59,8 @@ _FIELDS: Final = (
     Field("setpoint_middle", "float64", "C", "Setpoint of the temperature in the middle of the rod."),
     Field("mean_temperature", "float64", "C", "Estimate of the mean temperature."),
     Field("middle_temperature", "float64", "C", "Estimate of the temperature in the middle."),
+    Field("least_middle", "float64", "C", "Least temperature in the middle by the measured power."),
+    Field("most_middle", "float64", "C", "Greatest temperature in the middle by the measured power."),
     Field("middle_uncertainty", "float64", "K", "Standard uncertainty of the middle at the target."),
     Field("average_current", "float64", "A", "Exponential average."),
     Field("target_current", "float64", "A", "What the average is held at."),
@@ -90,7 +93,8 @@ class ShapeSetting(Process):
         arms = [setup.partners.get(name) or Partner(0) for name in config.arms]
         self.inputs = Inputs()
         self.interlocks = Interlocks()
-        self.supervision = Supervision(config, period_s, arms)
+        self.balance = HeatBalance()
+        self.supervision = Supervision(config, period_s, arms, self.balance)
         self.meter = ResistanceMeter(period_s, config.short_resistance, config.open_resistance)
         self.initial = InitialResistance()
         self.control = CurrentControl(
@@ -103,6 +107,8 @@ class ShapeSetting(Process):
         self.gate = False
         self.energy = self.uncertainty_k = 0.0
         self._lease = 0
+        self._cooled_c = inf
+        """Temperature to which the middle of the last rod has cooled, C; infinite: the rod is not said to be cold."""
         self._elapsed_s = self._pulse_s = self._hold_s = 0.0
         # A heating before this start is not known here.
         self._since_heat_s = 0.0
@@ -161,15 +167,22 @@ class ShapeSetting(Process):
             return messages.ProfileNumberOutOfRange(
                 messages.ProfileKey.HOLD_S, command.hold_s, 0.0, max(config.longest_s - ramp_s, 0.0)
             )
+        if not command.chuck_c < command.target_c:
+            least, _ = messages.PROFILE_RANGES[messages.ProfileKey.CHUCK_C]
+            return messages.ProfileNumberOutOfRange(
+                messages.ProfileKey.CHUCK_C, command.chuck_c, least, command.target_c
+            )  # fmt: skip
         if not command.initial_c < command.cool_c < command.target_c:
             return messages.CoolingOutOfRange(command.cool_c, command.initial_c, command.target_c)
         scale = RatioScale(
             command.initial_c, command.kelvin_per_ratio, command.chuck_c, command.mean_by_middle
         )  # fmt: skip
-        ratio = scale.ratio_for_middle(command.target_c)
-        if not ratio < config.greatest_ratio:
-            return messages.ProfileOutOfRange(command.target_c, ratio, config.greatest_ratio)
         self._profile, self._scale = command, scale
+        self.balance.set_rod(
+            command.initial_c, command.chuck_c, command.target_c, command.heat_capacity, command.convected,
+            command.radiated, command.tolerance,
+        )  # fmt: skip
+        self.supervision.set_rod(scale, command.target_c)
         return None
 
     def _arm(self) -> Refusal | None:
@@ -200,6 +213,8 @@ class ShapeSetting(Process):
         if self._since_heat_s < self._config.rod_cooling_s:
             return messages.RodStillHot(self._since_heat_s, self._config.rod_cooling_s)
         self.initial.begin()
+        self.balance.begin()
+        self._cooled_c = inf
         self._pulse_s, self._lease = 0.0, lease
         self.state = messages.HeaterState.MEASURING
         return None
@@ -241,6 +256,9 @@ class ShapeSetting(Process):
         self._read()
         self._since_heat_s = 0.0 if self.state in _HOT else self._since_heat_s + self._passed_s
         inputs, interlocks, meter = self.inputs, self.interlocks, self.meter
+        power = inputs.voltage * inputs.current
+        # In the first cycle without inputs the gate is still on.
+        self.balance.update(power if context.good or self.gate else 0.0, self._passed_s)
         meter.update(inputs.voltage, inputs.current, inputs.sample, inputs.gate_sense)
         holds = self.supervision.update(
             inputs, meter, self.initial.value, context, self._lease, interlocks.closed, self.gate
@@ -257,12 +275,20 @@ class ShapeSetting(Process):
         self._pending.clear()
         self.control.measure(inputs.current)
         if context.good and self.state in _BUSY:
-            self.energy += inputs.voltage * inputs.current * self._passed_s
+            self.energy += power * self._passed_s
+        self._watch_cold_rod(context)
         if not interlocks.closed:
             self._rest()
         else:
             self._work(context)
         self._write(context)
+
+    def _watch_cold_rod(self, context: PartContext) -> None:
+        """Report a rod that becomes hot after it was said to be cold."""
+        if self.balance.most_c > self._cooled_c + self._config.excess_temperature:
+            context.report(messages.RodHotAgain(self.balance.most_c, self._cooled_c))
+            self._open()
+            self._since_heat_s, self._cooled_c = 0.0, inf
 
     def _read(self) -> None:
         inputs = self.inputs
@@ -361,12 +387,14 @@ class ShapeSetting(Process):
         middle = self._scale.middle(self.ratio)
         self._hold_s += self._passed_s
         least = min(self._profile.initial_c, self._profile.chuck_c) - _BELOW_K
-        if self.meter.fresh and least <= middle <= self._profile.cool_c:
+        is_cool = self.balance.most_c <= self._profile.cool_c + self._config.excess_temperature
+        if self.meter.fresh and is_cool and least <= middle <= self._profile.cool_c:
             context.report(messages.ShapeSet(middle))
             self._open()
             # The rod is removed now: the next one is measured again.
             self.initial.forget()
             self.state = messages.HeaterState.DONE
+            self._cooled_c = self._profile.cool_c
             self._since_heat_s = self._hold_s
         elif self._hold_s > self._config.longest_cooling_s:
             context.report(messages.CoolingTooLong(middle, self._config.longest_cooling_s))
@@ -411,6 +439,6 @@ class ShapeSetting(Process):
             max(self._config.rod_cooling_s - self._since_heat_s, 0.0),
             meter.resistance, min(meter.age_s, _NO_AGE), initial.value, initial.uncertainty,
             ratio, scale.ratio_for_middle(self.ramp.setpoint_c), self.ramp.setpoint_c,
-            scale.mean(ratio) if ratio else 0.0, scale.middle(ratio) if ratio else 0.0, self.uncertainty_k,
-            control.average, control.target, self.energy,
+            scale.mean(ratio) if ratio else 0.0, scale.middle(ratio) if ratio else 0.0,
+            self.balance.least_c, self.balance.most_c, self.uncertainty_k, control.average, control.target, self.energy,
         )  # fmt: skip

@@ -19,12 +19,15 @@ from rtcp.config.findings import Finding
 from rtcp.config.numbers import NotNegative
 from rtcp.config.validation import Checker, rule
 from rtcp.processes.shape_setting import temperature
+from rtcp.processes.shape_setting.heat_balance import ThermalProperties
 from rtcp.processes.shape_setting.messages import PROFILE_RANGES, ProfileKey, SetHeatProfile
 
 # The ranges that the loop checks again.
 _RANGES = {key: (Ge(least), Le(greatest)) for key, (least, greatest) in PROFILE_RANGES.items()}
 _ROOM, _TARGET, _RAMP = _RANGES[ProfileKey.INITIAL_C], _RANGES[ProfileKey.TARGET_C], _RANGES[ProfileKey.RAMP_K_S]
 _COOL, _CURRENT, _POWER = (_RANGES[key] for key in (ProfileKey.COOL_C, ProfileKey.MAX_CURRENT, ProfileKey.MAX_POWER))
+_SPARE_POWER = 2.0
+"""Greatest ratio of the power limit to the power that the rod needs."""
 _Room = Annotated[float, _ROOM[0], _ROOM[1]]
 
 
@@ -44,6 +47,7 @@ class HeatProfile:
 
     alloy: temperature.Alloy
     ends: temperature.ColdEnds
+    thermal: ThermalProperties
     target_c: Annotated[float, _TARGET[0], _TARGET[1]]
     """Temperature in the middle of the rod, C; Nitinol loses its structure above 600 C."""
     hold_s: NotNegative
@@ -63,15 +67,24 @@ class HeatProfile:
     limits: Limits = field(default_factory=Limits)
 
 
-@rule(HeatProfile, "target_c", "cool_c", "initial_c")
+@rule(HeatProfile, "target_c", "cool_c", "initial_c", "chuck_c")
 def _order(profile: HeatProfile) -> Iterator[Finding]:
-    for key in ("cool_c", "initial_c"):
+    for key in ("cool_c", "initial_c", "chuck_c"):
         if getattr(profile, key) >= profile.target_c:
             wanted = f"less than target_c, {profile.target_c:g}"
             yield Finding((key,), "too_high", found=getattr(profile, key), allowed=wanted)
     if profile.cool_c <= profile.initial_c:
         wanted = f"more than initial_c, {profile.initial_c:g}"
         yield Finding(("cool_c",), "too_low", found=profile.cool_c, allowed=wanted)
+
+
+@rule(HeatProfile, "thermal", "ends", "target_c", "chuck_c", "ramp_k_s", "limits")
+def _power(profile: HeatProfile) -> Iterator[Finding]:
+    thermal, rod = profile.thermal, (profile.ends.length, profile.target_c, profile.chuck_c)
+    needed = thermal.convected(*rod) + thermal.radiated(*rod) + thermal.stored(profile.ends.length) * profile.ramp_k_s
+    if profile.limits.power > _SPARE_POWER * needed:
+        wanted = f"at most {_SPARE_POWER:g} times the {needed:.3g} W that the ramp and the target need"
+        yield Finding(("limits", "power"), "too_high", found=profile.limits.power, allowed=wanted)
 
 
 _FILE = Checker(HeatProfile)
@@ -122,6 +135,7 @@ def temperatures_along(
 def heat_command(profile: HeatProfile) -> SetHeatProfile:
     """Return the command that brings a profile to the loop."""
     scale = temperature.ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
+    thermal, length = profile.thermal, profile.ends.length
     return SetHeatProfile(
         initial_c=scale.initial_c,
         chuck_c=scale.chuck_c,
@@ -134,4 +148,8 @@ def heat_command(profile: HeatProfile) -> SetHeatProfile:
         cool_c=profile.cool_c,
         max_current=profile.limits.current,
         max_power=profile.limits.power,
+        heat_capacity=thermal.stored(length),
+        convected=thermal.convected(length, profile.target_c, profile.chuck_c),
+        radiated=thermal.radiated(length, profile.target_c, profile.chuck_c),
+        tolerance=thermal.tolerance,
     )

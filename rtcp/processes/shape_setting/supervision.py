@@ -8,8 +8,10 @@ from rtcp.control.part import PartContext
 from rtcp.ipc.states import State
 from rtcp.motion.step_group import Partner
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.heat_balance import HeatBalance
 from rtcp.processes.shape_setting.interlocks import TABLE, Mode, Row
 from rtcp.processes.shape_setting.resistance import ResistanceMeter
+from rtcp.processes.shape_setting.temperature import RatioScale
 
 _PLATFORM: Final = frozenset({State.HOLDING, State.MOVING})
 """States with enabled drives: every emergency stop, also a partner's, every fault and `rtcp disable` leave them."""
@@ -81,10 +83,14 @@ class Supervision:
         config: limits and times.
         period_s: the cycle, s.
         arms: the newest records of the arms that have to be engaged.
+        balance: heat balance of the rod.
     """
 
-    def __init__(self, config: ShapeSettingConfig, period_s: float, arms: list[Partner]) -> None:
-        self._config, self._arms = config, arms
+    def __init__(
+        self, config: ShapeSettingConfig, period_s: float, arms: list[Partner], balance: HeatBalance
+    ) -> None:  # fmt: skip
+        self._config, self._arms, self._balance = config, arms, balance
+        self._scale = RatioScale(0.0, 1.0, 0.0, 1.0)
         self._silence_ns = round(config.arm_silence_s * 1e9)
         discrepancy = config.discrepancy_s / period_s
         self._key, self._button, self._circuit = (Steadiness(discrepancy) for _ in range(3))
@@ -109,11 +115,15 @@ class Supervision:
         self.limits[Row.OVER_CURRENT] = config.over_current
         self.limits[Row.OVER_VOLTAGE] = config.over_voltage
         self.limits[Row.OPEN_CIRCUIT], self.limits[Row.SHORT_CIRCUIT] = config.open_resistance, config.short_resistance
-        self.limits[Row.IMPLAUSIBLE_RATIO] = config.greatest_ratio
         self.limits[Row.STEEP_GRADIENT] = config.greatest_gradient
         self.limits[Row.INSULATION] = config.least_chassis_voltage
         self.limits[Row.LOST_CYCLE] = config.lost_cycles - 1
         self.limits[Row.STALE_INPUT] = config.stale_cycles * period_s
+
+    def set_rod(self, scale: RatioScale, target_c: float) -> None:
+        """Set the temperatures by the resistance, and the target, C."""
+        self._scale = scale
+        self.limits[Row.EXCESS_HEAT] = target_c + self._config.excess_temperature
 
     def forget_gradient(self) -> None:
         """Restart the gradient: the circuit was opened."""
@@ -153,6 +163,9 @@ class Supervision:
         if not lease or context.lease_held(lease):
             holds |= 1 << Row.COMMANDER
         holds |= self._judge_arms(context.now_ns)
+        values[Row.EXCESS_HEAT] = self._balance.most_c
+        if self._balance.is_known and not values[Row.EXCESS_HEAT] <= self.limits[Row.EXCESS_HEAT]:
+            holds |= 1 << Row.EXCESS_HEAT
         values[Row.FUSE] = float(inputs.fuse_ok)
         if inputs.fuse_ok:
             holds |= 1 << Row.FUSE
@@ -225,12 +238,16 @@ class Supervision:
             values[Row.SHORT_CIRCUIT], holds = meter.seen, holds | 1 << Row.SHORT_CIRCUIT
         if not meter.fresh:
             return holds
-        if initial:
-            values[Row.IMPLAUSIBLE_RATIO] = ratio = meter.resistance / initial
-            limit = config.least_ratio if ratio < config.least_ratio else config.greatest_ratio
-            self.limits[Row.IMPLAUSIBLE_RATIO] = limit
-            if not config.least_ratio <= ratio <= config.greatest_ratio:
-                holds |= 1 << Row.IMPLAUSIBLE_RATIO
+        if initial and self._balance.is_known:
+            # The mean is below the middle by the cold ends. It is not below in a rod whose ends are not cold yet.
+            scale, balance, tolerance = self._scale, self._balance, config.temperature_tolerance
+            mean = scale.mean(meter.resistance / initial)
+            least = scale.mean_of_middle(balance.least_c) - tolerance
+            most = balance.most_c + tolerance
+            values[Row.IMPLAUSIBLE_TEMPERATURE] = mean
+            self.limits[Row.IMPLAUSIBLE_TEMPERATURE] = least if mean < least else most
+            if not least <= mean <= most:
+                holds |= 1 << Row.IMPLAUSIBLE_TEMPERATURE
         if self._anchor:
             # At once on a step, which is a contact that moves; over `gradient_s` on a slope, above the noise.
             change, limit = meter.resistance / self._anchor - 1.0, config.greatest_gradient

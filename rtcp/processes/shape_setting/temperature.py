@@ -120,8 +120,11 @@ class RatioScale:
 
     def ratio_for_middle(self, celsius: float) -> float:
         """Return the ratio at which the middle has a temperature, C."""
-        mean = self.chuck_c + self.mean_by_middle * (celsius - self.chuck_c)
-        return 1.0 + (mean - self.initial_c) / self.kelvin_per_ratio
+        return 1.0 + (self.mean_of_middle(celsius) - self.initial_c) / self.kelvin_per_ratio
+
+    def mean_of_middle(self, celsius: float) -> float:
+        """Return the mean temperature of a rod whose middle has a temperature, C."""
+        return self.chuck_c + self.mean_by_middle * (celsius - self.chuck_c)
 
 
 def ratio_scale(alloy: Alloy, ends: ColdEnds, initial_c: float, chuck_c: float) -> RatioScale:

@@ -21,7 +21,10 @@ PERIOD_S = 0.0005
 LATENCY = 2
 """Cycles from the gate's command to the conversion that shows it."""
 CONFIG = ShapeSettingConfig("shape_setting", "heater", arms=("left", "right"), relay_close_s=0.005, relay_open_s=0.005)
-PROFILE = messages.SetHeatProfile(20.0, 20.0, 5000.0, 1.0, 5.0, 500.0, 200.0, 0.2, 400.0, 50.0, 1000.0)
+PROFILE = messages.SetHeatProfile(
+    20.0, 20.0, 5000.0, 1.0, 5.0, 500.0, 200.0, 0.2, 400.0, 50.0, 1000.0,
+    heat_capacity=0.75, convected=24.0, radiated=0.0, tolerance=0.03,
+)  # fmt: skip
 CONFIRMED = messages.MeasureResistance(True, messages.RodPhase.AUSTENITE)
 LEASE = 7
 
@@ -147,7 +150,9 @@ class Rig:
         self.arm(mode)
         assert self.send(CONFIRMED) is None
         self.until(messages.HeaterState.ARMED)
-        assert self.send(replace(PROFILE, **profile)) is None
+        target_c = profile.get("target_c", PROFILE.target_c)
+        properties = {"heat_capacity": self.capacity, "convected": self.loss * (target_c - 20.0)} | profile
+        assert self.send(replace(PROFILE, **properties)) is None
         assert self.send(messages.StartHeating()) is None
         self.until(state)
         for _ in range(200):

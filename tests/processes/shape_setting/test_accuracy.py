@@ -33,7 +33,8 @@ def test_an_exact_calibration_holds_the_middle_within_gilbert_and_websters_error
 
 
 def test_a_slope_that_is_wrong_shows_in_the_middle() -> None:
-    series = run_rods([replace(EXACT, alpha=0.1)], range(2), 1)[EXACT.name]
+    # Of this rod the slope is too small by 8 %: the middle is too cold, so no interlock ends the heat.
+    series = run_rods([replace(EXACT, alpha=0.05)], [2], 1)[EXACT.name]
     assert max(series.steady) > 10.0
 
 

@@ -39,7 +39,7 @@ def permitted(mode: Mode, is_true: dict[str, npt.NDArray[np.bool_]]) -> npt.NDAr
         is_true["over_current"] | is_true["over_voltage"] | is_true["open_circuit"] | is_true["short_circuit"]
         | ~is_true["insulation"] | is_true["relay_feedback"] | is_true["gate_feedback"] | ~is_true["fuse"]
     )  # fmt: skip
-    measured = is_true["implausible_ratio"] | is_true["steep_gradient"]
+    measured = is_true["implausible_temperature"] | is_true["excess_heat"] | is_true["steep_gradient"]
     supervised = is_true["lost_cycle"] | is_true["stale_input"]
     platform = is_true["platform"] & is_true["commander"]
     key = is_true["key"] & ~is_true["key_discrepancy"]

@@ -71,7 +71,7 @@ def test_a_mistake_is_named_with_file_and_line(tmp_path: Path, old: str, new: st
 def test_a_mistake_of_the_profile_has_its_line_there(tmp_path: Path) -> None:
     (finding,) = mistakes(tmp_path, "target_c: 510", "target_c: hot", "nitinol.yaml")
     assert finding.file == tmp_path / "jobs" / "nitinol.yaml"
-    assert summary(finding, "10 ") == "10 target_c: type"
+    assert summary(finding, "16 ") == "16 target_c: type"
 
 
 def test_all_mistakes_come_at_once(tmp_path: Path) -> None:

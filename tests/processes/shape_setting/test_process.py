@@ -263,7 +263,8 @@ def test_pulses_wait_for_the_relay() -> None:
         ("kelvin_per_ratio", 0.0), ("max_current", -1.0), ("max_current", 301.0), ("max_power", 1e-300),
         ("hold_s", -1.0), ("hold_s", CONFIG.longest_s + 1.0), ("initial_c", -4000.0), ("chuck_c", 1e308),
         ("cool_c", 401.0), ("mean_by_middle", 1.5), ("mean_by_middle", 1e-300), ("ramp_k_s", 1e308),
-        ("uncertainty_k", -1.0),
+        ("uncertainty_k", -1.0), ("heat_capacity", 0.0), ("convected", math.nan), ("radiated", -1.0),
+        ("tolerance", 0.4),
     ],
 )  # fmt: skip
 def test_a_number_of_a_profile_out_of_range_is_refused_by_its_name(key: str, value: float) -> None:
@@ -271,6 +272,11 @@ def test_a_number_of_a_profile_out_of_range_is_refused_by_its_name(key: str, val
     assert isinstance(refusal, messages.ProfileNumberOutOfRange)
     assert refusal.quantity.name.lower() == key
     assert not refusal.least <= refusal.value <= refusal.greatest
+
+
+def test_chucks_as_hot_as_the_target_are_refused() -> None:
+    refusal = refused(Rig(), replace(PROFILE, chuck_c=150.0, target_c=150.0, cool_c=100.0))
+    assert refusal == messages.ProfileNumberOutOfRange(messages.ProfileKey.CHUCK_C, 150.0, -20.0, 150.0)
 
 
 def test_a_heater_may_narrow_the_target() -> None:
@@ -281,10 +287,6 @@ def test_a_heater_may_narrow_the_target() -> None:
 @pytest.mark.parametrize("wrong", [{"cool_c": 20.0}, {"target_c": 400.0}, {"initial_c": 200.0, "cool_c": 100.0}])
 def test_a_profile_cools_to_between_its_initial_temperature_and_its_target(wrong: dict[str, float]) -> None:
     assert isinstance(refused(Rig(), replace(PROFILE, **wrong)), messages.CoolingOutOfRange)
-
-
-def test_a_profile_beyond_the_plausible_ratio_is_refused() -> None:
-    assert isinstance(refused(Rig(), replace(PROFILE, kelvin_per_ratio=500.0)), messages.ProfileOutOfRange)
 
 
 def test_the_ranges_are_those_of_all_numbers_of_a_profile() -> None:
@@ -357,6 +359,10 @@ def fault_platform(rig: Rig) -> None:
     rig.context.state = State.FAULT
 
 
+def put_in_energy(rig: Rig) -> None:
+    rig.heater.balance.most_k = rig.heater.balance.least_k = 520.0
+
+
 def freeze(key: str) -> Cause:
     return lambda rig: rig.forced.update({key: rig.get(key)})
 
@@ -387,7 +393,8 @@ CAUSES: list[tuple[Row, Mode, int, Cause]] = [
     (Row.OVER_VOLTAGE, Mode.AUTO, 1, force(battery_voltage=16.0)),
     (Row.OPEN_CIRCUIT, Mode.AUTO, 1, force(gate_sense=1, current=0.0, voltage=12.0)),
     (Row.SHORT_CIRCUIT, Mode.AUTO, 1, force(gate_sense=1, current=200.0, voltage=0.1)),
-    (Row.IMPLAUSIBLE_RATIO, Mode.AUTO, 1, force(gate_sense=1, current=12.0, voltage=12.0)),
+    (Row.IMPLAUSIBLE_TEMPERATURE, Mode.AUTO, 1, force(gate_sense=1, current=12.0, voltage=12.0)),
+    (Row.EXCESS_HEAT, Mode.AUTO, 1, put_in_energy),
     (Row.INSULATION, Mode.AUTO, 1, force(chassis_voltage=0.0)),
     (Row.INSULATION, Mode.AUTO, 1, force(chassis_voltage=-5.0)),
     (Row.INSULATION, Mode.AUTO, 1, force(chassis_voltage=12.0)),
@@ -433,7 +440,7 @@ def test_a_step_of_the_resistance_is_too_steep_at_once() -> None:
         rig.cycle()
     rig.forced.update(gate_sense=1.0, current=30.0, voltage=30.0 * rig.heater.meter.resistance * 1.02)
     rig.cycle()
-    assert rig.heater.interlocks.cause is Row.STEEP_GRADIENT
+    assert rig.heater.interlocks.latched & 1 << Row.STEEP_GRADIENT
     assert not rig.gate
     assert not rig.relay
 
@@ -491,7 +498,7 @@ def test_a_ratio_that_falls_in_a_pause_faster_than_a_rod_cools_is_too_steep() ->
     assert rig.relay
     rig.initial *= 0.88
     rig.cycle(1100)
-    assert rig.heater.interlocks.cause is Row.STEEP_GRADIENT
+    assert rig.heater.interlocks.latched & 1 << Row.STEEP_GRADIENT
     assert not rig.relay
 
 

@@ -39,12 +39,14 @@ def test_the_example_is_a_profile_that_the_heater_takes() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("target_c: 510", "target_c: 5100", "10 target_c: range"),
-        ("cool_c: 80 ", "cool_c: 520", "13 cool_c: range"),
-        ("cool_c: 80\n", "cool_c: 21\n", "13 cool_c: too_low"),
+        ("target_c: 510", "target_c: 5100", "16 target_c: range"),
+        ("cool_c: 80 ", "cool_c: 520", "19 cool_c: range"),
+        ("cool_c: 80\n", "cool_c: 21\n", "19 cool_c: too_low"),
         ("alpha: 1.78e-10", "alpha: 2e-4", "4 alloy.alpha: range"),
-        ("hold_s: 120", "hold: 120", "11 hold: unknown"),
+        ("hold_s: 120", "hold: 120", "17 hold: unknown"),
         ("length: 0.3 ", "length: 300 ", "7 ends.length: range"),
+        ("power: 55 ", "power: 150 ", "24 limits.power: too_high"),
+        ("tolerance: 0.06 ", "tolerance: 0.6 ", "15 thermal.tolerance: range"),
     ],
 )
 def test_a_mistake_is_named_with_its_line(tmp_path: Path, old: str, new: str, expected: str) -> None:

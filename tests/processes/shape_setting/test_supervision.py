@@ -10,9 +10,11 @@ import pytest
 from rtcp.ipc.states import State
 from rtcp.motion.step_group import Partner
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.heat_balance import HeatBalance
 from rtcp.processes.shape_setting.interlocks import Row
 from rtcp.processes.shape_setting.resistance import ResistanceMeter
 from rtcp.processes.shape_setting.supervision import Inputs, Supervision
+from rtcp.processes.shape_setting.temperature import RatioScale
 from tests.processes.shape_setting.rig import LEASE, PERIOD_S, Context
 from tests.processes.shape_setting.test_interlocks import FAULT_FREE
 
@@ -30,7 +32,8 @@ class Cycles:
         self.arms = [Partner(6), Partner(6)]
         for arm in self.arms:
             arm.state, arm.motion_allowed = State.HOLDING, True
-        self.supervision = Supervision(CONFIG, PERIOD_S, self.arms)
+        self.balance = HeatBalance()
+        self.supervision = Supervision(CONFIG, PERIOD_S, self.arms, self.balance)
         self.inputs, self.context = Inputs(), Context()
         self.meter = ResistanceMeter(PERIOD_S, CONFIG.short_resistance, CONFIG.open_resistance)
         self.lease, self.relay, self.gate, self.initial = LEASE, False, False, INITIAL
@@ -253,16 +256,45 @@ def test_an_open_and_a_short_circuit_show_the_resistance(resistance: float, row:
     assert cycles.shown(row) == (pytest.approx(resistance), limit)
 
 
+def heat(cycles: Cycles, least_k: float, most_k: float) -> None:
+    """Let the power allow these rises in the middle of a rod of 20 C, whose mean rises by 0.9 of its middle."""
+    cycles.balance.set_rod(20.0, 20.0, 500.0, 0.75, 24.0, 0.0, 0.05)
+    cycles.balance.least_k, cycles.balance.most_k = least_k, most_k
+    cycles.supervision.set_rod(RatioScale(20.0, 5000.0, 20.0, 0.9), 500.0)
+
+
 @pytest.mark.parametrize(
-    ("ratio", "limit", "is_fault"), [(0.89, 0.9, True), (0.91, 1.25, False), (1.24, 1.25, False), (1.26, 1.25, True)]
+    ("mean", "limit", "is_fault"), [(254, 255, True), (256, 365, False), (364, 365, False), (366, 365, True)]
 )
-def test_a_ratio_outside_its_range_is_implausible(ratio: float, limit: float, is_fault: bool) -> None:
+def test_a_mean_temperature_that_the_power_does_not_allow_is_implausible(
+    mean: float, limit: float, is_fault: bool
+) -> None:
     cycles = Cycles()
-    assert cycles.measure(ratio * INITIAL) == (FAULT_FREE | 1 << Row.IMPLAUSIBLE_RATIO if is_fault else FAULT_FREE)
-    assert cycles.shown(Row.IMPLAUSIBLE_RATIO) == (pytest.approx(ratio), limit)
+    heat(cycles, 260.0 / 0.9, 320.0)
+    resistance = INITIAL * (1.0 + (mean - 20.0) / 5000.0)
+    fault = FAULT_FREE | 1 << Row.IMPLAUSIBLE_TEMPERATURE
+    assert cycles.measure(resistance) == (fault if is_fault else FAULT_FREE)
+    assert cycles.shown(Row.IMPLAUSIBLE_TEMPERATURE) == (pytest.approx(mean), pytest.approx(limit))
     cycles = Cycles()
+    heat(cycles, 290.0, 320.0)
     cycles.initial = 0.0
-    assert cycles.measure(ratio * INITIAL) == FAULT_FREE
+    assert cycles.measure(resistance) == FAULT_FREE
+
+
+def test_without_a_profile_no_temperature_is_implausible() -> None:
+    assert Cycles().measure(2.0 * INITIAL) == FAULT_FREE
+
+
+@pytest.mark.parametrize("good", [True, False])
+def test_a_power_that_may_heat_the_middle_far_above_its_target_is_excess_heat(good: bool) -> None:
+    cycles = Cycles()
+    cycles.cycle()
+    heat(cycles, 400.0, 509.9)
+    cycles.context.good = good
+    assert cycles.cycle() == FAULT_FREE
+    heat(cycles, 400.0, 510.1)
+    assert cycles.cycle() == FAULT_FREE | 1 << Row.EXCESS_HEAT
+    assert cycles.shown(Row.EXCESS_HEAT) == (pytest.approx(530.1), 530.0)
 
 
 def test_a_step_of_the_resistance_is_steep_at_once_and_a_slope_over_its_time() -> None:

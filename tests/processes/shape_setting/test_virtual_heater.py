@@ -19,7 +19,7 @@ from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.interlocks import TABLE, Mode, Row, Rule
 from rtcp.processes.shape_setting.process import ShapeSetting
-from rtcp.processes.shape_setting.profile import HeatProfile, heat_command, read_profile
+from rtcp.processes.shape_setting.profile import HeatProfile, Limits, heat_command, read_profile
 from rtcp.testing.simulation import Simulation
 from rtcp.virtual.heated_rod import HeatedRod
 from rtcp.virtual.heater_circuit import CircuitFault
@@ -32,7 +32,8 @@ KEY_OFF, CIRCUIT_OPEN, ONE_CHANNEL = 0x30, 0x01, 0x11
 
 def short_profile() -> HeatProfile:
     profile = read_profile(ROOT / "config" / "shape_setting" / "nitinol.yaml")
-    return replace(profile, hold_s=0.3, ramp_k_s=300.0, initial_c=20.0, chuck_c=20.0, cool_c=400.0)
+    limits = Limits(current=20.0, power=150.0)
+    return replace(profile, hold_s=0.3, ramp_k_s=300.0, initial_c=20.0, chuck_c=20.0, cool_c=400.0, limits=limits)
 
 
 class Platform(Simulation):
@@ -157,6 +158,10 @@ def overcharge(platform: Platform) -> None:
     circuit.data = replace(circuit.data, open_voltage=16.5)
 
 
+def put_in_energy(platform: Platform) -> None:
+    platform.process.balance.most_k = 600.0
+
+
 def change_rod(platform: Platform) -> None:
     rod = platform.control.rod
     platform.control.rod = HeatedRod(rod.alloy, diameter=0.85 * rod.diameter, length=rod.length)
@@ -187,17 +192,20 @@ CAUSES: list[tuple[Row, Mode, str, Cause]] = [
     (Row.OVER_VOLTAGE, Mode.AUTO, "battery of too high a voltage", overcharge),
     (Row.OPEN_CIRCUIT, Mode.AUTO, "power wire broken", defect(CircuitFault.POWER_WIRE_BROKEN)),
     (Row.SHORT_CIRCUIT, Mode.AUTO, "sense wire broken", defect(CircuitFault.SENSE_WIRE_BROKEN)),
-    (Row.IMPLAUSIBLE_RATIO, Mode.AUTO, "another rod", change_rod),
+    (Row.IMPLAUSIBLE_TEMPERATURE, Mode.AUTO, "another rod", change_rod),
     (Row.STEEP_GRADIENT, Mode.AUTO, "current with an offset", defect(CircuitFault.CURRENT_OFFSET)),
     (Row.INSULATION, Mode.AUTO, "insulation broken", defect(CircuitFault.INSULATION_BROKEN)),
     (Row.LOST_CYCLE, Mode.AUTO, "an answer lost", lose_answers(1)),
     (Row.STALE_INPUT, Mode.AUTO, "box hangs", freeze(ShapeSetterBox)),
     (Row.STALE_INPUT, Mode.AUTO, "meter hangs", freeze(ShapeSetterMeter)),
+    (Row.EXCESS_HEAT, Mode.AUTO, "more energy than the rod can have lost", put_in_energy),
 ]
 ENDED_BEFORE = {
     Row.KEY_DISCREPANCY: Row.KEY,
     Row.BUTTON_DISCREPANCY: Row.BUTTON,
     Row.CIRCUIT_DISCREPANCY: Row.ROBOT_CIRCUIT,
+    # A reading that jumps is also a temperature that the power does not allow: the first row is named.
+    Row.STEEP_GRADIENT: Row.IMPLAUSIBLE_TEMPERATURE,
     # A platform in fault has called `safe` already.
     Row.PLATFORM: Row.NONE,
 }
