@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shlex
@@ -26,20 +27,26 @@ from rtcp.cli.output import (
 )
 from rtcp.cli.platform import launch, refuse_second_platform
 from rtcp.config.model import VIRTUAL
+from rtcp.ipc.states import State
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from rtcp.config.cell import CellConfig
     from rtcp.config.model import ArmConfig
     from rtcp.config.segment import SegmentConfig
     from rtcp.telemetry.soak import Summary
     from rtcp.testing.sessions.cluster import SessionSummary
-    from rtcp.testing.sessions.session import Result
+    from rtcp.testing.sessions.coverage import Coverage
+    from rtcp.testing.sessions.session import Result, Segment
 
 LONGEST_MIN = 10_080.0
 LONGEST_SESSION_S = 3600.0
 MOST_SESSIONS = 1_000_000_000
 SHOWN_WORKERS = 10
+COVERED_SESSIONS = 2000
+"""Sessions from which on an empty row of the coverage table is an error."""
+SHOWN_ROWS = 20
 LARGEST_SEED = 2**63 - 1 - MOST_SESSIONS
 
 commands = typer.Typer()
@@ -65,6 +72,12 @@ def _soak(
     keep: Annotated[
         Path | None, option("--keep", "FILE", "Run one session here and write its black box (.mcap).")
     ] = None,
+    coverage_from: Annotated[
+        int | None,
+        option(
+            "--coverage-from", "N", "Sessions from which on an empty row of the coverage table fails. Default: 2000."
+        ),
+    ] = None,
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -76,11 +89,12 @@ def _soak(
     if not 0 <= seed <= LARGEST_SEED:
         raise CommandError(f"--seed {seed} is not allowed: 0 to {LARGEST_SEED}")
     only_simulated = {"--sessions": sessions, "--seconds": seconds, "--scheduler": scheduler, "--out": out,
-                      "--keep": keep}  # fmt: skip
+                      "--keep": keep, "--coverage-from": coverage_from}  # fmt: skip
     if simulated:
         if minutes is not None:
             raise CommandError("--minutes has no meaning with --simulated: give --sessions and --seconds")
-        _run_sessions(config, seed, sessions, seconds, scheduler, out, keep, as_json)
+        covered = COVERED_SESSIONS if coverage_from is None else coverage_from
+        _run_sessions(config, seed, sessions, seconds, scheduler, out, keep, covered, as_json)
         return
     for name, value in only_simulated.items():
         if value is not None:
@@ -167,13 +181,16 @@ def _run_sessions(
     scheduler: str | None,
     out: Path | None,
     keep: Path | None,
+    covered: int,
     as_json: bool,
 ) -> None:
     count = sessions if sessions is not None else 1 if keep is not None else 1000
     if not 1 <= count <= MOST_SESSIONS:
         raise CommandError(f"--sessions {count} is not allowed: 1 to {MOST_SESSIONS}")
+    if covered < 1:
+        raise CommandError(f"--coverage-from {covered} is not allowed: at least 1")
     positive("--seconds", seconds, "s", LONGEST_SESSION_S)
-    arm, segment = _simulated_arm(config)
+    arm, segment = _simulated(config)
     duration = 2.0 if seconds is None else seconds
     if keep is not None:
         if count != 1 or scheduler is not None or out is not None:
@@ -189,7 +206,8 @@ def _run_sessions(
     ended: CommandError | None = None
     try:
         with signals_raise(), cluster(scheduler) as client, transfer("sessions", count, quiet=as_json) as shown:
-            run = SessionRun(client, plan, Parts(folder, plan), lambda summary: shown(summary.sessions))
+            parts = Parts(folder, plan)
+            run = SessionRun(client, plan, parts, lambda summary: shown(summary.sessions))
             try:
                 run.run()
             except KeyboardInterrupt as interruption:
@@ -199,7 +217,12 @@ def _run_sessions(
                 ended = CommandError(f"{error}; {run.summary.sessions} sessions are known", ExitCode.FAULT)
     except SoakError as error:
         raise CommandError(str(error)) from error
-    _show_sessions(run.summary, folder, config, as_json)
+    rows = _coverage_rows(arm, segment)
+    try:
+        table_file = parts.write_coverage(run.summary.coverage, rows)
+    except SoakError as error:
+        raise CommandError(str(error), ExitCode.FAULT) from error
+    _show_sessions(run.summary, rows, folder, config, as_json)
     if ended is not None:
         raise ended
     _keep_failures(arm, segment, run.summary, folder)
@@ -208,17 +231,35 @@ def _run_sessions(
     if not run.summary.largest_speed:
         message = "no session moved the arm: `rtcp soak --simulated --keep FILE` and `rtcp faults show FILE` show why"
         raise CommandError(message, ExitCode.FAULT)
+    empty = run.summary.coverage.empty(rows)
+    if empty and run.summary.sessions >= covered:
+        shown_rows = "; ".join(empty[:SHOWN_ROWS]) + ("; ..." if len(empty) > SHOWN_ROWS else "")
+        message = (
+            f"{len(empty)} rows of the coverage table are empty after {run.summary.sessions} sessions ({table_file}): "
+        )
+        raise CommandError(message + shown_rows, ExitCode.FAULT)
 
 
-def _simulated_arm(config: Path | None) -> tuple[ArmConfig, SegmentConfig]:
-    """Load the arm and its segment; raises CommandError where its frames cannot be read."""
+def _simulated(config: Path | None) -> tuple[ArmConfig | CellConfig, Segment]:
+    """Load the arm, or the cell, and its segments; raises CommandError where their frames cannot be read."""
+    from rtcp.config.cell_file import is_cell_file, load_cell
+    from rtcp.config.find import find_config
+    from rtcp.config.loader import load
+
+    path = find_config(config)
+    if not is_cell_file(path):
+        arm = load(path)
+        return arm, _segment_of(arm)
+    cell = load_cell(path)
+    return cell, {member.name: _segment_of(member.config) for member in cell.arms}
+
+
+def _segment_of(arm: ArmConfig) -> SegmentConfig:
     from rtcp.config.segment import load_segment
     from rtcp.fieldbus.errors import BusError
-    from rtcp.launch.offline import configuration
     from rtcp.testing import Simulation
     from rtcp.testing.sessions.checker import reading_of
 
-    arm = configuration(config)
     try:
         reading_of(arm)
     except ValueError as error:
@@ -228,10 +269,25 @@ def _simulated_arm(config: Path | None) -> tuple[ArmConfig, SegmentConfig]:
         Simulation(arm, segment=segment).close()
     except BusError as error:
         raise CommandError(str(error)) from error
-    return arm, segment
+    return segment
 
 
-def _replay(arm: ArmConfig, segment: SegmentConfig, seed: int, seconds: float, file: Path, as_json: bool) -> None:
+def _coverage_rows(arm: ArmConfig | CellConfig, segment: Segment) -> Coverage:
+    """Return the rows that the sessions have to fill: none in a cell, whose sessions are about its arms together."""
+    from rtcp.config.model import ArmConfig
+    from rtcp.config.segment import SegmentConfig
+    from rtcp.testing import Simulation
+    from rtcp.testing.sessions.coverage import Coverage, rows_of
+
+    if not (isinstance(arm, ArmConfig) and isinstance(segment, SegmentConfig)):
+        return Coverage()
+    with contextlib.closing(Simulation(arm, segment=segment)) as simulation:
+        return rows_of(simulation)
+
+
+def _replay(
+    arm: ArmConfig | CellConfig, segment: Segment, seed: int, seconds: float, file: Path, as_json: bool
+) -> None:
     from rtcp.ipc.recording import RecordingError
     from rtcp.testing.sessions.black_box import replay
 
@@ -248,7 +304,7 @@ def _replay(arm: ArmConfig, segment: SegmentConfig, seed: int, seconds: float, f
         raise typer.Exit(ExitCode.FAULT)
 
 
-def _keep_failures(arm: ArmConfig, segment: SegmentConfig, summary: SessionSummary, folder: Path) -> None:
+def _keep_failures(arm: ArmConfig | CellConfig, segment: Segment, summary: SessionSummary, folder: Path) -> None:
     """Run the first failed sessions again in this process and write their black boxes."""
     from rtcp.ipc.recording import RecordingError
     from rtcp.testing.sessions.black_box import replay
@@ -273,12 +329,31 @@ def _outcome(result: Result) -> str:
     return f"{result.outcome.replace('_', ' ')} {result.violation}".rstrip()
 
 
-def _show_sessions(summary: SessionSummary, folder: Path, config: Path | None, as_json: bool) -> None:
+def _show_coverage(coverage: Coverage, rows: Coverage) -> None:
+    """Show how often each command was sent in each state, and each event and refusal; the modes are summed."""
+    from rtcp.testing.sessions.coverage import by_state
+
+    counts = by_state(coverage)
+    states = [state for state in State if any(state in row for row in counts.values())]
+    shown = table(("command", *(state.words for state in states)), ("command",), title="commands sent, by state")
+    for command, row in counts.items():
+        shown.add_row(command, *(str(row.get(state, 0)) for state in states))
+    show(shown)
+    for title, found, wanted in (
+        ("events", coverage.events, rows.events), ("refusals", coverage.refusals, rows.refusals)
+    ):  # fmt: skip
+        names = sorted({*found, *wanted})
+        report(f"\n{title}: " + ", ".join(f"{name.replace('_', ' ')} {found[name]}" for name in names))
+
+
+def _show_sessions(
+    summary: SessionSummary, rows_wanted: Coverage, folder: Path, config: Path | None, as_json: bool
+) -> None:
     option = "" if config is None else f" --config {shlex.quote(str(config))}"
     repeat = f"rtcp soak --simulated{option} --seconds {summary.seconds:g}"
     failures = [
         {
-            **dataclasses.asdict(result),
+            **{name: value for name, value in dataclasses.asdict(result).items() if name != "coverage"},
             "black_box": "" if result.outcome == "worker_died" else str(_black_box(folder, result)),
             "replay": f"{repeat} --seed {result.seed} --keep seed-{result.seed}.mcap",
         }
@@ -286,8 +361,14 @@ def _show_sessions(summary: SessionSummary, folder: Path, config: Path | None, a
     ]
     if as_json:
         shown = dataclasses.asdict(summary)
-        emit_json({**shown, "sessions": summary.sessions, "results": str(folder), "failures": failures})
+        counts = {**summary.coverage.as_dict(), "empty": summary.coverage.empty(rows_wanted)}
+        emit_json(
+            {
+                **shown, "sessions": summary.sessions, "results": str(folder), "coverage": counts, "failures": failures
+            }
+        )  # fmt: skip
         return
+    _show_coverage(summary.coverage, rows_wanted)
     rows = table(("outcome", "sessions"), ("outcome",))
     for outcome, count in sorted(summary.outcomes.items()):
         rows.add_row(outcome.replace("_", " "), str(count))

@@ -39,6 +39,16 @@ def _names(cell: _CellFile) -> Iterator[Finding]:
 _CELL = Checker(_CellFile)
 
 
+def is_cell_file(path: Path) -> bool:
+    """Return whether a file is that of a cell: it lists arms.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    data = read(path).data
+    return isinstance(data, dict) and "arms" in data
+
+
 def load_cell(path: Path) -> CellConfig:
     """Read the file of a cell and those of its arms.
 

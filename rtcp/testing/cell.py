@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from rtcp.config.cell import CellConfig
+from rtcp.config.segment import SegmentConfig
 from rtcp.control.partners import Partners
 from rtcp.ipc.commands import Command, Enable
 from rtcp.ipc.observer import Answer
@@ -14,16 +16,22 @@ from rtcp.testing.simulation import Simulation
 
 
 class CellSimulation:
-    """The arms of a cell; `cycle` runs the cycle that is due next.
+    """The arms of a cell; `cycle` runs the cycle that is due next, and a cycle of one arm those that are due before.
 
     Args:
         cell: a cell whose arms are on EtherCAT.
         seed: seed of the buses.
         positions: name of an arm -> positions of its joints at power-on, rad.
+        segments: name of an arm -> its slaves; left out: the configured segment.
     """
 
     def __init__(
-        self, cell: CellConfig, seed: int = 0, *, positions: Mapping[str, Sequence[float]] | None = None
+        self,
+        cell: CellConfig,
+        seed: int = 0,
+        *,
+        positions: Mapping[str, Sequence[float]] | None = None,
+        segments: Mapping[str, SegmentConfig] | None = None,
     ) -> None:
         self.partners = {member.name: Partners(cell, member.name) for member in cell.members}
         with contextlib.ExitStack() as stack:
@@ -31,7 +39,7 @@ class CellSimulation:
                 member.name: stack.enter_context(
                     Simulation(
                         member.config, seed + number, positions=(positions or {}).get(member.name),
-                        partners=self.partners[member.name],
+                        segment=(segments or {}).get(member.name), partners=self.partners[member.name],
                     )
                 )
                 for number, member in enumerate(cell.members)
@@ -42,6 +50,8 @@ class CellSimulation:
             partners.open()
         self.silent: set[str] = set()
         """Names of arms whose loop hangs, so that they have no cycles."""
+        for arm in self.arms.values():
+            arm.before_cycle = partial(self._catch_up, arm)
 
     def __enter__(self) -> CellSimulation:
         return self
@@ -60,6 +70,12 @@ class CellSimulation:
         """Run the cycle that is due next."""
         awake = [arm for name, arm in self.arms.items() if name not in self.silent]
         min(awake, key=lambda arm: arm.due_ns).cycle()
+
+    def _catch_up(self, arm: Simulation) -> None:
+        """Run the cycles of the other arms that are due before that of `arm`."""
+        for name, other in self.arms.items():
+            while other.due_ns < arm.due_ns and name not in self.silent:
+                other.cycle()
 
     def run(self, seconds: float) -> None:
         """Run the cycles of this time, s."""

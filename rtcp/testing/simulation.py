@@ -119,6 +119,8 @@ class Simulation(Closing):
         """Lease of the commands; 0: none."""
         self.on_frame: Callable[[Frame], None] | None = None
         """Called after each cycle."""
+        self.before_cycle: Callable[[], None] | None = None
+        """Called before each cycle."""
 
     def close(self) -> None:
         """Close the blackboard and remove its file; may be called again."""
@@ -155,6 +157,8 @@ class Simulation(Closing):
 
     def cycle(self) -> None:
         """Run one cycle."""
+        if self.before_cycle is not None:
+            self.before_cycle()
         now = self.now_ns = self._planned
         self.bus.advance_to(now)
         if now >= self._poll_at:

@@ -29,6 +29,13 @@ needs_cluster = pytest.mark.skipif(not CLUSTER, reason="needs rtcp[cluster]")
 pytestmark = pytest.mark.timeout(600)
 
 
+def run_batch(plan: Any, seeds: Any) -> Any:
+    """Run a batch as the product does."""
+    from rtcp.testing.sessions import cluster
+
+    return cluster.run_batch(plan, seeds)
+
+
 @pytest.fixture(scope="module")
 def workers(leftovers: Leftovers) -> Iterator[Any]:
     with two_workers(leftovers) as client:
@@ -56,11 +63,13 @@ def soak(rtcp: Callable[..., Any], workers: Any, tmp_path: Path, monkeypatch: py
         (("--sessions", "1000000001"), "--sessions 1000000001 is not allowed: 1 to"),
         (("--seed", "99999999999999999999"), "--seed 99999999999999999999 is not allowed: 0 to"),
         (("--seconds", "nan"), "--seconds nan is not allowed"),
+        (("--coverage-from", "0"), "--coverage-from 0 is not allowed: at least 1"),
         (("--minutes", "2"), "give --sessions and --seconds"),
         (("--keep", "box.mcap", "--sessions", "2"), "--keep runs one session"),
         (("--keep", "/nowhere/box.mcap", "--seconds", "0.1"), "--keep /nowhere/box.mcap: no recording can be written"),
         (("--config", str(default_config().parent / "abb_irb120.yaml")), "for arms of CiA 402 drives: slave joint_1"),
         (("--config", str(default_config().parent / "heater.yaml")), "it has no joints"),
+        (("--config", str(default_config().parent / "cell.yaml")), "for arms of CiA 402 drives: slave joint_1"),
         pytest.param(("--out", "/proc/nowhere"), "/proc/nowhere: results cannot be written there", marks=needs_cluster),
         pytest.param(("--scheduler", "no://x"), "--scheduler no://x: no Dask scheduler answers", marks=needs_cluster),
     ],
@@ -117,9 +126,32 @@ def test_sessions_on_a_local_cluster_end_with_a_table_and_its_files(rtcp: Callab
     assert ended.code == 0, ended.err
     summary = json.loads(ended.out)
     assert (summary["outcomes"], summary["results"]) == ({"passed": 3}, str(out))
-    assert [file.name for file in out.iterdir()] == ["part-000000.parquet"]
+    assert sorted(file.name for file in out.iterdir()) == ["coverage.json", "part-000000.parquet"]
+    coverage = json.loads((out / "coverage.json").read_text())
+    assert coverage == summary["coverage"]
+    assert coverage["events"]["ready"] == 3
+    assert "sent: halt moving joint csp" in coverage["empty"]
     again = rtcp("soak", "--simulated", "--sessions", "3", "--out", str(out))
     assert (again.code, "give another folder" in again.err, again.out) == (2, True, "")
+
+
+@needs_cluster
+def test_the_file_of_a_cell_runs_sessions_of_its_arms_together(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    shutil.copytree(default_config().parent, tmp_path / "config")
+    file, out = tmp_path / "config" / "two.yaml", tmp_path / "results"
+    file.write_text("""
+        name: two
+        arms:
+          - {name: left, config: assistive_arm.yaml}
+          - {name: right, config: assistive_arm.yaml, base: {position: [-1.5, 0, 0], rpy: [0, 0, pi]}}
+        """)
+    soak = ("soak", "--simulated", "--config", str(file), "--seconds", "0.1", "--json")
+    ended = rtcp(*soak, "--sessions", "2", "--out", str(out))
+    assert ended.code == 0, ended.err
+    summary = json.loads(ended.out)
+    assert (summary["outcomes"], summary["coverage"]["empty"]) == ({"passed": 2}, [])
+    assert summary["coverage"]["commands"]
+    assert rtcp(*soak, "--keep", str(tmp_path / "box.mcap")).code == 0
 
 
 @needs_cluster
@@ -130,7 +162,7 @@ def test_a_session_that_ends_its_process_is_not_repeated_in_this_one(soak: Calla
     assert ended.code == 5
     (failure,) = json.loads(ended.out)["failures"]
     assert (failure["seed"], failure["outcome"], failure["black_box"]) == (DEADLY, "worker_died", "")
-    assert [file.name for file in (tmp_path / "results").iterdir()] == ["part-000000.parquet"]
+    assert sorted(file.name for file in (tmp_path / "results").iterdir()) == ["coverage.json", "part-000000.parquet"]
 
 
 @needs_cluster
@@ -148,6 +180,19 @@ def test_a_failed_seed_is_kept_with_its_black_box_and_the_command_that_replays_i
     with narrowed():
         assert rtcp(*replay).code == 5
     assert (tmp_path / replay[-1]).is_file()
+
+
+@needs_cluster
+def test_the_coverage_is_shown_and_rows_that_stay_empty_are_named(soak: Callable[..., Any]) -> None:
+    ended = soak(run_batch, "--sessions", "3", "--seconds", "0.5", "--coverage-from", "4")
+    assert ended.code == 0, ended.err
+    assert "commands sent, by state" in ended.out
+    assert re.search(r"events: .*ready 3", ended.out.replace("\n", " "))
+    again = soak(run_batch, "--sessions", "3", "--seconds", "0.5", "--coverage-from", "3")
+    assert again.code == 5
+    assert re.search(
+        r"\d+ rows of the coverage table are empty after 3 sessions \(\S+coverage.json\): sent: ", again.err
+    )
 
 
 @needs_cluster

@@ -158,3 +158,11 @@ def test_a_velocity_that_is_computed_from_positions_forgets_a_false_position(rig
     for _ in range(40):
         rig.cycle()
         assert rig.arm.state.actual_velocity[0] == about(SPEED, rel=0.05)
+
+
+def test_a_false_torque_is_not_taken_for_the_weight(rig: LoopRig) -> None:
+    rig.hold(CST)
+    before = rig.arm.state.actual_torque[0]
+    falsify(rig, *FALSE["a torque of 40 Nm"])
+    rig.run((CYCLES - 1) * PERIOD_S)
+    assert rig.arm.state.actual_torque[0] == about(before, abs=0.5)

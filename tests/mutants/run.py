@@ -12,9 +12,7 @@ import difflib
 import os
 import random
 import resource
-import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -28,10 +26,10 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
+from tests.copied_tree import ROOT, copy_tree
 from tests.mutants.kinds import Mutant, mutants_of
 from tests.mutants.recording import Recorder, Recording, record_of, statement_at
 
-ROOT = Path(__file__).resolve().parents[2]
 TARGETS = (
     *("rtcp/control", "rtcp/devices", "rtcp/fieldbus/process_data.py", "rtcp/motion/drive_writers.py"),
     *("rtcp/motion/guards", "rtcp/motion/step_group.py", "rtcp/processes/shape_setting", "rtcp/realtime/discipline.py"),
@@ -184,18 +182,6 @@ def _verdict(status: int | None, log: str) -> str:
     return "survived" if status in _PASSED else "killed"
 
 
-def _copy(into: Path) -> None:
-    """Copy what git knows, with what is not committed yet."""
-    listed = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], cwd=ROOT, stdout=-1, check=True
-    )
-    for name in filter(None, listed.stdout.decode().split("\0")):
-        if (ROOT / name).is_file():
-            (into / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, into / name)
-    (into / ".venv").symlink_to((ROOT / ".venv").resolve())
-
-
 def _load() -> None:
     """Load the libraries of the tests, and nothing of this tree."""
     for name in ("hypothesis", "numpy", "pydantic", "ruckig", "scipy.optimize", "typer"):
@@ -214,7 +200,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="rtcp-mutants-") as folder:
         copy, log = Path(folder) / "tree", Path(folder) / "log"
         copy.mkdir()
-        _copy(copy)
+        copy_tree(copy)
         os.chdir(copy)
         sys.path[0] = os.environ["PYTHONPATH"] = str(copy)
         sys.path_importer_cache.clear()

@@ -60,7 +60,7 @@ class Outcome:
 
 def session_of(seed: int) -> Session:
     """Return the session of a seed."""
-    return Session(Random(seed), configuration(), reading(), periods_us=PERIODS_US)
+    return Session(Random(seed), configuration(), reading(), periods_us=PERIODS_US, number=seed)
 
 
 def run_session(seed: int) -> Outcome:

@@ -138,6 +138,14 @@ def test_a_joint_that_still_moves_after_a_stop_is_found(stop: str) -> None:
         assert Kind.NOT_AT_REST in kinds(commander)
 
 
+def test_a_motion_that_is_accepted_without_the_enabling_switch_is_found() -> None:
+    with holding("csp") as commander:
+        commander.environment.permitted = False
+        seconds(commander, 0.2)
+        move(commander, 0.0)
+        assert kinds(commander) == {Kind.NOT_PERMITTED}
+
+
 def test_a_motion_that_is_called_complete_elsewhere_is_found() -> None:
     with holding("csp") as commander:
         move(commander)

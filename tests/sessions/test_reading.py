@@ -18,7 +18,7 @@ from rtcp.ipc.states import State
 from rtcp.testing.sessions import run_session
 from rtcp.testing.sessions.checker import INCONSISTENT_S, Bounds, FrameChecker, Kind, Reading, reading_of
 from rtcp.testing.sessions.commander import Commander
-from rtcp.testing.sessions.session import Session
+from rtcp.testing.sessions.session import AnySession, Session
 from rtcp.testing.simulation import Frame
 from tests.control.test_nine_joints import nine_joints
 from tests.control.test_standard_drives import arm_of
@@ -50,7 +50,7 @@ OTHERS: dict[str, Callable[[Path], Arm]] = {
 def test_sessions_of_other_arms_move_them_and_break_no_limit(name: str, tmp_path: Path) -> None:
     config, segment = OTHERS[name](tmp_path)
 
-    def compare(session: Session, error: Exception | None) -> None:
+    def compare(session: AnySession, error: Exception | None) -> None:
         # The record is a cycle ahead of the frame.
         sent = session.commander.simulation.observer.latest()["sent_position"][0]
         assert session.commander.commanded == pytest.approx(list(sent), abs=2e-3)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rtcp.ipc.commands import Halt, SetControlMode
 from rtcp.ipc.states import ControlMode, State
-from rtcp.testing.sessions.commander import KINDS
+from rtcp.testing.sessions.coverage import PLATFORM_COMMANDS
 from tests.samples import THOROUGH
 from tests.sessions.session import Outcome, run_session, session_of
 
@@ -31,13 +31,14 @@ def test_the_sessions_visit_every_state_and_send_every_command() -> None:
     assert total.failures == []
     assert set(State.__members__) - set(total.states) <= {"OFF", "HOMING"}
     given = set(total.taken) | set(total.refused)
-    assert {command.name for command in KINDS} - given <= {"set_zero", "home"}
+    assert {command.name for command in PLATFORM_COMMANDS} - given <= {"set_zero", "home"}
 
 
 def test_plans_of_a_session_are_taken_and_move_the_arm() -> None:
     session = session_of(3)
     commander = session.commander
     try:
+        commander.start()
         commander.enable()
         for mode, begin in (ControlMode.JOINT, session.trajectory), (ControlMode.CARTESIAN, session.line):
             commander.send(SetControlMode(mode))
@@ -66,6 +67,7 @@ def test_no_frame_of_a_session_that_hypothesis_draws_breaks_a_limit(seed: int, s
     session = session_of(seed)
     commander = session.commander
     try:
+        commander.start()
         commander.enable()
         for action, number in steps:
             session.random.seed(number)

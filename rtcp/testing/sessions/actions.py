@@ -9,7 +9,7 @@ from rtcp.config.model import ControlModeName
 from rtcp.ipc import commands
 from rtcp.ipc.states import DriveMode, JogFrame
 
-NONSENSE = (nan, inf, -inf, 1e300, -1e300, 1e9, -1e9, 0.0)
+NONSENSE = (nan, inf, -inf, 1e308, -1e308, 1e300, -1e300, 1e9, -1e9, 5e-324, -5e-324, 0.0)
 CONTROL_MODES: tuple[ControlModeName, ...] = ("joint", "cartesian", "joystick", "velocity", "torque")
 SHARES = (3, 3, 2, 1, 1)
 """How often each of them is chosen."""

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
-from rtcp.config.segment import SegmentConfig
 from rtcp.ipc.recording import About, FaultRecording, Moment, RecordingError, versions, write_new
 from rtcp.ipc.states import State
 from rtcp.ipc.tool_motion import ToolMotion
-from rtcp.testing.sessions.session import Result, Session, run_session
+from rtcp.testing.sessions.session import AnySession, Result, Segment, run_session
 from rtcp.testing.simulation import NAME
 
 BEFORE_S, AFTER_S = 10.0, 1.0
@@ -20,9 +20,11 @@ BEFORE_S, AFTER_S = 10.0, 1.0
 
 
 def replay(
-    seed: int, config: ArmConfig, seconds: float, file: Path, segment: SegmentConfig | None = None
+    seed: int, config: ArmConfig | CellConfig, seconds: float, file: Path, segment: Segment | None = None
 ) -> tuple[Result, list[str]]:
     """Run the session of a seed alone and write its black box; return its result and what was done in it, in order.
+
+    The black box of a cell is that of the arm with the first violation, or of the first arm.
 
     `rtcp faults show FILE`, `rtcp plot`, `rtcp export` and `rtcp replay` open the file.
 
@@ -31,7 +33,7 @@ def replay(
     """
     done: list[str] = []
 
-    def inspect(session: Session, error: Exception | None) -> None:
+    def inspect(session: AnySession, error: Exception | None) -> None:
         done.extend(map(str, session.commander.log))
         write_new(file, _recording(session, error))
 
@@ -43,7 +45,7 @@ def replay(
     return result, done
 
 
-def _recording(session: Session, error: Exception | None) -> FaultRecording:
+def _recording(session: AnySession, error: Exception | None) -> FaultRecording:
     commander = session.commander
     simulation = commander.simulation
     config, checker = simulation.config, commander.checker

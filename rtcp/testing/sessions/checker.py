@@ -102,6 +102,12 @@ class Kind(str, Enum):
     """The distance of a joint itself from its target when the loop says that the motion is complete, rad."""
     BODY = "body"
     """Depth of a body itself in a keep-out box or another body, or of the tool outside its box, m."""
+    NOT_PERMITTED = "not_permitted"
+    """Time since the release of the enabling switch at which a command that lets something move was accepted, s."""
+    PARTNER = "partner"
+    """Distance of two arms of a cell that came too near to each other, m."""
+    NOT_LED_APART = "not_led_apart"
+    """Distance of two arms, m, of which one was stopped on a way on which all its bodies move away from the other."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +286,7 @@ class _Commands:
     velocities: list[float] = field(default_factory=list)
     resting: int = 0
     last: float = 0.0
-    """Target position of the last frame, in whatever mode."""
+    """Target position of the last frame; in CST the position of the joint."""
     received: float | None = None
     """The last target that reached the drive."""
 
@@ -368,6 +374,7 @@ class FrameChecker:
         self.frames += 1
         answered, self.is_answered = self.is_answered, frame.wkc == self._expected
         obeying = enabled = 0
+        homing = False
         self.samples = [joint.decode(frame.sent[joint.slot], frame.received[joint.slot]) for joint in self._joints]
         for axis, sample in enumerate(self.samples):
             commands, mode = self._commands[axis], sample.mode
@@ -376,6 +383,7 @@ class FrameChecker:
             obeys = sample.commanded and sample.enabled
             obeying += obeys
             if not obeys or mode not in (CSP, CSV, CST):
+                homing |= obeys and mode == HOMING
                 if obeys and mode != HOMING:
                     self.violate(Kind.MODE, frame.now_ns, axis, float(mode), CSP, CST)
                 if commands.mode:
@@ -399,13 +407,15 @@ class FrameChecker:
                     self._check_velocity(axis, commands, sample.velocity, answered, frame.now_ns)
             if mode != CST and commands.mode == mode and not commands.positions:
                 commands.positions.append(position)
-            commands.last = position
+            # In CST the joint need not be at its target: the next mode continues from the joint.
+            commands.last = sample.actual - self.zero[axis] if mode == CST else position
         if obeying:
             self.obeyed += 1
         self._check_stopped(obeying, frame.now_ns)
         workspace = self.workspace
         if workspace is not None:
-            if obeying < len(self._joints):
+            # By its new zero a homed joint may be anywhere.
+            if obeying < len(self._joints) or homing:
                 self._check_zones_in = 0
                 self._excused = True
             elif all(commands.positions for commands in self._commands):

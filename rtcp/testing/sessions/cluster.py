@@ -33,10 +33,12 @@ from distributed import Client, Future, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 
 import rtcp
+from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.config.serialization import to_json
-from rtcp.testing.sessions.session import Result, run_session
+from rtcp.testing.sessions.coverage import Coverage
+from rtcp.testing.sessions.session import Result, Segment, run_session
 
 PART = 1000
 """Sessions of a part of the results: the seeds of a file are the same wherever and in whatever order they ran."""
@@ -46,6 +48,8 @@ UPDATES = 20
 """Least number of tasks of each thread, where sessions are enough: progress shows, an interruption loses less."""
 TASKS_PER_THREAD = 3
 """Tasks under way for each thread of the workers."""
+COVERAGE_FILE = "coverage.json"
+"""File of the coverage table in the folder of the results."""
 SHOWN_FAILURES = 10
 """Failures that a summary has; the files have all."""
 HANG_S, HANG_RATIO = 60.0, 200.0
@@ -85,8 +89,8 @@ class SoakError(Exception):
 class SessionPlan:
     """What is run: the sessions of consecutive seeds."""
 
-    config: ArmConfig
-    segment: SegmentConfig
+    config: ArmConfig | CellConfig
+    segment: Segment
     first: int
     count: int
     seconds: float
@@ -95,10 +99,13 @@ class SessionPlan:
     @property
     def digest(self) -> str:
         """Digest of the configuration and of the segment, whatever the place of their files."""
-        slaves = tuple(replace(slave, file="") for slave in self.config.slaves)
-        config = to_json(replace(self.config, source=Path(), slaves=slaves))
-        segment = to_json(self.segment.slaves)
-        text = json.dumps([config, segment], sort_keys=True, default=str)
+        if isinstance(self.config, CellConfig):
+            config: Any = self.config.digest
+        else:
+            slaves = tuple(replace(slave, file="") for slave in self.config.slaves)
+            config = to_json(replace(self.config, source=Path(), slaves=slaves))
+        segments = [self.segment] if isinstance(self.segment, SegmentConfig) else self.segment.values()
+        text = json.dumps([config, *(to_json(segment.slaves) for segment in segments)], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -153,6 +160,7 @@ class SessionSummary:
     largest_step: float = 0.0
     largest_acceleration: float = 0.0
     largest_speed: float = 0.0
+    coverage: Coverage = field(default_factory=Coverage)
     failures: list[Result] = field(default_factory=list)
     """The first failed sessions, by their seeds."""
     workers: dict[str, Memory] = field(default_factory=dict)
@@ -176,6 +184,7 @@ class SessionSummary:
         self.simulated_s += result.simulated_s
         self.cycles += result.cycles
         self.cpu_s += result.cpu_s
+        self.coverage.add(Coverage.from_json(result.coverage))
         for name in ("largest_step", "largest_acceleration", "largest_speed"):
             setattr(self, name, max(getattr(self, name), getattr(result, name)))
         if result.outcome != "passed":
@@ -217,7 +226,7 @@ class Parts:
         plan = self._plan
         mine, seeds = (self._digest, plan.seconds, rtcp.__version__), range(plan.first, plan.first + plan.count)
         for file in sorted(self._folder.iterdir()):
-            if file.suffix == ".mcap" or file.name.endswith(".new"):
+            if file.suffix == ".mcap" or file.name == COVERAGE_FILE or file.name.endswith(".new"):
                 continue
             why, rows = "sessions of another configuration, length, version or seed", []
             try:
@@ -261,6 +270,13 @@ class Parts:
         """Write the parts that are not complete."""
         for number in sorted(self._results):
             self._write(number)
+
+    def write_coverage(self, coverage: Coverage, rows: Coverage) -> Path:
+        """Write the whole coverage table and its empty rows; return the file."""
+        path = self._folder / COVERAGE_FILE
+        with self._writes():
+            path.write_text(json.dumps({**coverage.as_dict(), "empty": coverage.empty(rows)}, indent=1))
+        return path
 
     def _write(self, number: int) -> None:
         rows = sorted(self._results.pop(number), key=lambda result: result.seed)

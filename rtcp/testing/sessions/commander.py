@@ -8,10 +8,9 @@ from collections import Counter
 from collections.abc import Sequence
 from math import inf
 from random import Random
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import MOST_AXES, ArmConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.ipc.commands import COMMANDS, Command, Enable, Halt, Reset, SetLimits, SetTool, SetZero
 from rtcp.ipc.layout import EVENTS_HEAD_AT
@@ -21,12 +20,12 @@ from rtcp.motion.limits import Values, rows
 from rtcp.testing.inputs import Inputs
 from rtcp.testing.sessions.actions import NONSENSE
 from rtcp.testing.sessions.checker import Bounds, FrameChecker, Reading
-from rtcp.testing.sessions.mechanics import MechanicsChecker, Surroundings
+from rtcp.testing.sessions.coverage import Coverage, Place, commands_of
+from rtcp.testing.sessions.environment import Environment
+from rtcp.testing.sessions.mechanics import MechanicsChecker
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models.servo import ServoAxis
 
-KINDS = sorted((kind for kind in COMMANDS if kind.__module__ == Command.__module__), key=lambda kind: kind.name)
-"""All commands of the platform; a package may have registered its own."""
 ODD_INTEGERS = (-1, 0, 7, 99, 1 << 40, -(1 << 63), (1 << 63) - 1)
 FAULTS = (0x2310, 0x3210, 0x3220, 0x4310, 0x8130, 0x8400, 0x8611, 0x8612, 0x7305)
 START_S = 3.0
@@ -61,22 +60,20 @@ class Raw:
         memory[at : at + PAYLOAD_SIZE] = self.payload
 
 
-def random_command(random: Random, joints: int) -> Command:
-    """Return a command of any kind, with fields that are of the right types and of any value.
-
-    Not SetLimits: it would put limits of an old plan in force, of which the checker is not told.
-    """
-    kind = random.choice([kind for kind in KINDS if kind is not SetLimits])
+def random_command(kind: type[Command], random: Random, joints: int) -> Command:
+    """Return a command of a kind, with fields that are of the right types and of any value."""
     return kind(*(_random_field(field, random, joints) for field in kind.field_types.values()))
 
 
 def _random_field(kind: Any, random: Random, joints: int) -> Any:
     if kind == Joints:
-        return tuple(_random_number(random) for _ in range(random.choice((0, 2, joints, joints, joints, joints + 2))))
+        return tuple(_random_number(random) for _ in range(random.choice((0, 2, joints, joints, joints, MOST_AXES))))
     if kind is float:
         return _random_number(random)
     if kind is int:
         return random.choice((random.randrange(8), random.choice(ODD_INTEGERS)))
+    if kind is str:
+        return "".join(chr(random.randrange(32, 0x300)) for _ in range(random.choice((0, 1, 8, 300))))
     return random.choice((False, True) if kind is bool else list(kind))
 
 
@@ -99,10 +96,15 @@ class Commander:
 
     Args:
         config: the arm.
-        seed: of the bus.
+        seed: of the bus and of the environment.
         positions: of the joints at power-on, rad.
         reading: how its frames are read.
         segment: the slaves; None: the configured segment.
+        simulation: the arm's simulation, which the caller starts; None: one is made here and started.
+
+    Attributes:
+        coverage: counts of commands by where they were sent, of events and of refusals.
+        environment: hands, loads, and measurements that are false.
     """
 
     def __init__(
@@ -112,11 +114,17 @@ class Commander:
         positions: Sequence[float],
         reading: Reading,
         segment: SegmentConfig | None = None,
+        simulation: Simulation | None = None,
     ) -> None:
         self.bounds = Bounds.configured(config)
         self.limits = Values.configured(config)
-        self.simulation = Simulation(config, seed, positions=positions, segment=segment, follow_clock=False)
-        self.simulation.unlink()
+        starts = simulation is None
+        if simulation is None:
+            simulation = Simulation(config, seed, positions=positions, segment=segment, follow_clock=False)
+            simulation.unlink()
+        self.simulation = simulation
+        self.kinds = commands_of(simulation)
+        """All commands of the arm."""
         count = len(config.joints)
         self.checker = FrameChecker(
             self.bounds, config.cycle.period_us * 1e-6, reading, self.simulation.data.expected_wkc,
@@ -129,31 +137,38 @@ class Commander:
         self.faults: Counter[str] = Counter()
         self.states: Counter[State] = Counter()
         self.log: list[Entry] = []
-        self.inputs = Inputs(self.simulation)
+        self.coverage = Coverage()
+        self.inputs = Inputs(simulation)
+        self.environment = Environment(Random(seed), simulation, self.servos, self.inputs, self.count_fault)
         self.mechanics = MechanicsChecker(self.checker, config, self.servos)
-        self._pushes: dict[int, float] = {}
-        self.environment: Surroundings = SimpleNamespace(pushed=self._pushes, payload_kg=0.0, permitted=True)
         self._stop_ns = round(
             1e9 * (STOP_S + max(j.velocity / j.acceleration + j.acceleration / j.jerk for j in config.joints))
         )
-        self._pressed = self._silent = False
-        """Whether the emergency stop is pressed, and whether the lease is not renewed."""
+        self.pressed = self._silent = False
+        """Whether an emergency stop is pressed that concerns the arm, and whether the lease is not renewed."""
         self._event = 0
         """Number of the last event in the log."""
-        self.simulation.on_frame = self._see
+        simulation.on_frame = self._see
+        if starts:
+            self.start()
+
+    def start(self) -> None:
+        """Acquire a lease and wait until the machine is ready."""
         self.simulation.acquire()
-        self.simulation.until(lambda: self.state is State.READY, START_S)
+        self.simulation.until(lambda: self.state is State.READY or self.simulation.done, START_S)
 
     def _see(self, frame: Frame) -> None:
         state = self.simulation.state
         self.states[state] += 1
         self.checker.check(frame, state)
+        self.environment.step(frame.now_ns)
         self.mechanics.check(frame, state, self.environment)
         head = self.simulation.board.words[EVENTS_HEAD_AT]
         if head != self._event:
             # An event has the time of the host.
             for record in self.simulation.observer.events_since(self._event):
                 self.log.append(Entry(frame.now_ns, self.simulation.names.message(record.event)))
+                self.coverage.events[record.event.name] += 1
                 self.mechanics.event(record.event, frame.now_ns)
             self._event = head
 
@@ -177,7 +192,13 @@ class Commander:
         return list(self.checker.targets)
 
     @property
-    def _stopped_ns(self) -> int:
+    def place(self) -> Place:
+        """Where a command arrives now."""
+        arm = self.simulation.loop.arm
+        return Place(self.state, arm.control_mode, arm.wanted_mode)
+
+    @property
+    def stopped_ns(self) -> int:
         """When the arm rests if a stop begins now, simulated time."""
         return self.simulation.now_ns + self._stop_ns
 
@@ -199,7 +220,10 @@ class Commander:
             return False
         self._note(f"{command}")
         at = len(self.log) - 1
+        place = self.place
+        under_way = self.simulation.loop.arm.active.name if place.state is State.MOVING else ""
         refusal = self.simulation.send(command, lease).refusal
+        self.coverage.command(command.name, place, under_way, refusal)
         (self.taken if refusal is None else self.refused)[command.name] += 1
         answer = "accepted" if refusal is None else self.simulation.names.message(refusal)
         self.log[at] = self.log[at]._replace(text=f"{self.log[at].text} -> {answer}")
@@ -210,15 +234,35 @@ class Commander:
     def _tell_checker(self, command: Command) -> None:
         """Tell what an accepted command changes for the checks."""
         checker = self.checker
-        self.mechanics.accepted(command)
+        self.mechanics.accepted(command, self.simulation.now_ns)
         if isinstance(command, SetZero) and command.axis < len(checker.zero):
             checker.zero[command.axis] = command.offset
         elif isinstance(command, SetTool):
             checker.use(command.tool)
-        elif isinstance(command, Reset | Enable) and not self._pressed:
+        elif isinstance(command, Reset | Enable) and not self.pressed:
             checker.torque_off_from_ns = inf
         if not self._silent:
-            checker.rest_from_ns = self._stopped_ns if isinstance(command, Halt) else inf
+            checker.rest_from_ns = self.stopped_ns if isinstance(command, Halt) else inf
+
+    def overtake(self, command: Command, stop: type[Command]) -> None:
+        """Send a command, and request a stop before the loop has taken the command: the stop overtakes it."""
+        simulation = self.simulation
+        if simulation.done:
+            return
+        observer, place = simulation.observer, self.place
+        self._note(f"{command}, overtaken by {stop.name}")
+        number = observer.command(simulation.lease, command)
+        requested_ns = observer.stop(stop)
+        self.wait(2)
+        for name, answer in (
+            (command.name, observer.answer(number)),
+            (stop.name, observer.stop_answer(stop, requested_ns)),
+        ):
+            if answer is not None:
+                self.coverage.command(name, place, "", answer.refusal)
+                (self.taken if answer.refusal is None else self.refused)[name] += 1
+                if answer.refusal is None:
+                    self._tell_checker(command if name == command.name else stop())
 
     def send_raw(self, number: int, numbers: Sequence[float]) -> bool:
         """Send bytes that may be no command; return whether they were accepted as one."""
@@ -274,7 +318,7 @@ class Commander:
         # The joystick moves the arm without a lease.
         if record is not None and int(record["control_mode"][0]) != ControlMode.JOYSTICK:
             lease_ns = round(1e9 * self.simulation.config.lease_s)
-            self.checker.rest_from_ns = self._stopped_ns + lease_ns
+            self.checker.rest_from_ns = self.stopped_ns + lease_ns
 
     def acquire(self) -> None:
         """Acquire a lease again."""
@@ -284,9 +328,7 @@ class Commander:
     def push(self, axis: int, torque: float) -> None:
         """Push a joint, Nm."""
         self.count_fault("push", f"{axis} {torque:.1f}")
-        # Beside the weight of the arm, which the segment puts there.
-        self.servos[axis].mechanics.external_torque += torque - self._pushes.get(axis, 0.0)
-        self._pushes[axis] = torque
+        self.environment.push(axis, torque)
 
     def joystick(self, pressed: int) -> None:
         """Press directions and paddles of the joystick, as `Inputs.joystick`."""
@@ -300,10 +342,15 @@ class Commander:
         """Press or release the emergency stop."""
         if self.inputs.present:
             self.count_fault("emergency stop" if pressed else "emergency stop released")
-            contact, self._pressed = self.simulation.config.inputs.emergency_stop, pressed
+            contact, self.pressed = self.simulation.config.inputs.emergency_stop, pressed
             self.inputs.set(contact, pressed)
             if contact is not None and pressed:
-                self.checker.torque_off_from_ns = self._stopped_ns
+                self.checker.torque_off_from_ns = self.stopped_ns
+
+    def switch(self, pressed: bool) -> None:
+        """Press or release the enabling switch."""
+        if self.environment.switch(pressed):
+            self.checker.rest_from_ns = inf if pressed else self.stopped_ns
 
     def toggle(self, arm: bool) -> None:
         """Switch the joystick to the arm or to the chair."""

@@ -12,7 +12,7 @@ from math import inf
 from typing import Protocol
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.commands import ApplyTorque, Command, Guide, MotionCommand, MoveJoints
+from rtcp.ipc.commands import ApplyTorque, Command, Enable, Guide, Home, MotionCommand, MoveGripper, MoveJoints
 from rtcp.ipc.events import Arrived, Event, FaultEvent, MotionEnded, Stopped
 from rtcp.ipc.states import State
 from rtcp.testing.sessions.checker import CSP, CST, CSV, FrameChecker, Kind
@@ -32,6 +32,8 @@ adds, rad/s."""
 TORQUE_SHARE, EXTRA_TORQUE = 0.1, 1.0
 """Largest step of a target torque in a cycle, as a fraction of the torque limit, and in addition, Nm: the joints of
 small inertia change their speed, and with it their damping, fast."""
+RELEASED_S = 0.1
+"""Time after which the release of the enabling switch counts, s: its contact bounces."""
 REST_S, REST_IN_CST_S = 0.5, 1.5
 """Time without a command after which a joint rests, s: the integral of the position loop in CST is slow."""
 MOVED_RAD = 5e-3
@@ -122,8 +124,10 @@ class MechanicsChecker:
 
     # -- what happens -----------------------------------------------------------------------------------------------
 
-    def accepted(self, command: Command) -> None:
-        """Take note of a command that was accepted."""
+    def accepted(self, command: Command, now_ns: int) -> None:
+        """Take note of a command that was accepted; without the enabling switch it must not let anything move."""
+        if isinstance(command, MotionCommand | Enable | Home | MoveGripper):
+            self._limit(Kind.NOT_PERMITTED, now_ns, -1, self._cycles_released * self._dt, RELEASED_S)
         if isinstance(command, MotionCommand):
             self._target = command.q if isinstance(command, MoveJoints) else None
             self._pushing = None

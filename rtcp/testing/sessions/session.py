@@ -4,27 +4,33 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import isfinite, sqrt
 from random import Random
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, cast
 
 import rtcp
 from kinematics import forward
-from rtcp.config.model import MODE_CHANNELS, MOST_AXES, ArmConfig, ControlModeName, DriveModeName
+from rtcp.config.cell import CellConfig
+from rtcp.config.model import MOST_AXES, ArmConfig, ControlModeName, DriveModeName, InputConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.ipc import commands
 from rtcp.ipc.message import PAYLOAD_SIZE
-from rtcp.ipc.states import ControlMode, State
+from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 from rtcp.motion.limits import Values
 from rtcp.motion.planning.interpolation import quaternion
 from rtcp.motion.planning.plan import COLUMNS, CUBIC, KIND, LINE, POSITIONS, QUINTIC, VELOCITIES
-from rtcp.testing.sessions.actions import CONTROL_MODES, NONSENSE, SHARES, RandomActions
+from rtcp.testing.sessions.actions import NONSENSE, SHARES, RandomActions
 from rtcp.testing.sessions.checker import Bounds, Reading, Violation, reading_of
-from rtcp.testing.sessions.commander import FAULTS, KINDS, ODD_INTEGERS, Commander, random_command
+from rtcp.testing.sessions.commander import FAULTS, ODD_INTEGERS, Commander, random_command
+from rtcp.testing.sessions.coverage import places_of
+from rtcp.testing.sessions.visits import Visit, place_of
+from rtcp.testing.simulation import Simulation
 
 LONGEST_WAIT_S = 0.3
+SWITCHES = 0.2
+"""Part of the sessions whose arm has an enabling switch, though none is configured."""
 MOVABLE = (State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING, State.CLOSING)
 _CLOSE_S = 2.5
 _PLACES = 1000
@@ -53,6 +59,8 @@ class Result:
     """Largest speed of a target, rad/s."""
     violation: str = ""
     """The first violation (fields of `rtcp.testing.sessions.checker.Violation`) or the error, as JSON."""
+    coverage: str = ""
+    """Counts of commands, events and refusals (fields of `rtcp.testing.sessions.coverage.Coverage`), as JSON."""
     cpu_s: float = 0.0
     wall_s: float = 0.0
 
@@ -66,6 +74,8 @@ class Session(RandomActions):
         reading: how its frames are read; None: by the configuration.
         segment: the slaves; None: the configured segment.
         periods_us: cycles to choose from, us; empty: the configured one.
+        number: of the session: consecutive numbers visit different places; None: a random one.
+        simulation: an arm of a cell, which has its modes already and which the caller starts; None: an arm of its own.
     """
 
     def __init__(
@@ -75,29 +85,64 @@ class Session(RandomActions):
         reading: Reading | None = None,
         segment: SegmentConfig | None = None,
         periods_us: Sequence[float] = (),
+        number: int | None = None,
+        simulation: Simulation | None = None,
     ) -> None:
         super().__init__(random)
         self.reading = reading = reading_of(config) if reading is None else reading
         self.bounds = Bounds.configured(config)
         self.joints = len(config.joints)
-        modes: list[tuple[ControlModeName, int]] = [*zip(CONTROL_MODES, SHARES, strict=True)]
-        if config.arm is None:
-            modes = [(mode, share) for mode, share in modes if mode not in ("cartesian", "joystick")]
-        (mode,) = random.choices([name for name, _ in modes], [share for _, share in modes])
+        place, round_ = place_of(random.randrange(1 << 16) if number is None else number, places_of(config))
         cycle = replace(config.cycle, period_us=random.choice(periods_us)) if periods_us else config.cycle
-        drive_mode = random.choice(drive_modes(config))
-        chosen = replace(config, cycle=cycle, drive_mode=drive_mode, control_mode=mode)
+        control_mode, drive_mode = place.control_mode, place.drive_mode
+        chosen = replace(
+            with_enabling_switch(config) if random.random() < SWITCHES else config,
+            cycle=cycle, drive_mode=cast(DriveModeName, drive_mode.name.lower()),
+            control_mode=cast(ControlModeName, control_mode.name.lower()),
+        )  # fmt: skip
         positions = self._place(random.random() < 0.9)
-        self.commander = commander = Commander(chosen, random.randrange(1 << 30), positions, reading, segment)
+        seed = random.randrange(1 << 30)
+        if simulation is None:
+            simulation = Simulation(chosen, seed, positions=positions, segment=segment, follow_clock=False)
+        else:
+            chosen, control_mode = simulation.config, simulation.loop.arm.control_mode
+        simulation.unlink()
+        self.commander = commander = Commander(chosen, seed, positions, reading, segment, simulation)
+        environment = commander.environment
+        self.visit = Visit(self, place, round_)
         self.period_s = chosen.cycle.period_us * 1e-6
-        self.mode = ControlMode[mode.upper()]
+        self.mode = control_mode
+        self._makers: dict[type[commands.Command], Callable[[], commands.Command]] = {
+            commands.SetDriveMode: lambda: commands.SetDriveMode(random.choice(list(DriveMode))),
+            commands.SetControlMode: lambda: commands.SetControlMode(random.choice(list(ControlMode))),
+            commands.SetOutput: lambda: commands.SetOutput(random.randrange(1, 17), random.random() < 0.5),
+            commands.SetSpeedOverride: lambda: commands.SetSpeedOverride(random.choice((1.0, 1.0, 0.5, 0.1))),
+            commands.SetTool: lambda: commands.SetTool(random.randrange(max(1, len(config.models)))),
+            commands.SetPayload: self._payload,
+            commands.SetZero: self._same_zero,
+            commands.Home: lambda: commands.Home(random.randrange(self.joints)),
+            commands.MoveJoints: self._long_move,
+            commands.RunTrajectory: self._short_trajectory,
+            commands.ExtendTrajectory: lambda: commands.ExtendTrajectory(random.randrange(1, 8), random.random() < 0.5),
+            commands.RunInStep: self._in_step,
+            commands.StreamPosition: self._next_position,
+            commands.OpenStream: lambda: commands.OpenStream(commander.simulation.now_ns),
+            commands.Jog: self._short_jog,
+            commands.MoveAtVelocity: lambda: commands.MoveAtVelocity(tuple(self._small(0.2)), 0.5),
+            commands.ApplyTorque: lambda: commands.ApplyTorque(
+                tuple(self._small(5.0)), self.or_nonsense(0.0, 0.1), 1.0, 0.5
+            ),
+            commands.Guide: lambda: commands.Guide(1.0),
+        }
+        """Commands that the arm accepts in the right place; commands without an entry get random fields."""
         self.actions: list[tuple[int, Callable[[], object]]] = [
             (4, self.enable),
             (24, self._begin_motion),
             (12, self.command),
             (4, self._change_mode),
             (2, lambda: self.send(commands.SetOutput(self.or_odd(random.randrange(0, 18)), random.random() < 0.5))),
-            (1, lambda: commander.send(random_command(random, self.joints))),
+            (1, lambda: self._send_random(random.choice(commander.kinds))),
+            (4, lambda: self.send_likely(random.choice(commander.kinds))),
             (1, lambda: commander.send_raw(self._kind(), [self._number() for _ in range(PAYLOAD_SIZE // 8)])),
             (1, lambda: commander.send(self._random_move(), lease=random.randrange(3))),
             (1, lambda: commander.fault(random.randrange(self.joints), random.choice(FAULTS))),
@@ -106,6 +151,16 @@ class Session(RandomActions):
             (3, self._silence),
             (2, self._halt),
             (2, self._push),
+            (4, environment.hand),
+            (2, environment.load),
+            (3, environment.falsify),
+            (1, environment.freeze),
+            (1, environment.delay),
+            (1, environment.burst),
+            (1, environment.lasting_fault),
+            (1, self._release),
+            (1, self._pause),
+            (1, lambda: commander.overtake(self._random_move(), random.choice((commands.Halt, commands.Disable)))),
             (2, self.joystick),
             (1, self.toggle),
             (1, self.emergency),
@@ -125,7 +180,11 @@ class Session(RandomActions):
 
     def seconds(self, least: float, most: float) -> None:
         """Let time pass."""
-        self.commander.wait(max(1, int(self.random.uniform(least, most) / self.period_s)))
+        self.commander.wait(self.cycles(self.random.uniform(least, most)))
+
+    def cycles(self, seconds: float) -> int:
+        """Return the number of cycles in this time, at least 1."""
+        return max(1, int(seconds / self.period_s))
 
     def show(self, code: int, seconds: float) -> None:
         """Show a byte at the joystick's inputs for a random time, at most `seconds`."""
@@ -153,7 +212,7 @@ class Session(RandomActions):
         return place
 
     def _kind(self) -> int:
-        return self.random.choice((self.random.randrange(1 << 32), self.random.choice(KINDS).number))
+        return self.random.choice((self.random.randrange(1 << 32), self.random.choice(self.commander.kinds).number))
 
     def _number(self) -> float:
         return self.or_nonsense(self.random.uniform(-3.0, 3.0))
@@ -214,15 +273,103 @@ class Session(RandomActions):
     def _begin_long_motion(self) -> None:
         """Mostly begin one that only a stop ends soon."""
         if self.random.random() < 0.7:
-            bounds = self.bounds
-            there = [max(a, min(b, q)) for q, a, b in zip(self.near(0.5), bounds.low, bounds.high, strict=True)]
-            self.send(commands.MoveJoints(tuple(there), 0.1, True))
+            self.send(self._long_move())
+
+    def _long_move(self) -> commands.MoveJoints:
+        bounds = self.bounds
+        there = [max(a, min(b, q)) for q, a, b in zip(self.near(0.5), bounds.low, bounds.high, strict=True)]
+        return commands.MoveJoints(tuple(there), 0.1, True)
 
     def _push(self) -> None:
         axis = self.random.randrange(self.joints)
         self.commander.push(axis, self.random.uniform(-15.0, 15.0))
         self.seconds(0.0, 0.2)
         self.commander.push(axis, 0.0)
+
+    def _release(self) -> None:
+        """Release the enabling switch for a while, mostly during a motion."""
+        self._begin_long_motion()
+        self.seconds(0.0, 0.2)
+        self.commander.switch(False)
+        self.seconds(0.0, 0.6)
+        kinds = (commands.Enable, commands.Jog, commands.MoveJoints, commands.Home, commands.MoveGripper)
+        self.send_likely(self.random.choice(kinds))
+        self.commander.switch(True)
+
+    def _pause(self) -> None:
+        """Pause a motion, and mostly resume it; now and then begin another one in between."""
+        self._begin_long_motion()
+        self.seconds(0.05, 0.3)
+        self.send(commands.Pause())
+        self.seconds(0.0, 0.2)
+        if self.random.random() < 0.5:
+            self.send_likely(self.random.choice((commands.MoveJoints, commands.Jog, commands.RunTrajectory)))
+        if self.random.random() < 0.8:
+            self.send(commands.Resume())
+
+    # -- one command of a kind --------------------------------------------------------------------------------------
+
+    def send_likely(self, kind: type[commands.Command]) -> None:
+        """Send a command of a kind, mostly one that the arm accepts in the right place."""
+        if kind is commands.SetLimits:
+            self.limits()
+        elif kind is commands.RunLines and self.commander.simulation.config.arm is not None:
+            self.line()
+        elif kind in self._makers and self.random.random() < 0.85:
+            other = 0.03 if kind.needs_lease else 0.3
+            lease = self.random.randrange(3) if self.random.random() < other else None
+            self.commander.send(self._makers[kind](), lease)
+        else:
+            self._send_random(kind)
+
+    def _send_random(self, kind: type[commands.Command]) -> None:
+        """Send a command of a kind with random fields.
+
+        Not SetLimits: it would put limits of an old plan in force, of which the checker is not told.
+        """
+        if kind is not commands.SetLimits:
+            self.send(random_command(kind, self.random, self.joints))
+
+    def _small(self, most: float) -> list[float]:
+        return [self.random.choice((0.0, self.random.uniform(-most, most))) for _ in range(self.joints)]
+
+    def _payload(self) -> commands.SetPayload:
+        random = self.random
+        return commands.SetPayload(
+            random.choice((0.0, random.uniform(0.0, 1.5))),
+            *self.some([random.uniform(-0.1, 0.1) for _ in range(3)], 0.05),
+        )
+
+    def _same_zero(self) -> commands.SetZero:
+        axis = self.random.randrange(self.joints)
+        zero = self.commander.checker.zero[axis]
+        return commands.SetZero(axis, self.random.choice((zero, zero, zero, 1e3)))
+
+    def _short_trajectory(self) -> commands.RunTrajectory:
+        rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (1.0, self.near(0.1)))]
+        slot = self.commander.simulation.observer.write_plan(rows)
+        return commands.RunTrajectory(slot, len(rows), open=self.random.random() < 0.5)
+
+    def _in_step(self) -> commands.RunInStep:
+        """A motion in step of this arm alone, with a table of five brakes after its rows."""
+        simulation = self.commander.simulation
+        rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (2.0, self.near(0.1)))]
+        slot = simulation.observer.write_plan([*rows, [self.or_nonsense(1.0, 0.1), *[1.0] * (COLUMNS - 1)]])
+        now_ns, step_s = simulation.now_ns, self.or_nonsense(0.5, 0.1)
+        choice = self.random.choice
+        motion, partners = choice((now_ns, now_ns, now_ns, 1, 1 << 60)), choice((0, 0, 0, 0, 1))
+        start_ns = now_ns + choice((20_000_000, 20_000_000, 20_000_000, -1, 1 << 50))
+        return commands.RunInStep(slot, len(rows), motion, partners, start_ns, 5, step_s)
+
+    def _next_position(self) -> commands.StreamPosition:
+        self.stamp += 0.01
+        return commands.StreamPosition(tuple(self.near(0.002)), self.stamp)
+
+    def _short_jog(self) -> commands.Jog:
+        frame = self.random.choice(list(JogFrame))
+        return commands.Jog(tuple(self._small(0.2 if frame is JogFrame.JOINTS else 0.1)), frame, 0.25)
+
+    # -- motions ----------------------------------------------------------------------------------------------------
 
     def trajectory(self) -> None:
         """A trajectory that nobody has planned: its pieces may be far too quick, or none at all."""
@@ -234,6 +381,13 @@ class Session(RandomActions):
             rows.append(_waypoint(t, q, kind, speed))
         rows[-1][VELOCITIES : VELOCITIES + self.joints] = [0.0] * self.joints
         self._run(commands.RunTrajectory, rows)
+
+    def hurry(self) -> None:
+        """Run a trajectory that is far too quick for the limits of the joints."""
+        there = [q + self.random.choice((-0.3, 0.3)) for q in self.commanded]
+        rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, self.commanded), (0.1, there))]
+        slot = self.commander.simulation.observer.write_plan(rows)
+        self.send(commands.RunTrajectory(slot, len(rows), tool=self.commander.checker.tool))
 
     def open_trajectory(self) -> None:
         """A trajectory to which rows are appended that nobody has planned; in time, too late, or never."""
@@ -310,7 +464,8 @@ class Session(RandomActions):
             return
         pose = forward(arm, self.commanded[:6])
         orientation = quaternion(pose.rotation)
-        rows, at = [], list(pose.position)
+        rows, off = [], 0.05 if random.random() < 0.05 else 0.0
+        at = [x + off for x in pose.position]
         for _ in range(random.randrange(1, 4)):
             far = random.choice((0.02, 0.1, 0.3))
             to = [x + random.uniform(-far, far) for x in at]
@@ -324,13 +479,17 @@ class Session(RandomActions):
 
     # -- limits -----------------------------------------------------------------------------------------------------
 
+    def widen(self) -> None:
+        """Put the configured limits in force."""
+        self.commander.set_limits(Values.configured(self.commander.simulation.config))
+
     def limits(self) -> None:
         """Narrower ones, now and then too narrow for the arm, too wide, or none at all; or those of the start again."""
         random, commander = self.random, self.commander
         old = commander.limits
         widest = Values.configured(commander.simulation.config)
         if random.random() < 0.2:
-            commander.set_limits(widest)
+            self.widen()
             return
         here = self.commanded
         share = random.choice((0.2, 0.6, 0.6, 0.9, 0.9, 1.1))
@@ -369,10 +528,25 @@ class Session(RandomActions):
             self.send(commands.Reset())
             self.commander.simulation.until(lambda: self.commander.state is not State.RESETTING, 0.5)
 
+    def _disturb(self, seconds: float) -> None:
+        """Let something of the surroundings act at two random instants, mostly during the visit."""
+        environment = self.commander.environment
+        happens = (
+            environment.falsify, environment.falsify, environment.falsify, environment.hand, environment.hand,
+            environment.load, environment.burst, environment.freeze, environment.delay,
+        )  # fmt: skip
+        for action in self.random.choices(happens, k=2):
+            environment.later(action, seconds)
+        if self.random.random() < 0.4:
+            environment.later(lambda: self.commander.switch(False), 0.5 * seconds)
+            environment.later(lambda: self.commander.switch(True), seconds)
+
     def run(self, seconds: float) -> None:
         """Run for this simulated time, s, or to the first violation."""
         commander, random = self.commander, self.random
         weights = [weight for weight, _ in self.actions]
+        self._disturb(seconds)
+        self.visit.run(seconds)
         while commander.seconds < seconds and not (commander.simulation.done or commander.checker.violations):
             if commander.state not in MOVABLE and random.random() < 0.7:
                 commander.enable()
@@ -381,9 +555,13 @@ class Session(RandomActions):
             commander.wait(int(random.expovariate(8.0 / LONGEST_WAIT_S) / self.period_s) + 1)
             if random.random() < 0.3:
                 commander.wait(int(random.uniform(0.0, LONGEST_WAIT_S) / self.period_s))
-        if random.random() < 0.15:
-            commander.send(commands.Shutdown())
+        self.visit.end()
+        if commander.state is State.CLOSING:
             commander.wait(int(_CLOSE_S / self.period_s))
+
+    def close(self) -> None:
+        """Free the memory."""
+        self.commander.close()
 
     def result(self, seed: int, error: Exception | None = None) -> Result:
         """Return the result of the session as it is now."""
@@ -400,33 +578,53 @@ class Session(RandomActions):
             largest_acceleration=checker.largest_acceleration,
             largest_speed=checker.largest_speed,
             violation=error_json(error) if error is not None else "" if first is None else violation_json(first),
+            coverage=commander.coverage.as_json(),
         )
 
 
-Inspect = Callable[[Session, Exception | None], None]
+class AnySession(Protocol):
+    """A session of an arm, or of a cell."""
+
+    @property
+    def commander(self) -> Commander:
+        """The commander of the arm, or of one of the arms."""
+
+    def run(self, seconds: float) -> None:
+        """Run for this simulated time, s, or to the first violation."""
+
+    def result(self, seed: int, error: Exception | None = None) -> Result:
+        """Return the result of the session as it is now."""
+
+    def close(self) -> None:
+        """Free the memory."""
+
+
+Segment = SegmentConfig | Mapping[str, SegmentConfig]
+"""The slaves of an arm, or of each arm of a cell by its name."""
+Inspect = Callable[[AnySession, Exception | None], None]
 
 
 def run_session(
     seed: int,
-    config: ArmConfig,
+    config: ArmConfig | CellConfig,
     seconds: float,
-    segment: SegmentConfig | None = None,
+    segment: Segment | None = None,
     inspect: Inspect | None = None,
 ) -> Result:
     """Run the session of a seed; an error of the session is its result.
 
     Args:
         seed: of everything in it.
-        config: the arm.
+        config: the arm, or the cell.
         seconds: simulated time, s.
-        segment: the slaves; None: the configured segment.
+        segment: the slaves, in a cell those of each arm by its name; None: the configured segment.
         inspect: called with the session before it is closed, and with its error.
     """
     began = time.thread_time(), time.perf_counter()
-    session: Session | None = None
+    session: AnySession | None = None
     failure: Exception | None = None
     try:
-        session = Session(Random(seed), config, segment=segment)
+        session = session_of(seed, config, segment)
         session.run(seconds)
     except Exception as error:
         failure = error
@@ -439,19 +637,40 @@ def run_session(
         return replace(session.result(seed, failure), cpu_s=cpu_s, wall_s=wall_s)
     finally:
         if session is not None:
-            session.commander.close()
+            session.close()
 
 
-def drive_modes(config: ArmConfig) -> list[DriveModeName]:
-    """Return the drive modes that the process data of all joints have; CSP, the usual one, twice."""
-    devices = {slave.name: slave.device for slave in config.slaves}
-    modes: list[DriveModeName] = ["csp"]
-    for mode, needed in MODE_CHANNELS.items():
-        images = [devices[joint.slave].of_axis(joint.axis) for joint in config.joints]
-        mapped = [({c.name for c in image.outputs}, {c.name for c in image.inputs}) for image in images]
-        if all(outputs.issuperset(needed[0]) and inputs.issuperset(needed[1]) for outputs, inputs in mapped):
-            modes.append(mode)
-    return modes
+def session_of(seed: int, config: ArmConfig | CellConfig, segment: Segment | None = None) -> AnySession:
+    """Return the session of a seed: that of an arm, or of a cell."""
+    if isinstance(config, ArmConfig):
+        assert not isinstance(segment, Mapping)
+        return Session(Random(seed), config, segment=segment, number=seed)
+    from rtcp.testing.sessions.cell_session import CellSession
+
+    assert not isinstance(segment, SegmentConfig)
+    return CellSession(Random(seed), config, segment)
+
+
+def with_enabling_switch(config: ArmConfig) -> ArmConfig:
+    """Return the configuration with an enabling switch at a free terminal; without an IO box the same configuration."""
+    inputs = config.inputs
+    if inputs.emergency_stop is None or inputs.enabling_switch is not None:
+        return config
+    contacts = [contact for contact in (inputs.emergency_stop, inputs.arm_toggle) if contact is not None]
+    joystick = inputs.joystick
+    used = {contact.number for contact in contacts}
+    if joystick is not None:
+        used |= {
+            joystick.forward,
+            joystick.backward,
+            joystick.left,
+            joystick.right,
+            joystick.mode_up,
+            joystick.mode_down,
+        }
+    free = next(number for number in range(1, 17) if number not in used)
+    switch = InputConfig(free, box=inputs.emergency_stop.box)
+    return replace(config, inputs=replace(inputs, enabling_switch=switch))
 
 
 def violation_json(violation: Violation) -> str:
