@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import ApplyTorque, Command, MoveJoints, SetControlMode, SetDriveMode, SetLimits
+from rtcp.ipc.commands import ApplyTorque, Command, Guide, MoveJoints, SetControlMode, SetDriveMode, SetLimits
 from rtcp.ipc.refusals import WeightUnknown
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.limits import rows
@@ -144,13 +144,16 @@ def test_a_stiffness_and_a_damping_that_change_under_way_change_the_torque_gradu
 
 
 @in_mode(control_mode="torque")
-def test_a_torque_motion_that_begins_while_a_joint_turns_is_refused_as_its_weight_is_unknown(arm: Simulation) -> None:
+@pytest.mark.parametrize("command", [ApplyTorque(NOTHING, 0.0, 0.0, 0.2), Guide(0.2)], ids=["torque", "guide"])
+def test_a_torque_motion_that_begins_while_a_joint_turns_is_refused_as_its_weight_is_unknown(
+    arm: Simulation, command: Command
+) -> None:
     joint = arm.models[5].mechanics
     joint.external_torque = 6.0
     assert arm.until(lambda: abs(arm.loop.arm.state.actual_velocity[5]) > 0.011, 1.0)
-    refusal = arm.send(ApplyTorque(NOTHING, 0.0, 0.0, 0.2)).refusal
+    refusal = arm.send(command).refusal
     assert isinstance(refusal, WeightUnknown)
     joint.external_torque = 0.0
     measured = arm.loop.arm.state.actual_velocity
     assert arm.until(lambda: max(map(abs, measured)) < 0.009, 3.0)
-    arm.do(ApplyTorque(NOTHING, 0.0, 0.0, 0.2))
+    arm.do(command)

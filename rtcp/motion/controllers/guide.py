@@ -25,7 +25,7 @@ from rtcp.ipc.states import ControlMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.controllers.jog_bounds import STANDOFF_M, JogBounds, lever, stopping
 from rtcp.motion.controllers.jog_inverse import JogInverse
-from rtcp.motion.controllers.torque import chase
+from rtcp.motion.controllers.torque import chase, not_at_rest
 from rtcp.motion.state import ArmState, Setpoint
 from rtcp.motion.tool_in_use import Gravity
 
@@ -118,6 +118,8 @@ class GuideController(Controller):
             return DurationOutOfRange(command.duration_s, LONGEST_S)
         if not self._gravity.is_known:
             return MassesUnknown()
+        if (refusal := not_at_rest(state)) is not None:
+            return refusal
         carried, limits = self._gravity.torques(state.actual), self.limits
         for i in self._joints:
             held = state.proven_torque(i)

@@ -19,6 +19,7 @@ _FADE: Final = 0.3
 """Last part of the allowed speed, as a share, over which the torque fades out."""
 _FREE = 1.0 - _FADE
 _STILL_RAD_S: Final = 0.01
+"""Speed up to which a joint rests, rad/s."""
 _AHEAD_RAD_S: Final = 0.1
 """Speed above that of the setpoint at which the torque has faded out, rad/s; twice as much is damped."""
 _CATCH_UP: Final = 20.0
@@ -74,9 +75,8 @@ class TorqueController(Controller):
             if not 0.0 <= fraction <= 1.0:
                 return FractionOutOfRange(fraction)
         if not continues or self.phase is not Phase.MOVE:
-            for i, speed in enumerate(state.actual_velocity):
-                if not abs(speed) <= _STILL_RAD_S:
-                    return WeightUnknown(i, speed)
+            if (refusal := not_at_rest(state)) is not None:
+                return refusal
             self._start(state)
         self._wanted[:] = command.torque
         if command.stiffness > 0.0 and self._stiff == 0.0:
@@ -146,6 +146,14 @@ class TorqueController(Controller):
             speeds[i] = speed = chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
             follows[i] = state.commanded[i] + speed * dt
         return target
+
+
+def not_at_rest(state: ArmState) -> WeightUnknown | None:
+    """Return the refusal of a motion that begins with the torque of joints at rest while one of them turns, or None."""
+    for i, speed in enumerate(state.actual_velocity):
+        if not abs(speed) <= _STILL_RAD_S:
+            return WeightUnknown(i, speed)
+    return None
 
 
 def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
