@@ -120,6 +120,7 @@ def test_a_state_that_contradicts_the_drives_for_long_is_found(wanted: State, sh
     session = Session(Random(5), configuration())
     commander = session.commander
     try:
+        commander.start()
         if wanted is State.HOLDING:
             commander.enable()
             commander.simulation.bring_to(wanted)
