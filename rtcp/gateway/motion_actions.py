@@ -23,7 +23,7 @@ from rtcp.gateway.method import Frame, Numbers, check_count, index_of, method
 from rtcp.gateway.tolerances import Tolerances, Tracking, Violation
 from rtcp.ipc import commands, refusals
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.events import Arrived, PermissionWithdrawn, ServiceEvent
+from rtcp.ipc.events import Arrived, PermissionWithdrawn, Stopped
 from rtcp.ipc.layout import PLAN_ROWS, PlanTooLong
 from rtcp.ipc.names import Names
 from rtcp.ipc.states import ControlMode, JogFrame, State
@@ -40,8 +40,6 @@ _COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 _JOINTS = ": one a joint, rad"
 _LARGEST = 100.0
 """Largest coordinate of a pose, m or rad: beyond any arm, and larger angles lose their precision."""
-_SAME_RAD, _SAME_PLANNED_RAD = 1e-6, 1e-4
-"""Largest distance of the commanded end from the goal: of a move, less than a count; of a plan, by rounding."""
 _REST_S = 3.0
 _TIMEOUT_S = 20.0
 _REPORT_S = 0.5
@@ -417,7 +415,7 @@ class MotionActions:
                 slot, len(plan.rows), motion, partners, start_ns, len(brakes), brake_step_s, plan.tool
             )
             name = "the motion in step"
-            arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, name)
+            arrival = self._arrival(lambda: plan.end, name)
             timeout_s = _TIMEOUT_S + 2 * plan.duration_s
             result = await self._run(lease, command, timeout_s, name, arrival, plan.end, self._says_accepted(caller))
             return result | {"duration_s": plan.duration_s, "length_m": plan.length_m, "slowed": plan.slowed}
@@ -467,22 +465,15 @@ class MotionActions:
             opened = _Open(plan, lease, channel.observer.write_plan(rows))
             resting: asyncio.Task[None] | None = None
 
-            arrival: Callable[[], Json | None] | None = None
-
-            def arrived() -> Json | None:
-                nonlocal arrival
-                if arrival is None:  # once: its end is known only now, and its settling time begins
-                    arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, "the trajectory")
-                return arrival()
-
             def begun() -> None:
                 nonlocal resting
                 accepted.set_result(opened)
                 resting = asyncio.create_task(self._rest_in_time(opened))
 
             command = commands.RunTrajectory(opened.slot, len(rows), open=True, tool=planner.tool)
+            arrival = self._arrival(lambda: plan.end, "the trajectory")
             try:
-                return await self._run(lease, command, LONGEST_OPEN_S, "the trajectory", arrived, begun=begun)
+                return await self._run(lease, command, LONGEST_OPEN_S, "the trajectory", arrival, begun=begun)
             finally:
                 if resting is not None:
                     resting.cancel()
@@ -758,7 +749,7 @@ class MotionActions:
         command = commands.MoveJoints(tuple(q), max(velocities) if speed is None else speed, synchronized)
         # Four turns at that speed: only a machine that hangs takes longer.
         timeout_s = _TIMEOUT_S + 4 * math.tau / slowest
-        arrived = self._arrival(q, _SAME_RAD, "the move")
+        arrived = self._arrival(lambda: q, "the move")
         return await self._run(lease, command, timeout_s, "the move", arrived, q, begun)
 
     def _write(self, plan: Plan) -> int:
@@ -780,7 +771,7 @@ class MotionActions:
         tracking = None
         if tolerances is not None:
             tracking = Tracking(self._channel, tolerances, plan.duration_s, plan.end)
-        arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, name, tracking)
+        arrival = self._arrival(lambda: plan.end, name, tracking)
         timeout_s = _TIMEOUT_S + 2 * plan.duration_s
         watch = None if tracking is None else tracking.check
         sent = command(slot, len(plan.rows), tool=plan.tool)
@@ -838,23 +829,24 @@ class MotionActions:
                 self.goal = None
 
     def _arrival(
-        self, q: Sequence[float], same_rad: float, name: str, tracking: Tracking | None = None
+        self, end: Callable[[], Sequence[float]], name: str, tracking: Tracking | None = None
     ) -> Callable[[], Json | None]:
-        """Return an outcome: the position of the arm, which has settled, once it is within the motion's tolerances."""
-        channel, is_checked = self._channel, False
+        """Return an outcome for a motion that begins now: the position of the arm, which has arrived at `end`.
+
+        The motion has failed unless it ended with the event `Arrived`: a halt may come when the setpoints are at the
+        end and the joints are not.
+        """
+        channel = self._channel
+        since = channel.observer.last_event
 
         def poll() -> Json | None:
-            nonlocal is_checked
-            if not is_checked:
-                is_checked = True
-                commanded = channel.joints("commanded_position")
-                if max(abs(a - b) for a, b in zip(commanded, q, strict=True)) > same_rad:
-                    events = [entry.event for entry in channel.events(0) if not isinstance(entry.event, ServiceEvent)]
-                    raise channel.ended(events[-1] if events else None, f"{name} ended before it arrived")
+            ends = [entry.event for entry in channel.events(since) if isinstance(entry.event, Arrived | Stopped)]
+            if not ends or not isinstance(ends[-1], Arrived):
+                raise channel.ended(ends[-1] if ends else None, f"{name} ended before it arrived")
             positions = channel.joints("actual_position")
             if tracking is not None and not tracking.arrived(positions):
                 return None  # `Tracking.check` ends it
-            return {"positions": positions, "error": max(abs(a - b) for a, b in zip(positions, q, strict=True))}
+            return {"positions": positions, "error": max(abs(a - b) for a, b in zip(positions, end(), strict=True))}
 
         return poll
 

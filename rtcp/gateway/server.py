@@ -133,7 +133,7 @@ class _Connection:
         self.transport: asyncio.Transport
         """Of the thread of the sockets."""
         self.backlog = 0
-        """Bytes of the lines that wait."""
+        """Bytes of the lines that wait. Only the thread of the sockets counts them."""
         self.unread_since: float | None = None
         """Since when the client has not read all of its answers, s."""
 
@@ -146,16 +146,17 @@ class _Connection:
             stops: instant of the stop by the index of its line.
             is_too_long: whether the line after them is longer than any request.
         """
-        lines = whole.splitlines(keepends=True)
+        lines = whole.split(b"\n")[:-1]
         self._lines += [(line, stops.get(index, received_ns)) for index, line in enumerate(lines)]
         self._is_too_long = is_too_long
         if self._reading is None or self._reading.done():
             self._reading = asyncio.create_task(self._read())
 
     async def _read(self) -> None:
+        read = 0
         while self._lines:
             line, received_ns = self._lines.popleft()
-            self.backlog -= len(line)
+            read += len(line) + 1
             if len(line) > jsonrpc.LINE_LIMIT:
                 self._is_too_long = True
                 self._lines.clear()
@@ -163,8 +164,7 @@ class _Connection:
             self._receive(line, received_ns)
             # The requests of other connections have their turn.
             await asyncio.sleep(0)
-        if self.backlog <= _MOST_BACKLOG:
-            self._gateway.in_sockets(self.transport.resume_reading)
+        self._gateway.in_sockets(self._read_on, read)
         if self._is_too_long:
             if self._requests:
                 await asyncio.wait(self._requests)
@@ -173,6 +173,10 @@ class _Connection:
             # The client reads its answer only after it has sent all.
             await asyncio.sleep(_LINGER_S)
             self._gateway.in_sockets(self.transport.close)
+
+    def _read_on(self, read: int) -> None:
+        self.backlog -= read
+        self.transport.resume_reading()
 
     def end(self) -> None:
         """End all that the client requested: it has disconnected."""
@@ -377,7 +381,7 @@ class Gateway:
         """Request the stops among whole lines; return the instant of each, ns, by the index of its line."""
         if not any(name in whole for name in self._stops):
             return _NO_STOPS
-        lines = enumerate(whole.splitlines(keepends=True))
+        lines = enumerate(whole.split(b"\n"))
         return {index: instant for index, line in lines if (instant := self._request_stop(line))}
 
     def _request_stop(self, line: bytes) -> int:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Command, Halt, MotionCommand, MoveJoints, RunLines, RunTrajectory, SetLimits, SetZero
-from rtcp.ipc.events import Event, ZeroSet
+from rtcp.ipc.events import Arrived, Event, ZeroSet
 from rtcp.ipc.layout import PLAN_COLUMNS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
 from rtcp.ipc.refusals import Malformed, Refusal
 from rtcp.ipc.schema import Field, RecordSchema, arm_schema
@@ -47,7 +47,7 @@ class FakeLoop:
         self.refusals: dict[type[Command], Refusal] = {}
         self.ends: dict[type[Command], Sequence[float]] = {}
         self.reports: dict[type[Command], Sequence[Event]] = {}
-        self.event_at_the_end: Event | None = None
+        self.event_at_the_end: Event | None = Arrived()
         self.ends_in = State.HOLDING
         self.moves_for = 40
         self._left = 0

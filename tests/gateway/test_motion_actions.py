@@ -57,10 +57,13 @@ def test_a_move_reports_its_progress(arm: FakePlatform) -> None:
     assert {"state", "fraction", "remaining_s", "positions"} == set(reports[0])
 
 
-@pytest.mark.parametrize(
-    ("motion", "params"),
-    [("move_joints", {"q": THERE}), ("run_trajectory", {"points": [{"t": 0.0, "q": BENT}, {"t": 2.0, "q": THERE}]})],
-)
+MOTIONS: list[tuple[str, dict[str, Any]]] = [
+    ("move_joints", {"q": THERE}),
+    ("run_trajectory", {"points": [{"t": 0.0, "q": BENT}, {"t": 2.0, "q": THERE}]}),
+]
+
+
+@pytest.mark.parametrize(("motion", "params"), MOTIONS)
 def test_a_motion_reports_once_that_it_was_accepted_and_one_that_is_refused_does_not(
     arm: FakePlatform, motion: str, params: dict[str, Any]
 ) -> None:
@@ -95,7 +98,8 @@ def test_the_status_has_the_goal_while_the_arm_moves_there(arm: FakePlatform, mo
         arm.loop.state = State.STOPPING
         assert (await status_in(arm, State.STOPPING, moving))["goal"] is None
         arm.loop.state = State.HOLDING
-        await moving
+        with pytest.raises(RtcpError):
+            await moving
         assert arm.methods._motion.goal is None
 
     arm.run(work)
@@ -294,6 +298,16 @@ def test_a_motion_that_ends_early_fails_with_the_event_that_ended_it(
     error = arm.error("move_joints", q=THERE)
     assert (error.kind, error.reason, error.fields) == ("fault", event.name, event.as_json())
     assert str(error).startswith(message)
+
+
+@pytest.mark.parametrize(("motion", "params"), MOTIONS)
+def test_a_halt_while_the_joints_settle_at_the_end_of_a_motion_is_no_arrival(
+    arm: FakePlatform, motion: str, params: dict[str, Any]
+) -> None:
+    arm.loop.event_at_the_end = Stopped()
+    error = arm.error(motion, **params)
+    assert arm.loop.q == THERE
+    assert (error.kind, error.reason) == ("fault", "stopped")
 
 
 def test_a_motion_that_another_command_ends_is_refused(arm: FakePlatform) -> None:

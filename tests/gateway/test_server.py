@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import signal
 import socket
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from rtcp.gateway import server
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.commands import Command, Disable, Halt, MoveJoints
 from rtcp.ipc.errors import Invalid, Refused
@@ -123,6 +125,36 @@ def test_requests_before_a_line_over_the_limit_are_answered_first(raw: Raw) -> N
 def test_a_client_whose_request_is_too_long_gets_that_answer(client: ControlClient) -> None:
     with pytest.raises(Invalid, match=f"longer than {LINE_LIMIT} bytes"):
         client.call("sdo_write", {**OBJECT, "hex": "00" * 3_000_000})
+
+
+def test_a_carriage_return_is_white_space_within_a_request(raw: Raw, loop: FakeLoop) -> None:
+    raw.send(b'{"jsonrpc": "2.0",\r"id": 1, "method": "sdo_read",\r\t"params": ' + json.dumps(OBJECT).encode() + b"}\r")
+    assert raw.receive()["result"] == {"hex": "2a"}
+    raw.send(b'{"jsonrpc": "2.0",\r"method":\r"halt", "id": 2}')
+    until(lambda: loop.kinds == [Halt], "the halt")
+
+
+def test_what_was_read_no_longer_counts_as_backlog(
+    directory: Path, loop: FakeLoop, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path))
+    monkeypatch.setattr(server, "_MOST_BACKLOG", 100)
+    ours, theirs = socket.socketpair()
+
+    async def work() -> tuple[list[int], int]:
+        gateway = server.Gateway(directory)
+        gateway._main = gateway._sockets = running = asyncio.get_running_loop()
+        _, served = await running.create_unix_connection(gateway._connect, sock=theirs)
+        reader, writer = await asyncio.open_unix_connection(sock=ours)
+        codes = []
+        for _ in range(10):
+            writer.write(b"[]\n" * 60)
+            codes += [json.loads(await reader.readline())["error"]["code"] for _ in range(60)]
+        await asyncio.sleep(0.01)
+        writer.close()
+        return codes, served._connection.backlog
+
+    assert asyncio.run(work()) == ([-32600] * 600, 0)
 
 
 def test_requests_beyond_256_pending_ones_are_refused(raw: Raw, loop: FakeLoop) -> None:
