@@ -403,9 +403,9 @@ class MessagesLeftOut(ServiceEvent, number=75):
 
 
 class ProcessDataLost(FaultEvent, number=1):
-    """process data lost: the count of cycles without the expected working counter reached {allowed}, the last {in_a_row}
-    in a row; a cycle with it takes off 1/10 ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers come
-    again"""
+    """process data lost: the count of cycles without the expected working counter reached {allowed}, the last
+    {in_a_row} in a row; a cycle with it takes off 1/10 ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers
+    come again"""
 
     stop_key = "lost_frames"
     in_a_row: int

@@ -31,6 +31,8 @@ class ArmState:
     """
 
     __slots__ = (
+        "_samples",
+        "_taken",
         "actual",
         "actual_torque",
         "actual_velocity",
@@ -38,8 +40,6 @@ class ArmState:
         "commanded_acceleration",
         "commanded_velocity",
         "now_ns",
-        "_samples",
-        "_taken",
     )
 
     def __init__(self, joints: int) -> None:

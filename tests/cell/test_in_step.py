@@ -365,7 +365,9 @@ def test_limits_under_which_the_stop_would_end_too_near_the_partner_are_refused_
 
 def test_an_arm_in_cst_that_is_pushed_towards_its_partner_is_stopped_by_its_drives() -> None:
     cell = cell_of(apart_m=0.55)
-    pair = Pair(17, replace(cell, arms=tuple(replace(m, config=replace(m.config, drive_mode="cst")) for m in cell.arms)))
+    pair = Pair(
+        17, replace(cell, arms=tuple(replace(m, config=replace(m.config, drive_mode="cst")) for m in cell.arms))
+    )
     pair.simulation.run(0.5)
     left, guard = pair.arm("left"), pair.arm("left").loop.arm.trajectory_guard
     own, (other,) = guard.neighbours._own, guard.neighbours._partners

@@ -119,7 +119,8 @@ class ComplianceGuard:
 
 
 def _stands(velocity: Sequence[float]) -> bool:
+    # No generator in the cycle.
+    fastest = 0.0
     for speed in velocity:
-        if not -_STILL_RAD_S <= speed <= _STILL_RAD_S:
-            return False
-    return True
+        fastest = max(fastest, speed, -speed)
+    return fastest <= _STILL_RAD_S

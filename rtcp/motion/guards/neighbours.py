@@ -22,7 +22,7 @@ from rtcp.motion.step_group import StepGroup
 
 _SLOW_M: Final = 0.02
 """Largest travel between two samples of the stops with which arms that are too near move apart, m."""
-_MOST_SAMPLES: Final = 24
+_MOST_SAMPLES: Final = 8
 """Upper bound on these samples, for lack of time in a cycle; arms that need more have to move apart more slowly."""
 _ROUNDING_M: Final = 1e-9
 
