@@ -23,6 +23,7 @@ class CellSimulation:
         seed: seed of the buses.
         positions: name of an arm -> positions of its joints at power-on, rad.
         segments: name of an arm -> its slaves; left out: the configured segment.
+        follow_clock: as of `Simulation`.
     """
 
     def __init__(
@@ -32,6 +33,7 @@ class CellSimulation:
         *,
         positions: Mapping[str, Sequence[float]] | None = None,
         segments: Mapping[str, SegmentConfig] | None = None,
+        follow_clock: bool = True,
     ) -> None:
         self.partners = {member.name: Partners(cell, member.name) for member in cell.members}
         with contextlib.ExitStack() as stack:
@@ -39,7 +41,8 @@ class CellSimulation:
                 member.name: stack.enter_context(
                     Simulation(
                         member.config, seed + number, positions=(positions or {}).get(member.name),
-                        segment=(segments or {}).get(member.name), partners=self.partners[member.name],
+                        segment=(segments or {}).get(member.name), follow_clock=follow_clock,
+                        partners=self.partners[member.name],
                     )
                 )
                 for number, member in enumerate(cell.members)

@@ -145,7 +145,7 @@ def test_the_file_of_a_cell_runs_sessions_of_its_arms_together(rtcp: Callable[..
           - {name: left, config: assistive_arm.yaml}
           - {name: right, config: assistive_arm.yaml, base: {position: [-1.5, 0, 0], rpy: [0, 0, pi]}}
         """)
-    soak = ("soak", "--simulated", "--config", str(file), "--seconds", "0.1", "--json")
+    soak = ("soak", "--simulated", "--config", str(file), "--seconds", "1", "--json")
     ended = rtcp(*soak, "--sessions", "2", "--out", str(out))
     assert ended.code == 0, ended.err
     summary = json.loads(ended.out)

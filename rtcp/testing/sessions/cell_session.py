@@ -99,7 +99,7 @@ class CellSession:
         self.cell = cell = replace(cell, arms=members)
         readings = {arm.name: reading_of(arm.config) for arm in members}
         self.simulation = CellSimulation(
-            cell, random.randrange(1 << 30), positions=self._places(readings), segments=segments
+            cell, random.randrange(1 << 30), positions=self._places(readings), segments=segments, follow_clock=False
         )
         self.arms = [Arm(arm, random, self.simulation.arms[arm.name], readings[arm.name]) for arm in members]
         self.live = list(self.arms)
@@ -299,7 +299,7 @@ class CellSession:
 
     def _lower_acceleration(self, arm: Arm) -> None:
         commander = arm.commander
-        part = self.random.choice((0.05, 0.1, 0.25, 0.5))
+        part = self.random.choice((0.2, 0.3, 0.5))
         widest = Values.configured(commander.simulation.config)
         commander.set_limits(replace(commander.limits, acceleration=tuple(part * rate for rate in widest.acceleration)))
 

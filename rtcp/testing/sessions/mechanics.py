@@ -12,7 +12,19 @@ from math import inf
 from typing import Protocol
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.commands import ApplyTorque, Command, Enable, Guide, Home, MotionCommand, MoveGripper, MoveJoints
+from rtcp.ipc.commands import (
+    ApplyTorque,
+    Command,
+    Enable,
+    Guide,
+    Home,
+    Jog,
+    MotionCommand,
+    MoveAtVelocity,
+    MoveGripper,
+    MoveJoints,
+    SetLimits,
+)
 from rtcp.ipc.events import Arrived, Event, FaultEvent, MotionEnded, Stopped
 from rtcp.ipc.states import State
 from rtcp.testing.sessions.checker import CSP, CST, CSV, FrameChecker, Kind
@@ -59,6 +71,7 @@ _UNCOMMANDED = _RESTING | {
     State.OFF, State.STARTING, State.STOPPING, State.DISABLING, State.FAULT, State.RESETTING, State.EMERGENCY_STOP,
 }  # fmt: skip
 _ENABLED = frozenset({State.HOLDING, State.MOVING, State.STOPPED_BY_LIMIT})
+_WITHOUT_TARGET = (Jog, MoveAtVelocity, ApplyTorque, Guide)
 _MOTION_ENDS = (Arrived, Stopped, MotionEnded, FaultEvent)
 
 
@@ -119,6 +132,8 @@ class MechanicsChecker:
         """Whether the arm was enabled where a body is too near and has not come away yet."""
         self._target: Sequence[float] | None = None
         """Where the last motion command leads, rad; None: to the last targets on the bus."""
+        self._arrives = True
+        """Whether the last motion command has a target."""
         self._pushing: Sequence[float] | None = None
         """Torques of the present torque motion without a spring, Nm; None: there is none."""
 
@@ -130,16 +145,20 @@ class MechanicsChecker:
             self._limit(Kind.NOT_PERMITTED, now_ns, -1, self._cycles_released * self._dt, RELEASED_S)
         if isinstance(command, MotionCommand):
             self._target = command.q if isinstance(command, MoveJoints) else None
+            self._arrives = not isinstance(command, _WITHOUT_TARGET)
             self._pushing = None
             if isinstance(command, Guide):
                 self._pushing = [0.0] * len(self._mechanics)
             elif isinstance(command, ApplyTorque) and command.stiffness == 0.0:
                 self._pushing = command.torque
             self._cycles_uncommanded, self._begin = 0, None
+        elif isinstance(command, SetLimits):
+            # What the joints do now began under the old limits.
+            self._cycles_calm = 0
 
     def event(self, event: Event, now_ns: int) -> None:
         """Check an event of the loop: a motion is only complete when the joints are at its target."""
-        if isinstance(event, Arrived):
+        if isinstance(event, Arrived) and self._arrives:
             targets = self._frames.targets if self._target is None else self._target
             allowed = self._settle + ARRIVED_RAD
             for axis, (target, q) in enumerate(zip(targets, self._positions(), strict=False)):
