@@ -43,22 +43,27 @@ class AsyncRobot(Methods):
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
         self._writer: asyncio.StreamWriter | None = None
+        self._failure: OSError | None = None
+        """Why there is no connection."""
         self._receiving: asyncio.Task[None] | None = None
         self._stops: StopWriter | None = None
 
     async def __aenter__(self) -> AsyncRobot:
-        """Connect.
+        """Connect. Where only the gateway is missing, every call raises NotRunning, but a stop reaches the loop first.
 
         Raises:
-            NotRunning: nobody listens.
+            NotRunning: nobody listens, and no loop could take a stop.
             Refused: the socket is another user's.
         """
+        self._stops = StopWriter(self._path.parent)
         try:
             reader, self._writer = await asyncio.open_unix_connection(self._path, limit=_REPLY_LIMIT)
         except OSError as error:
-            raise connection_error(self._path, error) from error
+            if not self._stops.is_open:
+                raise connection_error(self._path, error) from error
+            self._failure = error
+            return self
         self._writer.write(jsonrpc.line({"method": "identify", "params": self._identity}))
-        self._stops = StopWriter(self._path.parent)
         self._receiving = asyncio.create_task(self._receive(reader))
         return self
 
@@ -115,12 +120,18 @@ class AsyncRobot(Methods):
             robot.close()
 
     async def _carry_out(self, call: Call[T]) -> T:
+        stops = self._stops or StopWriter(self._path.parent)
+        with stops.requested(call.method, call.params) as params:
+            return await self._answered(call, params)
+
+    async def _answered(self, call: Call[T], params: Mapping[str, Any]) -> T:
         writer, number = self._writer, next(self._numbers)
+        if self._failure is not None:
+            raise connection_error(self._path, self._failure)
         if writer is None or writer.is_closing():
             raise RtcpError("lost", f"the connection is closed: {call.method!r} was not sent")
         pending = self._pending[number] = _Pending(call)
         try:
-            params = call.params if self._stops is None else self._stops.request_of(call.method, call.params)
             writer.write(jsonrpc.request(number, call.method, params))
             return call.result(jsonrpc.result(await pending.reply(), call.method))
         except BaseException:

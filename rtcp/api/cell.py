@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from rtcp.api.results import Arrival, Status, result
 from rtcp.api.robot import Robot
 from rtcp.config.cell import CellConfig, Member
+from rtcp.ipc.client import ControlClient
 from rtcp.ipc.closing import Closing
 from rtcp.ipc.errors import NotRunning, RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
@@ -241,11 +242,11 @@ class Cell(Closing):
 
     def disable(self) -> None:
         """Stop all arms and remove their torque. Needs no lease."""
-        self._apart(Robot.disable)
+        self._stop("disable")
 
     def halt(self) -> None:
         """Stop every motion of every arm, whoever began it. Needs no lease; may be called from any thread."""
-        self._apart(Robot.halt)
+        self._stop("halt")
 
     def reset(self) -> None:
         """Leave the faults of all arms."""
@@ -253,7 +254,7 @@ class Cell(Closing):
 
     def stop(self) -> dict[str, tuple[str, ...]]:
         """End the platforms of all arms; return the steps that failed."""
-        return self._apart(Robot.stop)
+        return {name: tuple(answer["problems"]) for name, answer in self._stop("stop").items()}
 
     # -- motions in step ----------------------------------------------------------------------------------------------
 
@@ -334,15 +335,14 @@ class Cell(Closing):
     def _each(self, call: Callable[[Robot], T]) -> dict[str, T]:
         return self._all(lambda name, robot: call(robot))
 
-    def _apart(self, call: Callable[[Robot], T]) -> dict[str, T]:
-        """Call a method of every arm over new connections: those of this cell may be waiting."""
+    def _stop(self, method: str) -> dict[str, dict[str, Any]]:
+        """Stop every arm over new connections: those of this cell may be waiting, or may have ended."""
 
-        def on_its_own(name: str, robot: Robot) -> T:
-            path = control_socket(self.config.member(name).directory)
-            with Robot(self._name, path) as another:
-                return call(another)
+        def stop(name: str, robot: Robot) -> dict[str, Any]:
+            with ControlClient(self._name, control_socket(robot.directory)) as client:
+                return client.call(method)
 
-        return self._all(on_its_own)
+        return self._all(stop)
 
     def _all(self, call: Callable[[str, Robot], T], names: Mapping[str, object] | None = None) -> dict[str, T]:
         """Call a function for several members at once; raise the most telling error when all have returned."""

@@ -36,6 +36,7 @@ from rtcp.api.results import (
 )
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.closing import Closing
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
@@ -812,6 +813,11 @@ class Robot(Methods, Closing):
 
     def __init__(self, name: str = "", path: Path | None = None) -> None:
         self._client = ControlClient(name, path)
+        try:
+            self._client.connect()
+        except RtcpError:
+            self._client.close()
+            raise
         self.directory = runtime_directory() if path is None else path.parent
         """Runtime directory of its platform."""
 

@@ -30,6 +30,7 @@ from rtcp.cli.platform import connect, stoppable
 from rtcp.config.model import UNLIMITED_TORQUE, ConfigError
 from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.session import read_session
+from rtcp.ipc.stops import requested
 
 Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Configured name, as joint2, or number from 1.")]
 COLUMNS = (
@@ -58,8 +59,8 @@ def _enable() -> None:
 @commands.command("disable")
 def _disable() -> None:
     """Disable the drives; returns when they report no torque."""
-    with connect("disable") as robot:
-        unconfirmed = robot.disable()
+    with requested(runtime_directory(), "disable") as params, connect("disable") as robot:
+        unconfirmed = robot.command("disable", **params)["unconfirmed"]
         by_controller = "power" in robot.status().raw["lacks"]
     unobserved = f"; also disabled, but not observed in the cycle: {', '.join(unconfirmed)}" if unconfirmed else ""
     stands = "the arm stands, held by its robot controller with the motors on"
@@ -82,8 +83,8 @@ def _reset() -> None:
 @commands.command("halt")
 def _halt() -> None:
     """Stop the motion in a controlled way, whoever commands it; returns when the arm holds."""
-    with connect("halt") as robot:
-        robot.halt()
+    with requested(runtime_directory(), "halt") as params, connect("halt") as robot:
+        robot.command("halt", **params)
     report("halted: the arm holds where it stopped")
 
 

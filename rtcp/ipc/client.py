@@ -31,29 +31,42 @@ _PEER = struct.Struct("3i")
 
 
 class ControlClient(Closing):
-    """A connection to the running platform.
+    """A connection to the running platform, made by `connect` or by the first call.
 
     Closing it while a move is under way ends the lease of this client: the arm comes to a controlled stop.
     """
 
     def __init__(self, name: str = "", path: Path | None = None) -> None:
-        """Connect.
+        """Prepare the connection.
 
         Args:
             name: of this client, in refusals to others; empty: name and id of this process.
             path: the control socket; that of the runtime directory when None.
-
-        Raises:
-            RtcpError: `not running` when nobody listens, `refused` when the socket is another user's, `invalid`
-                when its path is too long for a socket.
         """
         self._path = control_socket(runtime_directory()) if path is None else path
         self._greeting = jsonrpc.line({"method": "identify", "params": {"name": client_name(name)}})
         """Sent with the first request."""
         self._request = 0
         self._received = bytearray()
-        self._socket = _connect(self._path)
         self._stops = StopWriter(self._path.parent)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._is_connected = False
+
+    def connect(self) -> None:
+        """Connect; a second time is harmless.
+
+        Raises:
+            RtcpError: `not running` when nobody listens, `refused` when the socket is another user's, `invalid`
+                when its path is too long for a socket.
+        """
+        if self._is_connected:
+            return
+        self._socket.settimeout(ANSWER_TIMEOUT_S)
+        try:
+            self._socket.connect(os.fspath(self._path))
+        except OSError as error:
+            raise connection_error(self._path, error) from error
+        self._is_connected = True
 
     def close(self) -> None:
         """Close the connection; a second time is harmless."""
@@ -79,20 +92,22 @@ class ControlClient(Closing):
 
         Raises:
             RtcpError: the one that the platform answered; `timeout` after `timeout_s` of silence; `lost` when the
-                connection ends first.
+                connection ends first; as `connect`. A stop reaches the loop in all of these cases
+                (`StopWriter.requested`).
         """
         self._request = number = self._request + 1
-        self._socket.settimeout(timeout_s)
-        params = self._stops.request_of(method, params or {})
-        self._send(method, self._greeting + jsonrpc.request(number, method, params))
-        self._greeting = b""
-        try:
-            reply = self._reply(number, method, progress, timeout_s)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                self._socket.sendall(jsonrpc.line({"method": "cancel", "params": {"request": number}}))
-            raise
-        return jsonrpc.result(reply, method)
+        with self._stops.requested(method, params or {}) as sent:
+            self.connect()
+            self._socket.settimeout(timeout_s)
+            self._send(method, self._greeting + jsonrpc.request(number, method, sent))
+            self._greeting = b""
+            try:
+                reply = self._reply(number, method, progress, timeout_s)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    self._socket.sendall(jsonrpc.line({"method": "cancel", "params": {"request": number}}))
+                raise
+            return jsonrpc.result(reply, method)
 
     def _reply(self, number: int, method: str, progress: Progress | None, timeout_s: float) -> dict[str, Any]:
         """Return the answer to a request; report the progress before it."""
@@ -143,17 +158,6 @@ class ControlClient(Closing):
 def client_name(name: str) -> str:
     """Return the name of this client in messages to others: `name`, or name and id of the process."""
     return name or f"{Path(sys.argv[0]).name} (pid {os.getpid()})"
-
-
-def _connect(path: Path) -> socket.socket:
-    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    connection.settimeout(ANSWER_TIMEOUT_S)
-    try:
-        connection.connect(os.fspath(path))
-    except OSError as error:
-        connection.close()
-        raise connection_error(path, error) from error
-    return connection
 
 
 def connection_error(path: Path, error: OSError) -> RtcpError:

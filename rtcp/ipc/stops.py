@@ -8,15 +8,17 @@ a stop, and that the loop reads after it, is refused (`rtcp.ipc.refusals.Superse
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from rtcp.ipc.closing import Closing
 from rtcp.ipc.commands import Command, Disable, Halt, Shutdown
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import MAGIC, STOP_SIZE, STOPS_AT, AtomicWords
 from rtcp.ipc.refusals import WrongState
 from rtcp.ipc.runtime_directory import blackboard_file
@@ -26,6 +28,8 @@ STOPS: Final[tuple[type[Command], ...]] = (Shutdown, Disable, Halt)
 """The kinds of stops, in the order of their words and in which the loop reads them: the one that ends most first."""
 _OLDEST_NS = 10_000_000_000
 """Age of a request, ns, beyond which its time stamp is not believed: the request counts from now."""
+_TAKEN_S = 0.05
+"""Longest time in which a loop that runs takes a stop, s: several of the longest cycles."""
 
 
 def words_of(kind: type[Command]) -> int:
@@ -95,9 +99,51 @@ class StopWriter(Closing):
             words.close()
             self._map.close()
 
-    def request_of(self, method: str, params: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Request the stop of a method, if it is one; return the parameters by which the gateway knows the stop."""
-        kind = self._KINDS.get(method)
-        if kind is None or self._words is None:
-            return params
-        return {**params, "requested_ns": request(self._words, kind)}
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a blackboard."""
+        return self._words is not None
+
+    @contextlib.contextmanager
+    def requested(self, method: str, params: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+        """Request the stop of a method, if it is one; in the block its end is confirmed through the gateway.
+
+        Yields the parameters by which the gateway knows the stop. A stop that `params` names by its `requested_ns` is
+        not requested again.
+
+        Raises:
+            RtcpError: that of the block. If the gateway did not answer, the message and the field `stop_taken` say
+                whether the loop has taken the stop.
+        """
+        kind, words = self._KINDS.get(method), self._words
+        if kind is None or words is None:
+            yield params
+            return
+        requested_ns = request(words, kind, params.get("requested_ns", 0))
+        try:
+            yield {**params, "requested_ns": requested_ns}
+        except RtcpError as error:
+            is_answered = error.kind not in ("not running", "lost", "timeout") or "stop_taken" in error.fields
+            if is_answered or self._words is None:  # None: closed in the meantime
+                raise
+            is_taken = _is_taken(words, kind, requested_ns)
+            taken = "the loop has taken it" if is_taken else f"the loop has not taken it within {_TAKEN_S:g} s"
+            message = f"{method!r} was requested and {taken}, but the gateway did not confirm its end: {error.message}"
+            raise RtcpError(error.kind, message, error.reason, {**error.fields, "stop_taken": is_taken}) from error
+
+
+def _is_taken(words: AtomicWords, kind: type[Command], requested_ns: int) -> bool:
+    """Wait for at most `_TAKEN_S` until the loop has answered a stop; return whether it has."""
+    until = time.monotonic() + _TAKEN_S
+    while refusal(words, kind, requested_ns) is False:
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.001)
+    return True
+
+
+@contextlib.contextmanager
+def requested(directory: Path, method: str) -> Iterator[Mapping[str, Any]]:
+    """Request a stop before the platform is connected to; as `StopWriter.requested`."""
+    with StopWriter(directory) as stops, stops.requested(method, {}) as params:
+        yield params

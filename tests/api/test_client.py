@@ -156,20 +156,21 @@ def test_an_answer_that_is_no_json_is_shown(listener: socket.socket) -> None:
 def test_a_socket_that_nobody_serves_is_not_running(listener: socket.socket, path: Path) -> None:
     listener.close()
     assert path.exists()
-    with pytest.raises(RtcpError, match="nobody listens") as raised:
-        ControlClient()
+    with ControlClient() as client, pytest.raises(RtcpError, match="nobody listens") as raised:
+        client.connect()
     assert raised.value.kind == "not running"
 
 
 def test_a_path_too_long_for_a_socket_is_named_with_the_limit(tmp_path: Path) -> None:
-    with pytest.raises(RtcpError, match="at most 107") as raised:
-        ControlClient(path=tmp_path / ("x" * 120) / "control.sock")
+    path = tmp_path / ("x" * 120) / "control.sock"
+    with ControlClient(path=path) as client, pytest.raises(RtcpError, match="at most 107") as raised:
+        client.connect()
     assert raised.value.kind == "invalid"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open any socket")
 def test_the_socket_of_another_user_is_refused(listener: socket.socket, path: Path) -> None:
     path.chmod(0)
-    with pytest.raises(RtcpError, match="only its owner") as raised:
-        ControlClient()
+    with ControlClient() as client, pytest.raises(RtcpError, match="only its owner") as raised:
+        client.connect()
     assert raised.value.kind == "refused"

@@ -19,10 +19,10 @@ import rtcp
 from rtcp import api
 from rtcp.api import Arrival, AsyncRobot, GripperRest, JogFrame, Progress, Robot, State, Streamed
 from rtcp.api.robot import Method, Methods
-from rtcp.ipc.commands import Halt, Jog, MoveGripper, MoveJoints, SetOutput, StreamPosition
+from rtcp.ipc.commands import Disable, Halt, Jog, MoveGripper, MoveJoints, SetOutput, StreamPosition
 from rtcp.ipc.events import SlaveLost
-from rtcp.ipc.runtime_directory import control_socket
-from tests.gateway.fake_loop import JOINTS, FakeLoop
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket
+from tests.gateway.fake_loop import JOINTS, FakeLoop, RunningLoop
 from tests.waiting import HANG_S, until
 
 Q = [0.1] * JOINTS
@@ -177,7 +177,9 @@ def test_halt_overtakes_the_move_of_the_same_robot(directory: Path, loop: FakeLo
         while Halt not in loop.kinds:
             await asyncio.sleep(0.01)
         loop.state = State.HOLDING
-        await asyncio.gather(move, halt)
+        await halt
+        with pytest.raises(rtcp.Faulted):
+            await move
 
     run(directory, work)
 
@@ -296,6 +298,59 @@ def test_a_connection_that_the_platform_closes_fails_every_call_that_waits(tmp_p
                 await robot.status()
 
     asyncio.run(work())
+
+
+@pytest.fixture
+def alone(tmp_path: Path) -> Iterator[FakeLoop]:
+    """A loop without a gateway, in `tmp_path`."""
+    loop = RunningLoop(blackboard_file(tmp_path))
+    yield loop
+    loop.end()
+    blackboard_file(tmp_path).unlink()
+
+
+def test_a_stop_reaches_the_loop_after_the_gateway_has_closed_the_connection(tmp_path: Path, alone: FakeLoop) -> None:
+    async def work() -> rtcp.RtcpError:
+        async def close(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.close()
+
+        await asyncio.start_unix_server(close, control_socket(tmp_path))
+        async with rtcp.connect_async(path=control_socket(tmp_path)) as robot:
+            while robot.is_open:
+                await asyncio.sleep(0.001)
+            with pytest.raises(rtcp.ConnectionLost) as raised:
+                await robot.halt()
+            return raised.value
+
+    assert asyncio.run(work()).fields == {"stop_taken": True}
+    assert alone.kinds == [Halt]
+
+
+def test_a_stop_whose_robot_is_closed_before_its_answer_is_lost(tmp_path: Path, alone: FakeLoop) -> None:
+    async def work() -> None:
+        await asyncio.start_unix_server(lambda reader, writer: None, control_socket(tmp_path))
+        robot = await rtcp.connect_async(path=control_socket(tmp_path)).__aenter__()
+        halt = asyncio.create_task(robot.halt())
+        while Halt not in alone.kinds:
+            await asyncio.sleep(0.001)
+        await robot.close()
+        with pytest.raises(rtcp.ConnectionLost, match=r"^the platform closed the connection"):
+            await halt
+
+    asyncio.run(work())
+
+
+def test_a_stop_reaches_the_loop_where_there_is_no_gateway(tmp_path: Path, alone: FakeLoop) -> None:
+    async def work(robot: AsyncRobot) -> rtcp.RtcpError:
+        assert not robot.is_open
+        with pytest.raises(rtcp.NotRunning):
+            await robot.status()
+        with pytest.raises(rtcp.NotRunning) as raised:
+            await robot.disable()
+        return raised.value
+
+    assert run(tmp_path, work).fields == {"stop_taken": True}
+    assert alone.kinds == [Disable]
 
 
 def test_inputs_and_outputs_are_mappings_by_name_and_by_place(robot: Robot, loop: FakeLoop) -> None:

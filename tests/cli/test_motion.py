@@ -14,7 +14,10 @@ from typing import Any
 import pytest
 
 from rtcp.api import Progress, Refused
-from rtcp.cli.output import progress
+from rtcp.cli.output import ExitCode, progress
+from rtcp.ipc.commands import Command, Disable, Halt
+from rtcp.ipc.runtime_directory import blackboard_file
+from tests.gateway.fake_loop import RunningLoop
 
 HOME = ("0", "0", "0", "0", "0", "0")
 
@@ -27,6 +30,22 @@ def test_a_plain_verb_is_passed_on_and_answered_with_a_sentence(
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.strip()
     assert platform.asked(verb) == [{}]
+
+
+@pytest.mark.parametrize("kind", [Halt, Disable])
+def test_a_stop_reaches_the_loop_where_no_gateway_can_be_reached(
+    rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type[Command]
+) -> None:
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(tmp_path))
+    loop = RunningLoop(blackboard_file(tmp_path))
+    try:
+        ended = rtcp(kind.name)
+        assert ended.code == ExitCode.NOT_RUNNING
+        assert "the loop has taken it" in ended.err
+        assert loop.kinds == [kind]
+    finally:
+        loop.end()
+        blackboard_file(tmp_path).unlink()
 
 
 def test_a_drive_whose_torque_is_not_looked_at_is_named_when_the_others_are_disabled(

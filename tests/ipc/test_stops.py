@@ -9,13 +9,16 @@ from pathlib import Path
 import pytest
 
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.commands import Disable, Enable, Halt, SetSpeedOverride, SetTool
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, SetSpeedOverride, SetTool
+from rtcp.ipc.errors import NotRunning, RtcpError
 from rtcp.ipc.observer import Answer, Observer
 from rtcp.ipc.refusals import Superseded, WrongState
-from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.schema import arm_schema
 from rtcp.ipc.states import State
-from rtcp.ipc.stops import STOPS, StopWriter, words_of
+from rtcp.ipc.stops import STOPS, StopWriter, requested, words_of
+from tests.gateway.fake_loop import RunningLoop
 
 
 @pytest.fixture
@@ -84,22 +87,69 @@ def test_an_impossible_instant_of_a_request_counts_as_now(
     assert board.take_command()[2] == Halt()
 
 
-def test_a_client_stops_without_gateway_and_the_gateway_does_not_repeat_its_stop(tmp_path: Path) -> None:
-    board = Blackboard(blackboard_file(tmp_path), arm_schema(6), 500_000)
+@pytest.fixture
+def directory(tmp_path: Path) -> Iterator[Path]:
+    """A runtime directory; its blackboard is removed."""
+    yield tmp_path
+    blackboard_file(tmp_path).unlink(missing_ok=True)
+
+
+@pytest.fixture
+def own(directory: Path) -> Iterator[Blackboard]:
+    """The blackboard of a loop in a runtime directory; the loop takes nothing."""
+    board = Blackboard(blackboard_file(directory), arm_schema(6), 500_000)
+    yield board
+    board.close()
+
+
+def test_a_client_stops_without_gateway_and_the_gateway_does_not_repeat_its_stop(
+    own: Blackboard, directory: Path
+) -> None:
+    with StopWriter(directory) as writer:
+        with writer.requested("halt", {}) as params:
+            assert own.take_command()[2] == Halt()
+        with writer.requested("halt", params) as repeated:
+            assert repeated == params
+        with writer.requested("status", {}) as params_of_status:
+            assert params_of_status == {}
+    observer = Observer(blackboard_file(directory))
+    assert observer.stop(Halt, params["requested_ns"]) == params["requested_ns"]
+    assert not own.command_waits()
+    observer.close()
+
+
+def test_a_client_without_a_platform_requests_no_stop(directory: Path) -> None:
+    with requested(directory, "halt") as params:
+        assert params == {}
+
+
+@pytest.mark.parametrize("kind", [Halt, Disable])
+def test_a_stop_without_gateway_is_requested_and_an_error_says_that_the_loop_has_not_taken_it(
+    own: Blackboard, directory: Path, kind: type[Command]
+) -> None:
+    with ControlClient(path=control_socket(directory)) as client:
+        with pytest.raises(NotRunning, match="has not taken") as raised:
+            client.call(kind.name)
+        with pytest.raises(NotRunning) as of_status:
+            client.call("status")
+    assert own.take_command()[2] == kind()
+    assert raised.value.fields == {"stop_taken": False}
+    assert of_status.value.fields == {}
+
+
+def test_a_stop_without_gateway_that_the_loop_has_taken_is_an_error_that_says_so(directory: Path) -> None:
+    loop = RunningLoop(blackboard_file(directory))
     try:
-        with StopWriter(tmp_path) as writer:
-            requested_ns = writer.request_of("halt", {})["requested_ns"]
-            assert writer.request_of("status", {}) == {}
-        assert board.take_command()[2] == Halt()
-        observer = Observer(blackboard_file(tmp_path))
-        assert observer.stop(Halt, requested_ns) == requested_ns
-        assert not board.command_waits()
-        observer.close()
+        with ControlClient(path=control_socket(directory)) as client, pytest.raises(NotRunning) as raised:
+            client.call("halt")
+        assert raised.value.fields == {"stop_taken": True}
+        assert loop.kinds == [Halt]
     finally:
-        board.close()
-        blackboard_file(tmp_path).unlink()
+        loop.end()
 
 
-def test_a_client_without_a_platform_requests_no_stop(tmp_path: Path) -> None:
-    with StopWriter(tmp_path) as writer:
-        assert writer.request_of("halt", {}) == {}
+def test_a_stop_that_the_gateway_refuses_is_its_error(own: Blackboard, directory: Path) -> None:
+    refused = RtcpError("refused", "no", "wrong_state")
+    with pytest.raises(RtcpError) as raised, requested(directory, "halt"):
+        raise refused
+    assert raised.value is refused

@@ -10,6 +10,7 @@ import struct
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from math import nan
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,11 +33,15 @@ from rtcp.fieldbus.simple_message.messages import (
     TriState,
     Version,
 )
+from rtcp.ipc.commands import Halt
+from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ros import held_up
 from rtcp.ros.simple_message.arm import Point
+from rtcp.ros.simple_message.robot_arm import RobotArm
 from rtcp.ros.simple_message.sequence import BUFFER_POINTS
 from rtcp.ros.simple_message.server import ServerOptions, SimpleMessageServer
 from tests import simulated_time
+from tests.gateway.fake_loop import RunningLoop
 from tests.ros.fake_arm import HOME, READY, FakeArm, FakeTrajectory
 
 START, END, STOP = -1, -3, -4
@@ -710,3 +715,18 @@ def test_a_state_client_that_does_not_read_is_dropped_and_the_others_are_served(
         assert any("it does not read" in record.getMessage() for record in caplog.records)
 
     run(client)
+
+
+def test_a_stop_reaches_the_loop_although_the_gateway_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(tmp_path))
+    loop = RunningLoop(blackboard_file(tmp_path))
+    try:
+        with pytest.raises(RtcpError) as raised:
+            asyncio.run(RobotArm().halt())
+        assert raised.value.fields == {"stop_taken": True}
+        assert loop.kinds == [Halt]
+    finally:
+        loop.end()
+        blackboard_file(tmp_path).unlink()

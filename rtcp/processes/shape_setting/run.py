@@ -24,6 +24,7 @@ from rtcp.api.cell import Cell, begin_thread, rod_file
 from rtcp.api.robot import Process
 from rtcp.config.cell import Member
 from rtcp.config.model import VIRTUAL
+from rtcp.ipc.client import ControlClient
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.processes.rod import BendingPlan, Equilibrium, Release, plan_motion, release, set_fraction, shoot
 from rtcp.processes.rod.bending import HALF_TURN, plan_approach
@@ -417,8 +418,9 @@ class ShapeSettingRun:
 
 
 def _halt(member: Member) -> None:
-    with contextlib.suppress(Exception), Robot("shape-set: stop", control_socket(member.directory)) as robot:
-        robot.halt()
+    path = control_socket(member.directory)
+    with contextlib.suppress(Exception), ControlClient("shape-set: stop", path) as client:
+        client.call("halt")
 
 
 @contextlib.contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 import rtcp
@@ -88,11 +88,18 @@ class RobotArm:
 
     async def halt(self) -> None:
         """Stop along the path."""
-        await self._connected.halt()
+        await self._stop(rtcp.AsyncRobot.halt)
 
     async def disable(self) -> None:
         """Remove the torque."""
-        await self._connected.disable()
+        await self._stop(rtcp.AsyncRobot.disable)
+
+    async def _stop(self, stop: Callable[[rtcp.AsyncRobot], Awaitable[object]]) -> None:
+        if self._robot is not None:
+            await stop(self._robot)
+            return
+        async with rtcp.connect_async("Simple Message") as robot:
+            await stop(robot)
 
     def is_newest(self, motion: int) -> bool:
         """Whether no motion was begun after this one."""
