@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from rtcp.telemetry.soak import Summary
     from rtcp.testing.sessions.cluster import SessionSummary
     from rtcp.testing.sessions.coverage import Coverage
-    from rtcp.testing.sessions.session import Result, Segment
+    from rtcp.testing.sessions.run import Segment
+    from rtcp.testing.sessions.session import Result
 
 LONGEST_MIN = 10_080.0
 LONGEST_SESSION_S = 3600.0

@@ -11,7 +11,7 @@ from rtcp.ipc.commands import MoveJoints
 from rtcp.ipc.states import State
 from rtcp.testing.sessions.cell_session import CellSession
 from rtcp.testing.sessions.checker import Kind
-from rtcp.testing.sessions.session import run_session
+from rtcp.testing.sessions.run import run_session
 from tests.samples import THOROUGH
 from tests.sessions.reverted.sessions import a_cell
 

@@ -18,7 +18,8 @@ from rtcp.ipc.states import State
 from rtcp.testing.sessions import run_session
 from rtcp.testing.sessions.checker import INCONSISTENT_S, Bounds, FrameChecker, Kind, Reading, reading_of
 from rtcp.testing.sessions.commander import Commander
-from rtcp.testing.sessions.session import AnySession, Session
+from rtcp.testing.sessions.run import AnySession
+from rtcp.testing.sessions.session import Session
 from rtcp.testing.simulation import Frame
 from tests.control.test_nine_joints import nine_joints
 from tests.control.test_standard_drives import arm_of

@@ -28,7 +28,8 @@ from rtcp.config import default_config, load
 from rtcp.config.segment import load_segment
 from rtcp.ipc.recording import RecordingError, read
 from rtcp.testing.sessions.black_box import replay
-from rtcp.testing.sessions.session import Result, run_session
+from rtcp.testing.sessions.run import run_session
+from rtcp.testing.sessions.session import Result
 from tests.leftovers import Leftovers
 from tests.sessions.session import narrowed, run_narrowed, session_of, two_workers
 

@@ -12,7 +12,8 @@ from rtcp.config.model import ArmConfig
 from rtcp.ipc.recording import About, FaultRecording, Moment, RecordingError, versions, write_new
 from rtcp.ipc.states import State
 from rtcp.ipc.tool_motion import ToolMotion
-from rtcp.testing.sessions.session import AnySession, Result, Segment, run_session
+from rtcp.testing.sessions.run import AnySession, Segment, run_session
+from rtcp.testing.sessions.session import Result
 from rtcp.testing.simulation import NAME
 
 BEFORE_S, AFTER_S = 10.0, 1.0

@@ -38,7 +38,8 @@ from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig
 from rtcp.config.serialization import to_json
 from rtcp.testing.sessions.coverage import Coverage
-from rtcp.testing.sessions.session import Result, Segment, run_session
+from rtcp.testing.sessions.run import Segment, run_session
+from rtcp.testing.sessions.session import Result
 
 PART = 1000
 """Sessions of a part of the results: the seeds of a file are the same wherever and in whatever order they ran."""

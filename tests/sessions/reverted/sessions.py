@@ -15,7 +15,8 @@ from rtcp.config import default_config, load
 from rtcp.config.cell import Base, CellConfig, Member
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
-from rtcp.testing.sessions.session import Result, Segment, run_session
+from rtcp.testing.sessions.run import Segment, run_session
+from rtcp.testing.sessions.session import Result
 
 SECONDS = 2.0
 """Simulated time of a session, s."""
