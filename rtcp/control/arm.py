@@ -7,6 +7,7 @@ from math import isfinite
 from typing import Any
 
 from kinematics.model import LinkMass
+from rtcp.config.find import plugin_error
 from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import checked_refusal
@@ -140,7 +141,7 @@ class Arm(JointGroup):
         for controller in self.controllers.values():
             try:
                 controller.use_tool(number)
-            except (Exception, SystemExit) as error:
+            except BaseException as error:
                 self._note(controller, error)
         self._publishes_load = True
 
@@ -181,26 +182,26 @@ class Arm(JointGroup):
         try:
             if controller.phase is Phase.MOVE:
                 controller.stop(self.state)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._note(controller, error)
 
     def accept_motion(self, controller: Controller, command: Command, continues: bool) -> Refusal | None:
         """Let a controller accept a command; its exception is a fault of the next cycle with torque."""
         try:
             return checked_refusal(controller.accept(command, self.state, continues))
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._note(controller, error)
             return ControllerRaised(self.raised_by)
 
     def _note(self, controller: Controller, error: BaseException) -> None:
-        self.raised, self.raised_by = error, str(controller.name)
+        self.raised, self.raised_by = plugin_error(error), str(controller.name)
 
     def rest(self) -> None:
         """Hold at the setpoints; only at standstill."""
         for controller in self.controllers.values():
             try:
                 controller.hold()
-            except (Exception, SystemExit) as error:
+            except BaseException as error:
                 self._note(controller, error)
         holder = self.active = self._holder
         self._progress = (holder.held, holder.elapsed_s, holder.duration_s)
@@ -234,7 +235,7 @@ class Arm(JointGroup):
             if setpoint.direct and controller.follows_joints:
                 self._look_ahead()
             result = self.trajectory_guard.apply(state, setpoint, controller.tolerates_saturation)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._note(controller, error)
             return GuardResult.PASS
         if setpoint.direct and not self.trajectory_guard.stopping and result is not GuardResult.STOPPED:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.find import is_foreign
+from rtcp.config.find import is_foreign, plugin_error
 from rtcp.config.model import ArmConfig
 from rtcp.devices.drive import Drive
 from rtcp.devices.driver import Driver, make_driver
@@ -207,21 +207,21 @@ class Device(Part):
         self.is_timed = is_foreign(driver)
 
     def _fail(self, error: BaseException) -> None:
-        self._failed, self._error = True, error
+        self._failed, self._error = True, plugin_error(error)
 
     def decode(self, data: ProcessData) -> None:
         """Read the inputs of the slave."""
         try:
             if not self._failed:
                 self.driver.decode(data.input(self.slot))
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
         """Let the driver carry out the command."""
         try:
             return DriverRaised(self.slot + 1) if self._failed else checked_refusal(self.driver.accept(command))
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
             return DriverRaised(self.slot + 1)
 
@@ -246,7 +246,7 @@ class Device(Part):
                 self._failed = self._failed and self._stays_safe
                 if not self._failed:
                     self.driver.safe()
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
         else:
             if event is not None:
@@ -263,7 +263,7 @@ class Device(Part):
             outputs = self.driver.safe_outputs if self._failed else self.driver.encode()
             if not isinstance(outputs, bytes) or len(outputs) != self._size:
                 raise ValueError(f"encode returned {outputs!r:.80}, allowed are {self._size} bytes")
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
             outputs = self.driver.safe_outputs
         data.set_output(self.slot, outputs)
@@ -276,7 +276,7 @@ class Device(Part):
                 self.driver.publish(published.values, 0)
                 published.check()
                 values[self.at : self.at + published.count] = published.values
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
 
     def safe(self) -> None:
@@ -284,7 +284,7 @@ class Device(Part):
         self._stays_safe = True
         try:
             self.driver.safe()
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
 
 

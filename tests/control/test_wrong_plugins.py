@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +14,7 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, find, load
-from rtcp.config.find import made_by
+from rtcp.config.find import definition_of, made_by
 from rtcp.config.model import ArmConfig, InputsConfig, OutputsConfig, PluginError
 from rtcp.control.part import Device, PartContext
 from rtcp.control.processes import ProcessPart
@@ -21,9 +23,10 @@ from rtcp.ipc.commands import Command, MotionCommand, Reset
 from rtcp.ipc.events import ControllerRaised, DriverFailed, ErrorReported, Event, PluginSlow, ProcessFailed, Stopped
 from rtcp.ipc.events import StreamEnded as EndOfMotion
 from rtcp.ipc.refusals import ControllerRaised as MotionRefused
-from rtcp.ipc.refusals import DriverRaised, ProcessRaised, Refusal
+from rtcp.ipc.refusals import DriverRaised, Malformed, ProcessRaised, Refusal
 from rtcp.ipc.schema import Field
 from rtcp.ipc.states import State
+from rtcp.motion.controllers import controller as controllers
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.state import ArmState, Setpoint
 from rtcp.processes import OutputChannel, Process, ProcessConfig, ProcessSetup
@@ -41,6 +44,17 @@ class Swing(MotionCommand):
     """A motion of the controller under test."""
 
 
+class Picky(Command):
+    """A command that checks its field with an exception of its own kind."""
+
+    states = frozenset(State)
+    most: int
+
+    def __post_init__(self) -> None:
+        if self.most > 3:
+            raise KeyError(self.most)
+
+
 class Gone(Refusal):
     """{text}"""
 
@@ -55,7 +69,11 @@ def misbehave(what: Any) -> Any:
 
 
 WRONG: Any = None
-EXCEPTIONS = {"an exception": KeyError("heat"), "the end of the process": SystemExit(1)}
+EXCEPTIONS = {
+    "an exception": KeyError("heat"),
+    "the end of the process": SystemExit(1),
+    "a cancelled task": asyncio.CancelledError(),
+}
 WRONG_EVENTS: dict[str, Any] = {
     "a text": "hot",
     "a number": 5,
@@ -285,7 +303,8 @@ class Swinger(Controller):
     def stop(self, state: ArmState) -> None:
         if self.method == "stop":
             misbehave(self.what)
-        super().stop(state)
+        else:
+            super().stop(state)
 
     def hold(self) -> None:
         super().hold()
@@ -356,6 +375,38 @@ def test_a_plug_in_that_cannot_be_made_is_refused_at_load_with_file_and_line(err
         raise error
     with pytest.raises(DeviceError, match="a channel is missing"), made_by(entry):
         raise DeviceError("a channel is missing")
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value"),
+    [
+        *[("name", None), ("name", ""), ("commands", None), ("commands", (Poke,)), ("commands", ["swing"])],
+        *[("control_modes", None), ("control_modes", frozenset()), ("control_modes", {"joint"})],
+    ],
+)
+def test_a_controller_with_a_wrong_attribute_is_refused_at_load_with_file_and_line(
+    rig: LoopRig, monkeypatch: pytest.MonkeyPatch, attribute: str, value: Any
+) -> None:
+    kind = type("Wrong", (Swinger,), {"__module__": __name__, attribute: value})
+    monkeypatch.setattr(f"{__name__}.Wrong", kind, raising=False)
+    entry = EntryPoint("wrong", f"{__name__}:Swinger", "rtcp.controllers")
+    monkeypatch.setattr(controllers, "installed", lambda: ((entry, kind),))
+    arm = rig.arm
+    setup = ControllerSetup(CONFIG, arm.limits, arm.trajectory_guard, rig.context.period_s, rig.board.plan)
+    with pytest.raises(PluginError, match=rf"wrong.*`{attribute}` is .*allowed is.*Wrong"):
+        controllers.load_controllers(setup)
+
+
+def test_a_finding_about_a_class_names_its_file_and_line() -> None:
+    assert definition_of(Stove) == f"{__file__}, line {inspect.getsourcelines(Stove)[1]}"
+
+
+def test_a_command_whose_check_raises_is_malformed(rig: LoopRig) -> None:
+    rig.start()
+    command = Picky(1)
+    object.__setattr__(command, "most", 5)
+    assert rig.send(command).refusal == Malformed(Picky.number)
+    rig.enable()
 
 
 def test_fields_that_are_none_are_refused_at_load(config: ArmConfig, monkeypatch: pytest.MonkeyPatch) -> None:
