@@ -235,13 +235,20 @@ class Context(PartContext):
         if event is not None:
             return event
         result = joints.command()
-        if (error := arm.raised) is not None:
-            arm.raised = None
-            self.explain(f"controller {arm.raised_by}", error)
-            return ControllerRaised(arm.raised_by)
+        if arm.raised is not None:
+            return self.controller_raised()
         if result is GuardResult.PASS and arm.active.ended is None:
             return None
         return self._motion_end(result)
+
+    def controller_raised(self) -> ControllerRaised | None:
+        """Return the event of a controller that has raised an exception, or None; the log explains the exception."""
+        arm, error = self.arm, self.arm.raised
+        if error is None:
+            return None
+        arm.raised = None
+        self.explain(f"controller {arm.raised_by}", error)
+        return ControllerRaised(arm.raised_by)
 
     def track_homing(self) -> Event | None:
         """Run the homing for a cycle, supervised as any motion; return the event that ends the state."""

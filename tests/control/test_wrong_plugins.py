@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
@@ -19,13 +19,14 @@ from rtcp.config.model import ArmConfig, InputsConfig, OutputsConfig, PluginErro
 from rtcp.control.part import Device, PartContext
 from rtcp.control.processes import ProcessPart
 from rtcp.devices.driver import ENTRY_POINTS, DeviceError, Driver
-from rtcp.ipc.commands import Command, MotionCommand, Reset
+from rtcp.ipc.commands import Command, Disable, Halt, MotionCommand, Reset, Shutdown
 from rtcp.ipc.events import ControllerRaised, DriverFailed, ErrorReported, Event, PluginSlow, ProcessFailed, Stopped
 from rtcp.ipc.events import StreamEnded as EndOfMotion
 from rtcp.ipc.refusals import ControllerRaised as MotionRefused
 from rtcp.ipc.refusals import DriverRaised, Malformed, ProcessRaised, Refusal
 from rtcp.ipc.schema import Field
 from rtcp.ipc.states import State
+from rtcp.ipc.stop_reactions import longest_s
 from rtcp.motion.controllers import controller as controllers
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.state import ArmState, Setpoint
@@ -352,6 +353,50 @@ def test_a_controller_that_misbehaves_is_a_fault_of_that_controller(rig: LoopRig
     rig.run(0.02)
     assert rig.state is State.MOVING
     assert rig.longest_step(0) <= 1
+
+
+STOPS: dict[str, Callable[[LoopRig], object]] = {
+    "halt": lambda rig: rig.do(Halt()),
+    "disable": lambda rig: rig.do(Disable()),
+    "shutdown": lambda rig: rig.do(Shutdown()),
+    "the lease ends": lambda rig: rig.observer.release(rig.lease),
+    "its own end": lambda rig: setattr(rig.arm.active, "ended", EndOfMotion()),
+}
+
+
+@pytest.mark.parametrize("stop", STOPS.values(), ids=STOPS.keys())
+@pytest.mark.parametrize("what", [None, *EXCEPTIONS.values()], ids=["nothing", *EXCEPTIONS])
+def test_the_arm_stops_whatever_the_stop_of_a_controller_does(
+    rig: LoopRig, stop: Callable[[LoopRig], object], what: Any
+) -> None:
+    rig.hold()
+    controller = swinger(rig)
+    rig.do(Swing())
+    rig.run(0.02)
+    controller.method, controller.what = "stop", what
+    stop(rig)
+    rig.wait(lambda: ControllerRaised in rig.kinds, 2.5 * longest_s(CONFIG))
+    assert rig.last_of(ControllerRaised) == ControllerRaised("swinger")
+    rig.run(0.2)
+    stands = list(rig.arm.state.commanded)
+    if rig.state is not State.OFF:
+        assert rig.state is State.FAULT
+        rig.run(0.2)
+    assert rig.arm.state.commanded == stands
+    assert rig.longest_step(0) <= 1
+
+
+def test_a_controller_may_take_longer_to_stop_under_lower_accelerations(rig: LoopRig) -> None:
+    rig.hold()
+    controller = swinger(rig)
+    rig.arm.limits.acceleration[0] /= 3.0
+    rig.do(Swing())
+    rig.run(0.02)
+    controller.method = "stop"
+    rig.do(Halt())
+    rig.run(2.5 * longest_s(CONFIG))
+    assert rig.state is State.STOPPING
+    rig.wait(lambda: rig.state is State.FAULT, 4.0 * longest_s(CONFIG))
 
 
 def test_a_setpoint_that_is_no_number_ends_the_motion_at_a_guard(rig: LoopRig) -> None:
