@@ -8,7 +8,7 @@ when their outputs have to be safe.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from mypy_extensions import mypyc_attr
@@ -19,12 +19,13 @@ from rtcp.devices.drive import Drive
 from rtcp.devices.driver import Driver, make_driver
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.commands import Command
-from rtcp.ipc.events import DriverFailed, Event, MotionEnded
+from rtcp.ipc.events import DriverFailed, Event, MotionEnded, PluginSlow
 from rtcp.ipc.message import PAYLOAD_SIZE
 from rtcp.ipc.refusals import DriverRaised, Refusal
 from rtcp.ipc.schema import Field, device_field
 from rtcp.ipc.states import State
 
+_SLOW_AGAIN_NS: Final = 10_000_000_000
 _PAYLOAD: Final = bytearray(PAYLOAD_SIZE)
 """Where messages of plug-ins are packed before the cycle uses them."""
 
@@ -81,6 +82,31 @@ class PublishedValues:
             self.values[:] = [0] * self.count
             raise ValueError(f"publish wrote {found} values, its fields are {self.count}")
         self._pack(self._memory, 0, *self.values)
+
+
+class PluginTimer:
+    """Names each plug-in that takes more than half a period in one call, at most once in `_SLOW_AGAIN_NS`.
+
+    Args:
+        now: clock, ns.
+        period_ns: period of the cycle, ns.
+        report: publishes an event.
+    """
+
+    def __init__(self, now: Callable[[], int], period_ns: int, report: Callable[[Event], None]) -> None:
+        self.now = now
+        self._allowed_ns = period_ns // 2
+        self._report = report
+        self._again: dict[str, int] = {}
+        """Plug-in that was named -> instant from which on it is named again, ns."""
+
+    def check(self, plugin: str, began: int) -> None:
+        """Name a plug-in whose call began at the instant `began`, ns, if it took too long."""
+        now = self.now()
+        took = now - began
+        if took > self._allowed_ns and now >= self._again.get(plugin, now):
+            self._again[plugin] = now + _SLOW_AGAIN_NS
+            self._report(PluginSlow(plugin, took * 1e-3, self._allowed_ns * 1e-3))
 
 
 class PartContext:

@@ -131,7 +131,10 @@ class Controller:
         self.motion.hold()
 
     def stop(self, state: ArmState) -> None:
-        """Come to rest under the limits: phase STOP, then HOLD. No effect at rest or during a stop."""
+        """Come to rest under the limits: phase STOP, then HOLD. No effect at rest or during a stop.
+
+        A controller of another package that takes more than twice the longest controlled stop is a fault.
+        """
         if self.phase is Phase.MOVE:
             self.brake(state)
 
