@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import traceback
 from collections.abc import Iterator
@@ -169,6 +170,25 @@ def made_by(entry: EntryPoint) -> Iterator[None]:
         frame = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{frame.filename}, line {frame.lineno}"
         raise PluginError(entry, f"cannot be used: {type(error).__name__}: {error} ({where})") from error
+
+
+def plugin_error(error: BaseException) -> BaseException:
+    """Return what the code of a plug-in raised, sys.exit() and asyncio.CancelledError too.
+
+    Raises:
+        KeyboardInterrupt: the error is that one, which a person raised.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        raise error
+    return error
+
+
+def definition_of(kind: type[object]) -> str:
+    """Return the file and the line of a plug-in's class, for a finding about it."""
+    try:
+        return f"{inspect.getsourcefile(kind)}, line {inspect.getsourcelines(kind)[1]}"
+    except (OSError, TypeError):
+        return f"{kind.__module__}.{kind.__qualname__}, which has no source file"
 
 
 def load_class(entry: EntryPoint, base: type[T]) -> type[T]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import isfinite
-from typing import Any
+from math import ceil, isfinite
+from typing import Any, Final
 
 from kinematics.model import LinkMass
+from rtcp.config.find import is_foreign, plugin_error
 from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import checked_refusal
@@ -16,6 +17,7 @@ from rtcp.ipc.events import FaultEvent, MotionEnded, PushedNear, PushedNearPartn
 from rtcp.ipc.refusals import ControllerRaised, Refusal
 from rtcp.ipc.schema import ARM_MODES, LOAD_FIELDS, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
+from rtcp.ipc.stop_reactions import longest_s
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
 from rtcp.motion.controllers.jog import JogController
 from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveWriter
@@ -33,6 +35,8 @@ from rtcp.motion.step_group import StepGroup
 from rtcp.motion.tool_in_use import Gravity, ToolInUse
 
 _LARGEST_HELD = 0xFFFF_FFFF
+_STOP_TIMES: Final = 2.0
+"""Time that a controller of another package may take to stop: this many times the longest controlled stop."""
 _NOTHING = LinkMass(0.0, (0.0, 0.0, 0.0))
 
 
@@ -85,6 +89,10 @@ class Arm(JointGroup):
         """Exception of a controller that the machine has not handled."""
         self.raised_by = ""
         """Name of the controller that raised it."""
+        self._stop_s = _STOP_TIMES * longest_s(config) if joints else 0.0
+        self._configured_rates = [joint.acceleration for joint in joints]
+        self._stop_cycles = 0
+        """Cycles left for the stop of a controller of another package; 0: none stops."""
         self._progress = (0, 0.0, 0.0)
         """What the active controller publishes: its `held`, `elapsed_s` and `duration_s`."""
         self._holder = self.controllers[MoveJoints]
@@ -158,7 +166,7 @@ class Arm(JointGroup):
         for controller in self.controllers.values():
             try:
                 controller.use_tool(number)
-            except (Exception, SystemExit) as error:
+            except BaseException as error:
                 self._note(controller, error)
         self._publishes_load = True
 
@@ -196,31 +204,41 @@ class Arm(JointGroup):
     def stop(self) -> None:
         """Let the active controller come to rest."""
         controller = self.active
+        self.limit_stop()
         try:
             if controller.phase is Phase.MOVE:
                 controller.stop(self.state)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._note(controller, error)
+
+    def limit_stop(self) -> None:
+        """Limit the time in which a controller of another package comes to rest."""
+        if self._stop_cycles == 0 and not self.still and is_foreign(self.active):
+            # The configured time, longer where lower accelerations are in force.
+            rates = zip(self._configured_rates, self.limits.acceleration, strict=True)
+            longer = max(1.0, *(configured / rate for configured, rate in rates))
+            self._stop_cycles = ceil(longer * self._stop_s / self.period_s)
 
     def accept_motion(self, controller: Controller, command: Command, continues: bool) -> Refusal | None:
         """Let a controller accept a command; its exception is a fault of the next cycle with torque."""
         try:
             return checked_refusal(controller.accept(command, self.state, continues))
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._note(controller, error)
             return ControllerRaised(self.raised_by)
 
     def _note(self, controller: Controller, error: BaseException) -> None:
-        self.raised, self.raised_by = error, str(controller.name)
+        self.raised, self.raised_by = plugin_error(error), controller.name
 
     def rest(self) -> None:
         """Hold at the setpoints; only at standstill."""
         for controller in self.controllers.values():
             try:
                 controller.hold()
-            except (Exception, SystemExit) as error:
+            except BaseException as error:
                 self._note(controller, error)
         holder = self.active = self._holder
+        self._stop_cycles = 0
         self._progress = (holder.held, holder.elapsed_s, holder.duration_s)
 
     def hold(self) -> None:
@@ -251,8 +269,10 @@ class Arm(JointGroup):
             self._progress = (held, float(controller.elapsed_s), float(controller.duration_s))
             if setpoint.direct and controller.follows_joints:
                 self._look_ahead()
+            if self._stop_cycles:
+                self._count_stop()
             result = self.trajectory_guard.apply(state, setpoint, controller.tolerates_saturation)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._note(controller, error)
             return GuardResult.PASS
         if setpoint.direct and not self.trajectory_guard.stopping and result is not GuardResult.STOPPED:
@@ -261,6 +281,11 @@ class Arm(JointGroup):
             self._writer.update(state.commanded, state.commanded_velocity, drives)
         self.output_limiter.check(drives)
         return result
+
+    def _count_stop(self) -> None:
+        self._stop_cycles -= 1
+        if self._stop_cycles == 0 and not self.at_rest:
+            raise TimeoutError("the controller was told to stop, or has ended, and its setpoints still move")
 
     def _check_torques(self, setpoint: Setpoint) -> None:
         count, torque, weight = len(self.drives), setpoint.torque, setpoint.weight

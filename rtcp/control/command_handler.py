@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from functools import partial
 from math import hypot
 from typing import Any, Final
 
 from kinematics.model import LinkMass
+from rtcp.config.find import is_foreign
 from rtcp.config.model import ConfigError
 from rtcp.control.machine import StateMachine
-from rtcp.control.part import Device
+from rtcp.control.part import Device, Part
 from rtcp.control.processes import ProcessPart
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.ipc import commands, events, refusals
@@ -84,7 +86,7 @@ class CommandHandler:
             for kind in part.commands:
                 if kind in self._handlers or issubclass(kind, commands.MotionCommand):
                     raise ConfigError([f"{part.name}: the command {kind.name} is already taken by another part"])
-                self._handlers[kind] = part.accept
+                self._handlers[kind] = partial(self._timed_accept, part) if part.is_timed else part.accept
 
     def handle(self) -> None:
         """Carry out and answer the next command; called only when one waits."""
@@ -128,6 +130,13 @@ class CommandHandler:
         handler = self._handlers.get(type(command))
         return handler(command, lease) if handler is not None else refusals.Malformed(command.number)
 
+    def _timed_accept(self, part: Part, command: commands.Command, lease: int) -> refusals.Refusal | None:
+        timer = self._context.timer
+        began = timer.now()
+        refusal = part.accept(command, lease)
+        timer.check(part.name, began)
+        return refusal
+
     # -- motion ---------------------------------------------------------------------------------------------------
 
     def _motion_refusal(self, modes: frozenset[ControlMode]) -> refusals.Refusal | None:
@@ -158,7 +167,11 @@ class CommandHandler:
         if isinstance(command, _PLANNED) and command.tool != arm.tool.number:
             return refusals.PlannedForAnotherTool(command.tool, arm.tool.number)
         continues = machine.state is State.MOVING and arm.active is controller and not arm.still
+        timer = self._context.timer
+        began = timer.now()
         refusal = arm.accept_motion(controller, command, continues)
+        if is_foreign(controller):
+            timer.check(f"controller {controller.name}", began)
         if refusal is not None:
             return refusal
         if isinstance(command, _PLANNED):
@@ -188,7 +201,7 @@ class CommandHandler:
     def _halt(self, command: commands.Halt, lease: int) -> refusals.Refusal | None:
         self._joints.stop_others()
         for process in self._processes:
-            process.safe()
+            self._context.make_part_safe(process)
         if self._machine.state is State.HOMING and not self._context.homing.ended:
             self._context.homing.stop()
         else:

@@ -12,7 +12,7 @@ from rtcp.control.gripper import DrivenGripper
 from rtcp.control.homing import HomingSequence
 from rtcp.control.joint_group import Joints
 from rtcp.control.operator import Operator
-from rtcp.control.part import Device, Part, PartContext
+from rtcp.control.part import Device, Part, PartContext, PluginTimer
 from rtcp.control.partners import Partners
 from rtcp.devices.io_box import IoBox
 from rtcp.ipc.blackboard import Blackboard
@@ -49,6 +49,7 @@ class Context(PartContext):
 
     Args:
         config: timeouts, tolerated lost cycles, and the stop reactions.
+        timer: names plug-ins that take too long.
         arm: its joints.
         gripper: a gripper with a drive, or None.
         operator: the inputs and outputs with a function.
@@ -63,6 +64,7 @@ class Context(PartContext):
     def __init__(
         self,
         config: ArmConfig,
+        timer: PluginTimer,
         arm: Arm,
         gripper: DrivenGripper | None,
         operator: Operator,
@@ -75,9 +77,11 @@ class Context(PartContext):
     ) -> None:
         super().__init__(config.cycle.period_us * 1e-6)
         self.config = config
+        self.timer = timer
         self.arm = arm
         self.gripper = gripper
         self.joints = Joints(arm, [] if gripper is None else [gripper])
+        self.joints.time_foreign(timer)
         self.operator = operator
         if partners is not None:
             arm.trajectory_guard.neighbours = partners.watch(arm.state, arm.limits, self.period_s)
@@ -165,7 +169,14 @@ class Context(PartContext):
     def make_safe(self) -> None:
         """Set the outputs of every part to their safe state."""
         for part in self.parts:
-            part.safe()
+            self.make_part_safe(part)
+
+    def make_part_safe(self, part: Part) -> None:
+        """Set the outputs of a part to their safe state; a slow plug-in is named."""
+        began = self.timer.now()
+        part.safe()
+        if part.is_timed:
+            self.timer.check(part.name, began)
 
     # -- external ends of a state ---------------------------------------------------------------------------------
 
@@ -235,13 +246,20 @@ class Context(PartContext):
         if event is not None:
             return event
         result = joints.command()
-        if (error := arm.raised) is not None:
-            arm.raised = None
-            self.explain(f"controller {arm.raised_by}", error)
-            return ControllerRaised(arm.raised_by)
+        if arm.raised is not None:
+            return self.controller_raised()
         if result is GuardResult.PASS and arm.active.ended is None:
             return None
         return self._motion_end(result)
+
+    def controller_raised(self) -> ControllerRaised | None:
+        """Return the event of a controller that has raised an exception, or None; the log explains the exception."""
+        arm, error = self.arm, self.arm.raised
+        if error is None:
+            return None
+        arm.raised = None
+        self.explain(f"controller {arm.raised_by}", error)
+        return ControllerRaised(arm.raised_by)
 
     def track_homing(self) -> Event | None:
         """Run the homing for a cycle, supervised as any motion; return the event that ends the state."""

@@ -20,7 +20,7 @@ from rtcp.control.context import Context
 from rtcp.control.gripper import make_gripper
 from rtcp.control.machine import StateMachine
 from rtcp.control.operator import Operator
-from rtcp.control.part import Part, make_devices
+from rtcp.control.part import Part, PluginTimer, make_devices
 from rtcp.control.partners import Partners
 from rtcp.control.processes import make_processes
 from rtcp.devices.drive import Drive, drive_of
@@ -28,7 +28,7 @@ from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.master import PacedData
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.events import ClockLocked, ClockUnlocked, PluginSlow
+from rtcp.ipc.events import ClockLocked, ClockUnlocked
 from rtcp.ipc.schema import (
     CYCLE_FIELDS,
     FLAG_ALL_OP,
@@ -50,7 +50,6 @@ from rtcp.realtime.scheduling import Sleeper
 _LARGEST_COUNTER = 0x7FFF
 """Largest working counter in a record: a damaged frame may have a larger one than any segment."""
 _LONGEST_NS: Final = 2_000_000_000
-_SLOW_AGAIN_NS: Final = 10_000_000_000
 _TRANSIT_DIVISOR: Final = 20
 """Longest transit time of a frame: the period divided by this."""
 
@@ -87,8 +86,10 @@ class Cycle:
         group = None if partners is None else partners.group
         self.arm = Arm(config, make_drives(config), blackboard.plan, group)
         self.operator = Operator(config, boxes, gripper)
+        self._period_ns = round(config.cycle.period_us * 1000)
         context = Context(
-            config, self.arm, gripper, self.operator, devices, blackboard, service, discipline, partners,
+            config, PluginTimer(now, self._period_ns, blackboard.event), self.arm, gripper, self.operator, devices,
+            blackboard, service, discipline, partners,
             make_processes(config, devices, partners),
         )  # fmt: skip
         self.joints = context.joints
@@ -111,15 +112,13 @@ class Cycle:
         self._discipline = discipline
         self._now = now
         self._expected = data.expected_wkc
-        self._period_ns = round(config.cycle.period_us * 1000)
         ahead_ns = ahead_of_sync0(config)
         # Half of the time to SYNC0; the other half is for the frame's transit.
         self._late_ns = ahead_ns // 2
         # After a frame that misses its SYNC0, the next tick's frame would precede the same SYNC0 as that frame.
         self._apart_ns = max(self._period_ns // 2, self._period_ns - ahead_ns + self._period_ns // _TRANSIT_DIVISOR)
         self._spin_ns = round(config.cycle.spin_us * 1000)
-        self._slow_again = 0
-        """Instant from which on a slow plug-in is reported again, ns."""
+        self._timer = context.timer
         self._controllers_timed = any(map(is_foreign, self.arm.controllers.values()))
         self._locked = False
         self._shutdown = False
@@ -225,7 +224,7 @@ class Cycle:
             began = self._now()
             machine.update(good)
             if is_foreign(self.arm.active):
-                self._check_time(f"controller {self.arm.active.name}", began)
+                self._timer.check(f"controller {self.arm.active.name}", began)
         else:
             machine.update(good)
         if board.stream and not commands.open_stream:
@@ -241,14 +240,7 @@ class Cycle:
     def _timed(self, part: Part, call: Callable[[Any], None], argument: object) -> None:
         began = self._now()
         call(argument)
-        self._check_time(part.name, began)
-
-    def _check_time(self, plugin: str, began: int) -> None:
-        """Report a plug-in that has taken more than half a period since `began`, at most every `_SLOW_AGAIN_NS`."""
-        now = self._now()
-        if now - began > self._period_ns // 2 and now >= self._slow_again:
-            self._slow_again = now + _SLOW_AGAIN_NS
-            self._blackboard.event(PluginSlow(plugin, (now - began) * 1e-3, self._period_ns * 0.5e-3))
+        self._timer.check(part.name, began)
 
     def _publish(self, woken: int, planned: int, received: int, wkc: int) -> None:
         """Publish the record of the cycle."""
@@ -295,7 +287,10 @@ class Cycle:
             machine.motions,
         )
         for part in self.parts:
-            part.publish(values)
+            if part.is_timed:
+                self._timed(part, part.publish, values)
+            else:
+                part.publish(values)
         self._blackboard.publish(values)
 
 

@@ -45,6 +45,7 @@ class DrivenGripper(JointGroup):
 
     def update(self, context: PartContext) -> None:
         """Report its position when it has come to rest after a motion or a command."""
+        super().update(context)
         before, self._moved = self._moved, self.motion.moving
         if before and not self._moved and context.all_enabled:
             context.publish(GripperAtRest(self.first, self.state.commanded[0], self.motion.gripped))

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Sequence
 from typing import Final
 
+from rtcp.config.find import is_foreign, plugin_error
 from rtcp.config.model import ArmConfig
 from rtcp.control.measurements import Measurements
-from rtcp.control.part import Part
+from rtcp.control.part import Part, PartContext, PluginTimer
+from rtcp.devices.cia402 import blind_outputs
 from rtcp.devices.drive import Drive, TargetState, share_slaves
 from rtcp.fieldbus.bus import ProcessData
-from rtcp.ipc.events import FaultEvent
+from rtcp.ipc.events import DriverFailed, FaultEvent
 from rtcp.ipc.schema import Field
-from rtcp.ipc.states import WITH_TORQUE, DriveState, Missing
+from rtcp.ipc.states import WITH_TORQUE, DriveState, Missing, State
 from rtcp.motion.guards.output_limiter import OutputLimiter
 from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.guards.trajectory_guard import GuardResult
@@ -28,6 +31,94 @@ _STILL_RAD_S: Final = 0.01
 RANGE_MARGIN_RAD: Final = 0.02
 """Largest distance of a joint from its range, rad, at which it can be enabled, to return to the edge: an overshoot in
 CST must not leave an arm that no command can move."""
+
+
+_NUMBERS: Final = (
+    "position", "velocity", "torque", "temperature", "target_position", "target_velocity", "target_torque",
+    "mode_display", "statusword",
+)  # fmt: skip
+"""Numbers of a drive that the loop uses."""
+_NUMBER_TYPES: Final = struct.Struct("<7dbH")
+"""Their types, which the record and the events can hold."""
+_VALUES: Final = (*_NUMBERS, "state", "missing")
+
+
+class ForeignDrive:
+    """The calls of a drive's driver of another package.
+
+    An exception of the driver, or a wrong value, is a fault of that slave and does not end the cycle: the driver is not
+    called any more, its last good values stay, and its outputs are a quick stop, or no torque where the machine
+    commands that, until the machine is reset.
+
+    Args:
+        slot: index of the slave.
+        drive: driver of the drive.
+    """
+
+    def __init__(self, slot: int, drive: Drive) -> None:
+        self.drive = drive
+        self.timer: PluginTimer | None = None
+        self._slot = slot
+        self._failed = self._retries = False
+        self._error: BaseException | None = None
+        self._goal = TargetState.DISABLED
+        self._sent = bytes(drive.output_bytes)
+
+    def decode(self, data: bytes) -> None:
+        """Let the driver read the inputs of the slave."""
+        if self._retries:
+            # The machine commands the drive in this cycle, before outputs are encoded.
+            self._failed = self._retries = False
+        self._call(self.drive.decode, data)
+
+    def advance(self, target: TargetState) -> None:
+        """Let the driver take the next step towards `target`."""
+        self._goal = target
+        self._call(self.drive.advance, target)
+
+    def encode(self) -> bytes:
+        """Return the outputs of the driver, or of a drive whose driver failed."""
+        outputs = self._call(self.drive.encode)
+        size = self.drive.output_bytes
+        if not self._failed:
+            if isinstance(outputs, bytes) and len(outputs) == size:
+                self._sent = outputs
+                return outputs
+            self._fail(ValueError(f"encode returned {outputs!r:.80}, allowed are {size} bytes"))
+        return blind_outputs(self.drive, self._goal, self._sent)
+
+    def update(self, context: PartContext) -> None:
+        """Report an exception of the driver as a fault; try the driver again in a reset."""
+        if self._error is not None:
+            context.explain(f"driver of slave {self.drive.name}", self._error)
+            self._error = None
+            context.report(DriverFailed(self._slot + 1))
+        elif self._failed:
+            self._retries = context.state is State.RESETTING
+
+    def _call(self, call: Callable[..., object], *arguments: object) -> object:
+        if self._failed:
+            return None
+        drive = self.drive
+        timer = self.timer
+        began = 0 if timer is None else timer.now()
+        kept = [getattr(drive, name) for name in _VALUES]
+        result: object = None
+        try:
+            result = call(*arguments)
+            _NUMBER_TYPES.pack(*(getattr(drive, name) for name in _NUMBERS))
+            if not isinstance(drive.state, DriveState) or not isinstance(drive.missing, Missing):
+                raise TypeError(f"found the state {drive.state!r:.80} with {drive.missing!r:.80} missing")
+        except BaseException as error:
+            self._fail(error)
+            for name, value in zip(_VALUES, kept, strict=True):
+                setattr(drive, name, value)
+        if timer is not None:
+            timer.check(drive.name, began)
+        return result
+
+    def _fail(self, error: BaseException) -> None:
+        self._failed, self._error = True, plugin_error(error)
 
 
 class JointGroup(Part):
@@ -54,6 +145,8 @@ class JointGroup(Part):
         self.period_s = config.cycle.period_us * 1e-6
         self.pairs = list(drives)
         self.drives = [drive for _, drive in drives]
+        self.foreign = {i: ForeignDrive(slot, drive) for i, (slot, drive) in enumerate(drives) if is_foreign(drive)}
+        """Joints, counted within the group, whose drive has a driver of another package."""
         self.shares_slaves = False
         """Whether one of its drives is one of several axes of a slave."""
         self.state = ArmState(len(config.joints))
@@ -71,10 +164,14 @@ class JointGroup(Part):
         state, samples, measurements = self.state, self.samples, self.measurements
         actual, speed, torque = state.actual, state.actual_velocity, state.actual_torque
         positions, velocities, torques = samples.actual, samples.actual_velocity, samples.actual_torque
+        foreign = self.foreign
         measurements.begin(state.now_ns)
         for axis, (slot, drive) in enumerate(self.pairs):
             last_position, last_velocity, last_torque = drive.position, drive.velocity, drive.torque
-            drive.decode(data.input(slot))
+            if foreign and axis in foreign:
+                foreign[axis].decode(data.input(slot))
+            else:
+                drive.decode(data.input(slot))
             positions[axis] = drive.position
             velocities[axis] = drive.velocity
             torques[axis] = drive.torque
@@ -86,13 +183,19 @@ class JointGroup(Part):
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the drives."""
-        if self.shares_slaves:
-            for slot, drive in self.pairs:
-                own, slave = drive.encode(), drive.slave
+        if self.shares_slaves or self.foreign:
+            for i, (slot, drive) in enumerate(self.pairs):
+                own = self.foreign[i].encode() if i in self.foreign else drive.encode()
+                slave = drive.slave
                 data.set_output(slot, own if slave is None else slave.outputs(drive, own))
             return
         for slot, drive in self.pairs:
             data.set_output(slot, drive.encode())
+
+    def update(self, context: PartContext) -> None:
+        """Report what drivers of other packages have raised."""
+        for drive in self.foreign.values():
+            drive.update(context)
 
     def set_limits(self, new: Values) -> None:
         """Apply new limits."""
@@ -162,9 +265,23 @@ class Joints:
         for group in self.groups:
             group.shares_slaves = any(drive.slave is not None for drive in group.drives)
         self.drives = [drive for _, drive in self.pairs]
+        self.foreign = {group.first + i: drive for group in self.groups for i, drive in group.foreign.items()}
+        """Joints whose drive has a driver of another package."""
+
+    def time_foreign(self, timer: PluginTimer) -> None:
+        """Let `timer` measure the drivers of other packages."""
+        for drive in self.foreign.values():
+            drive.timer = timer
 
     def advance(self, target: TargetState) -> None:
         """Command every drive one step towards `target`."""
+        if self.foreign:
+            for axis, drive in enumerate(self.drives):
+                if axis in self.foreign:
+                    self.foreign[axis].advance(target)
+                else:
+                    drive.advance(target)
+            return
         for drive in self.drives:
             drive.advance(target)
 

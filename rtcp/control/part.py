@@ -8,23 +8,24 @@ when their outputs have to be safe.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.find import is_foreign
+from rtcp.config.find import is_foreign, plugin_error
 from rtcp.config.model import ArmConfig
 from rtcp.devices.drive import Drive
 from rtcp.devices.driver import Driver, make_driver
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.commands import Command
-from rtcp.ipc.events import DriverFailed, Event, MotionEnded
+from rtcp.ipc.events import DriverFailed, Event, MotionEnded, PluginSlow
 from rtcp.ipc.message import PAYLOAD_SIZE
 from rtcp.ipc.refusals import DriverRaised, Refusal
 from rtcp.ipc.schema import Field, device_field
 from rtcp.ipc.states import State
 
+_SLOW_AGAIN_NS: Final = 10_000_000_000
 _PAYLOAD: Final = bytearray(PAYLOAD_SIZE)
 """Where messages of plug-ins are packed before the cycle uses them."""
 
@@ -81,6 +82,31 @@ class PublishedValues:
             self.values[:] = [0] * self.count
             raise ValueError(f"publish wrote {found} values, its fields are {self.count}")
         self._pack(self._memory, 0, *self.values)
+
+
+class PluginTimer:
+    """Names each plug-in that takes more than half a period in one call, at most once in `_SLOW_AGAIN_NS`.
+
+    Args:
+        now: clock, ns.
+        period_ns: period of the cycle, ns.
+        report: publishes an event.
+    """
+
+    def __init__(self, now: Callable[[], int], period_ns: int, report: Callable[[Event], None]) -> None:
+        self.now = now
+        self._allowed_ns = period_ns // 2
+        self._report = report
+        self._again: dict[str, int] = {}
+        """Plug-in that was named -> instant from which on it is named again, ns."""
+
+    def check(self, plugin: str, began: int) -> None:
+        """Name a plug-in whose call began at the instant `began`, ns, if it took too long."""
+        now = self.now()
+        took = now - began
+        if took > self._allowed_ns and now >= self._again.get(plugin, now):
+            self._again[plugin] = now + _SLOW_AGAIN_NS
+            self._report(PluginSlow(plugin, took * 1e-3, self._allowed_ns * 1e-3))
 
 
 class PartContext:
@@ -207,21 +233,21 @@ class Device(Part):
         self.is_timed = is_foreign(driver)
 
     def _fail(self, error: BaseException) -> None:
-        self._failed, self._error = True, error
+        self._failed, self._error = True, plugin_error(error)
 
     def decode(self, data: ProcessData) -> None:
         """Read the inputs of the slave."""
         try:
             if not self._failed:
                 self.driver.decode(data.input(self.slot))
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
         """Let the driver carry out the command."""
         try:
             return DriverRaised(self.slot + 1) if self._failed else checked_refusal(self.driver.accept(command))
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
             return DriverRaised(self.slot + 1)
 
@@ -246,7 +272,7 @@ class Device(Part):
                 self._failed = self._failed and self._stays_safe
                 if not self._failed:
                     self.driver.safe()
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
         else:
             if event is not None:
@@ -263,7 +289,7 @@ class Device(Part):
             outputs = self.driver.safe_outputs if self._failed else self.driver.encode()
             if not isinstance(outputs, bytes) or len(outputs) != self._size:
                 raise ValueError(f"encode returned {outputs!r:.80}, allowed are {self._size} bytes")
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
             outputs = self.driver.safe_outputs
         data.set_output(self.slot, outputs)
@@ -276,7 +302,7 @@ class Device(Part):
                 self.driver.publish(published.values, 0)
                 published.check()
                 values[self.at : self.at + published.count] = published.values
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
 
     def safe(self) -> None:
@@ -284,7 +310,7 @@ class Device(Part):
         self._stays_safe = True
         try:
             self.driver.safe()
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
 
 

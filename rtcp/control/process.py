@@ -20,14 +20,15 @@ from types import FrameType
 from typing import Any
 
 from kinematics.compiled import BUILD
+from rtcp.config.find import plugin_error
 from rtcp.config.model import ArmConfig, ConfigError
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import Cycle, address_of, make_discipline, record_schema
 from rtcp.control.part import Device
 from rtcp.control.partners import Partners
-from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP
+from rtcp.devices.cia402 import blind_outputs
 from rtcp.devices.drive import Drive, TargetState
-from rtcp.devices.driver import DeviceError, make_codec
+from rtcp.devices.driver import DeviceError
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.master import Master, master_of
@@ -39,8 +40,6 @@ from rtcp.ipc.stop_reactions import quick_stop_s
 from rtcp.realtime import scheduling
 
 _DISABLE_CYCLES = 20
-_BLIND_WORDS = {TargetState.QUICK_STOPPED: QUICK_STOP, TargetState.DISABLED: DISABLE_VOLTAGE}
-"""Target state -> controlword for a drive whose driver raises."""
 
 
 class Report:
@@ -213,10 +212,11 @@ def _outputs(drive: Drive, data: ProcessData, slot: int, goal: TargetState) -> b
         drive.decode(data.input(slot))
         drive.advance(goal)
         own = drive.encode()
-    except Exception:
-        image = drive.rpdo
-        control = image.find("controlword")  # a node of another bus has none: zeros are its command to stand
-        own = make_codec(image).pack(*(_BLIND_WORDS[goal] if channel is control else 0 for channel in image.channels))
+        if len(own) != drive.output_bytes:
+            raise ValueError(f"encode returned {len(own)} bytes, allowed are {drive.output_bytes}")
+    except BaseException as error:
+        plugin_error(error)
+        own = blind_outputs(drive, goal, bytes(drive.output_bytes))
     return own if drive.slave is None else drive.slave.outputs(drive, own)
 
 

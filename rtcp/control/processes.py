@@ -13,7 +13,7 @@ from typing import Any
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.find import is_foreign, load_class, made_by
+from rtcp.config.find import is_foreign, load_class, made_by, plugin_error
 from rtcp.config.model import ArmConfig, ProcessConfig
 from rtcp.control.part import Device, Part, PartContext, PublishedValues, checked_refusal
 from rtcp.control.partners import Partners
@@ -121,13 +121,13 @@ class ProcessPart(Part):
         self.is_timed = is_foreign(process)
 
     def _fail(self, error: BaseException) -> None:
-        self._failed, self._error = True, error
+        self._failed, self._error = True, plugin_error(error)
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
         """Let the process carry out the command."""
         try:
             return ProcessRaised(self._number) if self._failed else checked_refusal(self.process.accept(command, lease))
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
             return ProcessRaised(self._number)
 
@@ -141,7 +141,7 @@ class ProcessPart(Part):
                 self.process.update(context)
                 for output in self._outputs:
                     output.check()
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
         if self._error is not None:
             context.explain(f"process {self.name}", self._error)
@@ -161,7 +161,7 @@ class ProcessPart(Part):
                 self.process.publish(published.values, 0)
                 published.check()
                 values[self.at : self.at + published.count] = published.values
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
         if self._failed:
             # Zeros: not busy, and off.
@@ -174,7 +174,7 @@ class ProcessPart(Part):
         """Let the process set its outputs to their safe state."""
         try:
             self.process.safe()
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             self._fail(error)
 
 

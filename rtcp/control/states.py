@@ -385,11 +385,13 @@ class Stopping(MachineState):
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Let the controller stop, unless it or a guard stops by itself."""
         ctx.operator.require_neutral()
-        if not isinstance(cause, MotionEnded):
+        if isinstance(cause, MotionEnded):
+            ctx.arm.limit_stop()
+            if ctx.limited:
+                ctx.joints.stop_others()
+        else:
             ctx.limited = ctx.limited and cause is Signal.STOP_FOR_CLOCK
             ctx.joints.stop()
-        elif ctx.limited:
-            ctx.joints.stop_others()
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Decelerate; at standstill hold, or begin the fault that caused the stop."""
@@ -842,7 +844,11 @@ class Closing(MachineState):
         if joints.at_rest or joints.first_not_enabled() >= 0:
             return True
         self._cycles = 0
-        if joints.command() is GuardResult.STOPPED:
+        result = joints.command()
+        event = ctx.controller_raised()
+        if event is not None:
+            self._stop_hard(ctx, event)
+        elif result is GuardResult.STOPPED:
             ctx.arm.rest()
         return False
 

@@ -89,6 +89,21 @@ def state_of(statusword: int) -> DriveState:
     return _STATE_OF[statusword & STATE_BITS]
 
 
+def blind_outputs(drive: Drive, goal: TargetState, sent: bytes) -> bytes:
+    """Return the outputs of a drive whose driver raises: `sent` with the controlword of a quick stop or of no torque.
+
+    Args:
+        drive: the drive; one of another bus has no controlword, and zeros are its command to stand.
+        goal: a state without torque; any other one is a quick stop.
+        sent: outputs that the driver has encoded last. A drive that reacts late may still follow their target.
+    """
+    if drive.rpdo.find("controlword") is None:
+        return bytes(drive.output_bytes)
+    word = DISABLE_VOLTAGE if goal in (TargetState.DISABLED, TargetState.TORQUE_OFF) else QUICK_STOP
+    channels = zip(drive.rpdo.channels, drive.codec_out.unpack(sent), strict=True)
+    return drive.codec_out.pack(*(word if channel.name == "controlword" else value for channel, value in channels))
+
+
 class Cia402Drive(Drive):
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 

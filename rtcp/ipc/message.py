@@ -160,7 +160,7 @@ class Kinds(Generic[M]):
         values = kind._format.unpack_from(memory, at)
         try:
             return kind(*(_decoder(hint)(value) for hint, value in zip(kind.field_types.values(), values, strict=True)))
-        except ValueError as error:
+        except Exception as error:  # the class of another package may check its fields
             raise MalformedMessage(f"{kind.name}: {error}") from None
 
 

@@ -15,9 +15,9 @@ from typing import ClassVar, Final
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.find import load_class, made_by, registered
-from rtcp.config.model import ArmConfig, ConfigError
-from rtcp.ipc.commands import Command
+from rtcp.config.find import definition_of, load_class, made_by, registered
+from rtcp.config.model import ArmConfig, ConfigError, PluginError
+from rtcp.ipc.commands import Command, MotionCommand
 from rtcp.ipc.events import ControllerFailed, MotionEnded
 from rtcp.ipc.layout import PLANS
 from rtcp.ipc.refusals import HoldTimeOutOfRange, NotFinite, PositionOutOfRange, Refusal, WrongCount, WrongRowCount
@@ -131,7 +131,10 @@ class Controller:
         self.motion.hold()
 
     def stop(self, state: ArmState) -> None:
-        """Come to rest under the limits: phase STOP, then HOLD. No effect at rest or during a stop."""
+        """Come to rest under the limits: phase STOP, then HOLD. No effect at rest or during a stop.
+
+        A controller of another package that takes more than twice the longest controlled stop is a fault.
+        """
         if self.phase is Phase.MOVE:
             self.brake(state)
 
@@ -230,11 +233,14 @@ def load_controllers(setup: ControllerSetup) -> dict[type[Command], Controller]:
 
     Raises:
         ConfigError: two controllers accept the same command, or `installed` raises it.
+        PluginError: an attribute of a class is missing or wrong, or its constructor raises an exception.
     """
     controllers: dict[type[Command], Controller] = {}
     for entry, kind in installed():
         if kind.needs_geometry and setup.config.arm is None:
             continue
+        if wrong := _wrong_attribute(kind):
+            raise PluginError(entry, f"cannot be used: {wrong} ({definition_of(kind)})")
         with made_by(entry):
             controller = kind(setup)
         for command in kind.commands:
@@ -243,3 +249,19 @@ def load_controllers(setup: ControllerSetup) -> dict[type[Command], Controller]:
                 raise ConfigError([f"the controllers {other} and {kind.name} both accept {command.name}"])
             controllers[command] = controller
     return controllers
+
+
+def _wrong_attribute(kind: type[Controller]) -> str:
+    """Return which attribute of a controller's class is missing or wrong, with its value; empty: none."""
+    name: object = getattr(kind, "name", None)
+    if not isinstance(name, str) or not name:
+        return f"`name` is {name!r:.80}, allowed is a text"
+    commands: object = getattr(kind, "commands", None)
+    if not isinstance(commands, tuple) or not all(
+        isinstance(command, type) and issubclass(command, MotionCommand) for command in commands
+    ):
+        return f"`commands` is {commands!r:.80}, allowed is a tuple of subclasses of MotionCommand"
+    modes: object = kind.control_modes
+    if not isinstance(modes, frozenset) or not modes or not all(isinstance(mode, ControlMode) for mode in modes):
+        return f"`control_modes` is {modes!r:.80}, allowed is a frozenset of ControlMode with at least one"
+    return ""
