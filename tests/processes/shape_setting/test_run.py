@@ -10,6 +10,7 @@ import signal
 import struct
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -51,9 +52,19 @@ class FakeRobot:
     def halt(self) -> None:
         self._done.append("halt")
 
+    def call(self, method: str) -> None:
+        assert method == "halt"
+        self.halt()
+
     @property
     def processes(self) -> dict[str, Any]:
         return {"heater": SimpleNamespace(fields={**OFF, **self.fields})}
+
+
+def connect_by(monkeypatch: pytest.MonkeyPatch, connect: Callable[[str, Path], FakeRobot]) -> None:
+    """Connect the run to fake robots, also for its stops, which need no connection to a gateway."""
+    monkeypatch.setattr(module, "Robot", connect)
+    monkeypatch.setattr(module, "ControlClient", connect)
 
 
 OFF = {
@@ -88,7 +99,7 @@ def test_what_ends_a_run_turns_the_heat_off_before_it_stops_the_arms(
     expected: list[str],
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr(module, "Robot", lambda name, path: FakeRobot(done, answers))
+    connect_by(monkeypatch, lambda name, path: FakeRobot(done, answers))
 
     def fail(self: ShapeSettingRun) -> None:
         raise ending
@@ -116,7 +127,7 @@ def test_heat_counts_as_off_only_by_what_is_measured(
     run: ShapeSettingRun, monkeypatch: pytest.MonkeyPatch, fields: dict[str, float]
 ) -> None:
     monkeypatch.setattr(module, "_RELAY_S", 0.1)
-    monkeypatch.setattr(module, "Robot", lambda name, path: FakeRobot([], True, **fields))
+    connect_by(monkeypatch, lambda name, path: FakeRobot([], True, **fields))
     run._stop()
     assert not run.heat_is_off
     assert run.outcome.interlocks["arm_lost"] == "latched"
@@ -135,7 +146,7 @@ def test_what_hangs_keeps_neither_heat_nor_arms_from_stopping(
 
     monkeypatch.setattr(module, "_HEAT_FIRST_S", 0.1)
     monkeypatch.setattr(module, "_STOP_S", 0.5)
-    monkeypatch.setattr(module, "Robot", connect)
+    connect_by(monkeypatch, connect)
     run._stop()  # it ends, though a part hangs
     assert done == ["halt"]
     assert not run.heat_is_off
@@ -154,7 +165,7 @@ def test_the_arms_stop_once_the_heat_is_commanded_off_while_the_relay_still_open
             halted.set()
 
     monkeypatch.setattr(module, "_HEAT_FIRST_S", 3.0)
-    monkeypatch.setattr(module, "Robot", lambda name, path: Arm(done, True))
+    connect_by(monkeypatch, lambda name, path: Arm(done, True))
     monkeypatch.setattr(run, "_await_off", lambda heater: halted.wait(1.0))
     run._stop()
     assert done[0] == "stop_heating"
@@ -409,7 +420,7 @@ def test_samples_are_taken_while_the_rod_is_heated_and_end_with_it(
 ) -> None:
     monkeypatch.setattr(module, "SAMPLE_S", 0.005)
     fields: dict[str, Any] = dict.fromkeys(Outcome().samples, 1.5) | {"ratio": None}
-    monkeypatch.setattr(module, "Robot", lambda name, path: FakeRobot([], True, **fields))
+    connect_by(monkeypatch, lambda name, path: FakeRobot([], True, **fields))
     with run._sampling():
         while len(run.outcome.times) < 3:
             time.sleep(0.001)
