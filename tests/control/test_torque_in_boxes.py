@@ -39,11 +39,11 @@ def approach(q: list[float]) -> list[float]:
     return [-1.0 if there > here else 1.0 for there in ahead]
 
 
-def pose(rnd: random.Random) -> list[float]:
-    """Return a pose near a box, whose stop is free."""
+def pose(rnd: random.Random, least: float = 0.05, most: float = 0.12) -> list[float]:
+    """Return a pose near a box, `least` to `most` m away."""
     while True:
         q = [rnd.uniform(-1.5, 1.5), rnd.uniform(-1.2, 1.0), rnd.uniform(0.0, 2.2), 0.0, rnd.uniform(-1.0, 1.5), 0.0]
-        if 0.05 < distance(q) < 0.12:
+        if least < distance(q) < most:
             return q
 
 
@@ -88,3 +88,21 @@ def test_a_hand_that_pushes_the_arm_towards_a_box_is_stopped_by_the_drives(seed:
             arm.cycle()
         assert least > 0.0
         assert arm.state is not State.FAULT or PushedNear in [type(record.event) for record in arm.events]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_drives_stop_an_arm_that_is_struck_towards_a_box_before_it_is_too_fast(seed: int) -> None:
+    with Simulation(CONFIG, positions=pose(random.Random(seed), 0.013, 0.03), follow_clock=False) as arm:
+        arm.hold()
+        arm.run(1.0)
+        joints = [model.mechanics for model in arm.models][:PUSHED]
+        # More than the drives can hold, for 60 ms.
+        blow = [60.0 * side for side in approach([model.mechanics.position for model in arm.models])]
+        for torque, joint in zip(blow, joints, strict=False):
+            joint.external_torque += torque
+        arm.run(0.06)
+        for torque, joint in zip(blow, joints, strict=False):
+            joint.external_torque -= torque
+        arm.run(0.5)
+        assert type(arm.events[-1].event) is PushedNear
+        assert distance([model.mechanics.position for model in arm.models]) > 0.005
