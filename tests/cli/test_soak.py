@@ -150,7 +150,7 @@ def test_the_file_of_a_cell_runs_sessions_of_its_arms_together(rtcp: Callable[..
     assert ended.code == 0, ended.err
     summary = json.loads(ended.out)
     assert (summary["outcomes"], summary["coverage"]["empty"]) == ({"passed": 2}, [])
-    assert summary["coverage"]["commands"]
+    assert summary["coverage"]["sent"]
     assert rtcp(*soak, "--keep", str(tmp_path / "box.mcap")).code == 0
 
 

@@ -62,6 +62,8 @@ class FakeLoop:
         for came in (self.commands, self.plans, self.requests):
             came.clear()
         self._set_up((0.0,) * JOINTS, State.READY)
+        # A test may have stopped it with a clock that was set ahead.
+        self.board._stopped_ns = 0
 
     def end(self) -> None:
         self.board.close()
