@@ -184,11 +184,11 @@ def test_a_failed_seed_is_kept_with_its_black_box_and_the_command_that_replays_i
 
 @needs_cluster
 def test_the_coverage_is_shown_and_rows_that_stay_empty_are_named(soak: Callable[..., Any]) -> None:
-    ended = soak(run_batch, "--sessions", "3", "--seconds", "0.5", "--coverage-from", "4")
+    ended = soak(run_batch, "--sessions", "3", "--seconds", "1", "--coverage-from", "4")
     assert ended.code == 0, ended.err
     assert "commands sent, by state" in ended.out
     assert re.search(r"events: .*ready 3", ended.out.replace("\n", " "))
-    again = soak(run_batch, "--sessions", "3", "--seconds", "0.5", "--coverage-from", "3")
+    again = soak(run_batch, "--sessions", "3", "--seconds", "1", "--coverage-from", "3")
     assert again.code == 5
     assert re.search(
         r"\d+ rows of the coverage table are empty after 3 sessions \(\S+coverage.json\): sent: ", again.err
