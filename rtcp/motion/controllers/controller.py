@@ -261,7 +261,7 @@ def _wrong_attribute(kind: type[Controller]) -> str:
         isinstance(command, type) and issubclass(command, MotionCommand) for command in commands
     ):
         return f"`commands` is {commands!r:.80}, allowed is a tuple of subclasses of MotionCommand"
-    modes: object = kind.control_modes
+    modes: object = getattr(kind, "control_modes", None)
     if not isinstance(modes, frozenset) or not modes or not all(isinstance(mode, ControlMode) for mode in modes):
         return f"`control_modes` is {modes!r:.80}, allowed is a frozenset of ControlMode with at least one"
     return ""
