@@ -112,7 +112,7 @@ def alarm(path: Path) -> Any:
     with started(path) as simulation:
         names = Names(simulation.config)
         refused = simulation.send(SetAlarm(200.0)).refusal
-        accepted = simulation.send(SetAlarm(302.0)).refusal is None
+        accepted = simulation.send(SetAlarm(305.0)).refusal is None
         simulation.until(lambda: simulation.events[-1].event.name == "warm", 5.0)
         states = [simulation.state.name]
         simulation.bring_to(State.FAULT)

@@ -82,7 +82,7 @@ def test_its_command_that_is_no_motion_is_refused_and_accepted_and_its_events_ar
     assert played["accepted"]
     assert played["states"] == ["HOLDING", "FAULT"]
     warm, hot = played["events"]
-    assert warm.startswith("the second channel has 302.")
+    assert warm.startswith("the second channel has 305.")
     assert hot.endswith("more than 10 K above the alarm")
     assert played["fault"] == 1002
 

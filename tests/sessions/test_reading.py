@@ -108,7 +108,7 @@ def test_the_bodies_of_the_tool_that_the_arm_has_are_checked(tmp_path: Path) -> 
         assert commander.checker.violations == []
         assert commander.send(SetTool(1))
         commander.wait(200)
-        assert {violation.kind for violation in commander.checker.violations} == {Kind.ZONE}
+        assert {violation.kind for violation in commander.checker.violations} == {Kind.ZONE, Kind.BODY}
     finally:
         commander.close()
 

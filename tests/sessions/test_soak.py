@@ -303,6 +303,7 @@ def test_a_worker_keeps_nothing_of_its_sessions_though_the_collector_never_runs_
 def test_a_session_whose_process_is_killed_leaves_no_file_behind() -> None:
     session = session_of(1)
     try:
+        session.commander.start()
         assert not session.commander.simulation.path.parent.exists()
         assert session.commander.simulation.observer.latest() is not None
     finally:

@@ -239,7 +239,7 @@ class CellSession:
             if arm.state not in MOVABLE:
                 arm.commander.enable()
         for arm in self.live:
-            arm.commander.simulation.until(lambda: arm.state is not State.ENABLING, 0.1)  # noqa: B023
+            arm.commander.simulation.until(lambda: arm.state is not State.ENABLING, 0.5)  # noqa: B023
 
     def _approach(self) -> None:
         """Let the arms move at once, mostly towards each other."""

@@ -292,7 +292,7 @@ class Commander:
             self.simulation.until(lambda: self.state in (State.READY, State.HOLDING, State.FAULT), 0.5)
         if self.state is State.READY:
             self.send(Enable())
-            self.simulation.until(lambda: self.state is not State.ENABLING, 0.1)
+            self.simulation.until(lambda: self.state is not State.ENABLING, 0.5)
 
     def fault(self, axis: int, code: int) -> None:
         """Let a drive fail."""
