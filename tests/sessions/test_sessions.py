@@ -40,6 +40,8 @@ def test_plans_of_a_session_are_taken_and_move_the_arm() -> None:
     try:
         commander.start()
         commander.enable()
+        simulation = commander.simulation
+        simulation.until(lambda: not simulation.loop.machine.changing_mode, 0.5)
         for mode, begin in (ControlMode.JOINT, session.trajectory), (ControlMode.CARTESIAN, session.line):
             commander.send(SetControlMode(mode))
             for _ in range(20):
