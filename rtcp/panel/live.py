@@ -505,8 +505,10 @@ class Live:
                 # Arms without torque have nothing to stop.
                 errors = {name: e for name, e in failed.items() if getattr(e, "reason", "") != "wrong_state"}
                 message = "; ".join(f"{name}: {error}" for name, error in errors.items())
-                has_reason = any(getattr(error, "reason", "") for error in errors.values())
-                return message if has_reason or not errors or not await self._all_stopped(requested) else ""
+                # An arm whose records nobody finds may move.
+                is_missing = len(requested) <= len(self.partners.members)
+                has_reason = is_missing or any(getattr(error, "reason", "") for error in errors.values())
+                return message if has_reason or not await self._all_stopped(requested) else ""
             async with AsyncRobot(_STOP) as robot:
                 await robot.halt()
         except (RtcpError, OSError) as error:
