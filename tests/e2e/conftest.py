@@ -167,7 +167,7 @@ class Platform:
             self.call("reset")
         self.call("mode", name="joint")
         self.call("mode", name="csp")
-        if max(map(abs, found["joints"]["actual_position"])) > 1e-2:
+        if max(map(abs, found["joints"]["actual_position"])) > 1e-3:
             self.call("enable")
             self.call("move_joints", q=[0.0] * 6)
         self.call("disable")
