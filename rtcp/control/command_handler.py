@@ -234,6 +234,8 @@ class CommandHandler:
         axis = joints.first_outside()
         if axis >= 0:
             return refusals.JointOutsideRange(axis, joints.drives[axis].position)
+        if (refusal := self._too_heavy_for(self._arm.wanted_mode)) is not None:
+            return refusal
         self._machine.change(command, lease)
         return None
 
@@ -272,6 +274,8 @@ class CommandHandler:
             return refusals.DriveModeFixed(arm.control_mode, command.mode)
         if (axis := arm.first_without(command.mode)) >= 0:
             return refusals.DriveModeUnsupported(axis, command.mode)
+        if (refusal := self._too_heavy_for(command.mode)) is not None:
+            return refusal
         arm.configured_mode = command.mode
         self._machine.change_drive_mode(command.mode)
         return None
@@ -283,12 +287,29 @@ class CommandHandler:
         drive_mode = arm.drive_mode_of(mode)
         if (axis := arm.first_without(drive_mode)) >= 0:
             return refusals.DriveModeUnsupported(axis, drive_mode)
+        if (refusal := self._too_heavy_for(drive_mode)) is not None:
+            return refusal
         arm.control_mode = mode
         arm.rest()
         self._operator.require_neutral()
         self._blackboard.event(events.ControlModeChanged(mode))
         if drive_mode is not arm.mode or self._machine.state is not State.HOLDING:
             self._machine.change_drive_mode(drive_mode)
+        return None
+
+    def _too_heavy_for(self, mode: DriveMode) -> refusals.Refusal | None:
+        """Return the refusal of CST where a torque limit is below what holds the arm now, or None: it would sag.
+
+        Without torque it is the weight that the arm's model knows.
+        """
+        if mode is not DriveMode.CST:
+            return None
+        arm, holds = self._arm, self._machine.state is State.HOLDING
+        weight = arm.gravity.torques(arm.state.actual)
+        for axis, most in enumerate(arm.limits.torque):
+            held = abs(arm.state.proven_torque(axis) if holds else weight[axis])
+            if held > most:
+                return refusals.TorqueLimitTooLow(axis, held, most)
         return None
 
     def _set_limits(self, command: commands.SetLimits, lease: int) -> refusals.Refusal | None:

@@ -535,7 +535,7 @@ class LimitWidened(Refusal):
 
 
 class TorqueLimitTooLow(Refusal):
-    """{joint} holds {held:.6g} Nm, more than the new limit of {limit:.6g} Nm: it would sag, nothing was changed"""
+    """{joint} holds {held:.6g} Nm, more than the limit of {limit:.6g} Nm: it would sag, nothing was changed"""
 
     axis: int
     held: float

@@ -11,8 +11,18 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.commands import ApplyTorque, Command, Guide, MoveJoints, SetControlMode, SetDriveMode, SetLimits
-from rtcp.ipc.refusals import WeightUnknown
+from rtcp.ipc.commands import (
+    ApplyTorque,
+    Command,
+    Disable,
+    Enable,
+    Guide,
+    MoveJoints,
+    SetControlMode,
+    SetDriveMode,
+    SetLimits,
+)
+from rtcp.ipc.refusals import TorqueLimitTooLow, WeightUnknown
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.limits import rows
 from rtcp.testing import Simulation
@@ -157,3 +167,37 @@ def test_a_torque_motion_that_begins_while_a_joint_turns_is_refused_as_its_weigh
     measured = arm.loop.arm.state.actual_velocity
     assert arm.until(lambda: max(map(abs, measured)) < 0.009, 3.0)
     arm.do(command)
+
+
+@in_mode(drive_mode="csp")
+def test_a_torque_limit_below_the_weight_permits_no_cst(arm: Simulation) -> None:
+    widest, held = arm.loop.arm.limits.widest, abs(arm.loop.arm.state.actual_torque[1])
+    # The supervision of CSP permits more than the limit.
+    limit = 0.9 * held
+    new = rows(replace(widest, torque=(widest.torque[0], limit, *widest.torque[2:])))
+    arm.do(Disable())
+    arm.bring_to(State.READY)
+    arm.do(SetLimits(arm.observer.write_plan(new), len(new)))
+    changes = (SetDriveMode(DriveMode.CST), SetControlMode(ControlMode.TORQUE))
+    for enable in (False, True):
+        if enable:
+            arm.do(Enable())
+            arm.bring_to(State.HOLDING)
+            arm.run(0.2)
+        for change in changes:
+            refusal = arm.send(change).refusal
+            assert isinstance(refusal, TorqueLimitTooLow)
+            assert (refusal.axis, refusal.limit) == (1, limit)
+            assert refusal.held == pytest.approx(held, rel=0.2)
+        assert arm.loop.arm.mode is DriveMode.CSP
+
+
+@in_mode(drive_mode="cst")
+def test_an_arm_that_its_torque_limits_cannot_hold_is_not_enabled_in_cst(arm: Simulation) -> None:
+    widest = arm.loop.arm.limits.widest
+    new = rows(replace(widest, torque=(widest.torque[0], 5.0, *widest.torque[2:])))
+    arm.do(Disable())
+    arm.bring_to(State.READY)
+    arm.do(SetLimits(arm.observer.write_plan(new), len(new)))
+    assert isinstance(arm.send(Enable()).refusal, TorqueLimitTooLow)
+    assert arm.state is State.READY
