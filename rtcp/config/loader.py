@@ -401,9 +401,10 @@ def widen(config: ArmConfig) -> ArmConfig:
     Master and virtual slaves are processes of one host: when it takes the CPU away for 30 ms, as virtual machines do,
     both stand still, and a limit that suits a cable would end every second run. The scale multiplies `bus.lost_cycles`,
     `watchdog_ms` of every device, up to 3 s `lease_s`, up to 5 s `bus.clock_lost_s`, and `supervision.acceleration`: a
-    virtual joint whose targets come late catches up faster than any joint with a mass. The sync error counter limit among
-    the start-up SDOs (0x10F1:02, ETG.1020) becomes 0, which disables that check: the counter rises by 3 at a missed
-    SYNC0 and falls by 1 at any other, so that a host which misses a quarter of its ticks exceeds any limit in the end.
+    virtual joint whose targets come late catches up faster than any joint with a mass. The sync error counter limit
+    among the start-up SDOs (0x10F1:02, ETG.1020) becomes 0, which disables that check: the counter rises by 3 at a
+    missed SYNC0 and falls by 1 at any other, so that a host which misses a quarter of its ticks exceeds any limit in
+    the end.
     """
     scale = config.bus.timeout_scale
     if config.bus.interface != VIRTUAL or scale == 1:
