@@ -94,8 +94,8 @@ _PERMITTED: dict[type[Message] | Signal, State] = {
     LeaseExpired: State.DISABLING,
     PermissionWithdrawn: State.DISABLING,
 }
-"""Of states in which joints return to their range: with torque they would do so without permission, and after a halt
-too."""
+"""Transitions of the states in which joints return to their range. Only without torque does a joint stay where it is:
+therefore a halt and the loss of the permission disable the drives."""
 
 
 class MachineState:

@@ -102,18 +102,7 @@ class Halt(Command):
     torque the joint would return. Without torque it is accepted too, and nothing moves.
     """
 
-    states = frozenset(
-        {
-            State.READY,
-            State.ENABLING,
-            State.HOLDING,
-            State.MOVING,
-            State.STOPPING,
-            State.STOPPED_BY_LIMIT,
-            State.HOMING,
-            State.DISABLING,
-        }
-    )
+    states = ANYWHERE - {State.STARTING, State.FAULT, State.EMERGENCY_STOP, State.RESETTING, State.CLOSING}
     superseded_by_stop = False
     needs_lease = False
 

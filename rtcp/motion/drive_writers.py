@@ -28,7 +28,6 @@ class Commanded(Protocol):
 
     position: float
     velocity: float
-    torque: float
     target_position: float
     target_velocity: float
     target_torque: float

@@ -504,6 +504,8 @@ class Live:
                 failed = await AsyncCell(self.partners.cell, _STOP).halt()
                 # Arms without torque have nothing to stop.
                 errors = {name: e for name, e in failed.items() if getattr(e, "reason", "") != "wrong_state"}
+                if not errors:
+                    return ""
                 message = "; ".join(f"{name}: {error}" for name, error in errors.items())
                 # An arm whose records nobody finds may move.
                 is_missing = len(requested) <= len(self.partners.members)
@@ -521,7 +523,8 @@ class Live:
     async def _all_stopped(self, requested: Sequence[tuple[Feed, int]]) -> bool:
         """Return whether every loop has taken its stop, within `_TAKEN_S`."""
         for _ in range(round(_TAKEN_S / _POLL_S)):
-            with contextlib.suppress(ValueError):  # the records of an arm that ended meanwhile are released
+            # The records of an arm are closed when it ends, which may happen while this waits.
+            with contextlib.suppress(ValueError):
                 if all(feed.has_taken(requested_ns) for feed, requested_ns in requested):
                     return bool(requested)
             await asyncio.sleep(_POLL_S)

@@ -20,7 +20,7 @@ from tests.sessions.oracle import configuration, reading, with_start
 START = [0.0, -0.5, 1.8, 0.0, 1.2, 0.0]
 PERIOD_US = 4000
 LONG_S = 2.0
-"""All that the environment begins is over by then."""
+"""Time after which nothing that the environment has begun still acts, s."""
 
 
 @pytest.fixture
