@@ -53,9 +53,10 @@ test-arms: setup ## run the end-to-end tests of the arm with the drives of each 
 	done; \
 	exit $$status
 
-test-ros: setup ## run the tests on ROS 1 and Fast DDS in network namespaces; as root on Debian 12 they are installed first
+test-ros: setup ## run the tests on ROS 1 and ROS 2 in network namespaces; as root on Debian 12 both are installed first
 	@sh .ci/ros
 	@$(BIN)/python -m pytest tests/ros1 tests/ros2
+	@sh .ci/test-ros2
 
 mutants: setup ## put small mistakes into a copy, and list those that no test notices; FILE=, SEED=, COUNT=
 	@$(BIN)/python -c 'import cosmic_ray' 2>/dev/null || sh .ci/install .venv --editable '.[dev,mutants]'
@@ -77,5 +78,5 @@ format: setup ## put imports and layout in order
 	@$(BIN)/ruff format .
 
 clean: ## remove .venv and all else that can be made again
-	rm -rf .venv .venv-egm-peers .venv-foreign build dist kinematics/_fast .mypy_cache .ruff_cache .pytest_cache .hypothesis .mutants
+	rm -rf .venv .venv-egm-peers .venv-foreign .venv-ros2 build dist kinematics/_fast .mypy_cache .ruff_cache .pytest_cache .hypothesis .mutants
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

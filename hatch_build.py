@@ -48,6 +48,9 @@ COMPILED = (
     "rtcp/virtual/models/servo.py",
     "rtcp/virtual/models/units.py",
     "rtcp/testing/bus.py",
+    "rtcp/testing/sessions/checker.py",
+    "rtcp/testing/sessions/mechanics.py",
+    "rtcp/testing/sessions/oracle.py",
 )
 INTERPRETED = (
     "kinematics/c_source.py",

@@ -29,9 +29,10 @@ from rtcp.ipc.states import State
 from rtcp.processes.rod import Form, Kinetics, Rod, release, sample_equilibrium, set_fraction
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.heat_balance import ThermalProperties
+from rtcp.processes.shape_setting.heat_profile import HeatProfile, Limits, heat_command
 from rtcp.processes.shape_setting.interlocks import Mode, Row
 from rtcp.processes.shape_setting.messages import ArmHeater, HeaterState, StartHeating
-from rtcp.processes.shape_setting.profile import HeatProfile, Limits, heat_command, read_profile
+from rtcp.processes.shape_setting.profile import read_profile
 from rtcp.processes.shape_setting.temperature import Alloy, ColdEnds, cold_end_length
 from rtcp.virtual.heated_rod import HeatedRod, convection, draw, radiation
 from rtcp.virtual.heater_circuit import FULL_SCALE, Circuit, SensePoint

@@ -133,7 +133,7 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
     )
     zones = Zones(ARM, limits, 0.01)
     ramp, scaled = TwistRamp(CONFIG.cartesian), ScaledTwist(limits)
-    writers = CspWriter(CONFIG.joints, DT), CsvWriter(CONFIG.joints, DT), CstWriter(CONFIG.joints, DT)
+    writers = CspWriter(CONFIG.joints, DT), CsvWriter(CONFIG.joints, DT), CstWriter(CONFIG.joints, DT, limits.torque)
     drives = [drive for _, drive in make_drives(CONFIG)]
     state, target = ArmState(6), Setpoint(6)
     while True:

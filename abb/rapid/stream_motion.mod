@@ -11,6 +11,7 @@ MODULE stream_motion
   VAR bool stopped := FALSE;
   VAR bool offered;
   VAR num points;
+  VAR num move_number;
   VAR num duration;
   VAR jointtarget target := [[0, 0, 0, 0, 0, 0], [9E+09, 9E+09, 9E+09, 9E+09, 9E+09, 9E+09]];
 
@@ -26,12 +27,16 @@ MODULE stream_motion
       stop_done{unit} := -1;
     ENDIF
     stopped := FALSE;
+    move_number := 0;
+    IF COORDINATED THEN
+      %"coordinate"%;
+    ENDIF
     WHILE TRUE DO
       wait_for_offer;
       IF offered THEN
         IF points = 0 THEN
           ! Returns when the queue has room, long before the arm is there.
-          MoveAbsJ target \NoEOffs, MOVE_SPEED \T:=duration, POINT_ZONE, tool0;
+          move_to_target POINT_ZONE;
         ELSE
           move_path;
         ENDIF
@@ -78,17 +83,39 @@ MODULE stream_motion
       target.robax := path{at};
       duration := path_durations{p};
       IF p = points THEN
-        MoveAbsJ target \NoEOffs, MOVE_SPEED \T:=duration, fine, tool0;
-      ELSEIF p > 1 OR NOT is_near(target.robax, here.robax, AT_START) THEN
-        MoveAbsJ target \NoEOffs, MOVE_SPEED \T:=duration, POINT_ZONE, tool0;
+        move_to_target fine;
+        ! In coordinated motion all tasks execute the same moves: no arm leaves its first one out.
+      ELSEIF p > 1 OR COORDINATED OR NOT is_near(target.robax, here.robax, AT_START) THEN
+        move_to_target POINT_ZONE;
       ENDIF
     ENDFOR
   ENDPROC
 
-  TRAP stop_requested
+  ! With MultiMove Coordinated all arms are on one motion planner, and every move has the same number in all tasks.
+  ! Called by name, because the module does not load without the option.
+  PROC move_to_target(zonedata zone)
+    IF COORDINATED THEN
+      move_number := move_number MOD 9999 + 1;
+      %"move_coordinated"% target, move_number, duration, zone;
+    ELSE
+      MoveAbsJ target \NoEOffs, MOVE_SPEED \T:=duration, zone, tool0;
+    ENDIF
+  ERROR
+    RAISE;
+  ENDPROC
+
+  PROC forget_queue()
     StopMove;
     ClearPath;
     StartMove;
+  ERROR
+    ! Motors off or program stopped: T_STREAM starts the movement of all motion tasks when it can.
+    IF ERRNO = ERR_STARTMOVE TRYNEXT;
+    RAISE;
+  ENDPROC
+
+  TRAP stop_requested
+    forget_queue;
     stopped := TRUE;
     ExitCycle;
   ENDTRAP

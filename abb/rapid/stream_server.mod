@@ -2,7 +2,7 @@ MODULE stream_server
   ! Task T_STREAM: receives points by Simple Message and offers them to the motion tasks.
   ! Streaming: sequence 0, 1, 2...; each point is executed as it comes, and the reply follows its acceptance.
   ! Downloading: sequence -1, 1, 2... -3; the trajectory is executed when the last point is there.
-  ! Sequence -4 stops, in both.
+  ! Sequence -4 stops, in both. PING is answered: a client that sends it is lost when it falls silent.
 
   CONST num START_DOWNLOAD := -1;
   CONST num END_TRAJECTORY := -3;
@@ -14,6 +14,9 @@ MODULE stream_server
   VAR errnum ERR_MESSAGE := -1;
   VAR rawbytes message;
   VAR num length;
+  VAR bool connected;
+  ! Time without a byte after which the client is lost, s.
+  VAR num silence_limit;
   VAR bool downloading := FALSE;
   VAR num collected := 0;
   ! All motion tasks have answered the last stop. Until then no arm moves, and no point is taken.
@@ -24,17 +27,26 @@ MODULE stream_server
   PROC main()
     VAR errnum reason;
     IF ERR_MESSAGE = -1 BookErrNo ERR_MESSAGE;
-    accept_client server, client, MOTION_PORT;
+    connected := FALSE;
+    IF MOTORS_OFF_TIME > 0 THEN
+      accept_client server, client, MOTION_PORT, MOTORS_OFF_TIME;
+    ELSE
+      accept_client server, client, MOTION_PORT, WAIT_MAX;
+    ENDIF
+    connected := TRUE;
+    silence_limit := IDLE_TIMEOUT;
     begin_at_rest;
     WHILE TRUE DO
       serve_message;
     ENDWHILE
   ERROR
-    ! The client is gone, its bytes are no message, or this task cannot go on: no arm goes on without them.
     reason := ERRNO;
+    ! The client is gone or silent, its bytes are no message, or this task cannot go on: no arm goes on without them.
     TPWrite "Streaming: the arms stop, ERRNO " \Num:=reason;
     stop_motion;
-    IF reason = ERR_SOCK_CLOSED OR reason = ERR_MESSAGE ExitCycle;
+    ! No client for MOTORS_OFF_TIME: a system input switches the motors off (config/parameters.md).
+    IF reason = ERR_SOCK_TIMEOUT AND NOT connected PulseDO \PLength:=ORDER_PULSE, doOrderMotorsOff;
+    IF reason = ERR_SOCK_CLOSED OR reason = ERR_SOCK_TIMEOUT OR reason = ERR_MESSAGE ExitCycle;
     Stop;
   ENDPROC
 
@@ -43,16 +55,44 @@ MODULE stream_server
     VAR num type;
     VAR num comm_type;
     VAR num code;
-    receive_bytes client, 4, message;
+    VAR num value;
+    receive_bytes client, 4, message, silence_limit;
     UnpackRawBytes message, 1, length \IntX:=DINT;
     IF length < 12 OR length > LONGEST_MESSAGE RAISE ERR_MESSAGE;
-    receive_bytes client, length, message;
+    receive_bytes client, length, message, silence_limit;
     UnpackRawBytes message, 1, type \IntX:=DINT;
     UnpackRawBytes message, 5, comm_type \IntX:=DINT;
     code := FAILURE;
+    IF type = PING THEN
+      silence_limit := CLIENT_TIMEOUT;
+      code := SUCCESS;
+    ENDIF
+    IF type = MOTORS AND length = 16 order_motors code;
+    IF type = BOARD_OUTPUTS AND length = 16 THEN
+      UnpackRawBytes message, 13, value \IntX:=DINT;
+      IF value >= 0 AND value <= 65535 THEN
+        SetGO goBoard, value;
+        code := SUCCESS;
+      ENDIF
+    ENDIF
     ! Only the type tells a 12-joint JOINT_POSITION from a 10-joint JOINT_TRAJ_PT: both are 64 long.
     IF type = JOINT_TRAJ_PT AND length >= 24 + 24 * UNITS AND length MOD 4 = 0 take_point code;
     IF comm_type = REQUEST send_message client, type, REPLY, code, empty;
+  ERROR
+    RAISE;
+  ENDPROC
+
+  ! Motors On or Motors Off by a system input. In manual mode the enabling device alone switches motors on.
+  PROC order_motors(INOUT num code)
+    VAR num value;
+    UnpackRawBytes message, 13, value \IntX:=DINT;
+    IF value = 0 THEN
+      PulseDO \PLength:=ORDER_PULSE, doOrderMotorsOff;
+      code := SUCCESS;
+    ELSEIF value = 1 AND OpMode() = OP_AUTO AND DOutput(doEmergencyStop) = 0 THEN
+      PulseDO \PLength:=ORDER_PULSE, doOrderMotorsOn;
+      code := SUCCESS;
+    ENDIF
   ERROR
     RAISE;
   ENDPROC
@@ -174,6 +214,8 @@ MODULE stream_server
       begin_at_rest;
       RETURN;
     ENDIF
+    ! Motors off or program stopped since: the arms stay stopped, and the next point stops them anew.
+    IF ERRNO = ERR_STARTMOVE RETURN;
     RAISE;
   ENDPROC
 

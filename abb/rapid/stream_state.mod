@@ -1,22 +1,45 @@
 MODULE stream_state
-  ! Task T_STATE: sends JOINT_POSITION, then STATUS, every STATE_PERIOD.
+  ! Task T_STATE: sends JOINT_POSITION, then STATUS, every STATE_PERIOD; to a client that sends PING also BOARD_STATE.
   ! The signals are system outputs (config/parameters.md).
 
   VAR socketdev server;
   VAR socketdev client;
   VAR num sequence := 0;
+  VAR bool has_heartbeat;
+  ! Time since the last PING.
+  VAR clock silence;
 
   PROC main()
-    accept_client server, client, STATE_PORT;
+    accept_client server, client, STATE_PORT, WAIT_MAX;
+    has_heartbeat := FALSE;
     WHILE TRUE DO
       send_joints;
       send_status;
+      read_heartbeat;
+      IF has_heartbeat THEN
+        send_board;
+        ! A client that is lost without a word keeps the connection open: the next client must not wait for it.
+        IF ClkRead(silence) > CLIENT_TIMEOUT ExitCycle;
+      ENDIF
       WaitTime STATE_PERIOD;
     ENDWHILE
   ERROR
     IF ERRNO = ERR_SOCK_CLOSED OR ERRNO = ERR_SOCK_TIMEOUT ExitCycle;
     TPWrite "State server stopped, ERRNO " \Num:=ERRNO;
     Stop;
+  ENDPROC
+
+  ! Whatever a client of this server sends is its heartbeat.
+  PROC read_heartbeat()
+    VAR rawbytes heartbeat;
+    IF SocketPeek(client) = 0 RETURN;
+    SocketReceive client \RawData:=heartbeat \Time:=CLIENT_TIMEOUT;
+    ClkStop silence;
+    ClkReset silence;
+    ClkStart silence;
+    has_heartbeat := TRUE;
+  ERROR
+    RAISE;
   ENDPROC
 
   ! 10 joints as in REP-I0006, 6 for each unit where that is more; joints that no arm has are 0.
@@ -58,10 +81,29 @@ MODULE stream_state
     pack_integer DOutput(doEmergencyStop), body;
     pack_integer 0, body;
     pack_integer DOutput(doExecutionError), body;
-    pack_integer 1 - DOutput(doNotMoving), body;
+    pack_integer moving(), body;
     pack_integer mode, body;
     pack_integer possible, body;
     send_message client, STATUS, TOPIC, 0, body;
+  ERROR
+    RAISE;
+  ENDPROC
+
+  ! System output Mechanical Unit Not Moving, a signal for each unit; those of units that do not exist are not read.
+  FUNC num moving()
+    IF DOutput(doNotMoving1) = 0 RETURN 1;
+    IF UNITS > 1 AND DOutput(doNotMoving2) = 0 RETURN 1;
+    IF UNITS > 2 AND DOutput(doNotMoving3) = 0 RETURN 1;
+    IF UNITS > 3 AND DOutput(doNotMoving4) = 0 RETURN 1;
+    RETURN 0;
+  ENDFUNC
+
+  ! 16 inputs and 16 outputs, bit 0 is number 1: group signals on the board, as a DSQC 652.
+  PROC send_board()
+    VAR rawbytes body;
+    pack_integer GInput(giBoard), body;
+    pack_integer GOutput(goBoard), body;
+    send_message client, BOARD_STATE, TOPIC, 0, body;
   ERROR
     RAISE;
   ENDPROC

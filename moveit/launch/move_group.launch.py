@@ -10,5 +10,10 @@ def generate_launch_description() -> LaunchDescription:
     builder = MoveItConfigsBuilder("{{ prefix }}", package_name="{{ package }}")
     builder.robot_description(file_path="config/{{ prefix }}.urdf")
     builder.robot_description_semantic(file_path="config/{{ prefix }}.srdf")
-    parameters = builder.to_moveit_configs().to_dict()
-    return LaunchDescription([Node(package="moveit_ros_move_group", executable="move_group", parameters=[parameters])])
+    builder.planning_pipelines("ompl", ["ompl", "pilz_industrial_motion_planner"])
+    configs = builder.to_moveit_configs()
+    # The joint limits again: in early releases of Humble the limits of Pilz take their place in to_dict().
+    parameters = [configs.to_dict(), configs.joint_limits]
+    return LaunchDescription(
+        [Node(package="moveit_ros_move_group", executable="move_group", output="screen", parameters=parameters)]
+    )

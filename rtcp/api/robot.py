@@ -8,8 +8,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import json
 import time
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -411,7 +412,8 @@ class Methods:
         a first point at time 0 is left out, and the others are delayed by what the way to the next one demands.
 
         Args:
-            points: times rise, from 0 on or later; where the first is later, the arm first moves to it.
+            points: times rise, from 0 on or later; where the first is later, the arm first moves to it. If all are 0,
+                the joints move at the speeds `v`, else at their limits, as fast as accelerations allow.
             approach: see above.
             progress: called about ten times a second meanwhile.
             replace: see above.
@@ -677,13 +679,15 @@ class Methods:
         return Call("limits", {}, _joint_limits)
 
     @Method
-    def set_limits(self, changes: Mapping[str, float]) -> Call[Json]:
+    def set_limits(self, changes: Mapping[str, float], *, widen: bool = False) -> Call[Json]:
         """Narrow limits, all or none, until the platform ends; return them.
 
         Args:
-            changes: by key: `joint2.max`, `joints.velocity`, `box.min.x`, `user.max.z`, ...
+            changes: by key: `joint2.max`, `joints.velocity`, `box.min.x`, `user.max.z`, `supervision.torque`, ...
+            widen: whether they may be wider than the configured ones, up to the keys `absolute` of the arm's file; only
+                while the drives have no torque.
         """
-        return Call("set_limits", {"changes": dict(changes)}, _as_is)
+        return Call("set_limits", {"changes": dict(changes), "widen": widen}, _as_is)
 
     @Method
     def zero(self, joint: str, at: float = 0.0) -> Call[Zero]:
@@ -936,6 +940,24 @@ class Process:
             Faulted: it ended early; `reason` and `fields` are the cause.
         """
         return self._robot.command(name, **fields)
+
+
+def command_fields(words: Iterable[str]) -> dict[str, Any]:
+    """Return the fields of a command that is written as words, NAME=VALUE, where a value is JSON or a text.
+
+    Raises:
+        ValueError: a word is no field.
+    """
+    found: dict[str, Any] = {}
+    for word in words:
+        name, separator, value = word.partition("=")
+        if not separator or not name:
+            raise ValueError(f"{word!r} is not a field of a command: write NAME=VALUE, as target_c=510")
+        try:
+            found[name] = json.loads(value)
+        except ValueError:
+            found[name] = value
+    return found
 
 
 def _reader(call: Call[Any]) -> Callable[[Mapping[str, Any]], object] | None:

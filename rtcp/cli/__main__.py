@@ -16,6 +16,7 @@ from rtcp.cli import (
     arm,
     bus,
     cell,
+    commission,
     demo,
     device,
     doctor,
@@ -37,6 +38,7 @@ from rtcp.cli import (
     slaves,
     soak,
     status,
+    user_trial,
 )
 from rtcp.cli.arguments import PlatformName, choose_platform
 from rtcp.cli.output import CommandError, ExitCode, code_of, complain, emit, interruption_code, mute
@@ -75,8 +77,8 @@ def _root(
 
 
 _GROUPS = (
-    platform, status, cell, motion, process, jog, arm, bus, device, slaves, segment, irc5, demo, service, doctor, soak,
-    faults, record, recorded, live, experiment, panel, ros, shape_set,
+    platform, status, cell, commission, motion, process, jog, arm, bus, device, slaves, segment, irc5, demo, service,
+    doctor, soak, faults, record, recorded, live, experiment, user_trial, panel, ros, shape_set,
 )  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)

@@ -1,4 +1,4 @@
-"""`rtcp arm`: forward and inverse kinematics, a picture, exports as URDF, C and MoveIt. No platform is needed."""
+"""`rtcp arm`: forward and inverse kinematics, pictures, exports as URDF, C and MoveIt. No platform is needed."""
 
 from __future__ import annotations
 
@@ -97,6 +97,26 @@ def _plot(
     _write(out, lambda: draw(model, q, out))
 
 
+@commands.command("range")
+def _range(
+    out: Annotated[Path, arguments.option("--out", "FILE", f"Picture: {', '.join(arguments.PICTURES)}.")] = (
+        Path("range.png")
+    ),
+    facing: Annotated[
+        float, typer.Option("--facing", min=0.0, metavar="M", help="A second arm that faces it, M meters away.")
+    ] = 0.0,
+    arm: ArmFile = None,
+) -> None:
+    """Draw where the wrist can be, within the mechanical limits of the joints."""
+    arguments.check_picture("--out", out)
+    from rtcp.cli.arm_range import draw_range
+    from rtcp.config import find_arm
+    from rtcp.config.loader import load_mechanics
+
+    model = load_mechanics(find_arm(arm))
+    _write(out, lambda: draw_range(model, out, facing))
+
+
 @commands.command("urdf")
 def _urdf(
     out: Annotated[Path | None, arguments.option("--out", "FILE", "File to write. Default: standard output.")] = None,
@@ -105,12 +125,11 @@ def _urdf(
     """Export the arm as URDF, for viewers, simulators and planners."""
     from kinematics.urdf import to_urdf
     from rtcp.config import find_arm, load_kinematics
-    from rtcp.config.loader import joints_of
+    from rtcp.config.loader import whole_arm
 
     file = find_arm(arm)
-    text = to_urdf(
-        load_kinematics(file), [joint.torque for joint in joints_of(file) if joint.torque < UNLIMITED_TORQUE] or None
-    )
+    joints = config.joints if (config := whole_arm(file)) else ()
+    text = to_urdf(load_kinematics(file), [joint.torque for joint in joints if joint.torque < UNLIMITED_TORQUE] or None)
     if out is None:
         emit(text.rstrip("\n"))
     else:

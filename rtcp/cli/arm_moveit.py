@@ -18,8 +18,8 @@ from kinematics.model import ArmModel
 from kinematics.pose import IDENTITY
 from kinematics.urdf import to_urdf
 from rtcp.config import load_kinematics
-from rtcp.config.loader import joints_of
-from rtcp.config.model import UNLIMITED_TORQUE
+from rtcp.config.loader import whole_arm
+from rtcp.config.model import UNLIMITED_TORQUE, CartesianConfig
 
 GROUP = "manipulator"
 """Planning group, named as ROS-Industrial does."""
@@ -45,7 +45,8 @@ def moveit_package(arm: Path) -> MoveItPackage:
         ConfigError: as `load_kinematics`.
         ValueError: the arm has no solver in C; the reason.
     """
-    model, settings = load_kinematics(arm), joints_of(arm)
+    model, config = load_kinematics(arm), whole_arm(arm)
+    settings = config.joints if config else ()
     solver = to_c(model)
     urdf = to_urdf(model, [joint.torque for joint in settings if joint.torque < UNLIMITED_TORQUE] or None)
     package = f"{solver.prefix}_moveit_config"
@@ -71,6 +72,7 @@ def moveit_package(arm: Path) -> MoveItPackage:
         "names": model.joint_names,
         "links": [link.get("name") for link in tree.findall("link")],
         "touching": _touching(model, tree, home),
+        "cartesian": config.cartesian if config else CartesianConfig(),
     }
     files = {f"src/{name}": text for name, text in solver.files.items()}
     files[f"config/{solver.prefix}.urdf"] = urdf

@@ -92,6 +92,9 @@ def _new(
     module: Annotated[list[str] | None, option("--module", "SLOT=IDENT", "Module in a slot; again for more.")] = None,
     kind: Annotated[str | None, option("--kind", "KIND", "Driver. Default: the one that fits.")] = None,
     mode: Annotated[str | None, option("--mode", "NAME", "Clock mode, and the PDOs that it assigns.")] = None,
+    samples: Annotated[
+        int | None, option("--samples", "N", "Values a cycle (oversampling). Default: the mode's.")
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Write a device's file that a person reads: process data with types and units, start-up SDOs, clocks, watchdog."""
@@ -108,6 +111,8 @@ def _new(
         raise CommandError("--from-bus and --slave belong together: which bus, and which position on its cable")
     if slave is not None and slave < 1:
         raise CommandError(f"--slave {slave} is not allowed: a position on the cable, from 1")
+    if samples is not None and mode is None:
+        raise CommandError("--samples needs --mode: the clock mode that takes several values a cycle")
     chosen = _slots(module or ())
     with new_file(out) as file:
         if esi is not None:
@@ -118,7 +123,7 @@ def _new(
             raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
         else:
             result = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
-        text = file_text(result, kind, mode)
+        text = file_text(result, kind, mode, samples)
         file.write(text.encode())
         file.flush()
         try:
@@ -194,7 +199,12 @@ def _differences(described: DeviceDescription, slave: Mapping[str, Any]) -> list
             f"assign_activate: the file says 0x{described.assign_activate:04X}, the slave has no distributed clock"
         )
     for (key, pdos), direction in zip(_images(described), ("outputs", "inputs"), strict=True):
-        file_entries = [(e.index, e.sub_index if e.index else 0, e.length) for pdo in pdos for e in pdo.channels]
+        file_entries = [
+            (e.index, e.sub_index if e.index else 0, e.length)
+            for each in pdos
+            for pdo in each.assigned
+            for e in pdo.channels
+        ]
         bus_entries = [(e["index"], e["sub_index"], e["bits"]) for pdo in slave[direction] for e in pdo["entries"]]
         if (described.coe or bus_entries) and file_entries != bus_entries:
             remark = "will be written" if described.coe and described.configurable_pdos else "cannot be written"
@@ -223,7 +233,7 @@ def _objects(described: DeviceDescription) -> list[_Object]:
         if not sdo.optional
     ]
     for key, pdos in _images(described):
-        for pdo in pdos:
+        for pdo in dict.fromkeys(pdo for each in pdos for pdo in each.assigned):
             objects.append(_Object(f"{key}: PDO 0x{pdo.index:04X}", pdo.index, 0, 1))
             for entry in pdo.channels:
                 length = None if entry.length % 8 else entry.length // 8
@@ -252,7 +262,7 @@ def _images(described: DeviceDescription) -> tuple[tuple[str, Sequence[Pdo]], ..
 
 
 def _bits(pdo: Pdo) -> int:
-    return sum(entry.length for entry in pdo.channels)
+    return pdo.samples * sum(entry.length for entry in pdo.channels)
 
 
 def _entries(entries: Sequence[tuple[int, int, int]]) -> str:

@@ -78,6 +78,8 @@ def _show(status: dict[str, Any], emit: Callable[[str], None]) -> None:
     )
     if streaming := status.get("streaming"):
         emit(f"RAPID streaming: motion at port {streaming['motion_port']}, state at port {streaming['state_port']}")
+        on = [name for name, level in streaming["board"].items() if level]
+        emit(f"board DSQC 652: on are {', '.join(on) or 'none'}")
     for name, unit in status["units"].items():
         rapid = "runs" if unit["rapid_running"] else "is stopped"
         joints = " ".join(f"{joint:.2f}" for joint in unit["position_deg"])
@@ -143,6 +145,10 @@ _VERBS = {
         },
     ),
     "clear": _Verb("End the faults that last.", {"unit": _UNIT}),
+    "input": _Verb(
+        "Set an input of the board (DSQC 652), with RAPID streaming.",
+        {"input": (str, typer.Argument(..., metavar="DI1..DI16")), "level": _choice("on", "off")},
+    ),
 }
 """Command -> action; the request has the command's name, with _ for -."""
 

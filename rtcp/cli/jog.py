@@ -396,7 +396,8 @@ def _force_by_keys(robot: Robot) -> None:
 
 
 def _show(status: Status, inputs: Sequence[str]) -> None:
-    modes = f"{status.raw['control_mode']}, {status.raw['joystick']['mode']}"
+    joystick = status.raw["joystick"]
+    modes = status.raw["control_mode"] if joystick is None else f"{status.raw['control_mode']}, {joystick['mode']}"
     line = f"{status.raw['state']}, {modes}: {' '.join(inputs) or 'neutral'}"
     sys.stdout.write(f"\r{line[:79]:79}")
     sys.stdout.flush()

@@ -25,7 +25,7 @@ from rtcp.cli.arguments import (
     pose_values,
     positive,
 )
-from rtcp.cli.output import CommandError, emit_json, progress, report, show, table
+from rtcp.cli.output import CommandError, confirm, emit_json, progress, report, show, table
 from rtcp.cli.platform import connect, stoppable
 from rtcp.config.model import UNLIMITED_TORQUE, ConfigError
 from rtcp.ipc.runtime_directory import runtime_directory
@@ -499,19 +499,35 @@ def _set(
         list[str],
         as_written(
             "KEY VALUE..",
-            "joint2.max, joints.velocity, box.min.x, user.max.z, ...: rad, m, s, Nm; all apply, or none.",
+            "joint2.max, joints.velocity, box.min.x, user.max.z, cup.angle, supervision.torque, ...: rad, m, s, Nm; "
+            "all apply, or none.",
         ),
     ],
+    widen: Annotated[
+        bool,
+        option(
+            "--widen",
+            "Allow more than the limits of the file, up to its keys `absolute`. The drives must have no torque.",
+        ),
+    ] = False,
+    yes: Annotated[bool, option("--yes", "Do not ask.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Change limits within the configured ones; refused as a whole where the arm would be outside."""
     changes = _changes(pairs)
+    if widen and not yes:
+        _confirm_widening(changes)
     with connect("limits set") as robot:
-        answer = robot.set_limits(changes)
+        answer = robot.set_limits(changes, widen=widen)
     if as_json:
         emit_json(answer)
     else:
         report(f"{len(changes)} {'limit is' if len(changes) == 1 else 'limits are'} changed until `rtcp stop`")
+
+
+def _confirm_widening(changes: Mapping[str, float]) -> None:
+    named = ", ".join(f"{key} {value:g}" for key, value in changes.items())
+    confirm(f"Allow {named} beyond the limits of the file until `rtcp stop`?")
 
 
 def _changes(pairs: Sequence[str]) -> dict[str, float]:
@@ -546,12 +562,21 @@ def _tables(answer: Mapping[str, Any]) -> list[Any]:
             before = before or box  # noqa: PLW2901
             spans = zip(box["min"], box["max"], before["min"], before["max"], strict=True)
             boxes.add_row(name, *(f"{_marked(low, was)} to {_marked(high, had)}" for low, high, was, had in spans))
+    cones = table(("cone", "axis", "direction", "angle rad"), ("cone", "axis"))
+    for name, cone in now["cones"].items():
+        angle = _marked(cone["angle"], configured["cones"][name]["angle"])
+        cones.add_row(name, cone["axis"], " ".join(f"{part:g}" for part in cone["direction"]), angle)
     tool = Table.grid(padding=(0, 2))
     for name, unit in UNITS.items():
         tool.add_row(f"tool: {name.replace('_', ' ')}", f"{answer['cartesian'][name]:g} {unit}")
+    for name, value in now["supervision"].items():
+        unit = "rad" if name == "following_error" else "times the limit"
+        tool.add_row(
+            f"supervision: {name.replace('_', ' ')}", f"{_marked(value, configured['supervision'][name])} {unit}"
+        )
     for name, value in answer["cartesian"]["singularity"].items():
         tool.add_row(f"singularity: {name}", f"{value:g} {'m' if name == 'shoulder' else 'rad'}")
-    return [joints, "", boxes, "", tool]
+    return [joints, "", boxes, "", *((cones, "") if now["cones"] else ()), tool]
 
 
 def _marked(value: float, configured: float) -> str:

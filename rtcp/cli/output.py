@@ -301,6 +301,29 @@ def interruptible(message: str, *more: signal.Signals) -> Iterator[None]:
 
 
 @contextmanager
+def asking(instead: str) -> Iterator[None]:
+    """Turn an end of the input at a question, as without a terminal, into a CommandError; `instead`: what to do."""
+    try:
+        yield
+    except (RuntimeError, UnicodeDecodeError):  # `typer.Abort`, or an input that is closed or no text
+        if sys.stdin is not None and sys.stdin.isatty():
+            raise
+        raise CommandError(f"standard input has ended at a question: {instead}") from None
+
+
+def confirm(question: str) -> None:
+    """Ask a question that the option --yes leaves out; end the command unless the answer is yes.
+
+    Raises:
+        CommandError: nobody answers.
+    """
+    with asking("answer it, or pass --yes"):
+        answer = typer.confirm(question)
+    if not answer:
+        raise typer.Abort
+
+
+@contextmanager
 def signals_raise(*more: signal.Signals) -> Iterator[None]:
     """Raise `Interrupted` on SIGTERM, SIGHUP and `more` while inside, so that `finally` blocks run."""
 

@@ -50,9 +50,14 @@ commands = typer.Typer()
 def _start(
     config: ConfigFile = None,
     bus: BusName = None,
+    controller: Annotated[
+        str | None,
+        option("--controller", "ADDRESS", "IPv4 address of the robot controller, for the buses egm and rapid."),
+    ] = None,
     mode: Annotated[str | None, option("--mode", "NAME", f"Initial mode: {', '.join(MODES)}.")] = None,
     cycle_us: Annotated[float | None, option("--cycle-us", "N", "Cycle, us. Default: the configured one.")] = None,
     poll: Poll = False,
+    enable: Annotated[bool, option("--enable", "Then reset a fault of the start and enable the drives once.")] = False,
     detach: Annotated[bool, option("--detach", "Return when it runs; `rtcp stop` ends it.")] = False,
     panel: Annotated[bool, option("--panel", "Serve the panel too, and open it where there is a screen.")] = False,
     port: Annotated[
@@ -85,17 +90,18 @@ def _start(
         from rtcp.config.cell_file import load_cell
 
         cell_config = load_cell(cell)
-    options = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll, cell=cell_config)
+    options = StartOptions(config, bus, controller, mode, cycle_us, poll, cell_config)
     if detach:
-        launch(options)  # the processes have sessions of their own and outlive this command
-        message, ready = _wait_ready("`rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop`")
+        running = launch(options)  # the processes have sessions of their own and outlive this command
+        hint = "`rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop`"
+        message, ready = _wait_ready(running, hint, enable)
         if not ready:
             raise CommandError(message, ExitCode.FAULT)
         report(message)
         return
 
-    def announce() -> None:
-        report(_wait_ready("`rtcp enable` in another terminal; Ctrl-C or `rtcp stop`")[0])
+    def announce(running: Platform) -> None:
+        report(_wait_ready(running, "`rtcp enable` in another terminal; Ctrl-C or `rtcp stop`", enable)[0])
 
     with _panel(8080 if port is None else port) if panel else nullcontext():
         code = serve(options, announce)
@@ -121,16 +127,30 @@ def _panel(port: int) -> Iterator[None]:
         serving.wait()
 
 
-def _wait_ready(hint: str) -> tuple[str, bool]:
+def _wait_ready(running: Platform, hint: str, enable: bool) -> tuple[str, bool]:
     """Wait until the machine leaves `starting`; return a message and whether the start succeeded.
 
     A loop that only got its gateway back may be in any state: the start failed only if that is a fault.
+
+    Args:
+        running: the platform.
+        hint: commands for the message.
+        enable: whether to reset a fault of the start and to enable the drives. An emergency stop is never reset here,
+            and neither is a fault of a loop that ran before: its cause may be the motion that it ended. The loop
+            refuses to enable while an emergency stop is pressed, or while an enabling switch is not held.
     """
     until = time.monotonic() + READY_TIMEOUT_S
     try:
         with connect("start") as robot:
             while (status := robot.status()).state is State.STARTING and time.monotonic() < until:
                 time.sleep(0.02)
+            if enable:
+                of_start = status.state is State.FAULT and running.started_loop
+                if of_start:
+                    robot.reset()
+                if of_start or status.state is State.READY:
+                    robot.enable()
+                    status = robot.status()
     except RtcpError as error:
         return f"started, but: {error.message}", False
     state, message = status.state, status.message
@@ -196,14 +216,14 @@ def running_platform(options: StartOptions) -> Iterator[float]:
             report("stopped")
 
 
-def serve(options: StartOptions, announce: Callable[[], None]) -> int:
+def serve(options: StartOptions, announce: Callable[[Platform], None]) -> int:
     """Start the platform, call `announce` when it is up, supervise it to its end and return the exit code."""
     from rtcp.launch.supervisor import supervise
 
     with signals_raise():
         running = launch(options)
         try:
-            announce()
+            announce(running)
             return supervise(running, report)
         except KeyboardInterrupt:  # a signal before `supervise` has installed its handlers
             return ExitCode.FAULT if running.stop(report) else ExitCode.DONE

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from enum import IntEnum
 from typing import Annotated, Any
 
 import typer
 
 from rtcp.api import RtcpError
+from rtcp.api.robot import command_fields
 from rtcp.cli.output import CommandError, facts, report, show, table
 from rtcp.cli.platform import connect, stoppable
 from rtcp.ipc.runtime_directory import runtime_directory
@@ -28,7 +28,10 @@ def _process(
     if not command:
         _show(name)
         return
-    values = dict(map(_pair, fields or []))
+    try:
+        values = command_fields(fields or [])
+    except ValueError as error:
+        raise CommandError(str(error)) from None
     ends = f"the connection is closed, {name} ends what it has begun"
     with stoppable(f"process {name}", ends) as robot:
         if name not in robot.processes:
@@ -76,13 +79,3 @@ def _allowed(hint: Any) -> str:
     if isinstance(hint, type) and issubclass(hint, IntEnum):
         return " | ".join(member.name.lower() for member in hint)
     return _TYPES.get(hint, "value")
-
-
-def _pair(text: str) -> tuple[str, Any]:
-    key, separator, value = text.partition("=")
-    if not separator or not key:
-        raise CommandError(f"{text!r} is not a field of a command: write NAME=VALUE, as target_c=510")
-    try:
-        return key, json.loads(value)
-    except ValueError:
-        return key, value

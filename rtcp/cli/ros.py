@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -46,6 +47,15 @@ def _ros(
             "--buffer", min=0.0, max=60.0, help="joint_command is executed so many seconds later; 0: each replaces."
         ),
     ] = 0.0,
+    most_points: Annotated[
+        int,
+        typer.Option(
+            "--downsample",
+            min=0,
+            max=4096,
+            help="Points to which a longer trajectory is reduced, at least 2. 0: more than 4096 points are refused.",
+        ),
+    ] = 0,
     zenoh: Annotated[bool, option("--zenoh", "ROS 2 without ROS, over a Zenoh router (docs/ros2.md).")] = False,
     router: Annotated[str, option("--router", "tcp/HOST:PORT", "Zenoh router.")] = "tcp/localhost:7447",
     dds: Annotated[bool, option("--dds", "ROS 2 without ROS, over DDS: topics only (docs/ros2.md).")] = False,
@@ -66,12 +76,19 @@ def _ros(
         bool,
         option("--joint-feedback", "Send velocities too (JOINT_FEEDBACK), which the reference client complains of."),
     ] = False,
+    messages: Annotated[
+        bool,
+        option("--messages", "Print the folder of the message classes, for PYTHONPATH of rostopic and rosservice."),
+    ] = False,
     until: Annotated[int, typer.Option("--until", hidden=True, help="End with this process; 0: with none.")] = 0,
 ) -> None:
     """Serve the arm to ROS until Ctrl-C: a node of ROS 1 (docs/ros.md) or ROS 2, or a Simple Message server.
 
     Waits for a platform, and for a master or router, that do not run.
     """
+    if messages:
+        print(_messages())
+        return
     for argument in remappings or ():
         if ":=" not in argument:
             raise CommandError(f"{argument} is no remapping: write NAME:=VALUE", ExitCode.USAGE)
@@ -80,7 +97,9 @@ def _ros(
         raise CommandError("choose one of --zenoh, --dds, --ros2, --simple-message", ExitCode.USAGE)
     from rtcp.ros.commands import CommandOptions  # here: it loads slowly, as do the imports below
 
-    options = CommandOptions(enable, partial, buffer)
+    if most_points == 1:
+        raise CommandError("--downsample 1 keeps no motion: allowed are 0, 2 and more", ExitCode.USAGE)
+    options = CommandOptions(enable, partial, buffer, most_points)
     # The name of a platform is its namespace; the group has that of no arm.
     space = "" if group else platform_name().replace("-", "_")
     if simple_message:
@@ -92,7 +111,8 @@ def _ros(
         orders = {"auto": None, "little": ByteOrder.LITTLE, "big": ByteOrder.BIG}
         if byte_order not in orders:
             raise CommandError(f"--byte-order {byte_order} is not known: {', '.join(orders)}", ExitCode.USAGE)
-        asyncio.run(_serve(ServerOptions(bind, motion_port, state_port, orders[byte_order], joint_feedback), until))
+        server = ServerOptions(bind, motion_port, state_port, orders[byte_order], joint_feedback)
+        asyncio.run(_serve(server, until, group))
     elif wires:
         if remappings and not ros2:
             raise CommandError(f"--{wires[0]} knows no remappings: leave out {remappings[0]}", ExitCode.USAGE)
@@ -100,8 +120,21 @@ def _ros(
 
         _run_ros2(wires[0], router, Ros2Options(name, rate, domain, options, remappings or (), group, space))
     else:
-        spaces = [f"__ns:=/{space}"] if space and not any(arg.startswith("__ns:=") for arg in remappings or ()) else []
-        _run_node(name, rate, [*(remappings or ()), *spaces], tf, options, group)
+        given = [word.partition(":=")[2] for word in remappings or () if word.startswith("__ns:=")]
+        # rospy reads the namespace when it is imported, from there.
+        if space or given:
+            os.environ["ROS_NAMESPACE"] = given[-1] if given else f"/{space}"
+        _run_node(name, rate, remappings or (), tf, options, group)
+
+
+def _messages() -> Path:
+    """Return the folder of the generated message classes."""
+    from rtcp.ros import ros1_messages
+
+    try:
+        return ros1_messages.generated()
+    except ros1_messages.RosMissing as error:
+        raise CommandError(str(error)) from None
 
 
 def _run_node(
@@ -155,10 +188,11 @@ def _log_to_stderr() -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
-async def _serve(options: ServerOptions, until: int) -> None:
+async def _serve(options: ServerOptions, until: int, group: bool) -> None:
     """Serve Simple Message until a signal comes or a process ends; the arm stops then as if its client was lost."""
     import asyncio
 
+    from rtcp.ros.simple_message.cell_arm import CellArm
     from rtcp.ros.simple_message.robot_arm import RobotArm
     from rtcp.ros.simple_message.server import SimpleMessageServer
 
@@ -171,7 +205,7 @@ async def _serve(options: ServerOptions, until: int) -> None:
             asyncio.get_running_loop().add_reader(os.pidfd_open(until), ended.set)
         except ProcessLookupError:
             return
-    arm = RobotArm()
+    arm = CellArm() if group else RobotArm()
     connection = asyncio.create_task(arm.run())
     try:
         async with SimpleMessageServer(arm, options) as server:

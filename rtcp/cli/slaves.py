@@ -16,6 +16,7 @@ from rtcp.cli.bus import Bus, SlaveName, offline_bus, open_bus, parse_integer, s
 from rtcp.cli.output import (
     CommandError,
     ExitCode,
+    confirm,
     emit,
     emit_json,
     facts,
@@ -169,7 +170,7 @@ def _eeprom_write(
         for finding in findings:
             report(finding)
         if not yes:
-            typer.confirm(f"Write {len(image)} bytes into the EEPROM of {access.label}?", abort=True)
+            confirm(f"Write {len(image)} bytes into the EEPROM of {access.label}?")
         with _interruptible_write(access), transfer("writing", 1.0) as progress:
             written = access.eeprom_write(target, before, image, progress)
     report(f"{access.label}: {written} words written and read back; switch it off and on to have it load them")
@@ -207,7 +208,7 @@ def _alias_set(
                     ExitCode.REFUSED,
                 )
         if not yes:
-            typer.confirm(f"Write alias {value} in place of {alias_of(before)} into {access.label}?", abort=True)
+            confirm(f"Write alias {value} in place of {alias_of(before)} into {access.label}?")
         with _interruptible_write(access):
             access.eeprom_write(target, before, with_alias(before, value))
     report(f"{access.label}: alias {value} written; switch it off and on to have it load it")

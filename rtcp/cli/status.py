@@ -211,8 +211,7 @@ def _facts(status: Json) -> Table:
     rows = facts()
     rows.columns[0].style = "bold"
     rows.add_row("robot", _robot(status["robot"]))
-    if status["control_mode"] == "joystick":
-        joystick = status["joystick"]
+    if (joystick := status["joystick"]) is not None:
         rows.add_row("joystick", f"{joystick['mode']}, controls the {'arm' if joystick['controls_arm'] else 'chair'}")
     rows.add_row("drives", _drives(status))
     if status["tool"] is not None:
@@ -301,9 +300,12 @@ def _robot(robot: Json) -> Text:
     """Return ROS-Industrial's RobotStatus in words."""
     from rich.text import Text
 
-    line = Text(f"{robot['mode']}, drives {'powered' if robot['drives_powered'] else 'without power'}")
+    powered = {True: "drives powered", False: "drives without power", None: "power of the drives unknown"}
+    moving = {True: ", in motion", False: ", not in motion", None: ", motion unknown"}
+    line = Text(f"{robot['mode']}, " if robot["mode"] else "")
+    line.append(powered[robot["drives_powered"]])
     line.append(", motion possible" if robot["motion_possible"] else ", no motion possible")
-    line.append(", in motion" if robot["in_motion"] else ", not in motion")
+    line.append(moving[robot["in_motion"]])
     if robot["e_stopped"]:
         line.append(", emergency stop", "bold red")
     if robot["in_error"]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 from annotated_types import Ge, Gt, Le
@@ -30,6 +30,7 @@ from rtcp.config.model import (
 from rtcp.config.numbers import Name, Positive
 
 ENTRY_POINTS = "rtcp.buses"
+_ANY_ADDRESS = "0.0.0.0"
 _ADDRESS = re.compile(r"(?:\d{1,3}\.){3}\d{1,3}", re.ASCII)
 Rows = tuple[tuple[str, DataTypeName, str], ...]
 """Channels: name, type, unit."""
@@ -46,6 +47,18 @@ JOINT_INPUTS: Rows = (
     ("missing", "uint8", ""),
 )
 """`state` is a `rtcp.ipc.states.DriveState`, `missing` a `Missing`."""
+BOARD_OUTPUTS: Rows = (("outputs", "uint16", ""),)
+BOARD_INPUTS: Rows = (("inputs", "uint16", ""),)
+"""The board of a controller: bit 0 is terminal 1."""
+
+CONTROLLER_STATUS: Rows = (
+    ("drives_powered", "int8", ""),
+    ("e_stopped", "int8", ""),
+    ("operating_mode", "int8", ""),
+)
+"""Input channels by which a slave or a unit tells the state of a robot controller: whether its motors are on, whether
+its emergency stop is active (1, 0), and the position of its key (1 manual, 2 automatic); -1: unknown. A bus declares
+those that its messages contain. What no slave declares is unknown in RobotStatus."""
 
 _CONTROLLERS_OWN: Mapping[Capability, str] = {
     "sdo": "a robot controller has no SDO: its parameters are set at its display",
@@ -53,13 +66,18 @@ _CONTROLLERS_OWN: Mapping[Capability, str] = {
     "clocks": "a robot controller has no distributed clocks: its messages set the pace",
     "torque": "the robot controller takes no torque and reports none",
     "homing": "the robot controller keeps the zero positions of its joints: calibrate them there",
-    "power": "only people at the robot controller switch its motors on and start its program",
+    "power": "the robot controller has the power: people there switch its motors on and start its program",
 }
 
 
 def bus_class(kind: str) -> type[BusConfig]:
     """Return the configuration class of a kind of bus; raises as `class_of_kind`."""
     return class_of_kind(BusConfig, ENTRY_POINTS, kind)
+
+
+def is_address(text: str) -> bool:
+    """Whether a text is an IPv4 address."""
+    return _ADDRESS.fullmatch(text) is not None
 
 
 def node(name: str, kind: str, outputs: Rows, inputs: Rows, watchdog_s: float) -> SlaveConfig:
@@ -82,6 +100,12 @@ class ControllerBus(BusConfig):
     LACKS: ClassVar[Mapping[Capability, str]] = _CONTROLLERS_OWN
     VIRTUAL_PROCESS: ClassVar[tuple[str, ...]] = ("rtcp.virtual.irc5", "--private")
     VIRTUAL_CONTROL: ClassVar[str] = "irc5"
+    HAS_ONE_CONNECTION: ClassVar[bool] = False
+    """Whether all mechanical units of a controller share one connection, which one platform of a cell holds."""
+
+    def at_controller(self, address: str) -> ControllerBus:
+        """Return this bus for the controller at an IPv4 address, in place of the virtual controller."""
+        return replace(self, interface=address)
 
     @staticmethod
     def joints_and_unit(joints: Sequence[str], inputs: Rows, unit: SlaveConfig) -> tuple[SlaveConfig, ...]:
@@ -92,7 +116,7 @@ class ControllerBus(BusConfig):
     def findings(self, arm: ArmFile) -> Iterator[Finding]:
         """Yield the keys that need a capability which the bus lacks, and an invalid address."""
         name = self.interface
-        if name != VIRTUAL and not _ADDRESS.fullmatch(name):
+        if name != VIRTUAL and not is_address(name):
             yield Finding(("bus", "interface"), "interface", found=name, allowed=f"{VIRTUAL}, or an IPv4 address")
         if arm.drive_mode == "cst" or arm.control_mode == "torque":
             key, mode = ("drive_mode", arm.drive_mode) if arm.drive_mode == "cst" else ("control_mode", "torque")
@@ -113,9 +137,9 @@ class EgmBus(ControllerBus):
     """`virtual`, or the IPv4 address of this host to which the controller sends; `0.0.0.0`: any."""
     segment: str = "irc5.yaml"
     """File of the virtual controller, relative to the arm's file."""
-    lost_cycles: Annotated[int, Ge(1), Le(1000)] = 10
+    lost_cycles: Annotated[int, Ge(1), Le(1000)] = 3
     """Count of missing messages that is a fault: each counts 1, each received one takes off 1/10."""
-    timeout_scale: Annotated[float, Ge(1), Le(100)] = 4.5
+    timeout_scale: Annotated[float, Ge(1), Le(100)] = 15.0
     """Factor on time limits on the virtual bus, where the host may be slow: [real time](realtime.md)."""
     port: Annotated[int, Ge(1), Le(65535)] = 6511
     """UDP port: that of the unit's UdpUc device, one for each mechanical unit."""
@@ -145,9 +169,16 @@ class EgmBus(ControllerBus):
         *((f"measured_force_{axis}", "float64", "N") for axis in "xyz"),
         *((f"measured_torque_{axis}", "float64", "Nm") for axis in "xyz"),
         *((f"path_deviation_{axis}", "float64", "m") for axis in "xyz"),
+        *CONTROLLER_STATUS[:1],
     )
     """Numbers of `motors`, `rapid` and `mci` are EGM's (docs/abb.md). `path_deviation`: the flange as measured minus as
-    planned by the controller. Counters count messages since the start."""
+    planned by the controller. Force and torque are no numbers (nan) while no sensor sends them. Counters count messages
+    since the start. EGM tells neither the emergency stop nor the key."""
+
+    def at_controller(self, address: str) -> EgmBus:
+        """As `ControllerBus`. The controller sends to this host: at any of its addresses where the file names none."""
+        interface = _ANY_ADDRESS if self.interface == VIRTUAL else self.interface
+        return replace(self, interface=interface, controller=address)
 
     def nodes(self, joints: Sequence[str], period_us: float) -> tuple[SlaveConfig, ...]:
         """Return the joints and the mechanical unit."""
@@ -195,22 +226,35 @@ class RapidBus(ControllerBus):
     state_period_s: Positive = 0.05
     """Longest interval between two state messages, s; later cycles count as lost until the next message."""
     answer_timeout_s: Positive = 1.0
-    """Time without acceptance of a point after which the connection counts as lost, s."""
+    """Time without answer to a point or a heartbeat, or without state, after which a connection counts as lost, s."""
+    board: str = ""
+    """Name of the controller's board of 16 inputs and 16 outputs, as a DSQC 652; then it is an IO box."""
 
     MASTER: ClassVar[str] = "rtcp.fieldbus.rapid:RapidMaster"
+    HAS_ONE_CONNECTION: ClassVar[bool] = True
 
     UNIT_INPUTS: ClassVar[Rows] = (
         ("accepted", "uint32", ""),
         ("refused", "uint32", ""),
         ("waiting", "uint8", ""),
         ("acceptance_s", "float64", "s"),
-        ("e_stopped", "uint8", ""),
-        ("mode", "uint8", ""),
+        *CONTROLLER_STATUS,
     )
-    """Points accepted and refused since the start; whether one waits, and how long the last acceptance took; the
-    controller's emergency stop, and its mode: 1 Hand, 2 Auto, 0 unknown."""
+    """Points accepted and refused since the start; whether one waits, and how long the last acceptance took."""
+    UNIT_OUTPUTS: ClassVar[Rows] = (("motors_order", "uint8", ""),)
+    """A change to 1 orders Motors On, which the controller carries out in automatic mode only; a change to 2 Motors
+    Off."""
 
     def nodes(self, joints: Sequence[str], period_us: float) -> tuple[SlaveConfig, ...]:
         """Return the joints and the mechanical unit."""
-        unit = node(self.unit, "generic", (), self.UNIT_INPUTS, self.answer_timeout_s)
-        return self.joints_and_unit(joints, JOINT_INPUTS, unit)
+        unit = node(self.unit, "generic", self.UNIT_OUTPUTS, self.UNIT_INPUTS, self.answer_timeout_s)
+        nodes = self.joints_and_unit(joints, JOINT_INPUTS, unit)
+        if not self.board:
+            return nodes
+        return (*nodes, node(self.board, "io", BOARD_OUTPUTS, BOARD_INPUTS, self.answer_timeout_s))
+
+    def findings(self, arm: ArmFile) -> Iterator[Finding]:
+        """Yield the values that RAPID streaming does not support."""
+        yield from super().findings(arm)
+        if self.board in (self.unit, *(joint.name for joint in arm.joints)):
+            yield Finding(("bus", "board"), "repeated", found=self.board, what="name", of="the unit or a joint")

@@ -59,6 +59,18 @@ class Share:
 
 
 @dataclass(frozen=True)
+class CellController:
+    """A robot controller with several arms of the cell: its mechanical units."""
+
+    arms: Annotated[tuple[Name, ...], MinLen(2), MaxLen(4)]
+    """Names of the arms, in the order of the units. The platform of the first holds what the arms share: the connection
+    of RAPID streaming, and the virtual controller. By EGM the UDP port of each arm is one above that of the arm before,
+    from `bus.port` of the first."""
+    segment: str = ""
+    """File of the virtual controller, beside the arm's file; left out: `bus.segment` of the first arm."""
+
+
+@dataclass(frozen=True)
 class CellSettings:
     """Settings both of a cell's file and of the configuration that its loops receive."""
 
@@ -69,6 +81,8 @@ class CellSettings:
     """Largest age of a partner's newest record in a motion in step, s; left out: two cycles of the slowest arm."""
     clearance: Annotated[float, Ge(0), Le(1)] = 0.02
     """Distance that bodies of two arms keep, m."""
+    controllers: tuple[CellController, ...] = ()
+    """Robot controllers that have several of the arms; an arm that none names has a controller of its own."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +94,15 @@ class Member:
     base: Base
     directory: Path = Path()
     """Runtime directory of its platform."""
+
+
+@dataclass(frozen=True)
+class ControllerUnits:
+    """The arms of one robot controller, and which of them is this platform's."""
+
+    members: tuple[Member, ...]
+    """In the order of the mechanical units."""
+    index: int
 
 
 @dataclass(frozen=True)
@@ -104,6 +127,13 @@ class CellConfig(CellSettings):
         names = ", ".join(member.name for member in self.members)
         text = f'{self.source}: found no arm with the name "{name}", allowed is one of {names}'
         raise ConfigError([text], "choice")
+
+    def units_of(self, name: str) -> ControllerUnits | None:
+        """Return the arms of the controller of an arm; None: it has one of its own."""
+        for controller in self.controllers:
+            if name in controller.arms:
+                return ControllerUnits(tuple(map(self.member, controller.arms)), controller.arms.index(name))
+        return None
 
     @property
     def slowest_s(self) -> float:

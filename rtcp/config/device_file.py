@@ -67,42 +67,61 @@ _CHANNEL = re.compile(r"(?:channel|ch\.?)\s*(\d+)", re.IGNORECASE)
 _WIDTH = 118
 
 
-def file_text(device: Device, kind: str | None = None, mode: str | None = None) -> str:
+def file_text(device: Device, kind: str | None = None, mode: str | None = None, samples: int | None = None) -> str:
     """Return the text of the device's file.
 
     Args:
         device: its description, with its modules in place.
         kind: the driver; None: the one that fits its process data.
         mode: name of the clock mode; None: the one that fits.
+        samples: values a cycle of the PDOs of that mode that take several; None: as the mode says.
 
     Raises:
-        EsiError: it has no such mode, or one that assigns a PDO several times over.
+        EsiError: it has no such mode, or does not take so many values.
     """
-    completed = complete(for_drive(device if mode is None else _in_mode(device, mode)))
+    completed = complete(for_drive(device if mode is None else _in_mode(device, mode, samples)))
     return "\n".join(_lines(completed, kind or kind_of(completed), mode is not None)) + "\n"
 
 
-def _in_mode(device: Device, name: str) -> Device:
+def _in_mode(device: Device, name: str, count: int | None) -> Device:
     """Return a device with one clock mode first, and the PDOs assigned that this mode assigns."""
     mode = next((mode for mode in device.dc_modes if mode.name == name), None)
     if mode is None:
         names = ", ".join(mode.name for mode in device.dc_modes) or "none"
         raise EsiError(device.origin, f"it has no clock mode {name!r}; there are: {names}")
-    if mode.oversamples:
-        raise EsiError(device.origin, f"clock mode {name} takes several values a cycle, which is not supported")
+    others = [following for following in device.dc_modes if following is not mode]
+    if count is not None:
+        mode = _with_samples(device, mode, count)
+    samples = dict(mode.samples)
     manager_of = {index: manager for manager, indices in mode.pdos for index in indices}
     managers = {manager for manager, _ in mode.pdos}
 
     def assigned_by(pdos: tuple[Pdo, ...]) -> tuple[Pdo, ...]:
         return tuple(
-            replace(pdo, sync_manager=manager_of.get(pdo.index))
+            replace(pdo, sync_manager=manager_of.get(pdo.index), samples=samples.get(pdo.index, 1))
             if pdo.index in manager_of or pdo.sync_manager in managers
             else pdo
             for pdo in pdos
         )
 
-    modes = (mode, *(following for following in device.dc_modes if following is not mode))
-    return replace(device, dc_modes=modes, rx_pdos=assigned_by(device.rx_pdos), tx_pdos=assigned_by(device.tx_pdos))
+    return replace(
+        device, dc_modes=(mode, *others), rx_pdos=assigned_by(device.rx_pdos), tx_pdos=assigned_by(device.tx_pdos)
+    )
+
+
+def _with_samples(device: Device, mode: DcMode, count: int) -> DcMode:
+    """Return a clock mode with `count` values a cycle, SYNC0 for each and SYNC1 once a cycle."""
+    named = {index for _, indices in mode.pdos for index in indices}
+    pdos = [pdo for pdo in (*device.rx_pdos, *device.tx_pdos) if pdo.index in named and pdo.most_samples > 1]
+    if not pdos:
+        raise EsiError(device.origin, f"clock mode {mode.name} assigns no PDO of several values a cycle (OSMax)")
+    for pdo in pdos:
+        if not pdo.fewest_samples <= count <= pdo.most_samples:
+            allowed = f"allowed are {pdo.fewest_samples} to {pdo.most_samples} (OSMin, OSMax)"
+            raise EsiError(device.origin, f"found {count} values a cycle of PDO 0x{pdo.index:04X}, {allowed}")
+    sync1 = -1 if mode.sync1_factor > 1 else mode.sync1_factor
+    samples = tuple((pdo.index, count) for pdo in pdos)
+    return replace(mode, samples=samples, sync0_factor=-count, sync0_cycle=0, sync1_factor=sync1)
 
 
 def kind_of(device: Device) -> str:
@@ -440,6 +459,11 @@ def _pdo_lines(
             yield "    fixed: true"
         if named_managers:
             yield f"    sync_manager: {pdo.sync_manager}"
+        if pdo.samples > 1:
+            yield f"    samples: {pdo.samples}     # values a cycle; each channel is their mean"
+            if pdo.sample_increment:
+                last = pdo.index + pdo.samples - 1
+                yield f"    sample_increment: {pdo.sample_increment}     # one PDO each, up to 0x{last:04X}"
         if start := device.registers_of(pdo):
             yield f"    start_address: 0x{start:04X}"
         axis = _axis_of(pdo) if kind == "cia402" else 1

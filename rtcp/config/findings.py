@@ -39,6 +39,7 @@ _SENTENCES = {
     "out_of_order": "found min {min:g} and max {max:g}{of}; min must be less than max",
     "outside": "found {found:g}, allowed is {low:g} to {high:g}, {of}",
     "below": "found {found:g}, allowed is at least {low:g}, {of}",
+    "not_more": "found {found:g}, allowed is more than {low:g}, {of}",
     "above": "found {found:g}, allowed is at most {high:g}, {of}",
     "zero": "found 0, allowed is any number but 0",
     "count": "found {found} numbers, allowed are {allowed}, {of}",
@@ -84,24 +85,33 @@ _SENTENCES = {
     "ends_alike": "found {found:g}, the open_position; the two must differ",
     "name_of_part": "found {found!v}, the name of a part of the platform",
     "too_many_axes": "found beside {joints} joints, allowed are {allowed}",
+    "never_trips": "found {found:g}, allowed is less than {high:.4g}: {of}, so no measured torque would exceed the "
+    "threshold",
+    "cut_wire": "found {found:g}: a cut wire reads 0, which would be an inclination; allowed is 0, or more than "
+    "{low:.4g} on either side",
     "limit_key": "found {found!v}, which in the key of a limit means {means}",
     "needs": "found {found!v}, which needs {need}: the key {key} is missing",
     "no_slave": "found {found!v}, which is no slave; allowed are the names under slaves: {allowed}",
     "moves_no_joint": "found {found!v}, which moves no joint: its device {device} is of kind {kind}; allowed is kind "
     "cia402",
     "not_mapped": "its device {device} maps no {lacking}, which drive_mode {drive_mode} needs",
+    "no_offset": "its device {device} maps no {lacking}, which feed_forward needs",
     "no_box_at_all": "found {kind} {found}, but no slave is of kind io; leave it out for such an arm",
     "no_box": "found {found!v}, which is no IO box; allowed is {allowed}",
     "beyond_wire": "found {sign}{found:g}, allowed is {low:g} to {high:g}: {of}",
     "tool_and_tools": "found beside tools: move it into the list, as its first",
     "mass_without_links": "found {found:g} beside links of unknown mass: it needs the key links",
-    "box_needs": "found a box, which needs {need}: the key {key} is missing",
+    "no_direction": "found (0, 0, 0), allowed is a direction along the axes of the base, as [0, 0, 1]",
+    "box_needs": "found a box or a cone, which needs {need}: the key {key} is missing",
     "box_out_of_reach": "found a box that begins {found:.3f} m from the shoulder, allowed is at most {high:.3f} m, the "
     "arm's reach: {what}",
     "box_around_base": "found a box around the arm's base, allowed is one beside it: the base is at (0, 0, 0), the "
     "shoulder at ({shoulder})",
     "box_around_box": "found a box around all of cartesian.box: the tool has no place left",
     "no_device": "found {found!v}, but there is no file {file}; {there}",
+    "one_controller": "found the bus {found}, allowed is {need}: the arms are of one controller",
+    "board_of_first": "found bus.board {found}, allowed is none: {first}, whose platform holds the connection, has the "
+    "board",
     "wrong_group": "{file} has {has}",
     # zero offsets
     "no_axis": "this is no axis of {of}; its axes are {allowed}",

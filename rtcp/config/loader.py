@@ -121,7 +121,7 @@ def load(path: Path) -> ArmConfig:
             devices[key] = load_device(file, cycle.period_us if cycle else None)
         except ConfigError as error:
             in_devices += error.findings
-    drives = FileRule(("slaves", "joints", "gripper"), partial(rules.drive_findings, devices=devices))
+    drives = FileRule(("slaves", "joints", "gripper", "feed_forward"), partial(rules.drive_findings, devices=devices))
     terminals = FileRule(("slaves", "inputs", "outputs", "gripper"), partial(rules.terminal_findings, devices=devices))
     suits = FileRule((EVERY_KEY,), lambda arm: arm.bus.findings(arm))
     checker: Checker[ArmFile] = _arm_checker(kind)  # type: ignore[arg-type]
@@ -343,13 +343,13 @@ def load_mechanics(path: Path) -> ArmModel:
     return model if part is None or part.limits is None else replace(model, limits=_mechanical(part.limits))
 
 
-def joints_of(path: Path) -> tuple[Joint, ...]:
-    """Return a whole arm's joints; none where the file has kinematics alone.
+def whole_arm(path: Path) -> ArmConfig | None:
+    """Return a whole arm; None where the file has kinematics alone.
 
     Raises:
         ConfigError: as `load_kinematics`.
     """
-    return load(path).joints if _is_whole_arm(read(path)) else ()
+    return load(path) if _is_whole_arm(read(path)) else None
 
 
 def device_path(arm: Path, key: str) -> Path:

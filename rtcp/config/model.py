@@ -15,7 +15,7 @@ from enum import IntEnum
 from functools import cached_property
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Final, Literal, Protocol, get_args, get_type_hints
 
 from annotated_types import Ge, Gt, Le, MaxLen, MinLen
 
@@ -28,6 +28,7 @@ from rtcp.config.numbers import (
     Angle,
     Factor,
     Fraction,
+    FractionOfPi,
     Length,
     Milliseconds,
     Name,
@@ -64,12 +65,14 @@ UNLIMITED_TORQUE = 1e9
 """Limit of joints whose torque is not measured, Nm."""
 MOST_TOOLS = 16
 """Most tools of an arm."""
+MOST_CONES = 8
+"""Most cones that limit the orientation of the tool."""
 MOST_POINTS = 4096
 """Most points or poses of a motion file."""
 
-NumberTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int24", "uint24", "int32", "uint32",
-                         "int40", "uint40", "int48", "uint48", "int56", "uint56", "int64", "uint64",
-                         "float32", "float64"]  # fmt: skip
+IntegerTypeName = Literal["int8", "uint8", "int16", "uint16", "int24", "uint24", "int32", "uint32",
+                          "int40", "uint40", "int48", "uint48", "int56", "uint56", "int64", "uint64"]  # fmt: skip
+NumberTypeName = Literal["bool", IntegerTypeName, "float32", "float64"]
 DataTypeName = Literal[NumberTypeName, "bits", "bytes"]
 BITS: dict[str, int] = {
     "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int24": 24, "uint24": 24, "int32": 32, "uint32": 32,
@@ -193,6 +196,26 @@ class Pdo:
     """First register that it carries, if its sync manager is a virtual one; 0: it is a real one."""
     axis: AxisNumber = 1
     """Axis of a drive with several that the channels belong to."""
+    samples: Annotated[int, Ge(1), Le(255)] = 1
+    """Times that it is assigned, for as many values a cycle: a channel is their mean. Above 1: kinds analog, generic.
+    """
+    sample_increment: U16 = 0
+    """Above 0: each value has its own PDO (index + 1) and objects (index + this)."""
+
+    @property
+    def assigned(self) -> tuple[Pdo, ...]:
+        """The PDOs that are assigned for its values, one for each."""
+        step = self.sample_increment
+        return tuple(
+            replace(
+                self,
+                index=self.index + n,
+                channels=tuple(replace(e, index=e.index + n * step) if e.index else e for e in self.channels),
+            )
+            if step and n
+            else self
+            for n in range(self.samples)
+        )
 
     def axis_of(self, entry: PdoEntry) -> int:
         """Return the axis that a channel belongs to."""
@@ -224,6 +247,32 @@ class StartupSdo:
     def length(self) -> int:
         """Length in bytes."""
         return len(bytes.fromhex(self.data)) if self.type == "bytes" else max(BITS[self.type] // 8, 1)
+
+    @property
+    def integer_data(self) -> bytes:
+        """`value` of an integer type as it is written (ETG.1000.6, 5.6.5: little endian)."""
+        return int(self.value or 0).to_bytes(self.length, "little", signed=self.type.startswith("int"))
+
+
+LimitName = Literal["position_min", "position_max", "velocity", "torque"]
+
+
+@dataclass(frozen=True)
+class LimitObject:
+    """An object of a drive that limits its joint by itself. At the start it gets the joint's limit and is read back."""
+
+    index: U16
+    """Object index."""
+    sub_index: U8
+    """Object subindex."""
+    type: IntegerTypeName
+    """Data type of the object."""
+    limit: LimitName
+    """Limit that it holds: ends of the position, speed, or torque; see [drives](drives.md#limits-inside-the-drive)."""
+    factor: float | None = None
+    """SI units per count; left out: that of the drive's position, velocity or torque channel. Not 0."""
+    axis: AxisNumber = 1
+    """Axis of a drive with several."""
 
 
 @dataclass(frozen=True)
@@ -268,6 +317,8 @@ class DeviceDescription:
     """Process-data (sync manager) watchdog, ms: without outputs for this time the device stops."""
     scaling: tuple[DriveScaling, ...] = ()
     """Of a CiA 402 drive: one for all its axes, or one an axis. Channels without `factor` have theirs from here."""
+    limits: tuple[LimitObject, ...] = ()
+    """Of a CiA 402 drive: the objects with which it limits its joints."""
 
     @property
     def has_channels(self) -> bool:
@@ -373,6 +424,8 @@ class SlaveConfig:
     """Path of the device's file; empty: made by a program."""
     alias: int = 0
     """Station alias; 0: the slave is identified by its place."""
+    limits: tuple[StartupSdo, ...] = ()
+    """Limits of its joints, written after the start-up SDOs (`rtcp.config.drive_limits.with_limits`)."""
 
 
 @dataclass(frozen=True)
@@ -383,6 +436,18 @@ class Range:
     """Lower position limit, rad."""
     max: float
     """Upper position limit, rad; greater than `min`."""
+
+
+@dataclass(frozen=True)
+class AbsoluteLimits:
+    """How far `rtcp limits set --widen` may go beyond the limits of a joint; what is left out is not widened."""
+
+    position: Range | None = None
+    """Widest range, rad; it holds the `position` of the joint."""
+    velocity: Rate | None = None
+    """Highest speed limit, rad/s."""
+    torque: Positive | None = None
+    """Highest torque limit, Nm."""
 
 
 @dataclass(frozen=True)
@@ -412,6 +477,13 @@ class Joint:
     """Integral gain in CST, Nm/(rad s)."""
     axis: AxisNumber = 1
     """Axis of `slave`, where its drive has several."""
+    drive_torque: Positive | None = None
+    """Largest torque that the drive gives, Nm, written to it at the start (0x6072); left out: that of the drive.
+
+    A larger `supervision.torque` threshold is refused, because it could never be exceeded."""
+    inertia: NotNegative = 0.0
+    """Inertia that the drive turns, seen from the joint, kg m², for `feed_forward.acceleration`."""
+    absolute: AbsoluteLimits = field(default_factory=AbsoluteLimits)
 
     @property
     def place(self) -> str:
@@ -536,6 +608,20 @@ class KeepOut:
 
 
 @dataclass(frozen=True)
+class Cone:
+    """Directions in which an axis of the tool may point: at most `angle` from `direction`."""
+
+    name: Name
+    """Name for messages and `rtcp limits set NAME.angle`; unique, as the name of a keep-out box."""
+    direction: Vector
+    """Direction as multiples of the base's unit vectors, of any length above 0."""
+    angle: Annotated[float, FractionOfPi(), Ge(0.05), Le(3.09)]
+    """Largest angle between the axis and the direction, rad."""
+    axis: Literal["x", "y", "z"] = "z"
+    """Axis of the tool's frame."""
+
+
+@dataclass(frozen=True)
 class SingularityLimits:
     """Minimum distances that Cartesian motion keeps from singularities; 0 disables a limit."""
 
@@ -549,7 +635,7 @@ class SingularityLimits:
 
 @dataclass(frozen=True)
 class CartesianConfig:
-    """Limits of the tool: boxes hold in every mode, speeds and singularities in Cartesian motion."""
+    """Limits of the tool: boxes and cones hold in every mode, speeds and singularities in Cartesian motion."""
 
     speed: Annotated[float, Gt(0), Le(0.25)] = 0.25
     """Tool speed limit, m/s; at most 0.25 under manual control (ISO 10218-1)."""
@@ -567,6 +653,7 @@ class CartesianConfig:
     """Distance that the arm's bodies keep from keep-out boxes and from each other, m."""
     box: Box | None = None
     keep_out: tuple[KeepOut, ...] = ()
+    cones: Annotated[tuple[Cone, ...], MaxLen(MOST_CONES)] = ()
     singularity: SingularityLimits = field(default_factory=SingularityLimits)
 
 
@@ -601,8 +688,25 @@ class GuidingConfig:
 
 
 @dataclass(frozen=True)
+class AbsoluteSupervision:
+    """How far `rtcp limits set --widen` may raise the thresholds of the supervision; what is left out is not raised."""
+
+    speed: Annotated[float, Ge(1), Le(10)] | None = None
+    """Highest multiple of the joint's `velocity`."""
+    torque: Annotated[float, Ge(1), Le(10)] | None = None
+    """Highest multiple of the joint's `torque`."""
+    following_error: Annotated[float, Gt(0), Le(1)] | None = None
+    """Largest following error, rad."""
+
+
+SUPERVISION: Final = ("speed", "torque", "following_error")
+"""Names of the thresholds of the supervision."""
+
+
+@dataclass(frozen=True)
 class SupervisionConfig:
-    """Limits on measured values; the emergency stop follows when one is exceeded for `cycles` in a row.
+    """Limits on measured values; the emergency stop follows when one is exceeded for `cycles` in a row, torque for
+    `torque_s`.
 
     False measurements are not used; `cycles` in a row are a fault.
     """
@@ -611,14 +715,37 @@ class SupervisionConfig:
     """Cycles in a row beyond a limit that cause the emergency stop, or with a false measurement that cause a fault."""
     speed: Annotated[float, Ge(1), Le(10)] = 1.5
     """Measured speed limit, multiple of the joint's `velocity`."""
-    torque: Annotated[float, Ge(1), Le(10)] = 1.5
+    torque: Annotated[float, Ge(1), Le(10)] = 1.01
     """Measured torque limit, multiple of the joint's `torque`."""
+    torque_s: Annotated[float, Gt(0), Le(10)] = 0.1
+    """Time beyond the torque limit that causes the emergency stop, s."""
     following_error: Annotated[float, Gt(0), Le(1)] = 0.15
     """Following error limit, rad: commanded minus actual position."""
+    absolute: AbsoluteSupervision = field(default_factory=AbsoluteSupervision)
     position_tolerance: Annotated[float, Gt(0), Le(1)] = 0.002
     """A measured position is false if its step is larger than the way at the measured speed limit plus this, rad."""
     acceleration: Annotated[float, Ge(1), Le(1000)] = 25.0
     """Largest possible acceleration, multiple of the joint's `acceleration`: a speed that changes faster is false."""
+    velocity_gap: Annotated[float, Gt(0), Le(10)] = 0.4
+    """Largest difference of positions and measured speed in 0.1 s, as a fraction of the way at the joint's speed."""
+
+
+@dataclass(frozen=True)
+class FeedForwardConfig:
+    """Offsets for drives that map 0x60B1 and 0x60B2: [feed-forward](motion.md#feed-forward)."""
+
+    velocity: Annotated[float, Ge(0), Le(1)] = 0.0
+    """Fraction of the setpoint's velocity sent as the velocity offset in CSP."""
+    gravity: Annotated[float, Ge(0), Le(1)] = 0.0
+    """Fraction of the joints' weight sent as the torque offset in CSP and CSV."""
+    acceleration: Annotated[float, Ge(0), Le(1)] = 0.0
+    """Fraction of `inertia` times the setpoint's acceleration sent as the torque offset in CSP and CSV."""
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels that the drives need for it."""
+        torque = ("torque_offset",) if self.gravity or self.acceleration else ()
+        return (*(("velocity_offset",) if self.velocity else ()), *torque)
 
 
 @dataclass(frozen=True)
@@ -652,6 +779,9 @@ class StopsConfig:
     """The commander of a motion was silent for `lease_s`, released its lease, or its connection closed."""
     enabling_switch: AnyStop = "controlled_stop"
     """The enabling switch was released while something moves."""
+    power_off_after_s: Positive | None = None
+    """After the controlled stop of `lease_ended` the arm holds for this time, then its drives are disabled, s, unless
+    somebody commands it; null: it holds."""
 
 
 @dataclass(frozen=True)
@@ -676,6 +806,41 @@ class EmergencyStopConfig(InputConfig):
     """Level that means pressed; low for a normally closed contact, where a cut wire stops the arm too."""
 
 
+InputChannel = Annotated[str, "tpdo"]
+"""A channel that a slave sends, written SLAVE.CHANNEL."""
+OutputChannel = Annotated[str, "rpdo"]
+"""A channel that a slave receives, written SLAVE.CHANNEL."""
+
+
+BEYOND_FULL: Final = 1.1
+"""Largest inclination of a stick that is intact, multiple of the full one."""
+
+
+@dataclass(frozen=True)
+class StickAxisConfig:
+    """An axis of an analog stick."""
+
+    channel: InputChannel
+    """Channel with the inclination, SLAVE.CHANNEL, of a device of kind `analog`, `encoder` or `generic`."""
+    neutral: float = 0.0
+    """Value at rest, in the channel's unit."""
+    full: float = 1.0
+    """Change of the value from rest to the full inclination forward or left, in the channel's unit; not 0. A negative
+    one where the value falls. A value beyond 1.1 times it stops the arm; that of a cut wire, 0, has to be one."""
+
+
+@dataclass(frozen=True)
+class AnalogStickConfig:
+    """The stick of the joystick on analog channels: its inclination replaces the four directions."""
+
+    forward: StickAxisConfig
+    left: StickAxisConfig
+    dead_zone: Annotated[float, Gt(0), Le(0.5)] = 0.1
+    """Fraction of the full inclination, about rest, that is neutral."""
+    curve: Annotated[float, Ge(1), Le(4)] = 1.0
+    """Exponent of the fraction of the speed over that of the inclination: 1 is proportional, 2 is finer near rest."""
+
+
 @dataclass(frozen=True)
 class JoystickConfig:
     """The terminals of the joystick, all active low through pull-ups, or all active high."""
@@ -698,6 +863,7 @@ class JoystickConfig:
     """Debounce time, ms."""
     box: Name | None = None
     """IO box of the joystick; needed with several boxes."""
+    analog: AnalogStickConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -904,12 +1070,6 @@ class Kinematics:
         return self.tools or (NamedTool(ArmModel.tool_name, self.tool.position, self.tool.rpy),)
 
 
-InputChannel = Annotated[str, "tpdo"]
-"""A channel that a slave sends, written SLAVE.CHANNEL."""
-OutputChannel = Annotated[str, "rpdo"]
-"""A channel that a slave receives, written SLAVE.CHANNEL."""
-
-
 @dataclass(frozen=True)
 class ProcessConfig:
     """A process of the platform. Each kind is a subclass, found by the entry point `rtcp.processes`."""
@@ -930,6 +1090,13 @@ class ProcessConfig:
     """Lamps on the panel: colour -> key of the displayed channel."""
     PLOT: ClassVar[tuple[str, ...]] = ()
     """Fields that the panel draws over time."""
+
+    @classmethod
+    def state_in_words(cls, number: int) -> str:
+        """Return the name of a state, the value of the field `state`, in words; empty: it has no states."""
+        if cls.STATES is None:
+            return ""
+        return next((state.name for state in cls.STATES if state == number), "unknown").lower().replace("_", " ")
 
     def findings(self, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
         """Yield the channels that the slaves, by name, lack or that cannot be used."""
@@ -989,6 +1156,7 @@ class ArmSettings:
     jog: JogConfig = field(default_factory=JogConfig)
     guiding: GuidingConfig = field(default_factory=GuidingConfig)
     supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
+    feed_forward: FeedForwardConfig = field(default_factory=FeedForwardConfig)
     settle: SettleConfig = field(default_factory=SettleConfig)
     stops: StopsConfig = field(default_factory=StopsConfig)
     inputs: InputsConfig = field(default_factory=InputsConfig)
@@ -1060,6 +1228,12 @@ class ArmConfig(ArmSettings):
         boxes = self.boxes
         named = None if user is None else user.box
         return named if named is not None else boxes[0] if boxes else ""
+
+    def measures(self, channel: str) -> bool:
+        """Return whether the drive of every joint sends this input, as `velocity` or `torque`."""
+        devices = {slave.name: slave.device for slave in self.slaves}
+        images = [devices[joint.slave].of_axis(joint.axis).tpdo for joint in self.joints]
+        return all(any(entry.name == channel for pdo in image for entry in pdo.channels) for image in images)
 
     @property
     def process_outputs(self) -> frozenset[tuple[str, str]]:

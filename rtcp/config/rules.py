@@ -10,14 +10,17 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 
+from rtcp.config.drive_limits import factor_of
 from rtcp.config.find import registered
 from rtcp.config.findings import Finding, KeyPath, dotted
 from rtcp.config.model import (
+    BEYOND_FULL,
     BITS,
     MODE_CHANNELS,
     MOST_AXES,
     PLATFORM_PARTS,
     VIRTUAL,
+    AnalogStickConfig,
     ArmConfig,
     ArmFile,
     Box,
@@ -256,6 +259,21 @@ def _scaling(device: DeviceDescription) -> Iterator[Finding]:
         yield Finding((), "several_axes", axes=len(axes))
 
 
+@rule(DeviceDescription, "limits", "rpdo", "tpdo", "kind")
+def _limit_objects(device: DeviceDescription) -> Iterator[Finding]:
+    """Yield limits of a device that is no drive, of another axis, or without a factor."""
+    for i, entry in enumerate(device.limits):
+        where, factor = ("limits", i), factor_of(device, entry)
+        if device.kind != "cia402":
+            if device.kind in CHANNELS:
+                yield Finding(where, "scaling_of_kind", kind=device.kind)
+        elif entry.axis not in device.axes:
+            yield Finding((*where, "axis"), "axis", found=entry.axis, allowed=" or ".join(map(str, device.axes)))
+        elif not factor:
+            wanted = "a number other than 0: no channel of the axis has one for it"
+            yield Finding((*where, "factor"), "range", found=entry.factor, allowed=wanted)
+
+
 @rule(DeviceDescription, "rpdo", "tpdo", "kind")
 def _drive_channels(device: DeviceDescription) -> Iterator[Finding]:
     """Yield factors that turn a joint against its position, and limits that leave an enabled drive without torque."""
@@ -310,11 +328,25 @@ def _pdos(direction: str, pdos: Sequence[Pdo], device: DeviceDescription) -> Ite
         if low <= pdo.index <= high and device.configurable_pdos:
             of_index = {"other": opposite, "low": low, "high": high, "image": direction}
             yield Finding((direction, i, "index"), "index_of_other", found=pdo.index, **of_index)
-        elif first.setdefault(pdo.index, i) != i:
-            of = f"{direction}[{first[pdo.index]}]"
-            yield Finding((direction, i, "index"), "repeated_index", found=pdo.index, of=of)
+        else:
+            for each in dict.fromkeys(part.index for part in pdo.assigned):
+                if first.setdefault(each, i) != i:
+                    yield Finding(
+                        (direction, i, "index"), "repeated_index", found=each, of=f"{direction}[{first[each]}]"
+                    )
+                    break
+        if pdo.samples > 1 and (direction != "tpdo" or kind not in ("analog", "generic")):
+            text = f"found {pdo.samples}, allowed is more than 1 for inputs of the kinds analog and generic alone"
+            yield Finding((direction, i, "samples"), "samples", text=text)
+        last = max(part.index for part in (pdo.assigned[-1], *pdo.assigned[-1].channels))
+        if last > 0xFFFF:
+            text = f"found an object of index 0x{last:X} for the last of {pdo.samples} values, allowed is 0xFFFF"
+            yield Finding((direction, i, "sample_increment"), "samples", text=text)
         for j, entry in enumerate(pdo.channels):
             where = (direction, i, "channels", j)
+            if pdo.samples > 1 and (entry.modulo or entry.type == "bytes"):
+                text = f"{entry.name}: found a counter or an array, which has no mean: give it a PDO with samples 1"
+                yield Finding(where, "samples", text=text)
             names = axes.setdefault(pdo.axis_of(entry), {}) if entry.index else {}
             if entry.index and names.setdefault(entry.name, (where, entry))[1] is not entry:
                 yield Finding((*where, "name"), "repeated_channel", found=entry.name, image=direction)
@@ -358,6 +390,9 @@ def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Fin
     if abs(device.sync0_shift_us) >= period_us:
         wanted = f"less than one cycle in either direction {cycles}"
         yield Finding(("sync0_shift_us",), "shift_too_long", found=device.sync0_shift_us, unit=" us", allowed=wanted)
+    if device.assign_activate and device.sync0_factor < 0 and round(period_us * 1000) % -device.sync0_factor:
+        wanted = f"a part of whole ns {cycles}: otherwise SYNC0 drifts away from the frames"
+        yield Finding(("sync0_factor",), "sync0_part", found=device.sync0_factor, allowed=wanted)
 
 
 # -- the arm -----------------------------------------------------------------------------------------------------------
@@ -548,13 +583,22 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
             if missing:
                 of = {"device": slave.device, "drive_mode": arm.drive_mode}
                 yield Finding((*where, "slave"), "not_mapped", lacking=missing, **of)
-            yield from _beyond_the_wire(where, joint, device)
+            mapped = {entry.name for entry in device.outputs}
+            if where[0] == "joints" and (missing := [n for n in arm.feed_forward.channels if n not in mapped]):
+                yield Finding((*where, "slave"), "no_offset", lacking=missing, device=slave.device)
+            yield from _beyond_the_wire(where, joint, device, arm.feed_forward.channels if where[0] == "joints" else ())
 
 
 def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
-    """Yield terminals without an IO box, or with several to choose from; `devices`: the valid ones by name."""
+    """Yield terminals without an IO box, or with several to choose from, and channels of a stick that no slave sends.
+
+    Args:
+        arm: the arm's file.
+        devices: the valid ones by name.
+    """
     if any(slave.device not in devices for slave in arm.slaves):
         return
+    yield from _stick_channels(arm, devices)
     boxes = [slave.name for slave in arm.slaves if devices[slave.device].is_box]
     for kind, terminals in (("input", _inputs(arm)), ("output", _outputs(arm))):
         for where, user, places in terminals:
@@ -568,22 +612,65 @@ def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) ->
                 yield Finding(where, "missing", key="box", need=need)
 
 
-def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> Iterator[Finding]:
+@rule(AnalogStickConfig)
+def _analog_stick(stick: AnalogStickConfig) -> Iterator[Finding]:
+    """Yield axes without an inclination, or whose cut wire, which reads 0, would be one; and a channel of two axes."""
+    for key, axis in (("forward", stick.forward), ("left", stick.left)):
+        full, rest = abs(axis.full), abs(axis.neutral)
+        if axis.full == 0.0:
+            yield Finding((key, "full"), "range", found=0.0, allowed="any other number")
+        elif stick.dead_zone * full < rest <= BEYOND_FULL * full:
+            yield Finding((key, "neutral"), "cut_wire", found=axis.neutral, low=BEYOND_FULL * full)
+    if stick.left.channel == stick.forward.channel:
+        yield Finding(("left", "channel"), "repeated", what="channel", found=stick.left.channel, of="forward")
+
+
+def _stick_channels(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
+    """Yield axes of the analog stick whose channel no slave sends."""
+    analog = None if arm.inputs.joystick is None else arm.inputs.joystick.analog
+    if analog is None:
+        return
+    sends = {
+        f"{slave.name}.{entry.name}"
+        for slave in arm.slaves
+        if devices[slave.device].has_channels
+        for entry in devices[slave.device].inputs
+    }
+    for key, axis in (("forward", analog.forward), ("left", analog.left)):
+        if axis.channel not in sends:
+            wanted = f"one of {', '.join(sorted(sends))}" if sends else "a channel of a device of kind analog"
+            where = ("inputs", "joystick", "analog", key, "channel")
+            yield Finding(where, "channel", found=axis.channel, allowed=wanted)
+
+
+def _beyond_the_wire(
+    axis: KeyPath, joint: Joint, device: DeviceDescription, offsets_used: Sequence[str]
+) -> Iterator[Finding]:
     """Yield limits that the drive's process data cannot express: a target near them would wrap around."""
-    position = joint.position
+    position, wide = joint.absolute.position or joint.position, joint.absolute
+    velocity, torque = wide.velocity or joint.velocity, wide.torque or joint.torque
+    offsets = tuple(
+        ((key,), (-bound, bound), f"{key}_offset")
+        for key, bound in (("velocity", velocity), ("torque", torque))
+        if f"{key}_offset" in offsets_used
+    )
     limits: tuple[tuple[KeyPath, tuple[float, ...], str], ...] = (
+        *offsets,
         (("position", "min"), (position.min,), "target_position"),
         (("position", "max"), (position.max,), "target_position"),
-        (("velocity",), (-joint.velocity, joint.velocity), "target_velocity"),
-        (("torque",), (-joint.torque, joint.torque), "target_torque"),
+        (("velocity",), (-velocity, velocity), "target_velocity"),
+        (("torque",), (-torque, torque), "target_torque"),
     )
     for where, ends, name in limits:
+        widened: KeyPath = ("absolute",) if getattr(wide, str(where[0])) is not None else ()
         low, high = device.wire_range(name)
         if not all(low <= end <= high for end in ends):
             entry = next(entry for pdo in device.rpdo for entry in pdo.channels if entry.name == name)
             of = f"{name} of {device.name} is {entry.type} with factor {entry.factor:g}"
             sign = "+-" if len(ends) == 2 else ""
-            yield Finding((*axis, *where), "beyond_wire", sign=sign, found=ends[-1], low=low, high=high, of=of)
+            yield Finding(
+                (*axis, *widened, *where), "beyond_wire", sign=sign, found=ends[-1], low=low, high=high, of=of
+            )
 
 
 @rule(ArmFile, "home", "joints")
@@ -598,6 +685,56 @@ def _home(arm: ArmFile) -> Iterator[Finding]:
 # -- geometry and boxes ------------------------------------------------------------------------------------------------
 
 
+@rule(ArmFile, "supervision", "joints")
+def _torque_supervision(arm: ArmFile) -> Iterator[Finding]:
+    """Yield the first threshold of the measured torque that is beyond what the drive of its joint can give."""
+    factor, wide = arm.supervision.torque, arm.supervision.absolute.torque
+    for i, joint in enumerate(arm.joints):
+        most = joint.drive_torque
+        if most is None:
+            continue
+        of = f"the drive of {joint.name} gives at most joints[{i}].drive_torque"
+        torque = joint.absolute.torque or joint.torque
+        if most <= joint.torque:
+            of = f"the torque of {joint.name}: the drive could not hold what the joint may carry"
+            yield Finding(("joints", i, "drive_torque"), "not_more", found=most, low=joint.torque, of=of)
+        elif joint.torque * factor >= most:
+            yield Finding(("supervision", "torque"), "never_trips", found=factor, high=most / joint.torque, of=of)
+        elif joint.torque * (wide or factor) >= most:
+            yield Finding(
+                ("supervision", "absolute", "torque"), "never_trips", found=wide, high=most / joint.torque, of=of
+            )
+        elif torque * (wide or factor) >= most:
+            high = most / (wide or factor)
+            yield Finding(("joints", i, "absolute", "torque"), "never_trips", found=torque, high=high, of=of)
+        else:
+            continue
+        return
+
+
+@rule(ArmFile, "supervision", "joints")
+def _absolute(arm: ArmFile) -> Iterator[Finding]:
+    """Yield absolute limits that are narrower than the limits themselves."""
+    for i, joint in enumerate(arm.joints):
+        where, wide = ("joints", i, "absolute"), joint.absolute
+        if wide.position is not None:
+            low, high, of = joint.position.min, joint.position.max, f"the position of {joint.name}"
+            if wide.position.min > low:
+                yield Finding((*where, "position", "min"), "above", found=wide.position.min, high=low, of=of)
+            if wide.position.max < high:
+                yield Finding((*where, "position", "max"), "below", found=wide.position.max, low=high, of=of)
+        for key in ("velocity", "torque"):
+            yield from _at_least((*where, key), getattr(wide, key), getattr(joint, key), f"the {key} of {joint.name}")
+    for key in ("speed", "torque", "following_error"):
+        least, most = getattr(arm.supervision, key), getattr(arm.supervision.absolute, key)
+        yield from _at_least(("supervision", "absolute", key), most, least, f"supervision.{key}")
+
+
+def _at_least(where: KeyPath, wide: float | None, least: float, of: str) -> Iterator[Finding]:
+    if wide is not None and wide < least:
+        yield Finding(where, "below", found=wide, low=least, of=of)
+
+
 @rule(ArmFile, "kinematics", "joints")
 def _joints_of_kinematics(arm: ArmFile) -> Iterator[Finding]:
     part = arm.kinematics
@@ -607,16 +744,17 @@ def _joints_of_kinematics(arm: ArmFile) -> Iterator[Finding]:
         wanted = f"{len(part.dh)}; leave it out for such an arm"
         yield Finding(("kinematics",), "too_many_axes", joints=len(arm.joints), allowed=wanted)
     for i, (joint, limit) in enumerate(zip(arm.joints, part.limits or ())):  # noqa: B905 the count is checked above
-        place, where = f"kinematics.limits[{i}]", ("joints", i, "position")
+        place = f"kinematics.limits[{i}]"
         end = f"the joint's mechanical end in {place}"
-        low, high = joint.position.min, joint.position.max
-        if low < limit.min:
-            yield Finding((*where, "min"), "below", found=low, low=limit.min, of=end)
-        if high > limit.max:
-            yield Finding((*where, "max"), "above", found=high, high=limit.max, of=end)
-        if limit.velocity is not None and joint.velocity > limit.velocity:
-            most = {"found": joint.velocity, "high": limit.velocity}
-            yield Finding(("joints", i, "velocity"), "above", **most, of=f"the velocity in {place}")
+        for keys, its in ((("joints", i), joint), (("joints", i, "absolute"), joint.absolute)):
+            where = (*keys, "position")
+            if its.position is not None and its.position.min < limit.min:
+                yield Finding((*where, "min"), "below", found=its.position.min, low=limit.min, of=end)
+            if its.position is not None and its.position.max > limit.max:
+                yield Finding((*where, "max"), "above", found=its.position.max, high=limit.max, of=end)
+            if limit.velocity is not None and (its.velocity or 0.0) > limit.velocity:
+                most = {"found": its.velocity, "high": limit.velocity}
+                yield Finding((*keys, "velocity"), "above", **most, of=f"the velocity in {place}")
 
 
 @rule(Kinematics)
@@ -647,19 +785,32 @@ def _boxes(arm: ArmFile) -> Iterator[Finding]:
             yield Finding(where, "box_around_box")
 
 
+@rule(ArmFile, "cartesian", "kinematics")
+def _cones(arm: ArmFile) -> Iterator[Finding]:
+    for i, cone in enumerate(arm.cartesian.cones):
+        if arm.kinematics is None:
+            yield Finding(("cartesian", "cones", i), "box_needs", need="the arm's geometry", key="kinematics")
+        if not any(cone.direction):
+            yield Finding(("cartesian", "cones", i, "direction"), "no_direction")
+
+
 @rule(ArmFile, "cartesian", "joints", "gripper")
 def _box_names(arm: ArmFile) -> Iterator[Finding]:
     """Yield names that make the key of a limit, as joint2.max or user.max.z, ambiguous."""
-    boxes = arm.cartesian.keep_out
-    yield from repeated(((("cartesian", "keep_out", i, "name"), box.name) for i, box in enumerate(boxes)), "name")
-    taken = {"box": "cartesian.box", _ALL_JOINTS: "all joints"}
+    cartesian = arm.cartesian
+    named: list[tuple[KeyPath, str]] = [
+        (("cartesian", "keep_out", i, "name"), box.name) for i, box in enumerate(cartesian.keep_out)
+    ]
+    named += [(("cartesian", "cones", i, "name"), cone.name) for i, cone in enumerate(cartesian.cones)]
+    yield from repeated(named, "name")
+    taken = {"box": "cartesian.box", "supervision": "supervision", _ALL_JOINTS: "all joints"}
     taken |= {joint.name: dotted(where) for where, joint in axes_of(arm) if joint.name not in taken}
-    for i, box in enumerate(boxes):
-        if box.name in taken:
-            yield Finding(("cartesian", "keep_out", i, "name"), "limit_key", found=box.name, means=taken[box.name])
-        elif "." in box.name:
+    for where, name in named:
+        if name in taken:
+            yield Finding(where, "limit_key", found=name, means=taken[name])
+        elif "." in name:
             wanted = "one without a dot: dots separate the parts of a key"
-            yield Finding(("cartesian", "keep_out", i, "name"), "dot", found=box.name, allowed=wanted)
+            yield Finding(where, "dot", found=name, allowed=wanted)
 
 
 def shoulder_and_reach(part: Kinematics) -> tuple[Position, float]:

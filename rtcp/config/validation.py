@@ -255,6 +255,8 @@ def allowed(kind: object) -> str:
         if MinLen in bounds and MaxLen in bounds:
             least, most = bounds[MinLen].min_length, bounds[MaxLen].max_length
             return f"a list of {least}{'' if least == most else f' to {most}'} {of}"
+        if MaxLen in bounds:
+            return f"a list of at most {bounds[MaxLen].max_length} {of}"
         return "a list" + (" with at least one entry" if MinLen in bounds else "")
     if is_dataclass(bare):
         return f"a mapping with the keys {', '.join(keys(bare))}"

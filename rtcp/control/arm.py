@@ -21,6 +21,7 @@ from rtcp.ipc.stop_reactions import longest_s
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
 from rtcp.motion.controllers.jog import JogController
 from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveWriter
+from rtcp.motion.feed_forward import FeedForward
 from rtcp.motion.guards.compliance import (
     PUSH_REACTION_S,
     PUSHED_CLEARANCE,
@@ -29,6 +30,7 @@ from rtcp.motion.guards.compliance import (
     ComplianceGuard,
 )
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
+from rtcp.motion.guards.zones import reported
 from rtcp.motion.speed_override import SpeedOverride
 from rtcp.motion.state import Phase, Setpoint
 from rtcp.motion.step_group import StepGroup
@@ -95,6 +97,9 @@ class Arm(JointGroup):
         """Cycles left for the stop of a controller of another package; 0: none stops."""
         self._progress = (0, 0.0, 0.0)
         """What the active controller publishes: its `held`, `elapsed_s` and `duration_s`."""
+        offsets = [drive.offsets for drive in self.drives]
+        self.feed_forward = FeedForward(config, self.limits, self.gravity, offsets) if any(offsets) else None
+        """Offsets for the drives; None: no drive takes any."""
         self._holder = self.controllers[MoveJoints]
         jog = self.controllers.get(Jog)
         self.jog = jog if isinstance(jog, JogController) and jog.has_geometry else None
@@ -103,7 +108,7 @@ class Arm(JointGroup):
         self.control_mode = ControlMode[config.control_mode.upper()]
         self.configured_mode = DriveMode[config.drive_mode.upper()]
         """Drive mode of moves, lines, streams and jogs."""
-        self._csp, self._cst = CspWriter(joints, self.period_s), CstWriter(joints, self.period_s)
+        self._csp, self._cst = CspWriter(joints, self.period_s), CstWriter(joints, self.period_s, self.limits.torque)
         self._writers: dict[DriveMode, DriveWriter] = {
             DriveMode.CSP: self._csp,
             DriveMode.CSV: CsvWriter(joints, self.period_s),
@@ -123,9 +128,20 @@ class Arm(JointGroup):
         """Command the drives to change to `mode`; only at standstill."""
         self.mode = mode
         self._writer = self._writers[mode]
-        self._writer.start(self.drives, [self.state.proven_torque(i) for i in range(len(self.drives))])
+        self._writer.start(self.drives, self.held_torques())
         for drive in self.drives:
             drive.mode = mode
+
+    def held_torques(self) -> list[float]:
+        """Return the torques, Nm, with which the drives hold the arm now (`ArmState.proven_torque`)."""
+        return [self.state.proven_torque(i) for i in range(len(self.drives))]
+
+    def first_beyond_torque_limit(self, torques: Sequence[float]) -> int:
+        """Return the first joint whose torque, Nm, is beyond its limit, or -1: in CST it would sag."""
+        for i, most in enumerate(self.limits.torque):
+            if abs(torques[i]) > most:
+                return i
+        return -1
 
     def change_mode(self, mode: DriveMode) -> None:
         """Command enabled drives to change to `mode`; only at standstill of the setpoints.
@@ -140,8 +156,12 @@ class Arm(JointGroup):
             self.set_mode(mode)
             return
         limits, commanded = self.limits, self.state.commanded
+        speeds = [
+            min(max(drive.velocity, -most), most) for drive, most in zip(self.drives, limits.velocity, strict=True)
+        ]
         for i, drive in enumerate(self.drives):
-            speed = drive.velocity
+            # A hand may have made the joint faster than any target may be.
+            speed = speeds[i]
             # The targets of this cycle arrive a cycle later than the positions were read.
             drive.target_position = drive.position + speed * self.period_s
             rest = drive.target_position + 0.5 * speed * abs(speed) / limits.acceleration[i]
@@ -150,7 +170,7 @@ class Arm(JointGroup):
         self.hold()
         self.set_mode(mode)
         if mode is DriveMode.CSP:
-            self._csp.take_over(commanded, self.drives)
+            self._csp.take_over(commanded, speeds, limits.acceleration, self.drives)
 
     @property
     def is_braking(self) -> bool:
@@ -319,7 +339,7 @@ class Arm(JointGroup):
         # Joints that stand there already are led out by their commander.
         if contact is None or self._pushes.is_inside:
             return None
-        return PushedNear(contact[0], max(contact[1], 0.0))
+        return PushedNear(contact[0], max(reported(*contact), 0.0))
 
     def first_without(self, mode: DriveMode) -> int:
         """Return the first joint whose drive does not map what `mode` needs, or -1."""

@@ -120,6 +120,8 @@ class CommandHandler:
             return command
         if command.needs_lease and not (lease and self._context.lease_held(lease)):
             return refusals.NoLease()
+        if command.needs_lease:
+            self._context.unattended = False
         state = self._machine.state
         if state not in command.states:
             return refusals.WrongState(command.number, state)
@@ -291,7 +293,7 @@ class CommandHandler:
             return refusal
         arm.control_mode = mode
         arm.rest()
-        self._operator.require_neutral()
+        self._operator.begin_joystick(self._blackboard)
         self._blackboard.event(events.ControlModeChanged(mode))
         if drive_mode is not arm.mode or self._machine.state is not State.HOLDING:
             self._machine.change_drive_mode(drive_mode)
@@ -300,17 +302,14 @@ class CommandHandler:
     def _too_heavy_for(self, mode: DriveMode) -> refusals.Refusal | None:
         """Return the refusal of CST where a torque limit is below what holds the arm now, or None: it would sag.
 
-        Without torque it is the weight that the arm's model knows.
+        Without torque it is the weight that the arm's model knows; what the drives then carry is checked in ENABLING.
         """
         if mode is not DriveMode.CST:
             return None
         arm, holds = self._arm, self._machine.state is State.HOLDING
-        weight = arm.gravity.torques(arm.state.actual)
-        for axis, most in enumerate(arm.limits.torque):
-            held = abs(arm.state.proven_torque(axis) if holds else weight[axis])
-            if held > most:
-                return refusals.TorqueLimitTooLow(axis, held, most)
-        return None
+        torques = arm.held_torques() if holds else arm.gravity.torques(arm.state.actual)
+        axis = arm.first_beyond_torque_limit(torques)
+        return refusals.TorqueLimitTooLow(axis, abs(torques[axis]), arm.limits.torque[axis]) if axis >= 0 else None
 
     def _set_limits(self, command: commands.SetLimits, lease: int) -> refusals.Refusal | None:
         arm = self._arm
@@ -325,15 +324,21 @@ class CommandHandler:
         if axis >= 0:
             # A drive without a ramp of its own stops under the limits.
             return refusals.NotAtStandstill(axis, self._joints.drives[axis].velocity)
-        refusal = arm.trajectory_guard.refusal_of(arm.state, new)
+        if command.widen and self._joints.first_with_torque() >= 0:
+            # The speed limit of a drive is fixed while it is enabled.
+            return refusals.TorquePresent()
+        refusal = arm.trajectory_guard.refusal_of(arm.state, new, widen=command.widen)
         if refusal is not None:
             return refusal
         limits = arm.limits
         if self._joints.first_with_torque() >= 0:
             for axis, torque in enumerate(arm.state.actual_torque):
-                most = new.torque[axis]
-                if most < limits.torque[axis] and abs(torque) > most:
-                    return refusals.TorqueLimitTooLow(axis, abs(torque), most)
+                most, held = new.torque[axis], abs(torque)
+                if most < limits.torque[axis] and held > most:
+                    return refusals.TorqueLimitTooLow(axis, held, most)
+            exceeded = arm.supervision.first_exceeded(arm.samples, new)
+            if exceeded is not None:
+                return exceeded
         arm.set_limits(new)
         self._blackboard.event(events.LimitsChanged())
         return None

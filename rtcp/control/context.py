@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import VIRTUAL, ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
 from rtcp.control.gripper import DrivenGripper
@@ -20,6 +20,7 @@ from rtcp.ipc.events import (
     ClockLost,
     ControllerFailed,
     ControllerRaised,
+    DisabledUnattended,
     DriveFault,
     DriveLeftEnabled,
     DriveModeTimeout,
@@ -40,8 +41,14 @@ from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.realtime.discipline import Discipline
 
 _GOOD_FOR_LOST: Final = 10
-"""Good cycles that make up for a lost one."""
+"""Good cycles that make up for a lost one; 1 on the virtual bus with wider timeouts: a busy host loses many there."""
 _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
+
+
+def good_for_lost(config: ArmConfig) -> int:
+    """Return the number of good cycles that make up for a lost one."""
+    bus = config.bus
+    return 1 if bus.interface == VIRTUAL and bus.timeout_scale > 1.0 else _GOOD_FOR_LOST
 
 
 class Context(PartContext):
@@ -99,7 +106,8 @@ class Context(PartContext):
         self.homing = HomingSequence(arm, self.joints, self.period_s)
         self.reactions = reactions(config.stops)
         self._discipline = discipline
-        self._lost_limit = _GOOD_FOR_LOST * config.bus.lost_cycles
+        self._good_for_lost = good_for_lost(config)
+        self._lost_limit = self._good_for_lost * config.bus.lost_cycles
         self._clock_cycles = round(config.ethercat.clock_lost_s / self.period_s)
         self._unlocked = 0
         self.entered = 0
@@ -107,10 +115,15 @@ class Context(PartContext):
         self.lost = 0
         """Consecutive cycles without the expected working counter."""
         self.wkc_error_count = 0
-        """Cycles without the expected working counter, `_GOOD_FOR_LOST` each, minus cycles with it; 0 to as many times
+        """Cycles without the expected working counter, `good_for_lost` each, minus cycles with it; 0 to as many times
         `bus.lost_cycles`."""
         self.lease = 0
         """Lease of the commander of the enabling or the motion; 0: the joystick, which needs none."""
+        self.unattended = False
+        """Whether a commander was lost while it moved something, and nobody has commanded since."""
+        self._commander_lost = 0
+        """Number of the cycle in which that commander was lost: with a gripper the arm may hold for long before."""
+        self._power_off_cycles = self.cycles(config.stops.power_off_after_s or 0.0)
         self.limited = False
         """Whether the present stop ends in the state stopped by limit; written by states."""
         self.pending: ClockLost | None = None
@@ -130,7 +143,7 @@ class Context(PartContext):
             return
         self.lost += 1
         self.operator.miss()
-        self.wkc_error_count = min(self.wkc_error_count + _GOOD_FOR_LOST, self._lost_limit)
+        self.wkc_error_count = min(self.wkc_error_count + self._good_for_lost, self._lost_limit)
 
     @property
     def waited(self) -> int:
@@ -209,7 +222,19 @@ class Context(PartContext):
         """Return the event that forbids motion for the commander of `lease`, or None."""
         if not self.operator.permitted:
             return PermissionWithdrawn()
-        return None if self.lease_held(lease) else LeaseExpired()
+        if self.lease_held(lease):
+            return None
+        self.unattended, self._commander_lost = True, self.cycle
+        return LeaseExpired()
+
+    def take_power_off(self) -> DisabledUnattended | None:
+        """Return, once, the event that disables the drives of an arm that holds since its commander was lost."""
+        if not self.unattended or not self._power_off_cycles:
+            return None
+        if self.cycle - max(self.entered, self._commander_lost) < self._power_off_cycles:
+            return None
+        self.unattended = False
+        return DisabledUnattended(self._power_off_cycles * self.period_s)
 
     def is_controlled(self, event: Event) -> bool:
         """Return whether the reaction to an event is a controlled stop, with the drives enabled."""
@@ -246,6 +271,8 @@ class Context(PartContext):
         if event is not None:
             return event
         result = joints.command()
+        if arm.feed_forward is not None:
+            arm.feed_forward.update(arm.state, arm.mode)
         if arm.raised is not None:
             return self.controller_raised()
         if result is GuardResult.PASS and arm.active.ended is None:
@@ -277,6 +304,8 @@ class Context(PartContext):
                 return event
             homing.stop()
         homing.step()
+        if self.arm.feed_forward is not None:
+            self.arm.feed_forward.update(self.arm.state, self.arm.mode)
         event = joints.beyond_limits() or self._supervise_gripper()
         if event is not None:
             return event

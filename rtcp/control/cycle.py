@@ -24,7 +24,6 @@ from rtcp.control.part import Part, PluginTimer, make_devices
 from rtcp.control.partners import Partners
 from rtcp.control.processes import make_processes
 from rtcp.devices.drive import Drive, drive_of
-from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.master import PacedData
 from rtcp.ipc.blackboard import Blackboard
@@ -81,11 +80,10 @@ class Cycle:
         partners: Partners | None = None,
     ) -> None:
         self.devices = devices = make_devices(config)
-        boxes = {device.name: device.driver for device in devices if isinstance(device.driver, IoBox)}
         gripper = make_gripper(config)
         group = None if partners is None else partners.group
         self.arm = Arm(config, make_drives(config), blackboard.plan, group)
-        self.operator = Operator(config, boxes, gripper)
+        self.operator = Operator(config, {device.name: device.driver for device in devices}, gripper)
         self._period_ns = round(config.cycle.period_us * 1000)
         context = Context(
             config, PluginTimer(now, self._period_ns, blackboard.event), self.arm, gripper, self.operator, devices,
@@ -120,6 +118,8 @@ class Cycle:
         self._spin_ns = round(config.cycle.spin_us * 1000)
         self._timer = context.timer
         self._controllers_timed = any(map(is_foreign, self.arm.controllers.values()))
+        self._controller_powers = "power" in config.bus.LACKS
+        """Whether only a robot controller knows if the motors are on."""
         self._locked = False
         self._shutdown = False
         self.missed = 0
@@ -285,6 +285,11 @@ class Cycle:
             machine.limit,
             machine.enables,
             machine.motions,
+            operator.drives_powered
+            if self._controller_powers
+            else int(context.all_enabled or self.joints.first_with_torque() >= 0),
+            operator.e_stopped,
+            operator.operating_mode,
         )
         for part in self.parts:
             if part.is_timed:

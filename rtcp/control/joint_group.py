@@ -203,8 +203,10 @@ class JointGroup(Part):
         for i, drive in enumerate(self.drives):
             drive.low, drive.high = self.limits.low[i], self.limits.high[i]
             drive.deceleration = self.limits.acceleration[i]
+            drive.speed_limit = max(self.limits.velocity[i], self.limits.widest.velocity[i])
         self.output_limiter.take(self.limits)
         self.supervision.take(self.limits)
+        self.measurements.take(self.limits)
 
     @property
     def at_rest(self) -> bool:

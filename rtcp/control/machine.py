@@ -171,7 +171,7 @@ class StateMachine:
         if target is None:
             return
         if lease is not None:
-            ctx.lease = lease
+            ctx.lease, ctx.unattended = lease, False
         self._count(cause, target)
         ctx.state, ctx.entered = target, ctx.cycle
         if target is not State.MOVING:

@@ -5,24 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from rtcp.config.buses import CONTROLLER_STATUS
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.gripper import DrivenGripper
 from rtcp.control.part import Part, PartContext
-from rtcp.devices.driver import DeviceError
-from rtcp.devices.io_box import Inputs, IoBox, JoystickInput, Outputs
+from rtcp.devices.driver import DeviceError, Driver
+from rtcp.devices.io_box import AnalogStick, Inputs, IoBox, JoystickInput, Outputs
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import (
     GripperCloses,
     GripperOpens,
     JoystickGranted,
     JoystickModeChanged,
+    JoystickOutOfRange,
     JoystickWithdrawn,
     UnknownJoystickCode,
 )
 from rtcp.ipc.schema import OPERATOR_FIELDS
 from rtcp.ipc.states import ControlMode, State
-from rtcp.motion.controllers.joystick import Joystick
+from rtcp.motion.controllers.joystick import Joystick, Shown
 from rtcp.motion.state import Phase
 
 UNREAD_S: Final = 0.5
@@ -35,24 +37,33 @@ class Operator(Part):
 
     Args:
         config: configuration of the inputs and outputs.
-        boxes: the IO boxes by name; without any no button is pressed, motion is permitted and there is no joystick.
+        drivers: the slaves that are no drives, by name; without an IO box no button is pressed, motion is permitted and
+            there is no joystick.
         driven: the gripper where it has a drive.
 
     Raises:
-        DeviceError: an input or output with a function is not at an IO box, so it would be ignored.
+        DeviceError: an input or output with a function is not at an IO box, so it would be ignored; or no slave sends a
+            channel of the joystick.
     """
 
-    def __init__(self, config: ArmConfig, boxes: Mapping[str, IoBox], driven: DrivenGripper | None) -> None:
+    def __init__(self, config: ArmConfig, drivers: Mapping[str, Driver], driven: DrivenGripper | None) -> None:
         super().__init__("operator", OPERATOR_FIELDS)
+        boxes = {name: driver for name, driver in drivers.items() if isinstance(driver, IoBox)}
+        told = [[each for each in drivers.values() if name in each.values] for name, _, _ in CONTROLLER_STATUS]
+        self._tell_power, self._tell_stop, self._tell_mode = told
         cycle_s = config.cycle.period_us * 1e-6
         inputs, outputs, gripper = config.inputs, config.outputs, config.gripper
         self._inputs = Inputs(inputs, cycle_s)
         self._outputs = Outputs(outputs, gripper)
         self._input = JoystickInput(inputs, cycle_s)
+        stick = inputs.joystick
+        self._analog = None if stick is None or stick.analog is None else AnalogStick(stick, drivers, cycle_s)
+        self._shown: Shown = self._input if self._analog is None else self._analog
         self._joystick = Joystick(config.jog)
         self._driven = driven
         self._stop_box = boxes.get(config.box_of(inputs.emergency_stop))
-        self._switch_box = boxes.get(config.box_of(inputs.enabling_switch))
+        switch = inputs.enabling_switch
+        self._switch_box = None if switch is None else boxes.get(config.box_of(switch))
         self._toggle_box = boxes.get(config.box_of(inputs.arm_toggle))
         self._stick_box = boxes.get(config.box_of(inputs.joystick))
         self._lamp_box = boxes.get(config.box_of(outputs))
@@ -73,8 +84,9 @@ class Operator(Part):
         self.permitted = self._switch_box is None or self._inputs.enabling_switch.active
         """Whether the enabling switch allows motion."""
         self._unread_limit = round(UNREAD_S / cycle_s)
-        self.unread_cycles = self._missed = 0
-        """Consecutive cycles in which the emergency stop was not read, and in which not all inputs arrived."""
+        self.unread_cycles = self._missed = self._unread_limit
+        """Consecutive cycles in which the emergency stop was not read, and in which not all inputs arrived: before the
+        first cycle they never have."""
         self.joystick_granted = False
         lamps = [(config.box_of(outputs), led) for led in (outputs.state_lamp, outputs.motion_lamp, outputs.heartbeat)]
         grip = None if gripper is None else gripper.output
@@ -108,6 +120,8 @@ class Operator(Part):
             self.joystick_granted = inputs.arm_toggle.active
         if self._stick_box is not None:
             self._input.read(self._stick_box.inputs)
+            if self._analog is not None:
+                self._analog.read(self._input)
 
     def read_emergency_stop(self) -> None:
         """Update the emergency stop to pressed where it is; never to released."""
@@ -127,6 +141,36 @@ class Operator(Part):
     def stop_unread(self) -> bool:
         """Whether the emergency stop was not read for `UNREAD_S`: for the partners it counts as pressed."""
         return self.has_button and self.unread_cycles > self._unread_limit
+
+    @property
+    def drives_powered(self) -> int:
+        """Whether motors that a robot controller powers are on: 1 or 0; -1: it does not tell, or was not read."""
+        return self._told(self._tell_power, "drives_powered")
+
+    @property
+    def e_stopped(self) -> int:
+        """Whether the emergency stop is pressed, here or at a robot controller: 1 or 0; -1: it was not read, or no
+        slave tells.
+        """
+        here = int(self.emergency_stop) if self.has_button and not self.stop_unread else -1
+        return max(here, self._told(self._tell_stop, "e_stopped"))
+
+    def _told(self, drivers: list[Driver], channel: str) -> int:
+        """Return the largest value of a channel of `CONTROLLER_STATUS`; -1: there is none, or it was not read."""
+        told = -1
+        if self._missed <= self._unread_limit:
+            for driver in drivers:
+                told = max(told, int(driver.values[channel]))
+        return told
+
+    @property
+    def operating_mode(self) -> int:
+        """Position of a robot controller's key: 1 manual, 2 automatic; -1: unknown, not read, or two differ."""
+        told = self._told(self._tell_mode, "operating_mode")
+        for driver in self._tell_mode:
+            if int(driver.values["operating_mode"]) != told:
+                return -1
+        return told
 
     @property
     def holds_grip(self) -> bool:
@@ -158,6 +202,13 @@ class Operator(Part):
         """Ignore the joystick until it was neutral once."""
         self._joystick.wait_for_neutral()
 
+    def begin_joystick(self, blackboard: Blackboard) -> None:
+        """Begin with the joystick's first mode, as after the start; a forward push must not open the gripper."""
+        changes = self._joystick.mode != 0
+        self._joystick.begin()
+        if changes:
+            blackboard.event(JoystickModeChanged(0))
+
     def grip(self, close: bool) -> None:
         """Close or open the gripper on its output."""
         if self._grip_box is not None:
@@ -175,16 +226,17 @@ class Operator(Part):
         if granted is not self._was_granted:
             self._was_granted = granted
             blackboard.event(JoystickGranted() if granted else JoystickWithdrawn())
-        joystick_input, joystick = self._input, self._joystick
+        lines, analog, shown, joystick = self._input, self._analog, self._shown, self._joystick
         before = joystick.mode
-        joystick.update(joystick_input, granted and self.permitted)
+        joystick.update(shown, granted and self.permitted)
         if joystick.mode != before:
             blackboard.event(JoystickModeChanged(joystick.mode))
-        if joystick_input.valid:
+        if shown.valid:
             self._code_reported = False
         elif granted:
             if not self._code_reported:
-                blackboard.event(UnknownJoystickCode(joystick_input.code))
+                out = analog is not None and not analog.in_range
+                blackboard.event(JoystickOutOfRange() if out else UnknownJoystickCode(lines.code))
             self._code_reported = True
         if joystick.grip is not None:
             self._grip_by_joystick(blackboard, opens=joystick.grip)

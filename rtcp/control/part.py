@@ -8,7 +8,7 @@ when their outputs have to be safe.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from mypy_extensions import mypyc_attr
@@ -230,6 +230,7 @@ class Device(Part):
         self._error: BaseException | None = None
         self._published = PublishedValues(self.fields)
         self._size = len(driver.safe_outputs)
+        self._inputs = tuple(driver.values)
         self.is_timed = is_foreign(driver)
 
     def _fail(self, error: BaseException) -> None:
@@ -240,8 +241,18 @@ class Device(Part):
         try:
             if not self._failed:
                 self.driver.decode(data.input(self.slot))
+                if self.is_timed:
+                    self._check_values()
         except BaseException as error:
             self._fail(error)
+
+    def _check_values(self) -> None:
+        """Raise an error where a driver of another package left a value that is no number: the joystick reads them."""
+        values: Mapping[str, object] = self.driver.values
+        for name in self._inputs:
+            value = values[name]
+            if not isinstance(value, int | float):
+                raise TypeError(f"values[{name!r}] is {value!r:.80}, allowed is a number")
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
         """Let the driver carry out the command."""

@@ -88,6 +88,9 @@ def main() -> int:
     try:
         config = session.config
         master = master_of(config.bus)(config, session.interface, session.segment_pid)
+        units = None if session.cell is None else session.cell.units_of(session.name)
+        if units is not None:
+            master.share(units)
         _work(master, session, directory, report)
     except (BusError, DeviceError, ConfigError, SchemaError, BlackboardTooLarge) as error:
         sentences = list(error.sentences) if isinstance(error, BusError) else str(error).splitlines()

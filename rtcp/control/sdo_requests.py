@@ -118,7 +118,9 @@ class SdoRequests:
             data = yield from objects.reading(index, subindex)
             return {"hex": data.hex()}
         if request["do"] == "sdo_write":
-            yield from objects.writing(index, subindex, bytes.fromhex(request["hex"]))
+            data = bytes.fromhex(request["hex"])
+            yield from objects.writing(index, subindex, data)
+            self._bus.note_written(position, index, subindex, data)
             return {}
         raise ValueError(f"{request['do']!r} is neither sdo_read nor sdo_write")
 

@@ -17,6 +17,7 @@ from rtcp.ipc.commands import Disable, Enable, Halt, Home, MotionCommand, Reset,
 from rtcp.ipc.events import (
     Arrived,
     Disabled,
+    DisabledUnattended,
     DisableTimeout,
     DriveFault,
     DriveLeftEnabled,
@@ -50,6 +51,7 @@ from rtcp.ipc.events import (
     SlavesParked,
     Stopped,
     StoppedByLimit,
+    TooHeavyForCst,
     TorqueRemoved,
 )
 from rtcp.ipc.message import Message
@@ -57,6 +59,7 @@ from rtcp.ipc.states import DriveMode, DriveState, State
 from rtcp.ipc.stop_reactions import StopReaction, quick_stop_s
 from rtcp.motion.guards.output_limiter import BACK_RAD_S
 from rtcp.motion.guards.trajectory_guard import GuardResult
+from rtcp.motion.guards.zones import reported
 
 
 class Signal(Enum):
@@ -197,7 +200,7 @@ class Enabling(MachineState):
         """Begin in CSP, where target = actual means standstill."""
         ctx.arm.set_mode(DriveMode.CSP)
         ctx.joints.hold()
-        ctx.operator.require_neutral()
+        ctx.operator.begin_joystick(ctx.blackboard)
         self._were_enabled = 0
         """Bit mask of the drives that have been enabled."""
         self._returning = False
@@ -260,6 +263,12 @@ class Enabling(MachineState):
             return None
         if ctx.cycle - self._enabled < ctx.cycles(self._CARRY_S):
             return None
+        arm = ctx.arm
+        if arm.wanted_mode is DriveMode.CST:
+            torques = arm.held_torques()
+            axis = arm.first_beyond_torque_limit(torques)
+            if axis >= 0:
+                return TooHeavyForCst(axis, abs(torques[axis]), arm.limits.torque[axis])
         joints.reset_supervision()
         return Enabled()
 
@@ -275,6 +284,7 @@ class Holding(MachineState):
         Signal.JOYSTICK_DEFLECTED: State.MOVING,
         MotionEnded: State.STOPPING,
         Signal.STOP_FOR_CLOCK: State.STOPPING,
+        DisabledUnattended: State.DISABLING,
         Home: State.HOMING,
     }
 
@@ -296,7 +306,7 @@ class Holding(MachineState):
             ctx.all_enabled = True
             distance, box = ctx.arm.trajectory_guard.nearest_box(ctx.arm.state.actual)
             if distance < 0.0:
-                ctx.publish(EnabledInBox(box, -distance))
+                ctx.publish(EnabledInBox(box, reported(box, -distance)))
             if ctx.arm.wanted_mode is not DriveMode.CSP:
                 self.change_mode(ctx, ctx.arm.wanted_mode)
 
@@ -309,7 +319,7 @@ class Holding(MachineState):
     def update(self, ctx: Context) -> Event | Signal | None:
         """Hold, wait for a mode change, or start to move by the joystick."""
         arm, joints = ctx.arm, ctx.joints
-        event = ctx.track()
+        event = ctx.track() or ctx.take_power_off()
         if event is not None:
             return event
         if self.changing_mode:
@@ -412,11 +422,11 @@ class StoppedByLimitState(MachineState):
 
     state = State.STOPPED_BY_LIMIT
     drives = "the setpoints at which it came to rest, unchanged"
-    leads_to = {**_TORQUE, Reset: State.HOLDING}
+    leads_to = {**_TORQUE, Reset: State.HOLDING, DisabledUnattended: State.DISABLING}
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Hold."""
-        return ctx.track()
+        return ctx.track() or ctx.take_power_off()
 
 
 class HomingState(MachineState):

@@ -109,7 +109,8 @@ class Cia402Drive(Drive):
 
     `encode` also takes `controlword`. A velocity that is not mapped is the mean one over 20 ms. In CSP the drive takes
     `speed_limit` from the field of the target velocity. A drive whose PDOs have no mode of operation stays in CSP, to
-    which a start-up SDO sets it. Whatever else is mapped, as the offsets 0x60B1 and 0x60B2, has its safe value, 0.
+    which a start-up SDO sets it. The offsets 0x60B1 and 0x60B2 are those of `offsets` while the drive is enabled in CSP
+    and CSV, else 0. Whatever else is mapped has its safe value, 0.
 
     Args:
         slave: the slave's name and description.
@@ -141,6 +142,7 @@ class Cia402Drive(Drive):
         self._limits = tuple((0, 0) if channel is None else integer_range(channel) for channel in targets)
         self._scales = tuple(0.0 if channel is None else 1.0 / channel.factor for channel in targets)
         self._in_factors = tuple(0.0 if slot < 0 else self.tpdo.channels[slot].factor for slot in self._in[1:4])
+        self.resolution, self.velocity_resolution = abs(self._in_factors[0]), abs(self._in_factors[1])
         (self._temperature_slot,) = _slots(self.tpdo, ("temperature",))
         self._unpack, self._pack = self.codec_in.unpack, self.codec_out.pack
         if self._in[4] < 0:
@@ -187,8 +189,13 @@ class Cia402Drive(Drive):
             self.target_position = here
 
     def advance(self, target: TargetState) -> bool:
-        """Choose the controlword of the next step towards `target` by the actual state; return whether it is there."""
-        state = self.state
+        """Choose the controlword of the next step towards `target` by the actual state; return whether it is there.
+
+        It is called while the drive does not follow setpoints: the offsets become 0.
+        """
+        state, offsets = self.state, self.offsets
+        if offsets is not None:
+            offsets.clear()
         word = CONTROLWORDS[state, target]
         if word == ENABLE_OPERATION:
             # At the transition, and again if the drive left the state by itself; never while it is enabled.
@@ -228,6 +235,12 @@ class Cia402Drive(Drive):
         if commanded != CSP or self._changed or commanded != self._sent_mode or word != self._sent_word:
             self._sent_mode, self._sent_word, self._changed = commanded, word, False
             self._fill(fields, word, commanded)
+        offsets = self.offsets
+        if offsets is not None:
+            shown = self.mode_display
+            at_once = word != ENABLE_OPERATION or self.state is not _ENABLED or CST in (commanded, shown)
+            follows = commanded in _WITH_SPEED and shown in _WITH_SPEED
+            offsets.write(fields, follows and not at_once, at_once)
         return self._pack(*fields)
 
     def _fill(self, fields: list[int], word: int, commanded: int) -> None:

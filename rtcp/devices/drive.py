@@ -11,7 +11,8 @@ from typing import ClassVar, Final
 from mypy_extensions import mypyc_attr
 
 from rtcp.config.model import ArmConfig, Joint, SlaveConfig
-from rtcp.devices.driver import DeviceError, Driver, make_driver
+from rtcp.devices.driver import DeviceError, Driver, integer_range, make_driver
+from rtcp.fieldbus.pdo import ImageLayout
 from rtcp.ipc.states import DriveState, Missing
 
 CSP, CSV, CST = 8, 9, 10
@@ -31,6 +32,48 @@ class TargetState(Enum):
     """Disable voltage from every state: no ramp, the brake closes on whatever moves."""
     RESET = "free of faults"
     """Resets a fault and stops at `switch on disabled`."""
+
+
+class DriveOffsets:
+    """What the drive adds to the outputs of its loops: `velocity`, rad/s, and `torque`, Nm; 0 until set.
+
+    The torque that is sent changes by `change`, Nm, in a cycle at most, but to 0 where the drive must not add it.
+
+    Args:
+        image: outputs of the drive.
+    """
+
+    __slots__ = ("_channels", "_fields", "_sent", "change", "torque", "velocity")
+
+    def __init__(self, image: ImageLayout) -> None:
+        self.velocity = self.torque = self.change = self._sent = 0.0
+        found = [image.find(name) for name in ("velocity_offset", "torque_offset")]
+        self._fields = [-1 if channel is None else image.channels.index(channel) for channel in found]
+        self._channels = [(0.0, 0, 0) if channel is None else (1.0 / channel.factor, *integer_range(channel))
+                          for channel in found]  # fmt: skip
+
+    def clear(self) -> None:
+        """Set both to 0, and begin anew with the torque."""
+        self.velocity = self.torque = self._sent = 0.0
+
+    def write(self, fields: list[int], acts: bool, at_once: bool) -> None:
+        """Write them into the fields of the outputs.
+
+        Args:
+            fields: of the outputs.
+            acts: whether the drive adds them as it is meant to; otherwise they become 0.
+            at_once: the torque becomes 0 in this cycle, because the drive has no torque or adds it to one that is sent.
+        """
+        self._put(fields, 0, self.velocity if acts else 0.0)
+        before, wanted = self._sent, self.torque if acts and math.isfinite(self.torque) else 0.0
+        self._sent = 0.0 if at_once else min(max(wanted, before - self.change), before + self.change)
+        self._put(fields, 1, self._sent)
+
+    def _put(self, fields: list[int], which: int, value: float) -> None:
+        at = self._fields[which]
+        if at >= 0:
+            scale, low, high = self._channels[which]
+            fields[at] = int(min(max(value * scale, low), high)) if math.isfinite(value) else 0
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -59,6 +102,8 @@ class Drive(Driver):
     def __init__(self, slave: SlaveConfig, period_s: float, *, speed_limit: float = 0.0, zero: float = 0.0) -> None:
         super().__init__(slave, period_s)
         self.position = self.velocity = self.torque = 0.0
+        self.resolution = self.velocity_resolution = 0.0
+        """One count of the position, rad, and of a measured velocity, rad/s; 0: unknown."""
         self.temperature = math.nan
         self.statusword = self.mode_display = 0
         self.state = DriveState.NOT_READY_TO_SWITCH_ON
@@ -72,6 +117,8 @@ class Drive(Driver):
         """Ends of that ramp, rad."""
         self.slave: SharedSlave | None = None
         """Set if other axes of its slave move joints too: its outputs are a part of the slave's."""
+        self.offsets: DriveOffsets | None = None
+        """Feed-forward, if the drive takes it and it is configured."""
         self._zero = zero
         self.target_position = self.target_velocity = self.target_torque = 0.0
         self._past: list[float] = []
@@ -107,6 +154,11 @@ class Drive(Driver):
         self.position = position
         if self._past:
             self._past[self._past_at - 1] = position + self._zero
+
+    @property
+    def measures_velocity(self) -> bool:
+        """Whether `velocity` is measured by the drive, and not computed here from its positions."""
+        return not self._past
 
     def _measured_velocity(self, position: float) -> float:
         """Return the mean velocity over 20 ms, rad/s; `position`: of this cycle, rad."""
@@ -166,4 +218,6 @@ def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     drive.deceleration = joint.acceleration
     drive.low, drive.high = joint.position.min, joint.position.max
     drive.zero = zero
+    if drive.HAS_STATUSWORD and any(map(drive.rpdo.find, config.feed_forward.channels)):
+        drive.offsets = DriveOffsets(drive.rpdo)
     return slot, drive

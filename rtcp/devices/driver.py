@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter as Counts
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
@@ -85,6 +86,9 @@ class Driver:
         self.safe_outputs = Driver.encode(self)
         """Output image of `safe_values`, sent when the driver has raised an exception."""
         self._input_names, self._output_names = tuple(self.values), tuple(self.targets)
+        counts = Counts(channel.name for channel in self.tpdo.channels if _is_number(channel))
+        self._shares = {name: 1.0 / count for name, count in counts.items() if count > 1}
+        """Share of each value in the mean of a channel that has several in a cycle."""
 
     def decode(self, data: bytes) -> None:
         """Decode the inputs of the cycle (`input_bytes` long)."""
@@ -96,6 +100,17 @@ class Driver:
                 counter = self._counters.get(channel.name)
                 counts = counts if counter is None else counter.follow(counts)  # noqa: PLW2901
                 self.values[channel.name] = counts * channel.factor + channel.offset
+        if self._shares:
+            self._average(data)
+
+    def _average(self, data: bytes) -> None:
+        """Replace the last value of each channel that has several in a cycle by their mean."""
+        shares = self._shares
+        for name in shares:
+            self.values[name] = 0.0
+        for channel, counts in zip(self.tpdo.channels, self.codec_in.unpack(data), strict=True):
+            if channel.index and channel.name in shares:
+                self.values[channel.name] += (counts * channel.factor + channel.offset) * shares[channel.name]
 
     def accept(self, command: Command) -> Refusal | None:
         """Execute one of `commands`, or return a refusal and change nothing."""
@@ -124,8 +139,7 @@ class Driver:
                 f"{about} 0x{channel.index:04X}:{channel.sub_index:02X}",
             )
             for image, about in ((self.tpdo, "Input"), (self.rpdo, "Output"))
-            for channel in image.channels
-            if _is_number(channel)
+            for channel in {channel.name: channel for channel in image.channels if _is_number(channel)}.values()
         ]
 
     def publish(self, values: list[Any], at: int) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from rtcp.config.model import (
+    BEYOND_FULL,
     GripperConfig,
     InputConfig,
     InputsConfig,
+    JoystickConfig,
     NamedTerminal,
     OutputsConfig,
     SlaveConfig,
@@ -222,7 +224,7 @@ RESTLESS: Final = 4
 
 
 class JoystickInput:
-    """State of the joystick: `read` sets `forward`, `side` (left is +1) and `paddle` (-1, 0, 1), `code` and `valid`.
+    """State of the joystick's lines: `read` sets `forward`, `side` (left is +1), `paddle` (-1, 0, 1), `code`, `valid`.
 
     Args:
         config: which inputs are the joystick's, and which others have a meaning.
@@ -236,7 +238,8 @@ class JoystickInput:
 
     def __init__(self, config: InputsConfig, cycle_s: float) -> None:
         joystick = config.joystick
-        self.forward = self.side = self.paddle = 0
+        self.forward = self.side = 0.0
+        self.paddle = 0
         self.code = 0
         self.valid = False
         self._candidate = -1
@@ -276,7 +279,7 @@ class JoystickInput:
             self._restless += 1
             if self._restless > RESTLESS * self._debounce:
                 # Lines that never settle, as at a loose contact: the last direction must not continue for ever.
-                self.forward = self.side = self.paddle = 0
+                self._rest()
                 self.valid = False
             return
         self._restless = 0
@@ -291,8 +294,87 @@ class JoystickInput:
             unassigned or (forward and backward) or (left and right) or (up and down) or (deflected and (up or down))
         )
         if self.valid:
-            self.forward = forward - backward
-            self.side = left - right
+            self.forward = float(forward - backward)
+            self.side = float(left - right)
             self.paddle = up - down
         else:
-            self.forward = self.side = self.paddle = 0
+            self._rest()
+
+    def _rest(self) -> None:
+        self.forward = self.side = 0.0
+        self.paddle = 0
+
+
+class AnalogStick:
+    """State of a joystick with an analog stick, as `JoystickInput`: `forward` and `side` are -1 to 1.
+
+    It is neutral inside the dead zone. From its edge the speed rises to 1 at the full inclination, as the curve says. A
+    value that is no number, or that no intact stick has, is not valid, and neither is a paddle beside an inclination.
+    An inclination changes by the full one in the debounce time at most, and a value counts as not valid after that
+    time: one false sample does nothing.
+
+    Args:
+        config: the joystick, with the stick's channels, dead zone and curve.
+        drivers: the slaves that are no drives, by name.
+        cycle_s: cycle time, s.
+
+    Raises:
+        DeviceError: no slave sends one of the channels.
+    """
+
+    __slots__ = (
+        "_axes",
+        "_curve",
+        "_cycles",
+        "_dead",
+        "_inclined",
+        "_wrong",
+        "forward",
+        "in_range",
+        "paddle",
+        "side",
+        "valid",
+    )  # fmt: skip
+
+    def __init__(self, config: JoystickConfig, drivers: Mapping[str, Driver], cycle_s: float) -> None:
+        analog = config.analog
+        assert analog is not None
+        self.forward = self.side = 0.0
+        self.paddle = 0
+        self.valid = self.in_range = False
+        self._dead, self._curve = analog.dead_zone, analog.curve
+        self._cycles = max(1, round(config.debounce_ms * 1e-3 / cycle_s))
+        self._inclined = [0.0, 0.0]
+        self._wrong = self._cycles
+        """Cycles in a row with a value that no intact stick has."""
+        self._axes: list[tuple[Driver, str, float, float]] = []
+        for axis in (analog.forward, analog.left):
+            slave, _, channel = axis.channel.partition(".")
+            driver = drivers.get(slave)
+            if driver is None or channel not in driver.values:
+                raise DeviceError(f"the joystick needs the channel {axis.channel}: no slave sends it")
+            self._axes.append((driver, channel, axis.neutral, 1.0 / axis.full))
+
+    def read(self, lines: JoystickInput) -> None:
+        """Update from the channels of a cycle and from the paddles of the joystick's lines."""
+        inclined, intact, change = self._inclined, True, 1.0 / self._cycles
+        for i, (driver, channel, neutral, scale) in enumerate(self._axes):
+            inclination = (driver.values[channel] - neutral) * scale
+            # False for a value that is no number, too.
+            if -BEYOND_FULL <= inclination <= BEYOND_FULL:
+                inclined[i] = min(max(inclination, inclined[i] - change), inclined[i] + change)
+            else:
+                intact = False
+        self._wrong = 0 if intact else min(self._wrong + 1, self._cycles)
+        self.in_range = self._wrong < self._cycles
+        self.paddle = lines.paddle
+        self.forward, self.side = self._speed(inclined[0]), self._speed(inclined[1])
+        self.valid = self.in_range and lines.valid and not (self.paddle and (self.forward or self.side))
+
+    def _speed(self, inclination: float) -> float:
+        """Return the fraction of the joystick's speed at an inclination."""
+        size = abs(inclination)
+        if size <= self._dead:
+            return 0.0
+        speed: float = min((size - self._dead) / (1.0 - self._dead), 1.0) ** self._curve
+        return speed if inclination > 0.0 else -speed

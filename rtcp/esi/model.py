@@ -134,6 +134,13 @@ class Pdo:
     """In a module: its index grows with the slot."""
     overwritten_by_module: bool = False
     """A module's PDO of the same index takes its place."""
+    samples: int = 1
+    """Times that it is assigned."""
+    sample_increment: int = 0
+    """Above 0: each further sample has a PDO of its own, of the next index, whose objects' indices grow by this."""
+    fewest_samples: int = 1
+    most_samples: int = 1
+    """Fewest and most samples that the device takes; 1 of a PDO without oversampling."""
 
     @property
     def bits(self) -> int:
@@ -242,8 +249,8 @@ class DcMode:
     sync1_shift: int = 0
     pdos: tuple[tuple[int, tuple[int, ...]], ...] = field(default=(), compare=False)
     """Sync managers whose PDOs it assigns in place of the default ones, and these; an EEPROM does not hold them."""
-    oversamples: bool = field(default=False, compare=False)
-    """It assigns a PDO several times over, for several values a cycle."""
+    samples: tuple[tuple[int, int], ...] = field(default=(), compare=False)
+    """PDOs that it assigns several times over, for several values a cycle (oversampling), and how often."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ DEVICE_LIMIT = 10_000
 SLOT_LIMIT = 1024
 """Places for modules of one slot element."""
 _MAX_ENTRY_BITS = 8 * 1486
+_MOST_SAMPLES = 255
+"""Values of a PDO in a cycle; a PDO assignment has as many subindices (ETG.1000.6, 5.6.7.4)."""
 _SYNC_MANAGERS = {
     "mboxout": model.SyncManagerType.MAILBOX_RECEIVE,
     "mboxin": model.SyncManagerType.MAILBOX_SEND,
@@ -239,6 +241,9 @@ class _Reader:
             sync_manager=values.number(node, "@Sm", low=0, high=15) if node.value("@Sm") else None,
             fixed=values.flag(node, "@Fixed"),
             mandatory=values.flag(node, "@Mandatory"),
+            sample_increment=values.number(node, "@OSIndexInc", 0, low=0, high=0xFFFF),
+            fewest_samples=min(values.number(node, "@OSMin", 1, low=0), _MOST_SAMPLES),
+            most_samples=min(values.number(node, "@OSMax", 1, low=0), _MOST_SAMPLES),
             virtual=values.flag(node, "@Virtual"),
             excludes=frozenset(value & 0xFFFF for value in excluded if value is not None) - {index},
             depends_on_slot=values.flag(node, "Index/@DependOnSlot"),
@@ -308,7 +313,12 @@ class _Reader:
             sync1_factor=factor("CycleTimeSync1", 0),
             sync1_shift=time("ShiftTimeSync1"),
             pdos=tuple((manager, indices) for manager, indices in managers if manager is not None and indices),
-            oversamples=any((number(item.value("@OSFac")) or 1) > 1 for item in node.below("Sm/Pdo")),
+            samples=tuple(
+                (index, count)
+                for item in node.below("Sm/Pdo")
+                if (index := number(item.text)) is not None
+                and (count := min(number(item.value("@OSFac")) or 1, _MOST_SAMPLES)) > 1
+            ),
         )
 
     # Slots and modules

@@ -12,7 +12,7 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import degrees, radians
+from math import degrees, nan, radians
 from pathlib import Path
 from time import monotonic_ns, sleep
 from typing import Any, Final
@@ -48,7 +48,10 @@ _LARGEST: Final = 1e6
 """Largest valid measurement, degrees or mm."""
 _COMMANDED: Final = struct.Struct("<ddB")
 _MEASURED: Final = struct.Struct("<dBBd")
-_UNIT: Final = struct.Struct("<5BdI6I9d")
+_UNIT: Final = struct.Struct("<5BdI6I9db")
+_POWERED: Final = {1: 1, 2: 0}
+"""EGM's state of the motors -> whether they are on; others: unknown, -1."""
+_NO_FORCE: Final = (nan,) * 6
 _COUNTER: Final = 0xFFFFFFFF
 _EXTERNAL: Final = 2
 """Index of the seventh axis in the kinematic order: j1, j2, external, j3 ... j6."""
@@ -320,8 +323,9 @@ class EgmData(PacedData):
             motors & 0xFF, rapid & 0xFF, self.mci & 0xFF, robot.mciConvergenceMet, collision,
             robot.utilizationRate, robot.moveIndex,
             self.session, self.lost, self.doubled, self.disordered, self.superseded, self.foreign,
-            *(force[:6] if len(force) >= 6 else (0.0,) * 6),
+            *(force[:6] if len(force) >= 6 else _NO_FORCE),
             1e-3 * (here.x - planned.x), 1e-3 * (here.y - planned.y), 1e-3 * (here.z - planned.z),
+            _POWERED.get(motors, -1),
         )  # fmt: skip
 
     def _force(self, encoded: bytes) -> Sequence[float]:

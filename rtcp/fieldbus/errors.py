@@ -27,5 +27,14 @@ class FoeRefused(Refused):
     """The slave refused a file; `code` is the error code (ETG.1000.6, table 92)."""
 
 
+class ValueNotKept(BusError):
+    """A slave does not keep a value that was written in its set-up: the object, the value wanted and the one found."""
+
+    def __init__(self, sentence: str, index: int, sub_index: int, wanted: str, found: str) -> None:
+        super().__init__(sentence)
+        self.index, self.sub_index = index, sub_index
+        self.wanted, self.found = wanted, found
+
+
 class ForeignSlave(BusError):
     """Another device answers at the position of a slave; nothing is written to it."""

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from rtcp.config.model import Pdo, SlaveConfig
+from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.pdo import INPUTS, OUTPUTS, by_sync_manager, layout
@@ -63,7 +63,7 @@ def limit_faults(slaves: Sequence[SlaveConfig]) -> list[str]:
         for key, pdos, usual in (("rpdo", device.rpdo, OUTPUTS), ("tpdo", device.tpdo, INPUTS)):
             groups = by_sync_manager(pdos, usual)
             areas += len(groups)
-            lengths = [_bits(group) for group in groups.values()]
+            lengths = [layout(group).bits for group in groups.values()]
             needed, reserved = sum((bits + 7) // 8 for bits in lengths), (sum(lengths) + 7) // 8
             if needed != reserved:
                 faults.append(
@@ -76,10 +76,6 @@ def limit_faults(slaves: Sequence[SlaveConfig]) -> list[str]:
                 f"{MOST_FMMUS} of a slave"
             )
     return faults
-
-
-def _bits(pdos: Sequence[Pdo]) -> int:
-    return sum(entry.length for pdo in pdos for entry in pdo.channels)
 
 
 class _Fmmu(NamedTuple):
@@ -141,7 +137,7 @@ def _read_places(port: RegisterPort, position: int, slave: SlaveConfig) -> Place
         several |= len(groups) > 1
         at = first // 8
         for number, group in groups.items() if len(groups) > 1 else ():
-            length = (_bits(group) + 7) // 8
+            length = layout(group).bytes
             wanted.append(_Fmmu(at, length, group[0].start_address or areas[number][0], kind))
             at += length
         if len(groups) == 1:

@@ -8,6 +8,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 from rtcp.config.buses import ENTRY_POINTS
+from rtcp.config.cell import ControllerUnits
 from rtcp.config.find import load_class
 from rtcp.config.model import ArmConfig, BusConfig
 from rtcp.fieldbus.bus import ProcessData
@@ -34,6 +35,10 @@ class Master(ABC):
     @abstractmethod
     def check_interface(name: str) -> None:
         """Raise BusError where `bus.interface` cannot be used on this host."""
+
+    def share(self, units: ControllerUnits) -> None:
+        """Take note of the other arms of the controller, before `start`."""
+        return  # each arm has a connection of its own
 
     @property
     def supervised(self) -> SupervisedBus | None:

@@ -86,12 +86,15 @@ def by_sync_manager(pdos: Sequence[Pdo], usual: int) -> dict[int, list[Pdo]]:
 
 
 def layout(pdos: Sequence[Pdo]) -> ImageLayout:
-    """Return the layout of `pdos`, assigned in this order; each sync manager begins at a whole byte."""
+    """Return the layout of `pdos`, assigned in this order; each sync manager begins at a whole byte.
+
+    A channel of a PDO that is assigned several times is there as often.
+    """
     channels = []
     offset = 0
     for group in by_sync_manager(pdos, 0).values():
         offset = -(-offset // 8) * 8
-        for entry in (entry for pdo in group for entry in pdo.channels):
+        for entry in (entry for pdo in group for _ in range(pdo.samples) for entry in pdo.channels):
             channels.append(
                 Channel(
                     entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, entry.length,
@@ -105,8 +108,10 @@ def layout(pdos: Sequence[Pdo]) -> ImageLayout:
 def mapping_of(pdos: Sequence[Pdo]) -> Mapping:
     """Return the mapping of a description's `pdos`."""
     return tuple(
-        (pdo.index, tuple((e.index, e.sub_index if e.index else 0, e.length) for e in pdo.channels)) for pdo in pdos
-    )  # fmt: skip
+        (pdo.index, tuple((e.index, e.sub_index if e.index else 0, e.length) for e in pdo.channels))
+        for whole in pdos
+        for pdo in whole.assigned
+    )
 
 
 def entries_of(mapping: Mapping) -> list[tuple[int, int, int]]:
@@ -134,8 +139,9 @@ def write_mapping(sdo: SdoClient, assignment: int, pdos: Sequence[Pdo]) -> Steps
     """Write PDO mapping and assignment: counts to 0, then the entries, then the counts (ETG.1000.6, 5.6.5.2)."""
     mapping = mapping_of(pdos)
     yield from sdo.writing_int(assignment, 0, 0, 1)
-    for (pdo, entries), fixed in zip(mapping, (pdo.fixed for pdo in pdos), strict=True):
-        if fixed:
+    fixed = {pdo.index for whole in pdos if whole.fixed for pdo in whole.assigned}
+    for pdo, entries in dict.fromkeys(mapping):  # each once, however often it is assigned
+        if pdo in fixed:
             continue
         yield from sdo.writing_int(pdo, 0, 0, 1)
         for i, (index, sub_index, bits) in enumerate(entries, 1):
@@ -146,8 +152,14 @@ def write_mapping(sdo: SdoClient, assignment: int, pdos: Sequence[Pdo]) -> Steps
     yield from sdo.writing_int(assignment, 0, len(mapping), 1)
 
 
-def compare_mapping(sdo: SdoClient, assignment: int, expected: Mapping, key: str) -> Steps[None]:
-    """Read the mapping and compare it; raises BusError where it differs; `key`: key in the device's file."""
+def compare_mapping(sdo: SdoClient, assignment: int, pdos: Sequence[Pdo], key: str) -> Steps[None]:
+    """Read the mapping and compare it; raises BusError where it differs; `key`: key in the device's file.
+
+    Of the second and further values of a fixed PDO only the lengths count: some devices number the objects of these
+    values in another way than their ESI.
+    """
+    expected = mapping_of(pdos)
+    further = {pdo.index for whole in pdos if whole.fixed for pdo in whole.assigned[1:]} - {pdo.index for pdo in pdos}
     try:
         actual = tuple(
             (pdo.index, tuple((e.index, e.sub_index, e.bits) for e in pdo.entries))
@@ -157,12 +169,18 @@ def compare_mapping(sdo: SdoClient, assignment: int, expected: Mapping, key: str
         if error.code not in ABSENT or expected:
             raise
         return
-    # Some devices assign PDOs without entries.
-    if [pdo for pdo in actual if pdo[1]] != [pdo for pdo in expected if pdo[1]]:
+    if _comparable(actual, further) != _comparable(expected, further):
         raise BusError(
             f"{slave_label(sdo.position, sdo.name)}: the mapping assigned through 0x{assignment:04X} differs from "
             f"the device's file (key `{key}`): expected {mapping_text(expected)}, found {mapping_text(actual)}"
         )
+
+
+def _comparable(mapping: Mapping, further: set[int]) -> list[tuple[int, tuple[tuple[int, ...], ...]]]:
+    # Some devices assign PDOs without entries.
+    return [
+        (pdo, tuple(entry[2:] if pdo in further else entry for entry in entries)) for pdo, entries in mapping if entries
+    ]
 
 
 def reading_assignment(sdo: SdoClient, assignment: int) -> Steps[tuple[PdoInfo, ...]]:

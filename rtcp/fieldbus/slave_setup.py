@@ -10,7 +10,7 @@ import math
 import struct
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -20,9 +20,9 @@ from rtcp.fieldbus.al_state import AlState, read_al, request_state
 from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
-from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
+from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted, ValueNotKept
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
-from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, mapping_of, write_mapping
+from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, write_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
 from rtcp.fieldbus.scaling import check_quick_stop, compare_scaling
 from rtcp.fieldbus.scan import name_of
@@ -101,11 +101,15 @@ class SlaveRestorer:
             period_ns: period of the cycle, ns.
         """
         self._port = port
-        self._slaves = slaves
+        self._slaves = list(slaves)
         self._set_ups = set_ups
         self._sdo = sdo
         self._period_ns = period_ns
         self._clocks = tuple(i for i, set_up in enumerate(set_ups, 1) if set_up.delay is not None)
+
+    def note_written(self, position: int, index: int, sub_index: int, data: bytes) -> None:
+        """Note an SDO that a client has written: a limit of a joint is written again when the slave is restored."""
+        self._slaves[position - 1] = with_written(self._slaves[position - 1], index, sub_index, data)
 
     def restore(self, position: int, place: int | None) -> Steps[None]:
         """Set up the slave at `position` and bring it to SAFE-OP.
@@ -299,7 +303,8 @@ def configure_slave(
         Sentences on tolerated deviations.
 
     Raises:
-        BusError: the slave refuses a service, or a value reads back differently.
+        BusError: the slave refuses a service.
+        ValueNotKept: a value reads back differently.
     """
     device = config.device
     notes: list[str] = []
@@ -315,8 +320,8 @@ def configure_slave(
                 file = config.file or "the device's file"
                 sentence = f"{error.sentences[0]}; the device does not take the mapping of {file} (key `{key}`)"
                 raise SdoAborted(sentence, error.code) from error
-        yield from compare_mapping(sdo, assignment, mapping_of(pdos), key)
-    for startup in device.sdo:
+        yield from compare_mapping(sdo, assignment, pdos, key)
+    for startup in (*device.sdo, *config.limits):
         notes += yield from write_startup(sdo, startup)
     if device.kind == "cia402":
         # Before any motion: a drive with other units must not come to SAFE-OP.
@@ -325,6 +330,20 @@ def configure_slave(
         for axis in device.axes:
             notes += yield from write_interpolation_time(sdo, period_ns, axis)
     return notes
+
+
+def with_written(config: SlaveConfig, index: int, sub_index: int, data: bytes) -> SlaveConfig:
+    """Return a slave with the data of an SDO that a client has written, where that holds a limit of a joint.
+
+    A slave that is set up again must not get the limit for the zero offset that the joint had at the start.
+    """
+
+    def newest(limit: StartupSdo) -> StartupSdo:
+        if (limit.index, limit.sub_index) != (index, sub_index):
+            return limit
+        return replace(limit, value=int.from_bytes(data, "little", signed=limit.type.startswith("int")))
+
+    return replace(config, limits=tuple(map(newest, config.limits)))
 
 
 def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
@@ -336,7 +355,7 @@ def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     elif startup.type.startswith("float"):
         data = struct.Struct("<" + STRUCT_CODES[startup.type]).pack(startup.value)
     else:
-        data = int(startup.value).to_bytes(startup.length, "little", signed=startup.type.startswith("int"))
+        data = startup.integer_data
     label = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
     try:
         yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, label, startup.type, startup.complete)
@@ -359,7 +378,9 @@ def _write_and_verify(
     if kept != data:
         text = _value_text(kept, kind) if len(kept) == len(data) else f"bytes {kept.hex(' ')}"
         where = slave_label(sdo.position, sdo.name)
-        raise BusError(f"{where}: {label} was set to {_value_text(data, kind)} and reads back as {text}")
+        wanted = _value_text(data, kind)
+        sentence = f"{where}: {label} was set to {wanted} and reads back as {text}: allowed is the value that was set"
+        raise ValueNotKept(sentence, index, sub_index, wanted, text)
 
 
 def _value_text(data: bytes, kind: str) -> str:

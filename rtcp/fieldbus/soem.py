@@ -13,6 +13,7 @@ from typing import Any
 
 from pysoem import pysoem
 
+from rtcp.config.drive_limits import with_limits
 from rtcp.config.model import ArmConfig, SlaveConfig
 from rtcp.esi.model import Device, EsiError
 from rtcp.esi.sii import read_sii
@@ -536,6 +537,11 @@ class SoemBus:
         self._names = []
         self.close()
 
+    def note_written(self, position: int, index: int, sub_index: int, data: bytes) -> None:
+        """Note an SDO that a client has written, for the slave's next set-up."""
+        assert self._restorer is not None, "only a configured bus has something to restore"
+        self._restorer.note_written(position, index, sub_index, data)
+
     def watcher(self, report: Callable[[Event], None]) -> SlaveWatcher:
         """Return the watcher of the configured slaves, all of them in OP; `report` receives its events."""
         assert self._restorer is not None, "only a configured bus has something to restore"
@@ -607,7 +613,7 @@ class SoemMaster(Master):
         report(f"{len(slaves)} slaves on {self.interface}")
         (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in slaves]))
         self.config = replace(self.config, slaves=by_alias(self.config.slaves, slaves))
-        data = bus.configure(self.config.slaves, round(self.config.cycle.period_us * 1000))
+        data = bus.configure(with_limits(self.config), round(self.config.cycle.period_us * 1000))
         for note in bus.notes:
             report(note)
         report("all slaves in SAFE-OP")

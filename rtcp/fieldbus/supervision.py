@@ -245,5 +245,8 @@ class SupervisedBus(Bus, Protocol):
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps."""
 
+    def note_written(self, position: int, index: int, sub_index: int, data: bytes) -> None:
+        """Note an SDO that a client has written, for the slave's next set-up."""
+
     def watcher(self, report: Callable[[Event], None]) -> SlaveWatcher:
         """Return the watcher of the configured slaves, all of them in OP; `report` receives its events."""

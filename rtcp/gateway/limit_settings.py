@@ -6,17 +6,29 @@ import dataclasses
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import Any
 
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import SUPERVISION, ArmConfig
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json
 from rtcp.gateway.method import method
 from rtcp.ipc.commands import SetLimits
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import limits_file
-from rtcp.motion.limits import FIELDS, Corners, Limits, Values, WrongLimit, rows, wrong_limits
+from rtcp.ipc.schema import FIRST_CONE
+from rtcp.motion.limits import (
+    FIELDS,
+    WIDENABLE,
+    Cone,
+    Corners,
+    Limits,
+    Values,
+    WrongLimit,
+    rows,
+    wrong_limits,
+)
 
 _JOINT_KEYS = {{"low": "min", "high": "max"}.get(name, name): name for name in FIELDS}
 _ENDS = ("min", "max")
@@ -43,12 +55,13 @@ class LimitSettings:
 
     @method(at_once=True)
     async def limits(self, caller: Caller) -> Json:
-        """Return the `limits` in force beside those that are `configured`."""
+        """Return the `limits` in force beside those that are `configured`, and how far they can be widened."""
         config = self._config
         return {
             "joint_names": [joint.name for joint in config.joints],
-            "limits": _as_json(config, now(self._limits)),
+            "limits": _as_json(config, self._limits.now),
             "configured": _as_json(config, self._limits.widest),
+            "absolute": _as_json(config, self._limits.absolute),
             "cartesian": {
                 name: getattr(config.cartesian, name)
                 for name in (
@@ -58,34 +71,31 @@ class LimitSettings:
         }  # fmt: skip
 
     @method()
-    async def set_limits(self, caller: Caller, changes: dict[str, Any]) -> Json:
-        """Narrow limits, all or none; keys as `joint2.max`, `joints.velocity`, `box.min.x`. Returns as `limits`."""
-        new = changed(self._config, now(self._limits), changes)
+    async def set_limits(self, caller: Caller, changes: dict[str, Any], widen: bool = False) -> Json:
+        """Narrow limits, all or none; keys as `joint2.max`, `joints.velocity`, `box.min.x`, `supervision.torque`.
+
+        With `widen`, without torque: up to the keys `absolute` of the file. Returns as `limits`.
+        """
+        new = changed(self._config, self._limits.now, changes, widen=widen)
         async with self._channel.lease(caller) as lease:
             plan = rows(new)
             slot = self._channel.observer.write_plan(plan)
-            await self._channel.send(lease, SetLimits(slot, len(plan)))
+            await self._channel.send(lease, SetLimits(slot, len(plan), widen))
             self._limits.apply(new)
             _write(self._file, new, self._channel.observer.loop_pid)
         return await self.limits(caller)
 
 
-def now(limits: Limits) -> Values:
-    """Return the limits in force."""
-    joints = {name: tuple(getattr(limits, name)) for name in FIELDS}
-    return Values(**joints, box=limits.box, keep_out=limits.keep_out)
-
-
-def changed(config: ArmConfig, values: Values, changes: Mapping[str, float]) -> Values:
-    """Return `values` with `changes`.
+def changed(config: ArmConfig, values: Values, changes: Mapping[str, float], *, widen: bool = False) -> Values:
+    """Return `values` with `changes`, within the absolute limits if they may `widen`, else within the configured ones.
 
     Raises:
         RtcpError: `invalid`, naming each invalid key or number.
     """
     if not changes:
         raise RtcpError("invalid", f"changes: found none, give a key and a number, as {_example(config)}")
-    widest = Values.configured(config)
-    wrong, limits, new = [], [], values
+    widest = Values.absolute(config) if widen else Values.configured(config).or_wider(values)
+    wrong, refused, new = [], [], values
     for key, number in changes.items():
         if type(number) not in (int, float) or not abs(number) <= sys.float_info.max:
             wrong.append(f"{key}: found {json.dumps(number)[:60]}, allowed is a finite number")
@@ -95,9 +105,9 @@ def changed(config: ArmConfig, values: Values, changes: Mapping[str, float]) -> 
         except KeyError:
             wrong.append(f"{key}: there is no such limit; allowed are {_example(config)}")
         # After each key, because a later one may replace its number, or make room for it.
-        limits += [limit for limit in wrong_limits(widest, new) if not limit.no_room]
-    limits += wrong_limits(widest, new)
-    wrong += dict.fromkeys(_sentence(config, limit) for limit in limits)
+        refused += [limit for limit in wrong_limits(widest, new) if not limit.no_room]
+    refused += wrong_limits(widest, new)
+    wrong += dict.fromkeys(_sentence(config, limit, widen) for limit in refused)
     if wrong:
         raise RtcpError("invalid", "\n".join(wrong))
     return new
@@ -107,7 +117,17 @@ def _put(config: ArmConfig, values: Values, key: str, number: float) -> Values:
     """Return `values` with a finite number at a key; raises KeyError."""
     names = [joint.name for joint in config.joints]
     per_joint, boxes = _lists(config, values)
-    head, _, rest = key.rpartition(".") if key.rpartition(".")[2] in _JOINT_KEYS else (key, "", "")
+    whole, _, name = key.rpartition(".")
+    cones = [cone.name for cone in config.cartesian.cones]
+    if whole == "supervision" and name in SUPERVISION:
+        thresholds = dict(zip(SUPERVISION, values.supervision, strict=True)) | {name: number}
+        speed, torque, following_error = thresholds.values()
+        return replace(values, supervision=(speed, torque, following_error))
+    if whole in cones and name == "angle":
+        named = zip(cones, values.cones, strict=True)
+        turned = tuple(cone._replace(angle=number) if cone_name == whole else cone for cone_name, cone in named)
+        return replace(values, cones=turned)
+    head, _, rest = key.rpartition(".") if name in _JOINT_KEYS else (key, "", "")
     which, _, end = head.rpartition(".")
     box, _, side = which.rpartition(".")
     if rest and (head in names or head == ALL):
@@ -117,16 +137,23 @@ def _put(config: ArmConfig, values: Values, key: str, number: float) -> Values:
         boxes[box][3 * _ENDS.index(side) + "xyz".index(end)] = number
     else:
         raise KeyError(key)
-    joints = {name: tuple(numbers) for name, numbers in per_joint.items()}
+    joints: dict[str, Any] = {name: tuple(numbers) for name, numbers in per_joint.items()}
     inner = _corners(boxes.pop("box")) if values.box is not None else None
-    return Values(**joints, box=inner, keep_out=tuple(_corners(corners) for corners in boxes.values()))
+    keep_out = tuple(_corners(corners) for corners in boxes.values())
+    return Values(**joints, box=inner, keep_out=keep_out, cones=values.cones, supervision=values.supervision)
 
 
-def _sentence(config: ArmConfig, wrong: WrongLimit) -> str:
+def _sentence(config: ArmConfig, wrong: WrongLimit, widen: bool) -> str:
     """Return the message for a limit that cannot be set: its key, its value and the allowed range."""
     name = next((key for key, name in _JOINT_KEYS.items() if name == wrong.name), wrong.name)
     if wrong.axis >= 0:
         part, where = config.joints[wrong.axis].name, f"joints[{wrong.axis}]"
+        allowed = f"{wrong.low:g} to {wrong.high:g}"
+    elif wrong.axis == -2:
+        part = where = "supervision"
+        allowed = f"{wrong.low:g} to {wrong.high:g}"
+    elif wrong.box >= FIRST_CONE:
+        part, where = config.cartesian.cones[wrong.box - FIRST_CONE].name, "cartesian.cones"
         allowed = f"{wrong.low:g} to {wrong.high:g}"
     else:
         part = "box" if wrong.box < 0 else config.cartesian.keep_out[wrong.box].name
@@ -135,7 +162,11 @@ def _sentence(config: ArmConfig, wrong: WrongLimit) -> str:
     text = f"{part}.{name}: found {wrong.found:g}, allowed is"
     if wrong.no_room:
         return f"{text} less than {part}.{name.replace('min', 'max')}, which is {wrong.high:g}"
-    return f"{text} {allowed} ({where} in {config.source.name}: limits are only narrowed while running)"
+    widenable, file = wrong.name in WIDENABLE, config.source.name
+    if widen and widenable:
+        return f"{text} {allowed} ({where}.absolute in {file})"
+    but = ", except with --widen up to its key absolute" if widenable else ""
+    return f"{text} {allowed} ({where} in {file}: this limit is only narrowed while running{but})"
 
 
 def _lists(config: ArmConfig, values: Values) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
@@ -150,7 +181,10 @@ def _example(config: ArmConfig) -> str:
     keys = ", ".join(_JOINT_KEYS)
     joints = f"{config.joints[0].name}.KEY or {ALL}.KEY (KEY: {keys})"
     boxes = [*_lists(config, Values.configured(config))[1]]
-    return f"{joints} and {boxes[-1]}.min.x (boxes: {', '.join(boxes)})" if boxes else joints
+    cones = [cone.name for cone in config.cartesian.cones]
+    text = f"{joints} and {boxes[-1]}.min.x (boxes: {', '.join(boxes)})" if boxes else joints
+    text += f", {cones[-1]}.angle (cones: {', '.join(cones)})" if cones else ""
+    return f"{text}, supervision.KEY (KEY: {', '.join(SUPERVISION)})"
 
 
 def _corners(six: list[float]) -> Corners:
@@ -164,6 +198,11 @@ def _as_json(config: ArmConfig, values: Values) -> Json:
         **{key: list(getattr(values, name)) for key, name in _JOINT_KEYS.items()},
         "box": None if values.box is None else _ends(values.box),
         "keep_out": {name: _ends(corners) for name, corners in boxes},
+        "cones": {
+            named.name: {"axis": named.axis, "direction": list(cone[1:4]), "angle": cone.angle}
+            for named, cone in zip(config.cartesian.cones, values.cones, strict=True)
+        },
+        "supervision": dict(zip(SUPERVISION, values.supervision, strict=True)),
     }
 
 
@@ -186,6 +225,8 @@ def _read(path: Path, loop: int) -> Values | None:
         values = kept["values"]
         box = None if values["box"] is None else _corners(values["box"])
         joints = {name: tuple(values[name]) for name in FIELDS}
-        return Values(**joints, box=box, keep_out=tuple(_corners(corners) for corners in values["keep_out"]))
+        keep_out = tuple(_corners(corners) for corners in values["keep_out"])
+        cones, (speed, torque, error) = tuple(Cone(*cone) for cone in values["cones"]), values["supervision"]
+        return Values(**joints, box=box, keep_out=keep_out, cones=cones, supervision=(speed, torque, error))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None

@@ -9,9 +9,11 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
+from rtcp.config.drive_limits import joint_limits
 from rtcp.config.model import ConfigError, Joint
 from rtcp.config.zero import read_zeros, store_zero
 from rtcp.fieldbus.al_state import AlState
+from rtcp.fieldbus.mailbox import ABSENT
 from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
 from rtcp.gateway.method import Numbers, check_count, index_of, method
 from rtcp.ipc import commands
@@ -214,16 +216,35 @@ class MachineActions:
                 offset = before + self._stood(axis, since) - at
                 try:
                     await channel.send(lease, commands.SetZero(axis, offset))
+                    await self._move_drive_limits(axis, offset)
                     path = store_zero(config, axis, offset)
                 except BaseException:
                     # Loop and file must agree, or positions differ after the next start: also if the client left or the
                     # answer was late while the loop set it.
                     with contextlib.suppress(RtcpError):
                         await channel.send(lease, commands.SetZero(axis, before))
+                        await self._move_drive_limits(axis, before)
                     raise
             except ConfigError as error:
                 raise RtcpError("refused", str(error)) from None
         return {"joint": config.axes[axis].name, "offset": offset, "before": before, "file": str(path)}
+
+    async def _move_drive_limits(self, axis: int, zero: float) -> None:
+        """Write the limits of an axis to its drive anew: its position limits count from the drive's own zero.
+
+        A drive whose limits belonged to the former zero would lead its joint back from positions that it may have.
+        """
+        joint = self._config.axes[axis]
+        for position, slave in enumerate(self._config.slaves, 1):
+            for sdo in joint_limits(self._config, slave, joint, zero) if slave.name == joint.slave else ():
+                if not sdo.name.startswith("position"):
+                    continue
+                request = {"slave": position, "index": sdo.index, "subindex": sdo.sub_index}
+                try:
+                    await self.service({"do": "sdo_write", **request, "hex": sdo.integer_data.hex()})
+                except RtcpError as error:
+                    if error.fields.get("code") not in ABSENT:
+                        raise
 
     def _stood(self, axis: int, since: int) -> float:
         """Return the position of an axis when its zero was last set, rad, by the events after the number `since`."""

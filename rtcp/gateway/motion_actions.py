@@ -97,6 +97,8 @@ class Planner:
         if box >= ITSELF:
             first, second = map(Names(self._config).link, self._zones.links(box))
             return f"a collision with itself ({first} and {second})"
+        if cone := Names(self._config).cone(box):
+            return f"an orientation outside the cone {cone}"
         boxes = self._config.cartesian.keep_out
         return f"the keep-out box {boxes[box].name}" if 0 <= box < len(boxes) else "the space outside the Cartesian box"
 
@@ -152,11 +154,16 @@ class Planner:
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused), type(refused).__name__) from None
 
-    def trajectory(self, points: Sequence[Point], q_now: Sequence[float], moving: bool = False) -> Plan:
+    def trajectory(
+        self, points: Sequence[Point], q_now: Sequence[float], moving: bool = False, start_tolerance: float = 0.0
+    ) -> Plan:
         """Return the plan of a trajectory from `q_now`; `moving`: with the arm in motion."""
         names = [joint.name for joint in self._config.joints]
         try:
-            plan = plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at, moving=moving)
+            plan = plan_trajectory(
+                points, self.limits, q_now, names=names, zone_at=self._zone_at, moving=moving,
+                start_tolerance=start_tolerance,
+            )  # fmt: skip
             return dataclasses.replace(plan, tool=self.tool)
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused), type(refused).__name__) from None
@@ -356,8 +363,10 @@ class MotionActions:
     ) -> Json:
         """Run a trajectory through points: time `t`, s, positions `q`, rad, and if given `v` and `a`.
 
-        One that begins at time 0 within `start_tolerance`, rad, of where the arm is commanded begins there. Tolerances,
-        rad, one a joint, 0: none: `path_tolerance` of the measured from the commanded position on the way,
+        A trajectory that begins at time 0 within `start_tolerance`, rad, of where the arm is commanded begins there. If
+        every `t` is 0, the joints move at the speeds `v`, else at their limits, as fast as accelerations allow.
+
+        Tolerances, rad, one a joint, 0: none: `path_tolerance` of the measured from the commanded position on the way,
         `goal_tolerance` at the end, at most `goal_time_s` later than planned. Where one is not kept the arm brakes on
         its path; reason `path_tolerance_violated` or `goal_tolerance_violated`, with `axis`, `error` and `limit`.
 
@@ -374,11 +383,8 @@ class MotionActions:
         async with self._channel.lease(caller) as lease:
             moving = self._channel.state is State.MOVING and not approach
             begin = self._joints(points[0].q) if approach and points else self.plan_start()
-            at_once = not moving and points and points[0].t == 0.0 and len(points[0].q) == len(begin)
-            if at_once and max(abs(a - b) for a, b in zip(points[0].q, begin, strict=True)) <= start_tolerance:
-                points = (dataclasses.replace(points[0], q=tuple(begin)), *points[1:])
             # Before the approach: a refused trajectory must move nothing.
-            plan = await asyncio.to_thread(self._planner.trajectory, points, begin, moving)
+            plan = await asyncio.to_thread(self._planner.trajectory, points, begin, moving, start_tolerance)
             slot = self._write(plan)
             if approach:
                 await self._move(lease, begin, None, True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,8 +20,12 @@ from rtcp.gateway.method import method
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.session import Pid, is_running, terminate, wait_for_exit
 
-_READY_S, _END_S = 12.0, 12.0
-"""Timeouts of a recorder's start and end, s: less than a client waits for its answer."""
+_READY_S = 120.0
+"""Timeout of a recorder's start, s: a busy host may take a minute to load one."""
+_REPORT_S = 5.0
+"""Interval of the progress reports while a recorder starts, s: a client waits longer for its answer."""
+_END_S = 12.0
+"""Timeout of a recorder's end, s: less than a client waits for its answer."""
 
 
 def recordings_directory() -> Path:
@@ -49,8 +54,8 @@ class Recordings:
             raise RtcpError("internal", f"{error.filename} cannot be written: {error.strerror}") from error
         await self.start(options)
 
-    async def start(self, options: RecordingConfig) -> Json:
-        """Start a recorder; return its fields.
+    async def start(self, options: RecordingConfig, report: Callable[[Json], None] = lambda progress: None) -> Json:
+        """Start a recorder; return its fields. Until it is ready, `report` is called every 5 s.
 
         Raises:
             RtcpError: it cannot start: reason `relative_path` (`out`), or one of the recorder's.
@@ -66,7 +71,13 @@ class Recordings:
         )
         assert process.stdout is not None
         try:
-            line = await asyncio.wait_for(process.stdout.readline(), _READY_S)
+            ready = asyncio.ensure_future(process.stdout.readline())
+            for _ in range(round(_READY_S / _REPORT_S)):
+                await asyncio.wait({ready}, timeout=_REPORT_S)
+                if ready.done():
+                    break
+                report({})
+            line = await asyncio.wait_for(ready, 0.0)
         except BaseException as error:
             # Also if the client has gone: nobody would know of this recording.
             process.kill()
@@ -97,7 +108,8 @@ class Recordings:
     ) -> Json:
         """Start a recording: the keys of `recording` in the arm's file. Returns what `record_status` lists."""
         rotation = (max_file_mb, max_file_seconds, keep)
-        return await self.start(RecordingConfig(out, formats, signals, every, seconds, *rotation, reserve_mb))
+        options = RecordingConfig(out, formats, signals, every, seconds, *rotation, reserve_mb)
+        return await self.start(options, caller.report)
 
     @method(at_once=True)
     async def record_stop(self, caller: Caller, pid: int | None = None) -> Json:

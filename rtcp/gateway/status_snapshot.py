@@ -25,7 +25,6 @@ from rtcp.ipc.schema import (
     FLAG_ARM_HAS_JOYSTICK,
     FLAG_DC_LOCKED,
     HELD_BOX_AT,
-    HELD_ITSELF,
     HELD_RANGE_AT,
     HELD_SHOULDER,
     HELD_SPEED_AT,
@@ -35,7 +34,8 @@ from rtcp.ipc.schema import (
 from rtcp.ipc.session import Processes, Session, is_running
 from rtcp.ipc.states import ControlMode, DriveMode, DriveState, State
 from rtcp.ipc.tool_motion import ToolMotion
-from rtcp.motion.guards.zones import Zones
+from rtcp.motion.controllers.jog_bounds import held_zone
+from rtcp.motion.guards.zones import Zones, is_cone, reported
 from rtcp.motion.limits import Limits
 from rtcp.realtime.statistics import Percentiles, SlidingPercentiles, diagnose
 
@@ -207,8 +207,10 @@ class StatusSnapshot:
         if (box := (held >> HELD_BOX_AT) - 2) >= -1:
             clearance = self._session.config.cartesian.clearance
             near = Zones(model, self.limits, clearance).clearances(frames(model, q), math.inf)
-            distance = next((zone.distance for zone in near if min(zone.zone, HELD_ITSELF) == box), 0.0)
-            limits["box"] = f"the arm is {distance:.3f} m from {names.box(box)}"
+            nearest = ((each.zone, each.distance) for each in near if held_zone(each.zone) == box)
+            zone, distance = next(nearest, (box, 0.0))
+            unit = "rad" if is_cone(zone) else "m"
+            limits["box"] = f"the arm is {reported(zone, distance):.3f} {unit} from {names.box(zone)}"
         return limits
 
     def _headline(self, state: State, limits: dict[str, str], paused: bool) -> str:
@@ -279,9 +281,7 @@ class StatusSnapshot:
         for process in self._session.config.processes:
             words = None
             if process.STATES is not None:
-                number = int(record[f"{identifier(process.name)}_state"])
-                names = (state.name for state in process.STATES if state == number)
-                words = next(names, "unknown").lower().replace("_", " ")
+                words = process.state_in_words(int(record[f"{identifier(process.name)}_state"]))
             commands = [command.name for command in process.COMMANDS]
             processes[process.name] = {"kind": process.kind, "state": words, "commands": commands}
         return processes
@@ -302,7 +302,8 @@ class StatusSnapshot:
         record = latest[0]
         state, control_mode, flags = State(int(record["state"])), int(record["control_mode"]), int(record["flags"])
         problem = self._loop_problem((time.monotonic_ns() - int(record["time_ns"])) * 1e-9)
-        robot = RobotStatus.lost(control_mode) if problem else RobotStatus.of_record(record)
+        lost_s = int(record["lost"]) * self._observer.period_ns * 1e-9
+        robot = RobotStatus.lost() if problem else RobotStatus.of_record(record, lost_s)
         figures = {name: figure.read() for name, figure in self._figures.items()}
         newest = list(self.messages)[-_SHOWN:]
         last_second, wkc = self._last_second()
@@ -319,7 +320,9 @@ class StatusSnapshot:
                 "mass": float(record["payload_mass"]),
                 "centre": [float(record[f"payload_{axis}"]) for axis in "xyz"],
             },
-            "joystick": {
+            "joystick": None
+            if self._session.config.inputs.joystick is None
+            else {
                 "mode": JOYSTICK_MODES[int(record["joystick_mode"]) % len(JOYSTICK_MODES)],
                 "controls_arm": bool(flags & FLAG_ARM_HAS_JOYSTICK),
             },
@@ -332,7 +335,7 @@ class StatusSnapshot:
             "time_ns": int(record["time_ns"]),
             "missed": int(record["missed"]),
             "skipped_ticks": self._skipped_ticks(int(record["cycle"]), int(record["missed"]), figures),
-            "lost_s": round(int(record["lost"]) * self._observer.period_ns * 1e-9, 3),
+            "lost_s": round(lost_s, 3),
             "wkc": {"expected": int(record["wkc_expected"]), "actual": -1 if problem else wkc},
             "last_second": last_second,
             "slaves": self._slaves(),

@@ -152,6 +152,8 @@ class SetLimits(Command):
     superseded_by_stop = False
     slot: int
     rows: int
+    widen: bool = False
+    """Whether they may be wider than the configured ones, up to the absolute ones; only without torque."""
 
 
 class SetSpeedOverride(Command):

@@ -158,11 +158,13 @@ class ReturningToRange(Event, number=44):
 
 
 class EnabledInBox(Event, number=41):
-    """the arm stands {depth:.6g} m beyond the bounds of {box_name}: only motion that leads out is accepted; jog out"""
+    """the arm stands {depth:.6g} {unit} beyond the bounds of {box_name}: only motion that leads out is accepted; jog
+    out"""
 
     is_warning = True
     box: int
     depth: float
+    """m; rad for a cone."""
 
 
 class MovedSinceFault(Event, number=45):
@@ -197,6 +199,13 @@ class UnknownJoystickCode(Event, number=38):
 
     is_warning = True
     code: int
+
+
+class JoystickOutOfRange(Event, number=160):
+    """a channel of the stick is no number, or beyond its full inclination (inputs.joystick.analog in {file}): the arm
+    stops until the stick is neutral; check its wires"""
+
+    is_warning = True
 
 
 class GripperOpens(Event, number=33):
@@ -404,7 +413,7 @@ class MessagesLeftOut(ServiceEvent, number=75):
 
 class ProcessDataLost(FaultEvent, number=1):
     """process data lost: the count of cycles without the expected working counter reached {allowed}, the last
-    {in_a_row} in a row; a cycle with it takes off 1/10 ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers
+    {in_a_row} in a row; cycles with it count down ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers
     come again"""
 
     stop_key = "lost_frames"
@@ -438,6 +447,15 @@ class EnableTimeout(FaultEvent, number=3):
     axis: int
     state: DriveState
     statusword: int
+
+
+class TooHeavyForCst(FaultEvent, number=155):
+    """{joint} holds {held:.6g} Nm, more than its torque limit of {limit:.6g} Nm: it would sag in CST: {reaction};
+    lighten the arm, or change the drive mode or the limit, then `rtcp reset`"""
+
+    axis: int
+    held: float
+    limit: float
 
 
 class DisableTimeout(FaultEvent, number=4):
@@ -559,6 +577,17 @@ class VelocityJumped(FaultEvent, number=76):
     bound: float
 
 
+class VelocityDisagrees(FaultEvent, number=156):
+    """{joint}: its positions and its speed of {velocity:.6g} rad/s differ by {gap:.3g} rad within 0.1 s, allowed are
+    {allowed:.3g} rad (supervision.velocity_gap in {file}): one of them is stuck or has a wrong factor; {reaction}; then
+    `rtcp reset`"""
+
+    axis: int
+    velocity: float
+    gap: float
+    allowed: float
+
+
 class HomingStillMoving(FaultEvent, number=39):
     """{joint} still turns at {velocity:.6g} rad/s 3 s after its homing: {reaction}; then `rtcp reset`"""
 
@@ -571,6 +600,14 @@ class LeaseExpired(Event, number=9):
 
     is_warning = True
     stop_key = "lease_ended"
+
+
+class DisabledUnattended(Event, number=166):
+    """the drives are disabled: nobody has commanded the arm for {seconds:g} s since its commander was lost in a motion
+    (stops.power_off_after_s)"""
+
+    is_warning = True
+    seconds: float
 
 
 class PermissionWithdrawn(Event, number=28):
@@ -620,8 +657,8 @@ class OverSpeed(EmergencyStop, number=24):
 
 
 class OverTorque(EmergencyStop, number=25):
-    """{joint}: measured torque {value:.6g} Nm exceeded {limit:.6g} Nm for {supervision}: {reaction}; then `rtcp
-    reset`"""
+    """{joint}: measured torque {value:.6g} Nm exceeded {limit:.6g} Nm for {torque_time:g} s (supervision.torque_s in
+    {file}): {reaction}; then `rtcp reset`"""
 
     stop_key = "supervision"
     axis: int
@@ -640,7 +677,8 @@ class FollowingError(EmergencyStop, number=26):
 
 
 class PushedNear(FaultEvent, number=77):
-    """the arm was pushed towards {box_name}, to {distance:.3g} m before its bounds: {reaction}; then `rtcp reset`"""
+    """the arm was pushed towards {box_name}, to {distance:.3g} {unit} before its bounds: {reaction}; then `rtcp
+    reset`"""
 
     box: int
     distance: float
@@ -830,15 +868,15 @@ class PlanDamaged(MotionEnded, number=106):
 
 
 class BoxReached(MotionEnded, number=107):
-    """the arm stopped {distance:.6g} m from {box_name}; the arm holds, then `rtcp reset`"""
+    """the arm stopped {distance:.6g} {unit} from {box_name}; the arm holds, then `rtcp reset`"""
 
     box: int
     distance: float
 
 
 class NotLeavingBox(MotionEnded, number=111):
-    """the arm is {depth:.6g} m beyond the bounds of {box_name}, and the motion did not lead out; `rtcp reset`, then jog
-    out"""
+    """the arm is {depth:.6g} {unit} beyond the bounds of {box_name}, and the motion did not lead out; `rtcp reset`,
+    then jog out"""
 
     box: int
     depth: float

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
 from rtcp.ipc.errors import ErrorKind, RtcpError
@@ -53,10 +53,23 @@ def request(number: int, method: str, params: Mapping[str, Any]) -> bytes:
     try:
         data = line({"id": number, "method": method, "params": dict(params)})
     except (TypeError, ValueError) as error:
-        raise RtcpError("invalid", f"{method}: the parameters cannot be sent as JSON: {error}") from error
+        why = next(_wrong_numbers(params), error)
+        raise RtcpError("invalid", f"{method}: the parameters cannot be sent as JSON: {why}") from error
     if len(data) > LINE_LIMIT:
         raise RtcpError("invalid", f"{method}: the parameters are {len(data)} bytes, longer than {LINE_LIMIT} bytes")
     return data
+
+
+def _wrong_numbers(value: Any, place: str = "") -> Iterator[str]:
+    """Yield the place of each number that is not finite, from 0, as `points[3].q[2] is nan`."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield f"{place} is {value}, a finite number is needed"
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _wrong_numbers(inner, f"{place}.{key}" if place else str(key))
+    elif isinstance(value, list | tuple):
+        for at, inner in enumerate(value):
+            yield from _wrong_numbers(inner, f"{place}[{at}]")
 
 
 def answer(message: Mapping[str, Any]) -> bytes:

@@ -9,11 +9,12 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any
 
-from rtcp.config.model import VIRTUAL, ArmConfig, Capability
+from rtcp.config.model import SUPERVISION, VIRTUAL, ArmConfig, Capability
 from rtcp.ipc import codes
 from rtcp.ipc.commands import COMMANDS, Reset
 from rtcp.ipc.events import JOYSTICK_MODES, EmergencyStop
 from rtcp.ipc.message import Message
+from rtcp.ipc.schema import FIRST_CONE
 from rtcp.ipc.states import DriveState, Missing, State
 from rtcp.ipc.stop_reactions import StopReaction, reactions
 
@@ -118,13 +119,20 @@ class Names:
         return processes[number].name if 0 <= number < len(processes) else "not configured"
 
     def box(self, which: int) -> str:
-        """Return the name and key of a keep-out box, of the box that the tool stays in (-1), else of the arm itself."""
+        """Return name and key of a keep-out box, of the box that the tool stays in (-1), of a cone, else of the arm."""
         boxes = self.config.cartesian.keep_out
+        if cone := self.cone(which):
+            return f"the cone {cone} (cartesian.cones[{which - FIRST_CONE}] in {self.file})"
         if 0 <= which < len(boxes):
             return f"the keep-out box {boxes[which].name} (cartesian.keep_out[{which}] in {self.file})"
         if which >= 0:
             return f"the clearance of the arm's own bodies (cartesian.clearance in {self.file})"
         return f"the box that the tool stays in (cartesian.box in {self.file})"
+
+    def cone(self, which: int) -> str:
+        """Return the name of a cone by its number among boxes and cones; empty: it is that of something else."""
+        cones = self.config.cartesian.cones
+        return cones[which - FIRST_CONE].name if 0 <= which - FIRST_CONE < len(cones) else ""
 
     def tool(self, number: int) -> str:
         """Return the name of a tool."""
@@ -166,7 +174,9 @@ class Names:
 _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "file": lambda names, about: names.file,
     "joint": lambda names, about: names.joint(about.axis),
-    "joint_or_box": lambda names, about: names.joint(about.axis) if about.axis >= 0 else "the Cartesian limits",
+    "joint_or_box": lambda names, about: (
+        names.joint(about.axis) if about.axis >= 0 else ("the supervision", "the Cartesian limits")[about.axis + 2]
+    ),
     "key": lambda names, about: names.key(about.axis),
     "drive_words": lambda names, about: names.drive(about),
     "mode_reason": lambda names, about: (
@@ -182,6 +192,7 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "missing_words": lambda names, about: MISSING_WORDS[about.missing],
     "low": lambda names, about: names.config.axes[about.axis].position.min,
     "high": lambda names, about: names.config.axes[about.axis].position.max,
+    "unit": lambda names, about: "rad" if names.cone(about.box) else "m",
     "box_name": lambda names, about: names.box(about.box),
     "tool_name": lambda names, about: names.tool(about.tool),
     "planned_tool": lambda names, about: names.tool(about.planned),
@@ -224,6 +235,8 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "lost_cycles": lambda names, about: names.lost_cycles(),
     "enable_timeout": lambda names, about: names.config.enable_timeout_s,
     "supervision": lambda names, about: f"{names.config.supervision.cycles} cycles (supervision in {names.file})",
+    "threshold": lambda names, about: SUPERVISION[about.quantity % 3],
+    "torque_time": lambda names, about: names.config.supervision.torque_s,
     "joystick_mode": lambda names, about: JOYSTICK_MODES[about.mode % len(JOYSTICK_MODES)],
     "direction_name": lambda names, about: _DIRECTIONS[about.direction % len(_DIRECTIONS)],
     "singularity": lambda names, about: SINGULARITIES[about.which % 3][0],

@@ -520,14 +520,14 @@ class ImpossibleLimit(Refusal):
     """{joint_or_box}: {value:.6g} cannot be set (its bound is {limit:.6g}): nothing was changed"""
 
     axis: int
-    """-1: of a box."""
+    """-1: of a box or a cone; -2: of the supervision."""
     value: float
     limit: float
 
 
 class LimitWidened(Refusal):
     """{joint_or_box}: {value:.6g} is beyond what the configuration allows, {limit:.6g} (in {file}): limits are only
-    narrowed at run time"""
+    narrowed at run time, or with --widen brought up to the key absolute"""
 
     axis: int
     value: float
@@ -539,6 +539,17 @@ class TorqueLimitTooLow(Refusal):
 
     axis: int
     held: float
+    limit: float
+
+
+class ThresholdTooLow(Refusal):
+    """{joint} is at {found:.6g}, beyond the new threshold of {limit:.6g} (supervision.{threshold}): it would be an
+    emergency stop, nothing was changed"""
+
+    axis: int
+    quantity: int
+    """0: speed, rad/s; 1: torque, Nm; 2: following error, rad."""
+    found: float
     limit: float
 
 

@@ -179,6 +179,9 @@ CYCLE_FIELDS = _fields_of(
     ("limit", "uint32", "", "Number of the event by which a limit ended the last motion; 0 for none."),
     ("enables", "uint32", "", "How often the arm was enabled."),
     ("moves", "uint32", "", "How many motions have begun."),
+    ("drives_powered", "int16", "", "Motors: 1 at least one has power, 0 none has, -1 unknown."),
+    ("e_stopped", "int16", "", "Emergency stop at an IO box or the robot controller: 1 pressed, 0 not, -1 unknown."),
+    ("operating_mode", "int16", "", "Key of the robot controller: 1 manual, 2 automatic, -1 unknown or no key."),
 )
 """Fields of every record, for any platform."""
 OPERATOR_FIELDS = (Field("joystick_mode", "uint8", "", "0 X-Y, 1 Z-yaw, 2 roll-pitch, 3 gripper.", part="operator"),)
@@ -265,5 +268,8 @@ the singularity of the shoulder; elbow and wrist are the next two bits."""
 HELD_RANGE_AT, HELD_SPEED_AT = 19, 23
 """4 bits each: 1 + the joint whose range, or whose speed, is the limit; 0: none."""
 HELD_BOX_AT = 27
-HELD_ITSELF = 29
-"""5 bits: 1: the box that the tool stays in; 2 + the number of a keep-out box; 2 + 29: the arm itself; 0: none."""
+HELD_CONE, HELD_ITSELF = 28, 29
+"""5 bits: 1: the box that the tool stays in; 2 + the number of a keep-out box; 2 + 28: a cone of the tool's
+orientation; 2 + 29: the arm itself; 0: none."""
+FIRST_CONE = 900
+"""Number of the first cone (cartesian.cones) where events and refusals name a box."""

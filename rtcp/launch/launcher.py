@@ -12,9 +12,10 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
-from rtcp.config.cell import CellConfig
+from rtcp.config.buses import ControllerBus, is_address
+from rtcp.config.cell import CellConfig, Member
 from rtcp.config.find import find_config
 from rtcp.config.loader import load, segment_path, widen, with_control_mode, with_period
 from rtcp.config.model import VIRTUAL, ArmConfig, ControlModeName, DriveModeName, EthercatBus
@@ -55,6 +56,9 @@ CheckSegment = Callable[[Path], object]
 
 START_TIMEOUT_S = 1.0
 """Longest wait for the lock in a start, s: restarting a gateway holds it for a moment."""
+SEGMENT_TIMEOUT_S = 30.0
+"""Longest wait for the virtual controller that the platform of another arm starts, s."""
+_POLL_S = 0.05
 STOP_TIMEOUT_S = 30.0
 """Longest wait for the lock in a stop, s: another stop holds it for 20 s at most, or a start."""
 
@@ -65,6 +69,8 @@ class StartOptions:
 
     config: Path | None = None
     bus: str | None = None
+    controller: str | None = None
+    """IPv4 address of the robot controller."""
     mode: str | None = None
     """A drive mode or a control mode."""
     cycle_us: float | None = None
@@ -228,6 +234,15 @@ def _configure(options: StartOptions) -> ArmConfig:
             raise RtcpError("invalid", f"mode {mode!r} is unknown: {', '.join([*control_modes, *drive_modes])}")
     if options.bus is not None:
         config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, interface=options.bus))
+    if (address := options.controller) is not None:
+        if not isinstance(config.bus, ControllerBus):
+            raise RtcpError(
+                "invalid",
+                f"--controller {address}: bus.kind is {config.bus.kind}, without a robot controller: use --bus",
+            )
+        if not is_address(address):
+            raise RtcpError("invalid", f"--controller {address}: allowed is an IPv4 address")
+        config = dataclasses.replace(config, bus=config.bus.at_controller(address))
     if options.cycle_us is not None:
         config = with_period(config, options.cycle_us)
     return widen(dataclasses.replace(config, zero_offsets=read_zeros(config)))
@@ -252,6 +267,18 @@ def _segment_words(facts: dict[str, Any]) -> str:
     return f"virtual controller of {', '.join(facts['units'])} (process {facts['pid']})"
 
 
+def _check_controller(config: ArmConfig, facts: dict[str, Any], arms: int) -> None:
+    """Compare a virtual controller's ready line with the bus; raises RtcpError: no arm would ever hear from it."""
+    if not isinstance(config.bus, ControllerBus):
+        return
+    path, streams, wanted = segment_path(config), "motion_port" in facts, config.bus.HAS_ONE_CONNECTION
+    if streams != wanted:
+        has, need = (f"{'has' if each else 'has no'} `rapid`" for each in (streams, wanted))
+        raise RtcpError("invalid", f"{path} {has}: bus.kind {config.bus.kind} needs a file that {need} (`segment`)")
+    if (count := len(facts["units"])) < arms:
+        raise RtcpError("invalid", f"{path} has {count} units, the controller has {arms} arms (`segment`)")
+
+
 def _placed(cell: CellConfig) -> CellConfig:
     """Return the cell with the runtime directories of its arms."""
     arms, processes = (
@@ -259,6 +286,26 @@ def _placed(cell: CellConfig) -> CellConfig:
         for group in (cell.arms, cell.processes)
     )
     return dataclasses.replace(cell, arms=arms, processes=processes)
+
+
+def _segment_of(holder: Member) -> tuple[str, int, Path | None]:
+    """Wait for the virtual controller that another platform of the cell starts; return what its session says of it.
+
+    Raises:
+        RtcpError: it does not start (fault).
+    """
+    until = time.monotonic() + SEGMENT_TIMEOUT_S
+    while time.monotonic() < until:
+        running = read_processes(holder.directory).segment
+        if is_running(running):
+            with contextlib.suppress(SessionError):
+                session = read_session(holder.directory)
+                if session.segment_pid == running:
+                    return session.interface, session.segment_pid, session.segment_control
+        time.sleep(_POLL_S)
+    raise RtcpError(
+        "fault", f"{holder.name}, which starts the virtual controller of both, does not run: start it first"
+    )
 
 
 def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_ns: int, report: Report) -> Platform:
@@ -272,15 +319,23 @@ def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_
     try:
         # Each process loads its modules while the one before it starts.
         loop = platform.load_loop()
-        if interface == VIRTUAL and config.bus.VIRTUAL_PROCESS:
+        name, cell = platform_name(), options.cell
+        placed = cell and _placed(cell)
+        units = placed and placed.units_of(name)
+        control: Path | None = None
+        if units and units.index:
+            holder = units.members[0]
+            if interface == VIRTUAL and not cast(ControllerBus, config.bus).HAS_ONE_CONNECTION:
+                report(f"the virtual controller is that of {holder.name}")
+                interface, segment, control = _segment_of(holder)
+        elif interface == VIRTUAL and config.bus.VIRTUAL_PROCESS:
             facts = platform.start_segment(segment_path(config), options.poll)
             interface, segment = str(facts["interface"]), int(facts["pid"])
+            control = platform.segment_control
             report(_segment_words(facts))
+            _check_controller(config, facts, len(units.members) if units else 1)
         bus = config.bus.interface
-        name, cell = platform_name(), options.cell
-        Session(
-            config, bus, interface, segment, began_ns, state, platform.segment_control, cell and _placed(cell), name
-        ).write(directory)  # fmt: skip
+        Session(config, bus, interface, segment, began_ns, state, control, placed, name).write(directory)
         ready = platform.load_gateway()
         platform.start_loop(loop, report)
         platform.await_gateway(ready)

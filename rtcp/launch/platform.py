@@ -194,6 +194,11 @@ class Platform:
             return
         raise self._not_ready("gateway", child)
 
+    @property
+    def started_loop(self) -> bool:
+        """Whether this process started the loop; False where the loop ran already and only got a new gateway."""
+        return any(child.pid == self.processes.loop for child in self._children)
+
     def exit_code(self, pid: int) -> int | None:
         """Return the exit code of a child of this process; None while it runs, or where it is no child."""
         return next((child.poll() for child in self._children if child.pid == pid), None)

@@ -19,6 +19,10 @@ _FADE_S: Final = 0.3
 
 _PASSED_S: Final = 0.03
 """Time constant of the transition from a passed torque to the position loop, s."""
+_RISE_S: Final = 0.02
+"""Shortest time in which a target torque changes by the joint's torque limit, s: what lost frames have hidden, and a
+false speed that is possible, changes the torque without a jerk."""
+_CSP: Final = int(DriveMode.CSP)
 _SLOW_RAD_S: Final = 0.05
 """Speed, rad/s, at which a joint that would come to rest outside its range is led to the edge."""
 
@@ -28,6 +32,7 @@ class Commanded(Protocol):
 
     position: float
     velocity: float
+    mode_display: int
     target_position: float
     target_velocity: float
     target_torque: float
@@ -60,7 +65,8 @@ class CspWriter:
 
     def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
         self._period_s = period_s
-        self._change = [joint.acceleration * period_s for joint in joints]
+        self._change = [0.0] * len(joints)
+        """Largest change of the pace in a cycle, rad/s."""
         self._slow = [min(_SLOW_RAD_S, joint.velocity) for joint in joints]
         self._away = [0.0] * len(joints)
         """Distance of each target from its setpoint, rad."""
@@ -72,12 +78,15 @@ class CspWriter:
         """Start at the setpoints."""
         self.is_braking = False
 
-    def take_over(self, position: Sequence[float], drives: Sequence[Commanded]) -> None:
-        """Start at the targets and velocities of the drives and brake to `position`, rad."""
+    def take_over(
+        self, position: Sequence[float], speeds: Sequence[float], rates: Sequence[float], drives: Sequence[Commanded]
+    ) -> None:
+        """Start at the drives' targets with `speeds`, rad/s, and brake to `position`, rad, by `rates`, rad/s^2."""
         self.is_braking = True
         for i, drive in enumerate(drives):
             self._away[i] = drive.target_position - position[i]
-            self._pace[i] = drive.velocity
+            self._pace[i] = speeds[i]
+            self._change[i] = rates[i] * self._period_s
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write the positions; drives with a velocity field use it as their speed limit, which the driver fills in."""
@@ -126,23 +135,32 @@ class CsvWriter:
         for i, drive in enumerate(drives):
             bias[i] *= keep
             drive.target_position = position[i]
-            drive.target_velocity = velocity[i] + gain[i] * (position[i] - drive.position - bias[i])
+            speed = velocity[i] + gain[i] * (position[i] - drive.position - bias[i])
+            # A drive that still shows CSP is sent no velocity: the first one begins at 0 too.
+            drive.target_velocity = 0.0 if drive.mode_display == _CSP else speed
             drive.target_torque = 0.0
 
 
 class CstWriter:
-    """CST: stiffness, damping and a bounded integral about the setpoint (an impedance without a steady-state error)."""
+    """CST: stiffness, damping and a bounded integral about the setpoint (an impedance without a steady-state error).
+
+    Args:
+        joints: the joints.
+        period_s: the cycle, s.
+        limits: torque limits in force, Nm: a list that is changed in place.
+    """
 
     mode = DriveMode.CST
 
-    def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
+    def __init__(self, joints: Sequence[Joint], period_s: float, limits: Sequence[float]) -> None:
         self._stiffness = [joint.cst_stiffness for joint in joints]
         self._damping = [joint.cst_damping for joint in joints]
         self._integral_step = [joint.cst_integral * period_s for joint in joints]
-        self._bound = [joint.torque for joint in joints]
-        self._integral = [0.0] * len(self._bound)
+        self._bound = limits
+        self._rise = period_s / _RISE_S
+        self._integral = [0.0] * len(limits)
         self._fade = exp(-period_s / _PASSED_S)
-        self._excess = [0.0] * len(self._bound)
+        self._excess = [0.0] * len(limits)
         """Rest of the last passed torque beyond the weight and the position loop, Nm."""
         self._passed = False
 
@@ -171,11 +189,11 @@ class CstWriter:
         integral = self._integral
         self._passed = True
         for i, drive in enumerate(drives):
-            bound, wanted, held = self._bound[i], torque[i], weight[i]
+            bound, held = self._bound[i], weight[i]
             integral[i] = bound if held > bound else -bound if held < -bound else held
             drive.target_position = position[i]
             drive.target_velocity = 0.0
-            drive.target_torque = bound if wanted > bound else -bound if wanted < -bound else wanted
+            self._approach(i, drive, torque[i])
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write target torques (Nm)."""
@@ -189,5 +207,12 @@ class CstWriter:
             integral[i] = summed = bound if summed > bound else -bound if summed < -bound else summed
             drive.target_position = position[i]
             drive.target_velocity = 0.0
-            drive.target_torque = loop + summed + excess[i]
+            self._approach(i, drive, loop + summed + excess[i])
         self._passed = False
+
+    def _approach(self, i: int, drive: Commanded, torque: float) -> None:
+        """Let the target torque approach `torque`, Nm, as fast as it may, inside the joint's bound."""
+        before, bound = drive.target_torque, self._bound[i]
+        change = bound * self._rise
+        torque = bound if torque > bound else -bound if torque < -bound else torque
+        drive.target_torque = min(max(torque, before - change), before + change)

@@ -166,7 +166,7 @@ async def _disable(robot: AsyncRobot) -> None:
 
 
 def _override(view: View) -> None:
-    """Show the speed override, which a slider sets."""
+    """Show the speed override, which a slider sets, and the joystick's mode."""
 
     async def changed(event: Any) -> None:
         token_ns, percent = event.args
@@ -180,6 +180,9 @@ def _override(view: View) -> None:
         slider.props.update({"type": "range", "min": "1", "max": "100", "step": "1", "data-override": ""})
         slider.on("change", changed, js_handler="(event) => emit([rtcp.token, +event.target.value])")
         live_value("speed_override", tag="output").props["data-suffix"] = " %"
+        with ui.element("div").props("id=joystick hidden"):
+            text("span", "Joystick ")
+            live_value("joystick", tag="b")
 
 
 def _first_steps(view: View) -> None:

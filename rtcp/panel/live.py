@@ -754,6 +754,7 @@ class Live:
             "control_mode": raw["control_mode"],
             "speed_override": round(100.0 * raw["speed_override"], 1),
             "tool_name": raw["tool_name"],
+            "joystick": _joystick(raw["joystick"]),
             "holder": raw["lease"]["holder"],
             "age_s": round(raw["lost_s"] + max(0, time.monotonic_ns() - raw["time_ns"]) * 1e-9, 1),
             "bus": raw["bus"],
@@ -799,6 +800,13 @@ def sentence(message: str) -> str:
     """Return a message as a sentence for a person without terminal and files."""
     short = _ASIDE.sub("", message).replace("`", "").rstrip(".")
     return short and f"{short[0].upper()}{short[1:]}."
+
+
+def _joystick(joystick: Mapping[str, Any] | None) -> str:
+    """Return the mode of the joystick and what it controls; empty: there is none."""
+    if joystick is None:
+        return ""
+    return f"{joystick['mode']}, controls the {'arm' if joystick['controls_arm'] else 'chair'}"
 
 
 def _number(value: float, digits: int) -> float | None:

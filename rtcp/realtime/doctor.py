@@ -130,7 +130,13 @@ def _at_boot(path: str, value: str) -> str:
 
 _JETSON_RELEASE = "/etc/nv_tegra_release"
 _JETSON_SOURCES = "/etc/apt/sources.list.d/nvidia-l4t-apt-source.list"
+_FIRST_PACKAGED_RELEASE = 36
+"""First release of Jetson Linux whose guide has the section "Real-Time Kernel Using OTA Update" for every board."""
+_JETSON_PACKAGES = (
+    "nvidia-l4t-rt-kernel nvidia-l4t-rt-kernel-headers nvidia-l4t-rt-kernel-oot-modules nvidia-l4t-display-rt-kernel"
+)
 """Jetson Linux Developer Guide, "Installing Real-Time Kernel"."""
+_BUILD_KERNEL = "# build a kernel with PREEMPT_RT from its sources: docs/realtime_kernel.md"
 _CLOCK = "/sys/devices/system/clocksource/clocksource0"
 _GOOD_CLOCKS = ("tsc", "arch_sys_counter")
 """Read from a register without leaving user space, on x86 and on ARM."""
@@ -148,21 +154,35 @@ def _preempt_rt(case: Case) -> Result:
 
 def _rt_kernel(host: Host) -> tuple[str, ...]:
     if host.exists(_JETSON_RELEASE):
-        # "# R36 (release), REVISION: 4.3, ...": the repository is called r36.4.
-        named = re.search(r"R(\d+) \(release\), REVISION: (\d+)", host.text(_JETSON_RELEASE))
-        repository = f"r{named[1]}.{named[2]}" if named else "RELEASE"
-        return (
-            f"echo 'deb https://repo.download.nvidia.com/jetson/rt-kernel {repository} main' >> {_JETSON_SOURCES}",
-            "apt update && apt install nvidia-l4t-rt-kernel nvidia-l4t-rt-kernel-headers "
-            "nvidia-l4t-rt-kernel-oot-modules nvidia-l4t-display-rt-kernel   # then reboot",
-        )
-    release = host.text_or("/etc/os-release", "").splitlines()
-    if "ID=ubuntu" in release:
-        return ("pro attach && pro enable realtime-kernel   # then reboot",)
-    if "ID=debian" in release:
-        machine = "arm64" if host.exists("/proc/device-tree/model") else "amd64"
-        return (f"apt install linux-image-rt-{machine}   # then reboot",)
-    return ("# install the distribution's kernel with PREEMPT_RT; Linux 6.12 and newer have it: CONFIG_PREEMPT_RT=y",)
+        return _jetson_kernel(host)
+    release = dict(line.partition("=")[::2] for line in host.text_or("/etc/os-release", "").splitlines())
+    if release.get("ID") == "ubuntu":
+        version = release.get("VERSION_ID", "").strip('"')
+        if version in ("22.04", "24.04"):
+            return ("pro attach && pro enable realtime-kernel   # then reboot",)
+        return ("apt install linux-realtime   # then reboot",) if version >= "25.10" else (_BUILD_KERNEL,)
+    if release.get("ID") == "debian":
+        return ("apt install linux-image-rt-$(dpkg --print-architecture)   # then reboot",)
+    return (
+        "# install the distribution's kernel with PREEMPT_RT; Linux 6.12 and newer have it: CONFIG_PREEMPT_RT=y",
+        _BUILD_KERNEL,
+    )
+
+
+def _jetson_kernel(host: Host) -> tuple[str, ...]:
+    # "# R36 (release), REVISION: 4.3, ...": the repository is called r36.4.
+    named = re.search(r"R(\d{1,3}) \(release\), REVISION: (\d{1,3})", host.text(_JETSON_RELEASE))
+    if named is None or int(named[1]) < _FIRST_PACKAGED_RELEASE:
+        return (f"{_BUILD_KERNEL}, and docs/jetson.md for this board",)
+    packages = _JETSON_PACKAGES
+    if int(named[1]) >= 38:
+        thor = "thor" in host.text_or("/proc/device-tree/model", "").lower()
+        packages += " nvidia-l4t-rt-kernel-openrm" if thor else " nvidia-l4t-rt-kernel-nvgpu"
+    repository = f"https://repo.download.nvidia.com/jetson/rt-kernel r{named[1]}.{named[2]}"
+    return (
+        f"echo 'deb {repository} main' >> {_JETSON_SOURCES}",
+        f"apt update && apt install {packages}   # then reboot",
+    )
 
 
 def _throttling(case: Case) -> Result:

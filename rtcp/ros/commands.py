@@ -9,15 +9,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import shlex
+import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, cast
 
 from rtcp.api import Arrival, AsyncRobot, Progress, Replaced, RtcpError, State, Status, Stream
+from rtcp.api.robot import command_fields
 from rtcp.config.model import MOST_POINTS
 from rtcp.ros.held_up import HeldUp
+from rtcp.ros.processes import ProcessService
 
 Numbers = Sequence[float]
 _NEEDS_RESET = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT)
@@ -34,6 +38,8 @@ _LATEST_S = 0.5
 """Upper bound on the age of a trajectory's stamp, s."""
 _LONGEST_WAIT_S = 60.0
 """Longest wait for the stamp of a trajectory, s."""
+MOST_WAITING = 100
+"""Most messages of a topic that wait to be carried out."""
 START_RAD = 0.01
 """Largest distance of a trajectory's first point from the commanded position; MoveIt allows as much."""
 GOAL_RAD = 0.01
@@ -93,6 +99,11 @@ _CODES = {
 """Reason of an RtcpError -> code; any other reason is an invalid goal if the motion had not begun."""
 
 
+CANCELLED = FollowCode.INVALID_GOAL, "cancelled: the arm brakes"
+"""Code and message of a goal that its client cancelled. The action has no code of its own for a goal that was cancelled
+or replaced; with SUCCESSFUL a client that looks at the code alone would take it for an arrival."""
+
+
 @dataclass(frozen=True)
 class Tolerances:
     """Tolerances of a FollowJointTrajectory goal; `goal_time_s`: 0 is the robot's default."""
@@ -115,6 +126,49 @@ class CommandOptions:
     """Whether joints that a trajectory does not name hold their position."""
     buffer_s: float = 0.0
     """Delay of joint_command, executed as a trajectory through the points, s; 0: each replaces the last."""
+    most_points: int = 0
+    """Number of points that are kept of a longer trajectory, evenly and with both ends; 0: it is refused."""
+
+
+class Inbox:
+    """Carries out the messages of topics on an event loop, from any thread; refusals are logged.
+
+    Args:
+        loop: of the commander.
+        log: receives a sentence.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, log: Callable[[str], None]) -> None:
+        self._loop, self._log = loop, log
+        self._lock = threading.Lock()
+        self._waiting: dict[str, int] = {}
+        """Messages that are not carried out yet, by topic."""
+        self._dropping: set[str] = set()
+        """Topics of which messages are dropped; logged."""
+
+    def put(self, topic: str, command: Coroutine[Any, Any, None]) -> None:
+        """Carry out a message; of a flood, those beyond `MOST_WAITING` are dropped."""
+        with self._lock:
+            waiting = self._waiting.get(topic, 0)
+            if waiting >= MOST_WAITING:
+                command.close()
+                if topic not in self._dropping:
+                    self._dropping.add(topic)
+                    self._log(f"{topic}: {MOST_WAITING} messages wait, further ones are dropped")
+                return
+            self._waiting[topic] = waiting + 1
+        asyncio.run_coroutine_threadsafe(self._carry_out(topic, command), self._loop)
+
+    async def _carry_out(self, topic: str, command: Coroutine[Any, Any, None]) -> None:
+        try:
+            await command
+        except Exception as error:  # also programming errors, which would be lost otherwise
+            self._log(f"{topic}: {error}")
+        finally:
+            with self._lock:
+                self._waiting[topic] -= 1
+                if not self._waiting[topic]:
+                    self._dropping.discard(topic)
 
 
 class Commander:
@@ -151,6 +205,7 @@ class Commander:
     async def close(self) -> None:
         """Close the connection: its motion comes to a controlled stop."""
         self._polling.cancel()
+        self._points.end()
         self._robot = None
         await self._closing.aclose()
 
@@ -234,12 +289,17 @@ class Commander:
             return code, error.message
         return FollowCode.SUCCESSFUL, f"there, largest error {arrival.error:.6f} rad"
 
-    async def command_point(self, point: TrajectoryPoint) -> None:
+    async def command_point(self, point: TrajectoryPoint, sender: str = "") -> None:
         """joint_command: move the joints, base to tool, to a point, which replaces the present motion; at any rate.
 
         A point whose time does not follow that of the last one is dropped, unless that one came over a second ago.
+        While the arm follows one sender, points of another one are refused; the first refusal has the names of both.
+
+        Args:
+            point: the point.
+            sender: name of its publisher; empty: unknown, and not distinguished.
         """
-        await self._points.take(point)
+        await self._points.take(point, sender)
 
     async def command_joints(self, trajectory: Trajectory) -> None:
         """joint_trajectory: one point, as MoveIt Servo sends it, is a `joint_command`; more are a trajectory."""
@@ -251,12 +311,13 @@ class Commander:
         time_s = trajectory.begin_s + ordered["t"] if trajectory.begin_s else 0.0
         await self._points.take(TrajectoryPoint(time_s, ordered["q"], ordered.get("v", ()), ordered.get("a", ())))
 
-    async def stop(self) -> None:
-        """stop_motion: stop any motion, also one that waits for its stamp; return when the arm holds."""
+    async def stop(self) -> str:
+        """stop_motion, robot_stop: stop any motion, also one that waits for its stamp; return when the arm holds."""
         self._bar()
         self._points.end()
         robot = await self.connected()
         await robot.halt()
+        return "the arm holds"
 
     # -- drives -------------------------------------------------------------------------------------------------------
 
@@ -280,12 +341,37 @@ class Commander:
         """speed_override: scale the speed of the present and all later motions."""
         await (await self.connected()).set_speed_override(fraction)
 
+    async def set_limits(self, changes: Mapping[str, float]) -> None:
+        """Narrow limits, all or none, by the keys of `rtcp limits set`."""
+        self._require_timely()
+        await (await self.connected()).set_limits(changes)
+
     async def set_outputs(self, values: Iterable[tuple[str, str, float]]) -> None:
         """Set outputs (slave, name, value), in this order, up to the first refusal."""
         self._require_timely()
         robot = await self.connected()
         for slave, name, value in values:
             await robot.set_output(f"{slave}.{name}", float(value))
+
+    async def command_process(self, service: ProcessService, text: str = "") -> str:
+        """Send a command to a process; return a sentence when it is carried out, of a lasting one when it has ended.
+
+        Args:
+            service: names the command.
+            text: its fields, as on the command line: `phase=austenite is_cold=true`.
+        """
+        if service.needs_lease:  # else it only makes the process safer
+            self._require_timely()
+        try:
+            fields = command_fields(shlex.split(text))
+        except ValueError as error:
+            raise refusal("no_field", str(error)) from None
+        robot = await self.connected()
+        if service.member:
+            robot = await cast(Any, robot).member(service.member)  # a `rtcp.ros.group.GroupRobot`
+        await robot.command(service.command, **fields)
+        state = (await robot.status()).raw["processes"][service.process]["state"]
+        return f"{service.process} is {state}" if state else "done"
 
     async def disable(self) -> str:
         """robot_disable: stop the arm and remove the torque; return a sentence."""
@@ -308,6 +394,7 @@ class Commander:
             raise refusal("no_points", "the trajectory has no points")
         robot = await self.connected()
         status = await self._known()
+        trajectory = downsampled(trajectory, self._options.most_points)
         points = points_of(trajectory, status, self._options.allows_partial)
         limits = {} if tolerances is None else tolerances_of(tolerances, status.joint_names)
         wait_s = trajectory.begin_s - time.time() if trajectory.begin_s > 0.0 else 0.0
@@ -399,6 +486,10 @@ class _Points:
         self.status: Status | None = None
         """Status of the robot at the begin of the stream; None: no stream."""
         self._has_ended = False
+        self._sender = ""
+        """Publisher of the points that the arm follows; empty: unknown."""
+        self._refused: set[str] = set()
+        """Other publishers whose refusal is logged."""
         self._newest: TrajectoryPoint | None = None
         self._last_s = 0.0
         """Time of the last point on its sender's clock, s."""
@@ -435,7 +526,7 @@ class _Points:
             self._stream.close()
         self._stream = self.status = self._attending = None
 
-    async def take(self, point: TrajectoryPoint) -> None:
+    async def take(self, point: TrajectoryPoint, sender: str = "") -> None:
         """Send a point to the platform; of points that arrive while the stream is being opened only the last is sent.
 
         Raises:
@@ -446,6 +537,15 @@ class _Points:
             self._came_s = now  # the pause before a new stream counts from here
             return
         is_first = now - self._came_s > _PAUSE_S
+        if is_first:
+            self._sender = sender
+            self._refused.clear()
+        elif sender and self._sender and sender != self._sender:
+            if sender in self._refused:
+                return  # logged once
+            self._refused.add(sender)
+            message = f"the arm follows {self._sender}: points of {sender} are refused until that one pauses for 1 s"
+            raise refusal("other_publisher", message)
         self._before_s, self._came_s = self._came_s, now
         if is_first:
             self._has_ended, self._anchor_s = False, None
@@ -460,7 +560,8 @@ class _Points:
         self._last_s, self._is_dropping = point.time_s, False
         for field_name, values in vars(point).items():
             if field_name != "time_s" and not all(map(math.isfinite, values)):
-                raise refusal("not_finite", f"{field_name} has a number that is not finite: dropped")
+                joint = [*map(math.isfinite, values)].index(False) + 1
+                raise refusal("not_finite", f"{field_name} of joint {joint} is not finite: the point is dropped")
         self._newest = point
         try:
             if self._buffer_s:
@@ -569,15 +670,23 @@ class _Points:
             await robot.open_trajectory([row | {"t": self._buffer_s}], replace=True)
 
 
+def downsampled(trajectory: Trajectory, most: int) -> Trajectory:
+    """Return a trajectory of at most `most` of its points, evenly chosen, with both ends; 0: all."""
+    last = len(trajectory.points) - 1
+    if not 2 <= most <= last:
+        return trajectory
+    return replace(trajectory, points=[trajectory.points[round(k * last / (most - 1))] for k in range(most)])
+
+
 def points_of(
     trajectory: Trajectory, status: Status, allows_partial: bool = False, hold_at: Numbers | None = None
 ) -> list[dict[str, Any]]:
-    """Return the points in the robot's order of joints, for `Robot.run_trajectory`, which checks the values.
+    """Return the points in the robot's order of joints, for `Robot.run_trajectory`, which checks their limits.
 
     `hold_at`: positions of joints that are not named, rad; None: the commanded ones.
 
     Raises:
-        RtcpError: `refused`; reasons too_many_points, unknown_joint, missing_joint, wrong_count.
+        RtcpError: `refused`; reasons too_many_points, unknown_joint, missing_joint, wrong_count, not_finite.
     """
     if len(trajectory.points) > MOST_POINTS:
         raise refusal(
@@ -596,6 +705,10 @@ def points_of(
         if len(values) != len(given_names):
             message = f"point {number} has {len(values)} {field_name}, its trajectory names {len(given_names)} joints"
             raise refusal("wrong_count", message)
+        for joint, value in zip(given_names, values, strict=True):
+            if not math.isfinite(value):
+                message = f"point {number}: {field_name} of {joint} has {value}, a finite number is needed"
+                raise refusal("not_finite", message)
         return [default if at is None else float(values[at]) for at, default in zip(place, defaults, strict=True)]
 
     holds, rests = status.commanded_positions if hold_at is None else hold_at, [0.0] * len(names)

@@ -18,16 +18,17 @@ from typing import Any, Final, TypeVar, cast
 
 from kinematics.pose import Pose
 from kinematics.urdf import fixed_axes_rpy, to_urdf
-from rtcp.api import Arrival, AsyncRobot, Progress, RtcpError, State, Stream
+from rtcp.api import Arrival, AsyncRobot, NotRunning, Progress, RtcpError, State, Stream
 from rtcp.api.async_robot import connect_async
 from rtcp.api.cell import CellStream, StepPlan, find_cell, most_telling
 from rtcp.api.feed import Feed
 from rtcp.api.results import result
 from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
-from rtcp.fieldbus.simple_message.messages import RobotMode, TriState
+from rtcp.fieldbus.simple_message.messages import RobotMode, Status, TriState
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.ros.commands import Connect
+from rtcp.ros.processes import ProcessService, ros_name
 from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus, Sink, StatePublisher
 
 T = TypeVar("T")
@@ -137,11 +138,17 @@ class GroupRobot:
         self._arms: dict[str, AsyncRobot] = {}
         self._counts: dict[str, int] = {}
         self._names: tuple[str, ...] = ()
+        self._processes: dict[str, Path] = {}
+        """Runtime directory of each platform of processes."""
+        self._others: dict[str, AsyncRobot] = {}
+        """Connections to those that were reached."""
+        self._reaching = asyncio.Lock()
 
     async def __aenter__(self) -> GroupRobot:
         """Connect to all arms; raises NotRunning."""
         cell = find_cell(directory=self._directory)
         self._names = joint_names(cell)
+        self._processes = {member.name: member.directory for member in cell.processes}
         try:
             for arm in cell.arms:
                 robot = AsyncRobot(self._name, control_socket(arm.directory), disable_when_lost=True)
@@ -155,31 +162,48 @@ class GroupRobot:
     async def __aexit__(self, *_: object) -> None:
         await self._closing.aclose()
 
+    async def member(self, name: str) -> AsyncRobot:
+        """Return the connection to a platform; that to one of processes is made now where there is none.
+
+        Raises:
+            NotRunning: the platform does not run.
+        """
+        if name in self._arms:
+            return self._arms[name]
+        async with self._reaching:
+            robot = self._others.get(name)
+            if robot is None or not robot.is_open:
+                reached = AsyncRobot(self._name, control_socket(self._processes[name]), disable_when_lost=True)
+                robot = self._others[name] = await self._closing.enter_async_context(reached)
+            return robot
+
     @property
     def is_open(self) -> bool:
-        """Whether all connections are open."""
+        """Whether all connections to arms are open."""
         return all(robot.is_open for robot in self._arms.values())
 
     async def status(self) -> GroupStatus:
-        """Return the worst state, and where all joints are commanded."""
+        """Return the worst state, of processes too while no arm moves, and where all joints are commanded."""
         statuses = await self._all(AsyncRobot.status)
         states = {status.state for status in statuses.values()}
+        if not states & {State.MOVING, State.STOPPING}:
+            states |= set((await self._of_processes(AsyncRobot.state)).values())
         state = next(state for state in _WORST if state in states)
         return GroupStatus(
             state, self._names, tuple(q for status in statuses.values() for q in status.commanded_positions)
         )
 
     async def enable(self) -> None:
-        """Enable the arms that are ready."""
-        await self._all(_enable)
+        """Enable the platforms that are ready."""
+        await self._everywhere(_enable)
 
     async def disable(self) -> None:
-        """Stop all arms and remove their torque."""
-        await self._all(AsyncRobot.disable)
+        """Stop all arms and processes, and remove the torque."""
+        await self._everywhere(AsyncRobot.disable)
 
     async def reset(self) -> State:
-        """Leave the faults of all arms; return the worst state that was left."""
-        states = await self._all(AsyncRobot.reset)
+        """Leave the faults of all platforms; return the worst state that was left."""
+        states = await self._everywhere(AsyncRobot.reset)
         return next(state for state in _WORST if state in states.values())
 
     async def set_speed_override(self, fraction: float) -> None:
@@ -197,8 +221,19 @@ class GroupRobot:
         raise RtcpError("invalid", text, "unknown_terminal", {"name": output})
 
     async def halt(self) -> None:
-        """Stop every motion."""
-        await self._all(AsyncRobot.halt)
+        """Stop every motion and every process."""
+        await self._everywhere(AsyncRobot.halt)
+
+    async def at_rest(self) -> GroupStatus:
+        """Stop the motion under way, if any, so that another one replaces it; return the status then.
+
+        Processes go on: only `halt` stops them.
+        """
+        status = await self.status()
+        if status.state in (State.MOVING, State.STOPPING):
+            await self._all(AsyncRobot.halt)
+            status = await self.status()
+        return status
 
     async def run_trajectory(
         self,
@@ -219,20 +254,41 @@ class GroupRobot:
         if any(path_tolerance):
             message = "a path tolerance is not supervised in motions in step: leave it out"
             raise RtcpError("refused", message, "unsupported_tolerance")
-        status = await self.status()
-        if status.state in (State.MOVING, State.STOPPING):
-            await self.halt()
-            status = await self.status()
-        here = status.commanded_positions
+        here = (await self.at_rest()).commanded_positions
         copies = [dict(point) for point in points]
         first = copies[0]
         if first["t"] > 0.0:
             # Every arm begins at time 0 at its present position.
             at_rest: dict[str, Any] = {key: [0.0] * len(here) for key in ("v", "a") if key in first}
             copies.insert(0, {"t": 0.0, "q": list(here), **at_rest})
-        elif max(abs(a - b) for a, b in zip(first["q"], here, strict=True)) <= start_tolerance:
+        else:
+            for name, planned, now in zip(self._names, first["q"], here, strict=True):
+                if abs(planned - now) > start_tolerance:
+                    message = f"point 1: at time 0 s {name} must be where it is, at {now:.4f} rad (within "
+                    message += f"{start_tolerance:g} rad), found {planned:.4f} rad"
+                    raise RtcpError("refused", message, "PlanRefused")
             first["q"] = list(here)
         targets = [{"arm": name, "points": rows} for name, rows in self._by_arm(copies).items()]
+        arrived = await self._run_in_step(targets, progress)
+        positions = tuple(q for arrival in arrived.values() for q in arrival.positions)
+        largest = max(arrival.error for arrival in arrived.values())
+        ends = copies[-1]["q"]
+        for i, (name, allowed) in enumerate(zip(self._names, goal_tolerance, strict=False)):
+            if allowed and abs(positions[i] - ends[i]) > allowed:
+                fields = {"axis": i, "error": abs(positions[i] - ends[i]), "limit": allowed}
+                message = f"{name} is {fields['error']:.4f} rad from its goal, allowed are {allowed:g} rad"
+                raise RtcpError("fault", message, "goal_tolerance_violated", fields)
+        return dataclasses.replace(next(iter(arrived.values())), positions=positions, error=largest)
+
+    async def move_joints(self, q: Numbers) -> None:
+        """Move all joints in step; a motion under way is stopped first. Raises as `Cell.move_joints`."""
+        await self.at_rest()
+        await self._run_in_step([{"arm": name, "q": part} for name, part in split(q, self._counts).items()])
+
+    async def _run_in_step(
+        self, targets: list[dict[str, Any]], progress: Callable[[Progress], None] | None = None
+    ) -> dict[str, Arrival]:
+        """Plan a motion in step and run it; return when all arms are there."""
         robot, asked_ns = next(iter(self._arms.values())), time.monotonic_ns()
         plan = StepPlan.from_json(await robot.command("plan_in_step", targets=targets), asked_ns)
         motion = time.monotonic_ns()
@@ -248,16 +304,7 @@ class GroupRobot:
             fields = plan.fields_of(name, motion)
             return result(Arrival, await self._arms[name].command("run_in_step", report, **fields))
 
-        arrived = await _gather({name: run(name) for name in self._arms})
-        positions = tuple(q for arrival in arrived.values() for q in arrival.positions)
-        largest = max(arrival.error for arrival in arrived.values())
-        ends = copies[-1]["q"]
-        for i, (name, allowed) in enumerate(zip(self._names, goal_tolerance, strict=False)):
-            if allowed and abs(positions[i] - ends[i]) > allowed:
-                fields = {"axis": i, "error": abs(positions[i] - ends[i]), "limit": allowed}
-                message = f"{name} is {fields['error']:.4f} rad from its goal, allowed are {allowed:g} rad"
-                raise RtcpError("fault", message, "goal_tolerance_violated", fields)
-        return dataclasses.replace(next(iter(arrived.values())), positions=positions, error=largest)
+        return await _gather({name: run(name) for name in self._arms})
 
     async def open_stream(self) -> GroupStream:
         """Begin a stream of all joints in step."""
@@ -297,6 +344,29 @@ class GroupRobot:
     async def _all(self, call: Callable[[AsyncRobot], Coroutine[Any, Any, T]]) -> dict[str, T]:
         return await _gather({name: call(robot) for name, robot in self._arms.items()})
 
+    async def _of_processes(self, call: Callable[[AsyncRobot], Coroutine[Any, Any, T]]) -> dict[str, T]:
+        """Call it for the platforms of processes; the result has no value for one that does not run."""
+        return _present(await _gather({name: self._if_running(name, call) for name in self._processes}))
+
+    async def _everywhere(self, call: Callable[[AsyncRobot], Coroutine[Any, Any, T]]) -> dict[str, T]:
+        """Call it for all arms, and for the platforms of processes that run."""
+        calls = {name: self._if_running(name, call) for name in self._processes}
+        return _present(await _gather({**calls, **{name: call(robot) for name, robot in self._arms.items()}}))
+
+    async def _if_running(self, name: str, call: Callable[[AsyncRobot], Coroutine[Any, Any, T]]) -> T | _NotRunning:
+        try:
+            return await call(await self.member(name))
+        except NotRunning:
+            return _NotRunning()
+
+
+class _NotRunning:
+    """In place of the result of a platform that does not run."""
+
+
+def _present(results: Mapping[str, T | _NotRunning]) -> dict[str, T]:
+    return {name: value for name, value in results.items() if not isinstance(value, _NotRunning)}
+
 
 async def _enable(robot: AsyncRobot) -> None:
     if await robot.state() is State.READY:
@@ -321,6 +391,30 @@ async def _gather(calls: Mapping[str, Coroutine[Any, Any, T]]) -> dict[str, T]:
 
 
 # -- states -----------------------------------------------------------------------------------------------------------
+
+
+def merged(statuses: Sequence[RobotStatus] | Sequence[Status]) -> dict[str, Any]:
+    """Return the status of all arms as fields: in motion or in error if one is, motion possible if it is for all."""
+
+    def first_of(field: str, *states: TriState) -> TriState:
+        values = {getattr(status, field) for status in statuses}
+        return next(state for state in states if state in values)
+
+    of_any = {
+        field: first_of(field, TriState.TRUE, TriState.UNKNOWN, TriState.FALSE)
+        for field in ("e_stopped", "in_motion", "in_error")
+    }
+    of_all = {
+        field: first_of(field, TriState.FALSE, TriState.UNKNOWN, TriState.TRUE)
+        for field in ("drives_powered", "motion_possible")
+    }
+    modes = {status.mode for status in statuses}
+    return {
+        **of_any,
+        **of_all,
+        "mode": modes.pop() if len(modes) == 1 else RobotMode.UNKNOWN,
+        "error_code": next((status.error_code for status in statuses if status.error_code), 0),
+    }
 
 
 class GroupStates:
@@ -349,10 +443,14 @@ class GroupStates:
             self._retry_at = time.monotonic() + 1.0
             with contextlib.suppress(RtcpError):
                 cell = find_cell(directory=self._directory)
-                self._parts = [_Part(self, f"{arm.name}_") for arm in cell.arms]
+                self._parts = [_Part(self, arm.name) for arm in cell.arms]
                 self._publishers = [
                     StatePublisher(part, _opens(arm.directory), self._rate_hz, self._name)
                     for part, arm in zip(self._parts, cell.arms, strict=True)
+                ]
+                self._publishers += [
+                    StatePublisher(_Part(self, member.name), _opens(member.directory), self._rate_hz, self._name)
+                    for member in cell.processes
                 ]
                 self._describe(group_urdf(cell))
         if not self._publishers:
@@ -378,40 +476,30 @@ class GroupStates:
         names = tuple(name for of_arm, _ in fresh for name in of_arm)
 
         def joined(field: str) -> tuple[float, ...]:
-            return tuple(number for _, sample in fresh for number in getattr(sample, field))
+            rows = [getattr(sample, field) for _, sample in fresh]
+            return tuple(number for row in rows for number in row) if all(rows) else ()
 
         self._sink.joints(
             names,
             JointSample(newest.stamp_ns, joined("position"), joined("velocity"), joined("effort"), joined("commanded")),
         )
 
-    def status(self) -> None:
-        """Publish the merged status: in motion or in error if any arm is, motion possible if it is for all arms."""
+    def status(self, part: _Part) -> None:
+        """Publish the merged status of the arms: in motion or in error if one is, motion possible if it is for all."""
         statuses = [part.robot for part in self._parts if part.robot is not None]
-        if len(statuses) < len(self._parts):
+        if part not in self._parts or len(statuses) < len(self._parts):
             return
-
-        def any_of(field: str) -> TriState:
-            values = {getattr(status, field) for status in statuses}
-            return next(state for state in (TriState.TRUE, TriState.UNKNOWN, TriState.FALSE) if state in values)
-
-        def all_of(field: str) -> TriState:
-            values = {getattr(status, field) for status in statuses}
-            return next(state for state in (TriState.FALSE, TriState.UNKNOWN, TriState.TRUE) if state in values)
-
-        modes = {status.mode for status in statuses}
         self._sink.status(
             RobotStatus(
-                max(status.stamp_ns for status in statuses), modes.pop() if len(modes) == 1 else RobotMode.UNKNOWN,
-                any_of("e_stopped"), all_of("drives_powered"), all_of("motion_possible"), any_of("in_motion"),
-                any_of("in_error"), next((status.error_code for status in statuses if status.error_code), 0),
-                min(status.speed_override for status in statuses),
+                stamp_ns=max(status.stamp_ns for status in statuses),
+                speed_override=min(status.speed_override for status in statuses),
+                **merged(statuses),
             )
-        )  # fmt: skip
+        )
 
-    def diagnostics(self, diagnostics: Diagnostics, prefix: str) -> None:
-        """Publish the diagnostics of an arm, with its name."""
-        self._sink.diagnostics(dataclasses.replace(diagnostics, message=f"{prefix.rstrip('_')}: {diagnostics.message}"))
+    def diagnostics(self, diagnostics: Diagnostics, member: str) -> None:
+        """Publish the diagnostics of a platform, with its name."""
+        self._sink.diagnostics(dataclasses.replace(diagnostics, message=f"{member}: {diagnostics.message}"))
 
     def channels(self, sample: ChannelSample, prefix: str) -> None:
         """Publish the channels of an arm, its name before those of the slaves."""
@@ -419,12 +507,20 @@ class GroupStates:
         settable = [(prefix + slave, name) for slave, name in sample.settable]
         self._sink.channels(ChannelSample(sample.stamp_ns, values, settable))
 
+    def processes(self, entries: Mapping[str, Diagnostics], member: str) -> None:
+        """Publish the processes of a platform."""
+        self._sink.processes({ros_name(name, member): entry for name, entry in entries.items()})
+
+    def serve(self, services: Sequence[ProcessService], member: str) -> None:
+        """Offer the commands of the processes of a platform."""
+        self._sink.serve([dataclasses.replace(service, member=member) for service in services])
+
 
 class _Part:
-    """Sink of one arm: keeps its newest sample and status, with prefixed names, and notifies the group."""
+    """Sink of one platform: keeps its newest sample and status, with prefixed names, and notifies the group."""
 
-    def __init__(self, group: GroupStates, prefix: str) -> None:
-        self._group, self._prefix = group, prefix
+    def __init__(self, group: GroupStates, member: str) -> None:
+        self._group, self._member = group, member
         self.names: tuple[str, ...] = ()
         self.sample: JointSample | None = None
         self.robot: RobotStatus | None = None
@@ -434,22 +530,30 @@ class _Part:
 
     def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
         """Store a sample."""
-        self.names = tuple(self._prefix + name for name in names)
+        self.names = tuple(f"{self._member}_{name}" for name in names)
         self.sample = sample
         self._group.joints(self)
 
     def status(self, status: RobotStatus) -> None:
         """Store a status."""
         self.robot = status
-        self._group.status()
+        self._group.status(self)
 
     def diagnostics(self, diagnostics: Diagnostics) -> None:
         """Publish diagnostics."""
-        self._group.diagnostics(diagnostics, self._prefix)
+        self._group.diagnostics(diagnostics, self._member)
 
     def channels(self, sample: ChannelSample) -> None:
         """Publish channels."""
-        self._group.channels(sample, self._prefix)
+        self._group.channels(sample, f"{self._member}_")
+
+    def processes(self, entries: Mapping[str, Diagnostics]) -> None:
+        """Publish processes."""
+        self._group.processes(entries, self._member)
+
+    def serve(self, services: Sequence[ProcessService]) -> None:
+        """Offer commands of processes."""
+        self._group.serve(services, self._member)
 
 
 def _opens(directory: Path) -> Callable[[], Feed]:

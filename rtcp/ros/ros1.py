@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Collection, Coroutine, Sequence
+from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -25,6 +25,7 @@ import rosgraph
 import rospy
 from control_msgs.msg import FollowJointTrajectoryAction, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.srv import AddDiagnostics, AddDiagnosticsResponse
 from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from industrial_msgs.msg import RobotStatus as RobotStatusMessage
 from industrial_msgs.srv import CmdJointTrajectory, CmdJointTrajectoryResponse, StopMotion, StopMotionResponse
@@ -40,15 +41,18 @@ from rtcp.api import Replaced, RtcpError
 from rtcp.config.model import ArmConfig
 from rtcp.fieldbus.simple_message.messages import TriState
 from rtcp.ros.commands import (
+    CANCELLED,
     Commander,
     CommandOptions,
     FollowCode,
+    Inbox,
     Tolerance,
     Tolerances,
     Trajectory,
     TrajectoryPoint,
 )
 from rtcp.ros.group import GroupStates, connects
+from rtcp.ros.processes import ProcessService
 from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus, StatePublisher, transforms_of
 
 T = TypeVar("T")
@@ -57,6 +61,8 @@ _STEP_S = 0.005
 _MASTER_S = 1.0
 """Interval between two checks of the master, s."""
 _MASTER_TIMEOUT_S = 2.0
+_SUCCESS, _FAILURE = 1, -1
+"""Values of industrial_msgs/ServiceReturnCode."""
 _CLOSE_S = 2.0
 """Longest wait for the end of the connection; the end of the process ends it too."""
 _END_S = 5.0
@@ -90,8 +96,10 @@ def run(options: NodeOptions) -> None:
     while not (identity := master.identity()):
         if ends.wait(_MASTER_S):
             return
-    # Without disable_signals rospy would install handlers of SIGINT and SIGTERM.
-    rospy.init_node(options.name, argv=[options.name, *options.arguments], disable_signals=True)
+    # Without disable_signals rospy would install handlers of SIGINT and SIGTERM. Without disable_rostime the timers of
+    # actionlib would wait for /clock where use_sim_time is set, and its finished goals would never be forgotten. All
+    # stamps here are the host's.
+    rospy.init_node(options.name, argv=[options.name, *options.arguments], disable_signals=True, disable_rostime=True)
     watch = threading.Thread(target=master.wait_for_another, args=(identity,), daemon=True)
     watch.start()
     commands = Commands(options.commands, options.group)
@@ -169,6 +177,7 @@ class Publications:
         self._tf = rospy.Publisher("/tf", TFMessage, queue_size=100, tcp_nodelay=True)
         self._channels: dict[tuple[str, str], rospy.Publisher | None] = {}
         """None: not yet registered."""
+        self._processes: rospy.Publisher | None = None
 
     def connected(self, config: ArmConfig) -> None:
         """Set robot_description, where the geometry is known and it is not yet set."""
@@ -224,15 +233,30 @@ class Publications:
 
     def diagnostics(self, diagnostics: Diagnostics) -> None:
         """Publish diagnostics."""
-        entry = DiagnosticStatus(
-            level=diagnostics.level,
-            name=f"{rospy.get_name().lstrip('/')}: robot",
-            message=diagnostics.message,
-            values=[KeyValue(*pair) for pair in diagnostics.values],
-        )
+        entry = _entry(f"{rospy.get_name().lstrip('/')}: robot", diagnostics)
         message = DiagnosticArray(status=[entry])
         message.header.stamp = _time(diagnostics.stamp_ns)
         self._diagnostics.publish(message)
+
+    def processes(self, entries: Mapping[str, Diagnostics]) -> None:
+        """Publish processes."""
+        if self._processes is not None:
+            message = DiagnosticArray(status=[_entry(*item) for item in entries.items()])
+            message.header.stamp = _time(max(entry.stamp_ns for entry in entries.values()))
+            self._processes.publish(message)
+
+    def serve(self, services: Sequence[ProcessService]) -> None:
+        """Offer the commands of processes."""
+        threading.Thread(target=self._register_processes, args=(services,), daemon=True).start()
+
+    def _register_processes(self, services: Sequence[ProcessService]) -> None:
+        """Register the topic and the services of processes, as `_register`."""
+        try:
+            if self._processes is None:
+                self._processes = rospy.Publisher("processes", DiagnosticArray, queue_size=10)
+            self._commands.serve(services)
+        except (rospy.ROSException, OSError) as error:
+            rospy.logerr("processes are not served: %s", error)
 
     def channels(self, sample: ChannelSample) -> None:
         """Publish each channel on a separate topic, and subscribe to commands of settable ones."""
@@ -264,17 +288,21 @@ class Commands:
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         self.commander = self._wait(self._make(options, group))
+        self._inbox = Inbox(self._loop, rospy.logerr)
         self._goals: dict[str, tuple[Any, asyncio.Task[None]]] = {}
         """Id of a goal of the action -> its handle and task."""
+        self._services: set[str] = set()
+        """Names of the services of processes."""
         for topic, kind, carry_out in (
             ("joint_path_command", JointTrajectory, lambda m: self.commander.begin_trajectory(_trajectory(m))),
-            ("joint_command", JointTrajectoryPoint, lambda m: self.commander.command_point(_point(m))),
+            ("joint_command", JointTrajectoryPoint, lambda m: self.commander.command_point(_point(m), _publisher(m))),
             ("joint_trajectory", JointTrajectory, lambda m: self.commander.command_joints(_trajectory(m))),
             ("speed_override", Float64, lambda m: self.commander.set_speed_override(m.data)),
         ):
             rospy.Subscriber(topic, kind, self._begin, (topic, carry_out), queue_size=100, tcp_nodelay=True)
         rospy.Service("joint_path_command", CmdJointTrajectory, self._path)
         rospy.Service("stop_motion", StopMotion, self._stop)
+        rospy.Service("robot_stop", Trigger, lambda request: self._trigger(self.commander.stop()))
         rospy.Service("robot_enable", Trigger, lambda request: self._trigger(self.commander.enable()))
         rospy.Service("robot_disable", Trigger, lambda request: self._trigger(self.commander.disable()))
         self._action = actionlib.ActionServer(
@@ -300,6 +328,22 @@ class Commands:
 
         rospy.Subscriber(topic, Float64, self._begin, (topic, carry_out), queue_size=100)
 
+    def serve(self, services: Sequence[ProcessService]) -> None:
+        """Offer the commands of processes, each once."""
+        for service in services:
+            if service.name not in self._services:
+                self._services.add(service.name)
+                self._serve(service)
+
+    def _serve(self, service: ProcessService) -> None:
+        kind, respond = (AddDiagnostics, AddDiagnosticsResponse) if service.has_fields else (Trigger, TriggerResponse)
+
+        def carry_out(request: Any) -> Any:
+            text = getattr(request, "load_namespace", "")
+            return self._trigger(self.commander.command_process(service, text), respond)
+
+        rospy.Service(service.name, kind, carry_out)
+
     def publish_feedback(self, feedback: Any) -> None:
         """Publish the feedback to the clients of the active goals."""
         for handle, _ in list(self._goals.values()):
@@ -315,14 +359,7 @@ class Commands:
     def _begin(self, message: Any, receiver: tuple[str, Callable[[Any], Coroutine[Any, Any, None]]]) -> None:
         """Execute a message in the background; a refusal is logged. `receiver`: topic and function."""
         topic, carry_out = receiver
-
-        async def logged() -> None:
-            try:
-                await carry_out(message)
-            except Exception as error:  # also programming errors, which would be lost otherwise
-                rospy.logerr("%s: %s", topic, error)
-
-        asyncio.run_coroutine_threadsafe(logged(), self._loop)
+        self._inbox.put(topic, carry_out(message))
 
     def _path(self, request: Any) -> Any:
         response = CmdJointTrajectoryResponse()
@@ -334,21 +371,21 @@ class Commands:
         response.code.val = self._served(self.commander.stop())
         return response
 
-    def _served(self, coroutine: Coroutine[Any, Any, None]) -> int:
-        """Return ServiceReturnCode.SUCCESS; a failure raises, since only an error reply contains a reason."""
+    def _served(self, coroutine: Coroutine[Any, Any, object]) -> int:
+        """Return a ServiceReturnCode; the response has no field for the reason of a FAILURE, which is logged."""
         try:
             self._wait(coroutine)
         except RtcpError as error:
             rospy.logerr("%s", error)
-            raise rospy.ServiceException(str(error)) from None
-        return 1
+            return _FAILURE
+        return _SUCCESS
 
-    def _trigger(self, coroutine: Coroutine[Any, Any, str]) -> Any:
+    def _trigger(self, coroutine: Coroutine[Any, Any, str], respond: Callable[..., Any] = TriggerResponse) -> Any:
         try:
-            return TriggerResponse(True, self._wait(coroutine))
+            return respond(True, self._wait(coroutine))
         except RtcpError as error:
             rospy.logerr("%s", error)
-            return TriggerResponse(False, str(error))
+            return respond(False, str(error))
 
     # -- the action ---------------------------------------------------------------------------------------------------
 
@@ -387,11 +424,11 @@ class Commands:
 
         try:
             code, text = await self.commander.follow(_trajectory(goal.trajectory), tolerances, accept)
-        except asyncio.CancelledError:
-            handle.set_canceled(result, "cancelled: the arm brakes")
-            return
-        except Replaced as error:
-            handle.set_canceled(result, str(error))
+        except (asyncio.CancelledError, Replaced) as error:
+            code, text = CANCELLED
+            text = str(error) or text
+            result.error_code, result.error_string = int(code), text
+            handle.set_canceled(result, text)
             return
         except Exception as error:  # the action has no code for it; a goal always ends with a result
             code, text = FollowCode.INVALID_GOAL, str(error)
@@ -415,8 +452,17 @@ def _point(message: Any) -> TrajectoryPoint:
     )
 
 
+def _publisher(message: Any) -> str:
+    return str(message._connection_header["callerid"])
+
+
 def _tolerances(messages: Any) -> tuple[Tolerance, ...]:
     return tuple(Tolerance(entry.name, entry.position, entry.velocity, entry.acceleration) for entry in messages)
+
+
+def _entry(name: str, diagnostics: Diagnostics) -> Any:
+    values = [KeyValue(*pair) for pair in diagnostics.values]
+    return DiagnosticStatus(level=diagnostics.level, name=name, message=diagnostics.message, values=values)
 
 
 def _time(stamp_ns: int) -> Any:

@@ -1,13 +1,21 @@
-"""Latency of commands of a ROS 1 client until their frame is sent, on the running platform.
+"""Latency of commands of a ROS 1 client, on the running platform: until their frame is sent, and until the arm moves.
 
-`python -m rtcp.ros.ros1_latency PROBES` runs a master, a node and, by itself again, a client: processes as a user's. It
-prints JSON: s from the call of rospy to the frame, for `topic` joint_command and `service` joint_path_command. The arm
-is enabled, at rest, and nobody commands it; it stays where it is.
+Each runs a master, a node and, by itself again, a client: processes as a user's. The arm is enabled, at rest, and
+nobody commands it.
+
+- `python -m rtcp.ros.ros1_latency probe COUNT` prints JSON: s from the call of rospy to the frame, for `topic`
+  joint_command and `service` joint_path_command. The arm stays where it is.
+- `python -m rtcp.ros.ros1_latency sine FOLDER RATE_HZ AMPLITUDE_RAD PERIOD_S PERIODS` publishes a sine of the first
+  joint as joint_command. A program beside it logs the topics into the files of `LOGGED`. It prints their time 0 on
+  CLOCK_MONOTONIC, s.
+- `python -m rtcp.ros.ros1_latency log FOLDER` is this program: it logs until its standard input ends. It needs a
+  running master, and works beside any publisher of joint_command.
 """
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import itertools
 import json
 import os
@@ -15,7 +23,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from math import cos, tau
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,9 +40,12 @@ _STEP_RAD, _MOVE_S = 1e-5, 0.1
 _LONGEST_S = 180.0
 _PAUSE_S = 2.0
 """Pause that ends a stream, s."""
+LOGGED = ("joint_command", "joint_states")
+"""Topics of the log, each in a file TOPIC.csv: time since the first message of any of them, s, then the positions, rad,
+under the names of the joints."""
 
 
-def _measure(probes: str) -> str:
+def _measure(arguments: Sequence[str]) -> str:
     """Return what the client prints; exit with one sentence where ROS 1 is missing or the client fails."""
     if problem := ros1_messages.missing():
         raise SystemExit(problem)
@@ -46,7 +59,7 @@ def _measure(probes: str) -> str:
             begun = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             running.callback(begun.wait)
             running.callback(begun.terminate)
-        client = [sys.executable, "-m", "rtcp.ros.ros1_latency", probes, "client"]
+        client = [sys.executable, "-m", "rtcp.ros.ros1_latency", "client", *arguments]
         try:
             process = subprocess.run(
                 client, env=environment, capture_output=True, text=True, check=False, timeout=_LONGEST_S
@@ -92,7 +105,9 @@ def _probe(count: int) -> dict[str, list[float]]:
             begun = np.flatnonzero(np.diff(has_begun(records).astype(int)) == 1) + 1
             # The outputs of a cycle leave at the beginning of the next one.
             if begun.size and begun[0] + 1 < len(records):
-                seconds.append(1e-9 * float(records["time_ns"][begun[0] + 1] - sent_ns))
+                passed_ns = int(records["time_ns"][begun[0] + 1]) - sent_ns
+                if passed_ns > 0:  # else the command before came only now
+                    seconds.append(1e-9 * passed_ns)
         return seconds
 
     def moves(records: Any) -> Any:
@@ -106,5 +121,79 @@ def _probe(count: int) -> dict[str, list[float]]:
     return by_kind
 
 
+def _sine(folder: str, rate_hz: float, amplitude: float, period_s: float, periods: int) -> float:
+    """Publish the sine while another process logs it; return time 0 of the log, CLOCK_MONOTONIC, s."""
+    ros1_messages.make_importable()
+    import rospy
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectoryPoint
+
+    rospy.init_node("sine", anonymous=True)
+    publisher = rospy.Publisher("joint_command", JointTrajectoryPoint, queue_size=10, tcp_nodelay=True)
+    base = list(rospy.wait_for_message("joint_states", JointState).position)
+    command = [sys.executable, "-m", "rtcp.ros.ros1_latency", "log", folder]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as log:
+        assert log.stdin is not None
+        assert log.stdout is not None
+        while publisher.get_num_connections() < len(("the node", "the log")):
+            if log.poll() is not None:
+                raise SystemExit("the log has ended")
+            time.sleep(0.05)
+        begun, number = time.monotonic(), 0
+        while (now := time.monotonic() - begun) < periods * period_s:
+            q = base[0] + amplitude * (1.0 - cos(tau * now / period_s))
+            publisher.publish(JointTrajectoryPoint(positions=[q, *base[1:]]))
+            # A missed tick is skipped: commands are never sent in a burst.
+            number = max(number + 1, int((time.monotonic() - begun) * rate_hz))
+            time.sleep(max(0.0, begun + number / rate_hz - time.monotonic()))
+        publisher.publish(JointTrajectoryPoint(positions=base))
+        time.sleep(_PAUSE_S)
+        log.stdin.close()
+        return float(log.stdout.read())
+
+
+def _log(folder: str) -> float:
+    """Log until standard input ends; return time 0 of the files, CLOCK_MONOTONIC, s."""
+    ros1_messages.make_importable()
+    import rospy
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectoryPoint
+
+    rows: dict[str, list[tuple[float, Sequence[float]]]] = {topic: [] for topic in LOGGED}
+    names: list[str] = []
+
+    def note(message: Any, topic: str) -> None:
+        if topic == "joint_command":
+            rows[topic].append((time.monotonic(), message.positions))
+        else:
+            names[:] = message.name
+            rows[topic].append((time.monotonic(), message.position))
+
+    rospy.init_node("latency_log", anonymous=True)
+    for topic, kind in zip(LOGGED, (JointTrajectoryPoint, JointState), strict=True):
+        rospy.Subscriber(topic, kind, note, topic, queue_size=1000, tcp_nodelay=True)
+    sys.stdin.read()
+    began = min((some[0][0] for some in rows.values() if some), default=0.0)
+    for topic, some in rows.items():
+        with (Path(folder) / f"{topic}.csv").open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time_s", *names])
+            writer.writerows([f"{at - began:.6f}", *(f"{q:.9g}" for q in positions)] for at, positions in list(some))
+    return began
+
+
+def _client(kind: str, *arguments: str) -> Any:
+    if kind == "probe":
+        return _probe(int(arguments[0]))
+    folder, rate_hz, amplitude, period_s, periods = arguments
+    return _sine(folder, float(rate_hz), float(amplitude), float(period_s), int(periods))
+
+
 if __name__ == "__main__":
-    print(json.dumps(_probe(int(sys.argv[1]))) if sys.argv[2:] else _measure(sys.argv[1]))
+    what, *others = sys.argv[1:]
+    if what == "client":
+        print(json.dumps(_client(*others)))
+    elif what == "log":
+        print(_log(*others))
+    else:
+        print(_measure([what, *others]))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from rtcp.ros.commands import FollowCode
+from rtcp.ros.commands import CANCELLED, FollowCode
 from rtcp.ros.ros2_node import ACTION, Commands, Make, time_of
 from rtcp.ros.ros2_types import CANCEL, FOLLOW
 
@@ -88,7 +88,7 @@ class ActionServer:
 
     def _end(self, goal: _Goal, task: asyncio.Task[tuple[FollowCode, str]]) -> None:
         if task.cancelled():
-            goal.state, code, text = GoalState.CANCELED, FollowCode.SUCCESSFUL, "cancelled: the arm brakes"
+            goal.state, (code, text) = GoalState.CANCELED, CANCELLED
         else:
             code, text = task.result()
             goal.state = GoalState.SUCCEEDED if code is FollowCode.SUCCESSFUL else GoalState.ABORTED

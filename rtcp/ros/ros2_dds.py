@@ -23,6 +23,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+from rtcp.ros.processes import ProcessService
 from rtcp.ros.ros2_node import DEPTH, IN, LATCHED, OUT, Commands, Ros2Options
 from rtcp.ros.ros2_types import Family, Field, dds_type, fields_of, type_hash
 
@@ -106,6 +107,9 @@ class DdsWire:
 
     def publish_feedback(self, feedback: Any) -> None:
         """See `Wire`: there are no goals."""
+
+    def serve(self, service: ProcessService) -> None:
+        """See `Wire`: there are no services."""
 
     def close(self) -> None:
         """Stop reading."""

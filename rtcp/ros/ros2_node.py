@@ -28,6 +28,7 @@ from rtcp.ros.commands import (
     CommandOptions,
     Connect,
     FollowCode,
+    Inbox,
     Tolerance,
     Tolerances,
     Trajectory,
@@ -35,7 +36,8 @@ from rtcp.ros.commands import (
     refusal,
 )
 from rtcp.ros.group import GroupStates, connects
-from rtcp.ros.ros2_types import CANCEL, FOLLOW, GROUP_VALUES, PATH_COMMAND, STOP_MOTION, TRIGGER
+from rtcp.ros.processes import ProcessService
+from rtcp.ros.ros2_types import CANCEL, FOLLOW, GROUP_VALUES, PATH_COMMAND, STOP_MOTION, TRIGGER, WITH_TEXT
 from rtcp.ros.state import ChannelSample, Diagnostics, JointSample, RobotStatus, StatePublisher
 
 Make = Callable[..., Any]
@@ -50,6 +52,7 @@ OUT: Mapping[str, str] = {
     "feedback_states": _FEEDBACK,
     "robot_status": "industrial_msgs/msg/RobotStatus",
     "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "processes": "diagnostic_msgs/msg/DiagnosticArray",
     "tf": "tf2_msgs/msg/TFMessage",
     "robot_description": "std_msgs/msg/String",
     "speed_override_state": "std_msgs/msg/Float64",
@@ -67,6 +70,7 @@ IN: Mapping[str, str] = {
 SERVICES: Mapping[str, str] = {
     "joint_path_command": PATH_COMMAND,
     "stop_motion": STOP_MOTION,
+    "robot_stop": TRIGGER,
     "robot_enable": TRIGGER,
     "robot_disable": TRIGGER,
 }
@@ -127,6 +131,9 @@ class Wire(Protocol):
     def publish_feedback(self, feedback: Any) -> None:
         """Publish the feedback to the clients of the active goals."""
 
+    def serve(self, service: ProcessService) -> None:
+        """Offer the command of a process, where the wire has services; `Commands.respond` executes it."""
+
 
 class Commands:
     """Executes incoming messages on an event loop in a separate thread, called by a wire's threads.
@@ -149,6 +156,7 @@ class Commands:
             return Commander(to_platform, options.commands, _LOG.error)
 
         self.commander = self.submit(commander()).result()
+        self._inbox = Inbox(self.loop, _LOG.error)
 
     def __enter__(self) -> Commands:
         return self
@@ -166,10 +174,10 @@ class Commands:
         """Run it on the loop."""
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop)
 
-    def receive(self, topic: str, message: Any) -> None:
-        """Execute a message on a topic of `IN` in the background; a refusal is logged."""
+    def receive(self, topic: str, message: Any, sender: str = "") -> None:
+        """Execute a message on a topic of `IN` in the background; a refusal is logged. `sender`: its publisher."""
         if topic == "joint_command":
-            command = self.commander.command_point(point_of(message))
+            command = self.commander.command_point(point_of(message), sender)
         elif topic == "joint_trajectory":
             command = self.commander.command_joints(trajectory_of(message))
         elif topic == "speed_override":
@@ -178,33 +186,28 @@ class Commands:
             command = self.commander.set_outputs(outputs_of(message))
         else:
             command = self.commander.begin_trajectory(trajectory_of(message))
+        self._inbox.put(topic, command)
 
-        async def logged() -> None:
-            try:
-                await command
-            except Exception as error:  # also programming errors, which would be lost otherwise
-                _LOG.error("%s: %s", topic, error)
-
-        self.submit(logged())
-
-    async def respond(self, make: Make, service: str, request: Any) -> Any:
-        """Execute a service of `SERVICES` and return its response."""
-        kind = SERVICES[service]
+    async def respond(self, make: Make, service: str | ProcessService, request: Any) -> Any:
+        """Execute a service of `SERVICES` or of a process, and return its response."""
+        kind = kind_of(service) if isinstance(service, ProcessService) else SERVICES[service]
         commander = self.commander
         has_succeeded, text = True, ""
         try:
-            if service == "robot_enable":
+            if isinstance(service, ProcessService):
+                text = await commander.command_process(service, getattr(request, "load_namespace", ""))
+            elif service == "robot_enable":
                 text = await commander.enable()
             elif service == "robot_disable":
                 text = await commander.disable()
-            elif service == "stop_motion":
-                await commander.stop()
+            elif service in ("stop_motion", "robot_stop"):
+                text = await commander.stop()
             else:
                 await commander.begin_trajectory(trajectory_of(request.trajectory))
         except Exception as error:  # without a response the client would wait for ever
-            _LOG.error("%s: %s", service, error)
+            _LOG.error("%s: %s", service if isinstance(service, str) else service.name, error)
             has_succeeded, text = False, str(error)
-        if kind == TRIGGER:
+        if kind in (TRIGGER, WITH_TEXT):
             return make(f"{kind}_Response", success=has_succeeded, message=text)
         # These responses have no field for the reason, and ROS 2 has no error reply: the reason is logged.
         code = make("industrial_msgs/msg/ServiceReturnCode", val=1 if has_succeeded else -1)
@@ -236,6 +239,7 @@ class Publications:
     def __init__(self, wire: Wire, name: str, note_stop: Callable[[], None]) -> None:
         self._wire, self._make = wire, wire.make
         self._name, self._note_stop = name, note_stop
+        self._served: set[ProcessService] = set()
         self._models: Sequence[ArmModel] = ()
 
     def connected(self, config: ArmConfig) -> None:
@@ -299,15 +303,31 @@ class Publications:
 
     def diagnostics(self, diagnostics: Diagnostics) -> None:
         """Publish diagnostics."""
+        entry = self._entry(f"{self._name}: robot", diagnostics)
+        self._publish("diagnostics", header=self._header(diagnostics.stamp_ns), status=[entry])
+
+    def processes(self, entries: Mapping[str, Diagnostics]) -> None:
+        """Publish processes."""
+        stamp_ns = max(entry.stamp_ns for entry in entries.values())
+        status = [self._entry(name, entry) for name, entry in entries.items()]
+        self._publish("processes", header=self._header(stamp_ns), status=status)
+
+    def serve(self, services: Sequence[ProcessService]) -> None:
+        """Offer the commands of processes."""
+        for service in services:
+            if service not in self._served:
+                self._served.add(service)
+                self._wire.serve(service)
+
+    def _entry(self, name: str, diagnostics: Diagnostics) -> Any:
         make = self._make
-        entry = make(
+        return make(
             "diagnostic_msgs/msg/DiagnosticStatus",
             level=diagnostics.level,
-            name=f"{self._name}: robot",
+            name=name,
             message=diagnostics.message,
             values=[make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in diagnostics.values],
         )
-        self._publish("diagnostics", header=self._header(diagnostics.stamp_ns), status=[entry])
 
     def channels(self, sample: ChannelSample) -> None:
         """Publish gpio_states."""
@@ -371,6 +391,11 @@ def run(options: Ros2Options, open_wire: OpenWire) -> None:
         while not ends.is_set():
             publisher.step(_STEP_S)
         publisher.close()
+
+
+def kind_of(service: ProcessService) -> str:
+    """Return the type of a process' service."""
+    return WITH_TEXT if service.has_fields else TRIGGER
 
 
 def time_of(make: Make, stamp_ns: int) -> Any:

@@ -7,30 +7,36 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import importlib
 import logging
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import rclpy
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rosidl_runtime_py.utilities import get_interface
 
-from rtcp.ros.commands import FollowCode
-from rtcp.ros.ros2_node import ACTION, DEPTH, IN, LATCHED, OUT, SERVICES, Commands, Ros2Options
+from rtcp.ros.commands import CANCELLED, FollowCode
+from rtcp.ros.processes import ProcessService
+from rtcp.ros.ros2_node import ACTION, DEPTH, IN, LATCHED, OUT, SERVICES, Commands, Ros2Options, kind_of
 from rtcp.ros.ros2_types import FOLLOW
 
 _THREADS = 8
 """Number of threads: each goal or service in progress occupies one."""
 _POLL_S = 0.01
 """Polling interval of a goal's cancellation, s."""
+_SPIN_S = 0.1
+"""Longest time until the executor notices that the node ends, s."""
 _SUBSCRIPTION_QOS = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Quality of service of subscriptions: it also matches reliable writers."""
+_LIMITS = "limits."
+"""Prefix of the parameters that are limits: `limits.box.max.z`."""
 _LOG = logging.getLogger("rtcp.ros")
 
 
@@ -42,7 +48,7 @@ def class_of(name: str) -> Any:
     """
     package, folder, last = name.split("/")
     base, _, part = last.partition("_")
-    message_class = get_interface(f"{package}/{folder}/{base}")
+    message_class = getattr(importlib.import_module(f"{package}.{folder}"), base)
     return getattr(message_class, part) if part else message_class
 
 
@@ -62,16 +68,27 @@ def open_wire(options: Ros2Options, commands: Commands, ends: threading.Event) -
         domain_id=options.domain,
         signal_handler_options=SignalHandlerOptions.NO,
     )
-    node = rclpy.create_node(options.name, namespace=options.namespace or None)
+    # A limit is a parameter from the moment on at which it is set.
+    node = rclpy.create_node(options.name, namespace=options.namespace or None, allow_undeclared_parameters=True)
     executor = MultiThreadedExecutor(_THREADS)
+    ended = threading.Event()
+
+    def spin() -> None:
+        while not ended.is_set():
+            executor.spin_once(_SPIN_S)
+
+    spinning = threading.Thread(target=spin, daemon=True)
     try:
         wire = RclpyWire(node, commands)
         executor.add_node(node)
-        spinning = threading.Thread(target=executor.spin, daemon=True)
         spinning.start()
         yield wire
+        wire.close()
+        # Before the shutdown: the executor fails if it waits while it is shut down.
+        ended.set()
+        spinning.join()
     finally:
-        executor.shutdown()
+        executor.shutdown()  # waits for the goals in progress
         node.destroy_node()
         rclpy.shutdown()
 
@@ -82,9 +99,10 @@ class RclpyWire:
     make = staticmethod(make)
 
     def __init__(self, node: Any, commands: Commands) -> None:
-        self._commands = commands
+        self.node, self._commands = node, commands
         self._goals: dict[bytes, Any] = {}
-        group = {"callback_group": ReentrantCallbackGroup()}
+        self._is_closing = False
+        self._group = group = {"callback_group": ReentrantCallbackGroup()}
         self._publishers = {
             topic: node.create_publisher(class_of(kind), topic, _qos(topic)) for topic, kind in _known(OUT).items()
         }
@@ -92,8 +110,9 @@ class RclpyWire:
         for topic, kind in _known(IN).items():
             receive = partial(commands.receive, topic)
             node.create_subscription(class_of(kind), topic, receive, _SUBSCRIPTION_QOS, **group)
-        for service, kind in _known(SERVICES).items():
-            node.create_service(class_of(kind), service, partial(self._respond, service), **group)
+        for service, kind in SERVICES.items():
+            self._serve(service, kind, service)
+        node.add_on_set_parameters_callback(self._set_limits)
         if _known({ACTION: FOLLOW}):
             self._action = ActionServer(
                 node,
@@ -113,7 +132,30 @@ class RclpyWire:
         for goal in list(self._goals.values()):
             goal.publish_feedback(feedback)
 
-    def _respond(self, service: str, request: Any, response: Any) -> Any:
+    def serve(self, service: ProcessService) -> None:
+        """See `Wire`."""
+        self._serve(service.name, kind_of(service), service)
+
+    def _serve(self, name: str, kind: str, service: str | ProcessService) -> None:
+        if _known({name: kind}):
+            self.node.create_service(class_of(kind), name, partial(self._respond, service), **self._group)
+
+    def close(self) -> None:
+        """End the goals in progress: the arm brakes."""
+        self._is_closing = True
+
+    def _set_limits(self, parameters: Sequence[Any]) -> Any:
+        """Narrow the limits among parameters that are set; all or none."""
+        limits = {each.name.removeprefix(_LIMITS): each.value for each in parameters if each.name.startswith(_LIMITS)}
+        try:
+            if limits:
+                self._commands.submit(self._commands.commander.set_limits(limits)).result()
+        except Exception as error:  # the answer has the reason, whatever it is
+            _LOG.error("parameters %s: %s", ", ".join(limits), error)
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _respond(self, service: str | ProcessService, request: Any, response: Any) -> Any:
         return self._commands.submit(self._commands.respond(make, service, request)).result()
 
     def _execute(self, goal: Any) -> Any:
@@ -122,12 +164,15 @@ class RclpyWire:
         self._goals[key] = goal
         while not following.done():
             concurrent.futures.wait([following], _POLL_S)
-            if goal.is_cancel_requested:
+            if goal.is_cancel_requested or self._is_closing:
                 following.cancel()
         del self._goals[key]
-        if following.cancelled():
+        if following.cancelled() and goal.is_cancel_requested:
             goal.canceled()
-            code, text = FollowCode.SUCCESSFUL, "cancelled: the arm brakes"
+            code, text = CANCELLED
+        elif following.cancelled():
+            goal.abort()
+            code, text = FollowCode.INVALID_GOAL, "the node ends: the arm brakes"
         else:
             code, text = following.result()
             (goal.succeed if code is FollowCode.SUCCESSFUL else goal.abort)()

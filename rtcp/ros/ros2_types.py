@@ -39,6 +39,8 @@ FOLLOW = "control_msgs/action/FollowJointTrajectory"
 GROUP_VALUES = "control_msgs/msg/DynamicInterfaceGroupValues"
 CANCEL = "action_msgs/srv/CancelGoal"
 TRIGGER = "std_srvs/srv/Trigger"
+WITH_TEXT = "diagnostic_msgs/srv/AddDiagnostics"
+"""Service of a process' command that has fields: a text, answered as a Trigger is (`rtcp.ros.processes`)."""
 STOP_MOTION = "industrial_msgs/srv/StopMotion"
 PATH_COMMAND = "industrial_msgs/srv/CmdJointTrajectory"
 
@@ -100,6 +102,7 @@ _MESSAGES = {
 }
 _SERVICES = {
     TRIGGER: ("", "bool success\nstring message"),
+    WITH_TEXT: ("string load_namespace", "bool success\nstring message"),
     STOP_MOTION: ("", "industrial_msgs/ServiceReturnCode code"),
     PATH_COMMAND: ("trajectory_msgs/JointTrajectory trajectory", "industrial_msgs/ServiceReturnCode code"),
     CANCEL: ("action_msgs/GoalInfo goal_info", "int8 return_code\naction_msgs/GoalInfo[] goals_canceling"),

@@ -21,6 +21,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
+from rtcp.ros.processes import ProcessService
 from rtcp.ros.ros2_action import ActionServer
 from rtcp.ros.ros2_node import (
     ACTION_SERVICES,
@@ -34,6 +35,7 @@ from rtcp.ros.ros2_node import (
     Commands,
     OpenWire,
     Ros2Options,
+    kind_of,
 )
 from rtcp.ros.ros2_types import dds_type, decode, encode, make, type_hash
 
@@ -102,7 +104,6 @@ class ZenohWire:
     def __init__(self, session: zenoh.Session, options: Ros2Options, commands: Commands) -> None:
         self._session, self._options, self._commands = session, options, commands
         self._entities = itertools.count(1)
-        self._numbers = itertools.count(1)
         self._space = f"/{options.namespace}".replace("/", "%")
         self._prefix = f"@ros2_lv/{options.domain}/{session.info.zid()}/0"
         self._action = ActionServer(commands, make, self.publish)
@@ -120,16 +121,18 @@ class ZenohWire:
 
     def publish(self, topic: str, message: Any) -> None:
         """See `Wire`."""
-        publisher, kind, gid = self._publishers[topic]
-        publisher.put(
-            encode(kind, message), attachment=ATTACHMENT.pack(next(self._numbers), time.time_ns(), len(gid), gid)
-        )
+        publisher, kind, gid, numbers = self._publishers[topic]
+        publisher.put(encode(kind, message), attachment=ATTACHMENT.pack(next(numbers), time.time_ns(), len(gid), gid))
 
     def publish_feedback(self, feedback: Any) -> None:
         """See `Wire`."""
         self._action.publish_feedback(feedback)
 
-    def _publisher(self, topic: str, kind: str) -> tuple[Any, str, bytes]:
+    def serve(self, service: ProcessService) -> None:
+        """See `Wire`."""
+        self._serve(service.name, kind_of(service), partial(self._commands.respond, make, service))
+
+    def _publisher(self, topic: str, kind: str) -> tuple[Any, str, bytes, itertools.count[int]]:
         key = key_of(self._options.domain, self._options.resolved(topic), kind)
         publisher: Any
         if topic in LATCHED:
@@ -137,7 +140,7 @@ class ZenohWire:
             publisher = zenoh.ext.declare_advanced_publisher(self._session, key, cache=cache, publisher_detection=True)
         else:
             publisher = self._session.declare_publisher(key)
-        return publisher, kind, self._announce(_PUBLISHER, topic, kind)
+        return publisher, kind, self._announce(_PUBLISHER, topic, kind), itertools.count(1)
 
     def _subscribe(self, topic: str, kind: str) -> None:
         def receive(sample: zenoh.Sample) -> None:
@@ -146,7 +149,9 @@ class ZenohWire:
             except ValueError as error:
                 _LOG.error("%s: %s", topic, error)
                 return
-            self._commands.receive(topic, message)
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            sender = f"the publisher {attachment[-16:].hex()}" if len(attachment) == ATTACHMENT.size else ""
+            self._commands.receive(topic, message, sender)
 
         self._declared.append(
             self._session.declare_subscriber(key_of(self._options.domain, self._options.resolved(topic), kind), receive)

@@ -6,12 +6,11 @@ cycles in which every slave answered; in the others the record repeats older val
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
-
-import numpy as np
 
 from kinematics.forward import frames
 from kinematics.model import ArmModel
@@ -21,6 +20,7 @@ from rtcp.api import ControlMode, NotRunning, State
 from rtcp.api.feed import Feed, Records
 from rtcp.fieldbus.simple_message.messages import RobotMode, TriState
 from rtcp.motion.planning.interpolation import Quaternion, quaternion
+from rtcp.ros.processes import ProcessService, services_of
 
 TOOL_FRAME = "tool0_controller"
 """Frame of the tool, named as by other drivers; `tool0` is a fixed child of the URDF's last link."""
@@ -30,13 +30,13 @@ _SECOND_NS = 1_000_000_000
 _STATUS_NS = _SECOND_NS // 10
 """Longest interval between two statuses, beside one at each change, and interval of the channels' samples, ns."""
 _DIAGNOSTICS_NS = _SECOND_NS
-_STALE_NS = _SECOND_NS // 2
-"""Age above which a record, or a measured value in one, is stale, ns: far beyond the stalls of a busy host."""
-_AT_REST = 0.01
-"""Measured speed below which a joint stands, rad/s: drives report some counts of noise."""
-_CHANGES = ("state", "flags", "control_mode", "fault", "limit", "speed_override")
+_STALE_NS = round(api.RobotStatus.STALE_S * 1e9)
+"""Age above which a record, or a measured value in one, is stale, ns."""
+_CHANGES = (
+    "state", "flags", "control_mode", "fault", "limit", "speed_override", "drives_powered", "e_stopped",
+    "operating_mode",
+)  # fmt: skip
 _IN_ERROR = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING)
-_AT_REST_STATES = (State.READY, State.ENABLING, State.HOLDING, State.STOPPED_BY_LIMIT)
 _TAKES_MOTIONS = (ControlMode.JOINT, ControlMode.CARTESIAN)
 
 Numbers = tuple[float, ...]
@@ -50,9 +50,9 @@ class JointSample:
     position: Numbers
     """Actual, rad."""
     velocity: Numbers
-    """Actual, rad/s."""
+    """Actual, rad/s; empty where the drives send none."""
     effort: Numbers
-    """Actual, Nm."""
+    """Actual, Nm; empty where the drives send none."""
     commanded: Numbers
     """Commanded position, rad."""
     tool: int = 0
@@ -92,7 +92,8 @@ class ChannelSample:
 
     stamp_ns: int
     values: Mapping[str, Mapping[str, float]]
-    """In the unit of the device's file; a level is 0 or 1."""
+    """In the unit of the device's file; a level is 0 or 1. What is not measured, as a force without a sensor, is left
+    out."""
     settable: Collection[tuple[str, str]] = ()
     """Slave and name of those that a command may set."""
 
@@ -115,6 +116,12 @@ class Sink(Protocol):
     def channels(self, sample: ChannelSample) -> None:
         """Publish the channels."""
 
+    def processes(self, entries: Mapping[str, Diagnostics]) -> None:
+        """Publish an entry for each process, by its name: the message is its state, the values are its fields."""
+
+    def serve(self, services: Sequence[ProcessService]) -> None:
+        """Offer the commands of the processes of a platform that was reached; those of before stay."""
+
 
 def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: bool = False) -> RobotStatus:
     """Return the status that a cycle record shows.
@@ -125,30 +132,23 @@ def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: boo
         stamp_ns: its instant, CLOCK_REALTIME.
         is_held_by_others: whether another commander holds the lease, so that a motion would be refused.
     """
-    status, state = api.RobotStatus.of_record(record), State(record["state"])
-    is_fresh = age_ns < _STALE_NS
-    # A drive that was last seen without torque does not get it back while no frame reaches it.
-    powered = TriState.UNKNOWN if status.drives_powered and not is_fresh else TriState(status.drives_powered)
-    if status.in_motion:
-        in_motion = TriState.TRUE
-    elif state in _AT_REST_STATES or (not is_fresh and powered is TriState.FALSE):
-        in_motion = TriState.FALSE
-    elif is_fresh:  # in a fault or an emergency stop the arm may still decelerate
-        in_motion = TriState(bool(np.abs(record["actual_velocity"]).max(initial=0.0) > _AT_REST))
-    else:
-        in_motion = TriState.UNKNOWN
-    takes_motions = int(record["control_mode"]) in _TAKES_MOTIONS and is_fresh and not is_held_by_others
+    status = api.RobotStatus.of_record(record, age_ns * 1e-9)
+    takes_motions = int(record["control_mode"]) in _TAKES_MOTIONS and not is_held_by_others
     return RobotStatus(
         stamp_ns,
-        RobotMode.MANUAL if status.mode == "manual" else RobotMode.AUTO,
-        TriState(status.e_stopped),
-        powered,
+        RobotMode.UNKNOWN if status.mode is None else RobotMode[status.mode.upper()],
+        _tri_state(status.e_stopped),
+        _tri_state(status.drives_powered),
         TriState(status.motion_possible and takes_motions),
-        in_motion,
+        _tri_state(status.in_motion),
         TriState(status.in_error),
         status.error_code,
         float(record["speed_override"]),
     )
+
+
+def _tri_state(value: bool | None) -> TriState:
+    return TriState.UNKNOWN if value is None else TriState(value)
 
 
 def transforms_of(arm: ArmModel, q: Numbers, has_links: bool) -> dict[str, tuple[Vector, Quaternion]]:
@@ -181,6 +181,7 @@ class StatePublisher:
         self._sink, self._open, self._name = sink, open_feed, name
         self._period_ns = round(_SECOND_NS / rate_hz)
         self._names: tuple[str, ...] = ()
+        self._measures_velocity = self._measures_effort = True
         self._feed: Feed | None = None
         self._why = ""
         """Reason for the missing feed."""
@@ -194,8 +195,10 @@ class StatePublisher:
         """Cycle of the last sample, CLOCK_MONOTONIC."""
         self._last: Any = None
         """Newest record; None: none yet."""
+        self._changes: tuple[str, ...] = _CHANGES
+        """Fields of which each change is published at once: also the states of processes."""
         self._level: tuple[float, ...] = ()
-        """Its fields `_CHANGES`."""
+        """Its fields `_changes`."""
 
     def step(self, wait_s: float) -> None:
         """Wait for new records, and publish what is due."""
@@ -230,7 +233,13 @@ class StatePublisher:
             return
         self._last, self._level, self._measured_ns, self._joints_ns, self._channels_ns = None, (), 0, 0, 0
         self._feed, self._names = feed, tuple(joint.name for joint in feed.config.joints)
+        names = {process.name for process in feed.config.processes if process.STATES is not None}
+        states = [field.name for field in feed.schema.fields if field.part in names and field.local_name == "state"]
+        self._changes = (*_CHANGES, *states)
+        self._measures_velocity, self._measures_effort = map(feed.config.measures, ("velocity", "torque"))
         self._sink.connected(feed.config)
+        if feed.config.processes:
+            self._sink.serve(services_of(feed.config))
 
     def _disconnect(self, why: str) -> None:
         self.close()
@@ -240,17 +249,17 @@ class StatePublisher:
         """Publish the samples that are due and each change of the status."""
         ahead_ns, half_cycle = _ahead_ns(), feed.period_ns // 2
         is_whole = records["wkc"] == records["wkc_expected"]
-        levels = zip(*(records[name].tolist() for name in _CHANGES), strict=True)
+        levels = zip(*(records[name].tolist() for name in self._changes), strict=True)
         for at, (instant, whole, level) in enumerate(
             zip(records["time_ns"].tolist(), is_whole.tolist(), levels, strict=True)
         ):
             if whole:
                 self._measured_ns = instant
-                if instant >= self._joints_ns - half_cycle:
+                if self._names and instant >= self._joints_ns - half_cycle:
                     # One period after this sample was due, so that the rate is kept; after a pause one from now.
                     due = self._joints_ns + self._period_ns
                     self._joints_ns = due if due > instant else instant + self._period_ns
-                    self._sink.joints(self._names, _sample(records[at], instant + ahead_ns))
+                    self._sink.joints(self._names, self._sample(records[at], instant + ahead_ns))
                 if feed.channels and instant >= self._channels_ns:
                     self._channels_ns = instant + _STATUS_NS
                     self._sink.channels(_channels(feed, records[at], instant + ahead_ns))
@@ -259,6 +268,19 @@ class StatePublisher:
                 self._publish_status(feed, records[at], instant, ahead_ns)
         if len(records):
             self._last = records[-1]
+
+    def _sample(self, record: Any, stamp_ns: int) -> JointSample:
+        def numbers(name: str, is_measured: bool = True) -> Numbers:
+            return tuple(record[name].tolist()) if is_measured else ()
+
+        return JointSample(
+            stamp_ns,
+            numbers("actual_position"),
+            numbers("actual_velocity", self._measures_velocity),
+            numbers("actual_torque", self._measures_effort),
+            numbers("commanded_position"),
+            int(record["tool"]),
+        )
 
     def _publish_due(self, now_ns: int) -> None:
         """Publish the status again, and the diagnostics."""
@@ -283,6 +305,8 @@ class StatePublisher:
         is_held = feed.holder not in ("", self._name)
         age_ns = instant - self._measured_ns
         self._sink.status(robot_status(record, age_ns, instant + ahead_ns, is_held))
+        if feed.config.processes:
+            self._sink.processes(_processes(feed, record, instant + ahead_ns))
 
 
 def _ahead_ns() -> int:
@@ -292,25 +316,23 @@ def _ahead_ns() -> int:
     return wall - (before + after) // 2
 
 
-def _sample(record: Any, stamp_ns: int) -> JointSample:
-    def numbers(name: str) -> Numbers:
-        return tuple(record[name].tolist())
-
-    return JointSample(
-        stamp_ns,
-        numbers("actual_position"),
-        numbers("actual_velocity"),
-        numbers("actual_torque"),
-        numbers("commanded_position"),
-        int(record["tool"]),
-    )
-
-
 def _channels(feed: Feed, record: Any, stamp_ns: int) -> ChannelSample:
     values: dict[str, dict[str, float]] = {}
     for item in feed.channels:
-        values.setdefault(item.slave, {})[item.local_name] = float(item.value(record))
+        if not math.isnan(value := float(item.value(record))):
+            values.setdefault(item.slave, {})[item.local_name] = value
     return ChannelSample(stamp_ns, values, [(item.slave, item.local_name) for item in feed.channels if item.settable])
+
+
+def _processes(feed: Feed, record: Any, stamp_ns: int) -> dict[str, Diagnostics]:
+    entries = {}
+    for process in feed.config.processes:
+        fields = [field for field in feed.schema.fields if field.part == process.name]
+        values = {field.local_name: str(record[field.name]) for field in fields}
+        words = "" if process.STATES is None else process.state_in_words(int(values["state"]))
+        level = 2 if State(record["state"]) in _IN_ERROR else 0
+        entries[process.name] = Diagnostics(stamp_ns, level, words, tuple(values.items()))
+    return entries
 
 
 def _diagnostics(feed: Feed, record: Any, ahead_ns: int) -> Diagnostics:

@@ -10,17 +10,17 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rtcp.telemetry.experiments.experiment import RESULT, ExperimentFailed, Result, Row, read_result, shown
 
-_MOST_FOLDERS = 2
+_MOST_FOLDERS = 3
 
 
 def page(folders: Sequence[Path]) -> str:
-    """Return the report on one folder, or on two side by side, as HTML.
+    """Return the report on one folder, or on two or three side by side, as HTML.
 
     Raises:
-        ExperimentFailed: no results, or damaged ones; more than two folders.
+        ExperimentFailed: no results, or damaged ones; more than three folders.
     """
     if not 1 <= len(folders) <= _MOST_FOLDERS:
-        raise ExperimentFailed(f"found {len(folders)} folders, allowed are 1 or {_MOST_FOLDERS}")
+        raise ExperimentFailed(f"found {len(folders)} folders, allowed are 1 to {_MOST_FOLDERS}")
     result_sets = [_results(folder) for folder in folders]
     names = list(dict.fromkeys(name for results in result_sets for name in results))
     sections = []

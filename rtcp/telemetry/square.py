@@ -54,8 +54,8 @@ class Square:
         return [[*corner, *self.rpy] for corner in self.corners[1:]]
 
 
-def place(config: ArmConfig, plane: str) -> Square:
-    """Return a square that the arm can drive, far from singularities, ends of ranges and boxes.
+def place(config: ArmConfig, plane: str, speed: float = SPEED_M_S) -> Square:
+    """Return a square that the arm can drive at `speed`, m/s, far from singularities, ends of ranges and boxes.
 
     Candidates are around configurations with a bent elbow and wrist; each is planned as the platform will plan it.
 
@@ -77,14 +77,14 @@ def place(config: ArmConfig, plane: str) -> Square:
             continue
         stops = [Stop(pose=tuple(pose)) for pose in square.poses]
         try:
-            plan = plan_lines(model, limits, config.cartesian, square.start, stops, speed=SPEED_M_S, zone_at=zone_at)
+            plan = plan_lines(model, limits, config.cartesian, square.start, stops, speed=speed, zone_at=zone_at)
         except PlanRefused:
             continue
         if plan.slowed == 1.0:
             return square
     raise NoSquare(
-        f"no place was found for a square of {SIDE_M:g} m in the plane {plane}: the ranges (joints[].position) and the "
-        "boxes (cartesian) leave no room"
+        f"no place was found for a square of {SIDE_M:g} m in the plane {plane} at {speed:g} m/s: the ranges "
+        "(joints[].position) and the boxes (cartesian) leave no room"
     )
 
 

@@ -23,7 +23,7 @@ from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import parse_emergency
 from rtcp.fieldbus.pdo import layout as image_of
 from rtcp.fieldbus.registers import Steps, finish
-from rtcp.fieldbus.slave_setup import configure_slave, identity_faults
+from rtcp.fieldbus.slave_setup import configure_slave, identity_faults, with_written
 from rtcp.ipc.codes import state_name
 from rtcp.ipc.events import EmergencyMessage
 from rtcp.virtual import coe, protocol
@@ -257,7 +257,7 @@ class InProcessBus:
         virtual = [Slave(device, b"", 0.0, clock_ns, 0, now_ns) for device in devices]
         self.segment = Segment(virtual, now_ns)
         self.slaves = [InProcessSlave(slave, self, position) for position, slave in enumerate(virtual, 1)]
-        self._configs: Sequence[SlaveConfig] = ()
+        self._configs: list[SlaveConfig] = []
         self._period_ns = 0
 
     # -- Bus --------------------------------------------------------------------------------------------------------
@@ -280,12 +280,16 @@ class InProcessBus:
         pysoem_like = [SimpleNamespace(man=who.vendor_id, id=who.product_code, name=who.name) for who, _ in identities]
         if faults := identity_faults(pysoem_like, slaves):
             raise BusError(*faults)
-        self._configs, self._period_ns = slaves, period_ns
+        self._configs, self._period_ns = list(slaves), period_ns
         self.notes = [note for slave in self.slaves for note in self.set_up(slave.position)]
         self.request_state(AlState.SAFEOP)
         if refused := self.wait_for_state(AlState.SAFEOP, 0.0):
             raise BusError(*refused)
         return InProcessData(self)
+
+    def note_written(self, position: int, index: int, sub_index: int, data: bytes) -> None:
+        """Note an SDO that a client has written, for the slave's next set-up."""
+        self._configs[position - 1] = with_written(self._configs[position - 1], index, sub_index, data)
 
     def set_up(self, position: int) -> list[str]:
         """Bring a slave to PRE-OP and configure it; return tolerated deviations. Raises BusError where it refuses."""

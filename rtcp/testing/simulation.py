@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+from rtcp.config.drive_limits import with_limits
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.control.bus_service import BusService
@@ -93,7 +94,7 @@ class Simulation(Closing):
         devices = _devices(config, segment, positions)
         self.bus = InProcessBus(devices, seed, _BEGIN_NS)
         self.bus.segment.arm = make_arm(segment, devices)
-        self.data = self.bus.configure(config.slaves, self.period_ns)
+        self.data = self.bus.configure(with_limits(config), self.period_ns)
         self.models = [device for device in map(self._model, config.joints) if isinstance(device, CubemarsDrive)]
         self.box = next((s.device for s in self.bus.slaves if isinstance(s.device, DiewuIoBox)), None)
         memory = _SHARED_MEMORY if _SHARED_MEMORY.is_dir() else None

@@ -6,6 +6,7 @@ A behaviour gives the device its function; without one it only serves its dictio
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 from rtcp.esi import types
@@ -49,6 +50,8 @@ _WRITE = {"P": Access.WRITE_PREOP, "S": Access.WRITE_SAFEOP, "O": Access.WRITE_O
 _COMPATIBILITY = 0x06040043
 """Abort code: general parameter incompatibility."""
 _MAPPED = Access.RXPDO | Access.TXPDO
+_LAST_INDEX, _MOST_ASSIGNED = 0xFFFF, 0xFF
+"""Highest index of an object, and most entries of a PDO assignment (ETG.1000.6, 5.6.7.4)."""
 
 
 class DescribedDevice(DeviceModel):
@@ -120,8 +123,8 @@ class DescribedDevice(DeviceModel):
     def _define_pdos(self, objects: ObjectDictionary) -> dict[int, Pdo]:
         """Add the mapping object of every PDO and its mapped entries; return the PDOs by the number of this object."""
         numbers: dict[int, Pdo] = {}
-        pdos = [(pdo, Access.RXPDO) for pdo in self.description.rx_pdos]
-        pdos += [(pdo, Access.TXPDO) for pdo in self.description.tx_pdos]
+        pdos = [(pdo, Access.RXPDO) for pdo in self._pdos(outputs=True)]
+        pdos += [(pdo, Access.TXPDO) for pdo in self._pdos(outputs=False)]
         own = frozenset(pdo.index for pdo, _ in pdos)
         for pdo, wanted in pdos:
             if pdo.virtual:
@@ -133,6 +136,21 @@ class DescribedDevice(DeviceModel):
             mapped = [mapping for entry in pdo.entries for mapping in _mappings(objects, entry, wanted, own)]
             self._define_mapping(objects, number, pdo, wanted, mapped)
         return numbers
+
+    def _pdos(self, outputs: bool) -> list[Pdo]:
+        """Return the PDOs of a direction, those of further values of a cycle (OSIndexInc) last."""
+        device = self.description
+        pdos = list(device.rx_pdos if outputs else device.tx_pdos)
+        taken = {pdo.index for pdo in pdos}
+        for pdo in [pdo for pdo in pdos if pdo.sample_increment]:
+            counts = [count for mode in device.dc_modes for index, count in mode.samples if index == pdo.index]
+            for number in range(1, max([pdo.most_samples, *counts])):
+                shift = number * pdo.sample_increment
+                index, entries = pdo.index + number, tuple(_moved(entry, shift) for entry in pdo.entries)
+                if index not in taken and all(entry.index <= _LAST_INDEX for entry in entries):
+                    further = replace(pdo, index=index, entries=entries, sync_manager=None, mandatory=False)
+                    pdos.append(further)
+        return pdos
 
     def _define_mapping(
         self, objects: ObjectDictionary, number: int, pdo: Pdo, wanted: Access, mapped: Sequence[int]
@@ -157,13 +175,17 @@ class DescribedDevice(DeviceModel):
         """Add the PDO assignment of a sync manager, with its rules on mandatory and mutually exclusive PDOs."""
         index = ASSIGN + manager
         outputs = manager in self.roles.outputs
-        pdos = self.description.rx_pdos if outputs else self.description.tx_pdos
+        pdos = self._pdos(outputs)
         own = {number: pdo for number, pdo in numbers.items() if pdo in pdos}
         assigned = self._assignments.get(manager, [])
         wanted = Access.RXPDO if outputs else Access.TXPDO
         described = objects.object(index) if (index, 0) in objects else None
         free = self._writable(described, "pdo_assignment")
-        room = max(len(assigned), len(own) if free else 0, 0 if described is None else described.highest_subindex)
+        # A clock mode may assign a PDO several times.
+        repeated = max((sum(count for _, count in mode.samples) for mode in self.description.dc_modes), default=0)
+        repeated = max(repeated, sum(pdo.most_samples - 1 for pdo in own.values() if not pdo.sample_increment))
+        places = 0 if described is None else described.highest_subindex
+        room = max(len(assigned), min(len(own) + repeated, _MOST_ASSIGNED) if free else 0, places)
         values = [*assigned, *[0] * (room - len(assigned))]
         entries = [Entry(index, n, f"Assigned PDO {n}", DataType.UNSIGNED16, v) for n, v in enumerate(values, 1)]
         assignment = objects.record(index, f"PDO assignment of SM{manager}", entries, code=ObjectCode.ARRAY)
@@ -364,6 +386,10 @@ def _mappings(objects: ObjectDictionary, entry: PdoEntry, wanted: Access, pdos: 
     if target.bit_length != entry.bits:
         objects.mappings[word] = target, entry.bits
     yield word
+
+
+def _moved(entry: PdoEntry, shift: int) -> PdoEntry:
+    return replace(entry, index=entry.index + shift) if entry.index else entry
 
 
 def _mapped_entry(objects: ObjectDictionary, entry: PdoEntry, wanted: Access) -> Entry:

@@ -217,6 +217,13 @@ class DistributedClockUnit:
         """SYNC0 cycle time, ns (0x09A0)."""
         return self._get(Register.DC_SYNC0_CYCLE, 4)
 
+    @property
+    def sync1_pulses(self) -> int:
+        """Number of SYNC0 pulses from one SYNC1 to the next (0x09A4); 1: each has one, or SYNC1 is off."""
+        cycle = self.sync0_cycle
+        active = self._memory[Register.DC_ACTIVATION] & SYNC1
+        return 1 + self._get(Register.DC_SYNC1_CYCLE, 4) // cycle if active and cycle else 1
+
     def latch(self, t: int) -> None:
         """Latch the receive times of the ports and the processing unit, for a write to 0x0900 at `t`."""
         local = self.clock.local(t)

@@ -243,6 +243,11 @@ class Circuit:
         if self._fuse_heat > data.fuse_melting:
             self.faults.add(CircuitFault.FUSE_BLOWN)
 
+    def resample(self) -> tuple[int, int]:
+        """Convert u and i once more within the step, and return the counts."""
+        self._sample()
+        return self.voltage_count, self.current_count
+
     def _sample(self) -> None:
         data, faults = self.data, self.faults
         alternating = self.sampling is Sampling.ALTERNATING

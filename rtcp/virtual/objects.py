@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from typing import Any
@@ -162,7 +162,8 @@ class Entry(Number):
     """
 
     __slots__ = (
-        "access", "bit_length", "data_type", "index", "maximum", "minimum", "name", "on_read", "on_write", "subindex",
+        "access", "bit_length", "data_type", "index", "maximum", "minimum", "name", "on_read", "on_write", "samples",
+        "subindex",
     )  # fmt: skip
 
     def __init__(
@@ -192,6 +193,8 @@ class Entry(Number):
         self.maximum = maximum
         self.on_write = on_write
         self.on_read: ReadHook | None = None
+        self.samples: Sequence[Value] = ()
+        """Values of one cycle, oldest first, where its PDO is assigned several times; empty: each is `value`."""
 
     @property
     def is_float(self) -> bool:

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import repeat
 from typing import NamedTuple
 
 from rtcp.virtual.objects import (
@@ -103,7 +104,7 @@ class PdoImage:
     Later changes of the mapping do not affect it.
     """
 
-    __slots__ = ("_bits", "_struct", "bit_length", "byte_length", "entries")
+    __slots__ = ("_bits", "_numbers", "_struct", "bit_length", "byte_length", "entries")
 
     def __init__(self, fields: Sequence[tuple[Entry | None, int]]) -> None:
         """Lay out `fields`, each an entry (None: a gap) and its number of bits, from bit 0."""
@@ -111,6 +112,14 @@ class PdoImage:
         self.byte_length = (self.bit_length + 7) // 8
         self.entries = tuple(entry for entry, _ in fields if entry is not None)
         self._struct = _compile(fields)
+        # An entry of a PDO that is assigned several times is there as often, each with its number.
+        seen: dict[int, int] = {}
+        numbers = []
+        for used in self.entries:
+            seen[id(used)] = number = seen.get(id(used), -1) + 1
+            numbers.append(number)
+        self._numbers = numbers if any(numbers) else None
+        """None: no entry is there twice."""
         self._bits: list[tuple[Entry, int, int]] = []
         offset = 0
         for entry, bits in fields:
@@ -163,12 +172,16 @@ class PdoImage:
         Raises:
             struct.error: a value out of its type's range, or `target` too short.
         """
-        if self._struct is not None:
+        if self._struct is not None and self._numbers is None:
             self._struct.pack_into(target, offset, *[entry.value for entry in self.entries])
             return
         image = 0
-        for entry, shift, mask in self._bits:
+        for number, (entry, shift, mask) in zip(self._numbers or repeat(0), self._bits):  # noqa: B905
+            newest = entry.value
+            if number < len(entry.samples):
+                entry.value = entry.samples[number]
             image |= (to_bits(entry) & mask) << shift
+            entry.value = newest
         target[offset : offset + self.byte_length] = image.to_bytes(self.byte_length, "little")
 
 

@@ -71,9 +71,13 @@ class Application:
         )
         self._emulated = not self._mailboxes and bool(esc.memory[Register.PDI_CONTROL + 1] & DEVICE_EMULATION)
         """True: no firmware; the controller itself follows every request (ETG.1000.4, 6.1.4)."""
+        self._pulses = 0
+        """SYNC0 pulses since the last SYNC1."""
         self._fed: int | None = None
         self._missing: set[int] = set()
         """Output sync managers not written yet."""
+        self._awaits_outputs = False
+        """Whether it has outputs, which the master has to send in each cycle."""
         self._op_wanted_at: int | None = None
         self._error = False
         self._stepped_at = t
@@ -202,6 +206,7 @@ class Application:
         for data in self._outputs + self._inputs:
             data.image = self.device.image(data.manager.index) or _EMPTY
         self._missing = {data.manager.index for data in self._outputs if data.image.byte_length}
+        self._awaits_outputs = bool(self._outputs and self._outputs[0].image.byte_length)
 
     def _start_process_data(self) -> None:
         self._lay_out()
@@ -292,9 +297,16 @@ class Application:
             self._try_op(t)
 
     def pulse(self, on_time: bool) -> None:
-        """Handle SYNC0: latch the outputs. `on_time`: this process was not late."""
+        """Handle SYNC0: latch the outputs. `on_time`: this process was not late.
+
+        With several conversions a cycle SYNC1 is the cycle, and SYNC0 the conversion: frames are expected by SYNC1.
+        """
         self.latch()
-        if self._level == _OP and self.sync.pulse(on_time):
+        self._pulses += 1
+        if self.esc.dc is not None and self._pulses < self.esc.dc.sync1_pulses:
+            return
+        self._pulses = 0
+        if self._level == _OP and self._awaits_outputs and self.sync.pulse(on_time):
             self.fall(AlState.SAFE_OP, AlStatusCode.SYNC_ERROR)
 
     def latch(self) -> None:

@@ -139,3 +139,74 @@ def test_a_point_is_near_only_if_every_joint_is_a_number_and_near(joint: int) ->
 
     assert (is_near(11.0, 1.0), is_near(9.0, 1.0)) == (True, True)
     assert (is_near(11.5, 1.0), is_near(8.5, 1.0), is_near(nan, 1.0), is_near(10.0, nan)) == (False,) * 4
+
+
+def procedure(module: str, name: str) -> str:
+    """Return the text of a procedure, function or trap of a module."""
+    text = (RAPID / module).read_text(encoding="utf-8")
+    return re.split(r"END(?:PROC|FUNC|TRAP)", text[re.search(rf"(?:PROC|FUNC \w+|TRAP) {name}\b", text).start() :])[0]
+
+
+def test_no_wait_for_a_client_is_without_a_time_limit() -> None:
+    shared = (RAPID / "stream_shared.sys").read_text(encoding="utf-8")
+    for path in STREAMING:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            assert not re.search(r"Socket(Receive|Accept) (?!.*\\Time)", line), line
+    assert "\\Time:=time_limit" in procedure("stream_shared.sys", "receive_bytes")
+    limits = {name: float(re.search(rf"{name} := ([\d.]+);", shared)[1]) for name in ("CLIENT_TIMEOUT", "IDLE_TIMEOUT")}
+    assert 0.0 < limits["CLIENT_TIMEOUT"] < limits["IDLE_TIMEOUT"]
+    assert "silence_limit := CLIENT_TIMEOUT;" in procedure("stream_server.mod", "serve_message")
+    assert "reason = ERR_SOCK_TIMEOUT" in procedure("stream_server.mod", "main")
+    assert "IF ClkRead(silence) > CLIENT_TIMEOUT ExitCycle;" in procedure("stream_state.mod", "main")
+
+
+def test_a_port_that_an_earlier_program_left_open_is_tried_again_until_it_is_free() -> None:
+    bind = procedure("stream_shared.sys", "bind_port")
+    steps = (
+        "ERRNO = ERR_SOCK_ADDR_INUSE",
+        "WaitTime PORT_RETRY;",
+        "SocketCreate server;",
+        "ResetRetryCount;",
+        " RETRY;",
+    )
+    assert sorted(bind.index(step) for step in steps) == [bind.index(step) for step in steps]
+
+
+def test_the_motors_go_off_when_no_client_has_come_and_on_only_in_automatic_mode() -> None:
+    main = procedure("stream_server.mod", "main")
+    assert "accept_client server, client, MOTION_PORT, MOTORS_OFF_TIME;" in main
+    assert re.search(r"AND NOT connected PulseDO .*doOrderMotorsOff;", main)
+    order = procedure("stream_server.mod", "order_motors")
+    assert re.search(r"OpMode\(\) = OP_AUTO AND .*doEmergencyStop\) = 0 THEN\s+PulseDO .*doOrderMotorsOn;", order)
+
+
+def test_the_arms_move_while_the_signal_of_any_unit_says_so() -> None:
+    moving = procedure("stream_state.mod", "moving")
+    for unit in range(1, 5):
+        guard = "" if unit == 1 else rf"UNITS > {unit - 1} AND "
+        assert re.search(rf"IF {guard}DOutput\(doNotMoving{unit}\) = 0 RETURN 1;", moving)
+
+
+def test_a_start_that_the_controller_refuses_stops_no_task() -> None:
+    assert "IF ERRNO = ERR_STARTMOVE TRYNEXT;" in procedure("stream_motion.mod", "forget_queue")
+    stop = procedure("stream_server.mod", "stop_motion")
+    assert "IF ERRNO = ERR_STARTMOVE RETURN;" in stop
+    assert stop.index("StartMove") < stop.index("stop_confirmed := TRUE;")  # skipped then: the next point stops anew
+
+
+def test_coordinated_moves_are_called_by_names_that_the_optional_module_has() -> None:
+    motion, optional = (
+        (RAPID / name).read_text(encoding="utf-8") for name in ("stream_motion.mod", "stream_coordinated.mod")
+    )
+    called = set(re.findall(r'%"(\w+)"%', motion))
+    assert called == names(optional, "PROC") | set(re.findall(r"PROC (\w+)\(", optional))
+    assert "SyncMove" not in motion
+    assert procedure("stream_coordinated.mod", "coordinate").index("SyncMoveUndo;") < optional.index("SyncMoveOn ")
+
+
+def test_every_signal_of_the_modules_is_in_the_table_of_parameters() -> None:
+    table = (RAPID.parent / "config" / "parameters.md").read_text(encoding="utf-8")
+    text = "".join(re.sub(r"!.*", "", path.read_text(encoding="utf-8")) for path in STREAMING)
+    signals = set(re.findall(r"\b(?:do|di|go|gi)[A-Z]\w+", text))
+    listed = set(re.findall(r"`((?:do|di|go|gi)[A-Z]\w+)`", table))
+    assert signals - listed == {"doNotMoving2", "doNotMoving3"}  # between the first and the last, which are listed

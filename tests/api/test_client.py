@@ -141,6 +141,13 @@ def test_what_json_cannot_express_is_not_sent(listener: socket.socket, value: ob
     assert raised.value.kind == "invalid"
 
 
+def test_a_number_that_is_not_finite_is_named_by_its_place(listener: socket.socket) -> None:
+    points = [{"t": 0.0, "q": [0.0, 1.0]}, {"t": 1.0, "q": [0.0, float("nan")]}]
+    with ControlClient() as client, pytest.raises(RtcpError) as raised:
+        client.call("run_trajectory", {"points": points})
+    assert raised.value.message.endswith("as JSON: points[1].q[1] is nan, a finite number is needed")
+
+
 def test_a_connection_that_ends_before_the_answer_is_lost(listener: socket.socket) -> None:
     error = error_of(listener, b'{"id": 1, "ok"')
     assert error.kind == "lost"

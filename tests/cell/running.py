@@ -43,8 +43,8 @@ def shipped_cell(apart_m: float = 1.6) -> str:
     text = (CONFIG / "cell.yaml").read_text()
     for old, new in {
         "silence_s: 0.1": "silence_s: 0.5",
-        "[0, 0.6, 0]": f"[0, {apart_m / 2:g}, 0]",
-        "[0, -0.6, 0]": f"[0, {-apart_m / 2:g}, 0]",
+        "[0, 0.457, 0]": f"[0, {apart_m / 2:g}, 0]",
+        "[0, -0.457, 0]": f"[0, {-apart_m / 2:g}, 0]",
     }.items():
         assert old in text
         text = text.replace(old, new)

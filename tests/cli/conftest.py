@@ -137,7 +137,8 @@ class Platform:
     def __init__(self, directory: Path) -> None:
         self.status = status()
         self.refusals: dict[str, tuple[str, str]] = {}
-        self.answers: dict[str, dict[str, Any]] = {}
+        self.answers: dict[str, dict[str, Any] | Callable[[dict[str, Any]], dict[str, Any]]] = {}
+        """Result of a method, or a function that returns it for the parameters of a request."""
         self.objects: dict[tuple[int, int, int], bytes] = {}
         self.requests: list[tuple[str, dict[str, Any]]] = []
         self.move_steps = 4
@@ -179,17 +180,15 @@ class Platform:
             threading.Thread(target=self._converse, args=(connection,), daemon=True).start()
 
     def _converse(self, connection: socket.socket) -> None:
-        with connection, connection.makefile("rb") as lines:
+        # A client may reset its connection while it is read or answered.
+        with contextlib.suppress(OSError), connection, connection.makefile("rb") as lines:
             for line in lines:
                 request = json.loads(line)
                 if "id" not in request:
                     continue  # the notification `identify`
                 method, params = request["method"], request["params"]
                 self.requests.append((method, params))
-                try:
-                    _send(connection, {"id": request["id"], **self._answer(request["id"], method, params, connection)})
-                except OSError:
-                    return
+                _send(connection, {"id": request["id"], **self._answer(request["id"], method, params, connection)})
 
     def _answer(self, number: int, method: str, params: dict[str, Any], connection: socket.socket) -> dict[str, Any]:
         if method in self.refusals:
@@ -198,7 +197,8 @@ class Platform:
         if method == "status":
             return {"result": self.status}
         if method in self.answers:
-            return {"result": self.answers[method]}
+            answer = self.answers[method]
+            return {"result": answer(params) if callable(answer) else answer}
         if method == "scan":
             return {"result": {"slaves": [SLAVE]}}
         if method == "sdo_read":

@@ -349,3 +349,24 @@ def _array(q: list[float]) -> Any:
     import numpy as np
 
     return np.array(q)
+
+
+# -- range -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_range_of_the_irb_120_is_that_of_its_data_sheet(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'rtcp[plot]'")
+    from rtcp.cli.arm_range import wrist_range
+    from rtcp.config import find_arm
+    from rtcp.config.loader import load_mechanics
+
+    grid = wrist_range(load_mechanics(find_arm("abb_irb120")))
+    # 3HAC035960-001: 580 mm before axis 1; the highest wrist is stretched out above axis 2, at 290 mm.
+    assert grid[:, :, 0].max() == pytest.approx(0.580, abs=1e-3)
+    assert grid[:, :, 1].max() == pytest.approx(0.290 + 0.270 + math.hypot(0.302, 0.070), abs=1e-3)
+
+
+def test_a_picture_of_the_range_is_written(rtcp: Rtcp, tmp_path: Path) -> None:
+    picture = tmp_path / "range.png"
+    rtcp("arm", "range", *IRB, "--facing", "0.914", "--out", str(picture))
+    assert picture.read_bytes().startswith(b"\x89PNG")

@@ -17,12 +17,15 @@ from rtcp.config.loader import load_device
 from rtcp.config.model import PdoEntry
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
+from rtcp.fieldbus.clocks import sync_cycles
 from rtcp.launch import offline
 from tests.drive_esi import write_esi
 from tests.fieldbus.terminals import write_segment
 
 FILES = Path(__file__).parents[1] / "esi" / "files"
-DRIVE, AXES, TERMINALS, ANALOG = (FILES / f"{name}.xml" for name in ("drive", "axes", "terminals", "analog"))
+DRIVE, AXES, TERMINALS, ANALOG, SAMPLING = (
+    FILES / f"{name}.xml" for name in ("drive", "axes", "terminals", "analog", "sampling")
+)
 
 
 def test_a_file_is_listed_with_its_devices_modules_and_what_is_hidden(rtcp: Callable[..., Any]) -> None:
@@ -74,8 +77,13 @@ def test_modules_are_put_into_slots_and_a_wrong_one_is_named_with_those_allowed(
         (("--esi", str(TERMINALS)), "3 devices fit without a choice"),
         (("--esi", str(TERMINALS), "--product", "0x99"), "no devices fit product 0x00000099"),
         (("--esi", str(TERMINALS), "--product", "x"), "'x' is not a whole number (--product)"),
-        (("--esi", str(ANALOG), "--mode", "DC"), "no clock mode 'DC'; there are: FreeRun, DcTimed, DcOversampling"),
-        (("--esi", str(ANALOG), "--mode", "DcOversampling"), "takes several values a cycle, which is not supported"),
+        (
+            ("--esi", str(ANALOG), "--mode", "DC"),
+            "no clock mode 'DC'; there are: FreeRun, DcTimed, DcOversampling, DcOwnObjects",
+        ),
+        (("--esi", str(SAMPLING), "--samples", "4"), "--samples needs --mode"),
+        (("--esi", str(SAMPLING), "--mode", "DcSync", "--samples", "65"), "allowed are 1 to 64 (OSMin, OSMax)"),
+        (("--esi", str(ANALOG), "--mode", "DcTimed", "--samples", "4"), "assigns no PDO of several values a cycle"),
         (("--esi", str(AXES), "--module", "0"), "allowed is SLOT=IDENT"),
         (("--esi", "there-is-none.xml"), "there-is-none.xml: cannot be read"),
         (("--sii", str(DRIVE)), "it is no EEPROM image"),
@@ -118,6 +126,44 @@ def test_a_clock_mode_is_chosen_by_name_with_the_pdos_that_it_assigns(rtcp: Call
     device = load_device(out)
     assert (device.assign_activate, [pdo.index for pdo in device.tpdo]) == (0x0300, [0x1A01])
     assert [pdo.index for pdo in device.rpdo] == [0x1600]
+
+
+def test_a_clock_mode_of_several_values_a_cycle_gives_the_number_of_samples(
+    rtcp: Callable[..., Any], tmp_path: Path
+) -> None:
+    out = tmp_path / "analog.yaml"
+    assert rtcp("device", "new", "--esi", str(ANALOG), "--mode", "DcOversampling", "--out", str(out)).code == 0
+    device = load_device(out)
+    assert [(pdo.index, pdo.samples) for pdo in device.tpdo] == [(0x1A00, 10)]
+    assert [(pdo.index, pdo.samples) for pdo in device.rpdo] == [(0x1600, 1)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "samples", "sync0_factor", "after_ns"),
+    [
+        (("DcSync",), [(0x1B00, 1), (0x1A00, 1), (0x1B01, 1), (0x1A80, 1)], -1, 0),
+        (("DcSync8",), [(0x1B00, 1), (0x1A00, 8), (0x1B01, 1), (0x1A80, 8)], -8, 875_000),
+        (("DcSync5-1",), [(0x1B00, 1), (0x1A00, 5), (0x1B01, 1)], -5, 800_000),
+        (("DcSync", "--samples", "20"), [(0x1B00, 1), (0x1A00, 20), (0x1B01, 1), (0x1A80, 20)], -20, 950_000),
+        (("DcSync5-1", "--samples", "16"), [(0x1B00, 1), (0x1A00, 16), (0x1B01, 1)], -16, 937_500),
+    ],
+)
+def test_values_with_pdos_of_their_own_are_taken_from_the_mode_or_as_many_as_are_wanted(
+    rtcp: Callable[..., Any],
+    tmp_path: Path,
+    arguments: tuple[str, ...],
+    samples: list[tuple[int, int]],
+    sync0_factor: int,
+    after_ns: int,
+) -> None:
+    out = tmp_path / "sampling.yaml"
+    assert rtcp("device", "new", "--esi", str(SAMPLING), "--mode", *arguments, "--out", str(out)).code == 0
+    device = load_device(out)
+    assert [(pdo.index, pdo.samples) for pdo in device.tpdo] == samples
+    assert {pdo.sample_increment for pdo in device.tpdo if pdo.samples > 1} in ({16}, set())
+    assert device.sync0_factor == sync0_factor
+    assert sync_cycles(device, 1_000_000) == (1_000_000 // -sync0_factor, after_ns)
+    assert rtcp("device", "check", str(out)).code == 0
 
 
 def test_the_kind_follows_from_the_default_process_data() -> None:

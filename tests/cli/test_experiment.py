@@ -45,6 +45,7 @@ def test_an_experiment_ends_with_1_where_a_figure_misses_its_aim(
 ) -> None:
     ended = rtcp("experiment", name, "--out", str(tmp_path / "out"))
     assert (ended.code, text in ended.out + ended.trouble) == (code, True)
+    assert "thesis" in ended.out
     assert read_result(tmp_path / "out").met is (code == 0)
 
 
@@ -55,7 +56,7 @@ def test_all_are_carried_out_whatever_fails_and_make_one_page(rtcp: Callable[...
         assert ended.code == 5
         assert "report.html" in ended.out
     page = (tmp_path / "a" / "report.html").read_text()
-    assert all(text in page for text in ("called good", "called bad", "there is no arm"))
+    assert all(text in page for text in ("called good", "called bad", "there is no arm", "<th>thesis</th>"))
     ended = rtcp("report", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "both.html"))
     assert (ended.code, ended.out) == (0, f"report: {tmp_path}/both.html\n")
     assert (tmp_path / "both.html").read_text().count('"number">0.25') >= 2

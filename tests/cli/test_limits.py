@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -19,10 +21,14 @@ def limits(platform: Any) -> dict[str, Any]:
     configured = {name: [value] * JOINTS for name, value in numbers.items()} | {
         "box": {"min": [-1.2, -1.0, -0.4], "max": [0.8, 1.0, 1.4]},
         "keep_out": {"user": {"min": [0.4, -0.3, -0.1], "max": [1.1, 0.3, 0.85]}},
+        "cones": {"cup": {"axis": "z", "direction": [0.0, 0.0, -1.0], "angle": 1.2}},
+        "supervision": {"speed": 1.5, "torque": 1.01, "following_error": 0.15},
     }
     now = copy.deepcopy(configured)
     now["max"][1] = 1.25  # type: ignore[index]
     now["keep_out"]["user"]["max"][2] = 0.95  # type: ignore[index]
+    now["cones"]["cup"]["angle"] = 0.5  # type: ignore[index]
+    now["supervision"]["speed"] = 1.2  # type: ignore[index]
     answer = {
         "joint_names": [f"joint{n}" for n in range(1, JOINTS + 1)],
         "limits": now,
@@ -44,7 +50,8 @@ def test_all_limits_and_boxes_are_shown_and_what_was_changed_is_marked(
     assert "1.25 *" in rows["joint2"]
     assert "*" not in rows["joint1"]
     assert "-0.1 to 0.95 *" in ended.out
-    for text in ("tool inside", "-1.2 to 0.8", "keep out: user", "0.25 m/s", "singularity: wrist", "0.07 rad"):
+    shown = ("tool inside", "-1.2 to 0.8", "keep out: user", "0.25 m/s", "singularity: wrist", "0.07 rad", "0 0 -1")
+    for text in (*shown, "0.5 *", "1.2 * times"):
         assert text in ended.out
     assert max(len(line) for line in ended.out.splitlines()) <= 80
 
@@ -56,7 +63,19 @@ def test_limits_are_shown_as_json(limits: dict[str, Any], rtcp: Callable[..., An
 def test_all_pairs_are_one_transaction(limits: dict[str, Any], platform: Any, rtcp: Callable[..., Any]) -> None:
     ended = rtcp("limits", "set", "joint2.max", "1.25", "box.min.x", "-0.5")
     assert (ended.code, ended.out) == (0, "2 limits are changed until `rtcp stop`\n")
-    assert platform.asked("set_limits") == [{"changes": {"joint2.max": 1.25, "box.min.x": -0.5}}]
+    assert platform.asked("set_limits") == [{"changes": {"joint2.max": 1.25, "box.min.x": -0.5}, "widen": False}]
+
+
+def test_limits_are_widened_once_somebody_has_said_yes(
+    limits: dict[str, Any], platform: Any, rtcp: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    nobody_answers = rtcp("limits", "set", "joint2.max", "2.5", "--widen")
+    assert nobody_answers.code == 2
+    assert "standard input has ended at a question: answer it, or pass --yes" in nobody_answers.trouble
+    assert platform.asked("set_limits") == []
+    assert rtcp("limits", "set", "joint2.max", "2.5", "--widen", "--yes").code == 0
+    assert platform.asked("set_limits") == [{"changes": {"joint2.max": 2.5}, "widen": True}]
 
 
 def test_a_refused_transaction_is_exit_code_3(limits: dict[str, Any], platform: Any, rtcp: Callable[..., Any]) -> None:

@@ -89,7 +89,8 @@ def test_a_runtime_directory_that_cannot_be_made_is_named(
 @pytest.fixture
 def launched(platform: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The processes of a platform that `rtcp start` has started."""
-    monkeypatch.setattr(start, "launch", lambda options: None)
+    platform.started_loop = True
+    monkeypatch.setattr(start, "launch", lambda options: platform)
     platform.status |= {"state": "ready", "message": "all slaves are in OP"}
     return platform
 
@@ -122,6 +123,42 @@ def test_a_start_that_ends_in_a_fault_says_why_and_leaves_the_platform_running(
     assert launched.asked("stop") == []
 
 
+@pytest.mark.parametrize(
+    ("arguments", "state", "started_loop", "asked"),
+    [
+        ((), "ready", True, []),
+        ((), "fault", True, []),
+        (("--enable",), "ready", True, ["enable"]),
+        (("--enable",), "fault", True, ["reset", "enable"]),
+        (("--enable",), "fault", False, []),
+        (("--enable",), "emergency_stop", True, []),
+        (("--enable",), "holding", True, []),
+    ],
+)
+def test_a_start_powers_the_drives_only_where_it_is_told_to_and_never_after_an_emergency_stop(
+    rtcp: Callable[..., Any],
+    launched: Any,
+    arguments: tuple[str, ...],
+    state: str,
+    started_loop: bool,
+    asked: list[str],
+) -> None:
+    launched.status |= {"state": state, "message": "as it is"}
+    launched.started_loop = started_loop
+    rtcp("start", "--detach", *arguments)
+    assert [name for name in ("reset", "enable") for _ in launched.asked(name)] == asked
+
+
+def test_a_start_whose_enabling_is_refused_says_why_and_leaves_the_platform_running(
+    rtcp: Callable[..., Any], launched: Any
+) -> None:
+    launched.refusals["enable"] = ("refused", "the enabling switch is not held")
+    ended = rtcp("start", "--detach", "--enable")
+    assert (ended.code, ended.out) == (5, "")
+    assert ended.trouble == "rtcp: started, but: the enabling switch is not held"
+    assert launched.asked("stop") == []
+
+
 def test_a_start_does_not_wait_for_ever(
     rtcp: Callable[..., Any], launched: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,8 +180,8 @@ def test_a_loop_that_is_given_its_gateway_back_while_it_holds_is_no_failed_start
 def test_a_start_in_the_foreground_shows_what_came_of_it_and_runs_on(
     rtcp: Callable[..., Any], launched: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def serve(options: object, announce: Callable[[], None]) -> int:
-        announce()
+    def serve(options: object, announce: Callable[[object], None]) -> int:
+        announce(launched)
         report("it runs on")
         return 0
 

@@ -107,7 +107,16 @@ def test_the_robot_status_and_the_states_are_reported_in_words(platform: Any, rt
     output = " ".join(rtcp("status").out.split())
     assert "STOPPED BY LIMIT joystick, csp on virtual" in output
     assert "robot manual, drives powered, no motion possible, not in motion, emergency stop, error 107" in output
-    assert "joystick Z-yaw, controls the chair" in output
+
+
+def test_the_joysticks_mode_is_shown_in_every_control_mode_where_there_is_a_joystick(
+    platform: Any, rtcp: Callable[..., Any]
+) -> None:
+    for mode in ("joint", "joystick"):
+        platform.status |= {"control_mode": mode, "joystick": {"mode": "Z-yaw", "controls_arm": False}}
+        assert "joystick Z-yaw, controls the chair" in " ".join(rtcp("status").out.split())
+    platform.status |= {"control_mode": "joint", "joystick": None}
+    assert "joystick" not in rtcp("status").out
 
 
 def test_the_last_messages_are_shown_with_their_local_time(

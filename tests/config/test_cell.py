@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ def written(tmp_path: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("file", ["cell.yaml", "cell_mixed.yaml"])
+@pytest.mark.parametrize("file", ["cell.yaml", "cell_mixed.yaml", "cell_irc5.yaml", "cell_egm.yaml"])
 def test_the_shipped_cells_are_read_and_handed_to_the_loops(file: str) -> None:
     cell = load_cell(CONFIG / file)
     assert len(cell.arms) == 2
@@ -81,3 +82,54 @@ def test_an_arm_that_is_not_in_the_cell_is_named() -> None:
 def test_a_name_that_could_be_another_path_is_none(name: str) -> None:
     assert not is_platform_name(name)
     assert is_platform_name("left_arm-2")
+
+
+# -- several arms at one controller ------------------------------------------------------------------------------------
+
+RAPID = "config: abb_irb120_rapid.yaml"
+EGM = "config: abb_irb120.yaml"
+SHARED = (
+    "name: a\narms: [{{name: left, {0}}}, {{name: right, {1}}}]\ncontrollers: [{{arms: [{2}], segment: two.yaml}}]\n"
+)
+
+
+def shared(folder: Path, *parts: str) -> CellConfig:
+    """Load a cell whose arms are at one controller; the files are beside the shipped ones."""
+    for file in default_config().parent.glob("abb_irb120*.yaml"):
+        (folder / file.name).write_text(file.read_text())
+    path = folder / "cell.yaml"
+    path.write_text(SHARED.format(*parts))
+    return load_cell(path)
+
+
+def test_the_arms_of_a_controller_share_its_virtual_one_and_by_egm_have_a_port_each(tmp_path: Path) -> None:
+    cell = shared(tmp_path, EGM, EGM, "right, left")
+    ports = {arm.name: (arm.config.bus.port, arm.config.bus.segment) for arm in cell.arms}  # type: ignore[attr-defined]
+    assert ports == {"right": (6511, "two.yaml"), "left": (6512, "two.yaml")}
+    units = cell.units_of("left")
+    assert units is not None
+    assert ([member.name for member in units.members], units.index) == (["right", "left"], 1)
+
+
+def test_an_arm_that_no_controller_names_has_one_of_its_own() -> None:
+    assert load_cell(default_config().with_name("cell.yaml")).units_of("left") is None
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ((RAPID, RAPID, "left, other"), 'found the text "other", allowed is one of left, right'),
+        ((RAPID, RAPID, "left, left"), "each needs its own"),
+        ((RAPID, EGM, "left, right"), "found the bus egm virtual, allowed is the kind and the interface of left"),
+    ],
+)
+def test_arms_that_no_controller_can_have_are_named(tmp_path: Path, parts: tuple[str, str, str], words: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        shared(tmp_path, *parts)
+
+
+def test_the_board_belongs_to_the_first_arm(tmp_path: Path) -> None:
+    text = (default_config().parent / "abb_irb120_rapid.yaml").read_text()
+    (tmp_path / "with_board.yaml").write_text(text.replace("  kind: rapid", "  kind: rapid\n  board: dsqc652"))
+    with pytest.raises(ConfigError, match="left, whose platform holds the connection, has the board"):
+        shared(tmp_path, RAPID, "config: with_board.yaml", "left, right")

@@ -291,6 +291,7 @@ def test_on_the_virtual_bus_limits_that_a_slow_host_exceeds_and_nothing_else_are
     assert (widened.bus.lost_cycles, widened.bus.clock_lost_s) == (400, 5.0)
     assert [slave.device.watchdog_ms for slave in widened.slaves] == [1000.0] + [200.0] * 6
     assert sync_error_limits(widened) == [0.0] * 6
+    assert widened.supervision == replace(shipped.supervision, acceleration=10.0 * shipped.supervision.acceleration)
     assert (widened.joints, widened.cycle, widened.lease_s) == (shipped.joints, shipped.cycle, 3.0)
     for slave, before in zip(widened.slaves, shipped.slaves, strict=True):
         others = [entry for entry in slave.device.sdo if entry.index != 0x10F1]

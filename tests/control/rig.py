@@ -379,7 +379,11 @@ def move_to(*target: float, speed: float = SPEED) -> MoveJoints:
 
 
 def turn(rig: LoopRig, axis: int, inertia: float, velocity: float, torque: float) -> None:
-    """Turn a joint against its drive, by a large inertia or an external torque."""
+    """Turn a joint against its drive, by a large inertia or an external torque; the drive may give all its torque."""
+    limits = rig.arm.limits
+    speed, _, error = limits.supervision
+    limits.supervision = (speed, 1.5, error)
+    rig.arm.supervision.take(limits)
     joint = rig.models[axis].mechanics
     joint.inertia, joint.velocity, joint.external_torque = inertia, velocity, torque
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.config.model import AbsoluteLimits, SupervisionConfig
 from rtcp.ipc.commands import (
     ApplyTorque,
     Command,
@@ -22,6 +23,7 @@ from rtcp.ipc.commands import (
     SetDriveMode,
     SetLimits,
 )
+from rtcp.ipc.events import TooHeavyForCst
 from rtcp.ipc.refusals import TorqueLimitTooLow, WeightUnknown
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.limits import rows
@@ -169,10 +171,10 @@ def test_a_torque_motion_that_begins_while_a_joint_turns_is_refused_as_its_weigh
     arm.do(command)
 
 
-@in_mode(drive_mode="csp")
+@in_mode(drive_mode="csp", supervision=SupervisionConfig(torque=1.5))
 def test_a_torque_limit_below_the_weight_permits_no_cst(arm: Simulation) -> None:
     widest, held = arm.loop.arm.limits.widest, abs(arm.loop.arm.state.actual_torque[1])
-    # The supervision of CSP permits more than the limit.
+    # The supervision permits more than the limit.
     limit = 0.9 * held
     new = rows(replace(widest, torque=(widest.torque[0], limit, *widest.torque[2:])))
     arm.do(Disable())
@@ -201,3 +203,71 @@ def test_an_arm_that_its_torque_limits_cannot_hold_is_not_enabled_in_cst(arm: Si
     arm.do(SetLimits(arm.observer.write_plan(new), len(new)))
     assert isinstance(arm.send(Enable()).refusal, TorqueLimitTooLow)
     assert arm.state is State.READY
+
+
+@in_mode(drive_mode="cst")
+def test_an_arm_with_a_load_that_its_torque_limits_cannot_hold_ends_in_a_fault_before_cst(arm: Simulation) -> None:
+    """The model does not know the load: only the drives show it, once they carry it."""
+    widest, weight = arm.loop.arm.limits.widest, abs(arm.loop.arm.state.actual_torque[1])
+    limit = 1.05 * weight
+    new = rows(replace(widest, torque=(widest.torque[0], limit, *widest.torque[2:])))
+    arm.do(Disable())
+    arm.bring_to(State.READY)
+    arm.do(SetLimits(arm.observer.write_plan(new), len(new)))
+    virtual = arm.bus.segment.arm
+    assert virtual is not None
+    virtual.push((0.0, 0.0, -10.0, 0.0, 0.0, 0.0))
+    modes: set[DriveMode] = set()
+    arm.on_frame = lambda frame: modes.add(arm.loop.arm.mode)
+    arm.do(Enable())
+    arm.run(1.0)
+    (event,) = (record.event for record in arm.events if isinstance(record.event, TooHeavyForCst))
+    assert (event.axis, event.limit) == (1, limit)
+    assert event.held > limit
+    assert arm.state is State.FAULT
+    assert modes == {DriveMode.CSP}
+
+
+@in_mode(drive_mode="cst")
+def test_targets_after_a_push_beyond_the_speed_limit_brake_by_the_acceleration_limit(arm: Simulation) -> None:
+    drive, limits = arm.loop.arm.drives[4], arm.loop.arm.limits
+    arm.models[4].mechanics.external_torque = -8.8
+    arm.run(0.06)
+    assert abs(drive.velocity) > limits.velocity[4]
+    arm.send(SetDriveMode(DriveMode.CSP))
+    targets = []
+    for _ in range(round(0.4 / PERIOD_S)):
+        arm.cycle()
+        targets.append(drive.target_position)
+    speeds = [(after - before) / PERIOD_S for before, after in pairwise(targets)]
+    assert max(map(abs, speeds)) <= limits.velocity[4] * 1.001
+    changes = [abs(after - before) / PERIOD_S for before, after in pairwise(speeds)]
+    assert max(changes) <= limits.acceleration[4] * 1.01
+
+
+NARROW, WIDE = 26.0, 49.0
+"""Nm: torque limit of the second joint in the file, and the one to which it can be widened."""
+
+
+@in_mode(
+    drive_mode="cst",
+    joints=tuple(
+        replace(joint, torque=NARROW, absolute=AbsoluteLimits(torque=WIDE)) if i == 1 else joint
+        for i, joint in enumerate(load(default_config()).joints)
+    ),
+)
+def test_a_torque_limit_that_was_widened_is_what_holds_the_arm_in_cst(arm: Simulation) -> None:
+    new = rows(replace(arm.loop.arm.limits.widest, torque=arm.loop.arm.limits.absolute.torque))
+    arm.do(Disable())
+    arm.bring_to(State.READY)
+    arm.do(SetLimits(arm.observer.write_plan(new), len(new), widen=True))
+    virtual = arm.bus.segment.arm
+    assert virtual is not None
+    virtual.push((0.0, 0.0, -20.0, 0.0, 0.0, 0.0))
+    before = arm.models[1].mechanics.position
+    arm.do(Enable())
+    arm.bring_to(State.HOLDING)
+    arm.run(1.0)
+    assert abs(arm.loop.arm.state.actual_torque[1]) > NARROW
+    assert arm.models[1].mechanics.position == pytest.approx(before, abs=0.005)
+    assert arm.state is State.HOLDING

@@ -168,6 +168,19 @@ def test_the_record_of_a_cycle_has_what_its_drive_measures_and_is_sent(hand: Han
     assert values[-1] == "behind"
 
 
+def test_its_lost_commander_is_waited_for_from_the_loss_on_however_long_the_arm_has_held(
+    with_hand: Callable[..., Hand],
+) -> None:
+    hand = with_hand(replace(CONFIG, stops=replace(CONFIG.stops, power_off_after_s=1.0)))
+    hand.run(2.0)
+    hand.on_its_way()
+    hand.acquire()
+    hand.run(0.9)
+    assert hand.reports_of(events.LeaseExpired)
+    assert hand.state is State.HOLDING
+    assert hand.until(lambda: hand.state is State.DISABLING, 0.2)
+
+
 def test_without_the_lease_it_does_not_begin(hand: Hand) -> None:
     assert hand.send(MoveGripper(False), lease=hand.lease + 1).refusal == NoLease()
     hand.run(0.2)
@@ -425,7 +438,8 @@ def test_its_following_error_is_supervised_but_not_that_of_what_it_holds(hand: H
 def test_too_fast_while_the_loop_closes_it_is_stopped_by_the_drives(hand: Hand) -> None:
     hand.on_its_way()
     hand.send(Shutdown())
-    hand.model.mechanics.external_torque = -60.0
+    # The loop notices it before the limit inside the drive.
+    hand.model.mechanics.external_torque = -22.0
     assert hand.until(lambda: bool(hand.reports_of(events.OverSpeed)), 1.0)
     hand.run(0.01)
     assert hand.controlwords == {0x0002}

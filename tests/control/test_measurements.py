@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
+from math import pi
+from random import Random
 
 import pytest
 
+from rtcp.control.cycle import make_drives
+from rtcp.control.measurements import Measurements
 from rtcp.ipc.commands import SetDriveMode
-from rtcp.ipc.events import DriveModeTimeout, PositionJumped, VelocityJumped
-from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.events import DriveModeTimeout, FaultEvent, PositionJumped, VelocityDisagrees, VelocityJumped
+from rtcp.ipc.states import DriveMode, DriveState, State
 
 from .rig import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, LoopRig, about
 
@@ -27,6 +32,7 @@ FALSE: dict[str, tuple[int, Falsify]] = {
     "a position of 0": (POSITION, lambda counts: 0),
     "a speed of 0": (VELOCITY, lambda counts: 0),
     "a speed of 5 rad/s": (VELOCITY, lambda counts: 50000),
+    "a speed 0.2 rad/s lower": (VELOCITY, lambda counts: counts - 2000),
     "a torque of 40 Nm": (TORQUE, lambda counts: 400000),
     "mode 0": (MODE, lambda counts: 0),
     "mode 10 or 9": (MODE, lambda counts: CST if counts != CST else CSV),
@@ -147,6 +153,66 @@ def test_samples_that_stay_false_are_a_fault_that_names_joint_sample_and_bound(
         assert found == DriveModeTimeout(1, 0, DriveMode(mode))
 
 
+@MODES
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize(("value", "stuck"), [(POSITION, True), (VELOCITY, True), (VELOCITY, False)])
+def test_a_value_that_is_stuck_or_has_a_wrong_factor_is_a_fault_although_each_sample_is_possible(
+    rig: LoopRig, mode: int, direction: int, value: int, stuck: bool
+) -> None:
+    rig.hold(mode)
+    shown: list[int] = []
+
+    def change(counts: int) -> int:
+        shown.append(counts)
+        return shown[0] if stuck else -counts
+
+    falsify(rig, value, change, axis=1)
+    rig.move(direction * 1.8, direction * 1.8)
+    rig.run(0.6)
+    found = rig.last_of(VelocityDisagrees)
+    allowed = (CONFIG.supervision.velocity_gap * CONFIG.joints[1].velocity + 1.0 / COUNTS) * 0.1
+    assert (found.axis, found.allowed) == (1, about(allowed))
+    assert found.gap == about(found.allowed, rel=0.1)
+    assert rig.state is State.FAULT
+
+
+def event_of(
+    period_s: float, speed: float, shown: Callable[[float], float], *, count: float, velocity_count: float = 0.0
+) -> FaultEvent | None:
+    """Turn a joint for 2 s, whose drive shows its velocity as `shown` and its position in counts; return its fault."""
+    config = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=period_s * 1e6))
+    (_, drive), *_ = make_drives(config)
+    drive.resolution, drive.velocity_resolution = count, velocity_count
+    drive.mode, drive.state = CSP, DriveState.OPERATION_ENABLED
+    measurements = Measurements(config, 0)
+    position = velocity = 0.0
+    for k in range(round(2.0 / period_s)):
+        drive.mode_display = CSP
+        drive.position, drive.velocity = round(speed * k * period_s / count) * count, shown(speed)
+        measurements.begin(1 + round(k * period_s * 1e9))
+        measurements.check(0, drive, position, velocity, 0.0)
+        if measurements.event is not None:
+            return measurements.event
+        position, velocity = drive.position, drive.velocity
+    return None
+
+
+def test_the_noise_of_a_measured_velocity_is_no_fault() -> None:
+    random = Random(1)
+    assert event_of(0.0005, 0.3, lambda speed: random.gauss(speed, 0.03), count=6e-6) is None
+
+
+@pytest.mark.parametrize("period_s", [0.0005, 0.02, 0.05, 0.1])
+def test_a_velocity_that_is_stuck_is_found_in_every_cycle_time(period_s: float) -> None:
+    assert isinstance(event_of(period_s, 0.3, lambda speed: 0.0, count=1e-4), VelocityDisagrees)
+
+
+def test_a_velocity_in_coarse_counts_is_no_fault() -> None:
+    rpm = pi / 30
+    assert event_of(0.0005, 0.3, lambda speed: speed // rpm * rpm, count=1e-4, velocity_count=rpm) is None
+    assert event_of(0.0005, 0.3, lambda speed: speed // (3 * rpm) * 3 * rpm, count=1e-4) is not None
+
+
 def test_a_velocity_that_is_computed_from_positions_forgets_a_false_position(rig: LoopRig) -> None:
     rig.set_in_motion()
     drive = rig.arm.drives[0]
@@ -158,6 +224,15 @@ def test_a_velocity_that_is_computed_from_positions_forgets_a_false_position(rig
     for _ in range(40):
         rig.cycle()
         assert rig.arm.state.actual_velocity[0] == about(SPEED, rel=0.05)
+
+
+def test_a_torque_that_no_drive_gives_is_never_used(rig: LoopRig) -> None:
+    rig.hold(CST)
+    before = rig.arm.state.actual_torque[0]
+    falsify(rig, TORQUE, lambda counts: abs(counts) - (1 << 31))
+    rig.run(3 * CYCLES * PERIOD_S)
+    assert rig.arm.state.actual_torque[0] == about(before, abs=0.5)
+    assert rig.state is State.HOLDING
 
 
 def test_a_false_torque_is_not_taken_for_the_weight(rig: LoopRig) -> None:

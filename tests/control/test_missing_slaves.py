@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
+from rtcp.control.context import good_for_lost
 from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.commands import Reset
 from rtcp.ipc.events import EmergencyStopActivated, ProcessDataLost
 from rtcp.ipc.states import State
 
-from .rig import CSP, CST, CSV, EMERGENCY_STOP_INPUT, LOST_CYCLES, PERIOD_S, VOLTAGE_OFF, LoopRig
+from .rig import CONFIG, CSP, CST, CSV, EMERGENCY_STOP_INPUT, LOST_CYCLES, PERIOD_S, VOLTAGE_OFF, LoopRig
 
 BOX, FIRST, SECOND = 0, 1, 2
 
@@ -123,3 +125,13 @@ def test_what_was_lost_before_a_reset_does_not_count_after_it(rig: LoopRig) -> N
     rig.lose_frames()
     rig.run((LOST_CYCLES - 2) * PERIOD_S)
     assert rig.state is State.READY
+
+
+@pytest.mark.parametrize(
+    ("interface", "scale", "good"), [("virtual", 100.0, 1), ("virtual", 1.0, 10), ("eth0", 100.0, 10)]
+)
+def test_only_on_the_virtual_bus_with_wider_timeouts_a_good_cycle_makes_up_for_a_lost_one(
+    interface: str, scale: float, good: int
+) -> None:
+    bus = replace(CONFIG.bus, interface=interface, timeout_scale=scale)
+    assert good_for_lost(replace(CONFIG, bus=bus)) == good

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from math import nan
+from math import nan, pi
 from unittest.mock import ANY
 
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.config.model import AbsoluteLimits, Cone
 from rtcp.control.arm import Arm
 from rtcp.ipc import refusals
 from rtcp.ipc.commands import Disable, SetLimits
-from rtcp.ipc.events import LimitsChanged, OverSpeed
+from rtcp.ipc.events import EnabledInBox, FollowingError, LimitsChanged, OverSpeed, OverTorque
+from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Answer
+from rtcp.ipc.schema import FIRST_CONE
 from rtcp.ipc.states import State
+from rtcp.motion.guards.zones import reported
 from rtcp.motion.limits import Values, rows
 from rtcp.motion.state import ArmState
 
-from .rig import CONFIG, COUNTS, PERIOD_S, LoopRig, about, move_to
+from .rig import CONFIG, COUNTS, CST, PERIOD_S, LoopRig, about, move_to
 
 WIDEST = Values.configured(CONFIG)
 
@@ -35,11 +40,7 @@ def send_limits(rig: LoopRig, new: Values) -> Answer:
 
 
 def in_force(rig: LoopRig) -> Values:
-    limits = rig.arm.limits
-    return Values(
-        tuple(limits.low), tuple(limits.high), tuple(limits.velocity), tuple(limits.acceleration), tuple(limits.jerk),
-        tuple(limits.torque), limits.box, limits.keep_out,
-    )  # fmt: skip
+    return rig.arm.limits.now
 
 
 @pytest.mark.parametrize("state", [State.READY, State.HOLDING, State.MOVING, State.FAULT, State.EMERGENCY_STOP])
@@ -105,6 +106,56 @@ def test_what_is_measured_is_compared_with_them_too(rig: LoopRig) -> None:
     watched.actual_velocity[0] = CONFIG.supervision.speed * 0.1 + 0.01
     seen = [rig.arm.supervision.check(watched) for _ in range(CONFIG.supervision.cycles)]
     assert seen[-1] == OverSpeed(0, watched.actual_velocity[0], CONFIG.supervision.speed * 0.1)
+
+
+def test_the_thresholds_of_what_is_measured_change_with_them(rig: LoopRig) -> None:
+    rig.hold()
+    assert send_limits(rig, replace(WIDEST, supervision=(1.1, *WIDEST.supervision[1:]))).refusal is None
+    watched = ArmState(len(CONFIG.joints))
+    watched.actual_velocity[0] = 1.2 * CONFIG.joints[0].velocity
+    seen = [rig.arm.supervision.check(watched) for _ in range(CONFIG.supervision.cycles)]
+    assert seen[-1] == OverSpeed(0, watched.actual_velocity[0], about(1.1 * CONFIG.joints[0].velocity))
+    refusal = send_limits(rig, replace(WIDEST, supervision=(1.7, *WIDEST.supervision[1:]))).refusal
+    assert refusal == refusals.LimitWidened(-2, 1.7, CONFIG.supervision.speed)
+
+
+def test_limits_are_widened_on_purpose_without_torque_and_the_drives_follow(new_rig: Callable[..., LoopRig]) -> None:
+    fast = replace(CONFIG.joints[0], absolute=AbsoluteLimits(velocity=0.8))
+    rig = new_rig(replace(CONFIG, joints=(fast, *CONFIG.joints[1:])))
+    plan = rows(of_first("velocity", 0.8))
+
+    def widen(plan: list[list[float]]) -> refusals.Refusal | None:
+        return rig.send(SetLimits(rig.observer.write_plan(plan), len(plan), True)).refusal
+
+    rig.hold()
+    assert widen(plan) == refusals.TorquePresent()
+    rig.send(Disable())
+    rig.bring_to(State.READY)
+    assert send_limits(rig, of_first("velocity", 0.8)).refusal == refusals.LimitWidened(0, 0.8, 0.5)
+    assert widen(rows(of_first("velocity", 0.9))) == refusals.LimitWidened(0, 0.9, 0.8)
+    assert widen(plan) is None
+    assert rig.arm.drives[0].speed_limit == 0.8
+    rig.hold()
+    rig.log.clear()
+    rig.move(1.5, 0.0, speed=0.8)
+    rig.bring_to(State.HOLDING)
+    assert rig.longest_step(0) > 0.75 * PERIOD_S * COUNTS
+    # What was widened stays when something else is narrowed.
+    assert send_limits(rig, replace(in_force(rig), jerk=tuple(0.5 * jerk for jerk in WIDEST.jerk))).refusal is None
+    assert in_force(rig).velocity[0] == 0.8
+
+
+def test_an_arm_that_is_enabled_outside_a_cone_is_told_by_how_much() -> None:
+    arm = standing_arm()
+    z = [arm.trajectory_guard.poses[6].rotation[2 + 3 * row] for row in range(3)]
+    cone = Cone("cup", (z[1], -z[0], 0.0), 1.0)
+    config = load(default_config())
+    config = replace(config, cartesian=replace(config.cartesian, cones=(cone,)))
+    arm = Arm(config, [], lambda slot: memoryview(b"").cast("d"))
+    distance, zone = arm.trajectory_guard.nearest_box([0.3, -0.5, 1.2, 0.2, 0.7, -0.4])
+    assert (zone, reported(zone, -distance)) == (FIRST_CONE, about(pi / 2 - 1.0))
+    message = Names(config).message(EnabledInBox(zone, reported(zone, -distance)))
+    assert message.startswith("the arm stands 0.570796 rad beyond the bounds of the cone cup (cartesian.cones[0] in")
 
 
 def test_a_move_under_way_that_leads_beyond_the_new_limit_is_stopped_before_it(rig: LoopRig) -> None:
@@ -175,14 +226,18 @@ def test_a_keep_out_box_that_the_arm_stands_in_is_refused(name: str) -> None:
     assert arm.trajectory_guard.refusal_of(arm.state, new) == refusals.LimitsExcludeArm(which)
 
 
-@pytest.fixture
-def loaded(rig: LoopRig) -> LoopRig:
+def leaned_on(rig: LoopRig) -> LoopRig:
     """Somebody leans on the first joint: its drive holds 5 Nm."""
     rig.hold()
     rig.models[0].mechanics.external_torque = 5.0
     rig.run(0.5)
     assert abs(rig.arm.state.actual_torque[0]) == pytest.approx(5.0, abs=WIDEST.torque[0] * 0.05)
     return rig
+
+
+@pytest.fixture
+def loaded(rig: LoopRig) -> LoopRig:
+    return leaned_on(rig)
 
 
 def test_less_torque_than_a_joint_holds_is_refused_and_nothing_changes(loaded: LoopRig) -> None:
@@ -192,18 +247,46 @@ def test_less_torque_than_a_joint_holds_is_refused_and_nothing_changes(loaded: L
     assert LimitsChanged not in loaded.kinds
 
 
+def test_a_threshold_below_what_is_measured_is_refused_and_nothing_changes(rig: LoopRig) -> None:
+    rig.hold(CST)
+    rig.models[0].mechanics.external_torque = 5.0
+    rig.run(0.1)
+    error = abs(rig.arm.samples.actual[0] - rig.arm.samples.commanded[0])
+    assert error > 1e-3
+    lower = replace(WIDEST, supervision=(*WIDEST.supervision[:2], 1e-3))
+    refusal = send_limits(rig, lower).refusal
+    assert isinstance(refusal, refusals.ThresholdTooLow)
+    assert (refusal.axis, refusal.quantity, refusal.limit) == (0, 2, 1e-3)
+    assert in_force(rig) == WIDEST
+
+
 def test_less_torque_that_is_still_more_than_a_joint_holds_is_taken(loaded: LoopRig) -> None:
     new = of_first("torque", 10.0)
     assert send_limits(loaded, new).refusal is None
     assert in_force(loaded) == new
 
 
-def test_a_torque_that_is_not_lowered_is_no_matter_whatever_is_held(loaded: LoopRig) -> None:
-    assert send_limits(loaded, of_first("torque", 10.0)).refusal is None
+def test_a_torque_that_is_not_lowered_is_no_matter_whatever_is_held(new_rig: Callable[..., LoopRig]) -> None:
+    config = replace(CONFIG, supervision=replace(CONFIG.supervision, torque=1.5))
+    loaded, lower = leaned_on(new_rig(config)), of_first("torque", 10.0)
+    lower = replace(lower, supervision=Values.configured(config).supervision)
+    assert send_limits(loaded, lower).refusal is None
     loaded.models[0].mechanics.external_torque = 12.0
     loaded.run(0.3)
     assert abs(loaded.arm.state.actual_torque[0]) > 10.0
-    assert send_limits(loaded, replace(of_first("torque", 10.0), velocity=(0.2, 0.2))).refusal is None
+    assert send_limits(loaded, replace(lower, velocity=(0.2, 0.2))).refusal is None
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_joint_that_is_pushed_beyond_its_torque_limit_ends_in_pre_op_by_its_torque(rig: LoopRig, axis: int) -> None:
+    rig.hold()
+    # Almost all that the drive gives: the joint stands still.
+    rig.models[axis].mechanics.external_torque = 49.9 - rig.arm.state.actual_torque[axis]
+    rig.bring_to(State.EMERGENCY_STOP)
+    (torque,) = [record.event for record in rig.events if isinstance(record.event, OverTorque)]
+    assert torque.axis == axis
+    assert WIDEST.torque[axis] < abs(torque.value) <= 50.0
+    assert not {OverSpeed, FollowingError} & set(rig.kinds)
 
 
 def test_without_torque_any_torque_limit_is_taken(loaded: LoopRig) -> None:

@@ -11,6 +11,7 @@ from rtcp.config.model import SettleConfig
 from rtcp.ipc.events import Arrived, NotSettled, Stopped
 from rtcp.ipc.states import State
 from tests.control.rig import CONFIG, CSP, CST, CSV, LoopRig
+from tests.control.test_measurements import FALSE, falsify
 
 TARGET = (0.1234567, -0.2345678)
 """Between two counts of the drives."""
@@ -59,3 +60,20 @@ def test_a_motion_that_follows_while_the_joints_settle_replaces_it(new_rig: Call
     motions = rig.machine.motions
     rig.move(*TARGET)
     assert (rig.state, rig.machine.motions, rig.arm.still) == (State.MOVING, motions + 1, False)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_motion_is_not_complete_by_a_position_that_was_replaced(new_rig: Callable[..., LoopRig], axis: int) -> None:
+    rig = new_rig(CONFIG).hold()
+    rig.move(*TARGET)
+    cycles = round(rig.wait(lambda: rig.state is State.HOLDING) / rig.context.period_s)
+    rig = new_rig(CONFIG).hold()
+    rig.move(*TARGET)
+    rig.run((cycles - 2) * rig.context.period_s)
+    end = falsify(rig, *FALSE["a hundredth of a radian off"], axis)
+    rig.run(4 * rig.context.period_s)
+    assert rig.state is State.MOVING
+    assert error(rig) < 1e-3
+    end()
+    rig.cycle()
+    assert rig.kinds[-1] is Arrived

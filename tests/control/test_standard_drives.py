@@ -81,7 +81,9 @@ def arm_of(directory: Path, name: str, differing: Objects | None = None) -> tupl
     joints = tuple(
         replace(joint, slave=f"drive{i // axes + 1}", axis=i % axes + 1) for i, joint in enumerate(SHIPPED.joints)
     )
-    config = replace(SHIPPED, slaves=(SHIPPED.slaves[0], *slaves), joints=joints)
+    # These drives turn more inertia than those whose torque limits the joints have.
+    supervision = replace(SHIPPED.supervision, torque=1.5)
+    config = replace(SHIPPED, slaves=(SHIPPED.slaves[0], *slaves), joints=joints, supervision=supervision)
     described = SegmentSlave(esi="drive.xml", behaviour="cia402", options=options)
     shipped = load_segment(segment_path(SHIPPED))
     segment = replace(

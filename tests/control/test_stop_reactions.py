@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from rtcp.ipc.commands import Disable, Halt, Reset, Shutdown
+from rtcp.ipc.commands import Command, Disable, Halt, Reset, SetControlMode, SetDriveMode, Shutdown
 from rtcp.ipc.events import ClockLost, Event, LeaseExpired, MovedSinceFault, PermissionWithdrawn
 from rtcp.ipc.names import Names
-from rtcp.ipc.states import State
+from rtcp.ipc.states import ControlMode, DriveMode, State
 
 from .rig import (
     CAUSES,
@@ -27,6 +27,7 @@ from .rig import (
     SWITCH_ON,
     VOLTAGE_OFF,
     LoopRig,
+    move_to,
     with_switch,
 )
 
@@ -68,6 +69,54 @@ def test_an_arm_that_holds_needs_neither_a_lease_nor_the_enabling_switch(
     rig.run(0.2)
     assert rig.state is State.HOLDING
     CAUSES[key][1](rig)
+
+
+@pytest.mark.parametrize("begins", [State.MOVING, State.HOMING])
+def test_drives_are_disabled_some_time_after_the_stop_of_an_arm_whose_commander_was_lost(
+    switch_rig: Make, begins: State
+) -> None:
+    rig = switch_rig(power_off_after_s=0.5)
+    if begins is State.MOVING:
+        rig.set_in_motion()
+    else:
+        rig.lead_to(begins)
+    CAUSES["lease_ended"][0](rig)
+    rig.wait(lambda: rig.state is State.HOLDING)
+    assert rig.wait(lambda: rig.state is State.DISABLING) == pytest.approx(0.5, abs=0.01)
+    rig.wait(lambda: rig.state is State.READY)
+    assert rig.messages[-2:] == [
+        "the drives are disabled: nobody has commanded the arm for 0.5 s since its commander was lost in a motion "
+        "(stops.power_off_after_s)",
+        "all drives are disabled",
+    ]
+    CAUSES["lease_ended"][1](rig)
+    rig.hold()
+    rig.run(1.0)
+    assert rig.state is State.HOLDING  # no commander was lost since
+
+
+@pytest.mark.parametrize("command", [SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1)])
+def test_who_commands_an_arm_after_the_loss_of_its_commander_keeps_its_drives_enabled(
+    switch_rig: Make, command: Command
+) -> None:
+    rig = switch_rig(power_off_after_s=0.5)
+    rig.set_in_motion()
+    CAUSES["lease_ended"][0](rig)
+    rig.wait(lambda: rig.state is State.HOLDING)
+    CAUSES["lease_ended"][1](rig)
+    rig.run(0.3)
+    rig.do(command)
+    rig.run(2.0)
+    assert rig.state is State.HOLDING
+
+
+def test_without_a_time_an_arm_whose_commander_was_lost_holds(switch_rig: Make) -> None:
+    rig = switch_rig()
+    rig.set_in_motion()
+    CAUSES["lease_ended"][0](rig)
+    rig.run(10.0)
+    assert rig.state is State.HOLDING
+    CAUSES["lease_ended"][1](rig)
 
 
 @pytest.mark.parametrize("reaction", HARD)

@@ -22,7 +22,7 @@ CONFIG = load(default_config())
 CONFIG = replace(CONFIG, control_mode="torque", cycle=replace(CONFIG.cycle, period_us=2000))
 MODEL = CONFIG.models[0]
 LIMITS = Values.configured(CONFIG)
-BODIES = Zones(MODEL, SimpleNamespace(box=LIMITS.box, keep_out=LIMITS.keep_out), 0.0)
+BODIES = Zones(MODEL, SimpleNamespace(box=LIMITS.box, keep_out=LIMITS.keep_out, cones=()), 0.0)
 """The bodies themselves, without a clearance."""
 PUSHED = 3
 """Joints that torques and hands turn."""

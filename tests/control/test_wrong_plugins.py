@@ -218,6 +218,11 @@ class Meter(Driver):
     what: Any = None
     commands = ()
 
+    def decode(self, data: bytes) -> None:
+        super().decode(data)
+        if self.method == "decode":
+            self.values[next(iter(self.values))] = misbehave(self.what)
+
     def accept(self, command: Command) -> Refusal | None:
         return misbehave(self.what) if self.method == "accept" else None
 
@@ -250,6 +255,7 @@ def install(monkeypatch: pytest.MonkeyPatch, driver: type[Driver], only: str = "
     ("encode", {"none": None, "a text": "on", "too short": b"", "too long": bytes(99), **EXCEPTIONS}),
     ("publish", WRONG_VALUES),
     ("accept", WRONG_REFUSALS),
+    ("decode", {"none": None, "a text": "on", **EXCEPTIONS}),
 )
 def test_a_driver_that_misbehaves_is_a_fault_of_its_slave(
     config: ArmConfig, monkeypatch: pytest.MonkeyPatch, method: str, what: Any

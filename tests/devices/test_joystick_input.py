@@ -28,7 +28,7 @@ def stick_of(debounce_ms: float = 0.0, **others: Any) -> JoystickInput:
     return JoystickInput(InputsConfig(joystick=JoystickConfig(debounce_ms=debounce_ms), **others), CYCLE)
 
 
-def shown(stick: JoystickInput) -> tuple[int, int, int]:
+def shown(stick: JoystickInput) -> tuple[float, float, int]:
     return stick.forward, stick.side, stick.paddle
 
 

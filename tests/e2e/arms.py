@@ -33,6 +33,7 @@ def replace_drives(folder: Path, name: str) -> None:
     for i, joint in enumerate(arm["joints"]):
         at, axis = i // axes, i % axes + 1
         joint |= {"slave": f"drive{at + 1}", "axis": axis, "torque": 1000.0 * described.scaling_of(axis).torque}
+        del joint["drive_torque"]
         drives[at]["options"][f"axis{axis}_load_inertia"] = segment["slaves"][i + 1]["options"]["load_inertia"]
     arm["slaves"] = [arm["slaves"][0], *({"name": f"drive{i + 1}", "device": device} for i in range(len(drives)))]
     segment["slaves"] = [segment["slaves"][0], *drives]

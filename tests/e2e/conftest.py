@@ -90,12 +90,15 @@ class Platform:
         if OTHER_ARM:
             replace_drives(mine, OTHER_ARM)
 
-    def rtcp(self, *arguments: str, check: int | None = 0) -> subprocess.CompletedProcess[str]:
-        """Run `rtcp` with `arguments`; assert its exit code unless `check` is None."""
+    def rtcp(
+        self, *arguments: str, check: int | None = 0, answers: str | None = None
+    ) -> subprocess.CompletedProcess[str]:
+        """Run `rtcp` with `arguments`, and `answers` at its input; assert its exit code unless `check` is None."""
         done = subprocess.run(
             [sys.executable, "-m", "rtcp.cli", *arguments],
             env=self.environment,
             text=True,
+            input=answers,
             capture_output=True,
             check=False,
         )

@@ -19,13 +19,17 @@ from rtcp.config.find import default_config
 from rtcp.ipc.session import Processes, identify
 from rtcp.telemetry.experiments import (
     CycleExperiment,
+    DelaysExperiment,
     Experiment,
+    JoystickExperiment,
     LatencyExperiment,
     PicksExperiment,
     ResourcesExperiment,
+    TemperatureExperiment,
     TrackingExperiment,
 )
-from rtcp.telemetry.experiments.experiment import Row, Setup, carry_out, read_result
+from rtcp.telemetry.experiments.experiment import ExperimentFailed, Row, Setup, carry_out, read_result
+from rtcp.telemetry.experiments.user_trials import read_trials
 
 from .conftest import SLAVES, Platform
 
@@ -64,6 +68,8 @@ def test_a_step_of_1_35_rad_settles_at_0_2_rad_s_without_overshoot(platform: Pla
     rows, printed = ran(platform, "step", tmp_path)
     assert all(row["met"] for row in rows.values())
     assert 6.0 < rows["settling within 0.0007 rad"]["here"] < 7.5
+    for edge in range(1, 5):
+        assert 6.0 < rows[f"square signal, edge {edge}: settling within 0.0007 rad"]["here"] < 7.5
     assert "steady-state error" in printed
     page = platform.rtcp("report", str(tmp_path / "step"))
     assert "report.html" in page.stdout
@@ -76,20 +82,47 @@ def test_the_square_is_driven_in_both_planes_within_1_mm_commanded_and_3_mm_actu
     platform: Platform, tmp_path: Path
 ) -> None:
     rows, _ = ran(platform, "square", tmp_path)
-    assert [row["met"] for row in rows.values()] == [True] * 4
-    assert (tmp_path / "square" / "recording-yz.mcap").stat().st_size > 0
+    assert [row["met"] for row in rows.values() if row["met"] is not None] == [True] * 4
+    for plane in ("xy", "yz"):
+        assert rows[f"{plane}, 50 mm/s: elapsed time"]["here"] > 16.0
+    assert rows["yz against xy, 50 mm/s: less time"]["source"] == 33.0
+    assert (tmp_path / "square" / "recording-yz-50.mcap").stat().st_size > 0
 
 
 @pytest.mark.platform
-def test_the_delays_are_those_of_the_source(platform: Platform, tmp_path: Path) -> None:
-    rows, _ = ran(platform, "delays", tmp_path)
-    assert [row["source"] for row in rows.values()] == [0, 820, 1660, 2500, 3320, 4160, 5020][:SLAVES]
-    assert all(row["met"] for row in rows.values())
+def test_the_delays_are_those_of_the_thesis(setup: Setup) -> None:
+    rows = carried_out(DelaysExperiment(2), setup)
+    assert [row.source for row in rows.values()] == [0, 820, 1660, 2500, 3320, 4160, 5020][:SLAVES]
+    assert all(row.met for row in rows.values())
+
+
+@pytest.mark.platform
+@pytest.mark.parametrize(
+    ("file", "sources"),
+    [
+        pytest.param(
+            "one_actuator.yaml",
+            (0, 880),
+            marks=pytest.mark.long("test_each_setup_of_the_thesis_has_a_file_and_its_own_column"),
+        ),
+        pytest.param(
+            "bench.yaml",
+            (0, 840, 1680, 2520, 3340, 4030, 4960),
+            marks=pytest.mark.long("test_each_setup_of_the_thesis_has_a_file_and_its_own_column"),
+        ),
+    ],
+)
+def test_the_setups_on_the_bench_have_the_delays_of_the_thesis(
+    setup: Setup, file: str, sources: tuple[float, ...]
+) -> None:
+    rows = carried_out(DelaysExperiment(1), replace(setup, config=default_config().with_name(file)))
+    assert tuple(row.source for row in rows.values()) == sources
+    assert all(row.met for row in rows.values())
 
 
 @pytest.mark.platform
 @pytest.mark.timing
-@pytest.mark.long("test_the_delays_are_those_of_the_source")
+@pytest.mark.long("test_the_delays_are_those_of_the_thesis")
 def test_the_cycle_is_the_same_from_inside_and_at_an_output_of_the_io_box(setup: Setup) -> None:
     rows = carried_out(CycleExperiment((2000.0,), 2.0), setup)
     inside, outside = (rows[f"2000 us, {side}: mean"].here for side in ("inside", "outside"))
@@ -98,11 +131,38 @@ def test_the_cycle_is_the_same_from_inside_and_at_an_output_of_the_io_box(setup:
 
 
 @pytest.mark.platform
-@pytest.mark.long("test_an_item_is_picked_by_joystick_bytes_alone")
+@pytest.mark.long("test_an_item_is_picked_and_placed_by_joystick_bytes_alone")
 def test_an_item_is_picked_by_the_joystick_of_the_virtual_arm(setup: Setup) -> None:
     rows = carried_out(PicksExperiment(("shelf",)), setup)
     assert rows["shelf: distance to the item"].met
+    assert rows["shelf: distance to its place"].met
+    assert rows["shelf: completion time"].here > 10.0
     assert rows["highest item above ground"].here == pytest.approx(0.8, abs=0.01)
+
+
+@pytest.mark.platform
+@pytest.mark.long("test_an_item_is_picked_and_placed_by_joystick_bytes_alone")
+def test_a_task_by_joystick_takes_longer_than_as_a_computed_motion(setup: Setup) -> None:
+    rows = carried_out(JoystickExperiment(1, ("shelf",)), setup)
+    assert rows["shelf: time by joystick / by trajectory"].here > 1.0
+    trials = read_trials(setup.folder)
+    assert [(trial.task, trial.way, trial.succeeded) for trial in trials] == [
+        ("shelf", "joystick", True),
+        ("shelf", "trajectory", True),
+    ]
+    assert all((setup.folder / trial.recording).stat().st_size > 0 for trial in trials)
+
+
+@pytest.mark.platform
+def test_the_form_of_a_trial_is_written_beside_its_recording(enabled: Platform, tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    arguments = ("user-trial", "--participant", "P01", "--task", "drink", "--by", "joystick", "--out", str(folder))
+    done = enabled.rtcp(*arguments, answers="\n\nmaybe\ny\nspilled a little\n")
+    [trial] = read_trials(folder)
+    assert (trial.participant, trial.task, trial.way, trial.number) == ("P01", "drink", "joystick", 1)
+    assert (trial.succeeded, trial.remarks) == (True, "spilled a little")
+    assert (folder / trial.recording).stat().st_size > 0
+    assert "done" in done.stdout
 
 
 @pytest.mark.platform
@@ -143,7 +203,23 @@ def test_each_process_has_its_share_of_a_core_and_its_memory(setup: Setup) -> No
     for activity in ("holding", "moving", "jogging", "recording"):
         assert rows[f"{activity}: loop"].here > 1.0
     assert rows["recording: recorder"].here > 0.0
+    assert rows["machine, before: CPU"].here >= 0.0
+    # The frames of the loop at 4 ms: 250 in a second, some 200 bytes each.
+    assert rows["machine, holding: network, sent"].here > 10.0
     assert rows["loop: resident"].here > 20.0
+
+
+def test_a_virtual_rod_has_the_temperature_that_its_heater_estimates(tmp_path: Path) -> None:
+    setup = Setup(tmp_path, running_platform, print)
+    rows = carried_out(TemperatureExperiment((200.0,), hold_s=3.0), setup)
+    # The ends of the rod are not steady after such a short hold.
+    assert -20.0 < rows["200 C: true minus target"].here < 0.0
+    assert abs(rows["200 C: estimated minus true"].here) < 20.0
+    assert rows["mean absolute error"].source == 10.0
+    with pytest.raises(ExperimentFailed, match="no process of kind shape_setting"):
+        carried_out(TemperatureExperiment(), replace(setup, config=default_config()))
+    with pytest.raises(ExperimentFailed, match="thermocouple"):
+        carried_out(TemperatureExperiment(), replace(setup, bus="eth0"))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import shlex
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +20,8 @@ from rtcp.api import Robot, RtcpError
 from rtcp.cli.__main__ import main
 from rtcp.config.find import default_config
 from rtcp.ipc.runtime_directory import control_socket, segment_control
-from rtcp.processes.shape_setting.profile import heat_command, read_profile
+from rtcp.processes.shape_setting.heat_profile import heat_command
+from rtcp.processes.shape_setting.profile import read_profile
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import Platform
 from tests.leftovers import Leftovers
@@ -100,9 +106,9 @@ def prepare(heater: Heater, robot: Robot) -> None:
 
 
 def arm(heater: Heater, robot: Robot) -> None:
-    """Arm; return when the loop has seen that the relay is closed."""
+    """Arm; the command returns when the loop has seen that the relay is closed."""
     robot.command("arm_heater")
-    until(lambda: robot.processes["heater"].fields["relay_closed"], "relay closed")
+    assert robot.processes["heater"].fields["relay_closed"]
 
 
 @contextlib.contextmanager
@@ -147,7 +153,7 @@ def test_a_released_button_another_client_and_the_end_of_the_connection_end_the_
         assert robot.processes["heater"].fields["cause"] == 6
 
 
-def test_the_command_line_shows_a_process_and_sends_it_any_of_its_commands_which_the_process_may_refuse(
+def test_the_steps_by_hand_of_the_page_heat_the_virtual_rod_and_a_process_may_refuse_a_command(
     heater: Heater, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, value in heater.platform.environment.items():
@@ -157,13 +163,25 @@ def test_the_command_line_shows_a_process_and_sends_it_any_of_its_commands_which
         assert main(("process", *arguments)) == code
         return capsys.readouterr().out
 
+    page = (CONFIG.parent / "docs" / "shape_setting.md").read_text()
+    block = page.partition("## The same steps by hand")[2].split("```")[1]
+    steps = [shlex.split(line, comments=True)[1:] for line in block.strip().splitlines()]
+    assert [step[0] for step in steps[:3]] == ["start", "enable", "segment"]
+    assert steps[-1] == ["process", "heater", "start_heating"]
     assert "shape_setting" in rtcp()
     assert "phase: unknown | austenite | martensite" in " ".join(rtcp("heater").split())
-    with heater.connect() as robot:
-        rtcp("heater", "arm_heater")
-        until(lambda: robot.processes["heater"].fields["relay_closed"], "relay closed")
-        rtcp("heater", "measure_resistance", "straight_and_unloaded=true", "phase=austenite")
-        assert robot.processes["heater"].fields["initial_resistance"] > 0.0
+    heater.set_contacts(AUTO)
+    before = heater.truth()["middle_temperature"]
+    for step in steps[2:-1]:
+        assert main(step) == 0, step
+    # The command line takes signals, which only the main thread of a process can do.
+    last = subprocess.Popen(
+        [sys.executable, "-m", "rtcp.cli", *steps[-1]], env=os.environ | heater.platform.environment
+    )
+    heater.until(lambda truth: truth["middle_temperature"] > before + 20.0, "heat")
+    last.send_signal(signal.SIGINT)
+    assert last.wait() != 0
+    heater.assert_off()
     assert "heater is ready" in rtcp("heater", "stop_heating")
     rtcp("heater", "measure_resistance", "straight_and_unloaded=yes", "phase=austenite", code=2)
     rtcp("heater", "melt", code=2)

@@ -26,18 +26,20 @@ from rtcp.cli.__main__ import main
 from rtcp.config.find import default_config
 from rtcp.ipc.runtime_directory import control_socket, irc5_control, segment_control
 from rtcp.ipc.session import read_processes
+from rtcp.processes.shape_setting.heat_profile import heat_command
 from rtcp.processes.shape_setting.job import read_job
-from rtcp.processes.shape_setting.profile import heat_command
 from rtcp.virtual.faults.control import SegmentClient
 from rtcp.virtual.request_socket import RequestClient, RequestRefused
 from tests.cell.running import leftovers_of, put_in_order
 from tests.e2e.conftest import Platform, kill, lives
 from tests.leftovers import Leftovers
+from tests.ros1.conftest import Ros, begin_node, ros, ros_on_the_path  # noqa: F401  # fixtures
 from tests.waiting import until
 
 pytestmark = pytest.mark.platform
 
 CONFIG = default_config().parent
+EXAMPLE = CONFIG.parent / "examples" / "shape_setting_ros.py"
 AWAY = (0.2, 0.0, 0.7, 0.0, -0.6, 0.0)
 BEGINS = {
     "approaching": "arms are enabled",
@@ -373,11 +375,33 @@ def test_a_halt_of_one_arm_that_bends_the_rod_ends_all(cell: HeaterCell) -> None
     assert "stop" in errors
 
 
-@pytest.mark.long("test_a_rod_gets_its_shape_and_the_report_says_what_was_measured")
-def test_a_run_after_all_that_is_complete(cell: HeaterCell) -> None:
-    folder = cell.directory / "last"
-    cell.platform.rtcp("shape-set", str(cell.job), "--yes", "--out", str(folder))
-    assert json.loads((folder / "report.json").read_text())["facts"]["result"] == "the profile is complete"
+def test_after_all_that_the_example_sets_the_shape_of_a_rod_through_ros(ros: Ros, cell: HeaterCell) -> None:  # noqa: F811
+    with cell.heater() as robot:
+        robot.disable()  # `robot_enable` reaches arms and heater
+    node = begin_node(ros, cell.platform, "--cell")
+    try:
+        files = (cell.config / "cell_shape_setting.yaml", cell.job)
+        said = ros.run(sys.executable, EXAMPLE, *files, "--yes").stdout
+        states = re.findall(r"the heater is (\w+), the rod has (\d+) C", said)
+        names = [name for name, _ in states]
+        assert names[-4:] == ["heating", "holding", "cooling", "done"]
+        assert names.index("measuring") < names.index("heating")
+        assert max(int(celsius) for _, celsius in states) > 450
+        assert "heater/start_heating: heater is done" in said
+        truth = cell.truth()
+        assert (truth["gate"], truth["relay"]) == (False, False)
+        fields = "straight_and_unloaded=true phase=austenite"
+        called = ros.run("/usr/bin/rosservice", "call", "/heater/measure_resistance", fields).stdout
+        assert "success: False" in called
+        assert "the heater is" in called  # the reason
+        shown = ros.run("/usr/bin/rostopic", "echo", "-n", "1", "/processes").stdout
+        assert 'name: "heater"' in shown
+        assert 'message: "done"' in shown
+        assert "success: True" in ros.run("/usr/bin/rosservice", "call", "/robot_disable").stdout
+        with cell.heater() as robot:
+            assert robot.state is State.READY
+    finally:
+        ros.stop(node)
 
 
 def put_in_order_once_it_stands(panel: RequestClient, first: dict[str, str]) -> None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Iterator
 from contextlib import nullcontext
 from math import pi, tau
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
+import psutil
 import pytest
 
 from rtcp.telemetry.experiments.experiment import (
@@ -20,6 +24,8 @@ from rtcp.telemetry.experiments.experiment import (
     read_result,
 )
 from rtcp.telemetry.experiments.latency import behind, fit_sine
+from rtcp.telemetry.experiments.motions import respond
+from rtcp.telemetry.experiments.resources import MachineMeter, traffic
 from rtcp.telemetry.experiments.timing import spread
 from rtcp.telemetry.experiments.tracking import identify, sine
 from rtcp.telemetry.report import page
@@ -56,7 +62,7 @@ def test_noise_of_30_hz_samples_themselves_still_gives_the_latency_within_its_st
     assert np.std(misses) == pytest.approx(1.0, abs=0.3)
 
 
-def test_mean_error_and_average_deviation_are_those_of_the_source() -> None:
+def test_mean_error_and_average_deviation_are_those_of_the_thesis() -> None:
     mean, percent, deviation = spread(np.array([450.0, 470.0, 460.0, 480.0]), 500.0)
     assert (mean, percent, deviation) == pytest.approx((465.0, 7.0, 10.0))
 
@@ -150,3 +156,73 @@ def test_a_folder_without_a_result_is_one_message(tmp_path: Path, content: bytes
         (tmp_path / "result.json").write_bytes(content)
     with pytest.raises(ExperimentFailed, match="result"):
         page([tmp_path])
+
+
+def test_the_rows_before_a_failure_stay_in_the_result(tmp_path: Path) -> None:
+    class FailingLater(Experiment):
+        name, title = "later", "An experiment that fails in its second part"
+
+        def run(self, setup: Setup) -> Iterator[Row]:
+            yield Row("xy: deviation", "mm", 0.1, most=1.0)
+            raise ExperimentFailed("the recorder has ended")
+
+    with pytest.raises(ExperimentFailed, match="recorder"):
+        carry_out(FailingLater(), Setup(tmp_path, nullcontext, print), "rtcp experiment later")
+    result = read_result(tmp_path)
+    assert [(row.figure, row.met) for row in result.rows] == [("xy: deviation", True), ("carried out", False)]
+
+
+PERIOD = 0.0005
+
+
+def approach(begin: float, goal: float, beyond: float = 0.0, error: float = 0.0) -> npt.NDArray[np.float64]:
+    """A joint at 0.2 rad/s from begin to goal, then `beyond` the goal for 0.1 s, then at rest with an error."""
+    way = np.arange(0.0, abs(goal - begin), 0.2 * PERIOD) * np.sign(goal - begin) + begin
+    after = np.sign(goal - begin) * np.array([beyond] * 200 + [error] * 2000)
+    return np.concatenate([way, goal + after])
+
+
+@pytest.mark.parametrize(("begin", "goal"), [(0.0, 1.35), (1.35, 0.0), (0.0, -1.35)])
+def test_a_step_settles_overshoots_and_rests_as_it_was_made(begin: float, goal: float) -> None:
+    response = respond(approach(begin, goal, 0.01, 0.0005), begin, goal, PERIOD)
+    assert response.settled_s == pytest.approx(1.35 / 0.2 + 0.1, abs=0.01)
+    assert response.overshoot == pytest.approx(0.01)
+    assert response.error == pytest.approx(0.0005)
+    with pytest.raises(ExperimentFailed, match="did not settle"):
+        respond(approach(begin, goal, 0.0, 0.001), begin, goal, PERIOD)
+
+
+def test_the_machines_load_is_that_of_the_time_between() -> None:
+    meter = MachineMeter()
+    begun = time.process_time()
+    while time.process_time() - begun < 0.3:
+        sum(range(10_000))
+    load = meter.read()
+    assert 0.0 < load.cpu_percent <= 100.0
+    assert load.memory_mb * 1e6 > psutil.Process().memory_info().rss
+    assert load.sent_kb_s >= 0.0
+
+
+def test_the_machines_network_is_that_of_the_host_and_of_the_namespace_of_the_virtual_bus() -> None:
+    table = "Inter-|   Receive |  Transmit\n face |bytes packets|bytes packets\n"
+    line = "{}: {} 7 0 0 0 0 0 0 {} 7 0 0 0 0 0 0\n"
+    host = table + line.format("  lo", 900, 900) + line.format("eth0", 100, 2500) + line.format("eth1", 20, 30)
+    bus = table + line.format("  lo", 700, 700) + line.format("ecat0", 3, 4)
+    assert traffic(host) == (2530, 120)
+    assert traffic(host, bus) == (2534, 123)
+    assert traffic(host, host) == (2530, 120)  # a real bus: the loop is in the namespace of the host
+
+
+def test_the_machines_network_contains_that_of_the_host_while_the_platform_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    opened: list[str] = []
+
+    def read_text(path: Path) -> str:
+        opened.append(str(path))
+        return "\n\n"
+
+    monkeypatch.setattr(Path, "read_text", read_text)
+    MachineMeter()
+    MachineMeter(42)
+    assert opened == ["/proc/self/net/dev", "/proc/self/net/dev", "/proc/42/net/dev"]

@@ -9,13 +9,23 @@ import pytest
 
 from kinematics import forward
 from rtcp.config import default_config, load
+from rtcp.config.model import AnalogStickConfig, StickAxisConfig
+from rtcp.config.segment import SegmentConfig, SegmentSlave, load_segment
 from rtcp.devices import Cia402Drive
 from rtcp.ipc import commands
-from rtcp.ipc.events import Event, UnknownJoystickCode
+from rtcp.ipc.events import (
+    Event,
+    GripperCloses,
+    GripperOpens,
+    JoystickModeChanged,
+    JoystickOutOfRange,
+    UnknownJoystickCode,
+)
 from rtcp.ipc.refusals import WrongControlMode
 from rtcp.ipc.states import ControlMode, JogFrame, State
-from rtcp.telemetry.experiments.motions import BACKWARD, FORWARD, LEFT, NEUTRAL, PADDLE_UP
+from rtcp.telemetry.experiments.picks import BACKWARD, FORWARD, LEFT, NEUTRAL, PADDLE_UP
 from rtcp.testing import Simulation
+from rtcp.virtual.models.diewu import DiewuIoBox
 
 CONFIG = load(default_config())
 TOGGLE = 0x100
@@ -127,6 +137,34 @@ def test_a_paddle_changes_the_mode_when_it_is_released(arm: Arm) -> None:
 
 
 @pytest.mark.parametrize(
+    "between",
+    [
+        [commands.SetControlMode(ControlMode.JOINT), commands.SetControlMode(ControlMode.JOYSTICK)],
+        [commands.SetControlMode(ControlMode.JOYSTICK)],
+        [commands.Disable()],
+    ],
+    ids=["from another mode", "again", "enabled anew"],
+)
+def test_the_joystick_begins_with_x_y_where_its_last_mode_was_the_gripper(
+    arm: Arm, between: list[commands.Command]
+) -> None:
+    for _ in range(3):
+        arm.joystick(PADDLE_UP, 0.1)
+        arm.joystick(NEUTRAL, 0.1)
+    assert arm.loop.operator.joystick_mode == 3
+    for command in between:
+        arm.do(command)
+    if arm.state is not State.HOLDING:
+        arm.hold()
+    before = arm.tool
+    arm.joystick(NEUTRAL, 0.1)
+    arm.joystick(BACKWARD, 0.5)
+    assert JoystickModeChanged(0) in [record.event for record in arm.events]
+    assert not {GripperOpens, GripperCloses} & set(arm.kinds)
+    assert arm.tool[0] < before[0] - 0.01
+
+
+@pytest.mark.parametrize(
     "command", [commands.MoveJoints(START, 0.2, True), commands.StreamPosition(START, 0.2)], ids=["move", "stream"]
 )
 def test_under_the_joystick_nobody_else_moves_the_arm(arm: Arm, command: commands.Command) -> None:
@@ -201,3 +239,75 @@ def test_the_joystick_moves_the_arm_again_after_a_fault_that_came_while_it_did(a
     arm.joystick(BACKWARD, 0.5)
     assert arm.state is State.MOVING
     assert arm.tool[0] < before[0] - 0.01
+
+
+REST, FULL = 0x8000, 0x5000
+"""Counts of the stick's channels at rest, and from there to the full inclination."""
+
+
+class ArmWithStick(Arm):
+    """An arm whose stick is on two analog channels: a second IO box plays the converter."""
+
+    def incline(self, forward: float, seconds: float) -> None:
+        converter = [slave.device for slave in self.bus.slaves if isinstance(slave.device, DiewuIoBox)][1]
+        converter.inputs = round(REST + forward * FULL)
+        self.run(seconds)
+
+    @property
+    def speed(self) -> float:
+        """Speed of the tool along x, m/s."""
+        before = self.tool[0]
+        self.run(0.1)
+        return (self.tool[0] - before) / 0.1
+
+
+@pytest.fixture
+def stick() -> Iterator[ArmWithStick]:
+    converter = replace(CONFIG.slaves[0], name="adc", device=replace(CONFIG.slaves[0].device, kind="generic"))
+    analog = AnalogStickConfig(StickAxisConfig("adc.inputs", REST, FULL), StickAxisConfig("adc.counter", 0.0, 1000.0))
+    assert CONFIG.inputs.joystick is not None
+    inputs = replace(CONFIG.inputs, joystick=replace(CONFIG.inputs.joystick, analog=analog))
+    slaves = load_segment(CONFIG.source.parent / "segment.yaml").slaves
+    adc = SegmentSlave("diewu-io", options={"inputs": REST})
+    config = replace(
+        CONFIG,
+        control_mode="joystick",
+        inputs=inputs,
+        slaves=(*CONFIG.slaves, converter),
+        cycle=replace(CONFIG.cycle, period_us=2000.0),
+    )
+    segment = SegmentConfig((*slaves, adc), CONFIG.source)
+    with ArmWithStick(config, seed=3, positions=START, segment=segment) as made:
+        made.hold()
+        made.run(0.1)
+        yield made
+
+
+def test_the_speed_of_the_arm_follows_the_inclination_of_an_analog_stick(stick: ArmWithStick) -> None:
+    stick.incline(-1.0, 0.6)
+    assert stick.speed == pytest.approx(-CONFIG.jog.speed, rel=0.02)
+    stick.incline(-0.55, 0.6)
+    assert stick.speed == pytest.approx(-0.5 * CONFIG.jog.speed, rel=0.02)
+    stick.incline(0.0, 0.6)
+    assert stick.state is State.HOLDING
+
+
+def test_an_analog_stick_that_is_inclined_at_the_start_or_whose_wire_was_cut_does_nothing_until_neutral(
+    stick: ArmWithStick,
+) -> None:
+    stick.send(commands.Disable())
+    stick.bring_to(State.READY)
+    stick.incline(-1.0, 0.1)
+    stick.hold()
+    before = stick.tool
+    stick.incline(-1.0, 0.5)
+    assert stick.tool == before
+    stick.incline(0.0, 0.1)
+    stick.incline(-1.0, 0.4)
+    assert stick.state is State.MOVING
+    stick.incline(-1.5, 1.0)
+    assert stick.state is State.HOLDING
+    assert JoystickOutOfRange in stick.kinds
+    rest = stick.tool
+    stick.incline(-1.0, 0.5)
+    assert stick.tool == rest

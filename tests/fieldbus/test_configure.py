@@ -80,6 +80,14 @@ def test_each_sync_manager_begins_at_a_whole_byte_in_the_order_of_its_number() -
     assert image.bits == 19
 
 
+def test_values_of_a_cycle_are_counted_in_the_lengths_of_sync_managers() -> None:
+    single = with_managers((3, 4), (4, 12))
+    first, second = single.device.tpdo
+    double = replace(single, device=replace(single.device, tpdo=(replace(first, samples=2), second)))
+    assert len(limit_faults([single])) == 1
+    assert limit_faults([double]) == []
+
+
 @pytest.mark.parametrize(
     ("slaves", "sentence"),
     [

@@ -19,7 +19,10 @@ pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip in
 
 from rtcp.config import default_config, load
 from rtcp.config.buses import EgmBus
+from rtcp.config.loader import widen
 from rtcp.config.model import ArmConfig
+from rtcp.control.operator import Operator
+from rtcp.devices.driver import make_driver
 from rtcp.fieldbus.egm import EgmData, EgmMaster
 from rtcp.fieldbus.errors import BusError
 from rtcp.ipc.states import DriveState, Missing
@@ -148,7 +151,7 @@ class Wire:
         return Missing(struct.unpack("<dBBd", self.data.input(0))[2])
 
     def counts(self) -> dict[str, int]:
-        values = struct.unpack("<5BdI6I9d", self.data.input(self.axes))
+        values = struct.unpack("<5BdI6I9db", self.data.input(self.axes))
         return dict(zip(COUNTS, values[7:13], strict=True))
 
 
@@ -524,15 +527,37 @@ FORCE = (1.0, -2.0, 3.0, 0.1, 0.2, -0.3)
     ("encoded", "shown"),
     [
         (entry(1, 1) + doubles(2, FORCE), FORCE),
-        (entry(1, 0) + doubles(2, FORCE), (0.0,) * 6),
+        (entry(1, 0) + doubles(2, FORCE), (math.nan,) * 6),
         (doubles(1, FORCE), FORCE),
-        (doubles(1, (math.nan,) * 6), (0.0,) * 6),
-        (b"\xff", (0.0,) * 6),
+        (doubles(1, (math.nan,) * 6), (math.nan,) * 6),
+        (b"\xff", (math.nan,) * 6),
+        (b"", (math.nan,) * 6),
     ],
-    ids=["RobotWare 7", "no sensor active", "RobotWare 6.08", "no numbers", "garbled"],
+    ids=["RobotWare 7", "no sensor active", "RobotWare 6.08", "no numbers", "garbled", "no sensor"],
 )
 def test_the_measured_force_is_read_in_the_form_of_both_versions(encoded: bytes, shown: Sequence[float]) -> None:
     wire = Wire()
     wire.cycle(message(0, force=encoded))
-    assert struct.unpack("<5BdI6I9d", wire.data.input(6))[13:19] == pytest.approx(shown)
+    assert struct.unpack("<5BdI6I9db", wire.data.input(6))[13:19] == pytest.approx(shown, nan_ok=True)
     wire.close()
+
+
+@pytest.mark.parametrize(("motors", "powered"), [(ON, 1), (OFF, 0), (0, -1)])
+def test_whether_the_motors_are_on_reaches_the_record_and_what_egm_does_not_tell_is_unknown(
+    motors: int, powered: int
+) -> None:
+    wire = Wire()
+    wire.cycle(message(0, motors=motors))
+    unit = make_driver(wire.config.slaves[-1], 0.004)
+    unit.decode(wire.data.input(6))
+    operator = Operator(wire.config, {unit.name: unit}, None)
+    assert (operator.drives_powered, operator.e_stopped, operator.operating_mode) == (powered, -1, -1)
+    wire.close()
+
+
+def test_a_controller_that_falls_silent_is_a_fault_at_the_third_missing_message() -> None:
+    shipped = load(default_config().with_name("abb_irb120.yaml"))
+    real = widen(replace(shipped, bus=replace(shipped.bus, interface="192.168.125.2")))
+    assert real.bus.lost_cycles == 3
+    # On the virtual bus a busy host is late by more.
+    assert widen(shipped).bus.lost_cycles == 45

@@ -18,7 +18,9 @@ from rtcp.config.find import default_config
 from rtcp.config.loader import load
 from rtcp.config.model import ArmConfig
 from rtcp.control.cycle import make_drives
+from rtcp.control.operator import UNREAD_S, Operator
 from rtcp.devices.drive import TargetState
+from rtcp.devices.driver import make_driver
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.rapid import RapidData, RapidMaster
 from rtcp.ipc.states import DriveState, Missing
@@ -27,6 +29,8 @@ STAND, FOLLOW, STOP = 0, 1, 2
 READY = (1, 0, 0, 0, 0, 2, 1)
 """STATUS of a controller that may be commanded: powered, e_stopped, error_code, in_error, in_motion, mode, possible."""
 S = 1_000_000_000
+PING = struct.pack("<3i", 1, 2, 0)
+"""The heartbeat of the motion client, without its length."""
 
 
 class Robot:
@@ -47,9 +51,16 @@ class Robot:
     def accept(self) -> None:
         """Let the bus connect."""
         self.data.receive()
-        self.motion, self.state = (listener.accept()[0] for listener in self.listeners)
+        self.state = self.listeners[1].accept()[0]
+        self.state.sendall(struct.pack("<11i", 40, 13, 1, 0, *READY))
+        self.until(lambda: self.data.motion._socket is not None)
+        self.motion = self.listeners[0].accept()[0]
         self.motion.settimeout(0.05)
-        self.until(lambda: self.data.motion.is_open and self.data.state.is_open)
+        self.until(lambda: self.data.motion.is_open)
+        self.data.send()
+        assert self.motion.recv(16)[4:] == PING
+        assert self.state.recv(16)[4:] == struct.pack("<3i", 1, 1, 0)
+        self.answer_heartbeat()
 
     def close(self) -> None:
         self.data.close()
@@ -67,9 +78,11 @@ class Robot:
     def report(self, joints: list[float], status: tuple[int, ...] = READY) -> None:
         """Send positions and status as the state server does, and let the bus read them."""
         body = struct.pack(f"<i{len(joints)}f", 0, *joints)
+        self.data._positions_ns = self.data._status_ns = 0
         self.state.sendall(struct.pack("<4i", 12 + len(body), 10, 1, 0) + body)
         self.state.sendall(struct.pack("<11i", 40, 13, 1, 0, *status))
-        self.until(lambda: self.actual(0)[0] == pytest.approx(joints[0]))
+        self.until(lambda: self.data._positions_ns == self.data._status_ns == self.time_ns)
+        assert self.actual(0)[0] == pytest.approx(joints[0])
 
     def command(self, target: float, command: int = FOLLOW) -> None:
         """Command all joints, then send and receive once."""
@@ -82,19 +95,31 @@ class Robot:
         position, state, missing = struct.unpack("<dBB", self.data.input(joint))
         return position, DriveState(state), Missing(missing)
 
+    def answer_heartbeat(self) -> None:
+        self.motion.sendall(struct.pack("<4i", 12, 1, 3, 1))
+        self.until(lambda: not self.data._asked[1])
+
+    def requests(self) -> list[bytes]:
+        """The messages that the motion server has received, without their lengths."""
+        messages: list[bytes] = []
+        with contextlib.suppress(TimeoutError):
+            while head := self.motion.recv(4):
+                messages.append(self.motion.recv(*struct.unpack("<i", head)))
+        return messages
+
     def received(self) -> list[tuple[Any, ...]]:
-        """Sequence, first joint and duration of the points that the motion server has received."""
+        """Sequence, first joint and duration of the points that the motion server has received; answers heartbeats."""
         points: list[tuple[Any, ...]] = []
-        while True:
-            try:
-                length = struct.unpack("<i", self.motion.recv(4))[0]
-            except TimeoutError:
-                return points
-            message = self.motion.recv(length)
+        for message in self.requests():
+            if message == PING:
+                self.answer_heartbeat()
+                continue
+            length = len(message)
             assert struct.unpack_from("<3i", message) == (11, 2, 0)
             count = (length - 12 - 12) // 4
             sequence, *numbers = struct.unpack(f"<i{count + 2}f", message[12:])
             points.append((sequence, numbers[0], numbers[-1]))
+        return points
 
     def answer(self, code: int = 1) -> None:
         """Reply to a request, and let the bus read it."""
@@ -146,6 +171,7 @@ def test_after_a_rest_the_way_begins_with_the_motion(following: Robot) -> None:
     following.command(0.6)
     following.answer()
     following.pass_time(20.0)
+    following.report([0.6] * 10)
     following.command(0.6)
     following.pass_time(0.03)
     following.command(0.7)
@@ -158,7 +184,7 @@ def test_until_the_answer_comes_the_newest_target_waits(following: Robot) -> Non
         following.command(target)
         following.pass_time(0.03)
     following.data.receive()
-    assert struct.unpack("<IIBdBB", following.data.input(6))[2] == 1
+    assert struct.unpack("<IIBdbbb", following.data.input(6))[2] == 1
     assert len(following.received()) == 1
     following.answer()
     following.command(0.9)
@@ -399,6 +425,7 @@ def test_a_motion_does_not_go_on_when_a_suspended_loop_does(following: Robot) ->
     following.pass_time(1.001)
     following.report([0.6] * 10)
     following.command(0.61)
+    assert following.requests() == [PING]
     assert following.motion.recv(1) == b""
     assert following.data.motion.problem.endswith(": the loop stood still for 1.0 s in a motion")
     assert following.actual(0)[1] is DriveState.NOT_READY_TO_SWITCH_ON
@@ -470,15 +497,21 @@ class Session:
     def forget(self) -> None:
         """Begin a connection."""
         self.bytes = b""
-        self.unanswered: list[tuple[float, ...]] = []
-        """Positions of the requests; empty: a stop."""
+        self.unanswered: list[tuple[float, ...] | None] = []
+        """Positions of the requests; empty: a stop; None: a heartbeat."""
         self.commanded: tuple[float, ...] = ()
 
     def serve(self, state: DriveState, shown: list[float]) -> None:
         """Check what the last cycle sent, and answer the oldest request at random."""
         with contextlib.suppress(OSError):
             self.bytes += self.robot.motion.recv(4096)
-        while len(self.bytes) >= 68:
+        while len(self.bytes) >= 16:
+            if self.bytes[4:16] == PING:
+                self.bytes = self.bytes[16:]
+                self.unanswered.append(None)
+                continue
+            if len(self.bytes) < 68:
+                break
             sequence, *joints, _, duration = struct.unpack("<i12f", self.bytes[16:68])
             self.bytes = self.bytes[68:]
             point = tuple(joints[: len(self.drives)]) if sequence >= 0 else ()
@@ -492,10 +525,12 @@ class Session:
             self.unanswered.append(point)
         if self.unanswered and self.random.random() < 0.5:
             taken = self.random.random() < 0.93
-            with contextlib.suppress(OSError):
-                self.robot.motion.sendall(struct.pack("<4i", 12, 11, 3, 1 if taken else 2))
             point = self.unanswered.pop(0)
-            self.commanded = point if taken else self.commanded
+            number = 1 if point is None else 11
+            with contextlib.suppress(OSError):
+                self.robot.motion.sendall(struct.pack("<4i", 12, number, 3, 1 if taken else 2))
+            if point is not None:
+                self.commanded = point if taken else self.commanded
             if self.commanded:
                 pairs = zip(self.actual, self.commanded, strict=True)
                 self.actual = [a + max(-0.004, min(0.004, b - a)) for a, b in pairs]
@@ -566,6 +601,37 @@ def test_in_a_random_session_no_point_leaves_that_must_not(seed: int) -> None:
     assert session.points > 0
 
 
+@pytest.mark.parametrize(
+    ("status", "told"),
+    [
+        ((1, 0, 0, 0, 0, 2, 1), (1, 0, 2)),
+        ((0, 1, 0, 1, 0, 1, 0), (0, 1, 1)),
+        ((-1, -1, 0, -1, -1, -1, -1), (-1, -1, -1)),
+    ],
+    ids=["in automatic mode", "emergency stop in manual mode", "unknown"],
+)
+def test_motors_emergency_stop_and_key_of_the_controller_reach_the_record(
+    robot: Robot, status: tuple[int, ...], told: tuple[int, ...]
+) -> None:
+    arm = config()
+    unit = make_driver(arm.slaves[-1], 0.004)
+    operator = Operator(arm, {unit.name: unit}, None)
+
+    def shown() -> tuple[int, ...]:
+        return operator.drives_powered, operator.e_stopped, operator.operating_mode
+
+    operator.miss()
+    assert shown() == (-1, -1, -1)  # nothing was ever received
+    robot.report([0.25] * 10, status)
+    unit.decode(robot.data.input(6))
+    operator.read()
+    assert shown() == told
+    for _ in range(round(UNREAD_S / (1e-6 * arm.cycle.period_us)) + 1):
+        assert shown() == told
+        operator.miss()
+    assert shown() == (-1, -1, -1)
+
+
 def test_an_interface_that_is_no_address_is_refused() -> None:
     RapidMaster.check_interface("192.168.125.1")
     with pytest.raises(BusError, match=r"eth0 .* is no IPv4 address: that of the controller is expected"):
@@ -576,5 +642,5 @@ def test_what_is_waited_for_is_the_connection_and_then_what_the_controller_lacks
     master = RapidMaster(config(), "virtual", 0)
     assert (master.connected, master.waiting_for()) == (False, "")
     master._data = robot_data = RapidData(config(), RapidBus(), "127.0.0.1")
-    assert master.waiting_for() == "no answer from its motion server at 127.0.0.1:11000 yet"
+    assert master.waiting_for() == "no answer from its state server at 127.0.0.1:11002 yet"
     robot_data.close()

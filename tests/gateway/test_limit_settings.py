@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.config.model import AbsoluteLimits, AbsoluteSupervision, Cone, Range
 from rtcp.gateway.limit_settings import changed
 from rtcp.ipc.commands import SetLimits
 from rtcp.ipc.errors import Invalid
@@ -18,10 +19,11 @@ from tests.gateway.fake_platform import fake_platform
 
 CONFIG = load(default_config())
 WIDEST = Values.configured(CONFIG)
-ONLY_NARROWED = "limits are only narrowed while running)"
+ONLY_NARROWED = "this limit is only narrowed while running"
+WIDENABLE = f"{ONLY_NARROWED}, except with --widen up to its key absolute"
 KEYS = (
     "allowed are joint1.KEY or joints.KEY (KEY: min, max, velocity, acceleration, jerk, torque) and chair.min.x "
-    "(boxes: box, user, chair)"
+    "(boxes: box, user, chair), supervision.KEY (KEY: speed, torque, following_error)"
 )
 
 
@@ -63,15 +65,15 @@ def test_what_was_narrowed_may_become_as_wide_as_configured_again() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"joint2.max": 2.5}, f"joint2.max: found 2.5, allowed is -2 to 2 (joints[1] in {{file}}: {ONLY_NARROWED}"),
-        ({"joint4.jerk": -1}, f"joint4.jerk: found -1, allowed is 0.02 to 20 (joints[3] in {{file}}: {ONLY_NARROWED}"),
+        ({"joint2.max": 2.5}, f"joint2.max: found 2.5, allowed is -2 to 2 (joints[1] in {{file}}: {WIDENABLE})"),
+        ({"joint4.jerk": -1}, f"joint4.jerk: found -1, allowed is 0.02 to 20 (joints[3] in {{file}}: {ONLY_NARROWED})"),
         (
             {"box.max.z": 1.5},
-            f"box.max.z: found 1.5, allowed is at most 1.4 (cartesian.box in {{file}}: {ONLY_NARROWED}",
+            f"box.max.z: found 1.5, allowed is at most 1.4 (cartesian.box in {{file}}: {ONLY_NARROWED})",
         ),
         (
             {"user.max.z": 0.8},
-            f"user.max.z: found 0.8, allowed is at least 0.85 (cartesian.keep_out in {{file}}: {ONLY_NARROWED}",
+            f"user.max.z: found 0.8, allowed is at least 0.85 (cartesian.keep_out in {{file}}: {ONLY_NARROWED})",
         ),
         ({"joint1.min": 1, "joint1.max": 0.5}, "joint1.min: found 1, allowed is less than joint1.max, which is 0.5"),
         ({"box.min.y": 0.5, "box.max.y": 0.5}, "box.min.y: found 0.5, allowed is less than box.max.y, which is 0.5"),
@@ -128,7 +130,64 @@ def test_an_arm_without_boxes_has_no_keys_for_them() -> None:
     assert changed(bare, values, {"joint1.max": 1.0}).box is None
     with pytest.raises(Invalid) as raised:
         changed(bare, values, {"box.min.x": 0.0})
-    assert str(raised.value) == f"box.min.x: there is no such limit; {KEYS.split(' and ', maxsplit=1)[0]}"
+    joints, thresholds = KEYS.split(" and ", maxsplit=1)[0], KEYS[KEYS.index(", supervision") :]
+    assert str(raised.value) == f"box.min.x: there is no such limit; {joints}{thresholds}"
+
+
+CUP = Cone("cup", (0.0, 0.0, -1.0), 1.2)
+WIDER = replace(
+    CONFIG,
+    joints=(
+        replace(CONFIG.joints[0], absolute=AbsoluteLimits(Range(-3.2, 3.1), 0.8, 49.2)), *CONFIG.joints[1:],
+    ),
+    cartesian=replace(CONFIG.cartesian, cones=(CUP,)),
+    supervision=replace(CONFIG.supervision, absolute=AbsoluteSupervision(speed=2.0)),
+)  # fmt: skip
+"""The arm with a cone, and with room beyond its limits."""
+
+
+def test_the_angle_of_a_cone_is_narrowed_by_its_name() -> None:
+    values = Values.configured(WIDER)
+    assert changed(WIDER, values, {"cup.angle": 0.5}).cones == (values.cones[0]._replace(angle=0.5),)
+    for number, allowed in ((1.3, "0.05 to 1.2"), (0.01, "0.05 to 1.2")):
+        with pytest.raises(Invalid, match=f"cup.angle: found {number:g}, allowed is {allowed} .cartesian.cones in"):
+            changed(WIDER, values, {"cup.angle": number})
+
+
+def test_limits_are_widened_on_purpose_only_up_to_the_absolute_ones_and_then_stay() -> None:
+    values = Values.configured(WIDER)
+    wider = {"joint1.min": -3.2, "joint1.velocity": 0.8, "joint1.torque": 49.2, "supervision.speed": 2.0}
+    for key, number in wider.items():
+        with pytest.raises(Invalid, match=f"{key}: found .*: {WIDENABLE}"):
+            changed(WIDER, values, {key: number})
+        changed(WIDER, values, {key: number}, widen=True)
+        with pytest.raises(Invalid, match=f"{key}: found .*absolute in"):
+            changed(WIDER, values, {key: 1.01 * number}, widen=True)
+    for key, where in (
+        ("joint1.max", r"joints\[0\].absolute in"),
+        ("joint2.velocity", r"joints\[1\].absolute in"),
+        ("supervision.torque", r"supervision.absolute in"),
+        ("joint1.jerk", rf"joints\[0\] in .*: {ONLY_NARROWED}\)"),
+        ("box.max.x", rf"cartesian.box in .*: {ONLY_NARROWED}\)"),
+        ("cup.angle", rf"cartesian.cones in .*: {ONLY_NARROWED}\)"),
+    ):
+        with pytest.raises(Invalid, match=rf"{key}: found .* \({where}"):
+            changed(WIDER, values, {key: 30.0}, widen=True)
+    widened = changed(WIDER, values, wider, widen=True)
+    # Another change leaves them as they are, and may narrow them.
+    assert changed(WIDER, widened, {"joint2.max": 1.0}).velocity[0] == 0.8
+    assert changed(WIDER, widened, {"joint1.velocity": 0.6}).velocity[0] == 0.6
+    narrow = changed(WIDER, widened, {"joint1.velocity": 0.4})
+    with pytest.raises(Invalid, match="joint1"):
+        changed(WIDER, narrow, {"joint1.velocity": 0.6})
+
+
+def test_thresholds_of_the_supervision_are_narrowed() -> None:
+    new = changed(CONFIG, WIDEST, {"supervision.following_error": 0.05, "supervision.speed": 1.2})
+    assert new.supervision == (1.2, WIDEST.supervision[1], 0.05)
+    for key, number in (("supervision.speed", 0.9), ("supervision.torque", 3.0), ("supervision.following_error", 0.2)):
+        (message,) = messages({key: number})
+        assert message.startswith(f"{key}: found {number:g}, allowed is")
 
 
 def test_a_change_is_one_transaction_that_the_next_gateway_finds(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.config.drive_limits import BEYOND_RANGE_RAD
 from rtcp.config.model import LARGEST, GripperConfig, Joint, Range
 from rtcp.config.zero import read_zeros, state_directory, zero_file
 from rtcp.ipc import commands
@@ -303,6 +304,22 @@ def test_the_present_position_becomes_the_zero_or_what_it_is_reported_to_be(arm:
     offsets = [(command.axis, pytest.approx(command.offset)) for command in arm.loop.received(commands.SetZero)]
     assert offsets == [(0, 0), (0, 0.25), (1, 0), (1, 0.15), (1, 0.15), (1, 0.25)]
     assert read_zeros(arm.config) == (0.25, pytest.approx(0.25), 0, 0, 0, 0)
+
+
+def test_the_position_limits_inside_the_drive_move_with_the_zero(arm: FakePlatform) -> None:
+    arm.ask("zero", joint="joint1")
+    low, high = arm.config.joints[0].position.min, arm.config.joints[0].position.max
+    ends = (low - BEYOND_RANGE_RAD + 0.25, high + BEYOND_RANGE_RAD + 0.25)
+    assert [request for request in arm.loop.requests if request["do"] == "sdo_write"] == [
+        {
+            "do": "sdo_write",
+            "slave": 2,
+            "index": 0x607D,
+            "subindex": subindex,
+            "hex": round(end * 1e4).to_bytes(4, "little", signed=True).hex(),
+        }
+        for subindex, end in enumerate(ends, 1)
+    ]
 
 
 def test_a_zero_that_the_loop_refuses_is_in_no_file(arm: FakePlatform) -> None:

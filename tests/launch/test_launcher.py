@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -23,6 +24,8 @@ from rtcp.ipc.runtime_directory import LockHeld, blackboard_file, control_socket
 from rtcp.ipc.schema import arm_schema
 from rtcp.launch import launcher, platform
 from rtcp.launch.platform import Platform
+from rtcp.virtual.irc5.config import load_irc5
+from rtcp.virtual.irc5.controller import Controller
 from tests.records import numbers
 from tests.waiting import until
 
@@ -206,6 +209,21 @@ def test_a_new_gateway_gets_the_state_directory_of_the_start(directory: Path, co
     assert f"RTCP_STATE_DIR={directory}/of the start".encode() in environment.split(b"\0")
 
 
+@pytest.mark.parametrize("part", ["loop", "gateway"])
+def test_a_platform_that_only_got_a_gateway_has_not_started_its_loop(
+    directory: Path, config: ArmConfig, part: str
+) -> None:
+    running = Platform(directory, config, session.Processes(loop=session.identify(os.getpid())))
+    if part == "loop":
+        os.close(running.load_loop()[1])
+    else:
+        os.close(running.load_gateway())
+    (child,) = running._children
+    child.kill()
+    child.communicate()
+    assert running.started_loop is (part == "loop")
+
+
 def test_a_gateway_whose_pipe_closes_before_it_exits_is_reported_with_its_exit_code(
     directory: Path, config: ArmConfig
 ) -> None:
@@ -238,3 +256,50 @@ def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmCo
         launcher._start_all(directory, broken, launcher.StartOptions(), 0, lambda text: None)
     assert (directory / "loop.log.1").read_text() == "what went wrong"
     assert (directory / "gateway.log.1").read_text() == "who asked"
+
+
+@pytest.mark.parametrize(
+    ("file", "interface", "controller"),
+    [("abb_irb120.yaml", "0.0.0.0", "10.0.0.2"), ("abb_irb120_rapid.yaml", "10.0.0.2", None)],
+)
+def test_the_start_puts_the_address_of_the_controller_into_the_configuration(
+    file: str, interface: str, controller: str | None
+) -> None:
+    """EGM: the controller sends to this host. RAPID: this host opens the connections."""
+    options = launcher.StartOptions(config=default_config().with_name(file), controller="10.0.0.2")
+    bus = launcher._configure(options).bus
+    assert (bus.interface, getattr(bus, "controller", None)) == (interface, controller)
+
+
+@pytest.mark.parametrize(
+    ("file", "address", "reason"),
+    [
+        ("assistive_arm.yaml", "10.0.0.2", "bus.kind is ethercat, without a robot controller: use --bus"),
+        ("abb_irb120.yaml", "irc5", "allowed is an IPv4 address"),
+    ],
+)
+def test_an_address_that_no_controller_has_is_refused(file: str, address: str, reason: str) -> None:
+    options = launcher.StartOptions(config=default_config().with_name(file), controller=address)
+    with pytest.raises(RtcpError, match=f"--controller {address}: {reason}"):
+        launcher._configure(options)
+
+
+@pytest.mark.parametrize(
+    ("bus", "segment", "arms", "reason"),
+    [
+        ("abb_irb120.yaml", "irc5_rapid.yaml", 1, "has `rapid`: bus.kind egm needs a file that has no `rapid`"),
+        ("abb_irb120_rapid.yaml", "irc5.yaml", 1, "has no `rapid`: bus.kind rapid needs a file that has `rapid`"),
+        ("abb_irb120.yaml", "irc5.yaml", 2, "has 1 units, the controller has 2 arms"),
+        ("abb_irb120.yaml", "irc5_egm_two_arms.yaml", 2, ""),
+        ("abb_irb120_rapid.yaml", "irc5_two_arms.yaml", 2, ""),
+    ],
+)
+def test_a_virtual_controller_that_the_arms_would_never_hear_is_refused(
+    bus: str, segment: str, arms: int, reason: str
+) -> None:
+    config = load(default_config().with_name(bus))
+    config = replace(config, bus=replace(config.bus, segment=segment))
+    controller = Controller(load_irc5(default_config().with_name(segment)))
+    facts = {"pid": 1, "units": list(controller.units)} | (controller.streaming.ports if controller.streaming else {})
+    with pytest.raises(RtcpError, match=reason) if reason else contextlib.nullcontext():
+        launcher._check_controller(config, facts, arms)

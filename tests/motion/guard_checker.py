@@ -11,6 +11,7 @@ from rtcp.config.model import ArmConfig, Box, KeepOut
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint
+from rtcp.testing.sessions.oracle import Shape
 from tests.arm_geometry import box_gaps, depth, own_gap, points
 
 ROUNDING_RAD = 1e-6
@@ -32,12 +33,16 @@ class GuardChecker:
         self._depths = self.depths()
 
     def depths(self) -> list[float]:
-        """How far the tool is beyond its box, and bodies too near to each other and to each box, m; else negative."""
+        """Return how far the tool is beyond its box, bodies too near to each other and to each box, m, and cones, rad.
+
+        Negative where all is well.
+        """
         if self.config.arm is None:
             return []
         q = self.state.commanded
         depths = [-1.0 if self.limits.box is None else -depth(points(q)[0], self.limits.box), -own_gap(q)]
-        return depths + [-gap for box in self.limits.keep_out for gap in box_gaps(q, box)]
+        tilts = [SHAPE.tilt(q, cone.axis, cone[1:4]) - cone.angle for cone in self.limits.cones]
+        return depths + [-gap for box in self.limits.keep_out for gap in box_gaps(q, box)] + tilts
 
     def request(
         self, position: Iterable[float], tolerates_saturation: bool, velocity: Iterable[float] | None = None
@@ -101,6 +106,8 @@ ARM = load(default_config())
 assert ARM.arm is not None
 MODEL = ARM.arm
 """Its geometry."""
+SHAPE = Shape([MODEL], 0, ARM.cartesian.clearance)
+"""Its shape, by code that the product does not use."""
 _RANGE = replace(ARM.joints[1].position, min=-0.3, max=0.2)
 _SHORT = replace(ARM.joints[1], acceleration=0.7, velocity=1.5, position=_RANGE)
 JOINTS_ONLY = replace(ARM, joints=(ARM.joints[0], _SHORT), arm=None)

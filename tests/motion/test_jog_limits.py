@@ -205,7 +205,7 @@ def test_boundaries_are_looked_for_at_once_after_another_motion_and_when_a_box_h
     far[0] -= math.pi if near[0] > 0.0 else -math.pi
     inverse = JogInverse(MODEL)
     assert inverse.at(poses)
-    bounds = JogBounds(drive.limits, drive.guard.zones, inverse, 0.5, NEAREST, 0.002)
+    bounds = JogBounds(drive.limits, drive.guard.zones, inverse, 0.5, 0.5, NEAREST, 0.002)
     x, y, z = drive.tool
     wall = (-9.0, -9.0, -9.0, 9.0, y + 0.02, 9.0)
     plate = (x - 0.1, y + 0.05, z - 0.1, x + 0.1, y + 0.06, z + 0.1)

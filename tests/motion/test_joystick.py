@@ -18,8 +18,8 @@ TABLE = [
 
 @dataclass
 class Shown:
-    forward: int = 0
-    side: int = 0
+    forward: float = 0
+    side: float = 0
     paddle: int = 0
     valid: bool = True
 
@@ -176,6 +176,17 @@ def test_a_mode_that_was_left_comes_back_with_its_own_directions_and_nothing_of_
     press(joystick, UP)
     joystick.update(PUSHED["left"], True)
     assert joystick.twist == [0.0, 0.0, 0.0, 0.0, 0.0, TURN]
+
+
+@pytest.mark.parametrize("mode", range(4))
+def test_it_begins_with_x_y_once_it_has_been_neutral(mode: int) -> None:
+    joystick = joystick_in(mode)
+    joystick.begin()
+    joystick.update(PUSHED["forward"], True)
+    assert at_rest(joystick)
+    joystick.update(NEUTRAL, True)
+    joystick.update(PUSHED["forward"], True)
+    assert (joystick.mode, joystick.grip, joystick.twist[X]) == (0, None, SPEED)
 
 
 def test_waiting_for_neutral_can_be_asked_for() -> None:

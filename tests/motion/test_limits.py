@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.ipc.refusals import ImpossibleLimit, LimitsExcludeArm, LimitsExcludeJoint, LimitWidened, Refusal
-from rtcp.motion.limits import Corners, Limits, Values, corners, read, rows
+from rtcp.motion.limits import Cone, Corners, Limits, Values, corners, read, rows
 from rtcp.motion.planning.plan import COLUMNS
 from tests.arm_geometry import points
 
@@ -171,12 +171,17 @@ NUMBER = st.floats(width=64)
 JOINT = st.tuples(*[NUMBER] * 6)
 
 
-@given(joints=st.lists(JOINT, min_size=1, max_size=6), box=st.none() | JOINT, keep_out=st.lists(JOINT, max_size=4))
+@given(
+    joints=st.lists(JOINT, min_size=1, max_size=6),
+    box=st.none() | JOINT,
+    keep_out=st.lists(JOINT, max_size=4),
+    cones=st.lists(st.builds(Cone, st.integers(0, 2), NUMBER, NUMBER, NUMBER, NUMBER), max_size=3),
+)
 def test_limits_come_back_from_their_rows_as_they_were(
-    joints: list[Corners], box: Corners | None, keep_out: list[Corners]
+    joints: list[Corners], box: Corners | None, keep_out: list[Corners], cones: list[Cone]
 ) -> None:
     low, high, velocity, acceleration, jerk, torque = zip(*joints, strict=True)
-    values = Values(low, high, velocity, acceleration, jerk, torque, box, tuple(keep_out))
+    values = Values(low, high, velocity, acceleration, jerk, torque, box, tuple(keep_out), tuple(cones))
     plan = rows(values)
     assert repr(read(full(plan), len(plan))) == repr(values)
 
@@ -188,10 +193,11 @@ def test_another_count_of_rows_is_none(count: int) -> None:
     assert read(full(plan), count) is None
 
 
-@pytest.mark.parametrize("column", [0, 1, 2])
+@pytest.mark.parametrize("column", [0, 1, 2, 3])
 @pytest.mark.parametrize("number", [nan, inf, -1.0, 0.5, 1e18, 7.0, 0.0])
 def test_a_head_that_does_not_fit_the_rows_is_none(column: int, number: float) -> None:
-    plan = rows(WIDEST)
+    plan = rows(replace(WIDEST, cones=(Cone(2, 0.0, 0.0, 1.0, 1.0),)))
+    assert read(full(plan), len(plan)) is not None
     plan[0][column] = number
     assert read(full(plan), len(plan)) is None
 

@@ -30,6 +30,7 @@ class Drive:
     position: float = 0.0
     velocity: float = 0.0
     torque: float = 0.0
+    mode_display: int = 0
     target_position: float = 0.0
     target_velocity: float = 0.0
     target_torque: float = 0.0

@@ -56,7 +56,10 @@ REFUSALS = [
         "point 2: velocities and accelerations must be given for all points or for none",
     ),
     ([Point(2.0, ZERO, None, ZERO)], "point 1: an acceleration needs a velocity too"),
-    ([Point(0.0, ZERO)], "point 1: it is the only one and its time is 0 s, so that there is nothing to move to"),
+    (
+        [Point(0.0, ZERO, at(0.6)), Point(0.0, at(1.0), at(0.6))],
+        "point 1: j1 moves at 0.6 rad/s, allowed is at most 0.5 rad/s",
+    ),
     (
         [Point(0.0, at(0.0, 0.2)), Point(2.0, ZERO)],
         "point 1: at time 0 s j2 must be where it is, at 0.0000 rad (within 0.001 rad), found 0.2000 rad; "
@@ -84,12 +87,12 @@ REFUSALS = [
         "point 1: j1 accelerates with 3 rad/s^2, allowed is at most 2 rad/s^2",
     ),
     (
-        [Point(0.0, ZERO, ZERO), Point(2.0, at(0.8), ZERO)],
-        "between points 1 and 2: j1 would move at 0.6 rad/s at 1.000 s, allowed is at most 0.5 rad/s",
+        [Point(0.0, ZERO, ZERO), Point(2.0, at(0.92), ZERO)],
+        "between points 1 and 2: j1 would move at 0.69 rad/s at 1.000 s, allowed is at most 0.5 rad/s",
     ),
     (
-        [Point(0.0, ZERO, ZERO), Point(0.5, at(0.0, 0.1), ZERO)],
-        "between points 1 and 2: j2 would accelerate with 2.4 rad/s^2 at 0.000 s, allowed is at most 2 rad/s^2",
+        [Point(0.0, ZERO, ZERO), Point(0.5, at(0.0, 0.13), ZERO)],
+        "between points 1 and 2: j2 would accelerate with 3.12 rad/s^2 at 0.000 s, allowed is at most 2 rad/s^2",
     ),
 ]
 
@@ -125,6 +128,85 @@ def test_a_joint_that_swings_beyond_its_range_between_two_points_is_refused(plan
 def test_a_plan_through_a_box_is_refused(plan: Planned, points: list[Point], where: str) -> None:
     with pytest.raises(PlanRefused, match=rf"^{where}: the arm would be in the keep-out box user at 2\.\d+ s$"):
         plan(points, zone_at=lambda q: "the keep-out box user" if 0.4 < q[0] < 0.45 else None)
+
+
+def at_the_limits(goal: Sequence[float], interval_s: float) -> list[Point]:
+    """A move from rest at 0 whose slowest joint keeps exactly 2 rad/s^2 and 0.5 rad/s, sampled as MoveIt samples it."""
+    size = max(map(abs, goal))
+    rate, most = 2.0 / size, min(0.5 / size, math.sqrt(2.0 / size))
+    ramp_s = most / rate
+    end_s = ramp_s + 1.0 / most
+    points = []
+    for t in [*(interval_s * k for k in range(int(end_s / interval_s - 1e-6) + 1)), end_s]:
+        left_s = end_s - t
+        if t < ramp_s:
+            s, speed, change = rate * t * t / 2, rate * t, rate
+        elif left_s > ramp_s:
+            s, speed, change = most * (t - ramp_s / 2), most, 0.0
+        else:
+            s, speed, change = 1.0 - rate * left_s * left_s / 2, rate * left_s, -rate
+        points.append(Point(t, *(tuple(factor * q for q in goal) for factor in (s, speed, change))))
+    return points
+
+
+@pytest.mark.parametrize("interval_s", [0.1, 0.01])
+@pytest.mark.parametrize("given", ["qva", "qv", "q"])
+@pytest.mark.parametrize("goal", [at(1.0), (0.8, -0.1, 0.3, 0.5, 0.4, -0.7), at(0.05)], ids=["one", "all", "short"])
+def test_a_motion_that_is_sampled_at_the_limits_is_planned_and_driven(
+    drive: Drive, plan: Planned, goal: Sequence[float], given: str, interval_s: float
+) -> None:
+    points = [
+        Point(p.t, p.q, p.v if "v" in given else None, p.a if "a" in given else None)
+        for p in at_the_limits(goal, interval_s)
+    ]
+    made = plan(points)
+    # Velocities say what the motion is; the spline through positions alone is faster at a change of acceleration.
+    assert made.slowed == 1.0 if "v" in given else 1.0 / 1.15 <= made.slowed <= 1.0
+    assert made.duration_s == pytest.approx(points[-1].t / made.slowed)
+    passed = {round(row[0], 9): row[1:7] for row in made.rows}
+    assert all(passed[round(p.t / made.slowed, 9)] == pytest.approx(p.q, abs=1e-12) for p in points)
+    mode = drive.controller(TrajectoryController)
+    assert drive.execute(mode, memory(made.rows), len(made.rows)) is None
+    drive.until_rest(mode)  # every cycle is inside the limits
+    assert drive.state.commanded == pytest.approx(goal, abs=1e-9)
+
+
+def test_a_motion_at_its_limits_with_more_rows_than_a_plan_has_is_refused(plan: Planned) -> None:
+    samples = at_the_limits(at(1.0), 0.1)
+    points = [*samples[:-1], *(Point(samples[-1].t + 0.002 * k, at(1.0), ZERO, ZERO) for k in range(4096 - 23))]
+    with pytest.raises(PlanRefused, match=r"^the motion needs 4\d\d\d rows at its limits, at most 4096 fit"):
+        plan(points)
+
+
+@pytest.mark.parametrize(
+    ("points", "least_s", "most_s"),
+    [
+        ([Point(0.0, at(0.5))], 1.25, 1.5),  # a trapezoid takes 1.25 s
+        ([Point(0.0, at(0.5), ZERO)], 1.25, 1.5),
+        ([Point(0.0, at(0.5), at(0.1))], 5.0, 5.2),
+        ([Point(0.0, ZERO), Point(0.0, at(0.25)), Point(0.0, at(0.5))], 1.25, 2.0),
+        ([Point(0.0, ZERO, ZERO), Point(0.0, at(0.25), at(0.2)), Point(0.0, at(0.5), ZERO)], 2.5, 3.2),
+        ([Point(0.0, at(0.1 * k, 0.1 * (k % 2))) for k in range(6)], 1.25, 6.0),
+        ([Point(0.0, ZERO)], 0.0, 0.1),  # already there
+    ],
+)
+def test_points_without_times_are_executed_in_sequence_at_a_default_speed_or_the_given_one(
+    drive: Drive, plan: Planned, points: list[Point], least_s: float, most_s: float
+) -> None:
+    made = plan(points)
+    assert least_s <= made.duration_s <= most_s
+    passed = [row[1:7] for row in made.rows]
+    assert all(any(row == pytest.approx(p.q, abs=1e-12) for row in passed) for p in points)
+    mode = drive.controller(TrajectoryController)
+    assert drive.execute(mode, memory(made.rows), len(made.rows)) is None
+    drive.until_rest(mode)
+    assert drive.state.commanded == pytest.approx(points[-1].q, abs=1e-9)
+
+
+def test_points_without_times_replace_a_motion(plan: Planned) -> None:
+    made = plan([Point(0.0, at(0.2)), Point(0.0, at(0.5))], moving=True)
+    assert made.rows[0][0] > 0.0
+    assert (made.rows[0][1], made.end) == (0.2, at(0.5))
 
 
 def test_rows_have_times_numbers_and_kind(plan: Planned) -> None:
@@ -168,3 +250,11 @@ def test_what_was_planned_is_driven_to_its_end_inside_the_limits(new_drive: Call
         if driven == 4:
             return
     raise AssertionError(f"only {driven} of 40 could be planned")
+
+
+def test_a_first_point_at_time_0_may_be_as_far_from_the_arm_as_the_start_tolerance_allows(plan: Planned) -> None:
+    here, points = at(0.1, -0.2), [Point(0.0, at(0.109, -0.209)), Point(2.0, ZERO)]
+    assert plan(points, here, start_tolerance=0.01) == plan([Point(0.0, here), points[1]], here)
+    for tolerance, shown in ((0.008, "within 0.008 rad"), (0.0, "within 0.001 rad")):
+        with pytest.raises(PlanRefused, match=rf"at time 0 s j1 must be where it is, at 0.1000 rad \({shown}\)"):
+            plan(points, here, start_tolerance=tolerance)

@@ -40,6 +40,7 @@ class Joint:
     position: float = 0.0
     velocity: float = 0.0
     torque: float = 0.0
+    mode_display: int = 0
     target_position: float = 0.0
     target_velocity: float = 0.0
     target_torque: float = 0.0
@@ -59,7 +60,7 @@ class Plant:
         self.state.actual_torque = self.holding(q)
         self.guard = TrajectoryGuard(replace(arm, arm=None), self.limits, PERIOD)
         self.guard.latch(self.state)
-        self.law = CstWriter(arm.joints, PERIOD)
+        self.law = CstWriter(arm.joints, PERIOD, self.limits.torque)
         self.law.start(self.joints, [joint.torque for joint in self.joints])
         setup = ControllerSetup(replace(arm, arm=model), self.limits, self.guard, PERIOD, no_plan)
         self.mode = TorqueController(setup)
@@ -245,7 +246,8 @@ def test_a_law_whose_set_point_is_elsewhere_takes_over_without_a_step(plant: Pla
     """For example after a blow, which the setpoint follows only slowly."""
     joint = plant.joints
     there = [drive.position + 0.05 for drive in joint]
-    plant.law.pass_on(there, [3.0] * 6, [3.0] * 6, joint)
+    for _ in range(100):
+        plant.law.pass_on(there, [3.0] * 6, [3.0] * 6, joint)
     plant.law.update(there, [0.2] * 6, joint)
     for i in range(6):
         assert joint[i].target_torque == pytest.approx(3.0, abs=0.05)

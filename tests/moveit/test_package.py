@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import ast
 import os
+import runpy
 import shutil
 import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, ClassVar
 
 import pytest
 import yaml
@@ -127,18 +130,125 @@ def test_the_controllers_of_both_moveits_have_the_same_action_and_joints(package
     assert old["joints"] == [joint.name for joint in load(find_arm("assistive_arm")).joints]
 
 
-def test_the_launch_files_name_files_that_are_there(package: Path) -> None:
-    texts = [
-        node.value
-        for node in ast.walk(ast.parse(read(package, "launch/move_group.launch.py")))
-        if isinstance(node, ast.Constant)
-    ]
-    named = [str(text) for text in texts if str(text).startswith("config/")]
-    parameters = ET.fromstring(read(package, "launch/planning_context.launch"))
-    files = [element.get("textfile") or element.get("file", "") for element in parameters]
-    named += [file.replace(f"$(find {package.name})/", "") for file in files]
-    assert len(named) == 6
-    assert [name for name in named if not (package / name).is_file()] == []
+def test_links_are_padded_and_pilz_has_its_limits_in_the_namespace_where_both_moveits_look(package: Path) -> None:
+    arm = load(find_arm("assistive_arm")).cartesian
+    assert yaml.safe_load(read(package, "config/joint_limits.yaml"))["default_robot_padding"] == arm.clearance == 0.01
+    assert yaml.safe_load(read(package, "config/pilz_cartesian_limits.yaml")) == {
+        "cartesian_limits": {
+            "max_trans_vel": arm.speed,
+            "max_trans_acc": arm.acceleration,
+            "max_trans_dec": -arm.acceleration,
+            "max_rot_vel": arm.angular_speed,
+        }
+    }
+
+
+class Builder:
+    """MoveItConfigsBuilder of moveit_configs_utils, which cannot be installed here, as to which files it reads."""
+
+    package: ClassVar[Path]
+
+    def __init__(self, robot: str, package_name: str) -> None:
+        assert package_name == self.package.name
+        self._robot, self._files = robot, {kind: f"config/{robot}.{kind}" for kind in ("urdf", "srdf")}
+        self._pipelines: list[str] = []
+
+    def robot_description(self, file_path: str) -> None:
+        self._files["urdf"] = file_path
+
+    def robot_description_semantic(self, file_path: str) -> None:
+        self._files["srdf"] = file_path
+
+    def planning_pipelines(self, default: str, pipelines: list[str]) -> None:
+        assert default in pipelines
+        self._pipelines = pipelines
+
+    def to_moveit_configs(self) -> Any:
+        """Read what it reads by default. Without a file for a pipeline it takes its own."""
+
+        def found(name: str) -> Any:
+            return yaml.safe_load(read(self.package, f"config/{name}.yaml"))
+
+        files = {path.name for path in (self.package / "config").iterdir()}
+        [controllers] = [name for name in ("moveit", "moveit2", self._robot) if f"{name}_controllers.yaml" in files][:1]
+        limits = {"robot_description_planning": found("joint_limits")}
+        parameters = {
+            "robot_description": read(self.package, self._files["urdf"]),
+            "robot_description_semantic": read(self.package, self._files["srdf"]),
+            "robot_description_kinematics": found("kinematics"),
+            "planning_pipelines": self._pipelines,
+            **found(f"{controllers}_controllers"),
+            # Early releases of Humble: in place of the joint limits.
+            "robot_description_planning": found("pilz_cartesian_limits"),
+        }
+        assert not any(name.endswith("_planning.yaml") for name in files), "its own pipelines suit its version"
+        return SimpleNamespace(to_dict=lambda: parameters, joint_limits=limits)
+
+
+def test_moveit_2_is_started_with_all_that_moveit_configs_utils_reads(
+    package: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Builder.package = package
+    modules: dict[str, dict[str, Any]] = {
+        "launch": {"LaunchDescription": list},
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": dict},
+        "moveit_configs_utils": {"MoveItConfigsBuilder": Builder},
+    }
+    for name, contents in modules.items():
+        module = ModuleType(name)
+        vars(module).update(contents)
+        monkeypatch.setitem(sys.modules, name, module)
+    started = runpy.run_path(str(package / "launch/move_group.launch.py"))["generate_launch_description"]()
+    [node] = started
+    assert (node["package"], node["executable"]) == ("moveit_ros_move_group", "move_group")
+    everything, limits = node["parameters"]
+    assert everything["planning_pipelines"] == ["ompl", "pilz_industrial_motion_planner"]
+    assert everything["moveit_controller_manager"].endswith("MoveItSimpleControllerManager")
+    assert limits["robot_description_planning"]["joint_limits"].keys() == {f"joint{n}" for n in range(1, 7)}
+
+
+def test_the_setup_assistant_finds_urdf_and_srdf(package: Path) -> None:
+    names = yaml.safe_load(read(package, ".setup_assistant"))["moveit_setup_assistant_config"]
+    assert names["URDF"]["package"] == package.name
+    assert [(package / names[kind]["relative_path"]).is_file() for kind in ("URDF", "SRDF")] == [True, True]
+
+
+@pytest.mark.parametrize("name", ["config/assistive_arm.urdf", "config/assistive_arm.srdf"])
+def test_xacro_finds_nothing_to_expand_in_the_descriptions(package: Path, name: str) -> None:
+    """moveit_configs_utils passes both through xacro."""
+    xacro = pytest.importorskip("xacro", reason="xacro is not installed: pip install xacro")
+    expanded = xacro.process_file(str(package / name)).toxml()
+    assert ET.canonicalize(expanded, strip_text=True) == ET.canonicalize(read(package, name), strip_text=True)
+
+
+@pytest.mark.skipif(shutil.which("roslaunch") is None, reason="roslaunch is not installed: make test-ros installs it")
+def test_roslaunch_starts_move_group_of_moveit_1_with_the_parameters_of_the_arm(package: Path) -> None:
+    environment = {**os.environ, "ROS_PACKAGE_PATH": str(package.parent)}
+
+    def roslaunch(option: str, *arguments: str) -> str:
+        command = ["roslaunch", option, package.name, "move_group.launch", *arguments]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+    assert roslaunch("--nodes").split() == ["/move_group"]
+    parameters = yaml.safe_load(roslaunch("--dump-params"))
+    assert ET.fromstring(parameters["/robot_description"]).get("name") == "assistive-arm"
+    for name, value in {
+        "/robot_description_planning/default_robot_padding": 0.01,
+        "/robot_description_planning/cartesian_limits/max_trans_vel": 0.25,
+        "/robot_description_planning/joint_limits/joint6/max_velocity": 0.5,
+        "/robot_description_kinematics/manipulator/kinematics_solver": f"{package.name}/KinematicsPlugin",
+        "/move_group/default_planning_pipeline": "ompl",
+        "/move_group/planning_pipelines/ompl/planning_plugin": "ompl_interface/OMPLPlanner",
+        "/move_group/planning_pipelines/ompl/manipulator/planner_configs": ["RRTConnect"],
+        "/move_group/planning_plugin": "ompl_interface/OMPLPlanner",
+        "/move_group/moveit_controller_manager": "moveit_simple_controller_manager/MoveItSimpleControllerManager",
+    }.items():
+        assert parameters[name] == value, name
+    assert parameters["/move_group/controller_list"][0]["name"] == "joint_trajectory_action"
+    others = yaml.safe_load(roslaunch("--dump-params", "load_robot_description:=false", "pipeline:=pilz"))
+    assert "/robot_description" not in others
+    assert others["/move_group/default_planning_pipeline"] == "pilz"
 
 
 @needs_cpp

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from functools import partial
 from http import HTTPStatus
@@ -116,13 +117,19 @@ def drawing_browser(leftovers: Leftovers, chromium: BrowserType) -> Iterator[Bro
 def kept(leftovers: Leftovers) -> Iterator[tuple[Platform, subprocess.Popen[str], str]]:
     """A started platform, a panel beside it and its address, for the tests of this worker.
 
-    The sixth joint and its drive have names that are scripts; the drives have their temperature in the process data.
+    The sixth joint and its drive have names that are scripts; the drives have their temperature in the process data. A
+    cone limits the tool, and the second joint has limits beyond those of the file.
     """
     made = Platform()
     leftovers.shared.add(str(made.directory))
     made.be_patient(lost_ms=2000, period_us=PERIOD_US)
     arm, drive = made.directory / "config/assistive_arm.yaml", made.directory / "config/devices/cubemars-orh.yaml"
-    arm.write_text(re.sub(r"\b(drive6|joint6)\b", rf'"\g<1> {HOSTILE}"', arm.read_text()))
+    text = re.sub(r"\b(drive6|joint6)\b", rf'"\g<1> {HOSTILE}"', arm.read_text())
+    text = re.sub(
+        r"(?m)^cartesian:.*$", r"\g<0>\n  cones: [{name: cup, axis: z, direction: [0, 0, 1], angle: 3.0}]", text
+    )
+    wider = "    absolute: {position: {min: -2.0, max: 2.1}}"
+    arm.write_text(re.sub(r"(?m)^    slave: drive2$", rf"\g<0>\n{wider}", text))
     temperature = "- {index: 0x2000, sub_index: 1, type: int16, name: temperature, factor: 0.1}"
     drive.write_text(re.sub(r"( *)- \{index: 0x6061.*", rf"\g<0>\n\1{temperature}", drive.read_text()))
     try:
@@ -216,14 +223,26 @@ def log_in(page: Page, password: str = PASSWORD) -> None:
     page.wait_for_selector(LIVE)
 
 
+_AT_REST = """() => !document.querySelector('[class*="-enter-active"], [class*="-leave-active"]')
+    && ![...document.querySelectorAll('.q-loading-bar, .nicegui-error-popup')]
+        .some(shown => getComputedStyle(shown).opacity > 0)"""
+"""Whether nothing fades in or out, no page loads and none has lost its connection: none has its colours then."""
+
+
 def barriers(page: Page, *rules: str) -> dict[str, list[str]]:
     """Return the serious and critical findings of axe-core, by rule; of some rules, or of all."""
+    page.wait_for_function(_AT_REST)
+    is_live = page.evaluate("Boolean(window.rtcp?.token)")
     options: dict[str, Any] = {"resultTypes": ["violations"], **({"runOnly": list(rules)} if rules else {})}
-    return {
+    found = {
         rule["id"]: [f"{node['html'][:150]}: {node['any'] and node['any'][0]['message']}" for node in rule["nodes"][:3]]
         for rule in Axe().run(page, options=options).response["violations"]
         if rule["impact"] in ("serious", "critical")
     }
+    if is_live:
+        # axe-core holds the page up for seconds, and a click with what it showed before is refused as late.
+        page.wait_for_function("now => rtcp.token > now", arg=time.monotonic_ns())
+    return found
 
 
 BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]

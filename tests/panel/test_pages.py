@@ -166,13 +166,22 @@ def test_the_arm_is_drawn_as_the_platform_reports_it_with_a_ghost_at_its_goal(dr
     expect(drawing.locator("#operator")).to_have_text("Nobody operates the arm")
 
 
+def test_the_frame_shows_the_joysticks_mode_and_what_it_controls_in_every_control_mode(
+    page: Page, holding: Platform
+) -> None:
+    show(page, "/arm")
+    assert holding.status()["control_mode"] != "joystick"
+    expect(page.locator("#joystick")).to_have_text("Joystick X-Y, controls the arm")
+
+
 @pytest.fixture
 def limits_of_the_file(holding: Platform) -> Iterator[Platform]:
     yield holding
-    holding.call("set_limits", changes={"joint2.max": 2.0, "box.max.z": 1.4})
+    of_the_file = {"joint2.max": 2.0, "box.max.z": 1.4, "cup.angle": 3.0, "supervision.following_error": 0.15}
+    holding.call("set_limits", changes=of_the_file)
 
 
-def test_limits_are_narrowed_and_never_widened_in_the_units_of_the_browser(
+def test_limits_are_narrowed_and_only_widened_on_purpose_in_the_units_of_the_browser(
     drawing: Page, limits_of_the_file: Platform
 ) -> None:
     platform = limits_of_the_file
@@ -207,7 +216,8 @@ def test_limits_are_narrowed_and_never_widened_in_the_units_of_the_browser(
     drawing.get_by_role("button", name="Plan").click()
     drawing.get_by_role("button", name="Send", exact=True).click()
     until(lambda: abs(platform.status()["joints"]["actual_position"][0] - math.radians(10)) < 1e-4, "10 degrees")
-    assert platform.status()["joints"]["commanded_position"][3] == pytest.approx(0.001, abs=1e-6)
+    step = pytest.approx(0.001, abs=1e-6)
+    until(lambda: platform.status()["joints"]["commanded_position"][3] == step, "a step of the slider")
     show(drawing, "/arm")  # loaded anew: the browser has kept them
     expect(drawing.locator("[data-live='actual_position.0']")).to_have_text("10.00")
     expect(drawing.locator("[data-live='tool.2']")).to_have_text(f"{1000 * tool_of(platform)[2]:.1f}")
@@ -218,6 +228,16 @@ def test_limits_are_narrowed_and_never_widened_in_the_units_of_the_browser(
     expect(drawing.get_by_label("box max z, m")).to_have_value("1.4")
     drawing.get_by_label("Angles").select_option("rad")
     expect(drawing.get_by_label("joint2 max, rad")).to_have_value("2")
+    drawing.get_by_label("cup angle").fill("2.9")
+    drawing.get_by_label("supervision following error").fill("0.1")
+    drawing.get_by_role("button", name="Set the limits").click()
+    until(lambda: platform.call("limits")["limits"]["cones"]["cup"]["angle"] == 2.9, "the cone")
+    assert platform.call("limits")["limits"]["supervision"]["following_error"] == 0.1
+    platform.call("disable")
+    drawing.get_by_label("joint2 max").fill("2.05")
+    drawing.get_by_role("button", name="Beyond the file").click()
+    drawing.get_by_role("button", name="Widen the limits").click()
+    until(lambda: platform.call("limits")["limits"]["max"][1] == 2.05, "the wider limit of joint 2")
 
 
 def test_a_recording_is_made_and_drawn_and_a_motion_file_is_run(page: Page, holding: Platform, tmp_path: Path) -> None:

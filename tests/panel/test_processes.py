@@ -47,9 +47,10 @@ def test_the_heater_shows_what_it_publishes_and_is_armed_measured_refused_and_st
     page.get_by_role("button", name="Arm heater", exact=True).click()
     expect(page.locator("[data-live='processes.heater.state']")).to_have_text("armed")
     expect(page.locator(".lamps")).to_contain_text("red: on")
-    page.get_by_label("Straight and unloaded").select_option("yes")
-    page.get_by_label("Phase").select_option("austenite")
-    page.get_by_role("button", name="Measure resistance", exact=True).click()
+    measurement = page.get_by_role("group", name="Measure resistance")
+    measurement.get_by_label("Straight and unloaded").select_option("yes")
+    measurement.get_by_label("Phase").select_option("austenite")
+    measurement.get_by_role("button", name="Measure resistance", exact=True).click()
     expect(page.locator("[data-live='processes.heater.fields.initial_resistance']")).to_contain_text(
         re.compile(r"0\.34|0\.3399")
     )

@@ -23,11 +23,11 @@ def test_a_panel_sees_the_curves_of_the_rod_from_its_own_base(tmp_path: Path) ->
     partners.own = replace(cell.arms[0], directory=tmp_path / "left")
     partners.find()
     assert partners.rod == []
-    # The left arm stands at y = 0.6 and looks along -y: what is at the world's origin is 0.6 m before it.
+    # The left arm stands at y = 0.457 and looks along -y: what is at the world's origin is 0.457 m before it.
     rod = {"pid": os.getpid(), "curves": [[[0.0, 0.0, 0.4], [0.0, 0.1, 0.4]]]}
     rod_file(tmp_path).write_text(json.dumps(rod))
     partners.find()
-    assert partners.rod == [[pytest.approx([0.6, 0.0, 0.4]), pytest.approx([0.5, 0.0, 0.4])]]
+    assert partners.rod == [[pytest.approx([0.457, 0.0, 0.4]), pytest.approx([0.357, 0.0, 0.4])]]
     os.utime(rod_file(tmp_path), (0.0, 0.0))
     partners.find()
     assert partners.rod == []

@@ -110,7 +110,7 @@ JETSON = GOOD_PC | {
 LAPTOP = GOOD_PC | {
     "proc/version": "Linux version 6.8.0-45-generic (gcc 13) #45-Ubuntu SMP PREEMPT_DYNAMIC",
     "sys/kernel/realtime": None,
-    "etc/os-release": "ID=ubuntu\n",
+    "etc/os-release": 'ID=ubuntu\nVERSION_ID="24.04"\n',
     "proc/sys/kernel/sched_rt_runtime_us": "950000",
     "sys/devices/system/clocksource/clocksource0/current_clocksource": "hpet",
     f"{CPUS}/isolated": "",

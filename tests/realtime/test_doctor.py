@@ -38,6 +38,8 @@ THREAD = "417 (irq/130-eth0-Tx) S 2" + " 0" * 34 + " 3 {} 0 0"
 """proc/417/stat with its priority and policy."""
 PACKET = "sk RefCnt Type Proto Iface R Rmem User Inode\nffff 3 3 88a4 {} 1 0 0 1234"
 WORDS = "isolcpus=managed_irq,domain,3 nohz_full=3 rcu_nocbs=3 irqaffinity=0-2"
+R38 = "# R38 (release), REVISION: 4.0"
+BUILD = "# build a kernel with PREEMPT_RT from its sources: docs/realtime_kernel.md"
 VIRTUAL: dict[str, object] = {"interface": None}
 
 Files = dict[str, str | None]
@@ -49,9 +51,17 @@ ROWS: list[tuple[str, str, Files, Severity, str, str]] = [
      OK, "PREEMPT_RT, Linux 5", ""),
     ("preempt-rt", "laptop", {}, WARNING, "Linux 6.8.0-45-generic is not a PREEMPT_RT kernel (PREEMPT_DYNAMIC)",
      "pro enable"),
-    ("preempt-rt", "laptop", {"etc/os-release": "ID=debian"}, WARNING, "", "linux-image-rt-amd64"),
+    ("preempt-rt", "laptop", {"etc/os-release": "ID=debian"}, WARNING, "",
+     "linux-image-rt-$(dpkg --print-architecture)"),
     ("preempt-rt", "laptop", {"etc/os-release": None}, WARNING, "", "install the distribution's kernel"),
+    *(("preempt-rt", "laptop", {"etc/os-release": f'ID=ubuntu\nVERSION_ID="{version}"'}, WARNING, "", remedy)
+      for version, remedy in (("18.04", BUILD), ("20.04", BUILD), ("22.04", "pro enable realtime-kernel"),
+                              ("25.04", BUILD), ("26.04", "apt install linux-realtime "))),
     ("preempt-rt", "jetson", {}, WARNING, "", "jetson/rt-kernel r36.4 main"),
+    ("preempt-rt", "jetson", {"etc/nv_tegra_release": R38}, WARNING, "", "nvidia-l4t-rt-kernel-nvgpu"),
+    ("preempt-rt", "jetson", {"etc/nv_tegra_release": R38, "proc/device-tree/model": "NVIDIA Jetson AGX Thor\0"},
+     WARNING, "", "nvidia-l4t-rt-kernel-openrm"),
+    ("preempt-rt", "jetson", {"etc/nv_tegra_release": "# unknown"}, WARNING, "", BUILD),
     ("rt-throttling", "good", {RUNTIME: "-1"}, OK, "not throttled", ""),
     ("rt-throttling", "good", {RUNTIME: "950000"}, OK, "950 of every 1000 ms", ""),
     ("rt-throttling", "good", {RUNTIME: "500000"}, WARNING, "500 of every 1000 ms",
@@ -210,6 +220,19 @@ def test_a_whole_host_has_these_findings_and_each_comes_with_a_remedy(
     assert [
         f.key for f in findings if (f.severity is OK and f.remedy) or (f.severity >= WARNING and not f.remedy)
     ] == []
+
+
+def test_a_jetson_nano_is_not_sent_to_a_repository_and_its_pages_exist(patient: Callable[[str], Any]) -> None:
+    nano = patient("jetson")
+    nano.put({
+        "proc/version": "Linux version 4.9.337-tegra (gcc 7) #1 SMP PREEMPT Thu Jun 8",
+        "etc/nv_tegra_release": "# R32 (release), REVISION: 7.6, GCID: 38171779, BOARD: t210ref",
+        "proc/device-tree/model": "NVIDIA Jetson Nano Developer Kit\0",
+    })  # fmt: skip
+    remedy = "\n".join(nano.finding("preempt-rt").remedy)
+    assert remedy == f"{BUILD}, and docs/jetson.md for this board"
+    pages = re.findall(r"docs/\w+\.md", remedy)
+    assert [page for page in pages if not (Path(__file__).parents[2] / page).exists()] == []
 
 
 def test_a_host_that_says_nothing_is_not_known_and_not_bad(tmp_path: Path) -> None:

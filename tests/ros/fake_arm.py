@@ -41,6 +41,7 @@ class FakeArm:
         self.refuses: dict[str, RtcpError] = {}
         """Errors by the name of the call that they refuse."""
         self.motion: asyncio.Future[None] | None = None
+        self.is_held_by_others = False
         self.stopped = asyncio.Event()
         """Set at the end of a stop."""
         self.stopped.set()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Awaitable
 
 import pytest
@@ -172,5 +173,59 @@ def test_a_controller_that_requests_is_answered_and_garbage_ends_the_connection(
         controller.writers[0].write(b"\0\0\0\0")
         await controller.until(connections=2)
         running.cancel()
+
+    run(test())
+
+
+class Link:
+    """The link to a server: while it is down nothing passes it, and TCP repeats the first packet of a connection 1, 3,
+    7, 15, 31 and 63 s after the first (Linux, tcp_syn_retries)."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._connect = asyncio.open_connection
+        self._writers: list[asyncio.StreamWriter] = []
+        self.is_down = False
+        monkeypatch.setattr(asyncio, "open_connection", self._open)
+
+    async def _open(self, host: str, port: int) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        for waits_s in (1, 2, 4, 8, 16, 32):
+            if not self.is_down:
+                reader, writer = await self._connect(host, port)
+                self._writers.append(writer)
+                return reader, writer
+            await asyncio.sleep(waits_s)
+        raise TimeoutError(110, "Connection timed out")
+
+    def cut(self) -> None:
+        """Cut it: both ends of a connection stay open, and hear nothing."""
+        self.is_down = True
+        for writer in self._writers:
+            writer.transport.pause_reading()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("down_s", [8.0, 60.0])
+def test_the_state_stream_is_back_seconds_after_a_link_that_was_down(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, down_s: float
+) -> None:
+    monkeypatch.undo()
+
+    async def test() -> None:
+        received, link = list[messages.Message](), Link(monkeypatch)
+        async with SimpleMessageServer(FakeArm(), ServerOptions(motion_port=0, state_port=0)) as server:
+            state = StateClient("127.0.0.1", received.append, server.ports[1])
+            running = asyncio.create_task(state.run())
+            while not received:
+                await asyncio.sleep(0.01)
+            link.cut()
+            await asyncio.sleep(down_s)
+            assert not state.is_connected
+            assert "no message for 5.0 s" in caplog.text
+            link.is_down = False
+            received.clear()
+            back = time.monotonic()
+            while not received:
+                await asyncio.sleep(0.01)
+            assert time.monotonic() - back < client_module.CONNECT_TIMEOUT_S + client_module.RECONNECT_S + 0.1
+            running.cancel()
 
     run(test())

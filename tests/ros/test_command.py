@@ -39,7 +39,11 @@ def test_it_serves_without_a_platform_refuses_motion_and_ends_with_a_signal(tmp_
 
 @pytest.mark.parametrize(
     ("arguments", "reason"),
-    [(["--rate", "0"], "--rate"), (["--simple-message", "--byte-order", "middle"], "--byte-order middle")],
+    [
+        (["--rate", "0"], "--rate"),
+        (["--downsample", "1"], "--downsample 1"),
+        (["--simple-message", "--byte-order", "middle"], "--byte-order middle"),
+    ],
 )
 def test_wrong_options_are_refused(arguments: list[str], reason: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["ros", *arguments]) == 2

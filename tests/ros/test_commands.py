@@ -6,14 +6,18 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from rtcp.api import Arrival, Progress, RtcpError, State, Status
+from rtcp.api import Arrival, AsyncRobot, Progress, RtcpError, State, Status
+from rtcp.config.find import default_config
+from rtcp.config.loader import load
 from rtcp.config.model import MOST_POINTS
 from rtcp.ros import commands, held_up
 from rtcp.ros.commands import (
@@ -22,18 +26,29 @@ from rtcp.ros.commands import (
     Commander,
     CommandOptions,
     FollowCode,
+    Inbox,
     Tolerance,
     Tolerances,
     Trajectory,
     TrajectoryPoint,
     points_of,
 )
+from rtcp.ros.group import GroupRobot
+from rtcp.ros.processes import ProcessService, services_of
+from rtcp.ros.simple_message.arm import Point
+from rtcp.ros.simple_message.cell_arm import CellArm
 from tests import simulated_time
 
 NAMES = ("a", "b", "c")
 HERE = (0.1, 0.2, 0.3)
 STATUS = cast(Status, SimpleNamespace(joint_names=NAMES, commanded_positions=HERE, state=State.HOLDING))
 PATH = Trajectory(NAMES, [TrajectoryPoint(0.0, HERE), TrajectoryPoint(1.0, (0, 0, 0))])
+
+ARM_HEATER, STOP_HEATING, HEAT_ROD = (
+    ProcessService("heater", "arm_heater", False),
+    ProcessService("heater", "stop_heating", False, needs_lease=False),
+    ProcessService("heater", "heat_rod", True),
+)
 
 
 class FakeStream:
@@ -80,15 +95,24 @@ class FakeArm:
 
     async def status(self) -> Status:
         self._check()
-        status = SimpleNamespace(joint_names=NAMES, commanded_positions=self.commanded, state=self.state)
+        raw = {"processes": {"heater": {"state": "armed"}, "fan": {"state": None}}}
+        status = SimpleNamespace(joint_names=NAMES, commanded_positions=self.commanded, state=self.state, raw=raw)
         return cast(Status, status)
 
     async def set_speed_override(self, fraction: float) -> None:
         self.calls.append(("speed_override", fraction))
 
+    async def set_limits(self, changes: Mapping[str, float]) -> None:
+        self._check()
+        self.calls.append(("set_limits", dict(changes)))
+
     async def set_output(self, output: str, value: float) -> None:
         self._check()
         self.calls.append((output, value))
+
+    async def command(self, name: str, **fields: Any) -> None:
+        self._check()
+        self.calls.append((name, fields))
 
     async def enable(self) -> None:
         self.calls.append("enable")
@@ -217,6 +241,71 @@ def test_joints_that_do_not_match_are_refused(names: Sequence[str], positions: S
 
 def test_more_points_than_the_robot_has_room_for_are_refused() -> None:
     assert reason_of(Trajectory(NAMES, [TrajectoryPoint(0.0, HERE)] * (MOST_POINTS + 1))) == "too_many_points"
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "kept"),
+    [(5, 0, [0, 1, 2, 3, 4]), (5, 5, [0, 1, 2, 3, 4]), (5, 3, [0, 2, 4]), (9, 4, [0, 3, 5, 8]), (5000, 2, [0, 4999])],
+)
+def test_a_longer_trajectory_is_reduced_to_the_points_asked_for_with_both_its_ends(
+    arm: FakeArm, count: int, most: int, kept: list[int]
+) -> None:
+    path = Trajectory(NAMES, [TrajectoryPoint(float(k), (float(k), 0.0, 0.0)) for k in range(count)])
+
+    async def begin(commander: Commander) -> None:
+        await commander.begin_trajectory(path)
+
+    carry_out(arm, begin, most_points=most)
+    assert [q[0] for q in arm.calls[0][1]] == kept
+
+
+def test_of_a_flood_only_so_many_messages_wait_and_the_other_topics_go_on() -> None:
+    carried_out: list[str] = []
+    logged: list[str] = []
+    may_go_on = asyncio.Event()
+
+    async def waits() -> None:
+        await may_go_on.wait()
+        carried_out.append("flood")
+
+    async def acts() -> None:
+        carried_out.append("other")
+        raise RtcpError("refused", "not now")
+
+    async def test() -> None:
+        inbox = Inbox(asyncio.get_running_loop(), logged.append)
+        for _ in range(5000):
+            inbox.put("flood", waits())
+        inbox.put("other", acts())
+        while not carried_out:
+            await asyncio.sleep(0)
+        assert carried_out == ["other"]
+        assert logged == ["flood: 100 messages wait, further ones are dropped", "other: not now"]
+        may_go_on.set()
+        while len(carried_out) < 101:
+            await asyncio.sleep(0)
+        inbox.put("flood", waits())
+        while len(carried_out) < 102:
+            await asyncio.sleep(0)
+
+    asyncio.run(test())
+    assert len(logged) == 2
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"positions": (0.0, math.nan, 0.0)}, "point 2: positions of b has nan, a finite number is needed"),
+        ({"velocities": (0.0, 0.0, math.inf)}, "point 2: velocities of c has inf, a finite number is needed"),
+        ({"accelerations": (-math.inf, 0.0, 0.0)}, "point 2: accelerations of a has -inf, a finite number is needed"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused_by_its_point_and_joint(fields: dict[str, Any], said: str) -> None:
+    zeros = (0.0, 0.0, 0.0)
+    first = TrajectoryPoint(0.0, zeros, zeros, zeros)
+    with pytest.raises(RtcpError) as refused:
+        points_of(Trajectory(("a", "b", "c"), [first, replace(first, time_s=1.0, **fields)]), STATUS)
+    assert (refused.value.reason, refused.value.message) == ("not_finite", said)
 
 
 def test_joints_that_are_not_named_hold_where_that_is_allowed() -> None:
@@ -609,6 +698,21 @@ def test_a_joint_command_from_the_past_is_dropped(arm: FakeArm) -> None:
     assert [sent[0][0] for sent in arm.streams[0].sent] == [1.0, 3.0]
 
 
+def test_a_second_publisher_of_joint_commands_is_refused_by_name_until_the_first_pauses(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        await commander.command_point(point(1.0), "/left")
+        with pytest.raises(RtcpError, match=r"^the arm follows /left: points of /right are refused"):
+            await commander.command_point(point(2.0), "/right")
+        await commander.command_point(point(2.0), "/right")  # said once
+        await commander.command_point(point(3.0), "/left")
+        assert [sent[0][0] for sent in arm.streams[0].sent] == [1.0, 3.0]
+        await asyncio.sleep(1.1)
+        await commander.command_point(point(4.0), "/right")
+        assert arm.streams[-1].sent[-1][0][0] == 4.0
+
+    carry_out(arm, test)
+
+
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
@@ -671,8 +775,12 @@ def test_what_waited_while_the_node_did_not_run_moves_nothing(arm: FakeArm, monk
         await commander.command_point(point(1.0))
         time.sleep(0.4)  # the whole process is stopped
         await commander.command_point(point(2.0))
-        for command in (commander.begin_trajectory(PATH), commander.enable(), commander.set_outputs([("io", "3", 1)])):
+        for command in (
+            commander.begin_trajectory(PATH), commander.enable(), commander.set_outputs([("io", "3", 1)]),
+            commander.command_process(ARM_HEATER),
+        ):  # fmt: skip
             assert await refusal_of(command) == "held_up"
+        assert await commander.command_process(STOP_HEATING)
         for _ in range(7):  # a sender that goes on
             await asyncio.sleep(0.1)
             await commander.command_point(point(3.0))
@@ -805,3 +913,87 @@ def test_outputs_are_set_in_their_order_up_to_the_first_that_is_refused(arm: Fak
 
     carry_out(arm, test)
     assert arm.calls == [("valves.current", 12.5), ("valves.open", 1.0)]
+
+
+# -- processes ------------------------------------------------------------------------------------------------------
+
+
+def test_a_process_gets_its_command_with_the_fields_of_the_text_and_its_state_is_the_answer(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        assert await commander.command_process(ARM_HEATER) == "heater is armed"
+        assert await commander.command_process(HEAT_ROD, "straight_and_unloaded=true  phase=austenite") == (
+            "heater is armed"
+        )
+        assert await commander.command_process(ProcessService("fan", "run_fan", True), "kelvin=3.5 'of=a b'") == "done"
+
+    carry_out(arm, test)
+    assert arm.calls == [
+        ("arm_heater", {}),
+        ("heat_rod", {"straight_and_unloaded": True, "phase": "austenite"}),
+        ("run_fan", {"kelvin": 3.5, "of": "a b"}),
+    ]
+
+
+@pytest.mark.parametrize("text", ["now", "=1", "phase='a"])
+def test_a_text_that_has_no_fields_is_refused(arm: FakeArm, text: str) -> None:
+    async def test(commander: Commander) -> None:
+        assert await refusal_of(commander.command_process(HEAT_ROD, text)) == "no_field"
+
+    carry_out(arm, test)
+    assert arm.calls == []
+
+
+def test_each_command_of_each_process_is_a_service() -> None:
+    services = {service.name: service for service in services_of(load(default_config().parent / "heater.yaml"))}
+    assert len(services) == 8
+    assert services["heater/arm_heater"] == ARM_HEATER
+    assert services["heater/stop_heating"] == STOP_HEATING
+    assert services["heater/heat_rod"] == HEAT_ROD
+    in_a_cell = [replace(HEAT_ROD, member=member).name for member in ("heater", "cell-2")]
+    assert in_a_cell == ["heater/heat_rod", "cell_2_heater/heat_rod"]
+
+
+# -- the arms of a cell as one robot ----------------------------------------------------------------------------------
+
+
+class Member(AsyncRobot):
+    """Connection to a platform of a cell: counts the halts, stands after one, and refuses all motions."""
+
+    is_open = True
+
+    def __init__(self, state: State, joints: int) -> None:
+        self._shown = SimpleNamespace(state=state, commanded_positions=(0.0,) * joints)
+        self.halts = 0
+
+    async def _carry_out(self, call: Any) -> Any:
+        if call.method == "halt":
+            self.halts += 1
+            self._shown.state = State.HOLDING
+            return None
+        if call.method == "status":
+            return self._shown
+        raise RtcpError("refused", f"no {call.method} here")
+
+
+def test_a_motion_that_replaces_another_leaves_the_processes_of_the_cell_alone(tmp_path: Path) -> None:
+    async def replaced(begin: Callable[[CellArm], Awaitable[object]]) -> None:
+        arms, heater = {"left": Member(State.MOVING, 6), "right": Member(State.MOVING, 6)}, Member(State.HOLDING, 0)
+        group, cell = GroupRobot("test", tmp_path), CellArm(tmp_path)
+        group._arms, group._others = cast(Any, arms), cast(Any, {"heater": heater})
+        group._processes, group._counts = {"heater": tmp_path}, {"left": 6, "right": 6}
+        group._names = tuple(f"{arm}_j{i}" for arm in arms for i in range(6))
+        cell._robot = group
+        with pytest.raises(RtcpError, match="here"):
+            await begin(cell)
+        assert [arm.halts for arm in arms.values()] == [1, 1]
+        assert heater.halts == 0
+        await cell.halt()
+        assert heater.halts == 1
+
+    goal = (0.1,) * 12
+    for begin in (
+        lambda cell: cell.move_joints(goal),
+        lambda cell: cell.open_trajectory([Point(1.0, goal)]),
+        lambda cell: cell.run_trajectory([Point(1.0, goal)]),
+    ):
+        asyncio.run(replaced(begin))

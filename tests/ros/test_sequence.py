@@ -236,7 +236,7 @@ def test_a_first_point_elsewhere_in_no_time_is_refused(receive: Receiver) -> Non
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
 def test_numbers_that_are_not_finite_are_refused(value: float) -> None:
-    Receiver().refuses(point(0, value), "joint 1: the position")
+    Receiver().refuses(point(0, value), "sequence 0, joint 1: the position")
     Receiver().refuses(point(0, 0.5, value), "not finite")
     Receiver().refuses(JointPosition(0, (0.0, value, 0.0, 0.0, 0.0, 0.0)), "joint 2: the position")
 

@@ -9,6 +9,7 @@ import socket
 import struct
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import replace
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -286,7 +287,7 @@ def test_a_downloaded_trajectory_is_executed_when_complete_and_its_topics_are_no
     assert run(client).calls[0] == ("run_trajectory", at(0.0, 0.0), at(0.5, 0.25), at(1.0, 0.5))
 
 
-def test_a_stream_of_100_000_points_is_refused_where_the_buffer_is_full(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_stream_is_refused_where_the_buffer_is_full(caplog: pytest.LogCaptureFixture) -> None:
     class SlowArm(FakeArm):
         async def open_trajectory(self, points: object) -> FakeTrajectory:
             await asyncio.Event().wait()
@@ -296,10 +297,10 @@ def test_a_stream_of_100_000_points_is_refused_where_the_buffer_is_full(caplog: 
         peer = await rig.motion()
 
         async def replies() -> list[ReplyCode]:
-            return [(await peer.frame()).reply_code for _ in range(100_000)]
+            return [(await peer.frame()).reply_code for _ in range(6000)]
 
         answered = asyncio.create_task(replies())
-        for number in range(0, 100_000, 500):
+        for number in range(0, 6000, 500):
             peer.send(*(point(each) for each in range(number, number + 500)))
             await peer.writer.drain()
         codes = await answered
@@ -559,8 +560,8 @@ def test_a_client_from_the_same_address_takes_over_and_gets_no_arm_before_it_res
         old = await streaming(rig)
         rig.arm.stopped.clear()
         new = await rig.motion(BIG)
+        assert await new.codes(Ping(), point(0), point(1), STOP_POINT) == [OK, NO, NO, OK]
         assert await old.is_closed()
-        assert await new.codes(point(0), point(1), STOP_POINT) == [NO, NO, OK]
         rig.arm.stopped.set()
         await rig.arm.until("disable")
         rig.arm.set_status(drives_powered=TriState.TRUE)
@@ -586,6 +587,45 @@ def test_points_that_come_with_a_connection_that_takes_over_find_the_arm_already
             rig.arm.stopped.set()
 
     run(client)
+
+
+def test_a_connection_without_points_leaves_the_client_that_moves_the_arm_alone() -> None:
+    async def client(rig: Rig) -> None:
+        first = await streaming(rig)
+        for host in ("127.0.0.1", "127.0.0.2"):
+            (await rig.motion(host=host)).writer.close()
+        idle = await rig.motion()
+        assert await idle.codes(Ping()) == [OK]
+        assert await first.codes(point(2)) == [OK]
+        idle.writer.close()
+        assert await first.codes(point(3)) == [OK]
+        assert "halt" not in rig.arm.names
+
+    run(client, bind="0.0.0.0")
+
+
+@pytest.mark.parametrize("moved_before", [False, True])
+def test_a_refused_client_that_closes_leaves_the_arm_of_another_commander_alone(
+    moved_before: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def client(rig: Rig) -> None:
+        if moved_before:
+            peer = await streaming(rig)
+            rig.arm.arrive()
+        else:
+            peer = await rig.motion()
+        rig.arm.refuses["open_trajectory"] = RtcpError("refused", "panel commands the arm", "lease_held")
+        # Without a motion of its own it leaves the drives alone also where nobody moves the arm now.
+        rig.arm.is_held_by_others = moved_before
+        await peer.codes(point(0), point(1))
+        while not lines(caplog):
+            await peer.codes(Ping())
+        peer.writer.close()
+        await peer.writer.wait_closed()
+
+    arm = run(client)
+    assert "halt" not in arm.names
+    assert "disable" not in arm.names
 
 
 def test_a_client_from_another_address_is_turned_away(caplog: pytest.LogCaptureFixture) -> None:
@@ -675,7 +715,9 @@ def test_the_state_of_an_arm_with_more_than_ten_joints_is_our_own_message() -> N
         peer = await rig.state()
         rig.arm.set_status(in_motion=TriState.TRUE)
         while not isinstance(message := await peer.message(), JointPoint):
-            assert isinstance(message, Status)
+            assert isinstance(message, Status | JointPosition)
+            # A client for two arms has wider arrays of joints.
+            assert isinstance(message, Status) or len(message.positions) == 12
 
     run(client, arm=FakeArm((0.125,) * 12))
 
@@ -713,6 +755,89 @@ def test_a_state_client_that_does_not_read_is_dropped_and_the_others_are_served(
         while served in rig.server._states:
             await good.message()
         assert any("it does not read" in record.getMessage() for record in caplog.records)
+
+    run(client)
+
+
+def test_positions_are_sent_at_their_rate_although_the_host_is_slow() -> None:
+    class SlowArm(FakeArm):
+        """Its state takes a while, and is new each time."""
+
+        def __getattribute__(self, name: str) -> Any:
+            if name == "state":
+                time.sleep(0.0037)
+                self.set_stamp()
+            return super().__getattribute__(name)
+
+        def set_stamp(self) -> None:
+            state = self.__dict__["state"]
+            self.__dict__["state"] = replace(state, stamp_ns=state.stamp_ns + 1)
+
+    async def client(rig: Rig) -> None:
+        peer = await rig.state()
+        began, received = time.monotonic(), 0
+        while time.monotonic() - began < 10.0:
+            received += isinstance(await peer.message(), JointPosition)
+        assert received >= 990
+
+    run(client, arm=SlowArm())
+
+
+def test_a_client_that_floods_holds_nobody_up_and_is_dropped(caplog: pytest.LogCaptureFixture) -> None:
+    ping = Frame.request(Ping(), LITTLE).pack(LITTLE)
+
+    async def client(rig: Rig) -> None:
+        flood, good = await rig.motion(), await rig.motion()
+        flood.writer.write(4000 * ping)
+        assert await good.codes(Ping()) == [OK]
+        answered = len(flood._reader._buffer) // 16  # type: ignore[attr-defined]
+        assert answered < 1000  # the other client has its turn in between
+        flood.writer.write(5000 * ping)
+        assert await flood.is_closed()
+        assert lines(caplog) == [f"{name_of(flood)}: it sends more than 8192 messages in 1 s"]
+        assert await good.codes(Ping()) == [OK]
+
+    run(client)
+
+
+def name_of(peer: Peer) -> str:
+    host, port = peer.writer.get_extra_info("sockname")
+    return f"motion client {host}:{port}"
+
+
+def test_a_motion_client_that_does_not_read_its_replies_is_dropped(caplog: pytest.LogCaptureFixture) -> None:
+    async def client(rig: Rig) -> None:
+        deaf, good = await rig.motion(), await rig.motion()
+        await deaf.codes(Ping())
+        deaf.writer.transport.pause_reading()  # type: ignore[attr-defined]
+        served = next(each for each in rig.server._clients if each.name == name_of(deaf))
+        served._writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        served._writer.write(bytes(1 << 24))
+        deaf.send(Ping())
+        while served in rig.server._clients:
+            await asyncio.sleep(0.0)
+        assert await good.codes(Ping()) == [OK]
+        assert lines(caplog) == [f"{name_of(deaf)}: it does not read"]
+
+    run(client)
+
+
+def test_connections_beyond_those_that_a_port_takes_are_closed_and_the_others_are_served(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def client(rig: Rig) -> None:
+        states = [await rig.state() for _ in range(32)]
+        for each in states:
+            await each.message()
+        for _ in range(3):
+            assert await (await rig.state()).is_closed()
+        assert lines(caplog) == ["32 state clients are connected: a further one is closed"]
+        assert await (await rig.motion()).codes(Ping()) == [OK]
+        await states[0].message()
+        states[1].writer.transport.abort()
+        while len(rig.server._states) == 32:
+            await states[0].message()
+        await (await rig.state()).message()
 
     run(client)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -29,6 +30,7 @@ from rtcp.ipc.schema import (
 )
 from rtcp.ipc.terminals import named, terminals_of
 from rtcp.motion.planning.interpolation import rotation
+from rtcp.ros.processes import ProcessService
 from rtcp.ros.state import (
     TOOL_FRAME,
     ChannelSample,
@@ -52,7 +54,7 @@ YES, NO, UNKNOWN = TriState.TRUE, TriState.FALSE, TriState.UNKNOWN
 def record(time_ns: int = 0, **fields: Any) -> Any:
     made = np.zeros(1, record_type(SCHEMA))
     values = {"state": State.HOLDING, "control_mode": ControlMode.JOINT, "flags": READY_TO_MOVE, "wkc": 21,
-              "wkc_expected": 21} | fields  # fmt: skip
+              "wkc_expected": 21, "drives_powered": 1, "operating_mode": -1} | fields  # fmt: skip
     for name, value in (values | {"time_ns": time_ns}).items():
         made[name] = value
     return made[0]
@@ -92,6 +94,8 @@ class Heard:
         self.statuses: list[RobotStatus] = []
         self.entries: list[Diagnostics] = []
         self.sampled: list[ChannelSample] = []
+        self.of_processes: list[dict[str, Diagnostics]] = []
+        self.services: list[ProcessService] = []
         self.names: tuple[str, ...] = ()
         self.connections = 0
 
@@ -110,6 +114,12 @@ class Heard:
 
     def channels(self, sample: ChannelSample) -> None:
         self.sampled.append(sample)
+
+    def processes(self, entries: Mapping[str, Diagnostics]) -> None:
+        self.of_processes.append(dict(entries))
+
+    def serve(self, services: Sequence[ProcessService]) -> None:
+        self.services += services
 
 
 @pytest.fixture
@@ -289,7 +299,7 @@ def test_motion_is_possible_only_where_a_trajectory_would_begin_now(fields: dict
 
 
 def test_an_emergency_stop_is_an_error_too() -> None:
-    pressed = status_of(flags=READY_TO_MOVE | FLAG_EMERGENCY_STOP)
+    pressed = status_of(flags=READY_TO_MOVE | FLAG_EMERGENCY_STOP, e_stopped=1)
     assert (pressed.e_stopped, pressed.in_error) == (YES, YES)
     stopped = status_of(state=State.EMERGENCY_STOP, flags=0, fault=23)
     assert (stopped.e_stopped, stopped.in_error, stopped.error_code) == (YES, YES, 23)
@@ -301,10 +311,10 @@ def test_the_error_code_is_the_event_behind_the_error(fields: dict[str, Any], co
     assert status_of(**fields | {"state": State.HOLDING}).error_code == 0
 
 
-def test_power_that_no_frame_shows_is_unknown_and_power_that_was_gone_is_not_back() -> None:
+def test_power_that_no_frame_shows_is_unknown() -> None:
     assert status_of(age_ms=600, state=State.FAULT).drives_powered is UNKNOWN
-    assert status_of(age_ms=600, state=State.FAULT, flags=0).drives_powered is NO
     assert status_of(age_ms=100, state=State.FAULT).drives_powered is YES
+    assert status_of(age_ms=100, state=State.FAULT, drives_powered=0).drives_powered is NO
 
 
 def test_an_arm_that_decelerates_in_a_fault_is_in_motion_until_it_rests() -> None:
@@ -313,9 +323,33 @@ def test_an_arm_that_decelerates_in_a_fault_is_in_motion_until_it_rests() -> Non
     assert status_of(age_ms=600, state=State.FAULT, actual_velocity=0.5).in_motion is UNKNOWN
 
 
-def test_under_the_joystick_the_mode_is_manual() -> None:
-    assert status_of(control_mode=ControlMode.JOYSTICK).mode is RobotMode.MANUAL
-    assert status_of().mode is RobotMode.AUTO
+def test_the_mode_is_the_position_of_the_controllers_key_and_never_the_joysticks() -> None:
+    assert status_of(operating_mode=1).mode is RobotMode.MANUAL
+    assert status_of(operating_mode=2).mode is RobotMode.AUTO
+    assert status_of(control_mode=ControlMode.JOYSTICK).mode is RobotMode.UNKNOWN
+
+
+def test_what_a_bus_does_not_measure_is_empty(heard: Heard) -> None:
+    for arm, velocities, efforts in (("abb_irb120", 6, 0), ("abb_irb120_rapid", 0, 0), ("assistive_arm", 6, 6)):
+        feed = FakeFeed(load(default_config().with_name(f"{arm}.yaml")))
+        feed.waiting = [record(time.monotonic_ns(), actual_torque=1.0)]
+        StatePublisher(heard, lambda feed=feed: cast(Feed, feed)).step(0)  # type: ignore[misc]
+        sample = heard.samples[-1]
+        assert (len(sample.position), len(sample.velocity), len(sample.effort)) == (6, velocities, efforts)
+
+
+def test_a_force_exists_only_while_a_sensor_sends_it(heard: Heard) -> None:
+    config = load(default_config().with_name("abb_irb120.yaml"))
+    schema = record_schema(config)
+    feed = FakeFeed(config, schema)
+    made = np.zeros(2, record_type(schema))
+    made["time_ns"] = [time.monotonic_ns() + at * 200 * MS for at in range(2)]
+    made["robot_measured_force_x"] = [np.nan, 4.0]
+    feed.waiting = list(made)
+    StatePublisher(heard, lambda: cast(Feed, feed)).step(0)
+    without, with_sensor = (sample.values["robot"] for sample in heard.sampled)
+    assert "measured_force_x" not in without
+    assert with_sensor["measured_force_x"] == 4.0
 
 
 def test_not_running_is_the_only_error_that_is_waited_out(heard: Heard) -> None:
@@ -368,3 +402,37 @@ def test_channels_and_named_terminals_are_published_ten_times_a_second_by_slave_
     assert {name for name, level in sample.values["io"].items() if level} == {"backward", "gripper"}
     assert not [name for name in sample.values["io"] if name[0].isdigit()]
     assert sample.settable == [("valves", "current")]
+
+
+def test_a_process_is_published_ten_times_a_second_and_at_each_change_of_its_state_and_has_no_joints(
+    heard: Heard,
+) -> None:
+    config = load(default_config().parent / "heater.yaml")
+    feed = FakeFeed(config, record_schema(config))
+    publisher = StatePublisher(heard, lambda: cast(Feed, feed))
+    made = np.zeros(5, record_type(feed.schema))
+    begin = time.monotonic_ns()
+    made["time_ns"], made["state"] = begin + np.arange(5) * 2 * MS, State.HOLDING
+    made["heater_state"] = [1, 1, 2, 2, 5]
+    made["heater_middle_temperature"][-1] = 81.5
+    feed.waiting = list(made)
+    publisher.step(0)
+    assert [(entries["heater"].message, entries["heater"].level) for entries in heard.of_processes] == [
+        ("ready", 0), ("armed", 0), ("holding", 0),
+    ]  # fmt: skip
+    first, *_, last = (entries["heater"] for entries in heard.of_processes)
+    assert last.stamp_ns - first.stamp_ns == 8 * MS
+    values = dict(last.values)
+    assert (values["middle_temperature"], values["busy"]) == ("81.5", "0")
+    assert "heater/arm_heater" in [service.name for service in heard.services]
+    assert heard.samples == []
+    made["state"][-1], made["time_ns"] = State.FAULT, time.monotonic_ns()
+    feed.waiting = list(made[-1:])
+    publisher.step(0)
+    assert heard.of_processes[-1]["heater"].level == 2
+    before = len(heard.of_processes)
+    time.sleep(0.11)
+    made["time_ns"] = time.monotonic_ns()
+    feed.waiting = list(made[-1:])
+    publisher.step(0)
+    assert len(heard.of_processes) == before + 1

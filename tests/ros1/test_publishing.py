@@ -107,7 +107,7 @@ def test_topics_show_the_platform_at_the_rate_asked_for(ros: Ros, platform: Plat
         assert description(ros).strip() == "my own"
 
         ready = listener.until("robot_status", lambda message: message["drives_powered"] == 0)
-        assert (ready["mode"], ready["motion_possible"], ready["in_error"], ready["e_stopped"]) == (2, 0, 0, 0)
+        assert (ready["mode"], ready["motion_possible"], ready["in_error"], ready["e_stopped"]) == (-1, 0, 0, 0)
         platform.call("enable")
         powered = ("drives_powered", "motion_possible")
         listener.until("robot_status", lambda message: [message[name] for name in powered] == [1, 1])
@@ -160,7 +160,7 @@ def test_after_the_loss_of_platform_and_master_everything_is_there_again(ros: Ro
         until(lambda: "<robot" in description(ros), "robot_description")
         ros.stop(listener.process)
         listener = Listener(ros)
-        listener.until("robot_status", lambda message: message["mode"] == 2)
+        listener.until("robot_status", lambda message: message["e_stopped"] == 0)
         assert node.poll() is None  # the same process: a supervisor sees no end
         node.send_signal(signal.SIGTERM)
         assert node.wait(HANG_S) == 0
@@ -179,6 +179,34 @@ def test_after_the_loss_of_platform_and_master_everything_is_there_again(ros: Ro
     finally:
         ros.stop(listener.process)
         ros.stop(node)
+
+
+def test_the_name_of_a_platform_is_the_namespace_of_its_node(ros: Ros, tmp_path: Path) -> None:
+    command = (sys.executable, "-m", "rtcp.cli", "--name", "left", "ros", "--name", "left_node")
+    node = ros.background(*command, RTCP_RUNTIME_DIR=str(tmp_path))
+    try:
+        until(lambda: "/left/robot_stop" in ros.run("/usr/bin/rosservice", "list").stdout.split(), "its services")
+        assert "/left/left_node" in ros.run("/usr/bin/rosnode", "list").stdout.split()
+    finally:
+        ros.stop(node)
+
+
+def test_the_tools_of_ros_read_its_messages_and_simulated_time_without_a_clock_holds_nothing_up(
+    ros: Ros, tmp_path: Path
+) -> None:
+    ros.run("/usr/bin/rosparam", "set", "/use_sim_time", "true")
+    node = ros.background(sys.executable, "-m", "rtcp.cli", "ros", RTCP_RUNTIME_DIR=str(tmp_path))
+    try:
+        folder = ros.run(sys.executable, "-m", "rtcp.cli", "ros", "--messages").stdout.strip()
+        echo = ("timeout", str(HANG_S), "/usr/bin/rostopic", "echo", "-n")
+        shown = ros.run(*echo, "2", "/robot_status", PYTHONPATH=folder).stdout
+        assert [int(value) for value in re.findall(r"val: (-?\d)", shown)] == 2 * [-1, -1, -1, 0, -1, -1]
+        # The first one is latched; the others come from a timer of actionlib.
+        statuses = ros.run(*echo, "3", "/joint_trajectory_action/status", PYTHONPATH=folder).stdout
+        assert statuses.count("status_list") == 3
+    finally:
+        ros.stop(node)
+        ros.run("/usr/bin/rosparam", "delete", "/use_sim_time")
 
 
 def test_a_word_that_is_no_remapping_is_refused(ros_on_the_path: None) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from rtcp.api import Feed
+from rtcp.telemetry.experiments.latency import fit_sine, read_log
 from tests.e2e.conftest import Platform
 from tests.e2e.wire import COUNTS_PER_RAD, outputs
 from tests.waiting import until
@@ -156,14 +158,27 @@ def test_whoever_goes_on_streaming_after_stop_motion_moves_nothing(ros: Ros, cli
 
 
 @pytest.mark.long("test_the_latency_of_each_wire_is_measured_in_the_frames[simple-message]")
-def test_the_latency_of_topic_and_service_is_measured_in_the_frames(ros_on_the_path: None, platform: Platform) -> None:
+def test_the_latency_of_topic_and_service_is_measured_in_the_frames_and_a_sine_is_logged_from_the_topics(
+    ros_on_the_path: None, platform: Platform, tmp_path: Path
+) -> None:
     platform.until(lambda status: not status["lease"]["holder"], "the end of the last stream's lease")
     platform.restore()
     platform.call("enable")
-    command = [sys.executable, "-m", "rtcp.ros.ros1_latency", "10"]
+    command = [sys.executable, "-m", "rtcp.ros.ros1_latency", "probe", "10"]
     done = subprocess.run(command, env=platform.environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert sorted(report) == ["service", "topic"]
     # At least the cycle that takes the command; how many of the ten are measured, and the rest, depends on the host.
     assert all(seconds and min(seconds) > 0.0 for seconds in report.values()), report
+    platform.until(lambda status: not status["lease"]["holder"], "the end of the node's lease")
+    command[3:] = ["sine", str(tmp_path), "30", "0.05", "2", "3"]
+    done = subprocess.run(command, env=platform.environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert 0.0 < time.monotonic() - float(done.stdout) < 3600.0
+    name = platform.status()["joint_names"][0]
+    logged = {topic: read_log(tmp_path / f"{topic}.csv", name) for topic in ("joint_command", "joint_states")}
+    assert min(t[0] for t, _ in logged.values()) == 0.0
+    sines = {topic: fit_sine(t[t > 2.0], q[t > 2.0], 2.0, 4.0) for topic, (t, q) in logged.items()}
+    assert sines["joint_command"].amplitude == pytest.approx(0.05, rel=0.2)
+    assert sines["joint_states"].amplitude == pytest.approx(0.05, rel=0.3)

@@ -1,13 +1,7 @@
-"""The node over DDS: against its own encoding, and against Debian's Fast DDS in a network namespace of their own."""
+"""The node over DDS: its encoding and quality of service. `test_rclpy.py` has it in front of a real ROS 2."""
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,12 +12,6 @@ from cyclonedds.qos import Policy
 
 from rtcp.ros import ros2_dds, ros2_types
 from rtcp.ros.ros2_node import IN, OUT
-
-from .node import SAMPLE
-
-HERE = Path(__file__).parent
-HEADERS = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
-IN_A_NAMESPACE = 'ip link set lo up multicast on && ip route add 224.0.0.0/4 dev lo && exec "$@"'
 
 
 def filled(make: Any, kind: str) -> Any:
@@ -58,56 +46,3 @@ def test_states_are_reliable_and_volatile_and_the_description_is_kept_for_late_r
     description = ros2_dds.qos_of("robot_description", OUT["robot_description"])
     assert description[Policy.Durability] == Policy.Durability.TransientLocal
     assert description[Policy.DurabilityService].history == Policy.History.KeepLast(1)
-
-
-@pytest.fixture(scope="module")
-def exchange(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Messages that the node and Fast DDS received from each other."""
-    if not HEADERS.exists() or shutil.which("g++") is None:
-        pytest.skip("Fast DDS is not installed: apt install libfastrtps-dev g++")
-    program = tmp_path_factory.mktemp("fast_dds") / "fast_dds"
-    subprocess.run(
-        ["g++", "-o", program, HERE / "fast_dds.cpp", "-lfastrtps", "-lfastcdr", "-pthread"], check=True, text=True
-    )
-    unshare = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--user", "--map-root-user"]
-    inside = [*unshare, "sh", "-c", IN_A_NAMESPACE, "sh"]
-    if (tried := subprocess.run([*inside, "true"], capture_output=True, text=True, check=False)).returncode:
-        pytest.skip(f"no network namespace with multicast can be made here: {tried.stderr.strip()}")
-    done = subprocess.run(
-        [*inside, sys.executable, "-m", "tests.ros2.dds_exchange", program],
-        capture_output=True, text=True, check=False, cwd=HERE.parent.parent,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return dict(json.loads(done.stdout) | {"log": done.stderr})
-
-
-def test_fast_dds_reads_the_joint_states(exchange: dict[str, Any]) -> None:
-    data = bytes.fromhex(exchange["joint_states"][0])
-    message = ros2_types.decode("sensor_msgs/msg/JointState", data)
-    assert data[:4] == b"\x00\x01\x00\x00"
-    assert (message.name, message.effort.tolist()) == (list("abcdef"), list(SAMPLE.effort))
-    assert len(set(exchange["joint_states"])) == 1
-
-
-def test_a_late_reader_of_fast_dds_receives_the_description(exchange: dict[str, Any]) -> None:
-    text = ros2_types.decode("std_msgs/msg/String", bytes.fromhex(exchange["robot_description"])).data
-    assert text.startswith("<?xml")
-    assert text.endswith("</robot>\n")
-
-
-def test_fast_dds_is_told_the_hash_of_each_type(exchange: dict[str, Any]) -> None:
-    announced = {
-        (f"rt/{topic}", ros2_types.dds_type(kind), f"typehash={ros2_types.type_hash(kind)};")
-        for topic, kind in OUT.items()
-    }
-    assert {tuple(writer) for writer in exchange["writers"]} == announced
-
-
-@pytest.mark.parametrize("quality", ["reliable", "best_effort"])
-def test_commands_written_by_fast_dds_reach_the_arm(exchange: dict[str, Any], quality: str) -> None:
-    assert exchange[f"joint_command, {quality}"] == ["stream", [0.1, 0.2, 0.3]]
-    assert exchange[f"joint_path_command, {quality}"] == ["run", [[0.1, 0.2, 0.3], [0.0, 0.0, 0.0]]]
-
-
-def test_bytes_that_are_no_message_are_logged_and_the_next_message_is_taken(exchange: dict[str, Any]) -> None:
-    assert "deserialization rt/joint" in exchange["log"]

@@ -26,7 +26,9 @@ from .node import free_port, outputs, point
 from .zenoh_client import GID, JOINT_STATES, Router, call
 
 THERE = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1]
-LONG = pytest.mark.long("test_the_latency_of_each_wire_is_measured_in_the_frames[simple-message]")
+LONG = pytest.mark.long(
+    "test_the_latency_of_topic_and_service_is_measured_in_the_frames_and_a_sine_is_logged_from_the_topics"
+)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,7 @@ def node(platform: Platform) -> Iterator[tuple[subprocess.Popen[str], Router]]:
 
 
 @pytest.mark.platform
-def test_the_arm_is_enabled_moved_and_seen_over_zenoh(
+def test_arm_and_channels_of_a_terminal_are_seen_and_commanded_over_zenoh(
     platform: Platform, node: tuple[subprocess.Popen[str], Router]
 ) -> None:
     router = node[1]
@@ -77,13 +79,10 @@ def test_the_arm_is_enabled_moved_and_seen_over_zenoh(
         stamp = decode("sensor_msgs/msg/JointState", received[-1].payload.to_bytes()).header.stamp
         assert 0.0 <= time.time() - stamp.sec - 1e-9 * stamp.nanosec < 3600.0
         subscriber.undeclare()
+    sees_sets_and_is_refused_channels(platform, *node)
 
 
-@pytest.mark.platform
-def test_channels_of_a_terminal_are_seen_and_set_over_zenoh_and_refused_as_everywhere(
-    platform: Platform, node: tuple[subprocess.Popen[str], Router]
-) -> None:
-    process, router = node
+def sees_sets_and_is_refused_channels(platform: Platform, process: subprocess.Popen[str], router: Router) -> None:
     kind = f"control_msgs::msg::dds_::DynamicInterfaceGroupValues_/{type_hash(GROUP_VALUES)}"
     received: list[Any] = []
 
@@ -131,7 +130,8 @@ def test_without_a_router_the_node_waits_and_ends_when_it_is_asked_to() -> None:
 
 
 @pytest.mark.platform
-@pytest.mark.parametrize("wire", ["simple-message", *(pytest.param(wire, marks=LONG) for wire in ("dds", "zenoh"))])
+@LONG
+@pytest.mark.parametrize("wire", ["simple-message", "dds", "zenoh"])
 def test_the_latency_of_each_wire_is_measured_in_the_frames(platform: Platform, wire: str) -> None:
     if wire == "dds":
         pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: pip install 'rtcp[dds]' (x86_64)")

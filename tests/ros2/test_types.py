@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'rtcp[zenoh]'")
 
-from rtcp.ros.ros2_types import CANCEL, FOLLOW, TRIGGER, dds_type, decode, encode, make, type_hash
+from rtcp.ros.ros2_types import CANCEL, FOLLOW, TRIGGER, WITH_TEXT, dds_type, decode, encode, make, type_hash
 
 PUBLISHED = {
     "sensor_msgs/msg/JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
@@ -18,6 +18,7 @@ PUBLISHED = {
     "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     "industrial_msgs/msg/RobotStatus": "0983f918a5b3fee8384138cb62b4b125ed17a0fde53d6229cd4a77d11d47d6f5",
+    WITH_TEXT: "6b91084c9f8bffd9b0c1f6883e0e8e491a831f4fc6c6aec77a4efaf3f1ea90b5",
     f"{FOLLOW}_Feedback": "3fd0aaecf71725121ae1ff7f01098a5e0da581e672be18a6b2c286cb43d96b49",
     f"{FOLLOW}_SendGoal": "b13789dddc325a7a962825c45e28c77d37237ec129dd0c34dc5994562938c57f",
     f"{FOLLOW}_GetResult": "e3ceb38e3e1867c8dc0f46014df26e90eb93422f27e9e97f936e07f94be4bc8b",

@@ -17,7 +17,7 @@ import zenoh.ext
 from rtcp.ros.ros2_node import Commands, Publications
 from rtcp.ros.ros2_types import FOLLOW, decode, encode, type_hash
 from rtcp.ros.ros2_zenoh import ZenohWire, open_session
-from tests.ros.test_commands import HERE, FakeArm
+from tests.ros.test_commands import ARM_HEATER, HEAT_ROD, HERE, FakeArm
 from tests.waiting import until
 
 from .node import CONFIG, OPTIONS, SAMPLE, arrive, commanded, point, trajectory
@@ -62,7 +62,7 @@ def test_a_subscriber_receives_joint_states_with_number_and_instant(session: Any
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_000, 250_000_000)
     assert (message.name, message.position.tolist()) == (list("abcdef"), list(SAMPLE.position))
     first, second = (struct.unpack("<qqB16s", sample.attachment.to_bytes()) for sample in received[:2])
-    assert second[0] > first[0] > 0
+    assert second[0] == first[0] + 1 > 1  # each publisher counts its own messages
     assert 0 <= time.time_ns() - first[1] < 3600 * 1e9
     assert first[2:] == (16, second[3])
 
@@ -143,6 +143,14 @@ def test_services_answer_with_the_reason(
         call(session, "joint_path_command", "industrial_msgs/srv/CmdJointTrajectory", trajectory=wrong).code.val == -1
     )
     assert "joint 'z' is unknown" in caplog.text
+
+
+def test_commands_of_processes_are_services(session: Any, publications: Publications, arm: FakeArm) -> None:
+    publications.serve([ARM_HEATER, HEAT_ROD])
+    assert call(session, "heater/arm_heater", "std_srvs/srv/Trigger").message == "heater is armed"
+    text = "straight_and_unloaded=true phase=austenite"
+    assert call(session, "heater/heat_rod", "diagnostic_msgs/srv/AddDiagnostics", load_namespace=text).success
+    assert arm.calls[-1] == ("heat_rod", {"straight_and_unloaded": True, "phase": "austenite"})
 
 
 def test_a_goal_has_feedback_and_a_result(

@@ -11,6 +11,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
+from rtcp.config.model import ArmConfig
 from rtcp.testing.sessions.checker import Bounds
 from rtcp.testing.sessions.session import Session
 from tests.leftovers import Leftovers
@@ -58,14 +59,15 @@ class Outcome:
         self.failures += other.failures
 
 
-def session_of(seed: int) -> Session:
-    """Return the session of a seed."""
-    return Session(Random(seed), configuration(), reading(), periods_us=PERIODS_US, number=seed)
+def session_of(seed: int, config: ArmConfig | None = None) -> Session:
+    """Return the session of a seed, of the shipped arm or of another one."""
+    its_reading = reading() if config is None else None
+    return Session(Random(seed), config or configuration(), its_reading, periods_us=PERIODS_US, number=seed)
 
 
-def run_session(seed: int) -> Outcome:
+def run_session(seed: int, config: ArmConfig | None = None) -> Outcome:
     """Run the session of `seed`; a failure is in the outcome, with what was done before it."""
-    session = session_of(seed)
+    session = session_of(seed, config)
     commander, checker = session.commander, session.commander.checker
     problems: list[str] = []
     try:

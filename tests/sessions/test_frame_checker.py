@@ -10,10 +10,12 @@ from math import pi
 import pytest
 
 from kinematics import forward
+from rtcp.config.model import Cone
 from rtcp.ipc.commands import Halt, MoveJoints, SetDriveMode
 from rtcp.ipc.states import DriveMode, State
-from rtcp.testing.sessions.checker import CSP, CST, CSV, ENABLE_OPERATION, Kind, Violation
+from rtcp.testing.sessions.checker import CSP, CST, CSV, ENABLE_OPERATION, Bounds, Kind, Violation, reading_of
 from rtcp.testing.sessions.commander import Commander
+from rtcp.testing.sessions.oracle import Shape
 from tests.arm_geometry import depth, points
 from tests.sessions.oracle import WIRE, commander_of, configuration, is_free, with_start
 
@@ -156,6 +158,10 @@ def test_a_speed_that_a_single_step_hides_in_its_rounding_is_found() -> None:
         return 0x1F, sent[1] + sum(min(n // 4, limit + 1) for n in range(cycle)), *sent[2:]
 
     with commander_in("csp") as commander:
+        # The drive gives all its torque, which is no emergency stop here.
+        arm = commander.simulation.loop.arm
+        arm.limits.supervision = (1.5, 1.5, 1.0)
+        arm.supervision.take(arm.limits)
         enable(commander)
         spoil(commander, defect)
         commander.wait(4 * limit + 40)
@@ -312,6 +318,18 @@ def test_a_tool_that_leaves_the_box_is_found() -> None:
         commander.checker.changed()
         move(commander, 0.3)
         assert Kind.ZONE in kinds(commander)
+
+
+def test_a_tool_that_turns_out_of_its_cone_is_found() -> None:
+    config = configuration()
+    shape = Shape(config.models, 0, config.cartesian.clearance)
+    here, there = (shape.tilt(q, 2, (0.0, 0.0, 1.0)) for q in (START, [q + 0.3 for q in START]))
+    sign = 1.0 if there > here else -1.0
+    cone = Cone("up", (0.0, 0.0, sign), (here if sign > 0.0 else pi - here) + 0.5 * abs(there - here))
+    around = reading_of(replace(config, cartesian=replace(config.cartesian, cones=(cone,)))).workspaces[0]
+    assert around is not None
+    bounds = replace(Bounds.configured(config), box=None, keep_out=(), cones=(cone.angle,))
+    assert around.deepest(bounds, START) < 0.0 < around.deepest(bounds, [q + 0.3 for q in START])
 
 
 # -- its own geometry -----------------------------------------------------------------------------------------------

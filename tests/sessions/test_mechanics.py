@@ -15,7 +15,7 @@ from rtcp.ipc.events import Arrived
 from rtcp.ipc.states import State
 from rtcp.testing.sessions.checker import Kind
 from rtcp.testing.sessions.commander import Commander
-from rtcp.testing.sessions.mechanics import REST_IN_CST_S, REST_S, SETTLED_S, MechanicsChecker
+from rtcp.testing.sessions.mechanics import REST_S, REST_WHERE_COMPLIANT_S, SETTLED_S, MechanicsChecker
 from tests.sessions.oracle import commander_of, configuration, with_start
 from tests.sessions.test_frame_checker import AXIS, START, kinds, spoil
 
@@ -58,7 +58,7 @@ def test_a_sound_loop_has_no_violation(mode: str) -> None:
             commander.lose(5, heard)
             seconds(commander, 0.1)
         commander.send(Halt())
-        seconds(commander, 2.0 + REST_IN_CST_S)
+        seconds(commander, 2.0 + REST_WHERE_COMPLIANT_S)
         assert commander.checker.violations == []
 
 

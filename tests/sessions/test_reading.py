@@ -64,7 +64,7 @@ def test_sessions_of_other_arms_move_them_and_break_no_limit(name: str, tmp_path
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
     """Every frame of a session in which the arm moves."""
-    session = Session(Random(5), configuration())
+    session = Session(Random(8), configuration())
     seen: list[Frame] = []
     check = session.commander.simulation.on_frame
 

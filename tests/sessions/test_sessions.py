@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rtcp.config.model import Cone
 from rtcp.ipc.commands import Halt, SetControlMode
 from rtcp.ipc.states import ControlMode, State
 from rtcp.testing.sessions.coverage import PLATFORM_COMMANDS
 from tests.samples import THOROUGH
+from tests.sessions.oracle import configuration
 from tests.sessions.session import Outcome, run_session, session_of
 
 SESSIONS, BATCH = (100, 20) if THOROUGH else (2, 1)
@@ -19,6 +23,16 @@ SESSIONS, BATCH = (100, 20) if THOROUGH else (2, 1)
 @pytest.mark.parametrize("first", range(1, SESSIONS + 1, BATCH))
 def test_no_frame_of_a_random_session_breaks_a_limit(first: int) -> None:
     failures = [failure for seed in range(first, first + BATCH) for failure in run_session(seed).failures]
+    assert failures == []
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("first", range(1, SESSIONS + 1, BATCH))
+def test_no_frame_of_a_random_session_leads_the_tool_out_of_a_cone(first: int) -> None:
+    shipped = configuration()
+    cones = (Cone("away", (-1.0, 0.0, 0.0), 2.0), Cone("upright", (0.0, 0.0, 1.0), 1.7, "x"))
+    config = replace(shipped, cartesian=replace(shipped.cartesian, cones=cones))
+    failures = [failure for seed in range(first, first + BATCH) for failure in run_session(seed, config).failures]
     assert failures == []
 
 

@@ -139,7 +139,7 @@ def guided() -> Any:
     """Cycle records of a hand: a slow motion with a tremor of 8 Hz, a rest of 3 s, and on."""
     t = np.arange(0.0, 2.0, PERIOD_NS * 1e-9)
     progress = 0.5 * (1.0 - np.cos(np.pi * t / 2.0))
-    tremor = 0.004 * np.sin(2 * np.pi * 8.0 * t) * np.sin(np.pi * t / 2.0)
+    tremor = 0.006 * np.sin(2 * np.pi * 8.0 * t) * np.sin(np.pi * t / 2.0)
     there = np.outer(progress + tremor, [0.2, -0.1, 0.15, 0.05, 0.0, 0.1])
     rest = np.tile(there[-1], (round(3.0 / (PERIOD_NS * 1e-9)), 1))
     q = np.concatenate([there, rest, there[-1] + there, np.tile(2 * there[-1], (200, 1))])

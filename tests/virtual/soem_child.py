@@ -81,6 +81,9 @@ def main() -> None:
         except pysoem.SdoError:
             continue
     master.config_map()
+    for slave in master.slaves:
+        # This process has no priority: beside other work it may leave the segment without outputs for 100 ms.
+        slave.set_watchdog("processdata", PATIENCE_US / 1000)
     master.config_dc()
     result["delays"] = [read(slave, 0x0928) for slave in master.slaves]
     result["safe_op"] = master.state_check(pysoem.SAFEOP_STATE, PATIENCE_US)

@@ -23,7 +23,7 @@ from rtcp.ipc.events import GuidedTooFast
 from rtcp.ipc.refusals import DurationOutOfRange, MassesUnknown, NoEnablingSwitch, Refusal, WeightDiffers
 from rtcp.ipc.states import ControlMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.controllers.jog_bounds import STANDOFF_M, JogBounds, lever, stopping
+from rtcp.motion.controllers.jog_bounds import JogBounds, lever, stopping
 from rtcp.motion.controllers.jog_inverse import JogInverse
 from rtcp.motion.controllers.torque import chase, not_at_rest
 from rtcp.motion.state import ArmState, Setpoint
@@ -80,13 +80,14 @@ class GuideController(Controller):
         self._slack = [guiding.hold * joint.torque / (_STIFF * joint.cst_stiffness) for joint in joints]
         self._damping = [_DAMPED * joint.cst_damping for joint in joints]
         self._drag = [guiding.damping * joint.cst_damping for joint in joints]
-        self._deceleration = _BRAKES * config.cartesian.acceleration
+        cartesian = config.cartesian
         self._bounds_of = [
             JogBounds(
                 self.limits,
                 setup.trajectory_guard.zones_of(number),
                 JogInverse(model),
-                self._deceleration,
+                _BRAKES * cartesian.acceleration,
+                _BRAKES * cartesian.angular_acceleration,
                 (0.0,) * 3,
                 setup.period_s,
             )
@@ -224,14 +225,12 @@ class GuideController(Controller):
 
         The removed part bends the springs in proportion to each joint's lever: they push along the boundary's normal.
         """
-        bounds, wanted, row, dt = self._bounds, self._wanted, self._row, self.period_s
+        bounds, wanted, row = self._bounds, self._wanted, self._row
         for clearance in bounds.near:
-            allowed = stopping(clearance.distance - STANDOFF_M, self._deceleration, dt)
-            x, y, z = clearance.normal
-            px, py, pz = clearance.place
+            allowed = bounds.allowed(clearance)
             for i in self._joints:
                 inside = clearance.other <= i < clearance.link
-                row[i] = -lever(poses[i], px, py, pz, x, y, z) if inside else 0.0
+                row[i] = -lever(poses[i], clearance) if inside else 0.0
             for _ in range(_PASSES):
                 approach = whole = 0.0
                 for i in self._joints:
@@ -251,12 +250,10 @@ class GuideController(Controller):
                         wanted[i] = reduced if reduced * wanted[i] > 0.0 else 0.0
         # With several boundaries, each correction may undo another: scale the whole motion.
         for clearance in bounds.near:
-            allowed = stopping(clearance.distance - STANDOFF_M, self._deceleration, dt)
-            x, y, z = clearance.normal
-            px, py, pz = clearance.place
+            allowed = bounds.allowed(clearance)
             approach = 0.0
             for i in range(clearance.other, clearance.link):
-                approach -= lever(poses[i], px, py, pz, x, y, z) * wanted[i]
+                approach -= lever(poses[i], clearance) * wanted[i]
             if approach > allowed + _TOLERANCE:
                 for i in self._joints:
                     wanted[i] *= allowed / approach

@@ -36,7 +36,7 @@ _FULL: Final = 0.98
 """Share of the joint speeds and accelerations that jogging uses, so that the guard never cuts."""
 _LAST_RAD: Final = 1e-6
 _BRAKING: Final = 0.7
-"""Share of the Cartesian acceleration with which the tool slows before a box."""
+"""Share of the Cartesian accelerations with which the tool slows before a box or a cone."""
 _BACK_1_S: Final = 100.0
 """Gain of the tool's return to its line, 1/s."""
 _OFF_LINE_M: Final = 2e-4
@@ -67,10 +67,11 @@ class JogController(Controller):
         singularity = cartesian.singularity
         self._trajectory_guard = setup.trajectory_guard
         nearest = (singularity.shoulder, singularity.elbow, singularity.wrist)
-        braking = _BRAKING * cartesian.acceleration
+        braking, turning = _BRAKING * cartesian.acceleration, _BRAKING * cartesian.angular_acceleration
+        zones_of = setup.trajectory_guard.zones_of
         self._inverses = [JogInverse(model) for model in self._models]
         self._bounds_of = [
-            JogBounds(limits, setup.trajectory_guard.zones_of(number), inverse, braking, nearest, setup.period_s)
+            JogBounds(limits, zones_of(number), inverse, braking, turning, nearest, setup.period_s)
             for number, inverse in enumerate(self._inverses)
         ]
         self.use_tool(setup.tool.number)

@@ -1,4 +1,4 @@
-"""Bounds on the velocity of a jogged tool: joint ranges, boxes and singularities.
+"""Bounds on the velocity of a jogged tool: joint ranges, boxes, cones and singularities.
 
 A bound is a row r and a speed b >= 0: r . (vx, vy, vz, wx, wy, wz) <= b. `slide` removes the part of the motion that
 exceeds a bound and keeps the rest; singularities halt the whole motion instead (`halt`).
@@ -11,9 +11,9 @@ from math import sqrt
 from typing import Final
 
 from kinematics.pose import Pose
-from rtcp.ipc.schema import HELD_BOX_AT, HELD_ITSELF, HELD_RANGE_AT, HELD_SHOULDER
+from rtcp.ipc.schema import HELD_BOX_AT, HELD_CONE, HELD_ITSELF, HELD_RANGE_AT, HELD_SHOULDER
 from rtcp.motion.controllers.jog_inverse import JogInverse, Row
-from rtcp.motion.guards.zones import INNER_BOX, Clearance, Zones
+from rtcp.motion.guards.zones import INNER_BOX, ITSELF, POINTER_M, Clearance, Zones, is_cone
 from rtcp.motion.limits import Limits
 
 STANDOFF_M: Final = 0.008
@@ -40,6 +40,7 @@ class JogBounds:
         zones: measures clearances; None: the arm has no boxes and no bodies.
         inverse: inverse Jacobian of the current configuration.
         braking: deceleration before a box, m/s^2.
+        turning: deceleration before a cone, rad/s^2.
         singularity: smallest distances from shoulder, elbow and wrist singularity, m, rad, rad; 0: no bound.
         dt: the cycle, s.
     """
@@ -50,19 +51,20 @@ class JogBounds:
         zones: Zones | None,
         inverse: JogInverse,
         braking: float,
+        turning: float,
         singularity: Sequence[float],
         dt: float,
     ) -> None:
         self._limits, self._inverse, self._dt = limits, inverse, dt
         self._zones = zones
-        self._braking = braking
+        self._braking, self._turning = braking, POINTER_M * turning
         self._nearest = tuple(singularity)
         self.near: Sequence[Clearance] = ()
         self._idle = 0
         self._boxes: object = None
         self._rotation_weight = 1.0 / inverse.length**2
         self.axis = self.box = -2
-        """Joint, and box or pair (`zones`), that limited the motion in this cycle; -2: none."""
+        """Joint, and box, cone or pair (`zones`), that limited the motion in this cycle; -2: none."""
         self._singular = 0
 
     def update(self, poses: Sequence[Pose], position: Sequence[float], jumped: bool) -> None:
@@ -83,7 +85,7 @@ class JogBounds:
         if zones is None or not self.watched:
             self.near = ()
             return
-        boxes = (limits.box, limits.keep_out)
+        boxes = (limits.box, limits.keep_out, limits.cones)
         self._idle -= 1
         if self._idle > 0 and not jumped and boxes == self._boxes:
             return
@@ -100,7 +102,7 @@ class JogBounds:
         if self.axis >= 0:
             bits |= (self.axis + 1) << HELD_RANGE_AT
         if self.box >= INNER_BOX:
-            bits |= (min(self.box, HELD_ITSELF) + 2) << HELD_BOX_AT
+            bits |= (held_zone(self.box) + 2) << HELD_BOX_AT
         return bits
 
     def passed(self, poses: Sequence[Pose], twist: Sequence[float], speeds: Sequence[float]) -> bool:
@@ -171,10 +173,15 @@ class JogBounds:
                 worst, most, self.axis = (r0, r1, r2, r3, r4, r5), excess, i
         for clearance in self.near:
             row = self._approach(poses, clearance)
-            excess = _along(row, twist) - stopping(clearance.distance - STANDOFF_M, self._braking, dt)
+            excess = _along(row, twist) - self.allowed(clearance)
             if excess > most:
                 worst, most, self.box = row, excess, clearance.zone
         return worst, most
+
+    def allowed(self, clearance: Clearance) -> float:
+        """Return the speed towards a boundary that can still stop before it, m/s."""
+        rate = self._turning if is_cone(clearance.zone) else self._braking
+        return stopping(clearance.distance - STANDOFF_M, rate, self._dt)
 
     def _approach(self, poses: Sequence[Pose], clearance: Clearance) -> Row:
         """Return the row whose product with a twist is the speed of a point towards its boundary, m/s."""
@@ -182,10 +189,11 @@ class JogBounds:
         x, y, z = -x, -y, -z
         if clearance.zone == INNER_BOX:
             return x, y, z, 0.0, 0.0, 0.0
-        px, py, pz = clearance.place
+        if is_cone(clearance.zone):
+            return 0.0, 0.0, 0.0, POINTER_M * x, POINTER_M * y, POINTER_M * z
         total = [0.0] * 6
         for i in range(clearance.other, clearance.link):
-            k = lever(poses[i], px, py, pz, x, y, z)
+            k = -lever(poses[i], clearance)
             row = self._inverse.rows[i]
             for j in range(6):
                 total[j] += k * row[j]
@@ -225,12 +233,10 @@ class JogBounds:
         share = 1.0
         acceleration = self._limits.acceleration
         for clearance in self.near:
-            x, y, z = clearance.normal
-            px, py, pz = clearance.place
             travel = 0.0
             for i in range(clearance.other, clearance.link):
                 v = speeds[i]
-                towards = -lever(poses[i], px, py, pz, x, y, z) * v
+                towards = -lever(poses[i], clearance) * v
                 if towards > 0.0:
                     travel += towards * (v if v > 0.0 else -v) / acceleration[i]
             travel *= 0.5
@@ -250,9 +256,17 @@ def stopping(stopping_distance: float, rate: float, dt: float) -> float:
     return sqrt(half * half + 2.0 * rate * stopping_distance) - half
 
 
-def lever(pose: Pose, px: float, py: float, pz: float, x: float, y: float, z: float) -> float:
-    """Return a point's speed along (x, y, z) for 1 rad/s about the axis of a frame."""
+def held_zone(zone: int) -> int:
+    """Return the number of a box, cone or pair in `held`."""
+    return HELD_ITSELF if zone >= ITSELF else HELD_CONE if is_cone(zone) else min(zone, HELD_CONE - 1)
+
+
+def lever(pose: Pose, clearance: Clearance) -> float:
+    """Return the speed away from a boundary for 1 rad/s about the axis of a frame, m/s."""
     (ox, oy, oz), (_, _, ax, _, _, ay, _, _, az) = pose
+    (px, py, pz), (x, y, z) = clearance.place, clearance.normal
+    if is_cone(clearance.zone):
+        return POINTER_M * (ax * x + ay * y + az * z)
     rx, ry, rz = px - ox, py - oy, pz - oz
     return (ay * rz - az * ry) * x + (az * rx - ax * rz) * y + (ax * ry - ay * rx) * z
 

@@ -23,8 +23,8 @@ _DIRECTIONS = (((0, 1.0), (1, 1.0)), ((2, -1.0), (5, 1.0)), ((3, 1.0), (4, 1.0))
 class Shown(Protocol):
     """State of the joystick; see `rtcp.devices.io_box`."""
 
-    forward: int
-    side: int
+    forward: float
+    side: float
     paddle: int
     valid: bool
 
@@ -54,6 +54,11 @@ class Joystick:
     def holds_grip(self) -> bool:
         """True while the joystick is deflected to open or close the gripper."""
         return self._gripped != 0
+
+    def begin(self) -> None:
+        """Begin with the first mode, X-Y, once the joystick has been neutral."""
+        self.mode = 0
+        self.wait_for_neutral()
 
     def wait_for_neutral(self) -> None:
         """Ignore the joystick until it has been neutral."""
@@ -87,8 +92,9 @@ class Joystick:
         if joystick.paddle:
             self._clear()
         elif self.mode == GRIPPER:
-            self.grip = joystick.forward > 0 if joystick.forward and joystick.forward != self._gripped else None
-            self._gripped = joystick.forward
+            direction = (joystick.forward > 0) - (joystick.forward < 0)
+            self.grip = direction > 0 if direction not in (0, self._gripped) else None
+            self._gripped = direction
         else:
             (along, sign), (across, side_sign) = _DIRECTIONS[self.mode]
             for i in range(6):

@@ -1,4 +1,4 @@
-"""The guard's own stop: its length, and whether it touches a box or the arm itself.
+"""The guard's own stop: its length, and whether it touches a box, a cone or the arm itself.
 
 From the mean speeds w of a cycle, each joint's speed falls by u = a dt per cycle; a rest below u falls to 0.
 """
@@ -11,7 +11,7 @@ from typing import Final
 
 from kinematics.forward import frames
 from kinematics.pose import Pose
-from rtcp.motion.guards.zones import INNER_BOX, ITSELF, Gap, Zones
+from rtcp.motion.guards.zones import INNER_BOX, ITSELF, Gap, Zones, is_cone
 
 _MOST_SAMPLES: Final = 16
 """Upper bound on the samples of a stop, for lack of time in a cycle; a stop that needs more counts as touching."""
@@ -59,7 +59,7 @@ def touched(
     acceleration: Sequence[float],
     dt: float,
 ) -> tuple[int, float] | None:
-    """Return the box or pair (`zones`) that a cycle and its stop would touch, with a signed distance (m), or None.
+    """Return the box, cone or pair that a cycle and its stop would touch, with a signed distance (m), or None.
 
     Between two samples a point is no farther from its chord than `_Stop.bend`: bodies do not touch if a plane separates
     them at both ends with that margin. Overlapping bodies may only move apart. In a single cycle that moves by less
@@ -128,8 +128,10 @@ def _next(
         distance = zones.remeasure(gap, poses)
         new = Gap(distance, gap.zone, gap.body, gap.share, gap.bend)
         bent = gap.bend * bend
-        if gap.zone == INNER_BOX:
-            free, out, slow = near >= bend and distance >= bend, True, near < bent
+        if is_cone(gap.zone):
+            near, distance = zones.depth(gap.zone, near), zones.depth(gap.zone, distance)
+        if gap.zone == INNER_BOX or is_cone(gap.zone):
+            free, out, slow = near >= bent and distance >= bent, True, near < bent
         else:
             moved = gap.share * (length if gap.zone < ITSELF else pair_length)
             free = near + distance > moved or zones.parted(gap, bent)
@@ -157,6 +159,7 @@ class _Stop:
     ) -> None:
         self._dt = dt
         self._q = q
+        self._zones = zones
         self._moving = []
         self.duration = bound = speeds = swept = 0.0
         for i, w in enumerate(mean):
@@ -204,7 +207,8 @@ class _Stop:
             if gap.distance < 0.0:
                 most = self.duration / _INSIDE_SAMPLES
             else:
-                least = min(least, gap.distance / gap.bend)
+                depth = self._zones.depth(gap.zone, gap.distance) if is_cone(gap.zone) else gap.distance
+                least = min(least, depth / gap.bend)
         # A bound of 0: the moving joints' axes go through the tool, and no point moves.
         if least < inf and self._bound > 0.0:
             most = min(most, sqrt(0.25 * dt * dt + 4.0 * least / self._bound) - 0.5 * dt)

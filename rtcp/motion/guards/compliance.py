@@ -15,8 +15,8 @@ from rtcp.config.model import ArmConfig
 from rtcp.ipc.events import PartnerNear
 from rtcp.motion.guards.braking import touched, travel
 from rtcp.motion.guards.neighbours import Neighbours
-from rtcp.motion.guards.zones import Zones
-from rtcp.motion.limits import Corners, Limits
+from rtcp.motion.guards.zones import POINTER_M, Zones
+from rtcp.motion.limits import Cone, Corners, Limits
 
 TORQUE_MARGIN_M: Final = 0.02
 """Distance beyond `cartesian.clearance`, and of the tool from its box, before which a torque motion stops, m."""
@@ -32,15 +32,18 @@ _STILL_RAD_S: Final = 0.003
 
 
 class _Boxes:
-    """The boxes to keep: that of the tool is smaller than the one in force."""
+    """The boxes and cones to keep: those of the tool are smaller than the ones in force."""
 
     def __init__(self) -> None:
         self.box: Corners | None = None
         self.keep_out: tuple[Corners, ...] = ()
+        self.cones: tuple[Cone, ...] = ()
 
     def take(self, limits: Limits, margin: float) -> None:
-        """Replace the boxes by those in force; `margin`: distance of the tool from its box, m."""
+        """Replace the boxes and cones by those in force; `margin`: distance of the tool from its box, m."""
         self.keep_out = limits.keep_out
+        turn = margin / POINTER_M
+        self.cones = tuple([cone._replace(angle=max(cone.angle - turn, 0.5 * cone.angle)) for cone in limits.cones])
         self.box = None
         if limits.box is not None:
             a, b, c, d, e, f = limits.box
@@ -70,7 +73,7 @@ class ComplianceGuard:
         self._here, self._next = [0.0] * n, [0.0] * n
         self._room = 0.0
         """Lower bound on `Zones.room` at `_here`, m."""
-        self._box, self._keep_out = limits.box, limits.keep_out
+        self._box, self._keep_out, self._cones = limits.box, limits.keep_out, limits.cones
         self._number = 0
 
     @property
@@ -88,8 +91,8 @@ class ComplianceGuard:
             return None
         limits, dt = self._limits, self._reaction_s
         zones, model = self._zones[self._number], self._models[self._number]
-        if limits.box is not self._box or limits.keep_out is not self._keep_out:
-            self._box, self._keep_out, self._room = limits.box, limits.keep_out, 0.0
+        if limits.box is not self._box or limits.keep_out is not self._keep_out or limits.cones is not self._cones:
+            self._box, self._keep_out, self._cones, self._room = limits.box, limits.keep_out, limits.cones, 0.0
             self._boxes.take(limits, self._margin)
         whole = travel(velocity, limits.acceleration, zones.reach, dt)[1]
         here, there, moved = self._here, self._next, 0.0

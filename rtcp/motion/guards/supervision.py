@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.events import EmergencyStop, FollowingError, OverSpeed, OverTorque
-from rtcp.motion.limits import Limits
+from rtcp.ipc.refusals import ThresholdTooLow
+from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState
 
 
@@ -12,17 +13,17 @@ class Supervision:
     """Counts consecutive cycles in which a joint is beyond a limit.
 
     Args:
-        config: factors, and allowed numbers of cycles.
-        limits: of the joints.
+        config: allowed number of cycles, and time of a torque.
+        limits: of the joints, with the thresholds.
         first: axis number of the first joint.
     """
 
     def __init__(self, config: ArmConfig, limits: Limits, first: int = 0) -> None:
-        bounds, n = config.supervision, len(config.joints)
+        n = len(config.joints)
         self._first = first
-        self._cycles = bounds.cycles
-        self._speed, self._torque = bounds.speed, bounds.torque
-        self.following_error = bounds.following_error
+        self._cycles = config.supervision.cycles
+        self._torque_cycles = max(1, round(config.supervision.torque_s * 1e6 / config.cycle.period_us))
+        self.following_error = 0.0
         """Limit in force, rad; infinite while a gripper holds an object."""
         self.take(limits)
         self._joints = range(n)
@@ -32,8 +33,25 @@ class Supervision:
 
     def take(self, limits: Limits) -> None:
         """Replace the limits."""
-        self._fastest = [self._speed * velocity for velocity in limits.velocity]
-        self._strongest = [self._torque * torque for torque in limits.torque]
+        by_speed, by_torque, self.following_error = limits.supervision
+        self._fastest = [by_speed * velocity for velocity in limits.velocity]
+        self._strongest = [by_torque * torque for torque in limits.torque]
+
+    def first_exceeded(self, state: ArmState, new: Values) -> ThresholdTooLow | None:
+        """Return the first measured value that is beyond a threshold which `new` lowers, as a refusal, or None."""
+        by_speed, by_torque, error = new.supervision
+        for i in self._joints:
+            values = (
+                abs(state.actual_velocity[i]),
+                abs(state.actual_torque[i]),
+                abs(state.actual[i] - state.commanded[i]),
+            )
+            lower = by_speed * new.velocity[i], by_torque * new.torque[i], error
+            present = self._fastest[i], self._strongest[i], self.following_error
+            for quantity in range(len(values)):
+                if lower[quantity] < present[quantity] and values[quantity] > lower[quantity]:
+                    return ThresholdTooLow(self._first + i, quantity, values[quantity], lower[quantity])
+        return None
 
     def reset(self) -> None:
         """Reset all counts."""
@@ -78,7 +96,7 @@ class Supervision:
             else:
                 torques[i] += 1
                 counted = True
-                if torques[i] >= cycles:
+                if torques[i] >= self._torque_cycles:
                     return OverTorque(self._first + i, value, bound)
             value = actual[i] - commanded[i]
             if -error <= value <= error:

@@ -2,8 +2,9 @@
 
 For each joint the mean speed of the next cycle is within its limit, differs from the last by no more than
 acceleration x cycle, and leaves room to stop inside the range (`braking.fastest_stoppable`). These conditions stay
-satisfiable: the next step of a stop always fulfils them. Boxes and the arm's own bodies are guarded in the same way: a
-setpoint passes only if the stop from it touches nothing, so that the stop from the last setpoint is always possible.
+satisfiable: the next step of a stop always fulfils them. Boxes, cones and the arm's own bodies are guarded in the same
+way: a setpoint passes only if the stop from it touches nothing, so that the stop from the last setpoint is always
+possible.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from rtcp.ipc.events import BoxReached, CollisionAhead, JointLimitReached, Motio
 from rtcp.ipc.refusals import LimitsExcludeArm, Refusal
 from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
 from rtcp.motion.guards.neighbours import Neighbours
-from rtcp.motion.guards.zones import ITSELF, Zones
+from rtcp.motion.guards.zones import ITSELF, Zones, reported
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint
 
@@ -75,7 +76,7 @@ class TrajectoryGuard:
         self._room = self._room_then = 0.0
         """Lower bound on `Zones.room` of the commanded position, m; 0: unknown."""
         self._poses_then: Sequence[Pose] | None = None
-        self._box, self._keep_out = limits.box, limits.keep_out
+        self._box, self._keep_out, self._cones = limits.box, limits.keep_out, limits.cones
         self._rests = False
         """Whether the last setpoint was at rest at the commanded position, not cut by a guard."""
         self.neighbours: Neighbours | None = None
@@ -136,7 +137,7 @@ class TrajectoryGuard:
         assert self.zones is not None
         here, nearest = self.zones.distance(self.poses)
         if here < 0.0 and nearest == zone:
-            return NotLeavingBox(zone, -here)
+            return NotLeavingBox(zone, reported(zone, -here))
         return self.reached(zone, ahead)
 
     def stop_for(self, ended: MotionEnded) -> None:
@@ -148,19 +149,20 @@ class TrajectoryGuard:
         """Return the reason of a stop before a box or pair, `ahead` m away."""
         assert self.zones is not None
         if zone < ITSELF:
-            return BoxReached(zone, max(ahead, 0.0))
+            return BoxReached(zone, max(reported(zone, ahead), 0.0))
         return CollisionAhead(*self.zones.links(zone), max(ahead, 0.0))
 
-    def refusal_of(self, state: ArmState, new: Values) -> Refusal | None:
+    def refusal_of(self, state: ArmState, new: Values, *, widen: bool = False) -> Refusal | None:
         """Return a refusal of `new` limits if the arm, or its stop under them, is outside them or too near a partner.
 
-        The refusal is None if the arm can still stop in time. Every change of the limits under way asks this method.
+        The refusal is None if the arm can still stop in time. Every change of the limits under way asks this method;
+        one that may `widen` is compared with the absolute limits in place of the configured ones.
         """
-        refused = self._limits.check(new, state.commanded, self._mean)
+        refused = self._limits.check(new, state.commanded, self._mean, widen=widen)
         if refused is not None or self._model is None:
             return refused
         limits, mean = self._limits, self._mean
-        same_boxes = new.box == limits.box and new.keep_out == limits.keep_out
+        same_boxes = (new.box, new.keep_out, new.cones) == (limits.box, limits.keep_out, limits.cones)
         slower = any(rate < now for rate, now in zip(new.acceleration, limits.acceleration, strict=True))
         longer_stop = slower and any(mean)
         if longer_stop and self.neighbours is not None:
@@ -274,8 +276,8 @@ class TrajectoryGuard:
         if not any(mean):
             self._poses_then = self._poses
             return None
-        if limits.box is not self._box or limits.keep_out is not self._keep_out:
-            self._box, self._keep_out, self._room = limits.box, limits.keep_out, 0.0
+        if limits.box is not self._box or limits.keep_out is not self._keep_out or limits.cones is not self._cones:
+            self._box, self._keep_out, self._cones, self._room = limits.box, limits.keep_out, limits.cones, 0.0
         step, whole = travel(mean, limits.acceleration, zones.reach, self._dt)
         if self._room <= whole:
             self._room = zones.room(self.poses)

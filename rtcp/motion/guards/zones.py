@@ -1,31 +1,37 @@
-"""The arm's workspace: the tool inside a box, the bodies clear of the keep-out boxes and of each other.
+"""The arm's workspace: the tool inside a box, its axes in cones, the bodies clear of keep-out boxes and of each other.
 
 Distances are signed, m: positive inside the workspace, negative outside. Bodies are capsules (`kinematics.capsules`);
 they keep `cartesian.clearance` from keep-out boxes and from each other, and distances are measured beyond it. A body
 that no joint moves, the base, is not compared with boxes. If a fixed end of a body, as the upper arm's in the
 shoulder, is nearer to a box than the clearance, the rest of that body may come as near.
+
+The angle of a tool's axis from the surface of its cone counts as the way of the tip of a pointer, `POINTER_M` long,
+that turns with the tool: everything that holds for a point and a wall then holds for an orientation and a cone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from math import dist, hypot, sqrt
+from math import atan2, cos, dist, hypot, sqrt
 from typing import Final, NamedTuple, Protocol
 
 from kinematics.capsules import Placed, between_axes, capsules, distance, from_box, outside, point_at, self_pairs
 from kinematics.forward import frames
 from kinematics.model import JOINTS, ArmModel, Capsule
-from kinematics.pose import Pose, Vector
+from kinematics.pose import Pose, Rotation, Vector
 from rtcp.config.model import MOST_TOOLS
-from rtcp.motion.limits import Corners
+from rtcp.ipc.schema import FIRST_CONE
+from rtcp.motion.limits import Cone, Corners
 
 TOOL: Final = 6
 """Index of the tool in `frames`."""
 INNER_BOX: Final = -1
 """Zone number of the box around the tool; the keep-out boxes are numbered from 0."""
 ITSELF: Final = 1000
-"""Zone number of the first pair of the arm's own bodies."""
+"""Zone number of the first pair of the arm's own bodies; the cones are numbered from `FIRST_CONE`, which is less."""
+POINTER_M: Final = 0.25
+"""Way of the pointer's tip for a turn of the tool by 1 rad, m/rad: about the length that the wrist turns."""
 _FAR: Final = 1e9
 """Distance without any boundary, m."""
 _FIXED_M: Final = 0.005
@@ -47,12 +53,18 @@ class Boxes(Protocol):
         """Boxes that the arm's bodies stay outside of."""
         ...
 
+    @property
+    def cones(self) -> tuple[Cone, ...]:
+        """Cones that axes of the tool stay inside."""
+        ...
+
 
 class Clearance(NamedTuple):
     """Signed distance of a point of the arm from a boundary, m.
 
-    `zone`: number of the box or pair. The point is at `place`, m, and moves with `link`; the unit vector `normal`
-    points away from the boundary, which moves with the link `other`; 0: fixed.
+    `zone`: number of the box, cone or pair. The point is at `place`, m, and moves with `link`; the unit vector `normal`
+    points away from the boundary, which moves with the link `other`; 0: fixed. For a cone `normal` is the axis of the
+    rotation that leads the tool's axis straight away from the boundary.
     """
 
     distance: float
@@ -64,7 +76,7 @@ class Clearance(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """A pair of bodies, a body and a keep-out box, or the tool and its box: signed distance (m), number, first body.
+    """A pair of bodies, a body and a keep-out box, or the tool and its box or a cone: distance (m), number, first body.
 
     A motion of the arm's farthest point changes the distance by at most `share` of it; a bend of that point from its
     chord bends the bodies of the gap by at most `bend` of it.
@@ -83,8 +95,25 @@ def inside(x: float, y: float, z: float, box: Corners) -> float:
     return min(x - a, d - x, y - b, e - y, z - c, f - z)
 
 
+def is_cone(zone: int) -> bool:
+    """Return whether a zone number is that of a cone."""
+    return FIRST_CONE <= zone < ITSELF
+
+
+def reported(zone: int, distance: float) -> float:
+    """Return a distance (m) as events report it: m, that from a cone in rad."""
+    return distance / POINTER_M if is_cone(zone) else distance
+
+
+def inside_cone(rotation: Rotation, cone: Cone) -> float:
+    """Return the angle of a tool's axis from the surface of its cone, rad; negative: outside."""
+    axis, u, v, w, angle = cone
+    x, y, z = rotation[axis], rotation[axis + 3], rotation[axis + 6]
+    return angle - atan2(hypot(y * w - z * v, z * u - x * w, x * v - y * u), x * u + y * v + z * w)
+
+
 class Zones:
-    """The boxes of an arm, and the arm itself.
+    """The boxes and cones of an arm, and the arm itself.
 
     Args:
         model: the geometry.
@@ -100,6 +129,10 @@ class Zones:
         self._pairs, self._shares, self._fixed = geometry.pairs, geometry.shares, geometry.fixed
         self._pair_shares, self._all_shares = geometry.pair_shares, geometry.all_shares
         self.reach, self.pair_reach = geometry.reach, geometry.pair_reach
+        if boxes.cones:
+            self.reach = [max(POINTER_M, reach) for reach in geometry.reach]
+        self._turn_share = POINTER_M / min(self.reach) if boxes.cones else 1.0
+        """Of `reach`: the part of the pointer; a cone has it as its `share` and `bend`."""
         self.before, self.after = Placed(geometry.bodies), Placed(geometry.bodies)
         """The bodies at the two ends of a piece of the motion."""
         self._moving = [number for number, body in enumerate(geometry.bodies) if body.link]
@@ -107,8 +140,9 @@ class Zones:
 
     @property
     def any(self) -> bool:
-        """Whether there are boxes or pairs of bodies."""
-        return self._boxes.box is not None or bool(self._boxes.keep_out) or bool(self._pairs)
+        """Whether there are boxes, cones or pairs of bodies."""
+        boxes = self._boxes
+        return boxes.box is not None or bool(boxes.keep_out) or bool(boxes.cones) or bool(self._pairs)
 
     def links(self, zone: int) -> tuple[int, int]:
         """Return the links of a pair of the arm's own bodies, the inner one first."""
@@ -117,14 +151,14 @@ class Zones:
         return (first, second) if first < second else (second, first)
 
     def distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
-        """Return the least signed distance at the frames of a configuration, and its box or pair."""
+        """Return the least signed distance at the frames of a configuration, and its box, cone or pair."""
         least, zone = self.box_distance(poses)
         own, pair = self.own_distance(poses)
         return (own, pair) if own < least else (least, zone)
 
     def box_distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
-        """Return the least signed distance from the boxes, and that box."""
-        return self._from_boxes(poses, self._whole)
+        """Return the least signed distance from the boxes and cones, and that box or cone."""
+        return self._from_boxes(poses, self._whole, 1.0)
 
     def own_distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
         """Return the least signed distance of the arm's bodies from each other, and that pair."""
@@ -132,7 +166,9 @@ class Zones:
 
     def room(self, poses: Sequence[Pose]) -> float:
         """Return the least motion of the arm's farthest point before a contact is possible, m."""
-        return min(self._from_boxes(poses, self._shares)[0], self._from_itself(poses, self._all_shares)[0])
+        return min(
+            self._from_boxes(poses, self._shares, self._turn_share)[0], self._from_itself(poses, self._all_shares)[0]
+        )
 
     def _margin(self, body: int, box: Corners) -> float:
         """Return the required distance of a body from a box, m."""
@@ -141,12 +177,17 @@ class Zones:
             least = min(least, outside(*place, box) - self.before.radii[body] - _FIXED_M)
         return least
 
-    def _from_boxes(self, poses: Sequence[Pose], shares: Sequence[float]) -> tuple[float, int]:
+    def _from_boxes(self, poses: Sequence[Pose], shares: Sequence[float], turn_share: float) -> tuple[float, int]:
         least, zone = _FAR, INNER_BOX
         boxes, placed = self._boxes, self.before
         if boxes.box is not None:
             x, y, z = poses[TOOL][0]
             least = inside(x, y, z, boxes.box)
+        if boxes.cones:
+            for number, cone in enumerate(boxes.cones, FIRST_CONE):
+                room = POINTER_M * inside_cone(poses[TOOL].rotation, cone) / turn_share
+                if room < least:
+                    least, zone = room, number
         if boxes.keep_out:
             placed.place(poses)
             for number, box in enumerate(boxes.keep_out):
@@ -178,6 +219,12 @@ class Zones:
             apart = inside(x, y, z, boxes.box)
             if apart <= within:
                 gaps.append(Gap(apart, INNER_BOX, TOOL, 1.0, 1.0))
+        if boxes.cones:
+            share = self._turn_share
+            for number, cone in enumerate(boxes.cones, FIRST_CONE):
+                apart = POINTER_M * inside_cone(poses[TOOL].rotation, cone)
+                if apart <= share * within:
+                    gaps.append(Gap(apart, number, TOOL, share, share))
         for number, box in enumerate(boxes.keep_out):
             for body in self._moving:
                 share, margin = shares[body], self._margin(body, box)
@@ -197,10 +244,25 @@ class Zones:
         if gap.zone == INNER_BOX:
             assert boxes.box is not None
             return inside(*poses[TOOL][0], boxes.box)
+        if is_cone(gap.zone):
+            return POINTER_M * inside_cone(poses[TOOL].rotation, boxes.cones[gap.zone - FIRST_CONE])
         if gap.zone < ITSELF:
             box = boxes.keep_out[gap.zone]
             return from_box(placed, gap.body, box)[0] - self._margin(gap.body, box)
         return distance(placed, placed, (self._pairs[gap.zone - ITSELF],))[0] - self._clearance
+
+    def depth(self, zone: int, distance: float) -> float:
+        """Return how deep the pointer's tip is behind the plane through the rim of a cone, m.
+
+        All that is inside the cone lies behind this plane, whatever the angle: a tip that moves straight between two
+        depths stays as deep as the lesser one.
+
+        Args:
+            zone: of the cone.
+            distance: of the tip from the cone, m along its arc.
+        """
+        angle = self._boxes.cones[zone - FIRST_CONE].angle
+        return POINTER_M * (cos(angle - distance / POINTER_M) - cos(angle))
 
     def parted(self, gap: Gap, margin: float) -> bool:
         """Return whether one plane separates the two sides of a gap at both ends of a piece, `before` and `after`.
@@ -259,6 +321,11 @@ class Zones:
                 ):
                     if apart < within:
                         clearances.append(Clearance(apart, INNER_BOX, TOOL, 0, position, _unit(axis, sign)))
+        for number, cone in enumerate(boxes.cones, FIRST_CONE):
+            apart = POINTER_M * inside_cone(poses[TOOL].rotation, cone)
+            if apart < self._turn_share * within:
+                turn = _turn_inward(poses[TOOL].rotation, cone)
+                clearances.append(Clearance(apart, number, TOOL, 0, poses[TOOL][0], turn))
         for number, box in enumerate(boxes.keep_out):
             for body in self._moving:
                 near, margin = self._shares[body] * within, self._margin(body, box)
@@ -376,6 +443,15 @@ def _greatest(axes: Sequence[float], at: int, x: float, y: float, z: float) -> f
 def _unit(axis: int, sign: float) -> Vector:
     x, y, z = (sign if axis == at else 0.0 for at in range(3))
     return x, y, z
+
+
+def _turn_inward(rotation: Rotation, cone: Cone) -> Vector:
+    """Return the axis of the shortest rotation of a tool's axis to the middle of its cone; 0 where there is no one."""
+    axis, u, v, w, _ = cone
+    x, y, z = rotation[axis], rotation[axis + 3], rotation[axis + 6]
+    x, y, z = y * w - z * v, z * u - x * w, x * v - y * u
+    length = hypot(x, y, z)
+    return (x / length, y / length, z / length) if length > 0.0 else (0.0, 0.0, 0.0)
 
 
 def _way_out(place: Vector, box: Corners) -> Vector:

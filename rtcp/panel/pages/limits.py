@@ -1,4 +1,4 @@
-"""Limits of joints and space: in force and configured; they are narrowed while the platform runs."""
+"""Limits of joints, space and supervision: in force and configured; they are narrowed while the platform runs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from nicegui import ui
 from rtcp.api import RtcpError
 from rtcp.panel.page import ENABLED, POSE, Field, View, button, no_platform, number, quantity, table, text
 
+_SUPERVISION = {"speed": "times the limit", "torque": "times the limit", "following_error": "rad"}
+"""Threshold of the supervision -> its unit."""
 _JOINT = {"min": "rad", "max": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "jerk": "rad/s³", "torque": "Nm"}
 """Limit of a joint -> its unit."""
 
@@ -28,19 +30,38 @@ async def build(view: View) -> None:
     limits = await view.live.view(lambda robot: robot.limits())
     fields: dict[str, Field] = {}
 
-    async def apply() -> None:
-        try:
-            changes = {key: control.number() for key, control in fields.items() if control.value != kept[key]}
-        except RtcpError as error:
-            view.warn(error.message)
-            return
-        if changes and await view.act(lambda robot: robot.set_limits(changes), "The limits are in force") is not None:
+    async def put(changes: dict[str, float], widen: bool) -> None:
+        done = await view.act(lambda robot: robot.set_limits(changes, widen=widen), "The limits are in force")
+        if done is not None:
             kept.update({key: fields[key].value for key in changes})
 
+    def changes() -> dict[str, float]:
+        try:
+            return {key: control.number() for key, control in fields.items() if control.value != kept[key]}
+        except RtcpError as error:
+            view.warn(error.message)
+            return {}
+
+    async def apply() -> None:
+        if changed := changes():
+            await put(changed, widen=False)
+
+    def widen() -> None:
+        async def confirmed() -> None:
+            dialog.close()
+            await put(changed, widen=True)
+
+        if changed := changes():
+            named = ", ".join(f"{key} {value:g}" for key, value in changed.items())
+            note = f"{named}: at most what the file has under `absolute`, and without torque."
+            with view.question("Allow more than the limits of the file?", note) as dialog:
+                button("Widen the limits", confirmed)
+                button("Leave them", dialog.close, plain=True)
+
     async def widest() -> None:
-        changes = dict(_all(limits["configured"], limits["joint_names"]))
-        if await view.act(lambda robot: robot.set_limits(changes), "The limits of the file are in force") is not None:
-            for key, value in changes.items():
+        allowed = dict(_all(limits["configured"], limits["joint_names"]))
+        if await view.act(lambda robot: robot.set_limits(allowed), "The limits of the file are in force") is not None:
+            for key, value in allowed.items():
                 fields[key].value = kept[key] = f"{value:g}"
 
     with table(("Joint", *_JOINT.items()), "Limits of the joints", "numbers"):
@@ -62,11 +83,31 @@ async def build(view: View) -> None:
                         now, allowed = (_boxes(limits[which])[box][side][axis] for which in ("limits", "configured"))
                         with ui.element("td"):
                             fields[f"{box}.{side}.{letter}"] = _field(f"{box} {side} {letter}", now, allowed, "m")
+    if cones := limits["limits"]["cones"]:
+        columns = (("Cone", ""), ("Axis of the tool", ""), ("Direction", ""), ("Largest angle", "rad"))
+        with table(columns, "Limits of the tool's orientation", "numbers"):
+            for name, cone in cones.items():
+                with ui.element("tr"):
+                    text("th", name, scope="row")
+                    text("td", cone["axis"], "text")
+                    text("td", " ".join(f"{part:g}" for part in cone["direction"]), "text")
+                    with ui.element("td"):
+                        allowed = limits["configured"]["cones"][name]["angle"]
+                        fields[f"{name}.angle"] = _field(f"{name} angle", cone["angle"], allowed, "rad")
+    with table(("Measured", "Threshold"), "Supervision", "numbers"):
+        for name, unit in _SUPERVISION.items():
+            with ui.element("tr"):
+                text("th", name.replace("_", " "), scope="row")
+                with ui.element("td"):
+                    now, allowed = (limits[which]["supervision"][name] for which in ("limits", "configured"))
+                    label = f"supervision {name.replace('_', ' ')}"
+                    fields[f"supervision.{name}"] = _field(label, now, allowed, unit)
     kept = {key: control.value for key, control in fields.items()}
     when = f"ready {ENABLED} stopped_by_limit fault"
     with ui.element("div").classes("buttons"):
         button("Set the limits", apply, when=when)
         button("As the file allows", widest, when=when, plain=True)
+        button("Beyond the file", widen, when="ready fault", plain=True)
 
 
 def _field(name: str, now: float, allowed: float, unit: str) -> Field:
@@ -91,3 +132,7 @@ def _all(limits: dict[str, Any], joints: Sequence[str]) -> Iterator[tuple[str, f
         for side in ("min", "max"):
             for axis, letter in enumerate("xyz"):
                 yield f"{box}.{side}.{letter}", corners[side][axis]
+    for name, cone in limits["cones"].items():
+        yield f"{name}.angle", cone["angle"]
+    for name, value in limits["supervision"].items():
+        yield f"supervision.{name}", value

@@ -173,6 +173,8 @@ window.rtcp = (() => {
       alarmed.hidden = !(connected && state.alarms);
       put(alarmed, `${state.alarms} ${state.alarms === 1 ? "alarm" : "alarms"}`);
     }
+    const joystick = document.getElementById("joystick");
+    if (joystick) joystick.hidden = !(connected && state.joystick);
     const override = document.querySelector("[data-override]");
     if (override) {
       override.disabled = !connected || state.speed_override === undefined;

@@ -15,9 +15,11 @@ from rtcp.config.numbers import Name, NotNegative, Positive
 from rtcp.processes.shape_setting.messages import (
     ArmHeater,
     HeaterState,
+    HeatRod,
     MeasureResistance,
     ResetTrips,
     SetHeatProfile,
+    SetTargetRatio,
     StartHeating,
     StopHeating,
 )
@@ -39,7 +41,9 @@ class ShapeSettingConfig(ProcessConfig):
     """A heater for Nitinol rods: battery, relay, gate (MOSFET), two-channel analog terminal, remote with a key."""
 
     PROCESS = "rtcp.processes.shape_setting.process:ShapeSetting"
-    COMMANDS = (ArmHeater, MeasureResistance, SetHeatProfile, StartHeating, StopHeating, ResetTrips)
+    COMMANDS = (
+        ArmHeater, MeasureResistance, SetHeatProfile, SetTargetRatio, StartHeating, HeatRod, StopHeating, ResetTrips,
+    )  # fmt: skip
     STATES = HeaterState
     LAMPS = MappingProxyType({"green": "lamp_green", "yellow": "lamp_yellow", "red": "relay_closed"})
     PLOT = ("setpoint_middle", "middle_temperature", "mean_temperature", "average_current")
@@ -104,7 +108,7 @@ class ShapeSettingConfig(ProcessConfig):
     relay: OutputChannel = "control.relay"
     """Main relay; 1: closed. The red lamp is wired to it."""
     lamp_green: OutputChannel = "control.lamp_green"
-    """Lamp for powered: the platform is ready or holding."""
+    """Lamp for powered: on in every state, in faults too."""
     lamp_yellow: OutputChannel = "control.lamp_yellow"
     """Lamp for armed: the relay is commanded to close."""
 
@@ -130,6 +134,8 @@ class ShapeSettingConfig(ProcessConfig):
     """Greatest current, A; below the fuse's."""
     over_voltage: Positive = 15.0
     """Greatest voltage of rod and battery, V."""
+    rod_length: Annotated[float, Ge(0.1), Le(0.5)] = 0.3
+    """Length of the rod between the chucks, m, for `set_target_ratio` without a length."""
     least_battery_voltage: NotNegative = 11.5
     """Least voltage of the battery for the heater to be armed, V."""
     open_resistance: Positive = 5.0
@@ -156,8 +162,8 @@ class ShapeSettingConfig(ProcessConfig):
     greatest_initial_uncertainty: Annotated[float, Gt(0), Le(0.1)] = 0.003
     """Greatest relative uncertainty of the initial resistance; 0.002 is worth some 10 K."""
     rod_cooling_s: Annotated[float, Ge(0), Le(3600)] = 600.0
-    """Time after a heating, and after each start of the platform, before an initial resistance is measured, s: a rod of
-    1 mm is cold after 120, one of 3.2 mm after 600."""
+    """Greatest time after a heating, and after each start of the platform, before an initial resistance is measured, s.
+    The heat balance of the rod shortens it to when this rod is cold; `is_cold` ends it."""
     greatest_target_c: Annotated[float, Gt(0), Le(600)] = 600.0
     """Greatest target in the middle of the rod, C: Nitinol loses its structure above."""
     longest_cooling_s: Positive = 600.0

@@ -18,7 +18,8 @@ from rtcp.config.model import MOST_AXES, ConfigError
 from rtcp.config.numbers import FractionOfPi, Name
 from rtcp.config.validation import Checker, rule
 from rtcp.processes.rod import Chuck, Equilibrium, Rod, bend, pre_bend
-from rtcp.processes.shape_setting.profile import HeatProfile, read_profile
+from rtcp.processes.shape_setting.heat_profile import HeatProfile
+from rtcp.processes.shape_setting.profile import read_profile
 
 _Place = Base
 _SAME_M = 1e-3
@@ -125,7 +126,7 @@ def read_job(path: Path) -> tuple[Job, HeatProfile]:
     """
     document = read(path)
     job = _FILE.read(document)
-    profile = read_profile(path.parent / job.heat)
+    profile = read_profile(path.parent / job.heat, job.rod.length, job.rod.diameter)
     if abs(profile.ends.length - job.rod.length) > _SAME_M:
         text = f"found {job.rod.length:g} m, the profile {job.heat} has ends.length {profile.ends.length:g} m: one rod"
         raise ConfigError(document.placed([Finding(("rod", "length"), "other_length", text=text)]))

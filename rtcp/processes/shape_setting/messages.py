@@ -46,8 +46,8 @@ class RodPhase(IntEnum):
 # -- commands ----------------------------------------------------------------------------------------------------------
 
 
-class ArmHeater(Command):
-    """Close the heater's relay; the gate stays off."""
+class ArmHeater(ProcessCommand):
+    """Close the heater's relay; the gate stays off. It lasts until the mirror contact shows a closed relay."""
 
     states = AT_REST
 
@@ -59,6 +59,8 @@ class MeasureResistance(ProcessCommand):
     """The operator confirms that nothing bends the rod: stress makes martensite, worth 7 to 20 % of resistance."""
     phase: RodPhase
     """The phase that the operator confirms; only austenite is measured, whose line the profile has."""
+    is_cold: bool = False
+    """The operator confirms that the rod has the temperature of the room: it is another rod, or was never hot."""
 
 
 class ProfileKey(IntEnum):
@@ -140,6 +142,55 @@ class StartHeating(ProcessCommand):
     """Heat by the profile: ramp, hold, cool down."""
 
 
+class RatioKey(IntEnum):
+    """A number of `SetTargetRatio`, by its position there."""
+
+    TARGET_RATIO = 0
+    HOLD_S = 1
+    LENGTH = 2
+    INITIAL_C = 3
+
+
+RATIO_RANGES: Final = MappingProxyType({
+    RatioKey.TARGET_RATIO: (1.001, 2.0),
+    RatioKey.HOLD_S: (0.0, inf),
+    RatioKey.LENGTH: (0.1, 0.5),
+    RatioKey.INITIAL_C: (-20.0, 70.0),
+})  # fmt: skip
+"""Least and greatest values of those numbers; the configuration narrows the hold further."""
+ROD_DIAMETERS: Final = (0.3e-3, 4e-3)
+"""Diameters of rods that are heated by the ratio alone, m."""
+
+
+class SetTargetRatio(Command):
+    """Heat rods of any diameter to a ratio of resistances: the measured initial resistance shows the diameter.
+
+    It takes the place of a heat profile, and lasts until `set_heat_profile`.
+    """
+
+    states = AT_REST
+    target_ratio: float
+    """Resistance at the target by the initial resistance (equation 4.3 of the thesis)."""
+    hold_s: float = 120.0
+    """Time at the target, s."""
+    length: float = 0.0
+    """Length of the rod between the chucks, m; 0: `rod_length` of the configuration."""
+    initial_c: float = 20.0
+    """Temperature of rod, air and chucks at the measurement of the initial resistance, C."""
+
+
+class HeatRod(ProcessCommand):
+    """Do all steps for one rod: close the relay, measure the initial resistance, heat, hold, cool down."""
+
+    states = AT_REST
+    straight_and_unloaded: bool
+    """As of `MeasureResistance`."""
+    phase: RodPhase
+    """As of `MeasureResistance`."""
+    is_cold: bool = False
+    """As of `MeasureResistance`."""
+
+
 class StopHeating(Command):
     """Turn gate and relay off."""
 
@@ -202,14 +253,14 @@ class ResistanceNotMeasured(Refusal):
 
 class RodStillHot(Refusal):
     """the rod may have been hot {elapsed_s:.0f} s ago, by a heating or before this start: an initial resistance is
-    measured {wait_s:.0f} s after it (rod_cooling_s)"""
+    measured {wait_s:.0f} s after it, or with is_cold of a rod that has the temperature of the room (rod_cooling_s)"""
 
     elapsed_s: float
     wait_s: float
 
 
 class NoHeatProfile(Refusal):
-    """there is no heat profile: set_heat_profile first"""
+    """there is no heat profile: set_heat_profile or set_target_ratio first"""
 
 
 class ProfileNumberOutOfRange(Refusal):
@@ -219,6 +270,27 @@ class ProfileNumberOutOfRange(Refusal):
     value: float
     least: float
     greatest: float
+
+
+class RatioNumberOutOfRange(Refusal):
+    """{quantity}: found {value:.6g}, allowed is a number from {least:g} to {greatest:g}"""
+
+    quantity: RatioKey
+    value: float
+    least: float
+    greatest: float
+
+
+class RodUnfit(Refusal):
+    """by its initial resistance, {resistance:.4g} ohm, and its length the rod is {diameter_mm:.3g} mm thick, and its
+    middle has {target_c:.4g} C at the target ratio: allowed are 0.3 to 4 mm and {least_c:g} to {greatest_c:g} C; check
+    contacts, length and ratio"""
+
+    resistance: float
+    diameter_mm: float
+    target_c: float
+    least_c: float
+    greatest_c: float
 
 
 class CoolingOutOfRange(Refusal):
@@ -332,6 +404,26 @@ class RodHotAgain(Event, number=141):
     is_warning = True
     middle_c: float
     cool_c: float
+
+
+class RodRejected(ProcessEnded, number=142):
+    """by its initial resistance, {resistance:.4g} ohm, and its length the rod is {diameter_mm:.3g} mm thick, and its
+    middle has {target_c:.4g} C at the target ratio: allowed are 0.3 to 4 mm and {least_c:g} to {greatest_c:g} C; the
+    relay opens; check contacts, length and ratio"""
+
+    resistance: float
+    diameter_mm: float
+    target_c: float
+    least_c: float
+    greatest_c: float
+
+
+class RodSized(Event, number=143):
+    """by its initial resistance the rod is {diameter_mm:.3g} mm thick; the target ratio is {target_c:.4g} C in its
+    middle"""
+
+    diameter_mm: float
+    target_c: float
 
 
 class ArmedTooLong(ProcessEnded, number=138):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, inf
+from math import hypot, inf, pi, sqrt
 from typing import Any, Final
 
 from rtcp.control.part import PartContext
@@ -18,6 +18,7 @@ from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.control import CurrentControl, Ramp
 from rtcp.processes.shape_setting.heat_balance import HeatBalance
+from rtcp.processes.shape_setting.heat_profile import NITINOL, HeatProfile, heat_command
 from rtcp.processes.shape_setting.interlocks import Interlocks, Mode, Row, first_row
 from rtcp.processes.shape_setting.resistance import InitialResistance, ResistanceMeter
 from rtcp.processes.shape_setting.supervision import Inputs, Supervision
@@ -33,12 +34,14 @@ _HALF: Final = 0.5
 """Threshold between the levels of a digital channel."""
 _BELOW_K: Final = 20.0
 """A rod that seems colder than room and chucks by more than this, K, has a changed contact."""
+_COOLED_K: Final = 10.0
+"""Least rise over the initial temperature, K, at which a rod that was heated to a ratio counts as cool."""
 _DEAD: Final = 1 << Row.LOST_CYCLE | 1 << Row.STALE_INPUT
 _NO_AGE: Final = 9999.0
 """Age of a value that was never received, s; a record is also written as JSON, which has no infinity."""
 _FIELDS: Final = (
     Field("state", "uint8", "", "What it is doing (HeaterState)."),
-    Field("busy", "uint8", "", "1: it measures, heats, holds or cools."),
+    Field("busy", "uint8", "", "1: it waits for its relay to close, measures, heats, holds or cools."),
     Field("mode", "uint8", "", "Position of the key: 0 Off, 1 Manual, 2 Auto."),
     Field("cause", "uint8", "", "Row of the interlocks that ended the last heating; 31: none."),
     Field("forbids", "uint32", "", "Rows that keep the relay from closing now, a bit each."),
@@ -103,6 +106,12 @@ class ShapeSetting(Process):
         self.ramp = Ramp()
         self.state = messages.HeaterState.OFF
         self._profile: messages.SetHeatProfile | None = None
+        self._by_ratio: messages.SetTargetRatio | None = None
+        """What takes the place of a profile: each measured rod gets its own by that."""
+        self._closing = False
+        """Whether a command waits for the relay to close."""
+        self._goes_on = False
+        """Whether a command goes on by itself: from the relay to the measurement, from there to the heat."""
         self._scale = RatioScale(0.0, 1.0, 0.0, 1.0)
         self.gate = False
         self.energy = self.uncertainty_k = 0.0
@@ -113,6 +122,8 @@ class ShapeSetting(Process):
         # A heating before this start is not known here.
         self._since_heat_s = 0.0
         """Time since the rod was, or may have been, heated, s."""
+        self._wait_s = self._longest_wait_s = config.rod_cooling_s
+        """Time after that heat before a rod is measured, s, and the longest: of a rod that was at its melting point."""
         self._pending: list[Event] = []
         """Events of commands and of `safe`; the next cycle reports them."""
 
@@ -129,9 +140,16 @@ class ShapeSetting(Process):
         if isinstance(command, messages.ResetTrips):
             return self._reset_trips()
         if isinstance(command, messages.SetHeatProfile):
-            return self._set_profile(command)
+            refusal = self._set_profile(command)
+            if refusal is None:
+                self._by_ratio = None
+            return refusal
+        if isinstance(command, messages.SetTargetRatio):
+            return self._set_ratio(command)
         if isinstance(command, messages.ArmHeater):
             return self._arm()
+        if isinstance(command, messages.HeatRod):
+            return self._heat_rod(command, lease)
         if self.state is not messages.HeaterState.ARMED:
             return messages.WrongHeaterState(self.state, messages.HeaterState.ARMED)
         if isinstance(command, messages.MeasureResistance):
@@ -178,12 +196,74 @@ class ShapeSetting(Process):
             command.initial_c, command.kelvin_per_ratio, command.chuck_c, command.mean_by_middle
         )  # fmt: skip
         self._profile, self._scale = command, scale
+        is_first = not self.balance.is_known
         self.balance.set_rod(
             command.initial_c, command.chuck_c, command.target_c, command.heat_capacity, command.convected,
             command.radiated, command.tolerance,
         )  # fmt: skip
         self.supervision.set_rod(scale, command.target_c)
+        self._longest_wait_s = min(config.rod_cooling_s, self.balance.longest_cooling_s)
+        if is_first:  # the rod that may have been hot before is this one, or another one that is cold
+            self._wait_s = min(self._wait_s, self._longest_wait_s)
         return None
+
+    def _set_ratio(self, command: messages.SetTargetRatio) -> Refusal | None:
+        if self.state not in _AT_REST and self.state is not messages.HeaterState.ARMED:
+            return messages.WrongHeaterState(self.state, messages.HeaterState.ARMED)
+        length = command.length or self._config.rod_length
+        command = messages.SetTargetRatio(command.target_ratio, command.hold_s, length, command.initial_c)
+        ramp_s = (self._config.greatest_target_c - command.initial_c) / HeatProfile.ramp_k_s
+        longest_hold_s = max(self._config.longest_s - ramp_s, 0.0)
+        for key, (least, most) in messages.RATIO_RANGES.items():
+            value, greatest = getattr(command, key.name.lower()), min(most, longest_hold_s)
+            if key is not messages.RatioKey.HOLD_S:
+                greatest = most
+            if not least <= value <= greatest:
+                return messages.RatioNumberOutOfRange(key, value, least, greatest)
+        self._by_ratio = command
+        return None
+
+    def _size_rod(self, wanted: messages.SetTargetRatio) -> Refusal | None:
+        """Make the profile of the measured rod: its resistance and its length show its diameter (equation 4.1)."""
+        resistance = self.initial.value
+        diameter = sqrt(4.0 * NITINOL.resistivity(wanted.initial_c) * wanted.length / (pi * resistance))
+        profile = HeatProfile(
+            target_ratio=wanted.target_ratio, hold_s=wanted.hold_s, initial_c=wanted.initial_c,
+            chuck_c=wanted.initial_c, cool_c=max(HeatProfile.cool_c, wanted.initial_c + _COOLED_K),
+        ).of_rod(wanted.length, diameter)  # fmt: skip
+        thin, thick = messages.ROD_DIAMETERS
+        if not thin <= diameter <= thick or self._set_profile(heat_command(profile)) is not None:
+            least, _ = messages.PROFILE_RANGES[messages.ProfileKey.TARGET_C]
+            return messages.RodUnfit(
+                resistance, 1e3 * diameter, profile.target_c, least, self._config.greatest_target_c
+            )  # fmt: skip
+        # The pulses before were balanced without this rod; they are worth some kelvin.
+        self.balance.begin()
+        self._pending.append(messages.RodSized(1e3 * diameter, profile.target_c))
+        return None
+
+    def _heat_rod(self, command: messages.HeatRod, lease: int) -> Refusal | None:
+        """Arm; the cycle goes on with the measurement and the heat."""
+        if self._profile is None and self._by_ratio is None:
+            return messages.NoHeatProfile()
+        if (
+            refusal := self._unfit_to_measure(command.straight_and_unloaded, command.phase, command.is_cold)
+            or self._arm()
+        ):
+            return refusal
+        self._goes_on, self._lease = True, lease
+        return None
+
+    def _unfit_to_measure(self, is_free: bool, phase: messages.RodPhase, is_cold: bool) -> Refusal | None:
+        if not is_free or phase is not messages.RodPhase.AUSTENITE:
+            return messages.RodNotConfirmed(phase)
+        if (hot_s := self._hot_s()) and not is_cold:
+            return messages.RodStillHot(self._since_heat_s, self._since_heat_s + hot_s)
+        return None
+
+    def _hot_s(self) -> float:
+        """Return for how long the rod may still be hot, s."""
+        return max(self._wait_s - self._since_heat_s, 0.0)
 
     def _arm(self) -> Refusal | None:
         interlocks, config = self.interlocks, self._config
@@ -201,32 +281,42 @@ class ShapeSetting(Process):
             interlocks.open()
             return messages.BatteryLow(voltage, config.least_battery_voltage)
         self.state, self._elapsed_s = messages.HeaterState.ARMED, 0.0
+        self._closing = True
         self.control.reset()
         self._pending.append(messages.HeaterArmed(interlocks.mode))
         return None
 
     def _measure(self, command: messages.MeasureResistance, lease: int) -> Refusal | None:
-        if not command.straight_and_unloaded or command.phase is not messages.RodPhase.AUSTENITE:
-            return messages.RodNotConfirmed(command.phase)
+        if refusal := self._unfit_to_measure(command.straight_and_unloaded, command.phase, command.is_cold):
+            return refusal
         if not self.inputs.relay_closed:
             return messages.HeatForbidden(Row.RELAY_FEEDBACK, self.interlocks.mode)
-        if self._since_heat_s < self._config.rod_cooling_s:
-            return messages.RodStillHot(self._since_heat_s, self._config.rod_cooling_s)
-        self.initial.begin()
-        self.balance.begin()
-        self._cooled_c = inf
-        self._pulse_s, self._lease = 0.0, lease
-        self.state = messages.HeaterState.MEASURING
+        self._begin_pulses(lease)
         return None
 
+    def _begin_pulses(self, lease: int) -> None:
+        self.initial.begin()
+        self.balance.begin()
+        if self._by_ratio is not None:
+            # Another rod: what is known of the one before does not hold.
+            self._profile = None
+            self.balance.forget_rod()
+        self._cooled_c = inf
+        # The rod in the chucks counts as cold now.
+        self._pulse_s, self._lease, self._wait_s = 0.0, lease, 0.0
+        self.state = messages.HeaterState.MEASURING
+
     def _start(self, lease: int) -> Refusal | None:
-        profile = self._profile
-        if profile is None:
+        if self._profile is None and self._by_ratio is None:
             return messages.NoHeatProfile()
         if not self.initial.value:
             return messages.ResistanceNotMeasured()
         if not self.inputs.relay_closed:
             return messages.HeatForbidden(Row.RELAY_FEEDBACK, self.interlocks.mode)
+        if self._by_ratio is not None and (refusal := self._size_rod(self._by_ratio)):
+            return refusal
+        profile = self._profile
+        assert profile is not None
         measured = profile.kelvin_per_ratio / profile.mean_by_middle * self.initial.uncertainty / self.initial.value
         self.uncertainty_k = hypot(profile.uncertainty_k, measured)
         self.ramp.begin(self._scale.middle(1.0), profile.target_c, profile.ramp_k_s)
@@ -246,6 +336,8 @@ class ShapeSetting(Process):
 
     def update(self, context: PartContext) -> None:
         """Do a cycle."""
+        # Powered, in every state: a fault does not disconnect the battery.
+        self._green.value = 1.0
         if context.state is State.STARTING:
             # The inputs are not valid yet.
             self._open()
@@ -254,7 +346,9 @@ class ShapeSetting(Process):
         self._passed_s = 1e-9 * (now_ns - self._before_ns) if self._before_ns else context.period_s
         self._before_ns = now_ns
         self._read()
-        self._since_heat_s = 0.0 if self.state in _HOT else self._since_heat_s + self._passed_s
+        self._since_heat_s += self._passed_s
+        if self.state in _HOT:
+            self._note_heat()
         inputs, interlocks, meter = self.inputs, self.interlocks, self.meter
         power = inputs.voltage * inputs.current
         # In the first cycle without inputs the gate is still on.
@@ -266,7 +360,7 @@ class ShapeSetting(Process):
         latched = interlocks.latched
         if holds & 1 << Row.GATE_FEEDBACK:
             # Whatever was commanded, a current may heat the rod.
-            self._since_heat_s = 0.0
+            self._note_heat()
         if interlocks.update(inputs.mode, holds):
             self._report_cause(context, interlocks.latched & ~latched)
             self._open()
@@ -288,7 +382,12 @@ class ShapeSetting(Process):
         if self.balance.most_c > self._cooled_c + self._config.excess_temperature:
             context.report(messages.RodHotAgain(self.balance.most_c, self._cooled_c))
             self._open()
-            self._since_heat_s, self._cooled_c = 0.0, inf
+            self._note_heat()
+            self._cooled_c = inf
+
+    def _note_heat(self) -> None:
+        """Count the time from now on: the rod is, or may be, heated."""
+        self._since_heat_s, self._wait_s = 0.0, self._longest_wait_s
 
     def _read(self) -> None:
         inputs = self.inputs
@@ -332,6 +431,11 @@ class ShapeSetting(Process):
 
     def _wait(self, context: PartContext) -> None:
         """Open a relay that is not used: no commander supervises an armed heater."""
+        if self._closing and self.inputs.relay_closed:
+            self._closing = False
+            if self._goes_on:
+                self._begin_pulses(self._lease)
+                return
         self._elapsed_s += self._passed_s
         if self._elapsed_s > self._config.armed_s:
             context.report(messages.ArmedTooLong(self._config.armed_s))
@@ -346,15 +450,33 @@ class ShapeSetting(Process):
             self.gate, self._pulse_s = False, 0.0
             if initial.pulses == config.pulses:
                 initial.finish()
+                lease, goes_on, self._goes_on = self._lease, self._goes_on, False
                 self.state, self._lease, self._elapsed_s = messages.HeaterState.ARMED, 0, 0.0
                 if initial.uncertainty > config.greatest_initial_uncertainty * initial.value:
                     percent, limit = initial.uncertainty / initial.value, config.greatest_initial_uncertainty
                     context.report(messages.ResistanceUncertain(initial.value, 100.0 * percent, 100.0 * limit))
                     initial.forget()
+                    if goes_on:
+                        self._open()
                 else:
                     context.report(messages.ResistanceMeasured(initial.value, initial.uncertainty, initial.pulses))
+                    if goes_on:
+                        self._go_on(context, lease)
         elif self._pulse_s >= config.pulse_interval_s or not initial.pulses:
             self.gate = True
+
+    def _go_on(self, context: PartContext, lease: int) -> None:
+        """Heat the rod that was just measured, or report why not and open the relay."""
+        refusal = self._start(lease)
+        if refusal is not None:
+            # The relay is closed, and profile and resistance are there: only the rod itself can be refused.
+            assert isinstance(refusal, messages.RodUnfit)
+            context.report(
+                messages.RodRejected(
+                    refusal.resistance, refusal.diameter_mm, refusal.target_c, refusal.least_c, refusal.greatest_c
+                )
+            )
+            self._open()
 
     def _heat(self, context: PartContext) -> None:
         config, meter, control, profile, scale = self._config, self.meter, self.control, self._profile, self._scale
@@ -396,6 +518,8 @@ class ShapeSetting(Process):
             self.state = messages.HeaterState.DONE
             self._cooled_c = self._profile.cool_c
             self._since_heat_s = self._hold_s
+            # Both thermometers have followed this rod until it was cool.
+            self._wait_s = min(self._wait_s, self._hold_s + self.balance.time_to_cold())
         elif self._hold_s > self._config.longest_cooling_s:
             context.report(messages.CoolingTooLong(middle, self._config.longest_cooling_s))
             self._open()
@@ -407,7 +531,6 @@ class ShapeSetting(Process):
         self._relay_output.value = float(closed)
         self._gate_output.value = float(self.gate)
         self._yellow.value = float(closed)
-        self._green.value = float(context.state in (State.READY, State.HOLDING))
 
     def safe(self) -> None:
         """Turn gate and relay off; they stay off until the heater is armed again."""
@@ -417,7 +540,7 @@ class ShapeSetting(Process):
 
     def _open(self) -> None:
         self.interlocks.open()
-        self.gate = False
+        self.gate = self._closing = self._goes_on = False
         self._lease = 0
         self._relay_output.value = self._gate_output.value = self._yellow.value = 0.0
         self.control.reset()
@@ -432,11 +555,11 @@ class ShapeSetting(Process):
         inputs = self.inputs
         ratio, scale = self.ratio, self._scale
         values[at : at + len(_FIELDS)] = (
-            self.state, self.state in _BUSY, interlocks.mode, interlocks.cause,
+            self.state, self._closing or self.state in _BUSY, interlocks.mode, interlocks.cause,
             interlocks.forbids(self.supervision.holds), interlocks.latched,
             self.gate, interlocks.closed, inputs.relay_closed, inputs.gate_sense, inputs.current,
             self._before_ns > 0 and not self.supervision.holds & _DEAD,
-            max(self._config.rod_cooling_s - self._since_heat_s, 0.0),
+            self._hot_s(),
             meter.resistance, min(meter.age_s, _NO_AGE), initial.value, initial.uncertainty,
             ratio, scale.ratio_for_middle(self.ramp.setpoint_c), self.ramp.setpoint_c,
             scale.mean(ratio) if ratio else 0.0, scale.middle(ratio) if ratio else 0.0,

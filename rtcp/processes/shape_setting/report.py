@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from rtcp.processes.rod.set_shape import aligned
+from rtcp.processes.shape_setting.heat_profile import HeatProfile, target_temperatures
 from rtcp.processes.shape_setting.job import Job
-from rtcp.processes.shape_setting.profile import HeatProfile, target_temperatures, temperatures_along
+from rtcp.processes.shape_setting.profile import temperatures_along
 from rtcp.processes.shape_setting.run import Array, Outcome
 
 _SHAPES = (("wanted", "k--"), ("held", "tab:blue"), ("released", "tab:red"))

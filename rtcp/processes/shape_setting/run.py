@@ -29,10 +29,11 @@ from rtcp.ipc.runtime_directory import control_socket
 from rtcp.processes.rod import BendingPlan, Equilibrium, Release, plan_motion, release, set_fraction, shoot
 from rtcp.processes.rod.bending import HALF_TURN, plan_approach
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.heat_profile import HeatProfile, heat_command, target_ratio
 from rtcp.processes.shape_setting.interlocks import TABLE, Mode
 from rtcp.processes.shape_setting.job import Job, pose_of
 from rtcp.processes.shape_setting.messages import HeatingStarted
-from rtcp.processes.shape_setting.profile import HeatProfile, heat_command, target_ratio, temperatures_along
+from rtcp.processes.shape_setting.profile import temperatures_along
 
 Array = npt.NDArray[np.float64]
 SAMPLE_S: Final = 0.2

@@ -28,7 +28,7 @@ class ArmState:
     positions: Joints
     """Actual positions, rad."""
     velocities: Joints
-    """Actual velocities, rad/s."""
+    """Actual velocities, rad/s; empty where the drives send none."""
     commanded: Joints
     """Commanded positions, rad: a motion begins there."""
     status: Status
@@ -56,6 +56,10 @@ class Arm(Protocol):
     @property
     def state(self) -> ArmState | None:
         """The newest sample; None: the platform is not running."""
+
+    @property
+    def is_held_by_others(self) -> bool:
+        """Whether another commander moves the arm."""
 
     async def run_trajectory(self, points: Sequence[Point]) -> None:
         """Run a trajectory; return at its end."""

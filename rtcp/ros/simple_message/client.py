@@ -8,13 +8,21 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
 
 from rtcp.fieldbus.simple_message import messages
 from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder, FrameError
 from rtcp.ros.simple_message.server import MOTION_PORT, STATE_PORT, notice_lost_peer
 
+T = TypeVar("T")
 RECONNECT_S = 1.0
+CONNECT_TIMEOUT_S = 3.0
+"""Longest attempt to connect, s. Without a limit an attempt that began while the link was down repeats its first packet
+at growing intervals, and finds a link that is back after 60 s up to a minute late.
+"""
+SILENCE_S = 5.0
+"""Time without a message after which a state stream counts as lost, s; robots send some 10 a second."""
 REPLY_TIMEOUT_S = 5.0
 _READ_BYTES = 4096
 log = logging.getLogger(__name__)
@@ -33,6 +41,8 @@ class _Connection:
         self._host, self._port, self._order = host, port, order
         self._writer: asyncio.StreamWriter | None = None
         self._problem = ""
+        self._silence_s: float | None = None
+        """Time without data after which the connection counts as lost, s; None: unlimited."""
 
     @property
     def is_connected(self) -> bool:
@@ -53,13 +63,15 @@ class _Connection:
             await asyncio.sleep(RECONNECT_S)
 
     async def _serve(self) -> None:
-        reader, writer = await asyncio.open_connection(self._host, self._port)
+        connecting = asyncio.open_connection(self._host, self._port)
+        reader, writer = await _within(CONNECT_TIMEOUT_S, connecting, "it does not answer")
+        silence = f"no message for {self._silence_s} s"
         try:
             notice_lost_peer(writer.get_extra_info("socket"))
             decoder = FrameDecoder(self._order)
             self._writer = writer
             log.info("controller %s:%d: connected", self._host, self._port)
-            while data := await reader.read(_READ_BYTES):
+            while data := await _within(self._silence_s, reader.read(_READ_BYTES), silence):
                 for frame in decoder.feed(data):
                     self._problem = ""
                     self._receive(frame, decoder.order or messages.ByteOrder.LITTLE)
@@ -74,6 +86,19 @@ class _Connection:
 
     def _disconnected(self) -> None:
         pass
+
+
+async def _within(seconds: float | None, work: Awaitable[T], problem: str) -> T:
+    """Return what `work` returns; raises ConnectionError with `problem` after this time."""
+    # Not `wait_for`: before Python 3.12 it loses a cancellation that comes together with the result.
+    task = asyncio.ensure_future(work)
+    try:
+        done, _ = await asyncio.wait([task], timeout=seconds)
+    finally:
+        task.cancel()
+    if not done:
+        raise ConnectionError(problem)
+    return task.result()
 
 
 class StateClient(_Connection):
@@ -95,6 +120,7 @@ class StateClient(_Connection):
     ) -> None:
         super().__init__(host, port, order)
         self._received = receive
+        self._silence_s = SILENCE_S
 
     def _receive(self, frame: Frame, order: messages.ByteOrder) -> None:
         code = messages.ReplyCode.SUCCESS

@@ -82,11 +82,21 @@ class MotionExecutor:
         """Number of pending calls of real-time points."""
         self._halts: set[asyncio.Task[None]] = set()
         self._releases: set[asyncio.Task[None]] = set()
+        self._has_moved = False
 
     @property
     def is_releasing(self) -> bool:
         """Whether the arm stops because a client was lost; it accepts no orders meanwhile."""
         return bool(self._releases)
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether the arm executes or executed a motion of this client; a refused motion does not count."""
+        return self._has_moved or bool(self._motions)
+
+    def begin_client(self) -> None:
+        """Begin with the orders of another client."""
+        self._has_moved = False
 
     def carry_out(self, order: sequence.Order) -> None:
         """Begin an order; returns at once. Raises PointRefused where the buffer is full."""
@@ -123,7 +133,7 @@ class MotionExecutor:
     def halt_own(self) -> None:
         """Stop this client's motion; another commander's motion continues."""
         self._supersede()
-        if self._motions:
+        if self._motions and not self._arm.is_held_by_others:
             self.halt()
 
     def release(self) -> None:
@@ -150,7 +160,9 @@ class MotionExecutor:
 
         def ended(task: asyncio.Task[None]) -> None:
             self._motions.discard(task)
-            if task.cancelled() or (error := task.exception()) is None:
+            error = None if task.cancelled() else task.exception()
+            self._has_moved |= not (isinstance(error, RtcpError) and error.kind == "refused")
+            if error is None:
                 return
             if not isinstance(error, RtcpError | sequence.PointRefused):
                 log.error("a motion met a defect", exc_info=error)
@@ -219,7 +231,9 @@ class MotionExecutor:
             last = stream.points[-1].time
             points = stream.take()
             if stream is self._stream and points[-1].time > 0.0:
-                await self._feed(stream, await self._arm.open_trajectory(points), last)
+                opened = await self._arm.open_trajectory(points)
+                self._has_moved = True
+                await self._feed(stream, opened, last)
         stream.is_running = False
 
     async def _feed(self, stream: _Stream, trajectory: OpenTrajectory, last: float) -> None:

@@ -7,9 +7,12 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 import rtcp
-from rtcp.fieldbus.simple_message.messages import Joints, RobotMode, Status, TriState
+from rtcp.fieldbus.simple_message.messages import Joints, Status, TriState
 from rtcp.ros.simple_message.arm import ArmState, Point
+from rtcp.ros.state import robot_status
 
+NAME = "Simple Message"
+"""Name of the server as a commander."""
 _RECONNECT_S = 1.0
 _CHECK_S = 0.1
 """Interval between two checks of the connection, s."""
@@ -26,6 +29,7 @@ class RobotArm:
         self._robot: rtcp.AsyncRobot | None = None
         self._feed: rtcp.Feed | None = None
         self._state: ArmState | None = None
+        self._has_velocity = False
         self._motions = 0
         """Number of begun motions; the newest one has ended all earlier ones."""
 
@@ -41,8 +45,8 @@ class RobotArm:
     async def _follow(self) -> None:
         feed = rtcp.Feed()
         try:
-            async with rtcp.connect_async("Simple Message") as robot:
-                self._robot, self._feed = robot, feed
+            async with rtcp.connect_async(NAME) as robot:
+                self._robot, self._feed, self._has_velocity = robot, feed, feed.config.measures("velocity")
                 while robot.is_open and not feed.ended(0.0):
                     await asyncio.sleep(_CHECK_S)
         finally:
@@ -55,8 +59,13 @@ class RobotArm:
         if self._feed is not None:
             records, _ = self._feed.records()
             if len(records):
-                self._state = _state_of(records[-1])
+                self._state = state_of(self._feed, records[-1], self._has_velocity, self.is_held_by_others)
         return self._state
+
+    @property
+    def is_held_by_others(self) -> bool:
+        """Whether another commander holds the lease."""
+        return self._feed is not None and self._feed.holder not in ("", NAME)
 
     @property
     def _connected(self) -> rtcp.AsyncRobot:
@@ -66,7 +75,7 @@ class RobotArm:
 
     async def run_trajectory(self, points: Sequence[Point]) -> None:
         """Run a trajectory, which replaces the present motion."""
-        await self._moved(self._connected.run_trajectory(_as_json(points), replace=True))
+        await self._moved(self._connected.run_trajectory(as_json(points), replace=True))
 
     async def move_joints(self, positions: Joints) -> None:
         """Move to joint positions, rad, which replaces the present motion."""
@@ -83,7 +92,7 @@ class RobotArm:
         """Begin a trajectory with an open end, which replaces the present motion."""
         self._motions += 1
         trajectory = RobotTrajectory(self, self._connected, self._motions)
-        await self._connected.open_trajectory(_as_json(points), replace=True)
+        await self._connected.open_trajectory(as_json(points), replace=True)
         return trajectory
 
     async def halt(self) -> None:
@@ -98,7 +107,7 @@ class RobotArm:
         if self._robot is not None:
             await stop(self._robot)
             return
-        async with rtcp.connect_async("Simple Message") as robot:
+        async with rtcp.connect_async(NAME) as robot:
             await stop(robot)
 
     def is_newest(self, motion: int) -> bool:
@@ -114,7 +123,7 @@ class RobotTrajectory:
 
     async def append(self, points: Sequence[Point]) -> None:
         """Append points."""
-        await self._robot.append(_as_json(points))
+        await self._robot.append(as_json(points))
 
     async def finish(self) -> None:
         """Come to rest at the last point; return then."""
@@ -135,7 +144,8 @@ class RobotTrajectory:
                 raise
 
 
-def _as_json(points: Sequence[Point]) -> list[dict[str, Any]]:
+def as_json(points: Sequence[Point]) -> list[dict[str, Any]]:
+    """Return points as commands of the API take them."""
     rows: list[dict[str, Any]] = []
     for time, positions, velocities, accelerations in points:
         optional = {"v": velocities, "a": accelerations}
@@ -143,21 +153,21 @@ def _as_json(points: Sequence[Point]) -> list[dict[str, Any]]:
     return rows
 
 
-def _state_of(record: Mapping[str, Any]) -> ArmState:
-    reported = rtcp.RobotStatus.of_record(record)
-    status = Status(
-        drives_powered=TriState(reported.drives_powered),
-        e_stopped=TriState(reported.e_stopped),
-        error_code=reported.error_code,
-        in_error=TriState(reported.in_error),
-        in_motion=TriState(reported.in_motion),
-        mode=RobotMode.MANUAL if reported.mode == "manual" else RobotMode.AUTO,
-        motion_possible=TriState(reported.motion_possible),
-    )
+def state_of(feed: rtcp.Feed, record: Mapping[str, Any], has_velocity: bool, is_held_by_others: bool) -> ArmState:
+    """Return the state of an arm by a cycle record of its feed."""
+    status = robot_status(record, int(record["lost"]) * feed.period_ns, int(record["time_ns"]), is_held_by_others)
     return ArmState(
-        stamp_ns=int(record["time_ns"]),
+        stamp_ns=status.stamp_ns,
         positions=tuple(map(float, record["actual_position"])),
-        velocities=tuple(map(float, record["actual_velocity"])),
+        velocities=tuple(map(float, record["actual_velocity"])) if has_velocity else (),
         commanded=tuple(map(float, record["commanded_position"])),
-        status=status,
+        status=Status(
+            drives_powered=status.drives_powered,
+            e_stopped=status.e_stopped,
+            error_code=status.error_code,
+            in_error=status.in_error,
+            in_motion=status.in_motion,
+            mode=status.mode,
+            motion_possible=status.motion_possible,
+        ),
     )

@@ -146,7 +146,7 @@ class PointSequence:
             raise PointIgnored
         self._begin(_Mode.IDLE)
         self._commanded = _commanded_by(state)
-        return [Target(self._checked("position", message.positions))]
+        return [Target(self._checked(message, "position", message.positions))]
 
     def _point(self, message: messages.TrajectoryPoint, state: ArmState | None) -> list[Order]:
         number = message.sequence
@@ -215,7 +215,7 @@ class PointSequence:
             accelerations = accelerations if valid & messages.ValidFields.ACCELERATION else ()
         elif isinstance(message, messages.JointPoint) and len(message.positions) != len(self._commanded):
             raise PointRefused(f"found {len(message.positions)} joints, and the arm has {len(self._commanded)}")
-        positions = self._checked("position", message.positions)
+        positions = self._checked(message, "position", message.positions)
         if accelerations and not velocities:
             raise PointRefused(f"sequence {message.sequence}: it has accelerations and no velocities")
         if not math.isfinite(time):
@@ -231,22 +231,27 @@ class PointSequence:
         return Point(
             time,
             positions,
-            self._checked("velocity", velocities) if velocities else None,
-            self._checked("acceleration", accelerations) if accelerations else None,
+            self._checked(message, "velocity", velocities) if velocities else None,
+            self._checked(message, "acceleration", accelerations) if accelerations else None,
         )
 
     def _is_at_start(self, positions: messages.Joints) -> bool:
         pairs = zip(positions, self._commanded, strict=True)
         return all(abs(wanted - commanded) <= AT_START_RAD for wanted, commanded in pairs)
 
-    def _checked(self, name: str, values: Sequence[float]) -> messages.Joints:
+    def _checked(
+        self, message: messages.JointPosition | messages.TrajectoryPoint, name: str, values: Sequence[float]
+    ) -> messages.Joints:
         """Return the values of the arm's joints in a message; the others of ten must be 0."""
         count = len(self._commanded)
         for joint, value in enumerate(values, start=1):
             if not math.isfinite(value):
-                raise PointRefused(f"joint {joint}: the {name} {value} is not finite")
+                raise PointRefused(f"sequence {message.sequence}, joint {joint}: the {name} {value} is not finite")
             if joint > count and value:
-                raise PointRefused(f"joint {joint}: found the {name} {value:g}, and the arm has {count} joints")
+                raise PointRefused(
+                    f"sequence {message.sequence}, joint {joint}: found the {name} {value:g}, and the arm has {count} "
+                    "joints"
+                )
         if len(values) < count:
             raise PointRefused(f"found {len(values)} joints, and the arm has {count}")
         return tuple(values[:count])

@@ -11,7 +11,7 @@ import platform
 import shutil
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
@@ -260,8 +260,8 @@ class Experiment(ABC):
     title = ""
 
     @abstractmethod
-    def run(self, setup: Setup) -> list[Row]:
-        """Carry it out and return its figures.
+    def run(self, setup: Setup) -> Iterable[Row]:
+        """Carry it out and return its figures; one that yields them keeps those before a failure.
 
         Raises:
             ExperimentFailed: it cannot be carried out or evaluated.
@@ -279,14 +279,15 @@ def carry_out(experiment: Experiment, setup: Setup, command: str) -> Result:
     """
     began, begun_s = datetime.now().astimezone(), time.monotonic()
     failure: Exception | None = None
+    rows: list[Row] = []
     try:
-        rows = experiment.run(setup)
+        rows.extend(experiment.run(setup))  # one by one: the rows before a failure stay
     except (ExperimentFailed, RtcpError) as error:
         failure = error
     except _FAILURES as error:
         failure = ExperimentFailed(str(error))
     if failure is not None:
-        rows = [Row("carried out", "", nan, least=1.0)]
+        rows.append(Row("carried out", "", nan, least=1.0))
         setup.notes.append(str(failure))
     result = Result(
         name=experiment.name,

@@ -15,18 +15,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, pi, tau
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import curve_fit
 
-from rtcp.api import Robot, State
+from rtcp.api import Robot, RtcpError, State
 from rtcp.config.buses import ControllerBus
+from rtcp.config.model import ArmConfig
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, irc5_control, runtime_directory
+from rtcp.ipc.schema import identifier
 from rtcp.telemetry.experiments.experiment import SPEED_RAD_S, Experiment, ExperimentFailed, Row, Setup
 from rtcp.telemetry.reading import Recorded, read
 from rtcp.virtual.request_socket import RequestClient
@@ -54,6 +57,10 @@ _MOST_BY_SOCKET_HZ = 1000.0
 _REST_S = 10.0
 _SPARE = 4.0
 """Ratio of the limits to the sine's needs: with less the motion to each target, not the platform, takes the time."""
+_TRIES = 5
+"""Attempts at a stream that this host held up."""
+_MOST_POINTS = 500
+"""Most points of a series in a picture."""
 _PROBES, _PROBE_INTERVAL_S = 200, 0.02
 _PROBE_TIMEOUT_NS = 1_000_000_000
 
@@ -190,19 +197,25 @@ class LatencyExperiment(Experiment):
     Args:
         rates_hz: rates of the commands, Hz.
         periods: number of periods of the sine; the first one is not evaluated.
+        accelerometer: input channel with the acceleration of the flange in the direction in which joint 1 moves it,
+            `SLAVE.CHANNEL`, m/s^2; empty: that of a virtual robot controller, else none.
     """
 
     name = "latency"
     title = "Latency of streamed joint commands"
 
-    def __init__(self, rates_hz: Sequence[float] = (30.0, 250.0, 1000.0, 2000.0), periods: int = 6) -> None:
+    def __init__(
+        self, rates_hz: Sequence[float] = (30.0, 250.0, 1000.0, 2000.0), periods: int = 6, accelerometer: str = ""
+    ) -> None:
         self._rates_hz = rates_hz
         self._periods = periods
+        self._accelerometer = accelerometer
         self._drive_us: Array = np.empty(0)
         """Lag of each actual position of the last stream behind the sent ones, us."""
 
-    def run(self, setup: Setup) -> list[Row]:
-        """See `Experiment.run`."""
+    def run(self, setup: Setup) -> Iterator[Row]:
+        """See `Experiment.run`; the rows before a failure stay."""
+        self._check_accelerometer(setup.arm)
         w = tau / PERIOD_S
         needs = {"velocity": AMPLITUDE_RAD * w, "acceleration": AMPLITUDE_RAD * w**2, "jerk": 10 * AMPLITUDE_RAD * w**3}
         setup = setup.with_limits(_JOINT, **{key: _SPARE * value for key, value in needs.items()})
@@ -210,21 +223,47 @@ class LatencyExperiment(Experiment):
         share = min(1.0, *(getattr(limits, key) / (_SPARE * value) for key, value in needs.items()))
         if share < 1.0:
             setup.note(f"the sine has {share:.2f} of its amplitude: the limits of {limits.name} allow no more")
-        rows: list[Row] = []
         fastest = _LARGEST_RATE_RATIO * 1e6 / setup.arm.cycle.period_us
         with setup.platform() as robot:
             for input_name in INTERFACES:
                 for rate in self._rates_hz:
                     if rate > fastest or (input_name == "socket" and rate > _MOST_BY_SOCKET_HZ):
                         continue  # by the socket each command is a line of JSON, and answered
-                    rows += self._stream(setup, robot, input_name, rate, share * AMPLITUDE_RAD)
+                    yield from self._repeated(setup, robot, input_name, rate, share * AMPLITUDE_RAD)
+            yield from self._sine_by_ros(setup, robot, share * AMPLITUDE_RAD)
             if isinstance(setup.arm.bus, ControllerBus):
-                return rows  # the rest is the platform's own, and the same on every bus
-            rows += self._parts(setup, robot)
-            rows += self._to_frame(robot)
-            rows += self._by_ros(setup, robot)
-            rows += _by_node(setup)
-        return rows
+                return  # the rest is the platform's own, and the same on every bus
+            yield from self._parts(setup, robot)
+            yield from self._to_frame(robot)
+            yield from self._by_ros(setup, robot)
+            yield from _by_node(setup)
+
+    def _check_accelerometer(self, arm: ArmConfig) -> None:
+        slave, _, channel = self._accelerometer.partition(".")
+        slaves = {each.name: each.device for each in arm.slaves}
+        if not self._accelerometer:
+            return
+        inputs = [entry.name for pdo in slaves[slave].tpdo for entry in pdo.channels] if slave in slaves else []
+        if channel not in inputs:
+            allowed = ", ".join(inputs) if inputs else f"of one of the slaves {', '.join(slaves)}"
+            raise ExperimentFailed(
+                f"the accelerometer {self._accelerometer} is no input channel, SLAVE.CHANNEL: allowed is {allowed}"
+            )
+
+    def _repeated(self, setup: Setup, robot: Robot, input_name: str, rate: float, amplitude: float) -> list[Row]:
+        """Stream the sine; begin anew where this host held up the sender or the platform for too long."""
+        base = list(robot.status().positions)
+        for _ in range(_TRIES - 1):
+            try:
+                return self._stream(setup, robot, input_name, rate, amplitude)
+            except (RtcpError, ExperimentFailed) as error:
+                state = robot.state
+                if state not in (State.HOLDING, State.MOVING, State.STOPPING):
+                    raise
+                setup.note(f"{input_name}, {rate:g} Hz is repeated: {error}")
+                _wait_until_it_rests(robot)
+                robot.move_joints(base, speed=SPEED_RAD_S)
+        return self._stream(setup, robot, input_name, rate, amplitude)
 
     def _stream(self, setup: Setup, robot: Robot, input_name: str, rate: float, amplitude: float) -> list[Row]:
         label, name = f"{input_name}, {rate:g} Hz", f"{input_name}-{rate:g}-Hz".replace(" ", "-")
@@ -232,7 +271,7 @@ class LatencyExperiment(Experiment):
         sign = 1.0 if base[_JOINT] + 2 * amplitude < setup.arm.joints[_JOINT].position.max else -1.0
         times: list[float] = []
         values: list[float] = []
-        with setup.recording(robot, f"recording-{name}", ("*_position",)) as path:
+        with setup.recording(robot, f"recording-{name}", ("*_position", *self._field())) as path:
             with INTERFACES[input_name](robot) as send, _accelerometer(setup) as accelerations:
                 begun, number = time.monotonic(), 0
                 while (now := time.monotonic() - begun) < self._periods * PERIOD_S:
@@ -245,14 +284,14 @@ class LatencyExperiment(Experiment):
                     time.sleep(max(0.0, begun + number / rate - time.monotonic()))
             _wait_until_it_rests(robot)
         robot.move_joints(base, speed=SPEED_RAD_S)
-        recorded = read(path, ("time_ns", "*_position"))
+        recorded = read(path, ("time_ns", "*_position", *self._field()))
         series = {"command": (np.array(times), np.array(values)), **_recorded_series(recorded)}
+        for field in self._field():
+            samples = recorded.records["time_ns"] * 1e-9, recorded.records[field]
+            accelerations = list(zip(*(column.tolist() for column in samples), strict=True))
         # Evaluate only times within the sine, without its first period.
         first, last = begun + PERIOD_S, times[-1]
-        sines = {}
-        for signal, (t, y) in series.items():
-            inside = (t >= first) & (t <= last)
-            sines[signal] = fit_sine(t[inside], y[inside], PERIOD_S, 0.5 * (first + last))
+        sines = _fitted(series, first, last)
         command = sines["command"]
         latency, error = behind(sines["actual"], command)
         wire, _ = behind(sines["sent"], command)
@@ -260,18 +299,8 @@ class LatencyExperiment(Experiment):
         aim = (0.0, AIM_CYCLES) if rate >= 1000.0 else ()
         thesis_ms = _THESIS_MS.get(setup.arm.bus.kind) if rate == 30.0 else None
         self._drive_us = 1e6 * _behind_each(*series["sent"], *series["actual"], first, last)
-        self._draw(setup, name, label, {signal: (t - begun, y) for signal, (t, y) in series.items()})
-        of_robot = []
-        if accelerations:
-            t, y = np.array(accelerations).T
-            inside = (t >= first) & (t <= last)
-            flange = fit_sine(t[inside], -y[inside], PERIOD_S, 0.5 * (first + last))
-            lag, lag_error = behind(sines["actual"], flange)
-            reported = _REPORTED_MS if setup.arm.bus.kind == "rapid" else None
-            of_robot = [
-                Row(f"{label}: reported behind the accelerometer", "ms", 1e3 * lag, reported),
-                Row(f"{label}: at most its standard error", "ms", 1e3 * lag_error),
-            ]
+        _draw(setup, name, f"{label}: actual {1e3 * latency:.1f} ms behind", series, sines, (first, last))
+        of_robot = _beside_accelerometer(setup, name, label, series, sines, "actual", accelerations, (first, last))
         setup.report(
             f"{label}: {1e3 * latency:.2f} +- {1e3 * error:.2f} ms to the motion, {cycles:.1f} cycles to the wire"
         )
@@ -350,11 +379,9 @@ class LatencyExperiment(Experiment):
     @staticmethod
     def _by_ros(setup: Setup, robot: Robot) -> list[Row]:
         """Measure the time of a ROS 1 client's commands until the frame has left, where ROS 1 is installed."""
-        until = time.monotonic() + _REST_S
-        while robot.status().holder and time.monotonic() < until:  # the lease of the last stream
-            time.sleep(0.05)
+        _wait_for_the_lease(robot)
         period_s = 1e-6 * setup.arm.cycle.period_us
-        command = [sys.executable, "-m", "rtcp.ros.ros1_latency", str(_PROBES // 2)]
+        command = [sys.executable, "-m", "rtcp.ros.ros1_latency", "probe", str(_PROBES // 2)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             setup.note(f"no figures for ROS 1: {done.stderr.strip()}")
@@ -365,19 +392,163 @@ class LatencyExperiment(Experiment):
             for p in (50, 99)
         ]
 
-    @staticmethod
-    def _draw(setup: Setup, name: str, title: str, series: Mapping[str, tuple[Array, Array]]) -> None:
-        from matplotlib.figure import Figure
+    def _field(self) -> tuple[str, ...]:
+        """Return the accelerometer's field of the record, where a slave has one."""
+        slave, _, channel = self._accelerometer.partition(".")
+        return (f"{identifier(slave)}_{channel}",) if channel else ()
 
-        figure = Figure(figsize=(9.0, 4.5), layout="constrained")
-        axes = figure.add_subplot()
-        for signal, (t, y) in series.items():
-            inside = (t >= PERIOD_S) & (t <= 2 * PERIOD_S)
-            axes.plot(t[inside], y[inside], "." if signal == "command" else "-", ms=4, lw=1.2, label=signal)
-        axes.set(xlabel="time, s", ylabel="joint 1, rad", title=title)
-        axes.legend()
-        axes.grid(alpha=0.3)
-        setup.draw(f"latency-{name}", figure)
+    def _sine_by_ros(self, setup: Setup, robot: Robot, amplitude: float) -> list[Row]:
+        """Stream the sine by `joint_command` of ROS 1 and log it from the topics, as the second thesis does."""
+        label = "ROS 1 joint_command, 30 Hz"
+        base = list(robot.status().positions)
+        sign = 1.0 if base[_JOINT] + 2 * amplitude < setup.arm.joints[_JOINT].position.max else -1.0
+        _wait_for_the_lease(robot)
+        arguments = ("30", f"{sign * amplitude:g}", f"{PERIOD_S:g}", str(self._periods))
+        command = [sys.executable, "-m", "rtcp.ros.ros1_latency", "sine", str(setup.folder), *arguments]
+        with _accelerometer(setup) as accelerations:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            setup.note(f"no sine through ROS 1: {done.stderr.strip()}")
+            return []
+        series = {
+            topic: read_log(setup.folder / f"{topic}.csv", setup.arm.joints[_JOINT].name)
+            for topic in ("joint_command", "joint_states")
+        }
+        begun = series["joint_command"][0][0]
+        first, last = begun + PERIOD_S, begun + self._periods * PERIOD_S
+        sines = _fitted(series, first, last)
+        latency, error = behind(sines["joint_states"], sines["joint_command"])
+        _draw(setup, "ros-1", f"{label}: joint_states {1e3 * latency:.1f} ms behind", series, sines, (first, last))
+        origin = float(json.loads(done.stdout))
+        samples = [(stamp - origin, y) for stamp, y in accelerations]
+        of_robot = _beside_accelerometer(
+            setup, "ros-1", label, series, sines, "joint_states", samples, (first, last)
+        )  # fmt: skip
+        setup.report(f"{label}: joint_states {1e3 * latency:.2f} +- {1e3 * error:.2f} ms behind")
+        return [
+            Row(f"{label}: joint_states behind", "ms", 1e3 * latency, _THESIS_MS.get(setup.arm.bus.kind)),
+            Row(f"{label}: its standard error", "ms", 1e3 * error),
+            *of_robot,
+        ]
+
+
+def read_log(path: Path, column: str) -> tuple[Array, Array]:
+    """Return time, s, and a column of a log: one of `rtcp.ros.ros1_latency`, or of `abb/rapid/latency.mod`.
+
+    Raises:
+        ExperimentFailed: the file has no such column, or no line.
+    """
+    with path.open() as file:
+        names = file.readline().strip().split(",")
+        lines = file.readlines()
+    if column not in names or not lines:
+        raise ExperimentFailed(f"{path}: found {len(lines)} lines with {', '.join(names)}, needed is {column}")
+    rows = np.loadtxt(lines, delimiter=",", ndmin=2)
+    return rows[:, 0], rows[:, names.index(column)]
+
+
+def lag_of_log(path: Path) -> tuple[float, float]:
+    """Return the lag of `actual` behind `command` in a log of `abb/rapid/latency.mod`, s, and its standard error.
+
+    Raises:
+        ExperimentFailed: as `read_log`.
+    """
+    series = {name: read_log(path, name) for name in ("command", "actual")}
+    t, _ = series["command"]
+    sines = _fitted(series, t[0] + PERIOD_S, t[-1])
+    return behind(sines["actual"], sines["command"])
+
+
+def _fitted(series: Mapping[str, tuple[Array, Array]], first: float, last: float) -> dict[str, Sine]:
+    """Return the fitted sine of each series, from its points between two instants, s."""
+    sines = {}
+    for signal, (t, y) in series.items():
+        inside = (t >= first) & (t <= last)
+        sines[signal] = fit_sine(t[inside], y[inside], PERIOD_S, 0.5 * (first + last))
+    return sines
+
+
+def _curve(sine: Sine, t: Array, first: float, last: float) -> Array:
+    """Return the values of a sine that was fitted between two instants."""
+    curve: Array = sine.amplitude * np.sin(tau * (t - 0.5 * (first + last) - sine.delay_s) / sine.period_s)
+    return curve + sine.offset
+
+
+def _draw(
+    setup: Setup, name: str, title: str, series: Mapping[str, tuple[Array, Array]], sines: Mapping[str, Sine],
+    window: tuple[float, float],
+) -> None:  # fmt: skip
+    """Draw each point of one period of all series, with the fitted curves between the two instants of `window`."""
+    from matplotlib.figure import Figure
+
+    first, last = window
+    figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    dense = np.linspace(first, min(first + PERIOD_S, last), 400)
+    for number, (signal, (t, y)) in enumerate(series.items()):
+        inside = (t >= dense[0]) & (t <= dense[-1])
+        stride = max(1, int(inside.sum() // _MOST_POINTS))
+        axes.plot(t[inside][::stride] - first, y[inside][::stride], ".", ms=4, color=f"C{number}", label=signal)
+        curve = _curve(sines[signal], dense, first, last)
+        axes.plot(dense - first, curve, "--", lw=1.0, color=f"C{number}", label=f"{signal}, fitted")
+    axes.set(xlabel="time, s", ylabel="joint 1, rad", title=title)
+    axes.legend()
+    axes.grid(alpha=0.3)
+    setup.draw(f"latency-{name}", figure)
+
+
+def _beside_accelerometer(
+    setup: Setup, name: str, label: str, series: Mapping[str, tuple[Array, Array]], sines: Mapping[str, Sine],
+    reported: str, samples: Sequence[tuple[float, float]], window: tuple[float, float],
+) -> list[Row]:  # fmt: skip
+    """Compare a reported series with the accelerometer: rows, a picture, and the samples as accelerometer-NAME.csv."""
+    if not samples:
+        return []
+    from matplotlib.figure import Figure
+
+    first, last = window
+    t, y = np.array(samples).T
+    np.savetxt(
+        setup.folder / f"accelerometer-{name}.csv", np.column_stack((t, y)), "%.6f,%.6g",
+        header="time_s,acceleration_m_s2", comments="",
+    )  # fmt: skip
+    sine = _fitted({"": (t, y)}, first, last)[""]
+    # The acceleration of a sine is the sine turned round.
+    lag, error = behind(sines[reported], replace(sine, delay_s=sine.delay_s + 0.5 * sine.period_s))
+    figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    dense = np.linspace(first, min(first + 2 * PERIOD_S, last), 400)
+    inside = (t >= dense[0]) & (t <= dense[-1])
+    axes.plot(t[inside] - first, y[inside], ".", ms=3, color="C2", label="accelerometer")
+    axes.plot(dense - first, _curve(sine, dense, first, last), "-", lw=1.0, color="C2", label="accelerometer, fitted")
+    axes.set(
+        xlabel="time, s",
+        ylabel="acceleration of the flange, m/s$^2$",
+        title=f"{label}: {reported} {1e3 * lag:.1f} ms behind",
+    )
+    beside = axes.twinx()
+    at, q = series[reported]
+    shown = (at >= dense[0]) & (at <= dense[-1])
+    beside.plot(at[shown] - first, q[shown], ".", ms=2, color="C1", label=reported)
+    beside.plot(
+        dense - first, _curve(sines[reported], dense, first, last), "--", color="C1", label=f"{reported}, fitted"
+    )
+    beside.set_ylabel("joint 1, rad")
+    figure.legend(loc="outside lower center", ncols=4)
+    axes.grid(alpha=0.3)
+    setup.draw(f"latency-{name}-accelerometer", figure)
+    source = _REPORTED_MS if setup.arm.bus.kind == "rapid" else None
+    return [
+        Row(f"{label}: reported behind the accelerometer", "ms", 1e3 * lag, source),
+        Row(f"{label}: at most its standard error", "ms", 1e3 * error),
+    ]
+
+
+def _wait_for_the_lease(robot: Robot) -> None:
+    """Wait until the lease of the last stream has ended."""
+    until = time.monotonic() + _REST_S
+    while robot.status().holder and time.monotonic() < until:
+        time.sleep(0.05)
 
 
 def _by_node(setup: Setup) -> list[Row]:

@@ -43,6 +43,8 @@ MEASURED_STEPS = 3
 """Cycles by which the measured place of a joint may be older than the target that begins there."""
 MOVED_RAD = 5e-3
 """Way of a target, rad, by which a joint that should rest has moved."""
+_POINTER_M = 0.1
+"""Distance, m, as which 1 rad outside a cone counts."""
 ZONE_TOLERANCE_M = 0.5e-3
 """Depth in a zone that the rounding of positions explains, m."""
 INCONSISTENT_S = 0.1
@@ -141,6 +143,8 @@ class Bounds:
     torque: list[float]
     box: Corners | None = None
     keep_out: tuple[Corners, ...] = ()
+    cones: tuple[float, ...] = ()
+    """Largest angle of each cone, rad."""
 
     @classmethod
     def configured(cls, config: ArmConfig) -> Bounds:
@@ -154,6 +158,7 @@ class Bounds:
             [joint.torque for joint in joints],
             None if cartesian.box is None else _corners(cartesian.box.min, cartesian.box.max),
             tuple(_corners(box.min, box.max) for box in cartesian.keep_out),
+            tuple(cone.angle for cone in cartesian.cones),
         )
 
     def put(self, new: Values) -> None:
@@ -161,6 +166,7 @@ class Bounds:
         self.low[:], self.high[:] = new.low, new.high
         self.velocity[:], self.acceleration[:], self.torque[:] = new.velocity, new.acceleration, new.torque
         self.box, self.keep_out = new.box, new.keep_out
+        self.cones = tuple(cone.angle for cone in new.cones)
 
 
 def _corners(low: Sequence[float], high: Sequence[float]) -> Corners:
@@ -235,10 +241,15 @@ def _workspace(config: ArmConfig, tool: int) -> Workspace | None:
     shape, cartesian = Shape(config.models, tool, config.cartesian.clearance), config.cartesian
 
     def deepest(limits: Bounds, q: Sequence[float]) -> float:
-        return -shape.distance(q[:JOINTS], limits.box, limits.keep_out)
+        tilts = [
+            _POINTER_M * (shape.tilt(q[:JOINTS], "xyz".index(cone.axis), cone.direction) - angle)
+            for cone, angle in zip(cartesian.cones, limits.cones, strict=True)
+        ]
+        return max([-shape.distance(q[:JOINTS], limits.box, limits.keep_out), *tilts])
 
-    is_guarded = shape.is_guarded or cartesian.box is not None or bool(cartesian.keep_out)
-    return Workspace(deepest, shape.reach) if is_guarded else None
+    is_guarded = shape.is_guarded or cartesian.box is not None or bool(cartesian.keep_out or cartesian.cones)
+    reach = [max(moved, _POINTER_M) for moved in shape.reach] if cartesian.cones else shape.reach
+    return Workspace(deepest, reach) if is_guarded else None
 
 
 def _joint_reading(config: ArmConfig, joint: Joint, slot: int) -> JointReading:
@@ -330,6 +341,8 @@ class FrameChecker:
         self.torque_off_from_ns = self.rest_from_ns = inf
         self._resting: list[float] | None = None
         """The targets at that time."""
+        self.stuck_until_ns = [0] * count
+        """Simulated time until which each drive shows a stuck value: its joint may be elsewhere when it is enabled."""
         self._dt = period_s
         self._joints = list(reading.joints)
         self._workspaces = reading.workspaces
@@ -400,7 +413,7 @@ class FrameChecker:
             elif mode == CST:
                 self._check_torque(axis, sample.torque, frame.now_ns)
             else:
-                self._check_position(axis, commands, position, answered, frame.now_ns)
+                self._check_position(axis, commands, position, mode, answered, frame.now_ns)
                 if frame.heard:
                     self._check_received(axis, commands, position, frame.now_ns)
                 if mode == CSV:
@@ -440,7 +453,8 @@ class FrameChecker:
         self._check_continued(axis, commands, position, actual, mode, now)
         if mode != CSP:
             return
-        if not commands.mode and abs(position - actual) > LATCHED_RAD + NUMERIC_RAD:
+        excused = now < self.stuck_until_ns[axis]
+        if not commands.mode and abs(position - actual) > LATCHED_RAD + NUMERIC_RAD and not excused:
             self.violate(Kind.FIRST_TARGET, now, axis, position, actual - LATCHED_RAD, actual + LATCHED_RAD)
         low, high = self._range(axis)
         if not low - MARGIN_RAD <= position <= high + MARGIN_RAD:
@@ -455,7 +469,9 @@ class FrameChecker:
         if commands.mode and mode == CSP and abs(step) > allowed and not is_at_joint:
             self.violate(Kind.MODE_STEP, now, axis, step, -allowed, allowed)
 
-    def _check_position(self, axis: int, commands: _Commands, position: float, answered: bool, now: int) -> None:
+    def _check_position(
+        self, axis: int, commands: _Commands, position: float, mode: int, answered: bool, now: int
+    ) -> None:
         past = commands.positions
         low, high = self._range(axis)
         last = past[-1]
@@ -477,6 +493,8 @@ class FrameChecker:
         past.append(position)
         if len(past) > _KEPT:
             del past[0]
+        if mode == CSV:
+            return  # the drive follows the velocities, whose changes are checked
         bound = self.bounds.acceleration[axis] * self._dt * self._dt
         count, fastest = self._joints[axis].resolution[0], self.bounds.velocity[axis]
         rounding = ROUNDING * count + NUMERIC_RAD

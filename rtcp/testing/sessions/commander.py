@@ -140,10 +140,8 @@ class Commander:
         self.coverage = Coverage()
         self.inputs = Inputs(simulation)
         self.environment = Environment(Random(seed), simulation, self.servos, self.inputs, self.count_fault)
+        self.checker.stuck_until_ns = self.environment.stuck_until_ns
         self.mechanics = MechanicsChecker(self.checker, config, self.servos)
-        self._stop_ns = round(
-            1e9 * (STOP_S + max(j.velocity / j.acceleration + j.acceleration / j.jerk for j in config.joints))
-        )
         self.pressed = self._silent = False
         """Whether an emergency stop is pressed that concerns the arm, and whether the lease is not renewed."""
         self._event = 0
@@ -200,7 +198,8 @@ class Commander:
     @property
     def stopped_ns(self) -> int:
         """When the arm rests if a stop begins now, simulated time."""
-        return self.simulation.now_ns + self._stop_ns
+        limits = zip(self.limits.velocity, self.limits.acceleration, self.limits.jerk, strict=True)
+        return self.simulation.now_ns + round(1e9 * (STOP_S + max(v / a + a / j for v, a, j in limits)))
 
     def _note(self, text: str) -> None:
         self.log.append(Entry(self.simulation.now_ns, f"{self.state.name} {text}"))
@@ -269,11 +268,11 @@ class Commander:
         raw = Raw(number, numbers)
         return self.send(raw.decoded or raw)  # type: ignore[arg-type]
 
-    def set_limits(self, new: Values) -> bool:
+    def set_limits(self, new: Values, *, widen: bool = False) -> bool:
         """Change the limits; the checker knows them from the first frame that is computed under them."""
         plan = rows(new)
         slot = self.simulation.observer.write_plan(plan)
-        if not self.send(SetLimits(slot, len(plan))):
+        if not self.send(SetLimits(slot, len(plan), widen)):
             return False
         self.limits = new
         self.bounds.put(new)

@@ -37,10 +37,10 @@ def commands_of(simulation: Simulation) -> list[type[Command]]:
 
 
 class NotReached(NamedTuple):
-    """An event or a refusal that simulated sessions do not reach."""
+    """Events and refusals that simulated sessions do not reach."""
 
-    kind: type[Event] | type[Refusal]
     reason: str
+    kinds: tuple[type[Event] | type[Refusal], ...]
     when: Callable[[ArmConfig], bool] = lambda config: True
     """Configurations of which that is so."""
 
@@ -69,133 +69,166 @@ def _boxes(config: ArmConfig) -> int:
     return sum(slave.device.kind == "io" for slave in config.slaves)
 
 
-_CELL = "the arm of a session has no partner in a cell"
-_SUPERVISION = "only the thread that supervises a real bus reports this"
-_CLOCK = "the loop of a session follows no reference clock, so that its start takes less time"
-_LONG = "takes 2 s or 3 s, as long as a session"
-_RAISES = "only a plug-in that raises an error causes this"
-_ROBOT = "only a robot behind a controller of its own reports this"
-_BRAKES = "the virtual drives and brakes stop a joint in time"
-
 NOT_REACHED: tuple[NotReached, ...] = (
-    NotReached(events.PluginSlow, "simulated time stands still during a cycle"),
-    NotReached(events.ClockLocked, _CLOCK),
-    NotReached(events.ClockUnlocked, _CLOCK),
-    NotReached(events.ClockLost, _CLOCK),
-    NotReached(refusals.ClockNotLocked, _CLOCK),
-    NotReached(events.SlavesBackInOp, _SUPERVISION),
-    NotReached(events.NoSlaveAnswers, _SUPERVISION),
-    NotReached(events.SlavesAnswerAgain, _SUPERVISION),
-    NotReached(events.StateNotReached, _SUPERVISION),
-    NotReached(events.OtherSlaveAnswers, _SUPERVISION),
-    NotReached(events.SlaveSetUpAgain, _SUPERVISION),
-    NotReached(events.DamagedFrames, _SUPERVISION),
-    NotReached(events.LinkLost, _SUPERVISION),
-    NotReached(events.ErrorReported, _SUPERVISION),
-    NotReached(events.MessagesLeftOut, _SUPERVISION),
-    NotReached(events.WaitingForRobot, _ROBOT),
-    NotReached(events.RobotReady, _ROBOT),
-    NotReached(events.ResetWithoutController, _ROBOT),
-    NotReached(refusals.DriveNotReady, _ROBOT),
-    NotReached(events.PartnerEmergencyStop, _CELL),
-    NotReached(events.PartnerStopUnread, _CELL),
-    NotReached(events.PartnerNotReady, _CELL),
-    NotReached(events.PartnerStopped, _CELL),
-    NotReached(events.PartnerLeft, _CELL),
-    NotReached(events.PartnerSilent, _CELL),
-    NotReached(events.PartnerNear, _CELL),
-    NotReached(events.PartnerForeign, _CELL),
-    NotReached(refusals.PartnerMissing, _CELL),
-    NotReached(refusals.PartnerOfAnotherCell, _CELL),
-    NotReached(refusals.PartnerStopPressed, _CELL),
-    NotReached(refusals.PartnerStopUnread, _CELL),
-    NotReached(refusals.LimitsTooNearPartner, _CELL),
-    NotReached(events.OutOfStep, "no cycle of a session is late"),
-    NotReached(events.DriverFailed, _RAISES),
-    NotReached(events.ProcessFailed, _RAISES),
-    NotReached(events.ControllerRaised, _RAISES),
-    NotReached(refusals.DriverRaised, _RAISES),
-    NotReached(refusals.ProcessRaised, _RAISES),
-    NotReached(refusals.ControllerRaised, _RAISES),
-    NotReached(events.GeneratorFailed, "the trajectory generator refuses no input that has passed the checks"),
-    NotReached(events.ControllerFailed, "the trajectory generator refuses no input that has passed the checks"),
-    NotReached(refusals.ApproachImpossible, "the trajectory generator refuses no input that has passed the checks"),
-    NotReached(events.ResetWhileMoving, _BRAKES),
-    NotReached(events.HomingStillMoving, _BRAKES),
-    NotReached(events.EnableTimeout, _LONG),
-    NotReached(events.DisableTimeout, _LONG),
-    NotReached(events.ResetTimeout, _LONG),
-    NotReached(events.ResetWithoutSlaves, _LONG),
-    NotReached(events.ResetWithoutFrames, _LONG),
-    NotReached(events.EstopUnobservable, _LONG),
+    NotReached("simulated time stands still during a cycle", (events.PluginSlow,)),
     NotReached(
-        refusals.NotInOp, "the machine leaves the state ready in the cycle in which a slave is known to be lost"
+        "the loop of a session follows no reference clock, so that its start takes less time",
+        (events.ClockLocked, events.ClockUnlocked, events.ClockLost, refusals.ClockNotLocked),
     ),
-    NotReached(refusals.TorquePresent, "in the state ready no drive has torque"),
-    NotReached(refusals.NoEnablingSwitch, "the bus of a session is not a real one"),
-    NotReached(refusals.NoArm, "this arm has joints", _has_arm),
-    NotReached(refusals.NoGeometry, "the geometry of this arm is known", _has_geometry),
     NotReached(
-        refusals.MassesUnknown,
+        "only the thread that supervises a real bus reports this",
+        (
+            events.SlavesBackInOp,
+            events.NoSlaveAnswers,
+            events.SlavesAnswerAgain,
+            events.StateNotReached,
+            events.OtherSlaveAnswers,
+            events.SlaveSetUpAgain,
+            events.DamagedFrames,
+            events.LinkLost,
+            events.ErrorReported,
+            events.MessagesLeftOut,
+        ),
+    ),
+    NotReached(
+        "only a robot behind a controller of its own reports this",
+        (events.WaitingForRobot, events.RobotReady, events.ResetWithoutController, refusals.DriveNotReady),
+    ),
+    NotReached(
+        "the arm of a session has no partner in a cell",
+        (
+            events.PartnerEmergencyStop,
+            events.PushedNearPartner,
+            events.PartnerStopUnread,
+            events.PartnerNotReady,
+            events.PartnerStopped,
+            events.PartnerLeft,
+            events.PartnerSilent,
+            events.PartnerNear,
+            events.PartnerForeign,
+            refusals.PartnerMissing,
+            refusals.PartnerOfAnotherCell,
+            refusals.PartnerStopPressed,
+            refusals.PartnerStopUnread,
+            refusals.LimitsTooNearPartner,
+        ),
+    ),
+    NotReached("no cycle of a session is late", (events.OutOfStep,)),
+    NotReached(
+        "only a plug-in that raises an error causes this",
+        (
+            events.DriverFailed,
+            events.ProcessFailed,
+            events.ControllerRaised,
+            refusals.DriverRaised,
+            refusals.ProcessRaised,
+            refusals.ControllerRaised,
+        ),
+    ),
+    NotReached(
+        "the trajectory generator refuses no input that has passed the checks",
+        (events.GeneratorFailed, events.ControllerFailed, refusals.ApproachImpossible),
+    ),
+    NotReached(
+        "the virtual drives and brakes stop a joint in time", (events.ResetWhileMoving, events.HomingStillMoving)
+    ),
+    NotReached(
+        "takes 2 s or 3 s, as long as a session, or longer",
+        (
+            events.EnableTimeout,
+            events.DisableTimeout,
+            events.ResetTimeout,
+            events.ResetWithoutSlaves,
+            events.ResetWithoutFrames,
+            events.EstopUnobservable,
+            events.NotSettled,
+        ),
+    ),
+    NotReached("the virtual drives home where they stand, and do not fail", (events.HomingFailed,)),
+    NotReached("the hands of a session are too weak to guide the tool so fast", (events.GuidedTooFast,)),
+    NotReached("a spherical wrist has joint positions for each pose in reach", (events.NoSolution,)),
+    NotReached(
+        "the machine leaves the state ready in the cycle in which a slave is known to be lost", (refusals.NotInOp,)
+    ),
+    NotReached("the bus of a session is not a real one", (refusals.NoEnablingSwitch,)),
+    NotReached("this arm has joints", (refusals.NoArm,), _has_arm),
+    NotReached("the geometry of this arm is known", (refusals.NoGeometry,), _has_geometry),
+    NotReached(
         "the masses of this arm are known",
+        (refusals.MassesUnknown,),
         lambda config: config.arm is not None and bool(config.arm.links),
     ),
     NotReached(
-        refusals.DriveModeUnsupported,
         "the drives of this arm have all modes",
+        (refusals.DriveModeUnsupported,),
         lambda config: len(drive_modes(config)) == len(DriveMode),
     ),
     NotReached(
-        refusals.HomingUnsupported, "the drives of this arm have homing", lambda config: len(drive_modes(config)) > 1
+        "the drives of this arm have homing", (refusals.HomingUnsupported,), lambda config: len(drive_modes(config)) > 1
     ),
-    NotReached(refusals.NoGripper, "this arm has a gripper", lambda config: config.gripper is not None),
-    NotReached(events.GripperOpens, "this arm has no gripper", lambda config: config.gripper is None),
-    NotReached(events.GripperCloses, "this arm has no gripper", lambda config: config.gripper is None),
+    NotReached("this arm has a gripper", (refusals.NoGripper,), lambda config: config.gripper is not None),
     NotReached(
-        events.GripperAtRest,
+        "this arm has no gripper", (events.GripperOpens, events.GripperCloses), lambda config: config.gripper is None
+    ),
+    NotReached(
         "no drive moves the gripper of this arm",
+        (events.GripperAtRest, refusals.GripperDisabled),
         lambda config: config.gripper is None or config.gripper.joint is None,
     ),
     NotReached(
-        refusals.GripperDisabled,
-        "no drive moves the gripper of this arm",
-        lambda config: config.gripper is None or config.gripper.joint is None,
+        "this arm has one tool", (events.ToolChanged, refusals.ToolInBox), lambda config: len(config.models) < 2
     ),
-    NotReached(events.ToolChanged, "this arm has one tool", lambda config: len(config.models) < 2),
-    NotReached(refusals.ToolInBox, "this arm has one tool", lambda config: len(config.models) < 2),
-    NotReached(refusals.NoOutputs, "this arm has an IO box", lambda config: _boxes(config) > 0),
-    NotReached(refusals.UnknownBox, "this arm has no IO box", lambda config: _boxes(config) == 0),
-    NotReached(refusals.UnknownOutput, "this arm has no IO box", lambda config: _boxes(config) == 0),
-    NotReached(refusals.ReservedOutput, "this arm has no IO box", lambda config: _boxes(config) == 0),
+    NotReached("this arm has an IO box", (refusals.NoOutputs,), lambda config: _boxes(config) > 0),
     NotReached(
-        refusals.ChannelOutOfRange,
+        "this arm has no IO box",
+        (refusals.UnknownBox, refusals.UnknownOutput, refusals.ReservedOutput),
+        lambda config: _boxes(config) == 0,
+    ),
+    NotReached(
         "no slave of this arm has channels that can be set",
+        (refusals.ChannelOutOfRange,),
         lambda config: all(slave.device.kind in ("cia402", "io") for slave in config.slaves),
     ),
-    NotReached(events.EmergencyStopActivated, "this arm has no emergency stop", _no_emergency_stop),
-    NotReached(refusals.EmergencyStopPressed, "this arm has no emergency stop", _no_emergency_stop),
-    NotReached(events.PermissionWithdrawn, "this arm has no IO box for an enabling switch", _no_emergency_stop),
-    NotReached(refusals.NotPermitted, "this arm has no IO box for an enabling switch", _no_emergency_stop),
-    NotReached(events.JoystickGranted, "this arm has no joystick", _no_joystick),
-    NotReached(events.JoystickWithdrawn, "this arm has no joystick", _no_joystick),
-    NotReached(events.JoystickModeChanged, "this arm has no joystick", _no_joystick),
-    NotReached(events.UnknownJoystickCode, "this arm has no joystick", _no_joystick),
-    NotReached(events.EnabledInBox, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.HomingInBox, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.PushedNear, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.GuidedTooFast, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.OutOfReach, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.NoSolution, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.SingularityReached, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.BoxReached, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.NotLeavingBox, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(events.CollisionAhead, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(refusals.TargetInBox, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(refusals.PathStartsElsewhere, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(refusals.LimitsExcludeArm, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(refusals.WeightDiffers, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(refusals.DurationOutOfRange, "the geometry of this arm is unknown", _no_geometry),
-    NotReached(refusals.JogSpeedOutOfRange, "the geometry of this arm is unknown", _no_geometry),
+    NotReached(
+        "this arm has no emergency stop",
+        (events.EmergencyStopActivated, refusals.EmergencyStopPressed),
+        _no_emergency_stop,
+    ),
+    NotReached(
+        "this arm has no IO box for an enabling switch",
+        (events.PermissionWithdrawn, refusals.NotPermitted),
+        _no_emergency_stop,
+    ),
+    NotReached(
+        "this arm has no joystick",
+        (events.JoystickGranted, events.JoystickWithdrawn, events.JoystickModeChanged, events.UnknownJoystickCode),
+        _no_joystick,
+    ),
+    NotReached(
+        "the stick of this arm is not analog",
+        (events.JoystickOutOfRange,),
+        lambda config: config.inputs.joystick is None or config.inputs.joystick.analog is None,
+    ),
+    NotReached(
+        "the geometry of this arm is unknown",
+        (
+            events.EnabledInBox,
+            events.HomingInBox,
+            events.PushedNear,
+            events.OutOfReach,
+            events.SingularityReached,
+            events.BoxReached,
+            events.NotLeavingBox,
+            events.CollisionAhead,
+            refusals.TargetInBox,
+            refusals.PathStartsElsewhere,
+            refusals.LimitsExcludeArm,
+            refusals.WeightDiffers,
+            refusals.DurationOutOfRange,
+            refusals.JogSpeedOutOfRange,
+        ),
+        _no_geometry,
+    ),
 )
 """All that is left out of the rows."""
 
@@ -325,7 +358,7 @@ def rows_of(simulation: Simulation) -> Coverage:
     commands = [kind.name for kind in commands_of(simulation)]
     config = simulation.config
     places = places_of(config)
-    out_of_reach = {entry.kind for entry in NOT_REACHED if entry.when(config)}
+    out_of_reach = {kind for entry in NOT_REACHED if entry.when(config) for kind in entry.kinds}
     controllers = {controller.name for controller in simulation.loop.arm.controllers.values()}
     return Coverage(
         sent=_zeros(f"{command} {place}" for command in commands for place in places),

@@ -27,6 +27,8 @@ FALSE_CYCLES = (1, 1, 2, 4, 4, 8)
 """Cycles of a false sample: the loop bridges up to 4 of them, and calls more a fault."""
 LATE_CYCLES = (1, 2, 4, 8)
 """Cycles by which a drive's answer is late."""
+STUCK_NS = 200_000_000
+"""Time for which a value that was stuck has consequences: what it let the joints do has to come to rest."""
 BURSTS = ((39, 39), (1, 1), (1, 3), (10, 10), (3, 30))
 """Lost and good frames of a burst that repeats."""
 LASTING_FAULTS = (0x3210, 0x3220, 0x4310)
@@ -50,6 +52,7 @@ class Environment:
         pushed: torque of a hand at each pushed joint, Nm, by the joint's number from 0.
         payload_kg: mass at the tool that the arm's model does not know, kg.
         false_until_ns: simulated time until which the loop gets false or late inputs.
+        stuck_until_ns: simulated time until which a value of each drive is stuck, or its consequences last.
         last_disturbed_ns: simulated time of the last cycle in which anything of the above acted, or a change of it.
         permitted: whether the enabling switch is pressed.
     """
@@ -65,6 +68,7 @@ class Environment:
         self.pushed: dict[int, float] = {}
         self.payload_kg = 0.0
         self.false_until_ns = 0
+        self.stuck_until_ns = [0] * len(servos)
         self.last_disturbed_ns = 0
         self.permitted = True
         self._random, self._simulation, self._inputs, self._note = random, simulation, inputs, note
@@ -194,7 +198,9 @@ class Environment:
                 shown.append(inputs[first:last])
             return inputs[:first] + shown[0] + inputs[last:]
 
-        self._lie_later(axis, self._cycles(0.002, 0.2), change, f"{self._config.joints[axis].name} {name} stuck")
+        self._lie_later(
+            axis, self._cycles(0.002, 0.2), change, f"{self._config.joints[axis].name} {name} stuck", STUCK_NS
+        )
 
     def delay(self) -> None:
         """Let all answers of a drive be late for a while."""
@@ -217,8 +223,11 @@ class Environment:
         joint: Joint = self._config.joints[axis]
         return layout(self._config.slaves[self._slots[axis]].device.of_axis(joint.axis).tpdo).find(name)
 
-    def _lie_later(self, axis: int, cycles: int, change: Transform, what: str) -> None:
-        """Change the inputs of a joint's slave for some cycles, from some later cycle on; one change at a time."""
+    def _lie_later(self, axis: int, cycles: int, change: Transform, what: str, lasts_ns: int = 0) -> None:
+        """Change the inputs of a joint's slave for some cycles, from some later cycle on; one change at a time.
+
+        A value that is stuck has consequences for `lasts_ns` after the last of these cycles.
+        """
         slot, simulation = self._slots[axis], self._simulation
 
         def begin() -> None:
@@ -230,6 +239,8 @@ class Environment:
             # The loop gets the first of them in the next cycle.
             until_ns = simulation.now_ns + cycles * simulation.period_ns
             self.false_until_ns = max(self.false_until_ns, until_ns)
+            if lasts_ns:
+                self.stuck_until_ns[axis] = until_ns + lasts_ns
             self._after(cycles, end)
 
         def end() -> None:

@@ -41,23 +41,32 @@ adds, which sticks and slips at slow speeds, rad/s^2."""
 SPEED, EXTRA_SPEED = 1.1, 0.02
 """Largest speed of a joint as a multiple of its limit, or of the supervised speed in CST, and what the position loop
 adds, rad/s."""
+STUCK = 2.0
+"""How much faster a joint may be in CST while its measured speed is stuck: nothing damps it until that is noticed."""
 TORQUE_SHARE, EXTRA_TORQUE = 0.1, 1.0
 """Largest step of a target torque in a cycle, as a fraction of the torque limit, and in addition, Nm: the joints of
 small inertia change their speed, and with it their damping, fast."""
+EXPLAINED = 1.5
+"""Change of a torque as a multiple of what the position loop makes of the motion: its measurements may be late."""
 RELEASED_S = 0.1
 """Time after which the release of the enabling switch counts, s: its contact bounces."""
-REST_S, REST_IN_CST_S = 0.5, 1.5
-"""Time without a command after which a joint rests, s: the integral of the position loop in CST is slow."""
+REST_S, REST_WHERE_COMPLIANT_S = 0.5, 1.5
+"""Time without a command after which a joint rests, s; the second in CST and CSV, whose position loops are slow where a
+hand or a load has moved the joint."""
 MOVED_RAD = 5e-3
 """Way by which a joint that should rest has moved, rad."""
 STILL_RAD_S = 0.03
 """Speed of a joint that should rest, rad/s."""
 ARRIVED_RAD = 1e-3
 """Way of a joint between its measurement and the event that says that it is at its target, and rounding, rad."""
-ENERGY_J, ENERGY_IN_CST_J = 0.02, 0.1
+FROM_OTHER_MODE = 1.5
+"""How much larger the first step of a torque in CST may be, whose torque before is measured."""
+ALMOST = 0.999
+"""Fraction of a torque limit that counts as all of it: a target torque is a whole count."""
+ENERGY_J, ENERGY_IN_CST_J = 0.02, 0.15
 """Kinetic energy of a joint that needs no explanation, J: in CST the position loop is a spring that has stored some."""
-DEEP_M = 3e-3
-"""Depth in what the arm keeps clear of that the following error of the joints explains, m."""
+DEEP_M, DEEP_WHERE_COMPLIANT_M = 3e-3, 6e-3
+"""Depth in what the arm keeps clear of that the following error of the joints explains, m, in CSP; in CSV and CST."""
 GRASPED_NM = 0.3
 """Step of a torque from outside in one cycle that only a hand or a load can be, Nm: the arm's weight changes slower."""
 GOOD_PER_LOST = 4
@@ -82,6 +91,8 @@ class Surroundings(Protocol):
     """Torque of a hand, Nm, by the joint's number from 0."""
     payload_kg: float
     """Mass at the tool that the arm's model does not know, kg."""
+    stuck_until_ns: list[int]
+    """Simulated time until which a value of each drive is stuck, or its consequences last."""
     permitted: bool
     """Whether the enabling switch is pressed, or there is none."""
 
@@ -108,14 +119,24 @@ class MechanicsChecker:
         self._dt = dt = config.cycle.period_us * 1e-6
         count = len(servos)
         self._window = max(1, round(WINDOW_S / dt))
-        self._speeds: deque[list[float]] = deque(maxlen=self._window + 1)
+        self._speeds: deque[list[float]] = deque(maxlen=3 * self._window + 1)
         """Speeds of the joints in the last cycles, rad/s."""
         self._outside = [mechanics.external_torque for mechanics in self._mechanics]
         self._obeys = [False] * count
         self._torques: list[float | None] = [None] * count
+        self._was_cst = [False] * count
         """Target torques of the last frame of drives in CST, Nm."""
+        self._efforts: deque[list[float | None]] = deque(maxlen=self._window + 1)
+        """The same of the last cycles."""
+        self._torque_steps = [TORQUE_SHARE * joint.torque + EXTRA_TORQUE for joint in config.joints]
+        self._stiffness = [joint.cst_stiffness for joint in config.joints]
+        self._damping = [joint.cst_damping for joint in config.joints]
+        self._cycles_by_position = 0
+        """Cycles since the last torque motion, or the torque that was left of it."""
         self._cycles_calm = 0
         """Cycles since the last change of what acts on the joints."""
+        self._cycles_stiff = 0
+        """Cycles since a joint was last in CST, where accelerations have no limit."""
         self._cycles_uncommanded = self._cycles_resting = self._cycles_released = 0
         """Cycles in a state without a command, in one in which the joints rest, and without the enabling switch."""
         self._energy = [inf] * count
@@ -190,12 +211,18 @@ class MechanicsChecker:
         self._check_lost(now, state)
         calm = self._cycles_calm * self._dt > SETTLED_S
         self._check_torques(now, calm)
+        self._check_efforts(now, calm, surroundings)
         pushed = any(surroundings.pushed.values())
         if calm and all(self._obeys):
             self._check_motion(now, speeds, surroundings)
         self._check_uncommanded(now, state, speeds, surroundings, calm)
-        self._check_stop(now, speeds, surroundings, calm and not pushed)
+        rests = not pushed and self._cycles_calm * self._dt > self._rest_s()
+        self._check_stop(now, speeds, surroundings, rests)
         self._check_bodies(now, pushed or not calm)
+
+    def _rest_s(self) -> float:
+        """Return the time after a change in which the joints come to rest in their drive mode, s."""
+        return SETTLED_S if self._frames.samples[0].mode == CSP else REST_WHERE_COMPLIANT_S
 
     def _find_changes(self) -> None:
         """Count the cycles since a hand, a load, a drive or lost frames last changed what acts on the joints."""
@@ -229,23 +256,54 @@ class MechanicsChecker:
             if sample.mode != CST:
                 # A torque that changes fast is measured too late.
                 self._torques[axis] = self._axes[axis].torque if calm else None
+                self._was_cst[axis] = False
                 continue
             last, self._torques[axis] = self._torques[axis], sample.torque
-            if last is not None and last != sample.torque:
-                allowed = TORQUE_SHARE * self._bounds.torque[axis] + EXTRA_TORQUE
+            if last is not None and last != sample.torque and not self._ends_outward(axis, last, sample.torque):
+                # Of another mode the last torques count that are no false samples.
+                allowed = self._torque_steps[axis] * (1.0 if self._was_cst[axis] else FROM_OTHER_MODE)
                 self._limit(Kind.TORQUE_STEP, now, axis, abs(sample.torque - last), allowed)
+            self._was_cst[axis] = True
+
+    def _ends_outward(self, axis: int, last: float, torque: float) -> bool:
+        """Whether a torque that pushes a joint further out of its range becomes smaller: that may be at once."""
+        position, bounds = self._mechanics[axis].position, self._bounds
+        side = 1.0 if position > bounds.high[axis] else -1.0 if position < bounds.low[axis] else 0.0
+        return 0.0 <= torque * side < last * side
+
+    def _check_efforts(self, now: int, calm: bool, surroundings: Surroundings) -> None:
+        """Over 10 ms too the position loop in CST changes its torque no more than the motion of the joint explains."""
+        self._cycles_by_position = 0 if self._pushing is not None or not calm else self._cycles_by_position + 1
+        in_cst = [self._obeys[axis] and s.mode == CST for axis, s in enumerate(self._frames.samples)]
+        self._efforts.append([self._torques[axis] if in_cst[axis] else None for axis in range(len(in_cst))])
+        if self._cycles_by_position * self._dt <= SETTLED_S:
+            return
+        for axis, (torque, before) in enumerate(zip(self._efforts[-1], self._efforts[0], strict=True)):
+            if torque is None or before is None or now < surroundings.stuck_until_ns[axis]:
+                continue
+            change, allowed = abs(torque - before), self._torque_steps[axis]
+            if change > allowed:
+                speeds = [each[axis] for each in self._speeds]
+                fastest = max(*speeds, -min(speeds))
+                explained = self._damping[axis] * (max(speeds) - min(speeds))
+                explained += self._stiffness[axis] * fastest * self._window * self._dt
+                allowed += EXPLAINED * explained
+                self._limit(Kind.TORQUE_STEP, now, axis, change, allowed)
 
     def _check_motion(self, now: int, speeds: Sequence[float], surroundings: Surroundings) -> None:
-        past, velocity, acceleration = self._speeds[0], self._bounds.velocity, self._bounds.acceleration
+        past = self._speeds[max(len(self._speeds) - 1 - self._window, 0)]
+        velocity, acceleration = self._bounds.velocity, self._bounds.acceleration
         pushed, window_s = surroundings.pushed, self._window * self._dt
+        self._cycles_stiff = 0 if any(s.mode == CST for s in self._frames.samples) else self._cycles_stiff + 1
         for axis, speed in enumerate(speeds):
             if pushed and abs(pushed.get(axis, 0.0)) > self._bounds.torque[axis]:
                 continue  # nothing holds against this hand
             in_cst = self._frames.samples[axis].mode == CST
-            fastest = SPEED * velocity[axis] * (self._fastest_in_cst if in_cst else 1.0) + EXTRA_SPEED
+            faster = self._fastest_in_cst * (STUCK if now < surroundings.stuck_until_ns[axis] else 1.0)
+            fastest = SPEED * velocity[axis] * (faster if in_cst else 1.0) + EXTRA_SPEED
             if not -fastest <= speed <= fastest:
                 self._limit(Kind.TRUE_SPEED, now, axis, abs(speed), fastest)
-            if not in_cst:
+            if self._cycles_stiff > self._window:
                 change, allowed = speed - past[axis], ACCELERATION * acceleration[axis] + EXTRA_ACCELERATION
                 if not -allowed * window_s <= change <= allowed * window_s:
                     self._limit(Kind.TRUE_ACCELERATION, now, axis, abs(change) / window_s, allowed)
@@ -267,8 +325,7 @@ class MechanicsChecker:
             self._cycles_resting = 0
             return
         self._cycles_resting += 1
-        in_cst = self._frames.samples[0].mode == CST
-        if self._cycles_resting * self._dt <= (REST_IN_CST_S if in_cst else REST_S):
+        if self._cycles_resting * self._dt <= max(self._rest_s(), REST_S):
             self._places = None
             return
         places = [mechanics.position for mechanics in self._mechanics]
@@ -294,11 +351,14 @@ class MechanicsChecker:
         for axis, (mechanics, speed) in enumerate(zip(self._mechanics, speeds, strict=True)):
             energy = 0.5 * mechanics.inertia * speed * speed
             if torques is None:
-                explained = min(self._energy[axis], energy)
+                # A drive that gives all that the limits allow may be too weak for the weight.
+                spent = abs(self._frames.samples[axis].torque) >= self._bounds.torque[axis] * ALMOST
+                explained = energy if spent else min(self._energy[axis], energy)
             else:
                 reach = workspace.reach[axis] if workspace is not None and axis < len(workspace.reach) else 1.0
                 pull = abs(torques[axis]) + abs(surroundings.pushed.get(axis, 0.0))
-                pull += surroundings.payload_kg * GRAVITY * reach * far
+                # What holds a joint at rest may be wrong by its friction.
+                pull += surroundings.payload_kg * GRAVITY * reach * far + mechanics.coulomb
                 explained = energy if self._energy[axis] == inf else self._energy[axis] + pull * abs(speed) * self._dt
             self._energy[axis] = explained
             is_spring = torques is None and self._frames.samples[axis].mode == CST
@@ -331,6 +391,7 @@ class MechanicsChecker:
         if self._is_excused and deepest > 0.0:
             return
         self._is_excused = False
-        self._limit(Kind.BODY, now, -1, deepest, self._clearance if pushed else DEEP_M)
+        follows = DEEP_M if self._frames.samples[0].mode == CSP else DEEP_WHERE_COMPLIANT_M
+        self._limit(Kind.BODY, now, -1, deepest, self._clearance if pushed else follows)
         fastest = sum(v * reach for v, reach in zip(self._bounds.velocity, workspace.reach, strict=False)) * self._dt
         self._check_bodies_in = int(max(-deepest, 0.01) / (self._fastest_in_cst * fastest))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
-from math import cos, hypot, inf, sin, sqrt
+from math import acos, cos, hypot, inf, sin, sqrt
 from typing import Any, NamedTuple
 
 Point = tuple[float, float, float]
@@ -112,6 +112,7 @@ class Shape:
         self._clearance = clearance
         self._rows = [(sin(row.alpha), cos(row.alpha), row.a, row.d, row.offset) for row in model.rows]
         self._tool: Point = tuple(model.tool.position)
+        self._axes = tuple(model.tool.rotation)
         own = [Body(*_numbers(body)) for body in model.bodies]
         lengths = [hypot(row.a, row.d) for row in model.rows]
         extent = sum(abs(row.a) + abs(row.d) for row in model.rows) or 1.0
@@ -213,6 +214,14 @@ class Shape:
         """Return the position of the tool at joint positions, rad."""
         rotation, origin = self.frames(q)[-1]
         return _plus(origin, _turned(rotation, self._tool))
+
+    def tilt(self, q: Sequence[float], axis: int, direction: Sequence[float]) -> float:
+        """Return the angle between an axis of the tool (0 to 2: x, y, z) and a direction of the base, rad."""
+        rotation, _ = self.frames(q)[-1]
+        along = _turned(rotation, (self._axes[axis], self._axes[3 + axis], self._axes[6 + axis]))
+        x, y, z = direction
+        cosine = _dot(along, (x, y, z)) / hypot(x, y, z)
+        return acos(min(max(cosine, -1.0), 1.0))
 
     def distance(self, q: Sequence[float], box: Box | None, keep_out: Sequence[Box]) -> float:
         """Return by how much the arm is clear of all that it has to keep clear of, m; negative: it is not.

@@ -23,6 +23,7 @@ from rtcp.testing.sessions.actions import NONSENSE, SHARES, RandomActions
 from rtcp.testing.sessions.checker import Bounds, Reading, Violation, reading_of
 from rtcp.testing.sessions.commander import FAULTS, ODD_INTEGERS, Commander, random_command
 from rtcp.testing.sessions.coverage import places_of
+from rtcp.testing.sessions.environment import HEAVIEST_KG
 from rtcp.testing.sessions.visits import Visit, place_of
 from rtcp.testing.simulation import Simulation
 
@@ -149,6 +150,7 @@ class Session(RandomActions):
             (3, self._silence),
             (2, self._halt),
             (2, self._push),
+            (3, self._arrive),
             (4, environment.hand),
             (2, environment.load),
             (3, environment.falsify),
@@ -188,6 +190,9 @@ class Session(RandomActions):
         """Show a byte at the joystick's inputs for a random time, at most `seconds`."""
         self.commander.joystick(~code & 0x3F)
         self.seconds(0.0, seconds)
+        if self.random.random() < 0.1:
+            for fraction in (0.5, 1.0):
+                self.send(commands.SetSpeedOverride(fraction))
 
     def or_odd(self, number: int) -> int:
         """Return the integer, or now and then one that nobody should send."""
@@ -250,7 +255,7 @@ class Session(RandomActions):
         if random.random() < 0.2:
             kept = random.randrange(self.joints)
             target = [q if axis != kept else wanted for axis, (q, wanted) in enumerate(zip(here, target, strict=True))]
-        speed = random.choice((0.5, 0.5, 0.2, random.uniform(0.0, 0.6)))
+        speed = random.choice((0.5, 0.5, 0.5, 0.2, 0.2, 1e-6, random.uniform(0.0, 0.6)))
         return commands.MoveJoints(tuple(target), self.or_nonsense(speed), random.random() < 0.5)
 
     def _move(self) -> None:
@@ -277,6 +282,32 @@ class Session(RandomActions):
         bounds = self.bounds
         there = [max(a, min(b, q)) for q, a, b in zip(self.near(0.5), bounds.low, bounds.high, strict=True)]
         return commands.MoveJoints(tuple(there), 0.1, True)
+
+    def _arrive(self) -> None:
+        """Move a little, mostly with a hand at a joint when the targets come to rest, and wait."""
+        if self.send(commands.MoveJoints(tuple(self.near(0.02)), 0.5, True)):
+            self.commander.environment.hand()
+            self.seconds(0.2, 0.8)
+
+    def torque(self) -> None:
+        """Joint torques; now and then with a load."""
+        if self.random.random() < 0.25:
+            self._weigh()
+        else:
+            super().torque()
+
+    def _weigh(self) -> None:
+        """A torque motion with a load that the model does not know, and one without it, mostly while a joint turns."""
+        environment, nothing = self.commander.environment, (0.0,) * self.joints
+        environment.carry(self.random.uniform(0.3, HEAVIEST_KG))
+        self.seconds(0.3, 0.6)
+        self.send(commands.ApplyTorque(nothing, 0.0, 0.0, 0.1))
+        self.seconds(0.2, 0.4)
+        environment.carry(0.0)
+        environment.hand()
+        self.seconds(0.1, 0.4)
+        self.send(commands.ApplyTorque(nothing, 0.0, 0.0, 0.3))
+        self.seconds(0.1, 0.5)
 
     def _push(self) -> None:
         axis = self.random.randrange(self.joints)
@@ -508,7 +539,13 @@ class Session(RandomActions):
             changes["keep_out"] = tuple(
                 tuple(x - by if at < 3 else x + by for at, x in enumerate(box)) for box in widest.keep_out
             )
-        commander.set_limits(replace(old, **changes))
+        if widest.cones and random.random() < 0.5:
+            scale = random.choice((0.6, 0.9, 1.0, 1.1))
+            changes["cones"] = tuple(cone._replace(angle=scale * cone.angle) for cone in widest.cones)
+        if random.random() < 0.2:
+            speed, torque, _ = widest.supervision
+            changes["supervision"] = (speed, torque, random.choice((0.01, 0.05, 0.15, 0.2)))
+        commander.set_limits(replace(old, **changes), widen=random.random() < 0.2)
 
     def toggle(self) -> None:
         """Give the joystick to the chair for a while."""

@@ -108,6 +108,12 @@ class RapidConfig:
     """Upper bound on a point's wait for room before a refusal (WaitSyncTask's timeout), s."""
     max_speed: Positive = 180.0
     """Upper bound on a joint's speed, degrees/s; a faster point is refused (MAX_SPEED of `abb/rapid`)."""
+    client_timeout_s: Positive = 2.0
+    """Time without a byte after which a client that has sent a PING is lost, s (CLIENT_TIMEOUT of `abb/rapid`)."""
+    idle_timeout_s: Positive = 60.0
+    """The same for a motion client that has sent none, s (IDLE_TIMEOUT)."""
+    motors_off_s: NotNegative = 300.0
+    """Time without a motion client after which the motors are switched off, s; 0: never (MOTORS_OFF_TIME)."""
     state_period_s: Positive = 0.01
     """Period of the state messages, s."""
     position_delay_s: tuple[PositionDelay, PositionDelay] = (-0.005, 0.012)

@@ -11,7 +11,7 @@ from rtcp.virtual.irc5.config import Irc5Config, UnitConfig
 from rtcp.virtual.irc5.faults import SHARES, DatagramFaults
 from rtcp.virtual.irc5.mechanical_unit import MechanicalUnit
 from rtcp.virtual.irc5.panel import Enabling, Mode, Panel, Stop
-from rtcp.virtual.irc5.streaming import STREAMING_FAULTS, RapidStreaming
+from rtcp.virtual.irc5.streaming import STREAMING_FAULTS, TERMINALS, RapidStreaming
 from rtcp.virtual.request_socket import RequestRefused, choose
 
 _LONGEST_DELAY = 250
@@ -188,6 +188,18 @@ def _choice(kind: type[Enum], request: dict[str, Any], key: str) -> Enum:
     raise RequestRefused(f"{key}: found {shown(value)}, allowed is one of {', '.join(c.value for c in kind)}")
 
 
+def _set_input(controller: Controller, request: dict[str, Any]) -> None:
+    streaming, name, level = controller.streaming, request.get("input"), request.get("level")
+    names = [f"DI{i + 1}" for i in range(TERMINALS)]
+    if streaming is None:
+        raise RequestRefused("the board is served with rapid only")
+    if name not in names:
+        raise RequestRefused(f"input: found {shown(name)}, allowed is one of {', '.join(names)}")
+    if level not in ("on", "off"):
+        raise RequestRefused(f"level: found {shown(level)}, allowed is one of on, off")
+    streaming.set_input(names.index(str(name)) + 1, level == "on")
+
+
 _Do = Callable[[Controller, dict[str, Any]], Any]
 
 
@@ -218,6 +230,7 @@ _VERBS: dict[str, tuple[tuple[str, ...], _Do]] = {
     "start_rapid": (("unit",), _for_each(MechanicalUnit.start_rapid)),
     "stop_rapid": (("unit",), _for_each(MechanicalUnit.stop_rapid)),
     "clear": (("unit",), Controller.clear),
+    "input": (("input", "level"), _set_input),
     "accelerometer": (
         ("unit",),
         lambda controller, request: {

@@ -19,11 +19,18 @@ _HEADER = struct.Struct("<4i")
 
 
 class MessageType(IntEnum):
-    """Messages of the RAPID tasks."""
+    """Messages of the RAPID tasks; those above 65000 are extensions of `abb/rapid`."""
 
+    PING = 1
     JOINT_POSITION = 10
     JOINT_TRAJ_PT = 11
     STATUS = 13
+    MOTORS = 65001
+    """1 orders Motors On, 0 Motors Off."""
+    BOARD_STATE = 65002
+    """Levels of inputs and outputs, bit 0 is number 1."""
+    BOARD_OUTPUTS = 65003
+    """Levels of the outputs."""
 
 
 class CommType(IntEnum):
@@ -116,6 +123,16 @@ def joint_position(sequence: int, joints: Sequence[float]) -> bytes:
     """Return a JOINT_POSITION as a topic; joints in rad, at least ten on the wire."""
     padded = (*joints, *[0.0] * (LEAST_JOINTS - len(joints)))
     return pack(MessageType.JOINT_POSITION, CommType.TOPIC, body=struct.pack(f"<i{len(padded)}f", sequence, *padded))
+
+
+def read_integer(frame: Frame) -> int | None:
+    """Return the integer that is the body of a message; None: the body is another one."""
+    return int.from_bytes(frame.body, "little", signed=True) if len(frame.body) == 4 else None
+
+
+def board_state(inputs: int, outputs: int) -> bytes:
+    """Return a BOARD_STATE as a topic."""
+    return pack(MessageType.BOARD_STATE, CommType.TOPIC, body=struct.pack("<2i", inputs, outputs))
 
 
 def status(powered: bool, e_stopped: bool, failed: bool, in_motion: bool, automatic: bool, possible: bool) -> bytes:

@@ -16,15 +16,18 @@ from rtcp.virtual.irc5.config import RapidConfig
 from rtcp.virtual.irc5.mechanical_unit import MechanicalUnit
 from rtcp.virtual.irc5.messages import ROBOT_AXES, MciState
 from rtcp.virtual.irc5.motion_task import SHORTEST_MOVE_S, MotionTask, Move
-from rtcp.virtual.irc5.panel import Mode, Motors, Panel, Stop
+from rtcp.virtual.irc5.panel import Mode, Motors, Panel, PanelRefused, Stop
 from rtcp.virtual.irc5.simple_message import (
     CommType,
     Frame,
     JointPoint,
+    MessageType,
     ReplyCode,
     SpecialSequence,
+    board_state,
     joint_position,
     pack,
+    read_integer,
     read_joint_point,
     status,
 )
@@ -32,8 +35,11 @@ from rtcp.virtual.irc5.simple_message import (
 MOST_POINTS = 200
 """Upper bound on the points of a downloaded path."""
 STOPPING_SEQUENCES = (SpecialSequence.STOP_TRAJECTORY, SpecialSequence.START_DOWNLOAD)
-STREAMING_FAULTS = ("socket_cut", "half_message", "silent_state", "silent_motion")
-"""Faults of the connections; socket_cut is a single event, the others last until cleared."""
+STREAMING_FAULTS = ("socket_cut", "half_message", "silent_state", "silent_motion", "server_crash")
+"""Faults of the connections; socket_cut is a single event, the others last until cleared. After server_crash the
+sockets stay open and nobody serves them; to clear it starts the server's tasks again, which take their ports anew."""
+TERMINALS = 16
+"""Inputs, and outputs, of the board, a DSQC 652."""
 
 
 class RapidStreaming:
@@ -48,6 +54,8 @@ class RapidStreaming:
         """Active `STREAMING_FAULTS`, including a pending socket_cut."""
         self.ports = {"motion_port": config.motion_port, "state_port": config.state_port}
         """TCP ports; the server replaces 0 by the assigned ones."""
+        self.inputs = self.outputs = 0
+        """Levels of the board, bit 0 is number 1."""
         self._panel = panel
         self._frame: Frame | None = None
         self._point: JointPoint | None = None
@@ -72,9 +80,37 @@ class RapidStreaming:
         """Begin to process a message."""
         self._frame, self._waited_s, self._offered = frame, 0.0, []
         self._point = read_joint_point(frame, ROBOT_AXES * len(self.tasks))
-        self._refused = self._point is None
+        self._refused = self._point is None and not self._carry_out(frame)
         if self._point is not None and self._point.sequence in STOPPING_SEQUENCES:
             self.stop()
+
+    def _carry_out(self, frame: Frame) -> bool:
+        """Carry out a message that is no point; return whether it was accepted."""
+        value = read_integer(frame)
+        if frame.msg_type == MessageType.PING:
+            return True
+        if frame.msg_type == MessageType.BOARD_OUTPUTS and value is not None and 0 <= value < 1 << TERMINALS:
+            self.outputs = value
+            return True
+        if frame.msg_type == MessageType.MOTORS and value == 0:
+            self._panel.switch_motors_off()
+            return True
+        if frame.msg_type == MessageType.MOTORS and value == 1 and self._panel.mode is Mode.AUTO:
+            try:
+                self._panel.press_motors_on()
+            except PanelRefused:
+                return False
+            return True
+        return False
+
+    def set_input(self, number: int, level: bool) -> None:
+        """Set the level of an input of the board, 1 to 16."""
+        bit = 1 << number - 1
+        self.inputs = self.inputs | bit if level else self.inputs & ~bit
+
+    def switch_motors_off(self) -> None:
+        """Switch the motors off: no client has come for `motors_off_s`."""
+        self._panel.switch_motors_off()
 
     def stop(self) -> None:
         """Stop all arms and clear their queues, after a stop message or a disconnect."""
@@ -100,19 +136,23 @@ class RapidStreaming:
         self.counts[code.name.lower()] += 1
         return pack(frame.msg_type, CommType.REPLY, code) if frame.comm_type == CommType.REQUEST else None
 
-    def state(self) -> bytes:
-        """Return a JOINT_POSITION and a STATUS, as the state server sends them."""
+    def state(self, with_board: bool = False) -> bytes:
+        """Return a JOINT_POSITION and a STATUS, as the state server sends them, and the BOARD_STATE."""
         tasks, panel = self.tasks.values(), self._panel
         delay = self._random.uniform(*self.config.position_delay_s)
         joints = [radians(joint) for task in tasks for joint in task.reported(delay)]
         self._sequence += 1
-        return joint_position(self._sequence - 1, joints) + status(
-            powered=panel.motors is not Motors.OFF,
-            e_stopped=Stop.EMERGENCY in panel.open,
-            failed=any(task.lost or task.unit.mci is MciState.ERROR for task in tasks),
-            in_motion=any(any(task.unit.speeds) for task in tasks),
-            automatic=panel.mode is Mode.AUTO,
-            possible=all(task.runs for task in tasks),
+        return (
+            joint_position(self._sequence - 1, joints)
+            + status(
+                powered=panel.motors is not Motors.OFF,
+                e_stopped=Stop.EMERGENCY in panel.open,
+                failed=any(task.lost or task.unit.mci is MciState.ERROR for task in tasks),
+                in_motion=any(any(task.unit.speeds) for task in tasks),
+                automatic=panel.mode is Mode.AUTO,
+                possible=all(task.runs for task in tasks),
+            )
+            + (board_state(self.inputs, self.outputs) if with_board else b"")
         )
 
     def clear(self) -> None:
@@ -134,6 +174,11 @@ class RapidStreaming:
             "downloaded": 0 if self._download is None else len(self._download),
             "counts": dict(self.counts),
             "faults": sorted(self.faults),
+            "board": {
+                f"{kind}{i + 1}": word >> i & 1
+                for kind, word in (("DI", self.inputs), ("DO", self.outputs))
+                for i in range(TERMINALS)
+            },
         }
 
     def _reply_code(self) -> ReplyCode | None:

@@ -6,7 +6,7 @@ import socket
 import time
 
 from rtcp.config.model import ConfigError
-from rtcp.virtual.irc5.simple_message import NotAMessage, take_frame
+from rtcp.virtual.irc5.simple_message import MessageType, NotAMessage, take_frame
 from rtcp.virtual.irc5.streaming import RapidStreaming
 
 _READ_BYTES = 4096
@@ -35,6 +35,10 @@ class ClientSocket:
         self._received = bytearray()
         self._unsent: list[bytes] = []
         """Unsent parts, one per cycle."""
+        self.has_heartbeat = False
+        """Whether the client has sent a heartbeat."""
+        self.silence_s = 0.0
+        """Time since the last byte of the client, or since it connected, while a byte was waited for, s."""
 
     @property
     def is_connected(self) -> bool:
@@ -64,11 +68,13 @@ class ClientSocket:
         try:
             if self._client is None:
                 self._client, _ = self._listener.accept()
+                self.has_heartbeat, self.silence_s = False, 0.0
                 self._client.setblocking(False)
                 self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if len(self._received) < _READ_BYTES:  # else the client is ahead of RAPID, and TCP holds it back
                 data = self._client.recv(_READ_BYTES)
                 self._received += data
+                self.silence_s = 0.0
                 if not data:
                     self.drop()
         except BlockingIOError:
@@ -118,7 +124,8 @@ class StreamingServer:
             self._motion.close()
             raise
         streaming.ports = {"motion_port": self._motion.port, "state_port": self._state.port}
-        self._state_due_s = 0.0
+        self._state_due_s = self._without_client_s = 0.0
+        self._has_crashed = False
 
     def close(self) -> None:
         """Close all sockets."""
@@ -131,8 +138,14 @@ class StreamingServer:
         if "socket_cut" in streaming.faults:
             streaming.faults.discard("socket_cut")
             self._cut()
-        self._serve_motion()
-        self._serve_state()
+        if "server_crash" in streaming.faults:
+            self._has_crashed = True
+            streaming.step(self.period_s)
+        else:
+            if self._has_crashed:
+                self._restart()
+            self._serve_motion()
+            self._serve_state()
         for task in streaming.tasks.values():
             task.unit.accelerometer.sample(task.unit.actual, time.monotonic())
 
@@ -142,10 +155,37 @@ class StreamingServer:
         self._motion.drop()
         self._state.drop()
 
+    def _restart(self) -> None:
+        """Start the tasks of the servers again: the old sockets are closed, and the ports are taken anew."""
+        self._has_crashed = False
+        ports, config = self._streaming.ports, self._streaming.config
+        self.close()
+        self._motion = ClientSocket(config.bind, ports["motion_port"])
+        self._state = ClientSocket(config.bind, ports["state_port"])
+        self._streaming.disconnect()
+
+    def _notice_silence(self, client: ClientSocket, limit_s: float) -> None:
+        """Drop a client that has not sent for too long, so that the next one is served."""
+        client.silence_s += self.period_s
+        if client.is_connected and client.silence_s > limit_s:
+            self._streaming.counts["silent_client"] += 1
+            client.drop()
+
+    def _count_time_without_client(self) -> None:
+        limit_s = self._streaming.config.motors_off_s
+        self._without_client_s = 0.0 if self._motion.is_connected else self._without_client_s + self.period_s
+        if 0.0 < limit_s <= self._without_client_s:
+            self._without_client_s = 0.0
+            self._streaming.switch_motors_off()
+
     def _serve_motion(self) -> None:
         streaming, motion = self._streaming, self._motion
         connected = motion.is_connected
         data = motion.receive()
+        if not streaming.is_busy:
+            config = streaming.config
+            self._notice_silence(motion, config.client_timeout_s if motion.has_heartbeat else config.idle_timeout_s)
+        self._count_time_without_client()
         if not streaming.is_busy and motion.is_connected:
             try:
                 frame = take_frame(data)
@@ -154,6 +194,7 @@ class StreamingServer:
                 motion.drop()
             else:
                 if frame is not None:
+                    motion.has_heartbeat = motion.has_heartbeat or frame.msg_type == MessageType.PING
                     streaming.receive(frame)
         if connected and not motion.is_connected:
             streaming.disconnect()
@@ -164,10 +205,15 @@ class StreamingServer:
 
     def _serve_state(self) -> None:
         streaming, state = self._streaming, self._state
-        state.receive().clear()  # a state client sends nothing
+        heartbeat = state.receive()
+        if heartbeat:
+            state.has_heartbeat = True
+            heartbeat.clear()
+        if state.has_heartbeat:
+            self._notice_silence(state, streaming.config.client_timeout_s)
         self._state_due_s -= self.period_s
         if self._state_due_s <= 0.0:
             self._state_due_s = max(self._state_due_s + streaming.config.state_period_s, 0.0)
             if state.is_connected and not state.is_blocked and "silent_state" not in streaming.faults:
-                state.send(streaming.state(), "half_message" in streaming.faults)
+                state.send(streaming.state(state.has_heartbeat), "half_message" in streaming.faults)
         state.flush()

@@ -126,6 +126,7 @@ class _StandardAxis:
             objects, size, mechanics, condition, self._feedback, errors, self._modes, self._max_speed,
             _POSITION_LIMIT * objects.units.position,
         )  # fmt: skip
+        self.servo.axis.velocity_share = self._option("velocity_share", 1.0)
 
     def _option(self, name: str, otherwise: float = 0.0) -> float:
         drive = self._drive
@@ -148,7 +149,11 @@ class _StandardAxis:
         if not rated.value or self._option("rated_torque", 0.0):
             rated.value = round(self._size.rated_torque * 1000.0 / self._torque_ratio)
         units.torque = rated.value * 1e-6 * self._torque_ratio
-        self._max_speed.value = round(self._option("max_speed") / units.velocity)
+        fastest = self._option("max_speed")
+        if motor_rpm := objects.number(0x6080).value:
+            # In revolutions per minute of the motor, whatever 0x60A9 says (CiA 402-2, object 0x6080).
+            fastest = min(fastest, motor_rpm * 2 * pi / 60 / self._gear_ratio)
+        self._max_speed.value = round(fastest / units.velocity)
         objects.fill(self._defaults(units))
 
     def _counts_per_turn(self) -> float:

@@ -28,6 +28,7 @@ SERVO_OPTIONS = MappingProxyType({
     "viscous_friction": Option(None, 0.0, 50.0, "viscous friction, Nm s/rad"),
     "holding_torque": Option(None, 0.0, 500.0, "torque of the brake that closes with the power stage off, Nm"),
     "initial_position": Option(0.0, -20.0, 20.0, "position of the encoder at power-on, rad"),
+    "velocity_share": Option(1.0, 0.0, 1.0, "fraction of the demand's speed that the position loop adds by itself"),
 })  # fmt: skip
 """Options of every axis."""
 CONDITION_OPTIONS = MappingProxyType({
@@ -81,6 +82,7 @@ class CubemarsDrive(DeviceModel):
         )  # fmt: skip
         self.servos = (self.servo,)
         self.mechanics, self.condition, self.axis = mechanics, self.servo.condition, self.servo.axis
+        self.axis.velocity_share = option("velocity_share")
         # Kept for fast access in a step.
         self.step = self.servo.step  # type: ignore[method-assign]
         self.power_on()

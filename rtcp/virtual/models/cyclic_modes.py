@@ -107,6 +107,8 @@ class Hold(Motion):
 class CyclicPosition(Motion):
     """CSP (8): interpolates from set-point to set-point, at most at `speed` and `top`.
 
+    0x60B1 is added to the input of the velocity loop, 0x60B2 to its output.
+
     `period` and `exponent` (0x60C2) give the duration of a set-point; 0: one step.
     """
 
@@ -116,6 +118,8 @@ class CyclicPosition(Motion):
         self._units = objects.units
         self._target = objects.number(0x607A)
         self._offset = objects.number(0x60B0)
+        self._velocity_offset = objects.number(0x60B1)
+        self._torque_offset = objects.number(0x60B2)
         self._speed = speed
         self._top = top
         self._low = objects.number(0x607D, 1)
@@ -145,6 +149,10 @@ class CyclicPosition(Motion):
         counts = target + offset
         if counts != self._set_point or limit != self._limit:
             self._take(counts, limit, h * count)
+        added: int = self._velocity_offset.value
+        fed: int = self._torque_offset.value
+        axis.velocity_offset = added * self._units.velocity
+        axis.torque_offset = fed * self._units.torque
         self._slope = axis.glide(self._goal, self._slope, self._fastest, h, count)
         bits = SPECIFIC
         if self._clamped or (self._held_back and axis.demand != self._goal):
@@ -194,10 +202,14 @@ class _WithoutPosition(Motion):
 
 
 class CyclicVelocity(_WithoutPosition):
-    """CSV (9): the velocity loop follows 0x60FF + 0x60B1 within 0x607F, and stops at the software position limits."""
+    """CSV (9): the velocity loop follows 0x60FF + 0x60B1 within 0x607F, and stops at the software position limits.
+
+    0x60B2 is added to its output.
+    """
 
     def __init__(self, axis: Axis, objects: AxisObjects) -> None:
         super().__init__(axis, objects, 0x60FF, 0x60B1)
+        self._torque_offset = objects.number(0x60B2)
 
     def update(self, controlword: int, h: float, count: int) -> None:
         """Run at the commanded velocity."""
@@ -205,6 +217,7 @@ class CyclicVelocity(_WithoutPosition):
         allowed = wanted = (self._target.value + self._offset.value) * self._units.velocity
         top = self._profile.top
         low, high, deceleration = self._limits()
+        axis.torque_offset = self._torque_offset.value * self._units.torque
         for _ in range(count):
             slowest, fastest = axis.velocity_range(low, high, deceleration)
             allowed = max(slowest, -top, min(fastest, top, wanted))

@@ -142,7 +142,8 @@ class Axis:
 
     __slots__ = (
         "_integral", "_integral_gain", "_velocity_gain", "demand", "mechanics", "offset", "reference",
-        "reference_velocity", "saturated", "torque", "torque_limit",
+        "reference_velocity", "saturated", "torque", "torque_limit", "torque_offset", "velocity_offset",
+        "velocity_share",
     )  # fmt: skip
 
     def __init__(self, mechanics: Mechanics) -> None:
@@ -151,6 +152,8 @@ class Axis:
         """User position minus encoder position, rad; set by homing."""
         self.torque = 0.0
         self.torque_limit = 0.0
+        self.velocity_share = 1.0
+        """Fraction of the demand's velocity that the position loop itself adds; 0: it relies on `velocity_offset`."""
         self.saturated = False
         """True: the last step reached the torque limit."""
         self._velocity_gain = _VELOCITY_BANDWIDTH * mechanics.inertia
@@ -164,7 +167,11 @@ class Axis:
         return self.mechanics.position + self.offset
 
     def synchronise(self) -> None:
-        """Set the demand to the joint's actual position and velocity, for a change of mode without a jump."""
+        """Set the demand to the joint's actual position and velocity, for a change of mode without a jump.
+
+        The offsets become 0: a mode that has some sets them before each step.
+        """
+        self.torque_offset = self.velocity_offset = 0.0
         self.demand = self.reference = self.mechanics.position + self.offset
         self.reference_velocity = self.mechanics.velocity
 
@@ -201,6 +208,7 @@ class Axis:
         limit, torque, saturated = self.torque_limit, self.torque, self.saturated
         inertia, viscous, external = mechanics.inertia, mechanics.viscous, mechanics.external_torque
         gravity, phase = mechanics.gravity_torque, mechanics.gravity_phase
+        share, added, fed = self.velocity_share, self.velocity_offset, self.torque_offset
         friction = mechanics.coulomb
         if mechanics.braked:
             friction += mechanics.holding_torque
@@ -216,9 +224,9 @@ class Axis:
             error = demand - reference
             along += _TRACKER * _TRACKER * error * h
             reference += (along + 2.0 * _TRACKER * error) * h
-            wanted = along + _POSITION_GAIN * (reference - along * h - position - offset)
+            wanted = share * along + added + _POSITION_GAIN * (reference - along * h - position - offset)
             error = (fastest if wanted > fastest else -fastest if wanted < -fastest else wanted) - speed
-            torque = gain * error + integral
+            torque = gain * error + integral + fed
             saturated = not -limit <= torque <= limit
             if saturated:
                 torque = limit if torque > limit else -limit
@@ -259,7 +267,7 @@ class Axis:
     def run(self, velocity: float, h: float) -> None:
         """Close the velocity loop on `velocity` rad/s."""
         error = velocity - self.mechanics.velocity
-        torque = self._velocity_gain * error + self._integral
+        torque = self._velocity_gain * error + self._integral + self.torque_offset
         limit = self.torque_limit
         if torque > limit:
             self.saturated = True

@@ -162,6 +162,11 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
         """Whether the relay is switched on."""
         return bool(self.outputs_valid and self._outputs[1].value)
 
+    @property
+    def lamp_green(self) -> bool:
+        """Whether the green lamp is on."""
+        return bool(self.outputs_valid and self._outputs[2].value)
+
     def truth(self) -> dict[str, Any]:
         """Return outputs, main contact, current (A) and temperature (C)."""
         circuit = self.circuit
@@ -204,7 +209,10 @@ class ShapeSetterBox(DeviceModel, FreezableInputs):
 
 
 class ShapeSetterMeter(DeviceModel, FreezableInputs):
-    """u at the rod and i of the shunt, 24 bit each, with the sample number and the state of the gate."""
+    """u at the rod and i of the shunt, 24 bit each, with the sample number and the state of the gate.
+
+    With the option `samples` a PDO of u and i is assigned as often, for that many conversions a cycle (oversampling).
+    """
 
     vendor_id = 0x00000A55
     product_code = 0x00000011
@@ -212,6 +220,7 @@ class ShapeSetterMeter(DeviceModel, FreezableInputs):
     name = "Shape setter meter"
     group = "Analog inputs"
     order_code = "RTCP-SSM"
+    options = MappingProxyType({"samples": Option(1, 1, 50, "conversions of u and i a cycle", whole=True)})
     uses_sync0 = False
 
     def __init__(self, **options: object) -> None:
@@ -229,8 +238,13 @@ class ShapeSetterMeter(DeviceModel, FreezableInputs):
             Entry(0x6020, 3, "Pairs of u and i of one instant", _U16, 0, tx),
             Entry(0x6020, 4, "Gate on during the whole conversion", _U8, 0, tx),
         ])  # fmt: skip
-        mapped = ((0x6020, 1, 32), (0x6020, 2, 32), (0x6020, 3, 16), (0x6020, 4, 8))
-        define_pdo_objects(objects, {}, {0x1A00: mapped}, [], [0x1A00], fixed=True)
+        measured, about = ((0x6020, 1, 32), (0x6020, 2, 32)), ((0x6020, 3, 16), (0x6020, 4, 8))
+        samples = int(self.option("samples"))
+        if samples == 1:
+            define_pdo_objects(objects, {}, {0x1A00: (*measured, *about)}, [], [0x1A00], fixed=True)
+        else:
+            pdos = {0x1A00: about, 0x1A01: measured}
+            define_pdo_objects(objects, {}, pdos, [], [0x1A00, *[0x1A01] * samples], fixed=True)
 
     def join(self, devices: Sequence[DeviceModel]) -> None:
         """Find the box with the measured circuit: the first one of the segment."""
@@ -243,6 +257,9 @@ class ShapeSetterMeter(DeviceModel, FreezableInputs):
             return
         circuit = box.circuit
         self._voltage.value, self._current.value = circuit.voltage_count, circuit.current_count
+        if (samples := int(self.option("samples"))) > 1:
+            counts = [(circuit.voltage_count, circuit.current_count), *(circuit.resample() for _ in range(samples - 1))]
+            self._voltage.samples, self._current.samples = zip(*counts, strict=True)
         paired = circuit.voltage_step == circuit.current_step
         self._sample.value = self._sample.value + paired & 0xFFFF
         self._sense.value = int(box.gate_was_on)

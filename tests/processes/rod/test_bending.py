@@ -18,7 +18,7 @@ from rtcp.ipc.errors import Invalid, Refused
 from rtcp.processes import rod
 from rtcp.processes.rod.bending import _check_between, _check_curves, _Holder, plan_approach
 
-CELL = load_cell(default_config().parent / "cell.yaml")
+CELL = load_cell(default_config().parent / "cell_shape_setting.yaml")
 ROD = rod.Rod(0.3, 1e-3)
 CHUCK = rod.Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.12, 0.0, -pi / 2, 0.0), 0.02)
 CHUCKS = {"left": CHUCK, "right": CHUCK}

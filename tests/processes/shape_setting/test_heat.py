@@ -14,9 +14,10 @@ from benchmarks.shape_setting import ROOT, Heater
 from rtcp.ipc.events import Event
 from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.heat_balance import HeatBalance
+from rtcp.processes.shape_setting.heat_profile import HeatProfile, Limits, heat_command
 from rtcp.processes.shape_setting.interlocks import Mode, Row
 from rtcp.processes.shape_setting.messages import HeaterState
-from rtcp.processes.shape_setting.profile import HeatProfile, Limits, heat_command, read_profile
+from rtcp.processes.shape_setting.profile import read_profile
 from rtcp.virtual.heated_rod import Alloy, HeatedRod
 from rtcp.virtual.heater_circuit import CircuitFault, SensePoint
 from tests.processes.shape_setting.rig import CONFIRMED, PERIOD_S
@@ -273,6 +274,41 @@ def test_without_a_profile_there_is_no_balance() -> None:
     assert nothing.most_k == 0.0
 
 
+@pytest.mark.parametrize(
+    ("diameter", "rise_k", "longest_s"),
+    [
+        (0.5e-3, 60.0, 60.0), (1e-3, 60.0, 120.0), (3.2e-3, 60.0, 620.0),
+        (0.5e-3, 1290.0, 65.0), (1e-3, 1290.0, 190.0), (2e-3, 1290.0, 520.0),
+    ],
+)  # fmt: skip
+def test_a_rod_is_cold_by_the_time_that_the_balance_states_which_its_diameter_decides(
+    diameter: float, rise_k: float, longest_s: float
+) -> None:
+    profile = HeatProfile(target_c=510.0).of_rod(0.3, diameter)
+    command = heat_command(profile)
+    known = HeatBalance()
+    known.set_rod(
+        command.initial_c, command.chuck_c, command.target_c, command.heat_capacity, command.convected,
+        command.radiated, command.tolerance,
+    )  # fmt: skip
+    known.most_k = rise_k
+    time_s = known.time_to_cold()
+    assert 0.2 * longest_s < time_s < longest_s
+    if rise_k > 1000.0:  # the melting point
+        assert time_s == known.longest_cooling_s
+    rod = HeatedRod(Alloy(), diameter=diameter, length=0.3, ambient=20.0)
+    rod._enthalpy += rod.alloy.specific_heat * rise_k
+    rod._transform()
+    for _ in range(round(10 * time_s)):
+        rod.step(0.1, 0.0)
+    assert 20.0 < rod.middle_temperature < 23.0
+    known.most_k = min(rise_k, 500.0)  # a step of 0.1 s of a hotter thin rod would not be stable
+    # A step of the balance itself, with all of the radiation, is a little faster.
+    for _ in range(round(10 * time_s)):
+        known.update(0.0, 0.1)
+    assert 0.2 < known.most_k < 3.5
+
+
 def test_losses_at_the_target_are_those_of_the_virtual_rod() -> None:
     command = heat_command(SHIPPED)
     rod = HeatedRod(Alloy(), diameter=SHIPPED.thermal.diameter, length=SHIPPED.ends.length, ambient=SHIPPED.chuck_c)
@@ -281,3 +317,45 @@ def test_losses_at_the_target_are_those_of_the_virtual_rod() -> None:
     rod._update()
     assert command.convected + command.radiated == pytest.approx(rod._air_power, rel=0.02)
     assert command.heat_capacity == pytest.approx(rod.mass * rod.alloy.specific_heat, rel=0.01)
+
+
+# -- the ratio alone ---------------------------------------------------------------------------------------------------
+
+
+class RatioHeating(Heating):
+    """A heating by the ratio alone, which is the same number for rods of all diameters; one command does all steps."""
+
+    def run(self) -> None:
+        heater = self.heater
+        heater.permit(Mode.AUTO)
+        wanted = messages.SetTargetRatio(1.09, hold_s=2.0, length=self.profile.ends.length)
+        assert heater.send(wanted) is None
+        assert heater.send(messages.HeatRod(True, messages.RodPhase.AUSTENITE)) is None
+        heater.until(HeaterState.HEATING)
+        self.resistance = heater.heater.initial.value
+        heater.until(HeaterState.HOLDING, cycles=60_000)
+        heater.until(HeaterState.COOLING)
+        self.ratio = self.rod.resistance / self.resistance
+
+
+@pytest.mark.parametrize(("diameter", "length"), [(0.5e-3, 0.2), (1e-3, 0.3), (2e-3, 0.25), (3.2e-3, 0.3)])
+def test_rods_of_other_dimensions_need_no_input_but_the_ratio(diameter: float, length: float) -> None:
+    ends = replace(SHIPPED.ends, length=length)
+    heating = RatioHeating(replace(SHIPPED, ends=ends), diameter=diameter, ambient=20.0)
+    heating.run()
+    (sized,) = heating.reported(messages.RodSized)
+    assert isinstance(sized, messages.RodSized)
+    assert sized.diameter_mm == pytest.approx(1e3 * diameter, rel=0.01)
+    assert heating.ratio == pytest.approx(1.09, abs=0.003)
+    assert not heating.reported(messages.HeaterTripped)
+    assert heating.hottest_c < sized.target_c + OVER_TARGET_K
+
+
+@pytest.mark.parametrize("length", [0.15, 0.3])
+def test_a_length_that_is_not_the_rods_trips_before_the_rod_is_too_hot(length: float) -> None:
+    heating = RatioHeating(replace(SHIPPED, ends=replace(SHIPPED.ends, length=0.22)), ambient=20.0)
+    heating.heater.permit(Mode.AUTO)
+    assert heating.heater.send(messages.SetTargetRatio(1.09, length=length)) is None
+    assert heating.heater.send(messages.HeatRod(True, messages.RodPhase.AUSTENITE)) is None
+    heating.heater.until(HeaterState.TRIPPED, cycles=60_000)
+    assert heating.hottest_c < SHIPPED.target_c

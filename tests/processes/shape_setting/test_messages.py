@@ -14,7 +14,7 @@ from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import REFUSALS
 from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
-from rtcp.processes.shape_setting.messages import MeasureResistance, StartHeating, StopHeating
+from rtcp.processes.shape_setting.messages import ArmHeater, HeatRod, MeasureResistance, StartHeating, StopHeating
 
 NAMES = Names(load(default_config()))
 KINDS: list[type[Message]] = [
@@ -44,4 +44,6 @@ def test_the_configuration_names_every_command_and_only_stop_needs_no_lease() ->
     commands = [kind for kind in KINDS if issubclass(kind, Command)]
     assert set(ShapeSettingConfig.COMMANDS) == set(commands)
     assert [kind for kind in commands if not kind.needs_lease] == [StopHeating]
-    assert {kind for kind in commands if issubclass(kind, ProcessCommand)} == {MeasureResistance, StartHeating}
+    assert {kind for kind in commands if issubclass(kind, ProcessCommand)} == {
+        ArmHeater, MeasureResistance, StartHeating, HeatRod,
+    }  # fmt: skip

@@ -115,17 +115,46 @@ def test_a_record_has_what_is_measured_beside_what_is_commanded() -> None:
 
 @pytest.mark.parametrize("cool_c", [300.0, 24.0])
 def test_a_rod_is_not_measured_before_its_time_to_cool_since_the_heat_is_over(cool_c: float) -> None:
-    rig = Rig(replace(CONFIG, rod_cooling_s=10.0))
+    # Of this rod the heat balance knows that it needs longer.
+    rig = Rig(replace(CONFIG, rod_cooling_s=5.0))
     rig.loss = 1.0
     rig.heat(state=messages.HeaterState.COOLING, target_c=350.0, cool_c=cool_c)
     began = rig.context.cycle
     rig.until(messages.HeaterState.DONE)
     cooled_s = (rig.context.cycle - began) * PERIOD_S
-    assert record(rig)["rod_hot_s"] == pytest.approx(10.0 - cooled_s, abs=0.01)
+    assert record(rig)["rod_hot_s"] == pytest.approx(5.0 - cooled_s, abs=0.01)
     rig.cycle(20)
     rig.arm()
     assert isinstance(rig.send(CONFIRMED), messages.RodStillHot)
-    rig.cycle(round((10.0 - cooled_s) / PERIOD_S))
+    rig.cycle(round((5.0 - cooled_s) / PERIOD_S))
+    assert rig.send(CONFIRMED) is None
+
+
+def test_after_a_complete_heating_the_time_to_cool_is_that_of_the_rod() -> None:
+    assert CONFIG.rod_cooling_s == 600.0
+    rig = Rig()
+    rig.heat(state=messages.HeaterState.DONE, target_c=350.0, cool_c=340.0, tolerance=0.0)
+    hot_s = record(rig)["rod_hot_s"]
+    assert 60.0 < hot_s < 200.0
+    rig.celsius = 20.0
+    rig.heater._since_heat_s += hot_s - 0.2
+    rig.cycle(20)
+    rig.arm()
+    assert isinstance(rig.send(CONFIRMED), messages.RodStillHot)
+    rig.cycle(400)
+    assert record(rig)["rod_hot_s"] == 0.0
+    assert rig.send(CONFIRMED) is None
+
+
+def test_who_confirms_that_a_rod_is_cold_does_not_wait() -> None:
+    rig = Rig()
+    rig.heater._since_heat_s = 0.0
+    rig.arm()
+    assert isinstance(rig.send(CONFIRMED), messages.RodStillHot)
+    assert rig.send(replace(CONFIRMED, is_cold=True)) is None
+    rig.until(messages.HeaterState.ARMED)
+    # The same rod is measured again without a wait.
+    assert record(rig)["rod_hot_s"] == 0.0
     assert rig.send(CONFIRMED) is None
 
 
@@ -136,6 +165,28 @@ def test_after_a_start_a_rod_is_not_measured_before_its_time_to_cool() -> None:
     assert isinstance(rig.send(CONFIRMED), messages.RodStillHot)
     rig.cycle(2000)
     assert rig.send(CONFIRMED) is None
+
+
+def test_after_a_start_or_an_early_end_the_longest_time_to_cool_is_that_of_the_rod() -> None:
+    rig = Rig()
+    rig.heater._since_heat_s = 0.0
+    assert record(rig)["rod_hot_s"] == 600.0  # nothing is known of the rod
+    assert rig.send(PROFILE) is None
+    hot_s = record(rig)["rod_hot_s"]
+    assert hot_s == rig.heater.balance.longest_cooling_s
+    assert 100.0 < hot_s < 400.0
+    rig.arm()
+    assert isinstance(rig.send(CONFIRMED), messages.RodStillHot)
+    rig.heater._since_heat_s = hot_s
+    assert rig.send(CONFIRMED) is None
+    rig = Rig()
+    rig.heat()
+    rig.send(messages.StopHeating())
+    rig.cycle(40)
+    assert record(rig)["rod_hot_s"] == pytest.approx(rig.heater.balance.longest_cooling_s, abs=0.1)
+    # The profile of a thinner rod says nothing of the one that was heated.
+    assert rig.send(replace(PROFILE, heat_capacity=0.1)) is None
+    assert record(rig)["rod_hot_s"] > 100.0
 
 
 def test_a_current_that_nobody_commands_keeps_the_rod_hot() -> None:
@@ -204,7 +255,95 @@ def test_lamps_show_powered_and_armed() -> None:
     assert (rig.get("lamp_green"), rig.get("lamp_yellow")) == (1.0, 1.0)
     rig.context.state = State.FAULT
     rig.cycle()
-    assert (rig.get("lamp_green"), rig.get("lamp_yellow")) == (0.0, 0.0)
+    assert (rig.get("lamp_green"), rig.get("lamp_yellow")) == (1.0, 0.0)
+
+
+def test_arming_lasts_until_the_mirror_contact_shows_a_closed_relay() -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    assert rig.send(messages.ArmHeater()) is None
+    while record(rig)["busy"]:
+        assert not rig.heater.inputs.relay_closed
+        rig.cycle()
+    assert rig.heater.inputs.relay_closed
+    assert rig.send(CONFIRMED) is None
+
+
+def test_arming_ends_where_the_relay_does_not_close() -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    rig.forced["relay_closed"] = 0.0
+    assert rig.send(messages.ArmHeater()) is None
+    assert record(rig)["busy"]
+    rig.until(messages.HeaterState.TRIPPED)
+    assert not record(rig)["busy"]
+
+
+WHOLE = messages.HeatRod(True, messages.RodPhase.AUSTENITE)
+
+
+def test_one_command_arms_measures_and_heats_and_is_busy_throughout() -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    assert rig.send(replace(PROFILE, heat_capacity=rig.capacity, convected=rig.loss * 480.0)) is None
+    assert rig.send(WHOLE) is None
+    states: list[messages.HeaterState] = []
+    while record(rig)["busy"]:
+        if not states or states[-1] is not rig.heater.state:
+            states.append(rig.heater.state)
+        rig.cycle()
+    names = [state.name for state in states]
+    assert names == ["ARMED", "MEASURING", "HEATING", "HOLDING", "COOLING"]
+    assert rig.heater.state is messages.HeaterState.DONE
+
+
+@pytest.mark.parametrize("state", [messages.HeaterState.ARMED, messages.HeaterState.MEASURING])
+def test_the_end_of_the_commanders_lease_ends_one_command_in_each_of_its_steps(state: messages.HeaterState) -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    assert rig.send(PROFILE) is None
+    assert rig.send(WHOLE) is None
+    rig.until(state)
+    rig.context.commander = False
+    rig.cycle()
+    assert not rig.relay
+    rig.context.commander = True
+    rig.cycle(100)
+    assert not rig.relay
+    assert not rig.gate
+
+
+def test_a_resistance_that_no_rod_has_ends_one_command_with_the_relay_open() -> None:
+    rig = Rig(resistance=4.5)
+    rig.permit(Mode.AUTO)
+    assert rig.send(messages.SetTargetRatio(1.09)) is None
+    assert rig.send(WHOLE) is None
+    rig.until(messages.HeaterState.READY)
+    (rejected,) = events(rig, messages.RodRejected)
+    assert isinstance(rejected, messages.RodRejected)
+    assert rejected.diameter_mm < 0.3
+    assert not rig.relay
+    rig.cycle(20)
+    rig.arm()
+    assert rig.send(CONFIRMED) is None
+    rig.until(messages.HeaterState.ARMED)
+    assert isinstance(refused(rig, messages.StartHeating()), messages.RodUnfit)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"target_ratio": 1.0}, {"target_ratio": math.nan}, {"hold_s": CONFIG.longest_s}, {"hold_s": -1.0},
+        {"length": 0.6}, {"length": 0.01}, {"initial_c": 71.0},
+    ],
+)  # fmt: skip
+def test_a_number_beside_the_ratio_out_of_range_is_refused_by_its_name(values: dict[str, float]) -> None:
+    refusal = refused(Rig(), messages.SetTargetRatio(**({"target_ratio": 1.09} | values)))
+    assert isinstance(refusal, messages.RatioNumberOutOfRange)
+    assert [refusal.quantity.name.lower()] == list(values)
+    assert [key.name.lower() for key in messages.RatioKey] == [
+        entry.name for entry in fields(messages.SetTargetRatio(1.09))
+    ]
 
 
 # -- refusals ----------------------------------------------------------------------------------------------------------
@@ -231,6 +370,7 @@ def test_heat_needs_its_steps_in_their_order() -> None:
         messages.HeaterState.ARMED, messages.HeaterState.READY
     )
     assert refused(rig, messages.StartHeating()) == messages.NoHeatProfile()
+    assert refused(rig, WHOLE) == messages.NoHeatProfile()
     assert rig.send(PROFILE) is None
     assert refused(rig, messages.StartHeating()) == messages.ResistanceNotMeasured()
 
@@ -247,6 +387,11 @@ def test_a_rod_that_is_bent_or_of_another_phase_is_not_measured(command: message
     rig = Rig()
     rig.arm()
     assert refused(rig, command) == messages.RodNotConfirmed(command.phase)
+    rig.send(messages.StopHeating())
+    rig.send(PROFILE)
+    whole = messages.HeatRod(command.straight_and_unloaded, command.phase)
+    assert refused(rig, whole) == messages.RodNotConfirmed(command.phase)
+    assert not rig.relay
 
 
 def test_pulses_wait_for_the_relay() -> None:

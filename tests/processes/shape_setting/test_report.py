@@ -10,8 +10,8 @@ import pytest
 
 from rtcp.config.find import default_config
 from rtcp.processes.rod import Rod, integrate
+from rtcp.processes.shape_setting.heat_profile import HeatProfile
 from rtcp.processes.shape_setting.job import Job, read_job
-from rtcp.processes.shape_setting.profile import HeatProfile
 from rtcp.processes.shape_setting.report import _facts, _plain, _temperatures, write_report
 from rtcp.processes.shape_setting.run import Outcome
 

@@ -26,9 +26,10 @@ from rtcp.config.find import default_config
 from rtcp.processes.rod import Rod, integrate
 from rtcp.processes.shape_setting import run as module
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.heat_profile import target_ratio
 from rtcp.processes.shape_setting.interlocks import Mode
 from rtcp.processes.shape_setting.job import read_job
-from rtcp.processes.shape_setting.profile import read_profile, target_ratio
+from rtcp.processes.shape_setting.profile import read_profile
 from rtcp.processes.shape_setting.run import Outcome, ShapeSettingRun
 
 

@@ -17,9 +17,10 @@ from rtcp.ipc.commands import Disable, Halt
 from rtcp.ipc.states import State
 from rtcp.processes.shape_setting import messages
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.heat_profile import HeatProfile, Limits, heat_command
 from rtcp.processes.shape_setting.interlocks import TABLE, Mode, Row, Rule
 from rtcp.processes.shape_setting.process import ShapeSetting
-from rtcp.processes.shape_setting.profile import HeatProfile, Limits, heat_command, read_profile
+from rtcp.processes.shape_setting.profile import read_profile
 from rtcp.testing.simulation import Simulation
 from rtcp.virtual.heated_rod import HeatedRod
 from rtcp.virtual.heater_circuit import CircuitFault
@@ -253,6 +254,16 @@ def test_stop_halt_and_disable_turn_the_virtual_gate_off_within_two_cycles(
         platform.cycle()
     assert not platform.control.gate
     assert not platform.control.relay
+
+
+def test_the_green_lamp_stays_on_in_a_fault_of_the_platform() -> None:
+    with enabled(lost_cycles=1000) as platform:
+        assert platform.until(lambda: bool(platform.control.lamp_green), 0.1)
+        lose_answers(1000)(platform)
+        assert platform.until(lambda: platform.loop.machine.state is State.FAULT, 5.0)
+        for _ in range(100):
+            platform.cycle()
+            assert platform.control.lamp_green
 
 
 def test_a_gate_that_sticks_is_cut_off_by_the_relay(platform: Platform) -> None:

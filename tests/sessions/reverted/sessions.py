@@ -1,4 +1,4 @@
-"""Sessions until the first that does not pass; runs in the changed copy, with as many processes as there are CPUs."""
+"""The sessions that do not pass; runs in the changed copy, with as many processes as there are CPUs."""
 
 from __future__ import annotations
 
@@ -41,20 +41,23 @@ def a_cell() -> tuple[CellConfig, Mapping[str, SegmentConfig]]:
     return CellConfig("two", silence_s=0.1, arms=(left, right)), {"left": segment, "right": segment}
 
 
+def configured(kind: str) -> tuple[ArmConfig | CellConfig, Segment]:
+    """Return what a session of this kind, `arm` or `cell`, is of."""
+    return a_cell() if kind == "cell" else an_arm()
+
+
 def run(config: ArmConfig | CellConfig, segment: Segment, seed: int) -> Result:
     """Run the session of a seed."""
     return run_session(seed, config, SECONDS, segment)
 
 
 def main(kind: str, seed: int, count: int) -> None:
-    """Print the number of sessions until the fault was found, or 0, and the violation or the error."""
-    config, segment = a_cell() if kind == "cell" else an_arm()
+    """Print a line of JSON for each session that does not pass: its seed, and the violation or the error."""
+    config, segment = configured(kind)
     with multiprocessing.Pool(len(os.sched_getaffinity(0))) as pool:
-        for number, result in enumerate(pool.imap(partial(run, config, segment), range(seed, seed + count)), 1):
+        for result in pool.imap(partial(run, config, segment), range(seed, seed + count)):
             if result.outcome != "passed":
-                json.dump((number, f"seed {result.seed}: {result.violation}"), sys.stdout)
-                return
-    json.dump((0, f"in {count} sessions"), sys.stdout)
+                print(json.dumps((result.seed, result.violation)), flush=True)
 
 
 if __name__ == "__main__":

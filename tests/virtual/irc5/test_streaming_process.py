@@ -156,8 +156,8 @@ def test_bytes_that_are_no_message_cost_the_connection_and_the_next_client_is_se
             with pytest.raises(ConnectionError):
                 read(motion)
         with robot.connect("motion") as motion:
-            motion.sendall(struct.pack("<4i", 12, 1, 2, 0))
-            assert read(motion) == (1, 3, 2, b"")  # RAPID knows no PING
+            motion.sendall(struct.pack("<4i", 12, 2, 2, 0))
+            assert read(motion) == (2, 3, 2, b"")  # RAPID knows no GET_VERSION
 
 
 def test_a_cut_closes_both_connections_and_stops_the_arm(tmp_path: Path) -> None:

@@ -1,0 +1,87 @@
+"""The limits of the joints inside their drives: a guard that does not depend on this software.
+
+A device's file names the objects (`limits`); their values follow from the joint in the arm's file. They lie a little
+beyond what this platform itself keeps to, so that its own guards and its supervision act first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+from rtcp.config.model import ArmConfig, DeviceDescription, Joint, LimitObject, SlaveConfig, StartupSdo, integer_range
+
+BEYOND_RANGE_RAD: Final = 0.05
+"""How far the drive's position limits lie outside the joint's range, rad: a joint that sagged out of it is led back."""
+BEYOND_SUPERVISION: Final = 1.5
+"""The drive's speed limit, multiple of the supervision's threshold."""
+_CHANNELS: Final = {
+    "position_min": ("target_position",),
+    "position_max": ("target_position",),
+    "velocity": ("target_velocity", "velocity"),
+    "torque": ("target_torque", "torque"),
+}
+"""Channels whose factor an object has that states none."""
+
+
+def factor_of(device: DeviceDescription, entry: LimitObject) -> float | None:
+    """Return the SI units per count of an object; None: neither the object nor a channel of the axis states one."""
+    if entry.factor is not None:
+        return entry.factor
+    factors = {
+        channel.name: channel.factor
+        for pdo in (*device.tpdo, *device.rpdo)
+        for channel in pdo.channels
+        if pdo.axis_of(channel) == entry.axis
+    }
+    return next((factors[name] for name in _CHANNELS[entry.limit] if name in factors), None)
+
+
+def joint_limits(config: ArmConfig, slave: SlaveConfig, joint: Joint, zero: float) -> Iterator[StartupSdo]:
+    """Yield the limits of a joint as objects of its drive, wide enough for all that `absolute` allows while it runs.
+
+    Args:
+        config: the arm.
+        slave: the drive of the joint.
+        joint: the joint.
+        zero: position of the drive at joint position 0, rad.
+    """
+    widest, supervision = joint.absolute.position or joint.position, config.supervision
+    low, high = widest.min - BEYOND_RANGE_RAD + zero, widest.max + BEYOND_RANGE_RAD + zero
+    threshold = (joint.absolute.velocity or joint.velocity) * (supervision.absolute.speed or supervision.speed)
+    velocity = threshold * BEYOND_SUPERVISION
+    for entry in slave.device.limits:
+        factor = factor_of(slave.device, entry)
+        if entry.axis != joint.axis or factor is None or (entry.limit == "torque" and joint.drive_torque is None):
+            continue
+        # A drive that turns the other way has its ends exchanged.
+        ends = sorted((low / factor, high / factor))
+        values = {
+            "position_min": ends[0],
+            "position_max": ends[1],
+            "velocity": abs(velocity / factor),
+            "torque": abs((joint.drive_torque or 0.0) / factor),
+        }
+        least, most = integer_range(entry.type)
+        counts = min(max(round(values[entry.limit]), least), most)
+        name = f"{entry.limit} of {joint.name}"
+        yield StartupSdo(entry.index, entry.sub_index, entry.type, counts, name, optional=True)
+
+
+def with_limits(config: ArmConfig) -> tuple[SlaveConfig, ...]:
+    """Return the slaves of an arm with the limits of their joints, for the bus to write."""
+    zeros = config.zero_offsets or (0.0,) * len(config.axes)
+    joints = list(zip(config.axes, zeros, strict=True))
+    return tuple(
+        replace(
+            slave,
+            limits=tuple(
+                sdo
+                for joint, zero in joints
+                if joint.slave == slave.name
+                for sdo in joint_limits(config, slave, joint, zero)
+            ),
+        )
+        for slave in config.slaves
+    )
