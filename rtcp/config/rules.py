@@ -338,7 +338,8 @@ def _pdos(direction: str, pdos: Sequence[Pdo], device: DeviceDescription) -> Ite
         if pdo.samples > 1 and (direction != "tpdo" or kind not in ("analog", "generic")):
             text = f"found {pdo.samples}, allowed is more than 1 for inputs of the kinds analog and generic alone"
             yield Finding((direction, i, "samples"), "samples", text=text)
-        last = max(part.index for part in (pdo.assigned[-1], *pdo.assigned[-1].channels))
+        part = pdo.assigned[-1]
+        last = max((part.index, *(entry.index for entry in part.channels)))
         if last > 0xFFFF:
             text = f"found an object of index 0x{last:X} for the last of {pdo.samples} values, allowed is 0xFFFF"
             yield Finding((direction, i, "sample_increment"), "samples", text=text)

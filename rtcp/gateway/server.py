@@ -194,8 +194,9 @@ class _Connection:
 
     def _receive(self, line: bytes, received_ns: int) -> None:
         try:
-            number, method, params, is_notification = jsonrpc.read_request(line)
-            if is_notification:
+            request = jsonrpc.read_request(line)
+            number, method, params = request.id, request.method, request.params
+            if request.is_notification:
                 return self._notified(method, params)
             if method not in self._methods.table:
                 allowed = ", ".join(self._methods.table)
@@ -203,9 +204,13 @@ class _Connection:
                 raise jsonrpc.InvalidMessage(jsonrpc.METHOD_NOT_FOUND, message, number)
         except jsonrpc.InvalidMessage as error:
             return self._send(jsonrpc.failure(error.request, RtcpError("invalid", str(error)), error.code))
+        is_stop = self._methods.table[method].stops is not None
+        if request.requested_ns and not is_stop:
+            # A long line arrives after a stop that its client has requested later.
+            received_ns = min(received_ns, request.requested_ns)
         if len(self._requests) >= _MOST_PENDING:
             many = f"{_MOST_PENDING} requests of this connection wait already"
-            if self._methods.table[method].stops is not None:
+            if is_stop:
                 many += "; the stop was sent to the loop, and its end is not waited for"
             return self._send(jsonrpc.failure(number, RtcpError("refused", many)))
         task = asyncio.create_task(self._answer(number, method, params, received_ns))
@@ -386,13 +391,13 @@ class Gateway:
 
     def _request_stop(self, line: bytes) -> int:
         with contextlib.suppress(jsonrpc.InvalidMessage):
-            _, method, params, _ = jsonrpc.read_request(line)
-            kind = self._stops.get(json.dumps(method).encode())
+            request = jsonrpc.read_request(line)
+            kind = self._stops.get(json.dumps(request.method).encode())
             if kind is Shutdown:
                 with contextlib.suppress(OSError):  # the method reports it; the stop comes first
                     self._expect_end()
             if kind is not None:
-                requested_ns = params.get("requested_ns")
+                requested_ns = request.params.get("requested_ns")
                 return self._observer.stop(kind, requested_ns if type(requested_ns) is int else 0)
         return 0
 

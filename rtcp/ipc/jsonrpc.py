@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Iterator, Mapping
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from rtcp.ipc.errors import ErrorKind, RtcpError
 
@@ -48,10 +49,22 @@ def line(message: Mapping[str, Any]) -> bytes:
     return json.dumps({"jsonrpc": VERSION, **message}, allow_nan=False).encode() + b"\n"
 
 
+class Request(NamedTuple):
+    """A request or a notification, as read."""
+
+    id: RequestId
+    method: str
+    params: dict[str, Any]
+    is_notification: bool
+    requested_ns: int
+    """When its sender requested it, CLOCK_MONOTONIC; 0: it does not say."""
+
+
 def request(number: int, method: str, params: Mapping[str, Any]) -> bytes:
-    """Return a request; raises RtcpError (`invalid`) for what JSON cannot express."""
+    """Return a request with the instant of this call; raises RtcpError (`invalid`) for what JSON cannot express."""
+    now = time.monotonic_ns()
     try:
-        data = line({"id": number, "method": method, "params": dict(params)})
+        data = line({"id": number, "method": method, "params": dict(params), "requested_ns": now})
     except (TypeError, ValueError) as error:
         why = next(_wrong_numbers(params), error)
         raise RtcpError("invalid", f"{method}: the parameters cannot be sent as JSON: {why}") from error
@@ -95,8 +108,8 @@ def failure(number: RequestId, error: RtcpError, code: int = 0) -> dict[str, Any
     return {"id": number, "error": details}
 
 
-def read_request(text: bytes) -> tuple[RequestId, str, dict[str, Any], bool]:
-    """Return id, method, parameters, and whether it is a notification.
+def read_request(text: bytes) -> Request:
+    """Return a request.
 
     Raises:
         InvalidMessage: it is no JSON or no request.
@@ -117,7 +130,11 @@ def read_request(text: bytes) -> tuple[RequestId, str, dict[str, Any], bool]:
         raise InvalidMessage(INVALID_REQUEST, f"method: found {type(method).__name__}, allowed is a text", number)
     if not isinstance(params, dict):
         raise InvalidMessage(INVALID_REQUEST, f"params: found {type(params).__name__}, allowed is an object", number)
-    return number, method, params, number is None
+    requested_ns = message.get("requested_ns", 0)
+    if type(requested_ns) is not int:
+        found = type(requested_ns).__name__
+        raise InvalidMessage(INVALID_REQUEST, f"requested_ns: found {found}, allowed is an integer", number)
+    return Request(number, method, params, number is None, requested_ns)
 
 
 def _refuse_constant(constant: str) -> float:

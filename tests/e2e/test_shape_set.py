@@ -28,6 +28,7 @@ from rtcp.ipc.runtime_directory import control_socket, irc5_control, segment_con
 from rtcp.ipc.session import read_processes
 from rtcp.processes.shape_setting.heat_profile import heat_command
 from rtcp.processes.shape_setting.job import read_job
+from rtcp.processes.shape_setting.run import VirtualRod
 from rtcp.virtual.faults.control import SegmentClient
 from rtcp.virtual.request_socket import RequestClient, RequestRefused
 from tests.cell.running import leftovers_of, put_in_order
@@ -378,6 +379,7 @@ def test_a_halt_of_one_arm_that_bends_the_rod_ends_all(cell: HeaterCell) -> None
 def test_after_all_that_the_example_sets_the_shape_of_a_rod_through_ros(ros: Ros, cell: HeaterCell) -> None:  # noqa: F811
     with cell.heater() as robot:
         robot.disable()  # `robot_enable` reaches arms and heater
+        VirtualRod(robot).renew()
     node = begin_node(ros, cell.platform, "--cell")
     try:
         files = (cell.config / "cell_shape_setting.yaml", cell.job)

@@ -260,6 +260,18 @@ def test_a_motion_that_was_requested_before_a_stop_does_not_begin_after_it(raw: 
     assert loop.kinds == [MoveJoints, Halt]
 
 
+def test_a_motion_that_arrives_after_a_stop_and_was_requested_before_it_does_not_begin(raw: Raw, loop: FakeLoop) -> None:
+    loop.state = State.HOLDING
+    requested_ns = time.monotonic_ns()
+    raw.send({"id": 1, "method": "halt"})
+    assert raw.receive()["id"] == 1
+    move = {"method": "move_joints", "params": MOVE}
+    raw.send({"id": 2, **move, "requested_ns": requested_ns})
+    assert raw.receive()["error"]["data"]["reason"] == "superseded"
+    raw.send({"id": 3, **move, "requested_ns": time.monotonic_ns()})
+    until(lambda: MoveJoints in loop.kinds, "the motion")
+
+
 def test_a_stop_without_an_answer_stops_all_the_same(raw: Raw, loop: FakeLoop) -> None:
     raw.send({"method": "halt"})
     assert raw.receive()["error"]["data"]["kind"] == "invalid"

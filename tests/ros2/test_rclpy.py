@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import itertools
 import signal
 import sys
 import threading
@@ -53,9 +55,9 @@ def trajectory(names: Any = NAMES, start: Any = HERE, end: Any = (0.0, 0.0, 0.0)
 class Client:
     """A node of a client, in a context of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self, domain: int) -> None:
         self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=0, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self.node = rclpy.create_node("client", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -129,11 +131,12 @@ class Client:
 class Ros(Client):
     """The node under test in front of a fake arm, and a client."""
 
-    def __init__(self, open_wire: Any, commands: Commands) -> None:
+    def __init__(self, open_wire: Any, commands: Commands, domain: int) -> None:
         self._opened = contextlib.ExitStack()
-        wire = self._opened.enter_context(open_wire(OPTIONS, commands, threading.Event()))
+        options = dataclasses.replace(OPTIONS, domain=domain)
+        wire = self._opened.enter_context(open_wire(options, commands, threading.Event()))
         self.publications = Publications(wire, "arm", lambda: None)
-        super().__init__()
+        super().__init__(domain)
 
     def end_node(self) -> None:
         self._opened.close()
@@ -143,18 +146,31 @@ class Ros(Client):
         super().close()
 
 
+_DOMAINS = itertools.count(1)
+
+
 @pytest.fixture
-def ros(commands: Commands) -> Iterator[Ros]:
+def domain() -> int:
+    """A domain of its own for each test.
+
+    Fast DDS gives the participants of a process the identities of those that have ended. One that still knows the older
+    one does not find the topics and services of the newer one, now and then.
+    """
+    return next(_DOMAINS)
+
+
+@pytest.fixture
+def ros(commands: Commands, domain: int) -> Iterator[Ros]:
     """The node on rclpy."""
-    made = Ros(ros2_rclpy.open_wire, commands)
+    made = Ros(ros2_rclpy.open_wire, commands, domain)
     yield made
     made.close()
 
 
 @pytest.fixture(params=["rclpy", "dds"])
-def each_wire(request: pytest.FixtureRequest, commands: Commands) -> Iterator[Ros]:
+def each_wire(request: pytest.FixtureRequest, commands: Commands, domain: int) -> Iterator[Ros]:
     """The node on rclpy, and the node on Cyclone DDS without ROS."""
-    made = Ros(ros2_rclpy.open_wire if request.param == "rclpy" else ros2_dds.open_wire, commands)
+    made = Ros(ros2_rclpy.open_wire if request.param == "rclpy" else ros2_dds.open_wire, commands, domain)
     yield made
     made.close()
 
@@ -330,12 +346,13 @@ def test_what_has_no_messages_here_is_left_out(
 
 
 @pytest.fixture
-def served() -> Iterator[tuple[Platform, Client]]:
+def served(domain: int) -> Iterator[tuple[Platform, Client]]:
     """A started platform, `rtcp ros --ros2` in front of it, and a client."""
     platform = Platform()
     platform.be_patient(2000)
+    platform.environment["ROS_DOMAIN_ID"] = str(domain)
     platform.rtcp("start", "--detach")
-    client = Client()
+    client = Client(domain)
     yield platform, client
     client.close()
     platform.end()
