@@ -163,8 +163,9 @@ class Platform:
                 all(slave["state"] == "OP" for slave in status["slaves"])
                 and status["state"] not in ("moving", "stopping")
                 and status["dc"]["locked"]
+                and not status["lease"]["holder"]
             ),
-            "OP, rest and a followed clock",
+            "OP, rest, a followed clock and a free lease",
         )
         if found["state"] in ("fault", "stopped_by_limit"):
             self.call("reset")
