@@ -83,7 +83,7 @@ def test_it_is_moved_from_ros(irb: Platform, wire: str) -> None:
 def test_seven_axes_are_moved_the_external_one_third(platform: Platform) -> None:
     config = default_config().parent
     unit = (config / "irc5.yaml").read_text().replace("arm: abb_irb120 ", f"arm: {config}/abb_irb120.yaml ")
-    unit = unit.replace("[0, 0, 0, 0, 30, 0] ", "[0, 0, 0, 0, 30, 0, 0] ")
+    unit = unit.replace("[0, -30, 20, 0, 30, 0] ", "[0, -30, 20, 0, 30, 0, 0] ")
     external = "    external_joint: {min: -100, max: 100, velocity: 100}\n    robotware"
     (platform.directory / "irc5.yaml").write_text(unit.replace("    robotware", external))
     arm, _, _ = (config / "abb_irb120.yaml").read_text().partition("kinematics:")

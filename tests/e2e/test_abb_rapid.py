@@ -30,6 +30,7 @@ from .conftest import Platform
 
 pytestmark = pytest.mark.platform
 HOME = [0.0, 0.0, 0.0, 0.0, 0.5, 0.0]
+BACK = [0.0, -0.5, 0.3, 0.0, 0.5, 0.0]
 SLOW_RAD_S = 0.2
 BOARD = """
 inputs: {named: [{name: door, number: 3}]}
@@ -139,10 +140,24 @@ def test_it_is_moved_halted_and_disabled_and_its_board_and_motors_are_used_by_na
     platform.until(can_be_commanded, "a controller that can be commanded")
 
 
-def test_two_arms_at_one_controller_follow_the_api_ros_and_simple_message(leftovers: Leftovers) -> None:
-    text = (CONFIG / "cell_irc5.yaml").read_text()
+@pytest.mark.parametrize(
+    ("file", "silence_s"),
+    [
+        pytest.param("cell_irc5.yaml", 0.2, id="rapid"),
+        pytest.param(
+            "cell_egm.yaml",
+            0.1,
+            marks=pytest.mark.long("test_two_arms_at_one_controller_follow_the_api_ros_and_simple_message"),
+            id="egm",
+        ),
+    ],
+)
+def test_two_arms_at_one_controller_follow_the_api_ros_and_simple_message(
+    file: str, silence_s: float, leftovers: Leftovers
+) -> None:
+    text = (CONFIG / file).read_text()
     # Loops that may be late for half a second need room to stop in.
-    for old, new in {"silence_s: 0.2": "silence_s: 0.5", "0.457, 0]": "0.8, 0]"}.items():
+    for old, new in {f"silence_s: {silence_s}": "silence_s: 0.5", "0.457, 0]": "0.8, 0]"}.items():
         assert old in text
         text = text.replace(old, new)
     with leftovers_of(leftovers, "left", "right") as platform:
@@ -155,8 +170,8 @@ def test_two_arms_at_one_controller_follow_the_api_ros_and_simple_message(leftov
 
         with running.connect() as cell:
             cell.enable()
-            cell.move_joints({"left": [0.2, *HOME[1:]], "right": [-0.2, *HOME[1:]]})
-            goal = [0.2, *HOME[1:], -0.2, *HOME[1:]]
+            cell.move_joints({"left": [0.2, *BACK[1:]], "right": [-0.2, *BACK[1:]]})
+            goal = [0.2, *BACK[1:], -0.2, *BACK[1:]]
             until(lambda: joints() == pytest.approx(goal, abs=1e-3), "the targets of the API")
         router = Router()
         node = platform.background("ros", "--zenoh", "--router", router.address, "--cell", "--auto-enable")

@@ -56,7 +56,7 @@ def test_twelve_joints_are_one_group(irbs: RunningCell) -> None:
         # The cell runs from the first test to the last; the arms start where the test before ended.
         there = HOME if begin == pytest.approx(THERE, abs=0.1) else THERE
         records = Records(irbs)
-        points = [point(0.0, begin), point(1.5, there)]
+        points = [point(0.0, begin), point(5.0, there)]
         trajectory = make("trajectory_msgs/msg/JointTrajectory", joint_names=NAMES, points=points)
         answer = call(session, "joint_path_command", "industrial_msgs/srv/CmdJointTrajectory", trajectory=trajectory)
         assert answer.code.val == 1

@@ -41,7 +41,7 @@ pytestmark = pytest.mark.platform
 
 CONFIG = default_config().parent
 EXAMPLE = CONFIG.parent / "examples" / "shape_setting_ros.py"
-AWAY = (0.2, 0.0, 0.7, 0.0, -0.6, 0.0)
+AWAY = (0.2, -0.6, 0.5, 0.0, 0.3, 0.0)
 BEGINS = {
     "approaching": "arms are enabled",
     "bending": "the rod is bent",
