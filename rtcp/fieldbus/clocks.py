@@ -18,13 +18,39 @@ _SYNC_DELAY_NS = 100_000_000
 _SETTLED_NS = 2_000
 _SETTLE_S = 1.5
 _UNTIL_2000_NS = 946_684_800 * 1_000_000_000
+_EARLIEST_NS = 86_400 * 1_000_000_000
+"""Least system time that is set, ns: a host's clock may be before 2000, and a clock of 64 bits needs to show more than
+one of 32 bits can."""
+_RANGE_32, _RANGE_64 = 1 << 32, 1 << 64
 _SYNC_ATTEMPTS = 4
 _SAME_DELAY_NS = 100
 """Largest difference between two measurements of one delay, ns; less than the delay of one slave."""
 _MEASUREMENTS = 20
 
 
-def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig], period_ns: int) -> None:
+class SystemTime:
+    """System time of the segment, ns, with more bits than its clocks may have: those of 32 bits wrap every 4.29 s.
+
+    All clocks are set to it, every SYNC0 lies on its grid, and the loop follows it. After the start it depends on no
+    clock of the host but CLOCK_MONOTONIC.
+    """
+
+    def __init__(self, offset_ns: int | None = None) -> None:
+        self.offset_ns = offset_ns
+        """System time less CLOCK_MONOTONIC, ns; the loop keeps it up to date. None: the first reading sets it."""
+
+    def extended(self, reading_ns: int, read_ns: int) -> int:
+        """Return what a clock showed at `read_ns` (CLOCK_MONOTONIC), extended to the system time, ns.
+
+        A reading below 2^32 counts as the low 32 bits; larger ones are complete.
+        """
+        if self.offset_ns is None or not 0 <= reading_ns < _RANGE_32:
+            return reading_ns
+        near = read_ns + self.offset_ns
+        return near + (reading_ns - near + _RANGE_32 // 2) % _RANGE_32 - _RANGE_32 // 2
+
+
+def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig], period_ns: int) -> SystemTime:
     """Set the clocks and start SYNC0 where the device's file says so (`assign_activate`).
 
     Args:
@@ -32,6 +58,9 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
         port: the port for registers.
         slaves: the slaves of the configuration.
         period_ns: the cycle of SYNC0.
+
+    Returns:
+        The time to which they are set.
 
     Raises:
         BusError: no clock, a clock that cannot be set (`measure_delays`, `_set_clocks`), SYNC0 in the past, or an
@@ -54,9 +83,11 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
                 f"{labels[position]}: its clock only measures delays, and SOEM takes the first slave with a clock as "
                 f"the reference: put it behind {labels[min(clocks)]} on the cable"
             )
-    _set_clocks(port, clocks, measure_delays(master, port, clocks))
+    system_time = SystemTime()
+    _set_clocks(port, clocks, measure_delays(master, port, clocks), system_time)
     for position, device in synchronous.items():
-        start_sync(port, station_of(position), labels[position], device, period_ns)
+        start_sync(port, station_of(position), labels[position], device, period_ns, system_time)
+    return system_time
 
 
 def clocks_of(port: RegisterPort, labels: dict[int, str]) -> dict[int, str]:
@@ -116,7 +147,9 @@ def measure_delays(master: Any, port: RegisterPort, clocks: dict[int, str]) -> d
     return delays
 
 
-def _set_clocks(port: RegisterPort, clocks: dict[int, str], delays: dict[int, int]) -> None:
+def _set_clocks(
+    port: RegisterPort, clocks: dict[int, str], delays: dict[int, int], system_time: SystemTime
+) -> None:
     """Set all clocks to the host's time since 2000: one broadcast latches their local times (ETG.1000.4, 6.8).
 
     SOEM has done so already, in frames that nobody checks. Raises BusError: a slave stopped answering.
@@ -125,11 +158,16 @@ def _set_clocks(port: RegisterPort, clocks: dict[int, str], delays: dict[int, in
         return
     if port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4)) < 1:
         raise BusError("no slave latched its local time while the clocks were set")
-    latched = time.time_ns() - _UNTIL_2000_NS
+    latched = max(time.time_ns() - _UNTIL_2000_NS, _EARLIEST_NS)
+    system_time.offset_ns = latched - time.monotonic_ns()
     for position, label in clocks.items():
         own = _read(port, position, Register.DC_RECEIVE_TIME, 8, label)
-        offset = latched + delays[position] - own & (1 << 64) - 1
-        port.put(station_of(position), Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
+        _write_time(port, station_of(position), Register.DC_OFFSET, latched + delays[position] - own, label)
+
+
+def _write_time(port: RegisterPort, station: int, register: Register, time_ns: int, label: str) -> None:
+    """Write a time; a clock of 32 bits takes its low half. Raises BusError: not even that was taken."""
+    port.put(station, register, (time_ns % _RANGE_64).to_bytes(8, "little"), label)
 
 
 def _read(
@@ -142,7 +180,14 @@ def _read(
 
 
 def take_over_time(
-    port: RegisterPort, station: int, label: str, delay: bytes, others: Sequence[int], *, always: bool
+    port: RegisterPort,
+    station: int,
+    label: str,
+    delay: bytes,
+    others: Sequence[int],
+    system_time: SystemTime,
+    *,
+    always: bool,
 ) -> None:
     """Set the clock of one slave by that of another: one broadcast latches the local times of both (ETG.1000.4, 6.8).
 
@@ -152,6 +197,7 @@ def take_over_time(
         label: the slave in messages.
         delay: its propagation delay from the reference clock, content of register 0x0928.
         others: the other slaves with a clock, the reference first; the first one that answers is used.
+        system_time: extends the other's time; without another clock it is the time that is set.
         always: set the clock even if it already shows the reference's time.
 
     Raises:
@@ -164,22 +210,23 @@ def take_over_time(
     # Otherwise the two registers below would hold times of two different frames.
     if port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4)) < 1:
         raise BusError(f"{label}: the local times could not be latched while its clock was set")
+    latched_ns = time.monotonic_ns()
+    # Without another clock this is the time that is set.
+    time_then = latched_ns + (system_time.offset_ns or 0)
     own = port.read(station, Register.DC_RECEIVE_TIME, 8)
     if own is None:
         raise BusError(f"{label} stopped answering while its clock was set")
-    # Without another clock: the host's time, as SOEM does, ns since 2000.
-    time_then = time.time_ns() - _UNTIL_2000_NS
     for neighbour in others:
         theirs = [port.read(station_of(neighbour), at, 8) for at in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
         their_delay = port.read(station_of(neighbour), Register.DC_DELAY, 4)
         if None not in theirs and their_delay is not None:
-            time_then = sum(int.from_bytes(part or b"", "little") for part in theirs)
+            shown = sum(int.from_bytes(part or b"", "little") for part in theirs) % _RANGE_32
+            time_then = system_time.extended(shown, latched_ns)
             time_then += int.from_bytes(delay, "little", signed=True)
             time_then -= int.from_bytes(their_delay, "little", signed=True)
             break
-    offset = time_then - int.from_bytes(own, "little") & (1 << 64) - 1
     port.put(station, Register.DC_DELAY, delay, label)
-    port.put(station, Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
+    _write_time(port, station, Register.DC_OFFSET, time_then - int.from_bytes(own, "little"), label)
 
 
 def forget_drift(port: RegisterPort, station: int, label: str) -> None:
@@ -225,8 +272,12 @@ def _cycle(factor: int, cycle_us: float, multiple_of_ns: int, part_of_ns: int) -
     return part_of_ns // -factor if factor else round(cycle_us * 1000)
 
 
-def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescription, period_ns: int) -> None:
+def start_sync(
+    port: RegisterPort, station: int, label: str, device: DeviceDescription, period_ns: int, system_time: SystemTime
+) -> None:
     """Start SYNC0 of one slave on the grid of the others: multiples of its cycle, shifted by `sync0_shift_us`.
+
+    The grid is that of the system time: 2^32 ns are no multiple of a cycle, so a clock of 32 bits does not show it.
 
     Raises:
         BusError: its first SYNC0 lies in the past, or the activation reads back differently.
@@ -238,11 +289,12 @@ def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescr
     activation = device.assign_activate.to_bytes(2, "little")
     for _ in range(_SYNC_ATTEMPTS):
         port.put(station, Register.DC_CYCLIC_UNIT, bytes(2), label)
-        now = port.read(station, Register.DC_SYSTEM_TIME, 8)
-        if now is None:
+        shown = port.read(station, Register.DC_SYSTEM_TIME, 4)
+        if shown is None:
             raise BusError(f"{label} stopped answering while its SYNC0 was started")
-        begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // grid * grid + grid + shift
-        port.put(station, Register.DC_START, begin.to_bytes(8, "little"), label)
+        now = system_time.extended(int.from_bytes(shown, "little"), time.monotonic_ns())
+        begin = (now + _SYNC_DELAY_NS) // grid * grid + grid + shift
+        _write_time(port, station, Register.DC_START, begin, label)
         port.put(station, Register.DC_SYNC0_CYCLE, cycles, label)
         if port.read(station, Register.DC_SYNC0_CYCLE, len(cycles)) != cycles:
             kept = f"SYNC0, {sync0 / 1000:g} us, and SYNC1, {after / 1000:g} us after it (registers 0x09A0 and 0x09A4)"

@@ -18,7 +18,7 @@ from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.al_state import AlState, read_al, request_state
 from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
-from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
+from rtcp.fieldbus.clocks import SystemTime, forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted, ValueNotKept
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
@@ -90,6 +90,7 @@ class SlaveRestorer:
         set_ups: Sequence[SlaveSetup],
         sdo: Callable[[int], SdoClient],
         period_ns: int,
+        system_time: SystemTime,
     ) -> None:
         """Prepare for a configured segment.
 
@@ -99,8 +100,10 @@ class SlaveRestorer:
             set_ups: their registers after `configure`.
             sdo: returns SDO access to the slave at a position.
             period_ns: period of the cycle, ns.
+            system_time: time of the segment, kept up to date by the cycle.
         """
         self._port = port
+        self._system_time = system_time
         self._slaves = list(slaves)
         self._set_ups = set_ups
         self._sdo = sdo
@@ -136,7 +139,8 @@ class SlaveRestorer:
             # reference clock by its address, and every other slave follows its time.
             port.put(address, Register.DC_ACTIVATION, b"\0", label)
             others = [clock for clock in self._clocks if clock != position]
-            take_over_time(port, address, label, set_up.delay, others, always=place is not None)
+            always = place is not None
+            take_over_time(port, address, label, set_up.delay, others, self._system_time, always=always)
         if place is not None:
             self._write_address(position, station, partial(port.write, address), partial(port.read, station))
         if set_up.delay is not None:
@@ -155,7 +159,7 @@ class SlaveRestorer:
         if config.device.assign_activate:
             if position != self._clocks[0]:
                 yield from settle_clock(port, station, label)
-            start_sync(port, station, label, config.device, self._period_ns)
+            start_sync(port, station, label, config.device, self._period_ns, self._system_time)
         yield
         yield from self._change_state(position, AlState.SAFEOP)
 

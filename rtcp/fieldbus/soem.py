@@ -20,7 +20,7 @@ from rtcp.esi.sii import read_sii
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, PdoInfo, SlaveInfo, SlaveState, slave_label, station_of
-from rtcp.fieldbus.clocks import clocks_of, measure_delays, start_clocks
+from rtcp.fieldbus.clocks import SystemTime, clocks_of, measure_delays, start_clocks
 from rtcp.fieldbus.describe import describe_device, pdos_of_eeprom
 from rtcp.fieldbus.eeprom import (
     BOOTSTRAP_WORD,
@@ -89,6 +89,7 @@ class SoemBus:
         """
         self.interface = interface
         self.notes: list[str] = []
+        self.system_time = SystemTime()
         self._fraction = receive_fraction
         self._pid = namespace_pid
         self._state_timeout_s = state_timeout_s
@@ -205,7 +206,7 @@ class SoemBus:
                 failures[position - 1] += 1
         places = read_places(self.port, slaves)
         self._trigger_watchdogs(slaves)
-        start_clocks(self._master, self.port, slaves, period_ns)
+        self.system_time = start_clocks(self._master, self.port, slaves, period_ns)
         data = self._process_data(places, period_ns)
         # Valid outputs, all zero, are in the slaves' buffers before any of them may use them.
         data.send()
@@ -218,7 +219,8 @@ class SoemBus:
             for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
         ]
         self._topology = self._read_topology()
-        self._restorer = SlaveRestorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
+        sdo = self._mailboxes.sdo
+        self._restorer = SlaveRestorer(self.port, slaves, set_ups, sdo, period_ns, self.system_time)
         # From here on a cycle runs, and the watcher needs to learn of losses soon.
         self.port.tries = TRIES
         return data

@@ -12,6 +12,7 @@ from itertools import groupby
 from typing import Protocol
 
 from rtcp.fieldbus.al_state import AlState, parse_al
+from rtcp.fieldbus.clocks import SystemTime
 from rtcp.fieldbus.bus import Bus
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.port_errors import REPORT_INTERVAL_S, ErrorCounters
@@ -241,6 +242,9 @@ class SlaveWatcher:
 
 class SupervisedBus(Bus, Protocol):
     """A bus on a wire: slaves are lost and recovered while the cycle runs."""
+
+    system_time: SystemTime
+    """Time of the segment since `configure`."""
 
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps."""

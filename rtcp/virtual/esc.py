@@ -22,6 +22,7 @@ from rtcp.virtual.protocol import (
     SM_COUNT,
     SM_SIZE,
     WRITABLE,
+    ONLY_IN_64_BITS,
     WRITABLE_DC,
     AlState,
     EcatEvent,
@@ -267,10 +268,12 @@ class Esc:
         self.dc: DistributedClockUnit | None = None
         if clock is not None:
             self.dc = DistributedClockUnit(self.memory, clock)
-            features |= FEATURE_DC | FEATURE_DC_64 | FEATURE_DC_SYNC_ENHANCED
+            features |= FEATURE_DC | FEATURE_DC_SYNC_ENHANCED | (FEATURE_DC_64 if clock.bits == 64 else 0)
             spaces += WRITABLE_DC
         for first, last in spaces:
             self.writable[first : last + 1] = b"\x01" * (last + 1 - first)
+        for time in ONLY_IN_64_BITS if clock is not None and clock.bits == 32 else ():
+            self.writable[time : time + 4] = bytes(4)
         for register, content in DEFAULTS:
             self.memory[register : register + len(content)] = content
         self.memory[Register.RAM] = ram_size // 1024

@@ -29,7 +29,6 @@ _BROADCAST = frozenset((DatagramCommand.BRD, DatagramCommand.BWR, DatagramComman
 _FIRST_LOGICAL, _LAST_LOGICAL = int(DatagramCommand.LRD), int(DatagramCommand.LRW)
 _MULTIPLE_WRITE = frozenset((DatagramCommand.ARMW, DatagramCommand.FRMW))
 _TIME_LENGTHS = (4, 8)
-_TIME_64 = (1 << 64) - 1
 _READS = frozenset(
     (
         DatagramCommand.APRD,
@@ -263,7 +262,8 @@ class Wire:
                 continue
             here = t + reader.delay
             if steering and reader.clock is not None:
-                frame[data:end] = (reader.clock.system(here) & _TIME_64).to_bytes(8, "little")[:length]
+                time = reader.clock.shown(reader.clock.system(here))
+                frame[data:end] = time.to_bytes(8, "little")[:length]
                 count += 1
             elif (read := reader.esc.read(offset, length, here)) is not None:
                 frame[data:end] = read

@@ -10,7 +10,15 @@ import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import clocks
-from rtcp.fieldbus.clocks import clocks_of, measure_delays, settle_clock, start_clocks, start_sync, take_over_time
+from rtcp.fieldbus.clocks import (
+    SystemTime,
+    clocks_of,
+    measure_delays,
+    settle_clock,
+    start_clocks,
+    start_sync,
+    take_over_time,
+)
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Answer, DatagramCommand, finish
 from rtcp.virtual.segment import make_segment
@@ -52,7 +60,7 @@ def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Dire
     port.lost = {(DatagramCommand.BWR, 0x0900)}
     before = port.read(STATION, 0x0920, 8)
     with pytest.raises(BusError, match=r"slave 3 \(drive2\): the local times could not be latched"):
-        take_over_time(port, STATION, LABEL, bytes(4), (1, 2), always=True)
+        take_over_time(port, STATION, LABEL, bytes(4), (1, 2), SystemTime(), always=True)
     assert port.read(STATION, 0x0920, 8) == before
 
 
@@ -148,7 +156,7 @@ def test_clocks_that_cannot_be_set_end_the_start(port: Direct, lost: str) -> Non
 def test_sync0_is_not_started_with_half_of_its_settings(port: Direct, register: int) -> None:
     port.lost = {(DatagramCommand.FPWR, register)}
     with pytest.raises(BusError, match=rf"slave 3 \(drive2\) did not take .* 0x{register:04X}"):
-        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
+        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD, SystemTime())
     assert port.read(STATION, 0x0981, 1) == b"\0"
 
 
@@ -157,7 +165,7 @@ def test_a_cycle_of_sync0_that_is_not_kept_is_told(port: Direct, monkeypatch: py
     put = port.put
     monkeypatch.setattr(port, "put", lambda station, address, *rest: address == 0x09A0 or put(station, address, *rest))
     with pytest.raises(BusError, match=r"does not keep the cycle of SYNC0, 1000 us, .* \(registers 0x09A0 and"):
-        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
+        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD, SystemTime())
     assert port.read(STATION, 0x0981, 1) == b"\0"
 
 
@@ -170,7 +178,7 @@ def test_an_activation_that_is_not_kept_is_told(port: Direct, monkeypatch: pytes
     monkeypatch.setattr(port, "put", keeps_sync1_off)
     device = with_device(arm(3)[2], assign_activate=0x0730).device
     with pytest.raises(BusError, match="`assign_activate` 0x0730 reads back from register 0x0980 as 0x0330"):
-        start_sync(port, STATION, LABEL, device, PERIOD)
+        start_sync(port, STATION, LABEL, device, PERIOD, SystemTime())
 
 
 def test_sync0_that_would_have_begun_in_the_past_is_started_again(
@@ -178,7 +186,7 @@ def test_sync0_that_would_have_begun_in_the_past_is_started_again(
 ) -> None:
     monkeypatch.setattr(clocks, "_SYNC_DELAY_NS", -5_000_000)
     with pytest.raises(BusError, match="its first SYNC0 lies in the past"):
-        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
+        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD, SystemTime())
     delays = iter((-5_000_000, 100_000_000))
     put = port.put
 
@@ -188,7 +196,7 @@ def test_sync0_that_would_have_begun_in_the_past_is_started_again(
         put(station, address, data, label)
 
     monkeypatch.setattr(port, "put", stalls_once)
-    start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
+    start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD, SystemTime())
     assert port.read(STATION, 0x0981, 1) == b"\x03"
 
 
@@ -208,7 +216,7 @@ def test_sync0_and_sync1_follow_the_factors_of_the_dc_mode_and_the_word_is_writt
     port: Direct, keys: dict[str, float], sync0: int, after: int
 ) -> None:
     device = with_device(arm(3)[2], assign_activate=0x0730, **keys).device
-    start_sync(port, STATION, LABEL, device, PERIOD)
+    start_sync(port, STATION, LABEL, device, PERIOD, SystemTime())
     assert port.read(STATION, 0x0980, 2) == b"\x30\x07"
     assert port.read(STATION, 0x09A0, 8) == struct.pack("<II", sync0, after)
     start = int.from_bytes(port.read(STATION, 0x0990, 8) or b"", "little")
