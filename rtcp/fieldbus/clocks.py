@@ -11,6 +11,7 @@ from rtcp.config.model import DeviceDescription, SlaveConfig
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
+from rtcp.fieldbus.topology import PortState, Topology, port_states
 
 _DC_SPEED_DEFAULT = b"\x00\x10"
 _SYNC_DELAY_NS = 100_000_000
@@ -23,9 +24,8 @@ _EARLIEST_NS = 86_400 * 1_000_000_000
 one of 32 bits can."""
 _RANGE_32, _RANGE_64 = 1 << 32, 1 << 64
 _SYNC_ATTEMPTS = 4
-_SAME_DELAY_NS = 100
-"""Largest difference between two measurements of one delay, ns; less than the delay of one slave."""
-_MEASUREMENTS = 20
+_LONGEST_DELAY_NS = 1_000_000
+"""Upper bound on a propagation delay, ns: of 200 slaves with 100 m of cable before each it is a third."""
 
 
 class SystemTime:
@@ -84,7 +84,9 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
                 f"the reference: put it behind {labels[min(clocks)]} on the cable"
             )
     system_time = SystemTime()
-    _set_clocks(port, clocks, measure_delays(master, port, clocks), system_time)
+    # SOEM's frames of process data carry the reference clock's time only after this; it sets clocks, unchecked.
+    master.config_dc()
+    _set_clocks(port, clocks, measure_delays(port, labels, clocks), system_time)
     for position, device in synchronous.items():
         start_sync(port, station_of(position), labels[position], device, period_ns, system_time)
     return system_time
@@ -105,51 +107,75 @@ def _measures(port: RegisterPort, position: int) -> bool:
     return features is not None and bool(features[0] & FEATURE_DC)
 
 
-def measure_delays(master: Any, port: RegisterPort, clocks: dict[int, str]) -> dict[int, int]:
+def measure_delays(port: RegisterPort, labels: dict[int, str], clocks: dict[int, str]) -> dict[int, int]:
     """Measure the propagation delays from the reference clock and write them; return them by position, ns.
 
-    SOEM measures, and does not notice a frame that was lost: the slave then gets times of the one before it, and a
-    delay of up to seconds. So a delay counts once it was found twice.
+    One broadcast latches in each slave when its frame passed each port (ETG.1000.4, 6.8). Every frame is checked:
+    SOEM's own measurement takes a time of another slave where a frame got lost (`benchmarks/delays.py`).
 
     Args:
-        master: pysoem's master, its slaves in PRE-OP.
         port: the port for registers.
+        labels: all slaves, by position.
         clocks: what `clocks_of` returned.
 
     Raises:
-        BusError: a slave stopped answering, or its delay was another one each time.
+        BusError: a slave stopped answering, or times that no cable gives.
     """
-    measured: dict[int, list[int]] = {position: [] for position in clocks}
-    delays: dict[int, int] = {}
-    for _ in range(_MEASUREMENTS):
-        # SOEM leaves alone the first clock, and those behind no other; that register may be from another place.
-        for position, label in clocks.items():
-            port.put(station_of(position), Register.DC_DELAY, bytes(4), label)
-        # Even without a clock: SOEM then knows that there is none.
-        master.config_dc()
-        for position in clocks.keys() - delays.keys():
-            # SOEM's may be negative, behind a junction without a clock.
-            delay = _read(port, position, Register.DC_DELAY, 4, clocks[position], signed=True)
-            if any(abs(delay - before) <= _SAME_DELAY_NS for before in measured[position]):
-                delays[position] = delay
-            measured[position].append(delay)
-        if len(delays) == len(clocks):
-            break
-    else:
-        position = min(clocks.keys() - delays.keys())
-        text = ", ".join(map(str, measured[position]))
-        raise BusError(
-            f"{clocks[position]}: {_MEASUREMENTS} measurements of its propagation delay (register 0x0928) do not "
-            f"agree: two have to be within {_SAME_DELAY_NS} ns of each other; found, in ns: {text}"
-        )
+    if not clocks:
+        return {}
+    status = [_read(port, position, Register.DL_STATUS, 2, label) for position, label in labels.items()]
+    ports = [port_states(register) for register in status]
+    measuring = [position for position in labels if _measures(port, position)]
+    if (latched := port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4))) < len(measuring):
+        raise BusError(f"{latched} of {len(measuring)} slaves latched the times that give the propagation delays")
+    passages = {position: _passages(port, position, labels[position], ports[position - 1]) for position in measuring}
+    tree = Topology.of(ports)
+    branches: dict[tuple[int, int], list[int]] = {}
+    for position in measuring:
+        parent, child = tree.parent(position), position
+        while parent and parent not in passages:
+            parent, child = tree.parent(parent), parent
+        number = sum(tree.parent(other) == parent for other in range(1, child + 1))
+        branches.setdefault((parent, number), []).append(position)
+    arrivals: dict[int, int] = {}
+    for (parent, number), members in branches.items():
+        if not parent:
+            # Nothing measures the way to them.
+            arrivals.update(dict.fromkeys(members, 0))
+            continue
+        if number >= len(passages[parent]):
+            raise BusError(
+                f"{labels[parent]}: {len(passages[parent]) - 1} of its ports lead to slaves, but {number} branches "
+                "were found (register 0x0110)"
+            )
+        out, back = passages[parent][number - 1 : number + 1]
+        # The cables between them take the rest; a frame takes as long there as back.
+        cables = back - out - sum(passages[member][-1] for member in members)
+        for count, member in enumerate(members, 1):
+            arrivals[member] = arrivals[parent] + out + count * cables // (len(members) + 1)
+            out += passages[member][-1]
+    reference = arrivals[min(clocks)]
+    delays = {position: arrivals[position] - reference for position in clocks}
     for position, delay in delays.items():
+        if abs(delay) > _LONGEST_DELAY_NS:
+            raise BusError(
+                f"{clocks[position]}: its propagation delay (register 0x0928) would be {delay} ns by the times at the "
+                f"ports (register 0x0900), allowed are {_LONGEST_DELAY_NS} ns"
+            )
         port.put(station_of(position), Register.DC_DELAY, delay.to_bytes(4, "little", signed=True), clocks[position])
     return delays
 
 
-def _set_clocks(
-    port: RegisterPort, clocks: dict[int, str], delays: dict[int, int], system_time: SystemTime
-) -> None:
+def _passages(port: RegisterPort, position: int, label: str, ports: Sequence[PortState]) -> list[int]:
+    """Return after which times the latching frame was at each open port, in its order: 0 at its arrival, ns."""
+    content = _read(port, position, Register.DC_PORT_RECEIVE_TIMES, 16, label)
+    times = [content >> 32 * number & _RANGE_32 - 1 for number, state in enumerate(ports) if state is PortState.OPEN]
+    # The times wrap, and a cable may be plugged into any port: from the arrival on the last one is nearest.
+    around = [sorted((time - first) % _RANGE_32 for time in times) for first in times]
+    return min(around, key=lambda passages: passages[-1], default=[0])
+
+
+def _set_clocks(port: RegisterPort, clocks: dict[int, str], delays: dict[int, int], system_time: SystemTime) -> None:
     """Set all clocks to the host's time since 2000: one broadcast latches their local times (ETG.1000.4, 6.8).
 
     SOEM has done so already, in frames that nobody checks. Raises BusError: a slave stopped answering.

@@ -156,9 +156,9 @@ class SoemBus:
         """
         self._discover()
         self._to_preop()
-        clocks = clocks_of(self.port, {i: slave_label(i, name) for i, name in enumerate(self._names, 1)})
+        labels = {i: slave_label(i, name) for i, name in enumerate(self._names, 1)}
         try:
-            delays: dict[int, int] = measure_delays(self._master, self.port, clocks)
+            delays: dict[int, int] = measure_delays(self.port, labels, clocks_of(self.port, labels))
         except BusError:
             # A scan is for a bus that is not in order, too.
             delays = {}

@@ -366,7 +366,17 @@ FIRST_LOCAL_TIME = 1_000_000_000
 class Slave:
     """A controller with its firmware, at `delay` ns from the master's port."""
 
-    __slots__ = ("_clock_bits", "_drift_ppm", "application", "clock", "delay", "device", "esc", "faults", "queued_until")
+    __slots__ = (
+        "_clock_bits",
+        "_drift_ppm",
+        "application",
+        "clock",
+        "delay",
+        "device",
+        "esc",
+        "faults",
+        "queued_until",
+    )
 
     def __init__(self, device: DeviceModel, eeprom: bytes, drift_ppm: float, start: int, delay: int, t: int,
                  clock_bits: int = 64) -> None:  # fmt: skip

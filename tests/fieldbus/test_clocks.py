@@ -21,10 +21,12 @@ from rtcp.fieldbus.clocks import (
 )
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Answer, DatagramCommand, finish
-from rtcp.virtual.segment import make_segment
+from rtcp.virtual.segment import Connection, make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm, with_device
+from tests.virtual.line import Line, TinyDevice
 
+MS = 1_000_000
 LABEL, STATION = "slave 3 (drive2)", 0x1003
 PERIOD = 1_000_000
 LABELS = {1: "slave 1 (io)", 2: "slave 2 (drive1)", 3: LABEL}
@@ -64,39 +66,66 @@ def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Dire
     assert port.read(STATION, 0x0920, 8) == before
 
 
-class Measuring:
-    """In place of SOEM, whose socket this port has not: writes the delays of drives 1 and 2, one tuple a call."""
-
-    def __init__(self, port: Direct, *delays: tuple[int | None, int | None]) -> None:
-        self._port = port
-        self._delays = iter(delays)
+class Soem:
+    """In place of SOEM, whose socket this port has not."""
 
     def config_dc(self) -> bool:
-        for station, delay in zip((0x1002, 0x1003), next(self._delays), strict=True):
-            if delay is not None:
-                self._port.put(station, 0x0928, delay.to_bytes(4, "little", signed=True), "SOEM")
         return True
 
 
-def delays_of(port: Direct) -> list[int]:
-    return [int.from_bytes(port.read(0x1000 + position, 0x0928, 4) or b"", "little") for position in (1, 2, 3)]
-
-
-def test_a_delay_counts_once_it_was_found_twice(port: Direct) -> None:
+def test_delays_are_those_of_the_cable_whatever_the_registers_held(port: Direct) -> None:
     # Of another place on the cable, and another master.
     port.put(0x1001, 0x0928, (5000).to_bytes(4, "little"), LABEL)
-    master = Measuring(port, (820, 834_300_572), (None, 1650), (830, 1_668_595_264), (820, 1660), (820, 7))
+    assert measure_delays(port, LABELS, clocks_of(port, LABELS)) == {1: 0, 2: 820, 3: 1660}
+    written = [int.from_bytes(port.read(0x1000 + position, 0x0928, 4) or b"", "little") for position in (1, 2, 3)]
+    assert written == [0, 820, 1660]
+
+
+def test_times_that_wrap_between_two_ports_give_the_same_delays(port: Direct) -> None:
+    for slave in port.segment.slaves:
+        slave.clock.jump(-slave.clock.local(port.now) - 500 - 10 * MS)
+    for _ in range(30):
+        assert measure_delays(port, LABELS, clocks_of(port, LABELS)) == {1: 0, 2: 820, 3: 1660}
+
+
+@pytest.mark.parametrize("lost", [(DatagramCommand.BWR, 0x0900), (DatagramCommand.FPRD, 0x0900),
+                                  (DatagramCommand.FPRD, 0x0110), (DatagramCommand.FPWR, 0x0928)])  # fmt: skip
+def test_a_frame_that_is_missing_ends_the_measurement_of_delays(
+    port: Direct, lost: tuple[DatagramCommand, int]
+) -> None:
     clocks = clocks_of(port, LABELS)
-    assert measure_delays(master, port, clocks) == {1: 0, 2: 830, 3: 1660}
-    assert delays_of(port) == [0, 830, 1660]
+    port.lost = {lost}
+    with pytest.raises(BusError):
+        measure_delays(port, LABELS, clocks)
 
 
-def test_delays_that_never_agree_are_refused_with_what_was_found(port: Direct) -> None:
-    master = Measuring(port, *((820, 1000 * (n + 1)) for n in range(20)))
-    with pytest.raises(
-        BusError, match=r"slave 3 .*: 20 measurements .* 0x0928\) do not agree.* ns: 1000, 2000, 3000, "
-    ):
-        measure_delays(master, port, clocks_of(port, LABELS))
+def test_times_that_no_cable_gives_are_refused(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = port.read
+
+    def latched_by_another(station: int, address: int, length: int) -> bytes | None:
+        times = read(station, address, length)
+        # Port 1 kept the time of a frame before.
+        return b"\0\0\0\0" + bytes.fromhex("0000 0001") + bytes(8) if (station, address) == (0x1001, 0x0900) else times
+
+    monkeypatch.setattr(port, "read", latched_by_another)
+    with pytest.raises(BusError, match=r"slave 2 \(drive1\): its propagation delay .* would be \d+ ns .* 1000000 ns"):
+        measure_delays(port, LABELS, clocks_of(port, LABELS))
+
+
+def test_clocks_behind_a_junction_without_a_clock_share_the_length_of_its_cables() -> None:
+    devices = [TinyDevice(), TinyDevice(supports_dc=False), TinyDevice(), TinyDevice(), TinyDevice()]
+    devices[1].physics = "YYYY"
+    connections = [Connection(None), Connection(0), Connection(1, 3), Connection(2), Connection(1, 1)]
+    line = Line(devices, delays=[0, 840, 1680, 2520, 5040], connections=connections)
+    line.address()
+    port, labels = Direct(line.segment), {position: f"slave {position}" for position in range(1, 6)}
+    delays = measure_delays(port, labels, clocks_of(port, labels))
+    assert delays == {
+        1: 0,
+        3: pytest.approx(1680, abs=600),
+        4: pytest.approx(2520, abs=600),
+        5: pytest.approx(5040, abs=600),
+    }
 
 
 def test_a_slave_that_only_measures_delays_gets_no_clock(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,14 +138,14 @@ def test_a_slave_that_only_measures_delays_gets_no_clock(port: Direct, monkeypat
 
     monkeypatch.setattr(port, "exchange", without_offset)
     clocks = clocks_of(port, LABELS)
-    assert measure_delays(Measuring(port, (None, 1660), (None, 1660)), port, clocks) == {1: 0, 3: 1660}
+    assert measure_delays(port, LABELS, clocks) == {1: 0, 3: 1660}
     config = arm(3)
     with pytest.raises(
         BusError, match=r"slave 2 \(drive1\): `assign_activate` is 0x0300 but it has no distributed clock"
     ):
-        start_clocks(Measuring(port), port, config, PERIOD)
+        start_clocks(Soem(), port, config, PERIOD)
     without_sync = [config[0], with_device(config[1], assign_activate=0), config[2]]
-    start_clocks(Measuring(port, (None, 1660), (None, 1660)), port, without_sync, PERIOD)
+    start_clocks(Soem(), port, without_sync, PERIOD)
     assert port.read(0x1003, 0x0981, 1) == b"\x03"
 
 
@@ -128,17 +157,16 @@ def test_a_first_slave_that_only_measures_delays_is_no_reference(port: Direct, m
     with pytest.raises(
         BusError, match=r"^slave 1 \(io\): its clock only measures .* put it behind slave 2 \(drive1\) on"
     ):
-        start_clocks(Measuring(port), port, arm(3), PERIOD)
+        start_clocks(Soem(), port, arm(3), PERIOD)
 
 
-@pytest.mark.parametrize("delays", [(820, 1660), (2520, -2520)])
-def test_clocks_are_set_together(port: Direct, delays: tuple[int, int]) -> None:
-    start_clocks(Measuring(port, delays, delays), port, arm(3), PERIOD)
+def test_clocks_are_set_together(port: Direct) -> None:
+    start_clocks(Soem(), port, arm(3), PERIOD)
     port.write_all(0x0900, bytes(4))
     times = [sum(int.from_bytes(port.read(station, at, 8) or b"", "little") for at in (0x0918, 0x0920))
              for station in (0x1001, 0x1002, 0x1003)]  # fmt: skip
     apart = [(time - times[0] + (1 << 63)) % (1 << 64) - (1 << 63) for time in times]
-    assert apart == pytest.approx([0, *delays], abs=200)
+    assert apart == pytest.approx([0, 820, 1660], abs=200)
 
 
 @pytest.mark.parametrize("lost", ["latch", "receive time", "offset"])
@@ -149,7 +177,7 @@ def test_clocks_that_cannot_be_set_end_the_start(port: Direct, lost: str) -> Non
         "offset": (DatagramCommand.FPWR, 0x0920),
     }[lost]}  # fmt: skip
     with pytest.raises(BusError):
-        start_clocks(Measuring(port, (820, 1660), (820, 1660)), port, arm(3), PERIOD)
+        start_clocks(Soem(), port, arm(3), PERIOD)
 
 
 @pytest.mark.parametrize("register", [0x0980, 0x0990, 0x09A0])
