@@ -1,4 +1,4 @@
-"""How often propagation delays are measured wrongly while frames get lost: `python benchmarks/delays.py [--starts 1000]`.
+"""How often propagation delays are wrong when frames get lost: `python benchmarks/delays.py [--starts 1000]`.
 
 The slaves of the shipped arm run in a process of their own. They are found once, because that takes most of a start;
 from then on a share of all frames gets lost, and the delays are measured as each start measures them. A delay is wrong

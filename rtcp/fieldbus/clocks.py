@@ -50,7 +50,9 @@ class SystemTime:
         return near + (reading_ns - near + _RANGE_32 // 2) % _RANGE_32 - _RANGE_32 // 2
 
 
-def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig], period_ns: int) -> SystemTime:
+def start_clocks(
+    master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig], period_ns: int
+) -> tuple[SystemTime, int | None]:
     """Set the clocks and start SYNC0 where the device's file says so (`assign_activate`).
 
     Args:
@@ -60,7 +62,8 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
         period_ns: the cycle of SYNC0.
 
     Returns:
-        The time to which they are set.
+        The time to which they are set. The position of the reference clock, the first clock that can be set, if SOEM's
+        frames do not carry its time: SOEM takes the first slave that measures delays.
 
     Raises:
         BusError: no clock, a clock that cannot be set (`measure_delays`, `_set_clocks`), SYNC0 in the past, or an
@@ -77,19 +80,16 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
                 f"{labels[position]}: `assign_activate` is 0x{device.assign_activate:04X} but it has no distributed "
                 "clock that can be set (registers 0x0008 and 0x0928)"
             )
-    for position in range(1, min(clocks)) if synchronous else ():
-        if _measures(port, position):
-            raise BusError(
-                f"{labels[position]}: its clock only measures delays, and SOEM takes the first slave with a clock as "
-                f"the reference: put it behind {labels[min(clocks)]} on the cable"
-            )
     system_time = SystemTime()
-    # SOEM's frames of process data carry the reference clock's time only after this; it sets clocks, unchecked.
-    master.config_dc()
+    reference = min(clocks, default=0)
+    is_first = not any(_measures(port, position) for position in range(1, reference))
+    if is_first:
+        # SOEM's frames of process data carry the time of a clock only after this. It also sets clocks, unchecked.
+        master.config_dc()
     _set_clocks(port, clocks, measure_delays(port, labels, clocks), system_time)
     for position, device in synchronous.items():
         start_sync(port, station_of(position), labels[position], device, period_ns, system_time)
-    return system_time
+    return system_time, None if is_first else reference
 
 
 def clocks_of(port: RegisterPort, labels: dict[int, str]) -> dict[int, str]:

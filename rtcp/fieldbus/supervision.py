@@ -12,8 +12,8 @@ from itertools import groupby
 from typing import Protocol
 
 from rtcp.fieldbus.al_state import AlState, parse_al
-from rtcp.fieldbus.clocks import SystemTime
 from rtcp.fieldbus.bus import Bus
+from rtcp.fieldbus.clocks import SystemTime
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.port_errors import REPORT_INTERVAL_S, ErrorCounters
 from rtcp.fieldbus.recovery import LONG_AGO, MonitoredSlave, SlaveRecovery

@@ -32,7 +32,7 @@ class Clock:
     def __init__(self, drift_ppm: float, start: int, t: int, bits: int = 64) -> None:
         """The clock shows `start` ns at instant `t` and runs fast by `drift_ppm` ppm; its registers have `bits` bits.
 
-        Times in here do not wrap; the registers show their low 32 or 64 bits (`shown`).
+        Times in here do not wrap; the registers show their low 32 or 64 bits (`shown`). 0: it only measures delays.
         """
         self.bits = bits
         self._natural = drift_ppm * 1e-6

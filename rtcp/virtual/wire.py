@@ -261,7 +261,7 @@ class Wire:
             if reader is None:
                 continue
             here = t + reader.delay
-            if steering and reader.clock is not None:
+            if steering and reader.clock is not None and reader.clock.bits:
                 time = reader.clock.shown(reader.clock.system(here))
                 frame[data:end] = time.to_bytes(8, "little")[:length]
                 count += 1
@@ -285,7 +285,7 @@ class Wire:
             if slave in readers:
                 groups.append((writers, slave))
                 writers = []
-            elif slave.clock is not None or not steering:
+            elif not steering or (slave.clock is not None and slave.clock.bits):
                 writers.append(slave)
         groups.append((writers, None))
         if len(self._orders) >= MOST_KNOWN:

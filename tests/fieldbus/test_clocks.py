@@ -69,7 +69,11 @@ def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Dire
 class Soem:
     """In place of SOEM, whose socket this port has not."""
 
+    def __init__(self) -> None:
+        self.asked = False
+
     def config_dc(self) -> bool:
+        self.asked = True
         return True
 
 
@@ -149,15 +153,21 @@ def test_a_slave_that_only_measures_delays_gets_no_clock(port: Direct, monkeypat
     assert port.read(0x1003, 0x0981, 1) == b"\x03"
 
 
-def test_a_first_slave_that_only_measures_delays_is_no_reference(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = port.read
-    monkeypatch.setattr(
-        port, "read", lambda station, at, n: None if (station, at) == (0x1001, 0x0928) else read(station, at, n)
-    )
-    with pytest.raises(
-        BusError, match=r"^slave 1 \(io\): its clock only measures .* put it behind slave 2 \(drive1\) on"
-    ):
-        start_clocks(Soem(), port, arm(3), PERIOD)
+def test_the_reference_is_the_first_clock_that_can_be_set_although_soem_takes_another(port: Direct) -> None:
+    soem = Soem()
+    assert start_clocks(soem, port, arm(3), PERIOD)[1] is None
+    assert soem.asked
+    models = ("diewu-io", "cubemars-orh70", "cubemars-orh70")
+    slaves = tuple(SegmentSlave(model=model, clock_bits=bits) for model, bits in zip(models, (0, 32, 64), strict=True))
+    port.segment = make_segment(SegmentConfig(slaves, Path()), port.now)
+    for position, slave in enumerate(port.segment.slaves, 1):
+        slave.esc.write(0x0010, (0x1000 + position).to_bytes(2, "little"), port.now)
+    soem = Soem()
+    config = arm(3)
+    without_sync = [with_device(config[0], assign_activate=0), *config[1:]]
+    assert start_clocks(soem, port, without_sync, PERIOD)[1] == 2
+    assert not soem.asked
+    assert [int.from_bytes(port.read(station, 0x0928, 4) or b"", "little") for station in (0x1002, 0x1003)] == [0, 840]
 
 
 def test_clocks_are_set_together(port: Direct) -> None:

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
+from rtcp.fieldbus.clocks import SystemTime
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Answer, DatagramCommand, finish
-from rtcp.fieldbus.clocks import SystemTime
 from rtcp.fieldbus.slave_setup import SlaveRestorer, SlaveSetup, trigger_watchdog
 from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct

@@ -68,7 +68,7 @@ class Host:
         self.slaves = [arm(2)[1]] * count
 
     def start(self, period_ns: int) -> SystemTime:
-        return start_clocks(Soem(), self.port, self.slaves, period_ns)
+        return start_clocks(Soem(), self.port, self.slaves, period_ns)[0]
 
     def sync0_beside_the_grid(self, period_ns: int, offset_ns: int) -> list[int]:
         """For each slave the time from an instant of the grid to its next SYNC0, ns."""
