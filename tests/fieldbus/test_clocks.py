@@ -162,8 +162,11 @@ def test_the_reference_is_the_first_clock_that_can_be_set_although_soem_takes_an
     soem = Soem()
     assert start_clocks(soem, port, arm(3), PERIOD)[1] is None
     assert soem.asked
-    models = ("diewu-io", "cubemars-orh70", "cubemars-orh70")
-    slaves = tuple(SegmentSlave(model=model, clock_bits=bits) for model, bits in zip(models, (0, 32, 64), strict=True))
+    slaves = (
+        SegmentSlave(model="diewu-io", clock_bits=0),
+        SegmentSlave(model="cubemars-orh70", clock_bits=32),
+        SegmentSlave(model="cubemars-orh70"),
+    )
     port.segment = make_segment(SegmentConfig(slaves, Path()), port.now)
     for position, slave in enumerate(port.segment.slaves, 1):
         slave.esc.write(0x0010, (0x1000 + position).to_bytes(2, "little"), port.now)

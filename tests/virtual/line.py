@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.faults.fault import Fault, Frames
@@ -176,7 +177,7 @@ class Line:
         assert [self.al(number) for number in range(len(self.devices))] == [(OP, 0)] * len(self.devices)
 
 
-def in_op(count: int = 4, **line: Sequence[int]) -> Line:
+def in_op(count: int = 4, **line: Any) -> Line:
     """Tiny devices in OP."""
     made = Line([TinyDevice() for _ in range(count)], **line)
     made.to_op()
