@@ -125,7 +125,7 @@ def measure_delays(port: RegisterPort, labels: dict[int, str], clocks: dict[int,
         return {}
     status = [_read(port, position, Register.DL_STATUS, 2, label) for position, label in labels.items()]
     ports = [port_states(register) for register in status]
-    measuring = [position for position in labels if _measures(port, position)]
+    measuring = [position for position in labels if position in clocks or _measures(port, position)]
     if (latched := port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4))) < len(measuring):
         raise BusError(f"{latched} of {len(measuring)} slaves latched the times that give the propagation delays")
     passages = {position: _passages(port, position, labels[position], ports[position - 1]) for position in measuring}
