@@ -25,8 +25,8 @@ from rtcp.control.partners import Partners
 from rtcp.control.processes import make_processes
 from rtcp.devices.drive import Drive, drive_of
 from rtcp.fieldbus.bus import ProcessData
-from rtcp.fieldbus.clocks import SystemTime
 from rtcp.fieldbus.master import PacedData
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import ClockLocked, ClockUnlocked
 from rtcp.ipc.schema import (

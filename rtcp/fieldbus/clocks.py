@@ -11,6 +11,7 @@ from rtcp.config.model import DeviceDescription, SlaveConfig
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
+from rtcp.fieldbus.system_time import RANGE_32, SystemTime
 from rtcp.fieldbus.topology import PortState, Topology, port_states
 
 _DC_SPEED_DEFAULT = b"\x00\x10"
@@ -22,32 +23,10 @@ _UNTIL_2000_NS = 946_684_800 * 1_000_000_000
 _EARLIEST_NS = 86_400 * 1_000_000_000
 """Least system time that is set, ns: a host's clock may be before 2000, and a clock of 64 bits needs to show more than
 one of 32 bits can."""
-_RANGE_32, _RANGE_64 = 1 << 32, 1 << 64
+_RANGE_64 = 1 << 64
 _SYNC_ATTEMPTS = 4
 _LONGEST_DELAY_NS = 1_000_000
 """Upper bound on a propagation delay, ns: of 200 slaves with 100 m of cable before each it is a third."""
-
-
-class SystemTime:
-    """System time of the segment, ns, with more bits than its clocks may have: those of 32 bits wrap every 4.29 s.
-
-    All clocks are set to it, every SYNC0 lies on its grid, and the loop follows it. After the start it depends on no
-    clock of the host but CLOCK_MONOTONIC.
-    """
-
-    def __init__(self, offset_ns: int | None = None) -> None:
-        self.offset_ns = offset_ns
-        """System time less CLOCK_MONOTONIC, ns; the loop keeps it up to date. None: the first reading sets it."""
-
-    def extended(self, reading_ns: int, read_ns: int) -> int:
-        """Return what a clock showed at `read_ns` (CLOCK_MONOTONIC), extended to the system time, ns.
-
-        A reading below 2^32 counts as the low 32 bits; larger ones are complete.
-        """
-        if self.offset_ns is None or not 0 <= reading_ns < _RANGE_32:
-            return reading_ns
-        near = read_ns + self.offset_ns
-        return near + (reading_ns - near + _RANGE_32 // 2) % _RANGE_32 - _RANGE_32 // 2
 
 
 def start_clocks(
@@ -169,9 +148,9 @@ def measure_delays(port: RegisterPort, labels: dict[int, str], clocks: dict[int,
 def _passages(port: RegisterPort, position: int, label: str, ports: Sequence[PortState]) -> list[int]:
     """Return after which times the latching frame was at each open port, in its order: 0 at its arrival, ns."""
     content = _read(port, position, Register.DC_PORT_RECEIVE_TIMES, 16, label)
-    times = [content >> 32 * number & _RANGE_32 - 1 for number, state in enumerate(ports) if state is PortState.OPEN]
+    times = [content >> 32 * number & RANGE_32 - 1 for number, state in enumerate(ports) if state is PortState.OPEN]
     # The times wrap, and a cable may be plugged into any port: from the arrival on the last one is nearest.
-    around = [sorted((time - first) % _RANGE_32 for time in times) for first in times]
+    around = [sorted((time - first) % RANGE_32 for time in times) for first in times]
     return min(around, key=lambda passages: passages[-1], default=[0])
 
 
@@ -246,7 +225,7 @@ def take_over_time(
         theirs = [port.read(station_of(neighbour), at, 8) for at in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
         their_delay = port.read(station_of(neighbour), Register.DC_DELAY, 4)
         if None not in theirs and their_delay is not None:
-            shown = sum(int.from_bytes(part or b"", "little") for part in theirs) % _RANGE_32
+            shown = sum(int.from_bytes(part or b"", "little") for part in theirs) % RANGE_32
             time_then = system_time.extended(shown, latched_ns)
             time_then += int.from_bytes(delay, "little", signed=True)
             time_then -= int.from_bytes(their_delay, "little", signed=True)

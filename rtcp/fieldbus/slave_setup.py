@@ -18,7 +18,7 @@ from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.al_state import AlState, read_al, request_state
 from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
-from rtcp.fieldbus.clocks import SystemTime, forget_drift, settle_clock, start_sync, take_over_time
+from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted, ValueNotKept
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
@@ -26,6 +26,7 @@ from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
 from rtcp.fieldbus.scaling import check_quick_stop, compare_scaling
 from rtcp.fieldbus.scan import name_of
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.ipc.codes import ERROR_BIT, refusal
 
 _FMMUS_SIZE = 0x80

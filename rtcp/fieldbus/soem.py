@@ -20,7 +20,7 @@ from rtcp.esi.sii import read_sii
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, PdoInfo, SlaveInfo, SlaveState, slave_label, station_of
-from rtcp.fieldbus.clocks import SystemTime, clocks_of, measure_delays, start_clocks
+from rtcp.fieldbus.clocks import clocks_of, measure_delays, start_clocks
 from rtcp.fieldbus.describe import describe_device, pdos_of_eeprom
 from rtcp.fieldbus.eeprom import (
     BOOTSTRAP_WORD,
@@ -49,6 +49,7 @@ from rtcp.fieldbus.slave_setup import (
     trigger_watchdog,
 )
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.fieldbus.topology import Topology, port_states
 from rtcp.ipc.events import EmergencyMessage, Event
 

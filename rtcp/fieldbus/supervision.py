@@ -13,12 +13,12 @@ from typing import Protocol
 
 from rtcp.fieldbus.al_state import AlState, parse_al
 from rtcp.fieldbus.bus import Bus
-from rtcp.fieldbus.clocks import SystemTime
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.port_errors import REPORT_INTERVAL_S, ErrorCounters
 from rtcp.fieldbus.recovery import LONG_AGO, MonitoredSlave, SlaveRecovery
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, T
 from rtcp.fieldbus.slave_setup import SlaveRestorer
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.fieldbus.topology import Topology
 from rtcp.ipc.events import Event, NoSlaveAnswers, SlavesAnswerAgain, SlavesBackInOp, SlavesLeftOp
 

@@ -19,7 +19,7 @@ from typing import Final
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.fieldbus.clocks import SystemTime
+from rtcp.fieldbus.system_time import SystemTime
 
 MEASURE_CYCLES: Final = 100
 LOCK_CYCLES: Final = 200

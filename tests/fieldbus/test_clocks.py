@@ -11,7 +11,6 @@ import pytest
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import clocks
 from rtcp.fieldbus.clocks import (
-    SystemTime,
     clocks_of,
     measure_delays,
     settle_clock,
@@ -21,6 +20,7 @@ from rtcp.fieldbus.clocks import (
 )
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Answer, DatagramCommand, finish
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.virtual.segment import Connection, make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm, with_device

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
-from rtcp.fieldbus.clocks import SystemTime
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Answer, DatagramCommand, finish
 from rtcp.fieldbus.slave_setup import SlaveRestorer, SlaveSetup, trigger_watchdog
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm

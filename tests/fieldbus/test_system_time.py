@@ -10,8 +10,9 @@ import pytest
 
 from rtcp.fieldbus import clocks
 from rtcp.fieldbus.bus import station_of
-from rtcp.fieldbus.clocks import SystemTime, start_clocks, start_sync, take_over_time
+from rtcp.fieldbus.clocks import start_clocks, start_sync, take_over_time
 from rtcp.fieldbus.registers import Answer, DatagramCommand, build_frame
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.realtime.discipline import Discipline
 from rtcp.virtual.protocol import DatagramCommand as WireCommand
 from tests.fieldbus.direct import Direct
