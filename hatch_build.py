@@ -28,6 +28,7 @@ COMPILED = (
     "rtcp/motion/guards/*.py",
     "rtcp/motion/planning/*.py",
     "rtcp/fieldbus/process_data.py",
+    "rtcp/fieldbus/system_time.py",
     "rtcp/ipc/blackboard.py",
     "rtcp/ipc/layout.py",
     "rtcp/realtime/discipline.py",

@@ -61,6 +61,9 @@ class SegmentSlave:
     list has this order."""
     drift_ppm: Annotated[float, Ge(-1000), Le(1000)] = 0.0
     """How much faster than the host its own clock runs, parts per million."""
+    clock_bits: Literal[0, 32, 64] = 64
+    """Size of its clock; one of 32 bits starts again at 0 every 4.29 s. 0: it measures delays, but has no system time
+    that can be set (registers 0x0910 to 0x097F)."""
     delay_ns: Annotated[int, Ge(0), Le(1_000_000)] | None = None
     """Propagation delay from the master, ns, along the frame's path; None: as on the real arm."""
     alias: U16 = 0

@@ -26,6 +26,7 @@ from rtcp.control.processes import make_processes
 from rtcp.devices.drive import Drive, drive_of
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.master import PacedData
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import ClockLocked, ClockUnlocked
 from rtcp.ipc.schema import (
@@ -248,7 +249,9 @@ class Cycle:
         operator, context = self.operator, self._context
         flags = FLAG_ALL_OP if self._service.all_op else 0
         offset = filtered = 0
+        dc_time = self._data.dc_time
         if discipline is not None:
+            dc_time = discipline.system_time.extended(dc_time, woken)
             offset, filtered = discipline.raw_ns, int(discipline.filtered_ns)
             if discipline.locked:
                 flags |= FLAG_DC_LOCKED
@@ -269,7 +272,7 @@ class Cycle:
         values[: len(CYCLE_FIELDS) - 1] = (
             context.cycle,
             woken,
-            self._data.dc_time,
+            dc_time,
             context.state,
             flags,
             min(wkc, _LARGEST_COUNTER),
@@ -328,13 +331,14 @@ def ahead_of_sync0(config: ArmConfig) -> int:
     return min([(shift - shifts[0] - sent) % period_ns for shift in shifts], default=period_ns // 2)
 
 
-def make_discipline(config: ArmConfig) -> Discipline | None:
-    """Return the clock discipline; None without distributed clocks."""
+def make_discipline(config: ArmConfig, system_time: SystemTime | None = None) -> Discipline | None:
+    """Return the clock discipline, None without distributed clocks; `system_time`: of the bus, where it has one."""
     period_ns = round(config.cycle.period_us * 1000)
     shifts = [slave.device.sync0_shift_us for slave in config.slaves if slave.device.assign_activate]
     if not shifts:
         return None
-    return Discipline(period_ns, round(shifts[0] * 1000 + config.ethercat.send_phase * period_ns))
+    phase_ns = round(shifts[0] * 1000 + config.ethercat.send_phase * period_ns)
+    return Discipline(period_ns, phase_ns, system_time)
 
 
 def address_of(config: ArmConfig, joint: Joint) -> tuple[int, int]:

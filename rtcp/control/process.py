@@ -118,7 +118,7 @@ def _work(master: Master, session: Session, directory: Path, report: Report) -> 
     if config.slaves != session.config.slaves:
         # The gateway counts the slaves as the bus does: it starts once the loop is ready.
         replace(session, config=config).write(directory)
-    discipline = make_discipline(config)
+    discipline = make_discipline(config, None if master.supervised is None else master.supervised.system_time)
     partners = None if session.cell is None else Partners(session.cell, session.name)
     blackboard = Blackboard(blackboard_file(directory), record_schema(config, partners), period_ns)
     cpu = scheduling.choose_cpu(config.cycle.cpu)

@@ -119,7 +119,7 @@ class SlaveInfo:
     dc: bool
     """Whether it has a distributed clock."""
     delay_ns: int | None
-    """Propagation delay from the reference clock, as measured; None: it has no clock, or its measurements differ."""
+    """Propagation delay from the reference clock, as measured; None: it has no clock, or was not measured."""
     ports: tuple[PortState, ...]
     """Ports 0 to 3."""
     parent: int

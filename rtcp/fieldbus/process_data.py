@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from rtcp.fieldbus.image import Place, Places, image_memory, missing_counts
-from rtcp.fieldbus.registers import DatagramCommand, build_frame, open_socket
+from rtcp.fieldbus.registers import DatagramCommand, Register, build_frame, open_socket
 
 _LARGEST_FRAME_DATA: Final = 1466
 """Most process data of a frame with the clock's datagram, bytes (SOEM: EC_MAXLRWDATA - EC_FIRSTDCDATAGRAM)."""
@@ -37,6 +37,7 @@ class SoemProcessData:
         barrier: FrameBarrier,
         receive_us: int,
         barrier_us: int,
+        reference: ReferenceFrame | None = None,
     ) -> None:
         """Use the image of `slaves` (pysoem's), with all outputs 0.
 
@@ -48,6 +49,7 @@ class SoemProcessData:
             barrier: the frame barrier on the same interface.
             receive_us: longest wait for an answer, us.
             barrier_us: longest wait for the barrier frame, us.
+            reference: sends the reference clock's time where SOEM's frames do not.
         """
         self.expected_wkc = int(master.expected_wkc) + missing_counts(places)
         self.missed = 0
@@ -56,6 +58,7 @@ class SoemProcessData:
         self._slaves = tuple(slaves)
         self._fd = socket_fd
         self._barrier = barrier
+        self._reference = reference
         self._receive_us = receive_us
         self._barrier_ns = barrier_us * 1000
         self._inputs = [bytes(slave.input) for slave in slaves]
@@ -87,6 +90,8 @@ class SoemProcessData:
             slave.output = outputs[i]
         if self._small is not None:
             self._small.write(outputs)
+        if self._reference is not None:
+            self._reference.send()
         self._master.send_processdata()
 
     def receive(self) -> int:
@@ -109,7 +114,7 @@ class SoemProcessData:
             inputs[i] = slave.input
         if self._small is not None:
             self._small.read(inputs)
-        self.dc_time = self._master.dc_time
+        self.dc_time = self._master.dc_time if self._reference is None else self._reference.time_of_answer()
         return wkc
 
     def input(self, index: int) -> bytes:
@@ -161,7 +166,10 @@ class SmallImages:
 
 _BYTES: Final = tuple(bytes((value,)) for value in range(256))
 _INDEX = 0xF0
+_INDEX_AT: Final = 17
 _NUMBER_AT: Final = 26
+_COUNTER_AT: Final = 34
+"""Working counter behind 8 bytes of data."""
 # PyDLL keeps the interpreter's lock, so that the cycle need not regain it from another thread after each poll.
 _libc = ctypes.PyDLL(None)
 _DONTWAIT = int(socket.MSG_DONTWAIT)
@@ -194,6 +202,52 @@ class FrameBarrier:
                     return True
             elif time.monotonic_ns() >= deadline:
                 return False
+
+    def close(self) -> None:
+        """Close its socket; may be called twice."""
+        self._socket.close()
+
+
+_FIRST_INDEX, _LAST_INDEX = 0xF1, 0xFF
+
+
+class ReferenceFrame:
+    """A frame each cycle that brings the time of the reference clock to all other clocks (ETG.1000.4, 5.4: FRMW).
+
+    SOEM's own datagram for this always names the first slave that measures delays, even where its clock cannot be set.
+    """
+
+    def __init__(self, interface: str, station: int) -> None:
+        """Open the socket; raises BusError where the interface cannot be opened. `station`: the reference clock's."""
+        self._socket = open_socket(interface, _FIRST_INDEX, _LAST_INDEX)
+        self._socket.setblocking(False)
+        self._fd = self._socket.fileno()
+        self._frame = bytearray(
+            build_frame(DatagramCommand.FRMW, _FIRST_INDEX, station, Register.DC_SYSTEM_TIME, bytes(8))
+        )
+        self._out = (ctypes.c_char * len(self._frame)).from_buffer(self._frame)
+        self._answer = bytearray(1518)
+        self._in = (ctypes.c_char * len(self._answer)).from_buffer(self._answer)
+        self._index = _FIRST_INDEX
+        self._time = 0
+
+    def send(self) -> None:
+        """Send the frame, before that of the process data: it is back before that one."""
+        self._index = _FIRST_INDEX if self._index == _LAST_INDEX else self._index + 1
+        self._frame[_INDEX_AT] = self._index
+        _libc.send(self._fd, self._out, len(self._frame), _DONTWAIT)
+
+    def time_of_answer(self) -> int:
+        """Return the time that the last frame brought back; where the reference did not answer, the one before."""
+        answer = self._answer
+        while _libc.recv(self._fd, self._in, len(answer), _DONTWAIT) > 0:
+            # Late answers carry an older index.
+            if answer[_INDEX_AT] == self._index and answer[_COUNTER_AT]:
+                time_bytes = answer[_NUMBER_AT:_COUNTER_AT]
+                self._time = int.from_bytes(time_bytes, "little")
+                # As in SOEM: without the reference the other clocks get its last time.
+                self._frame[_NUMBER_AT:_COUNTER_AT] = time_bytes
+        return self._time
 
     def close(self) -> None:
         """Close its socket; may be called twice."""

@@ -20,7 +20,7 @@ from rtcp.fieldbus.errors import BusError
 
 ETHERTYPE = 0x88A4
 FIRST_INDEX, LAST_INDEX = 0x80, 0xEF
-"""Datagram indices of this port; the frame barrier uses those above."""
+"""Datagram indices of this port; the frames beside the process data use those above."""
 _COMMAND_AT, _INDEX_AT, _STATION_AT, _ADDRESS_AT, _LENGTH_AT = 16, 17, 18, 20, 22
 _LENGTH_MASK = 0x07FF
 _DATA_AT = 26
@@ -40,6 +40,7 @@ class DatagramCommand(IntEnum):
     FPWR = 5
     BRD = 7
     BWR = 8
+    FRMW = 14
 
 
 class Register(IntEnum):

@@ -26,6 +26,7 @@ from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
 from rtcp.fieldbus.scaling import check_quick_stop, compare_scaling
 from rtcp.fieldbus.scan import name_of
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.ipc.codes import ERROR_BIT, refusal
 
 _FMMUS_SIZE = 0x80
@@ -90,6 +91,7 @@ class SlaveRestorer:
         set_ups: Sequence[SlaveSetup],
         sdo: Callable[[int], SdoClient],
         period_ns: int,
+        system_time: SystemTime,
     ) -> None:
         """Prepare for a configured segment.
 
@@ -99,8 +101,10 @@ class SlaveRestorer:
             set_ups: their registers after `configure`.
             sdo: returns SDO access to the slave at a position.
             period_ns: period of the cycle, ns.
+            system_time: time of the segment, kept up to date by the cycle.
         """
         self._port = port
+        self._system_time = system_time
         self._slaves = list(slaves)
         self._set_ups = set_ups
         self._sdo = sdo
@@ -136,7 +140,8 @@ class SlaveRestorer:
             # reference clock by its address, and every other slave follows its time.
             port.put(address, Register.DC_ACTIVATION, b"\0", label)
             others = [clock for clock in self._clocks if clock != position]
-            take_over_time(port, address, label, set_up.delay, others, always=place is not None)
+            always = place is not None
+            take_over_time(port, address, label, set_up.delay, others, self._system_time, always=always)
         if place is not None:
             self._write_address(position, station, partial(port.write, address), partial(port.read, station))
         if set_up.delay is not None:
@@ -155,7 +160,7 @@ class SlaveRestorer:
         if config.device.assign_activate:
             if position != self._clocks[0]:
                 yield from settle_clock(port, station, label)
-            start_sync(port, station, label, config.device, self._period_ns)
+            start_sync(port, station, label, config.device, self._period_ns, self._system_time)
         yield
         yield from self._change_state(position, AlState.SAFEOP)
 

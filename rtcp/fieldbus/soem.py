@@ -37,7 +37,7 @@ from rtcp.fieldbus.interface import PromiscuousMode, check_interface, check_name
 from rtcp.fieldbus.mailbox import Mailbox, Mailboxes, SdoClient
 from rtcp.fieldbus.master import Master
 from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, entries_of, layout, mapping_of, mapping_text
-from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
+from rtcp.fieldbus.process_data import FrameBarrier, ReferenceFrame, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
 from rtcp.fieldbus.scan import describe, name_of, read_mailbox, read_serial, watchdog_off
 from rtcp.fieldbus.slave_setup import (
@@ -49,6 +49,7 @@ from rtcp.fieldbus.slave_setup import (
     trigger_watchdog,
 )
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.fieldbus.topology import Topology, port_states
 from rtcp.ipc.events import EmergencyMessage, Event
 
@@ -89,6 +90,7 @@ class SoemBus:
         """
         self.interface = interface
         self.notes: list[str] = []
+        self.system_time = SystemTime()
         self._fraction = receive_fraction
         self._pid = namespace_pid
         self._state_timeout_s = state_timeout_s
@@ -98,6 +100,7 @@ class SoemBus:
         self._promiscuous: PromiscuousMode | None = None
         self._port: RegisterPort | None = None
         self._barrier: FrameBarrier | None = None
+        self._reference: ReferenceFrame | None = None
         self._names: list[str] = []
         self._infos: list[MailboxInfo | None] = []
         self._serials: list[int] = []
@@ -155,9 +158,9 @@ class SoemBus:
         """
         self._discover()
         self._to_preop()
-        clocks = clocks_of(self.port, {i: slave_label(i, name) for i, name in enumerate(self._names, 1)})
+        labels = {i: slave_label(i, name) for i, name in enumerate(self._names, 1)}
         try:
-            delays: dict[int, int] = measure_delays(self._master, self.port, clocks)
+            delays: dict[int, int] = measure_delays(self.port, labels, clocks_of(self.port, labels))
         except BusError:
             # A scan is for a bus that is not in order, too.
             delays = {}
@@ -205,7 +208,8 @@ class SoemBus:
                 failures[position - 1] += 1
         places = read_places(self.port, slaves)
         self._trigger_watchdogs(slaves)
-        start_clocks(self._master, self.port, slaves, period_ns)
+        self.system_time, reference = start_clocks(self._master, self.port, slaves, period_ns)
+        self._reference = None if reference is None else ReferenceFrame(self.interface, station_of(reference))
         data = self._process_data(places, period_ns)
         # Valid outputs, all zero, are in the slaves' buffers before any of them may use them.
         data.send()
@@ -218,7 +222,8 @@ class SoemBus:
             for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
         ]
         self._topology = self._read_topology()
-        self._restorer = SlaveRestorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
+        sdo = self._mailboxes.sdo
+        self._restorer = SlaveRestorer(self.port, slaves, set_ups, sdo, period_ns, self.system_time)
         # From here on a cycle runs, and the watcher needs to learn of losses soon.
         self.port.tries = TRIES
         return data
@@ -400,7 +405,8 @@ class SoemBus:
         receive_us = max(1, round(self._fraction * period_us))
         barrier_us = max(1, round(min(receive_us, 0.75 * period_us - receive_us)))
         return SoemProcessData(
-            self._master, self._master.slaves, places, self._socket.fileno(), self._barrier, receive_us, barrier_us
+            self._master, self._master.slaves, places, self._socket.fileno(), self._barrier, receive_us, barrier_us,
+            self._reference,
         )  # fmt: skip
 
     def request_state(self, state: AlState, positions: Iterable[int] | None = None) -> None:
@@ -560,10 +566,13 @@ class SoemBus:
             self.notes.append(f"the slaves on {self.interface} could not be brought back to INIT: {error}")
         finally:
             # The claim last: the next master must not start while this one still cleans up.
-            for part in (self._port, self._barrier, self._socket, self._master, self._promiscuous, self._claim):
+            for part in (
+                self._port, self._barrier, self._reference, self._socket, self._master, self._promiscuous, self._claim,
+            ):  # fmt: skip
                 if part is not None:
                     part.close()
-            self._port = self._barrier = self._socket = self._claim = self._promiscuous = self._master = None
+            self._port = self._barrier = self._reference = None
+            self._socket = self._claim = self._promiscuous = self._master = None
             self._names = []
 
     def _to_init(self, port: RegisterPort) -> None:

@@ -18,6 +18,7 @@ from rtcp.fieldbus.port_errors import REPORT_INTERVAL_S, ErrorCounters
 from rtcp.fieldbus.recovery import LONG_AGO, MonitoredSlave, SlaveRecovery
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, T
 from rtcp.fieldbus.slave_setup import SlaveRestorer
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.fieldbus.topology import Topology
 from rtcp.ipc.events import Event, NoSlaveAnswers, SlavesAnswerAgain, SlavesBackInOp, SlavesLeftOp
 
@@ -241,6 +242,9 @@ class SlaveWatcher:
 
 class SupervisedBus(Bus, Protocol):
     """A bus on a wire: slaves are lost and recovered while the cycle runs."""
+
+    system_time: SystemTime
+    """Time of the segment since `configure`."""
 
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps."""

@@ -83,7 +83,7 @@ class StatusSnapshot:
         self.message = ""
         """The last message about the arm."""
         self._message_ns = 0
-        """Instant of `message`, CLOCK_REALTIME, ns."""
+        """Instant of `message`, CLOCK_MONOTONIC, ns: the wall clock may be set."""
         self._moves = 0
         self._moving = False
         self._began_ns = 0
@@ -152,7 +152,7 @@ class StatusSnapshot:
             new.append(message)
             self.messages.append((record.time_ns, message))
             if not isinstance(event, ServiceEvent) or event.is_problem:
-                self.message, self._message_ns = message, record.time_ns
+                self.message, self._message_ns = message, record.monotonic_ns
             if type(event) in self.names.faults:
                 # An emergency stop during a fault must be ended first.
                 self.fault = message if event.is_emergency else self.fault or message
@@ -219,8 +219,7 @@ class StatusSnapshot:
             return self.fault or self.message
         if paused:
             return "paused: the motion rests on its path"
-        began_ns = self._began_ns + time.time_ns() - time.monotonic_ns()
-        if self._message_ns > began_ns:
+        if self._message_ns > self._began_ns:
             return self.message
         return f"{state.words}, limited: {'; '.join(limits.values())}" if limits else state.words
 

@@ -6,7 +6,8 @@ A second-order filter tracks that difference (phase and rate), and the next wake
 reference time: wake-up jitter never enters the clocks, and there is no gain to tune against it. Residuals are bounded:
 one late frame moves the estimate by little. A frame that is later than any clock drifts (its sender or its receiver
 was kept off the CPU) is ignored, until late frames outnumber timely ones so far that the clock itself has moved. A
-reference whose time stands although frames return is not tracked until it moves again.
+reference whose time stands although frames return is not tracked until it moves again. The time of a clock of 32 bits
+is extended first (`SystemTime`).
 
 Three phases: *measure* (the clocks are compared for `MEASURE_CYCLES`, nothing is moved), *align* (one jump of the
 grid to the configured phase between two SYNC0, before any drive is in OP), *track*.
@@ -17,6 +18,8 @@ from __future__ import annotations
 from typing import Final
 
 from mypy_extensions import mypyc_attr
+
+from rtcp.fieldbus.system_time import SystemTime
 
 MEASURE_CYCLES: Final = 100
 LOCK_CYCLES: Final = 200
@@ -46,14 +49,16 @@ class Discipline:
     Args:
         period_ns: the cycle.
         phase_ns: wanted reference time of the frame, modulo the cycle: SYNC0 shift + send phase * period.
+        system_time: time of the segment, which this keeps up to date; None: it begins with the first frame.
     """
 
     __slots__ = (
         "_base", "_difference", "_good_cycles", "_late", "_measured", "_period", "_phase", "_rate", "_reference",
-        "_seen", "_standing", "aligned", "filtered_ns", "locked", "raw_ns",
+        "_seen", "_standing", "aligned", "filtered_ns", "locked", "raw_ns", "system_time",
     )  # fmt: skip
 
-    def __init__(self, period_ns: int, phase_ns: int) -> None:
+    def __init__(self, period_ns: int, phase_ns: int, system_time: SystemTime | None = None) -> None:
+        self.system_time = SystemTime() if system_time is None else system_time
         self._period = period_ns
         self._phase = phase_ns % period_ns
         # Reference less master: an integer part, too large for a float's 53 bits, and a small float part.
@@ -75,7 +80,10 @@ class Discipline:
         more than 50 us late: how well the clock is followed."""
 
     def observe(self, sent_ns: int, reference_ns: int) -> None:
-        """Update from one frame: the master's time just before sending and the reference time when it passed, ns."""
+        """Update from one frame: the master's time just before sending and the reference time when it passed, ns.
+
+        The reference time has all bits or the low 32.
+        """
         if reference_ns == self._reference:
             # The reference slave did not answer: the field returned as it was sent.
             self.holdover()
@@ -86,6 +94,10 @@ class Discipline:
             return
         self._standing = 0
         self._reference = reference_ns
+        system_time = self.system_time
+        if system_time.offset_ns is None:
+            system_time.offset_ns = reference_ns - sent_ns
+        reference_ns = system_time.extended(reference_ns, sent_ns)
         period = self._period
         offset = (reference_ns - self._phase) % period
         self.raw_ns = offset - period if 2 * offset > period else offset
@@ -100,6 +112,7 @@ class Discipline:
             self._base += shift
             residual -= shift
         if abs(residual) <= _LATE_BEYOND_NS:
+            system_time.offset_ns = self._base + int(self._difference)
             if self._late:
                 self._late -= 1
         else:

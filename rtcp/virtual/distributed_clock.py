@@ -26,11 +26,15 @@ class Clock:
     """
 
     __slots__ = (
-        "_fraction", "_last", "_local", "_natural", "_rate", "_t", "delay", "difference", "offset",
+        "_fraction", "_last", "_local", "_natural", "_rate", "_t", "bits", "delay", "difference", "offset",
     )  # fmt: skip
 
-    def __init__(self, drift_ppm: float, start: int, t: int) -> None:
-        """The clock shows `start` ns at instant `t` and runs fast by `drift_ppm` ppm."""
+    def __init__(self, drift_ppm: float, start: int, t: int, bits: int = 64) -> None:
+        """The clock shows `start` ns at instant `t` and runs fast by `drift_ppm` ppm; its registers have `bits` bits.
+
+        Times in here do not wrap; the registers show their low 32 or 64 bits (`shown`). 0: it only measures delays.
+        """
+        self.bits = bits
         self._natural = drift_ppm * 1e-6
         self._rate = self._natural
         self._t = t
@@ -50,6 +54,19 @@ class Clock:
     def system(self, t: int) -> int:
         """System time at `t`, in ns."""
         return self.local(t) + self.offset
+
+    def shown(self, time: int) -> int:
+        """Return a time as the registers show it."""
+        return time & ((1 << self.bits) - 1)
+
+    def next_match(self, shown: int, t: int) -> int:
+        """Return the system time, not before that at `t`, that the registers show as `shown`.
+
+        With 64 bits a time in the past stays there: it comes again only after centuries.
+        """
+        now = self.system(t)
+        ahead = self.shown(shown - now)
+        return now + (ahead - (1 << 64) if ahead >> 63 else ahead)
 
     def instant(self, system: int) -> int:
         """Return the instant at which the system time is `system`, at the present rate."""
@@ -107,7 +124,8 @@ class SyncGenerator:
     """SYNC0: a pulse at the start time plus each multiple of the cycle, in system time (0x0981..0x09A3).
 
     The hardware compares for equality: if the system time has passed the next pulse, because the start time was in the
-    past or the offset was rewritten while running, there are no further pulses.
+    past or the offset was rewritten while running, there are no further pulses. A clock of 32 bits shows each time
+    again after 4.29 s: the pulses then begin that late.
     """
 
     __slots__ = ("_clock", "_suspended", "cycle", "due", "next", "pulses", "running")
@@ -148,6 +166,7 @@ class SyncGenerator:
         """Compute the instant of the next pulse; it is lost if the system time has passed it."""
         if not self.running or self._suspended:
             return
+        self.next = self._clock.next_match(self.next, t)
         due = self._clock.instant(self.next)
         self.due = due if due >= t else None
 
@@ -188,7 +207,6 @@ class SyncGenerator:
 CYCLIC = 0x01
 SYNC0 = 0x02
 SYNC1 = 0x04
-TIME_64 = (1 << 64) - 1
 NEGATIVE = 0x8000_0000
 
 
@@ -231,16 +249,16 @@ class DistributedClockUnit:
         for port in (1, 2, 3):
             returned = self.returns.get(port)
             self._put(Register.DC_RECEIVE_TIME + 4 * port, 0 if returned is None else local + returned, 4)
-        self._put(Register.DC_RECEIVE_TIME_UNIT, local, 8)
+        self._put(Register.DC_RECEIVE_TIME_UNIT, self.clock.shown(local), 8)
 
     def before_read(self, t: int) -> None:
         """Update the time-dependent registers for a frame that arrives at `t`."""
         clock, sync0 = self.clock, self.sync0
-        self._put(Register.DC_SYSTEM_TIME, clock.system(t), 8)
+        self._put(Register.DC_SYSTEM_TIME, clock.shown(clock.system(t)), 8)
         difference = clock.difference
         self._put(Register.DC_DIFFERENCE, abs(difference) | (NEGATIVE if difference < 0 else 0), 4)
         if sync0.running:
-            self._put(Register.DC_START_TIME, sync0.next, 8)
+            self._put(Register.DC_START_TIME, clock.shown(sync0.next), 8)
             pending = 0x01 if sync0.due is not None and not sync0.pulses else 0x00
             self._memory[Register.DC_ACTIVATION_STATUS] = pending
 

@@ -17,10 +17,12 @@ from rtcp.virtual.protocol import (
     FEATURE_SEPARATE_FCS,
     FMMU_COUNT,
     FMMU_SIZE,
+    ONLY_IN_64_BITS,
     RAM_SIZE,
     REGISTER_SPACE,
     SM_COUNT,
     SM_SIZE,
+    SYSTEM_TIME_SPACE,
     WRITABLE,
     WRITABLE_DC,
     AlState,
@@ -267,10 +269,16 @@ class Esc:
         self.dc: DistributedClockUnit | None = None
         if clock is not None:
             self.dc = DistributedClockUnit(self.memory, clock)
-            features |= FEATURE_DC | FEATURE_DC_64 | FEATURE_DC_SYNC_ENHANCED
+            features |= FEATURE_DC | FEATURE_DC_SYNC_ENHANCED | (FEATURE_DC_64 if clock.bits == 64 else 0)
             spaces += WRITABLE_DC
         for first, last in spaces:
             self.writable[first : last + 1] = b"\x01" * (last + 1 - first)
+        self._only_measures = clock is not None and not clock.bits
+        for time in ONLY_IN_64_BITS if clock is not None and clock.bits == 32 else ():
+            self.writable[time : time + 4] = bytes(4)
+        if self._only_measures:
+            first, end = SYSTEM_TIME_SPACE
+            self.writable[first:end] = bytes(end - first)
         for register, content in DEFAULTS:
             self.memory[register : register + len(content)] = content
         self.memory[Register.RAM] = ram_size // 1024
@@ -401,6 +409,8 @@ class Esc:
             if self.dc is not None:
                 self.dc.before_read(t)
             elif address >= DC_SPACE[0] and end <= DC_SPACE[1]:
+                return None
+            if address < SYSTEM_TIME_SPACE[1] and end > SYSTEM_TIME_SPACE[0] and self._only_measures:
                 return None
         if address <= Register.EEPROM_CONTROL + 1 < end:
             self.eeprom.before_read(t)

@@ -128,6 +128,10 @@ WRITABLE_DC = (
     (0x0990, 0x0997),
     (0x09A0, 0x09A9),
 )
+ONLY_IN_64_BITS = (0x0914, 0x0924, 0x0994)
+"""Upper four bytes of the writable times: reserved, and read as 0, where clocks have 32 bits (ETG.1000.4, 6.8)."""
+SYSTEM_TIME_SPACE = (0x0910, 0x0980)
+"""Addresses that a slave which only measures delays has not, end excluded."""
 ERROR_COUNTERS = ((0x0300, 0x030C), (0x030C, 0x030D), (0x030D, 0x030E), (0x0310, 0x0314))
 """Groups of error counters, ends excluded: a write to any one clears its group (ET1100, 0x0300 to 0x0313)."""
 DC_SPACE = (0x0900, 0x0A00)

@@ -456,7 +456,8 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
         raise ConfigError(read(config.source).placed(findings))
     drifts = [entry.drift_ppm for entry in config.slaves]
     aliases = [entry.alias for entry in config.slaves]
-    slaves = make_slaves(devices, drifts, [cable.arrival for cable in cables], aliases, t)
+    bits = [entry.clock_bits for entry in config.slaves]
+    slaves = make_slaves(devices, drifts, [cable.arrival for cable in cables], aliases, t, bits)
     segment = Segment(slaves, t, connections)
     segment.arm = make_arm(config, devices)
     document = read(config.source) if any(isinstance(device, DescribedDevice) for device in devices) else None

@@ -366,10 +366,22 @@ FIRST_LOCAL_TIME = 1_000_000_000
 class Slave:
     """A controller with its firmware, at `delay` ns from the master's port."""
 
-    __slots__ = ("_drift_ppm", "application", "clock", "delay", "device", "esc", "faults", "queued_until")
+    __slots__ = (
+        "_clock_bits",
+        "_drift_ppm",
+        "application",
+        "clock",
+        "delay",
+        "device",
+        "esc",
+        "faults",
+        "queued_until",
+    )
 
-    def __init__(self, device: DeviceModel, eeprom: bytes, drift_ppm: float, start: int, delay: int, t: int) -> None:
+    def __init__(self, device: DeviceModel, eeprom: bytes, drift_ppm: float, start: int, delay: int, t: int,
+                 clock_bits: int = 64) -> None:  # fmt: skip
         """Power on at instant `t` with the clock at `start` ns; the segment connects it."""
+        self._clock_bits = clock_bits
         self.device = device
         self.delay = delay
         self.faults = SlaveFaults()
@@ -380,7 +392,7 @@ class Slave:
 
     def _start(self, eeprom: bytes, drift_ppm: float, start: int, t: int) -> None:
         device = self.device
-        self.clock = Clock(drift_ppm, start, t) if device.supports_dc else None
+        self.clock = Clock(drift_ppm, start, t, self._clock_bits) if device.supports_dc else None
         self.esc = Esc(eeprom, self.clock, physics=device.physics, ram_size=device.ram_size)
         self.application = Application(self.esc, device, self.faults, t)
 
@@ -403,12 +415,16 @@ class Slave:
 
 
 def make_slaves(devices: Sequence[DeviceModel], drifts_ppm: Sequence[float], delays: Sequence[int],
-                aliases: Sequence[int], t: int) -> list[Slave]:  # fmt: skip
-    """Return a slave for every device, in the order of the wire; `delays` are ns from the master."""
+                aliases: Sequence[int], t: int, clock_bits: Sequence[int] = ()) -> list[Slave]:  # fmt: skip
+    """Return a slave for every device, in the order of the wire; `delays` are ns from the master.
+
+    `clock_bits` are the sizes of their clocks; left out: 64.
+    """
     slaves = []
     for device in devices:
         device.join(devices)
-    for position, (device, drift, delay, alias) in enumerate(zip(devices, drifts_ppm, delays, aliases, strict=True)):
+    each = zip(devices, drifts_ppm, delays, aliases, clock_bits or [64] * len(devices), strict=True)
+    for position, (device, drift, delay, alias, bits) in enumerate(each, 1):
         eeprom = device.eeprom(alias) or build_sii(device, SyncManagerLayout(), alias)
-        slaves.append(Slave(device, eeprom, drift, FIRST_LOCAL_TIME * (position + 1), delay, t))
+        slaves.append(Slave(device, eeprom, drift, FIRST_LOCAL_TIME * position, delay, t, bits))
     return slaves

@@ -29,7 +29,6 @@ _BROADCAST = frozenset((DatagramCommand.BRD, DatagramCommand.BWR, DatagramComman
 _FIRST_LOGICAL, _LAST_LOGICAL = int(DatagramCommand.LRD), int(DatagramCommand.LRW)
 _MULTIPLE_WRITE = frozenset((DatagramCommand.ARMW, DatagramCommand.FRMW))
 _TIME_LENGTHS = (4, 8)
-_TIME_64 = (1 << 64) - 1
 _READS = frozenset(
     (
         DatagramCommand.APRD,
@@ -262,8 +261,9 @@ class Wire:
             if reader is None:
                 continue
             here = t + reader.delay
-            if steering and reader.clock is not None:
-                frame[data:end] = (reader.clock.system(here) & _TIME_64).to_bytes(8, "little")[:length]
+            if steering and reader.clock is not None and reader.clock.bits:
+                time = reader.clock.shown(reader.clock.system(here))
+                frame[data:end] = time.to_bytes(8, "little")[:length]
                 count += 1
             elif (read := reader.esc.read(offset, length, here)) is not None:
                 frame[data:end] = read
@@ -285,7 +285,7 @@ class Wire:
             if slave in readers:
                 groups.append((writers, slave))
                 writers = []
-            elif slave.clock is not None or not steering:
+            elif not steering or (slave.clock is not None and slave.clock.bits):
                 writers.append(slave)
         groups.append((writers, None))
         if len(self._orders) >= MOST_KNOWN:

@@ -32,6 +32,7 @@ OWN = [
     "channels.md",
     "drives.md",
     "segment.md",
+    "distributed_clocks.md",
     "behaviours.md",
     "guiding.md",
     "conformance.md",

@@ -20,10 +20,14 @@ MODELS = ("diewu-io", *("cubemars-orh70",) * 3, "cubemars-orh60", "cubemars-orh5
 class Segment:
     """A virtual segment in a process of its own, and masters that are started against it."""
 
-    def __init__(self, file: Path, slaves: int | Sequence[str], program: str = "rtcp.virtual") -> None:
+    def __init__(
+        self, file: Path, slaves: int | Sequence[str], program: str = "rtcp.virtual", clock_bits: Sequence[int] = ()
+    ) -> None:
         """Start it with the first `slaves` of the arm, or with these of `terminals`."""
         if isinstance(slaves, int):
-            file.write_text("slaves:\n" + "".join(f"  - model: {model}\n" for model in MODELS[:slaves]))
+            bits = clock_bits or [64] * slaves
+            lines = [f"  - {{model: {MODELS[n]}, clock_bits: {bits[n]}}}\n" for n in range(slaves)]
+            file.write_text("slaves:\n" + "".join(lines))
             self.count = slaves
         else:
             write_segment(file, *slaves)
@@ -63,8 +67,8 @@ StartSegment = Callable[..., Segment]
 def start_segment(tmp_path: Path) -> Iterator[StartSegment]:
     running: list[Segment] = []
 
-    def start(slaves: int | Sequence[str], **program: str) -> Segment:
-        running.append(Segment(tmp_path / f"segment{len(running)}.yaml", slaves, **program))
+    def start(slaves: int | Sequence[str], **more: Any) -> Segment:
+        running.append(Segment(tmp_path / f"segment{len(running)}.yaml", slaves, **more))
         return running[-1]
 
     yield start

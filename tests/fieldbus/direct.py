@@ -11,7 +11,8 @@ class Direct(RegisterPort):
 
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
-        self._t = 0
+        self.now = 0
+        """Time of the last frame, ns."""
         self.lost: set[tuple[DatagramCommand, int]] = set()
         """Command and register of datagrams that get lost."""
         self.losses = 0
@@ -35,8 +36,8 @@ class Direct(RegisterPort):
             if lost == tries:
                 return Answer(b"", -1)
         frame = bytearray(build_frame(command, 0x80, station, address, data))
-        self._t += 1_000_000
-        self.segment.process(frame, len(frame), self._t)
-        self.segment.settle(self._t)
+        self.now += 1_000_000
+        self.segment.process(frame, len(frame), self.now)
+        self.segment.settle(self.now)
         end = 26 + len(data)
         return Answer(bytes(frame[26:end]), int.from_bytes(frame[end : end + 2], "little"))

@@ -6,6 +6,7 @@ import random
 import signal
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -39,6 +40,18 @@ def test_seven_slaves_go_from_init_to_op_with_clocks_and_a_mapping_that_reads_ba
     # The reference clock is the first slave's: it drifts by ppm, not by per cent.
     least, most = result["host_passed_ns"]
     assert 0.9 * least < result["dc_passed_ns"] < 1.1 * most
+
+
+@pytest.mark.parametrize("clock_bits", [(32, 64, 32), (0, 32, 64)])
+def test_slaves_with_clocks_of_32_bits_or_a_first_one_that_cannot_be_set_get_to_op_and_show_their_time(
+    start_segment: StartSegment, clock_bits: Sequence[int]
+) -> None:
+    segment = start_segment(3, clock_bits=clock_bits)
+    result = segment.master("op", receive_fraction=0.5, period_ns=4_000_000)["result"]
+    assert result["states"] == ["OP"] * 3
+    least, most = result["host_passed_ns"]
+    # The cycle's frames bring the reference clock's time, as it is on the wire.
+    assert 0.9 * least < result["dc_passed_ns"] % (1 << 32) < 1.1 * most
 
 
 def test_close_leaves_the_slaves_in_init_without_sync(segment: Segment) -> None:

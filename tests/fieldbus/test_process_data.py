@@ -12,7 +12,8 @@ from collections.abc import Iterator
 import pytest
 
 from rtcp.fieldbus.image import Place, Places
-from rtcp.fieldbus.process_data import FrameBarrier, SmallImages, SoemProcessData
+from rtcp.fieldbus.process_data import FrameBarrier, ReferenceFrame, SmallImages, SoemProcessData
+from rtcp.fieldbus.registers import DatagramCommand
 
 pytestmark = pytest.mark.interpreted  # `Barrier` takes the place of a compiled class
 
@@ -210,6 +211,36 @@ def test_a_barrier_frame_that_is_not_back_in_time_does_not_pass(segment: tuple[F
     assert not barrier.pass_through(0)
     slaves.close()
     assert not barrier.pass_through(60_000_000_000)  # cannot be sent: no wait
+
+
+def test_the_reference_clocks_time_is_that_of_the_last_frame_and_stays_where_it_does_not_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    monkeypatch.setattr("rtcp.fieldbus.process_data.open_socket", lambda *_: near)
+    frame = ReferenceFrame("ecat0", 0x1002)
+
+    def answer(sent: bytes, time_ns: int, wkc: int) -> None:
+        far.send(sent[:26] + time_ns.to_bytes(8, "little") + wkc.to_bytes(2, "little") + sent[36:])
+
+    frame.send()
+    first = far.recv(1518)
+    assert (first[16], first[18:22]) == (DatagramCommand.FRMW, bytes.fromhex("0210 1009"))
+    answer(first, 7_000_000_000, 3)
+    assert frame.time_of_answer() == 7_000_000_000
+    frame.send()
+    second = far.recv(1518)
+    # The other clocks get the last time, also where the reference is away.
+    assert second[26:34] == (7_000_000_000).to_bytes(8, "little")
+    answer(second, 7_000_000_000, 0)
+    assert frame.time_of_answer() == 7_000_000_000
+    frame.send()
+    third = far.recv(1518)
+    answer(third, 7_002_000_000, 3)
+    answer(second, 7_001_000_000, 3)
+    assert frame.time_of_answer() == 7_002_000_000
+    frame.close()
+    far.close()
 
 
 def test_images_of_a_few_bits_share_bytes_and_keep_their_own_bits() -> None:

@@ -11,6 +11,7 @@ from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Answer, DatagramCommand, finish
 from rtcp.fieldbus.slave_setup import SlaveRestorer, SlaveSetup, trigger_watchdog
+from rtcp.fieldbus.system_time import SystemTime
 from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm
@@ -48,7 +49,7 @@ def port(request: pytest.FixtureRequest) -> Direct:
 def test_a_write_that_got_lost_ends_the_attempt(port: Direct, register: int) -> None:
     port.lost = {(DatagramCommand.FPWR, register)}
     set_up = SlaveSetup(bytes(0x80), (bytes(8),) * 8, bytes(4), 0, 2)
-    restorer = SlaveRestorer(port, arm(3), [set_up] * 3, lambda position: pytest.fail("too far"), PERIOD)
+    restorer = SlaveRestorer(port, arm(3), [set_up] * 3, lambda position: pytest.fail("too far"), PERIOD, SystemTime())
     with pytest.raises(BusError, match=rf"slave 3 \(drive2\) did not take .* register 0x{register:04X}"):
         finish(restorer.restore(3, place=3))
 
@@ -75,6 +76,6 @@ def test_outputs_trigger_the_watchdog_or_a_drive_is_refused_and_any_other_slave_
 def test_a_slave_that_forgets_the_trigger_of_the_watchdog_is_not_set_up_again(port: Direct) -> None:
     managers = (bytes(8), bytes(8), SYNC_MANAGER_2[:4] + b"\x64" + SYNC_MANAGER_2[5:], *(bytes(8),) * 5)
     set_up = SlaveSetup(bytes(0x80), managers, None, 0, 3)
-    restorer = SlaveRestorer(port, arm(3), [set_up] * 3, lambda position: pytest.fail("too far"), PERIOD)
+    restorer = SlaveRestorer(port, arm(3), [set_up] * 3, lambda position: pytest.fail("too far"), PERIOD, SystemTime())
     with pytest.raises(BusError, match=r"slave 2 \(drive1\) does not keep sync manager 2 \(register 0x0810\)"):
         finish(restorer.restore(2, place=None))

@@ -122,7 +122,7 @@ class Watched:
             replace(config, device=other) if at == position else config for at, config in enumerate(self.slaves, 1)
         ]
         set_ups = [read_set_up(self.bus.port, at, config.name, serial) for at, config in enumerate(self.slaves, 1)]
-        restorer = SlaveRestorer(self.bus.port, changed, set_ups, self.bus.sdo, PERIOD)
+        restorer = SlaveRestorer(self.bus.port, changed, set_ups, self.bus.sdo, PERIOD, self.bus.system_time)
         return SlaveWatcher(self.bus.port, self.count, restorer, report)
 
     def episode(

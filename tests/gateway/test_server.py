@@ -260,7 +260,9 @@ def test_a_motion_that_was_requested_before_a_stop_does_not_begin_after_it(raw: 
     assert loop.kinds == [MoveJoints, Halt]
 
 
-def test_a_motion_that_arrives_after_a_stop_and_was_requested_before_it_does_not_begin(raw: Raw, loop: FakeLoop) -> None:
+def test_a_motion_that_arrives_after_a_stop_and_was_requested_before_it_does_not_begin(
+    raw: Raw, loop: FakeLoop
+) -> None:
     loop.state = State.HOLDING
     requested_ns = time.monotonic_ns()
     raw.send({"id": 1, "method": "halt"})

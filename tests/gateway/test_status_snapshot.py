@@ -114,6 +114,17 @@ def test_while_the_arm_moves_the_message_is_not_the_end_of_the_last_motion(writt
     assert written.headline == arrived
 
 
+def test_a_wall_clock_that_is_set_forward_hides_no_message_of_the_motion(
+    written: Written, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written.publish(State.MOVING, moves=1)
+    time.sleep(0.002)
+    written.board.event(ErrorReported("said meanwhile"))
+    own = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: own() + 3600 * 10**9)
+    assert written.headline == "said meanwhile"
+
+
 def test_while_a_motion_is_limited_the_message_says_by_what_and_a_later_message_comes_first(written: Written) -> None:
     written.publish(State.MOVING, moves=1, held=HELD_SHOULDER << 1 | 3 << HELD_RANGE_AT)
     status = written.status

@@ -251,3 +251,20 @@ def test_two_bursts_of_late_frames_with_a_frame_in_time_between_them_do_not_unlo
     burst = [200_000] * 35
     delays = [*burst, 0, *burst, *[0] * 2 * len(burst)] * 20
     assert all(line.frames(delays))
+
+
+@pytest.mark.parametrize("period_us", [250, 500, 1000, 2000, 4000])
+def test_a_reference_of_32_bits_is_followed_as_one_of_64_bits_over_many_wraps(period_us: int) -> None:
+    period_ns = 1000 * period_us
+    wakeups = []
+    for wraps in (False, True):
+        discipline = Discipline(period_ns, period_ns // 2)
+        offset, planned, seen = (1 << 32) - 2_000_000_000, 0, []
+        while planned < 45 * 10**9:
+            true = offset + planned + planned // 50_000
+            discipline.observe(planned, true % (1 << 32) if wraps else true)
+            planned = discipline.next_wakeup(planned)
+            seen.append((planned, discipline.locked))
+        assert discipline.locked
+        wakeups.append(seen)
+    assert wakeups[0] == wakeups[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.faults.fault import Fault, Frames
@@ -10,7 +11,7 @@ from rtcp.virtual.faults.registry import ActiveFault, Planned
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
 from rtcp.virtual.protocol import DatagramCommand
-from rtcp.virtual.segment import Segment
+from rtcp.virtual.segment import Connection, Segment
 from rtcp.virtual.slave import make_slaves
 from tests.virtual.frames import Datagram, build, parse
 
@@ -64,15 +65,16 @@ class Line:
     """The segment, its devices and the time."""
 
     def __init__(self, devices: Sequence[DeviceModel] | None = None, drifts: Sequence[float] | None = None,
-                 delays: Sequence[int] | None = None, aliases: Sequence[int] | None = None) -> None:  # fmt: skip
+                 delays: Sequence[int] | None = None, aliases: Sequence[int] | None = None,
+                 clock_bits: Sequence[int] = (), connections: Sequence[Connection] | None = None) -> None:  # fmt: skip
         self.devices: list[DeviceModel] = [TinyDevice() for _ in range(3)] if devices is None else list(devices)
         count = len(self.devices)
         self.now = 50 * MS
         self.slaves = make_slaves(
             self.devices, drifts or [0.0] * count, delays or [820 * n for n in range(count)], aliases or [0] * count,
-            self.now,
+            self.now, clock_bits,
         )  # fmt: skip
-        self.segment = Segment(self.slaves, self.now)
+        self.segment = Segment(self.slaves, self.now, connections)
 
     @property
     def tiny(self) -> list[TinyDevice]:
@@ -175,7 +177,7 @@ class Line:
         assert [self.al(number) for number in range(len(self.devices))] == [(OP, 0)] * len(self.devices)
 
 
-def in_op(count: int = 4, **line: Sequence[int]) -> Line:
+def in_op(count: int = 4, **line: Any) -> Line:
     """Tiny devices in OP."""
     made = Line([TinyDevice() for _ in range(count)], **line)
     made.to_op()

@@ -160,6 +160,44 @@ def test_a_start_time_in_the_past_brings_no_pulse() -> None:
     assert sync0.lost
 
 
+@pytest.mark.parametrize("unix_s", [600, 946_684_700, 1_790_000_000])
+def test_a_system_time_before_2000_starts_sync0_as_any_other(unix_s: int) -> None:
+    line = Line([TinyDevice()])
+    line.address()
+    own = line.number(0, 0x0910, 8)
+    line.write(0, 0x0920, ((unix_s - 946_684_800) * 10**9 - own & (1 << 64) - 1).to_bytes(8, "little"))
+    start_sync0(line, 0, MS, first_in=100 * MS)
+    assert 0 < line.slaves[0].esc.dc.sync0.due - line.now < 100 * MS
+    line.pass_time(200 * MS)
+    assert line.slaves[0].esc.dc.sync0.pulses > 100
+
+
+def test_a_clock_of_32_bits_shows_and_takes_the_low_half_of_times_and_wraps() -> None:
+    line = Line([TinyDevice()], clock_bits=(32,))
+    line.address()
+    features = line.number(0, 0x0008, 2)
+    assert features & 0x000C == 0x0004
+    line.write(0, 0x0920, ((1 << 64) - 1).to_bytes(8, "little"))
+    assert line.number(0, 0x0920, 8) == (1 << 32) - 1
+    line.pass_time((1 << 32) - line.slaves[0].clock.local(line.now) - 50 * MS)
+    before = line.number(0, 0x0910, 8)
+    start_sync0(line, 0, MS, first_in=100 * MS)
+    line.pass_time(90 * MS)
+    after = line.send(Datagram(DatagramCommand.FRMW, 0, STATION, 0x0910, bytes(8)))[0]
+    assert int.from_bytes(after.data, "little") < 100 * MS < before < 1 << 32
+    line.pass_time(20 * MS)
+    sync0 = line.slaves[0].esc.dc.sync0
+    assert 0 < sync0.pulses < 20
+    assert line.number(0, 0x0990, 8) < 1 << 32
+
+
+def test_a_start_time_in_the_past_of_a_clock_of_32_bits_comes_after_its_wrap() -> None:
+    clock = Clock(0.0, 0, 0, 32)
+    sync0 = SyncGenerator(clock)
+    sync0.activate(start=999, cycle=500, t=1000)
+    assert sync0.due == (1 << 32) + 999
+
+
 def test_pulses_skipped_after_a_stop_keep_to_the_grid() -> None:
     clock = Clock(-20.0, 0, 0)
     sync0 = SyncGenerator(clock)
