@@ -111,8 +111,12 @@ class Setting:
     @property
     def text(self) -> str:
         """Object, name, value in the drive and in SI units, or its meaning."""
-        scaled = self.meaning or ("" if self.value is None else f"{self.value:.4g} {self.unit}")
-        return f"{self.name} ({self.where}) is {self.raw}" + (f", {scaled}" if scaled else "")
+        return f"{self.name} ({self.where}) is {self.raw}" + (f", {self.scaled}" if self.scaled else "")
+
+    @property
+    def scaled(self) -> str:
+        """The meaning, or the value with its unit; empty: unknown."""
+        return self.meaning or ("" if self.value is None else f"{self.value:.4g} {self.unit}")
 
     @property
     def where(self) -> str:
@@ -144,6 +148,17 @@ def settings_of(values: Values, axis: int, device: DeviceDescription | None = No
             meaning = meanings.get(code, "by the manual of the drive")
             settings.append(Setting(index + shift, 0, name, code, None, "", meaning))
     return sorted(settings, key=lambda setting: (setting.index, setting.sub_index))
+
+
+def after_start(values: Values, config: SlaveConfig, axis: int) -> Values:
+    """Return the settings of an axis with the start-up SDOs and the limits that the start writes into the drive."""
+    shift = (axis - 1) * OBJECTS_PER_AXIS
+    written = {
+        (sdo.index - shift, sdo.sub_index): sdo.integer_data
+        for sdo in (*config.device.sdo, *config.limits)
+        if "int" in sdo.type
+    }
+    return {at: written.get(at, data) for at, data in values.items()}
 
 
 def compare(
