@@ -149,9 +149,8 @@ class PdoEntry:
     max: float | None = None
     """Of an output: largest value that is sent, in the channel's unit; left out: that of `type`."""
     safe: float | None = None
-    """Of an output: value, in the channel's unit, from the start until it is commanded, and after a fault. Left out: 0,
-    and in a drive, where `rtcp` does not drive it, [the drive's own value](drives.md#objects-that-rtcp-does-not-drive).
-    """
+    """Of an output: value until it is commanded, and after a fault, in the channel's unit. Left out: 0, of a drive
+    [its own](drive_settings.md)."""
     axis: AxisNumber | None = None
     """Axis of a drive with several, where one PDO holds channels of more than one; left out: that of the PDO."""
 
@@ -272,7 +271,7 @@ class LimitObject:
     type: IntegerTypeName
     """Data type of the object."""
     limit: LimitName
-    """Limit that it holds: ends of the position, speed, or torque; see [drives](drives.md#limits-inside-the-drive)."""
+    """Limit that it holds: ends of the position, speed, or torque; see [limits](drive_settings.md)."""
     factor: float | None = None
     """SI units per count; left out: that of the drive's position, velocity or torque channel. Not 0."""
     axis: AxisNumber = 1
