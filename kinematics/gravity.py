@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 from kinematics.forward import frames
 from kinematics.model import ArmModel, LinkMass
@@ -11,6 +13,9 @@ from kinematics.pose import Pose, as_floats, require_finite
 Torques = tuple[float, float, float, float, float, float]
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)  # m/s^2 in the base frame of an upright arm; CGPM 1901
+_SWEEPS, _BETTER = 4, 1e-9
+"""Most sweeps over all joints of a search, and the least improvement, Nm."""
+_THIRD, _HALF_TURNS = 2.0 * math.pi / 3.0, 4
 
 
 def gravity_torques(
@@ -56,3 +61,42 @@ def _moment(pose: Pose, body: LinkMass) -> tuple[float, float, float, float]:
     m = body.mass
     x, y, z = body.centre
     return m, m * (px + a * x + b * y + c * z), m * (py + d * x + e * y + f * z), m * (pz + g * x + h * y + i * z)
+
+
+def worst_torques(model: ArmModel, ranges: Sequence[tuple[float, float]]) -> Torques:
+    """Return the largest holding torque of each joint, Nm, that a search of its range finds; `ranges`: rad, six pairs.
+
+    As a function of one angle each torque is a + b cos(q) + c sin(q), whose extremes are known: the search goes from
+    extreme to extreme, joint by joint, until no angle improves. Collisions of the arm with itself are not considered.
+    """
+    return _worst_torques(model, tuple(ranges))
+
+
+@lru_cache(maxsize=32)
+def _worst_torques(model: ArmModel, ranges: tuple[tuple[float, float], ...]) -> Torques:
+    starts = [[low + part * (high - low) for low, high in ranges] for part in (0.5, 0.2)]
+    return tuple(max(_climb(model, ranges, i, list(q)) for q in starts) for i in range(6))  # type: ignore[return-value]
+
+
+def _climb(model: ArmModel, ranges: Sequence[tuple[float, float]], joint: int, q: list[float]) -> float:
+    """Return the largest magnitude of a joint's torque, Nm, by coordinate search from the pose `q`."""
+
+    def torque(axis: int, angle: float) -> float:
+        return gravity_torques(model, [*q[:axis], angle, *q[axis + 1 :]])[joint]
+
+    best = abs(torque(0, q[0]))
+    for _ in range(_SWEEPS):
+        before = best
+        for axis, (low, high) in enumerate(ranges):
+            thirds = [torque(axis, k * _THIRD) for k in range(3)]
+            b = (2.0 * thirds[0] - thirds[1] - thirds[2]) / 3.0
+            c = (thirds[1] - thirds[2]) / math.sqrt(3.0)
+            peak = math.atan2(c, b)
+            peaks = [peak + k * math.pi for k in range(-_HALF_TURNS, _HALF_TURNS + 1)]
+            for angle in (low, high, *(angle for angle in peaks if low < angle < high)):
+                if abs(torque(axis, angle)) > best + _BETTER:
+                    best = abs(torque(axis, angle))
+                    q[axis] = angle
+        if best <= before:
+            break
+    return best

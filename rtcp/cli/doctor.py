@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from rtcp.cli.arguments import AsJson, ConfigFile, option
+from rtcp.cli.drive_settings import exit_code, settings_of_drives, show_drives
 from rtcp.cli.output import CommandError, ExitCode, complain, emit, emit_json, show, table
 from rtcp.config.model import VIRTUAL
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
@@ -30,22 +31,32 @@ Bus = Annotated[
     option("--bus", "virtual|NAME", "virtual, or a network interface. Default: the configured one."),
 ]
 
+Drives = Annotated[bool, option("--drives", "Also read and check the settings of the drives.")]
+
 commands = typer.Typer()
 
 
 @commands.command("doctor")
-def _doctor(bus: Bus = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
+def _doctor(bus: Bus = None, config: ConfigFile = None, drives: Drives = False, as_json: AsJson = False) -> None:
     """Show what on this host prevents real time, why, and how to fix it; changes nothing.
 
-    Exit codes: 0 no obstacle, 3 cycles will be late at times, 5 the loop cannot keep its cycle.
+    With --drives the limits and the reactions to stops that the drives hold themselves follow, as they are after the
+    start, compared with what the joints need. The slaves are then brought to PRE-OP if no platform runs.
+
+    Exit codes: 0 no obstacle, 3 cycles will be late at times, or a drive differs, 5 the loop cannot keep its cycle, or
+    a drive is refused at the start.
     """
     case = _case(bus, config)
     findings = sorted(examine(case), key=lambda finding: -finding.severity)  # stable: keeps the order of the checks
+    found = settings_of_drives(bus, config) if drives else []
     if as_json:
-        emit_json(_as_json(case, findings))
+        emit_json(_as_json(case, findings) | ({"drives": [drive.as_json() for drive in found]} if drives else {}))
     else:
         _show(case, findings)
-    raise typer.Exit(RESULTS[findings[0].severity][0])
+        if drives:
+            emit("")
+            show_drives(found)
+    raise typer.Exit(max(RESULTS[findings[0].severity][0], exit_code(found)))
 
 
 def _case(bus: str | None, config: Path | None) -> Case:

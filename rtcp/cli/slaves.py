@@ -13,6 +13,7 @@ import typer
 from rtcp.api import NotRunning
 from rtcp.cli.arguments import AsJson, BusName, ConfigFile, as_written, option, positive
 from rtcp.cli.bus import Bus, SlaveName, offline_bus, open_bus, parse_integer, scan_tables
+from rtcp.cli.drive_settings import settings_of_slave, settings_table
 from rtcp.cli.output import (
     CommandError,
     ExitCode,
@@ -250,14 +251,15 @@ def _capture(
 
 
 def _describe(slave: str, bus: str | None, config: Path | None, as_json: bool) -> None:
-    """Show a slave's description of itself: identity, assigned PDOs, object dictionary."""
+    """Show a slave's description of itself: identity, assigned PDOs, object dictionary; a drive also its settings."""
     with (
         own_bus("scan --describe", bus, config) as (opened, access),
         transfer("reading", 1.0, quiet=as_json) as progress,
     ):
         device = access.describe(opened.slave(slave), progress)
+        drives = settings_of_slave(access, opened.slave(slave), device, config)
     if as_json:
-        emit_json(device)
+        emit_json({**device, "drives": [drive.as_json() for drive in drives]})
         return
     identity = device["identity"]
     emit(f"{device['name']}: vendor 0x{identity['vendor_id']:08X}, product 0x{identity['product_code']:08X}")
@@ -273,7 +275,7 @@ def _describe(slave: str, bus: str | None, config: Path | None, as_json: bool) -
                 access_rights + (f" in {entry['write_states']}" if entry["write_states"] else ""),
                 _plain(entry["name"] if entry["name"] in ("", item["name"]) else f"{item['name']}: {entry['name']}"),
             )
-    show(*[rows for rows in (_pdo_table(device), objects) if rows.row_count])
+    show(*[rows for rows in (_pdo_table(device), objects, settings_table(drives)) if rows.row_count])
 
 
 def _plain(text: str) -> str:

@@ -1,41 +1,61 @@
 """The limits of the joints inside their drives: a guard that does not depend on this software.
 
 A device's file names the objects (`limits`); their values follow from the joint in the arm's file. They lie a little
-beyond what this platform itself keeps to, so that its own guards and its supervision act first.
+beyond what this platform itself keeps to, so that its own guards and its supervision act first. Limits that the file
+does not name stay as the drive holds them, and are compared with what the joints need (`AxisNeeds`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from math import inf
 from typing import Final
 
-from rtcp.config.model import ArmConfig, DeviceDescription, Joint, LimitObject, SlaveConfig, StartupSdo, integer_range
+from kinematics.gravity import worst_torques
+from rtcp.config.model import (
+    JOINTS,
+    UNLIMITED_TORQUE,
+    ArmConfig,
+    AxisNeeds,
+    DeviceDescription,
+    Joint,
+    LimitObject,
+    SlaveConfig,
+    StartupSdo,
+    integer_range,
+)
 
 BEYOND_RANGE_RAD: Final = 0.05
 """How far the drive's position limits lie outside the joint's range, rad: a joint that sagged out of it is led back."""
 BEYOND_SUPERVISION: Final = 1.5
 """The drive's speed limit, multiple of the supervision's threshold."""
+SLOWEST_QUICK_STOP_S: Final = 2.0
+"""Time for which the platform waits for a quick stop whose deceleration no start-up SDO sets, s."""
 _CHANNELS: Final = {
-    "position_min": ("target_position",),
-    "position_max": ("target_position",),
+    "position": ("target_position", "position"),
     "velocity": ("target_velocity", "velocity"),
     "torque": ("target_torque", "torque"),
 }
-"""Channels whose factor an object has that states none."""
+"""Channels whose factor an object has that states none, by quantity."""
+
+
+def channel_factor(device: DeviceDescription, quantity: str, axis: int) -> float | None:
+    """Return the SI units per count of `position`, `velocity` or `torque` of an axis; None: no channel states them."""
+    factors = {
+        channel.name: channel.factor
+        for pdo in (*device.tpdo, *device.rpdo)
+        for channel in pdo.channels
+        if pdo.axis_of(channel) == axis
+    }
+    return next((factors[name] for name in _CHANNELS[quantity] if name in factors), None)
 
 
 def factor_of(device: DeviceDescription, entry: LimitObject) -> float | None:
     """Return the SI units per count of an object; None: neither the object nor a channel of the axis states one."""
     if entry.factor is not None:
         return entry.factor
-    factors = {
-        channel.name: channel.factor
-        for pdo in (*device.tpdo, *device.rpdo)
-        for channel in pdo.channels
-        if pdo.axis_of(channel) == entry.axis
-    }
-    return next((factors[name] for name in _CHANNELS[entry.limit] if name in factors), None)
+    return channel_factor(device, entry.limit.partition("_")[0], entry.axis)
 
 
 def joint_limits(config: ArmConfig, slave: SlaveConfig, joint: Joint, zero: float) -> Iterator[StartupSdo]:
@@ -70,9 +90,10 @@ def joint_limits(config: ArmConfig, slave: SlaveConfig, joint: Joint, zero: floa
 
 
 def with_limits(config: ArmConfig) -> tuple[SlaveConfig, ...]:
-    """Return the slaves of an arm with the limits of their joints, for the bus to write."""
+    """Return the slaves of an arm with the limits of their joints, for the bus to write, and with what these need."""
     zeros = config.zero_offsets or (0.0,) * len(config.axes)
     joints = list(zip(config.axes, zeros, strict=True))
+    needs = list(_needs(config, zeros))
     return tuple(
         replace(
             slave,
@@ -82,6 +103,31 @@ def with_limits(config: ArmConfig) -> tuple[SlaveConfig, ...]:
                 if joint.slave == slave.name
                 for sdo in joint_limits(config, slave, joint, zero)
             ),
+            needs=tuple(need for (joint, _), need in zip(joints, needs, strict=True) if joint.slave == slave.name),
         )
         for slave in config.slaves
     )
+
+
+def _needs(config: ArmConfig, zeros: Sequence[float]) -> Iterator[AxisNeeds]:
+    """Yield what each axis needs of its drive's own settings."""
+    weights = [0.0] * len(config.axes)
+    ranges = tuple((joint.position.min, joint.position.max) for joint in config.joints)
+    for model in config.models:
+        if model.links and len(ranges) == JOINTS:
+            weights[: len(ranges)] = map(max, weights, worst_torques(model, ranges))
+    quick = tuple(key.name for key in fields(config.stops) if getattr(config.stops, key.name) == "quick_stop")
+    for joint, zero, weight in zip(config.axes, zeros, weights, strict=True):
+        measured = joint.torque < UNLIMITED_TORQUE
+        yield AxisNeeds(
+            joint.name,
+            joint.axis,
+            (joint.position.min + zero, joint.position.max + zero),
+            joint.velocity,
+            config.supervision.following_error,
+            weight,
+            joint.torque * config.supervision.torque if measured else inf,
+            joint.velocity / SLOWEST_QUICK_STOP_S,
+            quick,
+            config.feed_forward.channels,
+        )

@@ -51,6 +51,8 @@ _SENTENCES = {
     # devices
     "bool_scaled": "found {found:g} with the type bool, allowed is none: it is 0 or 1; leave it out",
     "modulo_of_type": "found {found} with the type {type}, allowed is an integer type",
+    "position_wraps": "found with {channel}; a drive whose position wraps within the range of its joint is not "
+    "supported: leave it out, and set 0x607B in the drive so that it does not wrap there",
     "bits_fixed": "found {found}, but the type {type} has {bits} bits; leave it out, or write the type bits or bytes",
     "only_for_bytes": "found with the type {type}, allowed is the type bytes",
     "output_and_input": "found {found!v}, an output's name too; each channel of the device needs its own",
@@ -68,7 +70,7 @@ _SENTENCES = {
     "axes_with_gap": "found channels of axis {axes}; axes are counted from 1, without a gap",
     "several_axes": "found channels of {axes} axes, allowed is kind cia402 for a device with several",
     "safe_zero": "found 0 for {channel} ({bound}), which the drive is always sent: enabled it would have no torque, or "
-    "no motion; allowed is any other value",
+    "no motion; allowed is any other value, and with coe: true none, for the value that the drive holds itself",
     "unlike": "found {found:.10g} for {channel}, and {first:.10g} for {of}; all {alike}",
     "unlike_scaling": "found {found:.10g}, but from scaling follows {scaled:.10g}: leave it out",
     "two_torques": "found beside rated_current, allowed is one of them: what torques are thousandths of",

@@ -91,6 +91,8 @@ MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "cst": (("target_torque", "modes_of_operation"), ("velocity", "torque")),
 }
 """Channels of rpdo and of tpdo that a drive mode needs beside those of every CiA 402 drive."""
+DRIVEN_OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
+"""Channels of rpdo that the driver of a CiA 402 drive commands; feed-forward adds the offsets."""
 ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
 FrameName = Literal["base", "tool"]
 Level = Literal["high", "low"]
@@ -146,8 +148,9 @@ class PdoEntry:
     """Of an output: smallest value that is sent, in the channel's unit; left out: that of `type`."""
     max: float | None = None
     """Of an output: largest value that is sent, in the channel's unit; left out: that of `type`."""
-    safe: float = 0.0
-    """Of an output: value, in the channel's unit, from the start until it is commanded, and after a fault."""
+    safe: float | None = None
+    """Of an output: value until it is commanded, and after a fault, in the channel's unit. Left out: 0, of a drive
+    [its own](drive_settings.md)."""
     axis: AxisNumber | None = None
     """Axis of a drive with several, where one PDO holds channels of more than one; left out: that of the PDO."""
 
@@ -268,7 +271,7 @@ class LimitObject:
     type: IntegerTypeName
     """Data type of the object."""
     limit: LimitName
-    """Limit that it holds: ends of the position, speed, or torque; see [drives](drives.md#limits-inside-the-drive)."""
+    """Limit that it holds: ends of the position, speed, or torque; see [limits](drive_settings.md)."""
     factor: float | None = None
     """SI units per count; left out: that of the drive's position, velocity or torque channel. Not 0."""
     axis: AxisNumber = 1
@@ -366,12 +369,15 @@ class DeviceDescription:
         index += (axis - 1) * OBJECTS_PER_AXIS
         return next((sdo.value for sdo in reversed(self.sdo) if (sdo.index, sdo.sub_index) == (index, 0)), None)
 
-    def wire_range(self, channel: str) -> tuple[float, float]:
-        """Return the range of a channel to the device, SI; infinite if it does not exist."""
-        for entry in (entry for pdo in self.rpdo for entry in pdo.channels):
-            if entry.name == channel:
-                return entry.range
-        return -math.inf, math.inf
+    def channel(self, name: str) -> PdoEntry | None:
+        """Return the channel of a name, the outputs first; None: it does not exist."""
+        entries = (entry for pdo in (*self.rpdo, *self.tpdo) for entry in pdo.channels)
+        return next((entry for entry in entries if entry.name == name), None)
+
+    def wire_range(self, name: str) -> tuple[float, float]:
+        """Return the range of a channel, SI; infinite if it does not exist."""
+        entry = self.channel(name)
+        return (-math.inf, math.inf) if entry is None else entry.range
 
 
 def _of_axis(pdos: Sequence[Pdo], axis: int) -> tuple[Pdo, ...]:
@@ -415,6 +421,31 @@ class SlaveEntry:
 
 
 @dataclass(frozen=True)
+class AxisNeeds:
+    """What a joint needs of the settings that its drive holds itself, SI units at the joint."""
+
+    joint: Name
+    axis: AxisNumber
+    """Axis of the drive."""
+    position: tuple[float, float]
+    """Lowest and highest position that the drive shows within the joint's range, rad."""
+    velocity: float
+    """Speed limit of the joint, rad/s."""
+    following_error: float
+    """Following error at which the supervision stops the arm, rad."""
+    holding_torque: float
+    """Torque that carries the arm itself in the worst pose of its range, Nm; 0: unknown."""
+    supervised_torque: float
+    """Measured torque at which the supervision stops the arm, Nm; infinite: the torque is not measured."""
+    deceleration: float
+    """Least deceleration of a quick stop, rad/s²: it ends within the time that the platform waits for it."""
+    quick_stops: tuple[str, ...] = ()
+    """Keys of `stops` whose reaction is a quick stop."""
+    feed_forward: tuple[str, ...] = ()
+    """Output channels that feed-forward drives."""
+
+
+@dataclass(frozen=True)
 class SlaveConfig:
     """A slave of the segment, in the order of the cable: position is its index + 1."""
 
@@ -426,6 +457,8 @@ class SlaveConfig:
     """Station alias; 0: the slave is identified by its place."""
     limits: tuple[StartupSdo, ...] = ()
     """Limits of its joints, written after the start-up SDOs (`rtcp.config.drive_limits.with_limits`)."""
+    needs: tuple[AxisNeeds, ...] = ()
+    """What its joints need of it (`rtcp.config.drive_limits.with_limits`)."""
 
 
 @dataclass(frozen=True)
@@ -1198,6 +1231,11 @@ class ArmConfig(ArmSettings):
     """The file it was read from."""
     warnings: tuple[str, ...] = ()
     """Values that are allowed but implausible: file, line, key, value and the likely mistake."""
+
+    def with_devices(self, devices: Sequence[DeviceDescription]) -> ArmConfig:
+        """Return the configuration with other descriptions of its slaves, in their order."""
+        pairs = zip(self.slaves, devices, strict=True)
+        return replace(self, slaves=tuple(replace(slave, device=device) for slave, device in pairs))
 
     @property
     def models(self) -> tuple[ArmModel, ...]:

@@ -118,7 +118,7 @@ def _entry(entry: PdoEntry) -> Iterator[Finding]:
         yield Finding(("factor",), "zero")
     if entry.min is not None and entry.max is not None and not entry.min < entry.max:
         yield from _order(entry.min, entry.max)
-    elif entry.factor and entry.is_number and entry.length:
+    elif entry.factor and entry.is_number and entry.length and entry.safe is not None:
         yield from _within(("safe",), entry.safe, *entry.range, "the range of the channel")
     if entry.type == "bool" and entry.index and (entry.factor, entry.offset) != (1.0, 0.0):
         key = "factor" if entry.factor != 1 else "offset"
@@ -291,7 +291,7 @@ def _drive_channels(device: DeviceDescription) -> Iterator[Finding]:
     }
     for axis, where, entry in channels:
         bound = BOUNDING_OBJECTS.get(entry.index - (axis - 1) * OBJECTS_PER_AXIS)
-        if bound is not None and where[0] == "rpdo" and entry.safe == 0:
+        if bound is not None and where[0] == "rpdo" and not entry.safe and not (entry.safe is None and device.coe):
             yield Finding((*where, "safe"), "safe_zero", channel=entry.name, bound=bound)
         quantity = QUANTITIES.get(entry.name)
         if quantity is None or axis not in positions:
@@ -362,7 +362,9 @@ def _pdos(direction: str, pdos: Sequence[Pdo], device: DeviceDescription) -> Ite
             for key in unused:
                 if getattr(entry, key) != getattr(PdoEntry, key):
                     of_key = {"channel": entry.name, "image": direction, "kind": kind}
-                    yield Finding((direction, i, "channels", j, key), "no_meaning", **of_key)
+                    wraps = key == "modulo" and (kind, entry.name) == ("cia402", "position")
+                    code = "position_wraps" if wraps else "no_meaning"
+                    yield Finding((direction, i, "channels", j, key), code, **of_key)
     for axis, names in (axes or {1: {}}).items():
         if missing := [name for name in needed if name not in names and name not in OPTIONAL]:
             there = f"its channels are {', '.join(names)}" if names else "it has no channels"
@@ -659,15 +661,22 @@ def _beyond_the_wire(
         *offsets,
         (("position", "min"), (position.min,), "target_position"),
         (("position", "max"), (position.max,), "target_position"),
+        (("position", "min"), (position.min,), "position"),
+        (("position", "max"), (position.max,), "position"),
         (("velocity",), (-velocity, velocity), "target_velocity"),
         (("torque",), (-torque, torque), "target_torque"),
     )
+    found: set[KeyPath] = set()
     for where, ends, name in limits:
         widened: KeyPath = ("absolute",) if getattr(wide, str(where[0])) is not None else ()
         low, high = device.wire_range(name)
-        if not all(low <= end <= high for end in ends):
-            entry = next(entry for pdo in device.rpdo for entry in pdo.channels if entry.name == name)
+        if where not in found and not all(low <= end <= high for end in ends):
+            found.add(where)
+            entry = device.channel(name)
+            assert entry is not None
             of = f"{name} of {device.name} is {entry.type} with factor {entry.factor:g}"
+            if entry.type.startswith("uint") and min(ends) < 0:
+                of += "; if the drive counts below 0 in two's complement, write the signed type"
             sign = "+-" if len(ends) == 2 else ""
             yield Finding(
                 (*axis, *widened, *where), "beyond_wire", sign=sign, found=ends[-1], low=low, high=high, of=of

@@ -168,7 +168,8 @@ def _wrong(config: ArmConfig, axis: int, offset: object) -> Finding | None:
         wanted = f"a number from {-LARGEST:g} to {LARGEST:g} (rad)"
         return Finding(where, "range", found=offset, allowed=wanted)
     device = next(slave.device for slave in config.slaves if slave.name == joint.slave).of_axis(joint.axis)
-    low, high = device.wire_range("target_position")
+    ranges = [device.wire_range(name) for name in ("target_position", "position")]
+    low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
     ends = (joint.position.min + offset, joint.position.max + offset)
     if all(low <= end <= high for end in ends):
         return None

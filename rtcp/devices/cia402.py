@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Final, cast
 
-from rtcp.config.model import MODE_CHANNELS, SlaveConfig
+from rtcp.config.model import DRIVEN_OUTPUTS, MODE_CHANNELS, SlaveConfig
 from rtcp.devices.drive import CSP, CST, CSV, Drive, TargetState
 from rtcp.devices.driver import DeviceError, integer_range
 from rtcp.fieldbus.pdo import ImageLayout
@@ -69,7 +69,6 @@ _RESET_HOLD: Final = 5
 """Calls of `advance` for which the fault reset bit stays set before the next edge: a drive answers cycles later."""
 _EXACT: Final = 1e-9
 """Largest round-off of a conversion between counts and SI units, in either unit."""
-_OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
 _WITH_SPEED = (CSP, CSV)
 _NEEDED = {CSP: MODE_CHANNELS["csp"], CSV: MODE_CHANNELS["csv"], CST: MODE_CHANNELS["cst"]}
@@ -109,8 +108,9 @@ class Cia402Drive(Drive):
 
     `encode` also takes `controlword`. A velocity that is not mapped is the mean one over 20 ms. In CSP the drive takes
     `speed_limit` from the field of the target velocity. A drive whose PDOs have no mode of operation stays in CSP, to
-    which a start-up SDO sets it. The offsets 0x60B1 and 0x60B2 are those of `offsets` while the drive is enabled in CSP
-    and CSV, else 0. Whatever else is mapped has its safe value, 0.
+    which a start-up SDO sets it. With feed-forward, the offsets 0x60B1 and 0x60B2 are those of `offsets` while the
+    drive is enabled in CSP and CSV, else 0. Whatever else is mapped has its safe value, which the bus takes from the
+    drive where the description states none.
 
     Args:
         slave: the slave's name and description.
@@ -128,7 +128,7 @@ class Cia402Drive(Drive):
 
     def __init__(self, slave: SlaveConfig, period_s: float, *, speed_limit: float = 0.0, zero: float = 0.0) -> None:
         super().__init__(slave, period_s, speed_limit=speed_limit, zero=zero)
-        self._out, self._in = _slots(self.rpdo, _OUTPUTS), _slots(self.tpdo, _INPUTS)
+        self._out, self._in = _slots(self.rpdo, DRIVEN_OUTPUTS), _slots(self.tpdo, _INPUTS)
         targets = [None if slot < 0 else self.rpdo.channels[slot] for slot in self._out[1:4]]
         if any(channel is not None and channel.factor == 0 for channel in targets):
             raise DeviceError(f"{self.device}: a factor of 0 in `rpdo` is not allowed")

@@ -19,6 +19,8 @@ CSP, CSV, CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
 _WINDOW_S: Final = 0.02
 """Window of the velocity measurement for drives that do not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
+OFFSETS: Final = ("velocity_offset", "torque_offset")
+"""Output channels of feed-forward, 0x60B1 and 0x60B2."""
 
 
 class TargetState(Enum):
@@ -41,13 +43,14 @@ class DriveOffsets:
 
     Args:
         image: outputs of the drive.
+        names: the channels that feed-forward drives; another one keeps its value.
     """
 
     __slots__ = ("_channels", "_fields", "_sent", "change", "torque", "velocity")
 
-    def __init__(self, image: ImageLayout) -> None:
+    def __init__(self, image: ImageLayout, names: Sequence[str] = OFFSETS) -> None:
         self.velocity = self.torque = self.change = self._sent = 0.0
-        found = [image.find(name) for name in ("velocity_offset", "torque_offset")]
+        found = [image.find(name) if name in names else None for name in OFFSETS]
         self._fields = [-1 if channel is None else image.channels.index(channel) for channel in found]
         self._channels = [(0.0, 0, 0) if channel is None else (1.0 / channel.factor, *integer_range(channel))
                           for channel in found]  # fmt: skip
@@ -219,5 +222,5 @@ def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     drive.low, drive.high = joint.position.min, joint.position.max
     drive.zero = zero
     if drive.HAS_STATUSWORD and any(map(drive.rpdo.find, config.feed_forward.channels)):
-        drive.offsets = DriveOffsets(drive.rpdo)
+        drive.offsets = DriveOffsets(drive.rpdo, config.feed_forward.channels)
     return slot, drive

@@ -74,7 +74,7 @@ class Driver:
         self.period_s = period_s
         self.codec_in, self.codec_out = make_codec(self.tpdo), make_codec(self.rpdo)
         self.values: dict[str, float] = {channel.name: 0.0 for channel in self.tpdo.channels if _is_number(channel)}
-        self.safe_values = {entry.name: entry.safe for entry in device.outputs}
+        self.safe_values = {entry.name: entry.safe or 0.0 for entry in device.outputs}
         """Outputs at the start and after a fault, SI."""
         self.targets: dict[str, float] = dict(self.safe_values)
         self._counters = {entry.name: Counter(entry.modulo) for entry in device.inputs if entry.modulo}

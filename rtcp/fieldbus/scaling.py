@@ -14,24 +14,19 @@ from rtcp.config.model import SlaveConfig
 from rtcp.config.scaling import (
     FACTOR_TOLERANCE,
     OBJECTS_PER_AXIS,
-    QUICK_STOP_OPTION,
     TORQUE_UNITS,
     VELOCITY_UNITS,
     DriveScaling,
 )
-from rtcp.fieldbus.bus import slave_label
+from rtcp.fieldbus.drive_settings import UNREADABLE, axis_label
 from rtcp.fieldbus.errors import BusError, SdoAborted
-from rtcp.fieldbus.mailbox import ABSENT, SdoClient
+from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.registers import Steps
 
 _ENCODER, _GEAR, _FEED = 0x608F, 0x6091, 0x6092
 """Ratios: subindex 1 by subindex 2."""
 _RATED_CURRENT, _RATED_TORQUE, _VELOCITY_UNIT = 0x6075, 0x6076, 0x60A9
 _AMPERE_PER_COUNT: Final = 1e-3
-_HOLDING: Final = range(5, 9)
-"""Quick stop option codes after which the drive stays in quick stop active, with torque."""
-_WRITE_ONLY: Final = 0x06010001
-_UNREADABLE: Final = ABSENT | {_WRITE_ONLY}
 
 
 def compare_scaling(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
@@ -47,7 +42,7 @@ def compare_scaling(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
         scaling = device.scaling_of(axis)
         if scaling is None:
             continue
-        where = _axis_label(sdo, config, axis)
+        where = axis_label(sdo, config, axis)
         lacking: list[str] = []
         for index, key, wanted, reading, unit in _compared(scaling, (axis - 1) * OBJECTS_PER_AXIS):
             actual = yield from reading(sdo, index)
@@ -66,10 +61,6 @@ def compare_scaling(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
     if faults:
         raise BusError(*faults)
     return notes
-
-
-def _axis_label(sdo: SdoClient, config: SlaveConfig, axis: int) -> str:
-    return slave_label(sdo.position, sdo.name) + ("" if config.device.axes == (1,) else f", axis {axis}")
 
 
 Value = float | str
@@ -108,7 +99,7 @@ def _reading(sdo: SdoClient, index: int, subindex: int) -> Steps[int | None]:
     try:
         return (yield from sdo.reading_int(index, subindex))
     except SdoAborted as error:
-        if error.code in _UNREADABLE:
+        if error.code in UNREADABLE:
             return None
         raise
 
@@ -132,18 +123,3 @@ def _velocity_unit(sdo: SdoClient, index: int) -> Steps[Value | None]:
     """Return the unit of velocities, as its number where `velocity_unit` does not know it."""
     code = yield from _reading(sdo, index, 0)
     return None if not code else VELOCITY_UNITS.get(code, f"the unit 0x{code:08X}")
-
-
-def check_quick_stop(sdo: SdoClient, config: SlaveConfig) -> Steps[list[str]]:
-    """Read the quick stop option code of each axis; return a sentence for each that removes the torque afterwards."""
-    notes = []
-    for axis in config.device.axes:
-        index = QUICK_STOP_OPTION + (axis - 1) * OBJECTS_PER_AXIS
-        option = yield from _reading(sdo, index, 0)
-        if option is not None and option not in _HOLDING:
-            signed = option - (1 << 16) if option >> 15 else option
-            notes.append(
-                f"{_axis_label(sdo, config, axis)}: after a quick stop it does not hold (0x{index:04X} is {signed}; "
-                f"5 to 8 hold): write it among the start-up SDOs of {config.file or 'its device file'}"
-            )
-    return notes

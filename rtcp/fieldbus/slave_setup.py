@@ -24,7 +24,7 @@ from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted, ValueNotKep
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
 from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, write_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
-from rtcp.fieldbus.scaling import check_quick_stop, compare_scaling
+from rtcp.fieldbus.scaling import compare_scaling
 from rtcp.fieldbus.scan import name_of
 from rtcp.fieldbus.system_time import SystemTime
 from rtcp.ipc.codes import ERROR_BIT, refusal
@@ -331,7 +331,6 @@ def configure_slave(
     if device.kind == "cia402":
         # Before any motion: a drive with other units must not come to SAFE-OP.
         notes += yield from compare_scaling(sdo, config)
-        notes += yield from check_quick_stop(sdo, config)
         for axis in device.axes:
             notes += yield from write_interpolation_time(sdo, period_ns, axis)
     return notes

@@ -14,7 +14,7 @@ from typing import Any
 from pysoem import pysoem
 
 from rtcp.config.drive_limits import with_limits
-from rtcp.config.model import ArmConfig, SlaveConfig
+from rtcp.config.model import ArmConfig, DeviceDescription, SlaveConfig
 from rtcp.esi.model import Device, EsiError
 from rtcp.esi.sii import read_sii
 from rtcp.fieldbus import al_state
@@ -22,6 +22,7 @@ from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import LARGEST_MAILBOX, MailboxInfo, PdoInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import clocks_of, measure_delays, start_clocks
 from rtcp.fieldbus.describe import describe_device, pdos_of_eeprom
+from rtcp.fieldbus.drive_settings import check_settings
 from rtcp.fieldbus.eeprom import (
     BOOTSTRAP_WORD,
     Progress,
@@ -91,6 +92,8 @@ class SoemBus:
         self.interface = interface
         self.notes: list[str] = []
         self.system_time = SystemTime()
+        self.devices: tuple[DeviceDescription, ...] = ()
+        """Descriptions of the slaves after `configure`, with the own values of drives (`check_settings`)."""
         self._fraction = receive_fraction
         self._pid = namespace_pid
         self._state_timeout_s = state_timeout_s
@@ -265,14 +268,19 @@ class SoemBus:
                 slave._disable_complete_access()
         if faults := [*self._eeprom_faults(slaves), *self._to_preop()]:
             raise BusError(*faults)
+        devices: list[DeviceDescription] = []
         for i, config in enumerate(slaves):
             try:
                 sdo, station = self._mailboxes.sdo(i + 1), station_of(i + 1)
                 self.notes += finish(configure_slave(sdo, self.port, station, config, period_ns))
+                device, notes = finish(check_settings(sdo, config))
+                devices.append(device)
+                self.notes += notes
             except BusError as error:
                 faults += error.sentences
         if faults:
             raise BusError(*faults)
+        self.devices = tuple(devices)
 
     def _eeprom_faults(self, slaves: Sequence[SlaveConfig]) -> list[str]:
         """Return a sentence for each slave without CoE whose EEPROM maps other objects than its device's file."""
@@ -623,6 +631,7 @@ class SoemMaster(Master):
         (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in slaves]))
         self.config = replace(self.config, slaves=by_alias(self.config.slaves, slaves))
         data = bus.configure(with_limits(self.config), round(self.config.cycle.period_us * 1000))
+        self.config = self.config.with_devices(bus.devices)
         for note in bus.notes:
             report(note)
         report("all slaves in SAFE-OP")

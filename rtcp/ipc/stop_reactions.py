@@ -12,6 +12,7 @@ from enum import IntEnum
 from math import sqrt
 from typing import NamedTuple
 
+from rtcp.config.drive_limits import SLOWEST_QUICK_STOP_S
 from rtcp.config.model import ArmConfig, Joint, StopsConfig
 from rtcp.ipc.events import EVENTS, Event
 
@@ -20,8 +21,6 @@ _LATENCY_CYCLES = 3
 _DRIVE_S = 0.03
 """Upper bound on the time from the end of the drive's ramp, or of the setpoints, to rest, s."""
 _QUICK_STOP_DECELERATION = 0x6085
-_UNKNOWN_S = 2.0
-"""Time of a quick stop whose rate is unknown, s: as in an emergency stop."""
 
 
 class StopReaction(IntEnum):
@@ -108,7 +107,7 @@ def quick_stop_s(config: ArmConfig) -> float:
     try:
         return max(bound.time_s for bound in bounds(replace(config, joints=config.axes), StopReaction.QUICK_STOP))
     except ValueError:
-        return _UNKNOWN_S
+        return SLOWEST_QUICK_STOP_S
 
 
 def longest_s(config: ArmConfig) -> float:

@@ -93,6 +93,12 @@ class OfflineBus:
         """Return the lengths of objects, by index and subindex, bytes; -1: there is none; None: it cannot be read."""
         return list(self._ask("object_lengths", slave=slave, objects=[list(address) for address in objects])["lengths"])
 
+    def read_objects(self, objects: Mapping[int | str, Sequence[tuple[int, int]]]) -> list[list[bytes | None]]:
+        """Return objects of several slaves, by index and subindex, little endian; None: one that cannot be read."""
+        asked = [[slave, [list(address) for address in addresses]] for slave, addresses in objects.items()]
+        found = self._ask("read_objects", objects=asked)["found"]
+        return [[None if text is None else bytes.fromhex(text) for text in of_slave] for of_slave in found]
+
     def describe(self, slave: int | str, progress: Progress = ignore) -> dict[str, Any]:
         """Return the description of a slave: the fields of `rtcp.esi.model.Device`, bytes as hex."""
         return dict(self._ask("describe", progress, slave=slave)["device"])
@@ -132,9 +138,7 @@ class OfflineBus:
         """Bring a slave to an AL state through those before it and leave it there; return its state in words."""
         return str(self._ask("state", slave=slave, state=state)["state"])
 
-    def _ask(
-        self, do: str, progress: Progress = ignore, **arguments: int | str | bool | list[list[int]]
-    ) -> dict[str, Any]:
+    def _ask(self, do: str, progress: Progress = ignore, **arguments: int | str | bool | list[Any]) -> dict[str, Any]:
         config = None if self._config is None else str(self._config)
         answered = _ask(self._bus, self._config, {"do": do, "config": config, **arguments}, progress)
         self.position, self.label = answered.get("position", 0), answered.get("label", "")
@@ -262,9 +266,10 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
     """
     from rtcp.fieldbus.soem import SoemBus  # here: the command itself does without SOEM
 
-    slave = question.get("slave")
+    asked = [slave for slave, _ in question.get("objects", ())] if question["do"] == "read_objects" else []
+    has_name = any(isinstance(slave, str) for slave in (question.get("slave"), *asked))
     # Before joining the namespace, in which this user has another id.
-    named = configuration(Path(question["config"]) if question["config"] else None) if isinstance(slave, str) else None
+    named = configuration(Path(question["config"]) if question["config"] else None) if has_name else None
     bus = SoemBus(question["interface"], namespace_pid=question["namespace_pid"])
     bus.open()
     try:
@@ -273,10 +278,19 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
         slaves = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
         if do == "scan":
             return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(info)) for info in slaves]}
-        position = int(question["slave"]) if named is None else bus.position_of(str(slave), named.slaves, slaves)
-        if not 1 <= position <= len(slaves):
-            missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
-            return {"error": missing, "kind": "invalid"}
+
+        def position_of(slave: int | str) -> int:
+            return int(slave) if named is None else bus.position_of(str(slave), named.slaves, slaves)
+
+        positions = [position_of(slave) for slave in asked or [question["slave"]]]
+        for position in positions:
+            if not 1 <= position <= len(slaves):
+                missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
+                return {"error": missing, "kind": "invalid"}
+        if asked:
+            pairs = zip(positions, question["objects"], strict=True)
+            return {"found": [_read_objects(bus, position, objects) for position, (_, objects) in pairs]}
+        position = positions[0]
         device = slaves[position - 1]
         label = f"slave {position} ({device.name}, serial {device.serial})"
         return {"position": position, "label": label, **_ANSWERS[do](bus, position, question)}
@@ -309,6 +323,15 @@ def _object_lengths(bus: SoemBus, position: int, question: dict[str, Any]) -> di
         except SdoAborted as error:
             lengths.append(-1 if error.code in ABSENT else None)
     return {"lengths": lengths}
+
+
+def _read_objects(bus: SoemBus, position: int, objects: Sequence[tuple[int, int]]) -> list[str | None]:
+    from rtcp.fieldbus.drive_settings import reader
+    from rtcp.fieldbus.registers import finish
+
+    read = reader(bus.sdo(position))
+    found = [finish(read(index, subindex)) for index, subindex in objects]
+    return [None if data is None else data.hex() for data in found]
 
 
 def _sdo_write(bus: SoemBus, position: int, question: dict[str, Any]) -> dict[str, Any]:

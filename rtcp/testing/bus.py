@@ -15,10 +15,11 @@ from typing import Any, cast
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.model import SlaveConfig
+from rtcp.config.model import DeviceDescription, SlaveConfig
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import PortErrors, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import sync_cycles
+from rtcp.fieldbus.drive_settings import check_settings
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import parse_emergency
 from rtcp.fieldbus.pdo import layout as image_of
@@ -248,6 +249,8 @@ class InProcessBus:
     def __init__(self, devices: Sequence[DeviceModel], seed: int = 0, now_ns: int = 0) -> None:
         self.random = Random(seed)
         self.notes: list[str] = []
+        self.devices: tuple[DeviceDescription, ...] = ()
+        """Descriptions of the slaves after `configure`, with the own values of drives (`check_settings`)."""
         self.now_ns = now_ns
         self.offset_ns = _EPOCH_NS + self.random.randrange(_EPOCH_NS)
         """Reference clock minus simulated time, ns."""
@@ -282,6 +285,11 @@ class InProcessBus:
             raise BusError(*faults)
         self._configs, self._period_ns = list(slaves), period_ns
         self.notes = [note for slave in self.slaves for note in self.set_up(slave.position)]
+        checked = [
+            finish(check_settings(cast(Any, slave), config)) for slave, config in zip(self.slaves, slaves, strict=True)
+        ]
+        self.devices = tuple(device for device, _ in checked)
+        self.notes += [note for _, notes in checked for note in notes]
         self.request_state(AlState.SAFEOP)
         if refused := self.wait_for_state(AlState.SAFEOP, 0.0):
             raise BusError(*refused)

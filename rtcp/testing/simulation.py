@@ -95,6 +95,7 @@ class Simulation(Closing):
         self.bus = InProcessBus(devices, seed, _BEGIN_NS)
         self.bus.segment.arm = make_arm(segment, devices)
         self.data = self.bus.configure(with_limits(config), self.period_ns)
+        self.config = config = config.with_devices(self.bus.devices)
         self.models = [device for device in map(self._model, config.joints) if isinstance(device, CubemarsDrive)]
         self.box = next((s.device for s in self.bus.slaves if isinstance(s.device, DiewuIoBox)), None)
         memory = _SHARED_MEMORY if _SHARED_MEMORY.is_dir() else None
@@ -286,7 +287,9 @@ class _InlineMaster(Master):
 
     def start(self, directory: Path, report: Callable[[str], None]) -> ProcessData:
         """Bring the slaves to SAFE-OP."""
-        return self._bus.configure(self.config.slaves, round(self.config.cycle.period_us * 1000))
+        data = self._bus.configure(self.config.slaves, round(self.config.cycle.period_us * 1000))
+        self.config = self.config.with_devices(self._bus.devices)
+        return data
 
     def close(self) -> None:
         """Do nothing: there is no interface."""

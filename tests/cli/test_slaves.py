@@ -1,4 +1,4 @@
-"""`rtcp foe`, `eeprom`, `alias`, `state` and `scan --describe`: real segments, each for as long as a command takes."""
+"""`rtcp foe`, `eeprom`, `alias`, `state`, `scan --describe`, `doctor --drives`: a real segment for each command."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from typing import Any
 import pytest
 import yaml
 
-from rtcp.cli import slaves
+from rtcp.cli import doctor, slaves
 from rtcp.esi.sii import crc, write_sii
 from rtcp.fieldbus.eeprom import is_sound, with_alias
 from rtcp.ipc.errors import RtcpError
 from rtcp.launch import offline
+from rtcp.realtime.doctor import Finding, Severity
 from tests.fieldbus.terminals import DEVICES, write_segment
 from tests.forked import Forked
 
@@ -306,3 +307,40 @@ def test_what_needs_the_bus_for_itself_is_refused_while_a_platform_holds_it(
     ended = rtcp(*command)
     assert ended.code == 3
     assert "holds the bus virtual" in ended.trouble
+
+
+def test_a_drive_shows_what_it_holds_beside_its_process_data_in_its_own_units_and_in_si_units(
+    rtcp: Rtcp, arm: Path, lasting: Callable[[], int]
+) -> None:
+    lasting()
+    options = ("scan", "--describe", "2", "--config", str(arm), "--bus", "virtual")
+    (drive,) = json.loads(rtcp(*options, "--json").out)["drives"]
+    texts = [setting["text"] for setting in drive["settings"]]
+    assert "quick stop option code (0x605A) is 2, slows down by 0x6085, then the torque goes off" in texts
+    assert "following error window (0x6065) is 1000, 0.1 rad" in texts
+    assert "quick stop deceleration (0x6085) is 100000, 10 rad/s^2" in texts
+    assert "1000 following error window: 0.1 rad" in " ".join(rtcp(*options).out.split())
+
+
+def test_the_drives_hold_what_their_joints_need_or_are_named_with_what_is_to_be_done(
+    rtcp: Rtcp, arm: Path, lasting: Callable[[], int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lasting()
+    monkeypatch.setattr(doctor, "examine", lambda case: [Finding(Severity.OK, "good", (), "host", "")])
+    options = ("doctor", "--drives", "--config", str(arm), "--bus", "virtual")
+    ended = rtcp(*options)
+    shown = " ".join(ended.out.split())
+    assert (ended.code, ended.err) == (0, "")
+    assert "drive1 0x605A 6 quick stop option code: slows down by 0x6085, then holds" in shown
+    assert "drive6 0x6072 190000 max torque: 19 Nm" in shown
+    assert "The drives hold what their joints need." in shown
+    drive = arm.parent / "devices" / "cubemars-orh.yaml"
+    text = drive.read_text()
+    assert text.count("value: 6, ") == text.count("value: 2000, ") == 1
+    drive.write_text(text.replace("value: 6, ", "value: 2, ").replace("value: 2000, ", "value: 200, "))
+    ended = rtcp(*options, "--json")
+    assert (ended.code, ended.err) == (3, "")
+    answer = json.loads(ended.out)
+    window, stop = answer["drives"][0]["warnings"][::-1]
+    assert window.startswith("drive1: following error window (0x6065) is 200, 0.02 rad, and the supervision of joint1")
+    assert stop.startswith("drive1: after a quick stop it does not hold: quick stop option code (0x605A) is 2, slows")

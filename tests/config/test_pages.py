@@ -31,6 +31,7 @@ OWN = [
     "descriptions.md",
     "channels.md",
     "drives.md",
+    "drive_settings.md",
     "segment.md",
     "distributed_clocks.md",
     "behaviours.md",
@@ -66,7 +67,8 @@ def test_the_generated_parts_of_a_page_are_up_to_date(page: Path) -> None:
 def test_every_key_of_a_file_is_on_exactly_one_page(file: str) -> None:
     arm_pages = (*OWN[:6], "guiding.md", "kinematics.md", "processes.md", "stops.md")
     arm = "".join((FOLDER / name).read_text() for name in arm_pages)
-    device = "".join((FOLDER / name).read_text() for name in ("devices.md", "channels.md", "drives.md"))
+    device_pages = ("devices.md", "channels.md", "drives.md", "drive_settings.md")
+    device = "".join((FOLDER / name).read_text() for name in device_pages)
     text = {"arm": arm, "device": device} | {
         kind: (FOLDER / page).read_text() for kind, page in (("segment", "segment.md"), ("motion", "motion.md"))
     }

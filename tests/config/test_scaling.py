@@ -122,12 +122,16 @@ def test_a_drive_is_not_sent_that_it_may_have_no_torque_or_speed(
     written: Write, findings: Findings, index: int
 ) -> None:
     outputs = pdos("rpdo", 2)
-    outputs[0]["channels"].append({"index": index + 0x800, "sub_index": 0, "type": "uint16", "name": "most"})
+    outputs[0]["channels"].append({"index": index + 0x800, "sub_index": 0, "type": "uint16", "name": "most", "safe": 0})
     both = {"rpdo": [*pdos("rpdo"), *outputs], "tpdo": [*pdos("tpdo"), *pdos("tpdo", 2)]}
     (finding,) = findings(**both)
     assert summary(finding, " channel=") == "rpdo[1].channels[5].safe: safe_zero channel=most"
     outputs[0]["channels"][-1]["safe"] = 1000
     written(**both)
+    del outputs[0]["channels"][-1]["safe"]  # the drive's own value
+    written(**both)
+    (finding,) = findings(**both, coe=False)  # cannot be read
+    assert finding.code == "safe_zero"
 
 
 def test_each_axis_has_its_own_scaling_or_all_have_one(written: Write) -> None:

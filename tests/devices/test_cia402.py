@@ -5,6 +5,7 @@ import struct
 
 import pytest
 
+from rtcp.config.model import BITS, DataTypeName, integer_range
 from rtcp.devices import Cia402Drive, DeviceError, DriveState
 from rtcp.devices import TargetState as T
 
@@ -221,6 +222,33 @@ def test_a_target_out_of_the_field_is_cut_to_it(drive: Cia402Drive, wire: Wire, 
     wire.receive(ENABLED)
     drive.target_position = target
     assert wire.sent()[1] == counts
+
+
+@pytest.mark.parametrize("kind", ["int16", "uint16", "int32", "uint32", "int64", "uint64"])
+def test_targets_of_each_width_are_exact_within_it_and_cut_to_its_ends(kind: DataTypeName) -> None:
+    bits, signed = BITS[kind], kind.startswith("int")
+    low, high = integer_range(kind)
+    as_sent: tuple[Channel, ...] = tuple(
+        (name, index, kind if name.startswith("target") else own, factor) for name, index, own, factor in RPDO
+    )
+    shown: tuple[Channel, ...] = tuple((name, i, kind if name == "position" else own, f) for name, i, own, f in TPDO)
+    drive = Cia402Drive(slave(as_sent, shown), 0.001, speed_limit=1e30)
+    drive.mode, drive.controlword = 9, 0x0F
+
+    def sent(count: float) -> tuple[int, int]:
+        """Position and velocity as the drive gets them, for a target of so many counts."""
+        inputs = struct.pack("<H", ENABLED) + min(max(round(count), low), high).to_bytes(
+            bits // 8, "little", signed=signed
+        )
+        drive.decode(inputs + struct.pack("<iib", 0, 0, 9))
+        drive.target_position = drive.target_velocity = count * FACTOR
+        fields = drive.encode()[2:]
+        return tuple(int.from_bytes(fields[at : at + bits // 8], "little", signed=signed) for at in (0, bits // 8))  # type: ignore[return-value]
+
+    for count in (1, 30_000, high // 3 if bits < 64 else 2**40, -1 if signed else 0, -30_000 if signed else 0):
+        assert sent(count) == (count, count)
+    assert sent(4.0 * high) == (high, high)
+    assert sent(-4.0 * high) == (low, low)
 
 
 def test_values_are_in_si_units(drive: Cia402Drive, wire: Wire) -> None:

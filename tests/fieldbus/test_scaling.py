@@ -85,17 +85,6 @@ def test_a_drive_that_counts_otherwise_is_refused_with_both_values(
     assert sentence.endswith("correct the one that is wrong before the arm moves")
 
 
-@pytest.mark.parametrize("option", [0, 2])
-def test_a_drive_that_drops_its_torque_after_a_quick_stop_is_noted(option: int) -> None:
-    bus = InProcessBus([create("cubemars-orh70")])
-    stop = replace(DEVICE.sdo[0], value=option)
-    bus.configure([SlaveConfig("drive1", replace(DEVICE, sdo=(stop,)), "devices/x.yaml")], PERIOD_NS)
-    assert bus.notes == [
-        f"slave 1 (drive1): after a quick stop it does not hold (0x605A is {option}; 5 to 8 hold): write it among the "
-        "start-up SDOs of devices/x.yaml"
-    ]
-
-
 def test_a_feed_constant_that_the_drive_does_not_count_in_is_not_compared() -> None:
     assert notes((replace(AGREES, feed_constant=0.0),), (0x6092, (1, 1)), (0x60A9, (0,)))
     assert notes((AGREES,), (0x6092, (0, 0)), (0x60A9, (0x00B50300,))) == []  # 0 is no ratio

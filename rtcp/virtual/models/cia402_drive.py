@@ -9,7 +9,7 @@ that are 0 or missing get a default.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import pi
+from math import isnan, nan, pi
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -22,7 +22,7 @@ from rtcp.virtual.models.profile_modes import Homing, ProfilePosition, ProfileVe
 from rtcp.virtual.models.protection import BoundedFeedback, Condition, ErrorLog
 from rtcp.virtual.models.servo import ServoAxis
 from rtcp.virtual.models.units import AXIS_STRIDE, LIMITLESS, AxisObjects, Units, rate_unit
-from rtcp.virtual.objects import Number
+from rtcp.virtual.objects import Access, DataType, Entry, Number
 from rtcp.virtual.protocol import AlState
 
 MOST_AXES = 8
@@ -37,6 +37,25 @@ _MODEL = SIZES["orh60"]
 _POSITION_LIMIT = (1 << 31) - 1
 _SUPPORTED = {1: 0x607A, 3: 0x60FF, 6: 0x6098, 8: 0x607A, 9: 0x60FF, 10: 0x6071}
 """Modes, and the object that each of them requires."""
+_HELD: Mapping[str, tuple[tuple[int, int], DataType, str]] = MappingProxyType({
+    "following_error_window": ((0x6065, 0), DataType.UNSIGNED32, "position"),
+    "following_error_timeout": ((0x6066, 0), DataType.UNSIGNED16, "ms"),
+    "max_torque": ((0x6072, 0), DataType.UNSIGNED16, "torque"),
+    "positive_torque_limit": ((0x60E0, 0), DataType.UNSIGNED16, "torque"),
+    "negative_torque_limit": ((0x60E1, 0), DataType.UNSIGNED16, "torque"),
+    "max_profile_velocity": ((0x607F, 0), DataType.UNSIGNED32, "velocity"),
+    "max_motor_speed": ((0x6080, 0), DataType.UNSIGNED32, "rpm"),
+    "quick_stop_deceleration": ((0x6085, 0), DataType.UNSIGNED32, "acceleration"),
+    "quick_stop_option": ((0x605A, 0), DataType.INTEGER16, "code"),
+    "fault_reaction_option": ((0x605E, 0), DataType.INTEGER16, "code"),
+    "velocity_offset": ((0x60B1, 0), DataType.INTEGER32, "velocity"),
+    "torque_offset": ((0x60B2, 0), DataType.INTEGER16, "torque"),
+    "wrap_low": ((0x607B, 1), DataType.INTEGER32, "position"),
+    "wrap_high": ((0x607B, 2), DataType.INTEGER32, "position"),
+})  # fmt: skip
+"""Options for what a drive holds beside its process data: object, type where the description lacks it, quantity."""
+_MAPPABLE = Access.RW | Access.RXPDO
+_MOST = 0xFFFF_FFFF
 _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
     "rated_torque": Option(None, 0.001, 10_000.0, "Nm at the joint; left out: by 0x6076, else 28"),
     "peak_torque": Option(None, 0.001, 30_000.0, "Nm; left out: twice the rated torque"),
@@ -45,6 +64,20 @@ _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
     "velocity_ratio": Option(None, 1e-3, 1e6, "turns that 0x60A9 counts in for one of the joint; left out: by 0x6091"),
     "torque_ratio": Option(None, 1e-6, 1e6, "Nm at the joint for 1000 of 0x6076; left out: by 0x6091"),
     "rated_current": Option(_MODEL.rated_current, 0.001, 10_000.0, "A (0x6075)"),
+    "following_error_window": Option(None, 0.0, _MOST, "rad: the drive's own fault beyond it (0x6065)"),
+    "following_error_timeout": Option(None, 0.0, 0xFFFF, "ms beyond the window until that fault (0x6066)"),
+    "max_torque": Option(None, 0.0, 30_000.0, "Nm at the joint that the drive gives at most (0x6072); 0: none"),
+    "positive_torque_limit": Option(None, 0.0, 30_000.0, "Nm at the joint (0x60E0)"),
+    "negative_torque_limit": Option(None, 0.0, 30_000.0, "Nm at the joint (0x60E1)"),
+    "max_profile_velocity": Option(None, 0.0, 1000.0, "rad/s of its own profiles and of CSV (0x607F)"),
+    "max_motor_speed": Option(None, 0.0, 1e6, "rpm of the motor: a fault above it (0x6080)"),
+    "quick_stop_deceleration": Option(None, 0.0, 1e6, "rad/s^2 of a quick stop (0x6085)"),
+    "quick_stop_option": Option(None, -32768.0, 8.0, "what a quick stop does (0x605A); 0: the torque goes off at once"),
+    "fault_reaction_option": Option(None, -32768.0, 4.0, "what a fault does (0x605E); 0: the torque goes off at once"),
+    "velocity_offset": Option(None, -1000.0, 1000.0, "rad/s in 0x60B1 until a master writes it"),
+    "torque_offset": Option(None, -30_000.0, 30_000.0, "Nm in 0x60B2 until a master writes it"),
+    "wrap_low": Option(None, -1e6, 1e6, "rad: 0x6064 and targets wrap to `wrap_high` below it (0x607B:1)"),
+    "wrap_high": Option(None, -1e6, 1e6, "rad: 0x6064 and targets wrap to `wrap_low` from here on (0x607B:2)"),
     **SERVO_OPTIONS,
 })  # fmt: skip
 
@@ -79,6 +112,7 @@ class Cia402Drive(Behaviour):
         """Set up the axes at power-on."""
         for axis in self.axes:
             axis.read_units()
+            axis.hold_settings()
             axis.servo.power_on()
 
     def on_state(self, old: AlState, new: AlState) -> None:
@@ -104,6 +138,7 @@ class _StandardAxis:
         self._drive = drive
         self._number = number
         objects = self._objects = AxisObjects(drive.device.objects, Units(1.0, 1.0, 1.0, 1.0, 1.0), number)
+        self._add_settings()
         self._rated = objects.number(0x6076)
         stated = self._rated.value * 1e-3 * self._torque_ratio
         rated_torque = self._option("rated_torque", 0.0) or stated or _MODEL.rated_torque
@@ -132,6 +167,30 @@ class _StandardAxis:
         drive = self._drive
         return drive.option(f"axis{self._number + 1}_{name}", drive.option(name, otherwise))
 
+    def _add_settings(self) -> None:
+        """Add the objects of the options that the description lacks."""
+        dictionary, shift = self._drive.device.objects, AXIS_STRIDE * self._number
+        for name, ((index, sub_index), kind, _) in _HELD.items():
+            at = index + shift
+            if isnan(self._option(name, nan)) or (at, sub_index) in dictionary:
+                continue
+            if sub_index:
+                dictionary.record(at, name, [Entry(at, n, name, kind, 0, _MAPPABLE) for n in (1, 2)])
+            else:
+                dictionary.variable(at, name, kind, 0, _MAPPABLE)
+
+    def hold_settings(self) -> None:
+        """Set what the drive holds at power-on."""
+        units = self._objects.units
+        counts = {
+            "position": units.position, "velocity": units.velocity, "acceleration": units.acceleration,
+            "torque": units.torque, "ms": 1.0, "rpm": 1.0, "code": 1.0,
+        }  # fmt: skip
+        for name, (at, _, quantity) in _HELD.items():
+            if not isnan(value := self._option(name, nan)):
+                low, high = self._objects.bounds(*at)
+                self._objects.number(*at).value = min(max(round(value / counts[quantity]), low), high)
+
     def read_units(self) -> None:
         """Read the units from the objects."""
         self._read_units()
@@ -154,7 +213,8 @@ class _StandardAxis:
             # In revolutions per minute of the motor, whatever 0x60A9 says (CiA 402-2, object 0x6080).
             fastest = min(fastest, motor_rpm * 2 * pi / 60 / self._gear_ratio)
         self._max_speed.value = round(fastest / units.velocity)
-        objects.fill(self._defaults(units))
+        kept = {at for name, (at, _, _) in _HELD.items() if not isnan(self._option(name, nan))}
+        objects.fill({at: value for at, value in self._defaults(units).items() if at not in kept})
 
     def _counts_per_turn(self) -> float:
         """Return the position counts per joint revolution from the objects."""
@@ -190,6 +250,8 @@ class _StandardAxis:
             (0x606F, 0): min(0xFFFF, max(1, speed // 200)),
             (0x6075, 0): round(1000.0 * self._option("rated_current")),
             (0x6072, 0): round(1000.0 * self._size.peak_torque / self._size.rated_torque),
+            (0x60E0, 0): round(1000.0 * self._size.peak_torque / self._size.rated_torque),
+            (0x60E1, 0): round(1000.0 * self._size.peak_torque / self._size.rated_torque),
             (0x607F, 0): self._max_speed.value,
             (0x6081, 0): speed,
             (0x6083, 0): acceleration,

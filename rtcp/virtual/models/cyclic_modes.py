@@ -124,6 +124,8 @@ class CyclicPosition(Motion):
         self._top = top
         self._low = objects.number(0x607D, 1)
         self._high = objects.number(0x607D, 2)
+        self._wrap_low = objects.number(0x607B, 1)
+        self._wrap_high = objects.number(0x607B, 2)
         self._period = period
         self._exponent = exponent
         self._period_told = self._exponent_told = 0
@@ -162,6 +164,11 @@ class CyclicPosition(Motion):
     def _take(self, counts: int, limit: int, step: float) -> None:
         # Called every cycle of a motion: comparisons are faster than min and max.
         self._set_point, self._limit = counts, limit
+        if self._wrap_low.value < self._wrap_high.value:
+            # A target of an axis that wraps is reached by the shorter way (CiA 402-2, object 0x607B).
+            turn = self._wrap_high.value - self._wrap_low.value + 1
+            here = round(self._axis.demand / self._units.position)
+            counts = here + (counts - here + turn // 2) % turn - turn // 2
         high: int = self._high.value
         low: int = self._low.value
         allowed = high if counts > high else counts

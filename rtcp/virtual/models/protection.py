@@ -173,16 +173,20 @@ class FeedbackWithCondition(Feedback):
 
 
 class BoundedFeedback(Feedback):
-    """Feedback that saturates at the limits of an object's bits."""
+    """Feedback that saturates at the limits of an object's bits; the position wraps at the ends in 0x607B."""
 
     def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
         super().__init__(objects, rated_torque)
         indices = (0x6062, 0x6063, 0x6064, 0x606B, 0x606C, 0x6074, 0x6077, 0x6078, 0x60F4)
         self._bounded = [(objects.number(n), *objects.bounds(n)) for n in indices if (n, 0) in objects]
+        self._ends = objects.number(0x607B, 1), objects.number(0x607B, 2)
 
     def publish(self, status: int, axis: Axis, following: float) -> None:
         """Write the statusword and the measurements."""
         super().publish(status, axis, following)
+        lowest, highest = (end.value for end in self._ends)
+        if lowest < highest:
+            self._position.value = lowest + (self._position.value - lowest) % (highest - lowest + 1)
         for entry, low, high in self._bounded:
             value = entry.value
             if not low <= value <= high:

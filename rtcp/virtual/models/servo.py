@@ -61,6 +61,7 @@ class ServoAxis:
         self._window = objects.number(0x6065)
         self._window_time = objects.number(0x6066)
         self._max_torque = objects.number(0x6072)
+        self._torque_limits = [objects.number(index) for index in (0x60E0, 0x60E1) if (index, 0) in objects]
         self._quick_deceleration = objects.number(0x6085)
         self._quick_stop_option = objects.number(0x605A)
         self._shutdown_option = objects.number(0x605B)
@@ -154,6 +155,9 @@ class ServoAxis:
         if mode != self._mode:
             self._choose_mode(mode)
         max_torque: int = self._max_torque.value
+        for limit in self._torque_limits:
+            # The mechanics know one limit for both directions: the smaller one counts.
+            max_torque = min(max_torque, limit.value)
         if max_torque != self._torque_counts:
             self._torque_counts = max_torque
             self.axis.torque_limit = min(self._torque_counts * self._units.torque, self.size.start_stop_torque)
