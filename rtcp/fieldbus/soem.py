@@ -7,7 +7,7 @@ import json
 import os
 import socket
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -32,12 +32,13 @@ from rtcp.fieldbus.eeprom import (
     read_eeprom,
     write_eeprom,
 )
-from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.errors import BusError, Refused
 from rtcp.fieldbus.foe import FoeClient, bootstrap_mailbox, enter_boot
 from rtcp.fieldbus.image import MOST_SLAVES, Places, limit_faults, read_places
 from rtcp.fieldbus.interface import PromiscuousMode, check_interface, check_name, claim, enter
 from rtcp.fieldbus.mailbox import Mailbox, Mailboxes, SdoClient
 from rtcp.fieldbus.master import Master
+from rtcp.fieldbus.other_masters import OtherMasters, other_master_words
 from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, entries_of, layout, mapping_of, mapping_text
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
@@ -101,6 +102,7 @@ class SoemBus:
         self._socket: socket.socket | None = None
         self._claim: socket.socket | None = None
         self._promiscuous: PromiscuousMode | None = None
+        self._others: OtherMasters | None = None
         self._port: RegisterPort | None = None
         self._barrier: FrameBarrier | None = None
         self._names: list[str] = []
@@ -143,6 +145,7 @@ class SoemBus:
         check_interface(self.interface)
         self._claim = claim(self.interface)
         try:
+            self._others = OtherMasters(self.interface)
             self._port = RegisterPort(self.interface)
             self._port.tries = PATIENT_TRIES
             self._barrier = FrameBarrier(self.interface)
@@ -151,6 +154,22 @@ class SoemBus:
         except BaseException:
             self.close()
             raise
+
+    def other_master(self) -> str:
+        """Return the sentence for a second master that was heard since the bus was opened; empty: none was."""
+        address = "" if self._others is None else self._others.address()
+        return other_master_words(address) if address else ""
+
+    @contextlib.contextmanager
+    def naming_other_master(self) -> Iterator[None]:
+        """Add `other_master` to a BusError as its probable cause."""
+        try:
+            yield
+        except BusError as error:
+            cause = self.other_master()
+            if not cause or isinstance(error, Refused):
+                raise
+            raise BusError(*error.sentences, cause) from error
 
     def scan(self) -> tuple[SlaveInfo, ...]:
         """Find the slaves, bring them to PRE-OP, measure delays; return their descriptions.
@@ -585,7 +604,7 @@ class SoemBus:
     def watcher(self, report: Callable[[Event], None]) -> SlaveWatcher:
         """Return the watcher of the configured slaves, all of them in OP; `report` receives its events."""
         assert self._restorer is not None, "only a configured bus has something to restore"
-        return SlaveWatcher(self.port, len(self._names), self._restorer, report, self._topology)
+        return SlaveWatcher(self.port, len(self._names), self._restorer, report, self._topology, self._others)
 
     def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
         wanted = range(1, len(self._names) + 1) if positions is None else positions
@@ -600,10 +619,12 @@ class SoemBus:
             self.notes.append(f"the slaves on {self.interface} could not be brought back to INIT: {error}")
         finally:
             # The claim last: the next master must not start while this one still cleans up.
-            for part in (self._port, self._barrier, self._socket, self._master, self._promiscuous, self._claim):
+            sockets = (self._others, self._port, self._barrier, self._socket)
+            for part in (*sockets, self._master, self._promiscuous, self._claim):
                 if part is not None:
                     part.close()
-            self._port = self._barrier = self._socket = self._claim = self._promiscuous = self._master = None
+            self._others = self._port = self._barrier = self._socket = None
+            self._claim = self._promiscuous = self._master = None
             self._names = []
 
     def _to_init(self, port: RegisterPort) -> None:
@@ -649,15 +670,20 @@ class SoemMaster(Master):
         """Find the slaves, compare them with the configuration, bring them to SAFE-OP."""
         bus = self._bus
         bus.open()
+        with bus.naming_other_master():
+            data = self._configure(directory, report)
+        for note in (*bus.notes, *filter(None, [bus.other_master()])):
+            report(note)
+        report("all slaves in SAFE-OP")
+        return data
+
+    def _configure(self, directory: Path, report: Callable[[str], None]) -> SoemProcessData:
+        bus = self._bus
         slaves = bus.scan()
         report(f"{len(slaves)} slaves on {self.interface}")
         (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in slaves]))
         self.config = replace(self.config, slaves=by_alias(self.config.slaves, slaves))
-        data = bus.configure(with_limits(self.config), round(self.config.cycle.period_us * 1000))
-        for note in bus.notes:
-            report(note)
-        report("all slaves in SAFE-OP")
-        return data
+        return bus.configure(with_limits(self.config), round(self.config.cycle.period_us * 1000))
 
     def close(self) -> None:
         """Bring the slaves back to INIT, close everything."""

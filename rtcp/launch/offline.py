@@ -268,20 +268,25 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
     bus = SoemBus(question["interface"], namespace_pid=question["namespace_pid"])
     bus.open()
     try:
-        do = question["do"]
-        # Requests for EEPROM or state need no slave in PRE-OP, which a wrong EEPROM may prevent.
-        slaves = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
-        if do == "scan":
-            return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(info)) for info in slaves]}
-        position = int(question["slave"]) if named is None else bus.position_of(str(slave), named.slaves, slaves)
-        if not 1 <= position <= len(slaves):
-            missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
-            return {"error": missing, "kind": "invalid"}
-        device = slaves[position - 1]
-        label = f"slave {position} ({device.name}, serial {device.serial})"
-        return {"position": position, "label": label, **_ANSWERS[do](bus, position, question)}
+        with bus.naming_other_master():
+            return _ask_bus(bus, question, named)
     finally:
         bus.close()
+
+
+def _ask_bus(bus: SoemBus, question: dict[str, Any], named: ArmConfig | None) -> dict[str, Any]:
+    do = question["do"]
+    # Requests for EEPROM or state need no slave in PRE-OP, which a wrong EEPROM may prevent.
+    slaves = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
+    if do == "scan":
+        return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(info)) for info in slaves]}
+    position = int(question["slave"]) if named is None else bus.position_of(str(question["slave"]), named.slaves, slaves)
+    if not 1 <= position <= len(slaves):
+        missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
+        return {"error": missing, "kind": "invalid"}
+    device = slaves[position - 1]
+    label = f"slave {position} ({device.name}, serial {device.serial})"
+    return {"position": position, "label": label, **_ANSWERS[do](bus, position, question)}
 
 
 def _report_progress(done: float) -> None:
