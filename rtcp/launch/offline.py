@@ -280,7 +280,8 @@ def _ask_bus(bus: SoemBus, question: dict[str, Any], named: ArmConfig | None) ->
     slaves = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
     if do == "scan":
         return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(info)) for info in slaves]}
-    position = int(question["slave"]) if named is None else bus.position_of(str(question["slave"]), named.slaves, slaves)
+    slave = question["slave"]
+    position = int(slave) if named is None else bus.position_of(str(slave), named.slaves, slaves)
     if not 1 <= position <= len(slaves):
         missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
         return {"error": missing, "kind": "invalid"}
