@@ -25,8 +25,8 @@ from rtcp.ipc.session import read_session
 LARGEST_ANGLE_DEG = 30.0
 SPEED_DEG_S = 1.0
 _LARGEST_SEEN_DEG = 36_000.0
-_NOTHING = 0.1
-"""Part of the commanded angle below which nothing has turned."""
+_NOTHING_REPORTED, _NOTHING_SEEN = 0.01, 0.1
+"""Part of the commanded angle below which nothing has turned, by the drive and by the eye."""
 _REPORTED_WITHIN, _SEEN_WITHIN = 0.1, 0.3
 """Largest relative difference of the reported angle, and of an angle that a person has estimated."""
 _INCREMENTS_PER_LINE = 4
@@ -50,7 +50,9 @@ class Diagnosis(NamedTuple):
     remedy: str
 
 
-def diagnose(commanded: float, reported: float, seen: float, scaling: DriveScaling | None) -> list[Diagnosis]:
+def diagnose(
+    commanded: float, reported: float, seen: float, scaling: DriveScaling | None, *, ended_early: bool = False
+) -> list[Diagnosis]:
     """Return what is wrong with an axis; empty: nothing.
 
     Args:
@@ -58,10 +60,11 @@ def diagnose(commanded: float, reported: float, seen: float, scaling: DriveScali
         reported: angle by which it turned by the drive's own position.
         seen: angle by which a person saw its shaft turn; all three in one unit, positive in the joint's sense.
         scaling: of the axis, in the device's file.
+        ended_early: a fault or a stop ended the motion, so that less was turned than commanded.
     """
     by_drive, by_eye = reported / commanded, seen / commanded
-    if abs(by_drive) < _NOTHING:
-        if abs(by_eye) < _NOTHING:
+    if abs(by_drive) < _NOTHING_REPORTED:
+        if abs(by_eye) < _NOTHING_SEEN:
             remedy = "neither the drive nor the eye saw a motion: check the brake, the motor's phases and 0x6072"
             return [Diagnosis(Cause.NO_MOTION, remedy)]
         remedy = (
@@ -72,13 +75,15 @@ def diagnose(commanded: float, reported: float, seen: float, scaling: DriveScali
     if by_drive < 0:
         remedy = "the drive reports a motion against the commanded one: its encoder counts against the motor's sense"
         found.append(Diagnosis(Cause.ENCODER, f"{remedy}; correct it in the drive (phases, or 0x607E)"))
-    elif not _near(by_drive, 1.0, _REPORTED_WITHIN):
+    elif not _near(by_drive, 1.0, _REPORTED_WITHIN) and not (ended_early and by_drive < 1.0):
         remedy = (
             f"the drive reports {by_drive:.3g} times the commanded angle: its `position` (0x6064) counts in another "
-            "unit than `target_position` (0x607A), or the motion did not end"
+            "unit than `target_position` (0x607A)"
         )
         found.append(Diagnosis(Cause.ENCODER, remedy))
-    if abs(by_eye) < _NOTHING:
+    if found and _near(by_eye, 1.0, _SEEN_WITHIN):
+        return found  # the drive turned the shaft as commanded, and reports something else
+    if abs(by_eye) < min(_NOTHING_SEEN, abs(by_drive) / 2):
         remedy = (
             "the drive reports a motion that the shaft did not make: check the coupling between motor and shaft; or "
             "`gear_ratio` is far too small, so that the turn was too small to be seen"
@@ -201,7 +206,7 @@ def _turn_and_compare(robot: Robot, config: ArmConfig, joint: Joint, angle: floa
         _LARGEST_SEEN_DEG, "degrees", of_motion=True,
     )  # fmt: skip
     slave = next(slave for slave in config.slaves if slave.name == joint.slave)
-    found = diagnose(angle, turned, seen, slave.device.scaling_of(joint.axis))
+    found = diagnose(angle, turned, seen, slave.device.scaling_of(joint.axis), ended_early=bool(failure))
     for cause, remedy in found:
         report(f"{cause.value}: {remedy}")
     if found or failure:

@@ -41,6 +41,8 @@ BARE = DriveScaling(encoder_increments=65536)
         (0.0, 0.0, GEARED, [Cause.NO_MOTION], "brake"),
         (-1.0, -1.0, GEARED, [Cause.ENCODER], "against the motor's sense"),
         (2.0, 2.0, GEARED, [Cause.ENCODER], "counts in another unit"),
+        (2.0, 1.0, GEARED, [Cause.ENCODER], "counts in another unit"),
+        (-2.0, 1.0, GEARED, [Cause.ENCODER], "against the motor's sense"),
     ],
 )  # fmt: skip
 def test_the_number_that_is_wrong_is_named(
@@ -50,6 +52,13 @@ def test_the_number_that_is_wrong_is_named(
         found = diagnose(turned, turned * reported, turned * seen, scaling)
         assert [entry.cause for entry in found] == causes
         assert words in " ".join(entry.remedy for entry in found)
+
+
+def test_a_motion_that_a_fault_ended_early_is_judged_by_what_was_turned_until_then() -> None:
+    # 1 degree was commanded; the supervision of the speed stopped a shaft without the gear of the file.
+    (gear,) = diagnose(1.0, 0.026, 1.3, DriveScaling(131072, 50), ended_early=True)
+    assert gear.cause is Cause.GEAR
+    assert diagnose(1.0, 0.4, 0.4, GEARED, ended_early=True) == []
 
 
 @pytest.fixture
