@@ -50,8 +50,8 @@ def _new(
     segment = "" if esi is None else f"{out.stem}_segment.yaml"
     written = [(out, arm_text(out.stem, device, described, numbers, period_us, segment))]
     if esi is not None and description is not None:
-        path = os.path.relpath(esi, out.parent or ".")
-        written.append((out.parent / segment, segment_text(path, description, described, joints)))
+        relative = os.path.relpath(esi, out.parent)
+        written.append((out.parent / segment, segment_text(relative, description, described, joints)))
     with new_file(out) as first:
         first.write(written[0][1].encode())
         first.flush()

@@ -20,11 +20,11 @@ from rtcp.ipc.commands import MoveJoints
 from rtcp.ipc.states import State
 from rtcp.testing.simulation import Simulation
 from rtcp.virtual.segment import check_segment
-from tests.drive_esi import write_esi
+from tests.drive_esi import Objects, write_esi
 
 Rtcp = Callable[..., Any]
 PAGE = (Path(__file__).parents[2] / "docs" / "your_own_arm.md").read_text(encoding="utf-8")
-UNSET = {
+UNSET: Objects = {
     0x603F: ("UINT", 0), 0x6076: ("UDINT", 0), 0x608F: (0, 0), 0x6091: (1, 1), 0x6098: ("SINT", 37),
     0x60A9: ("UDINT", 0x00B44700),
 }  # fmt: skip

@@ -102,8 +102,8 @@ def test_sigterm_to_all_its_processes_ends_a_capture_with_a_complete_file(segmen
         assert "capturing on ecat0" in command.stdout.readline()
         assert len(segment.master("scan")["result"]) == 3
         # As a service manager does it: the command, and the child that captures for it.
-        for process in (*psutil.Process(command.pid).children(), command):
-            process.send_signal(signal.SIGTERM)
+        for pid in (*(child.pid for child in psutil.Process(command.pid).children()), command.pid):
+            os.kill(pid, signal.SIGTERM)
         reported = command.stdout.read()
     frames = sum(kind == PACKET for kind, _ in blocks(out))
     assert (command.returncode, reported) == (0, f"{frames} frames written to {out}\n")

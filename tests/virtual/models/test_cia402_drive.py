@@ -110,9 +110,7 @@ def test_a_turn_of_the_joint_has_the_counts_that_the_drives_objects_say(
     [({}, 1.0, 1.0), ({"counts_per_turn": 655.36}, 1.0, 100.0), ({"encoder_ratio": -2.0}, -2.0, 1.0)],
     ids=["sound", "a gear that is not there", "an encoder that counts twice, and backwards"],
 )
-def test_options_play_a_wrong_gear_and_a_wrong_encoder(
-    options: dict[str, float], reported: float, turned: float
-) -> None:
+def test_options_play_a_wrong_gear_and_a_wrong_encoder(options: dict[str, Any], reported: float, turned: float) -> None:
     degree = 65536 / 360
     bench = Bench(**options)
     bench.enable(8)
