@@ -77,9 +77,9 @@ class Forked:
         self._output.close()
 
 
-def answer_of(module: str, *arguments: str) -> Any:
+def answer_of(module: str, *arguments: str, given: str = "") -> Any:
     """Run a module until it ends; return its output, which is JSON. Without an output: None."""
-    process = Forked(module, *arguments)
+    process = Forked(module, *arguments, given=given)
     try:
         output = process.output()
     finally:

@@ -14,6 +14,8 @@ import rtcp
 from rtcp.api import RtcpError
 from rtcp.cli import (
     arm,
+    arm_new,  # noqa: F401  registers `rtcp arm new`
+    bench,  # noqa: F401  registers `rtcp device try`
     bus,
     cell,
     commission,

@@ -61,14 +61,18 @@ class Answers:
         report(f"{question} {'yes' if answer else 'no'} (--answers)")
         return answer
 
-    def offset(self, joint: str, question: str) -> float:
-        """Return the electrical offset angle, rad; raises CommandError as `yes`, and for a number out of range."""
-        key = "electrical_offset"
-        with asking(_ANSWER):
-            answer = self._of_file(joint, key) if self.given else typer.prompt(question, type=float)
+    def number(
+        self, joint: str, key: str, question: str, largest: float, unit: str, *, of_motion: bool = False
+    ) -> float:
+        """Return a number from -`largest` to `largest`; raises CommandError as `yes`, and for another number."""
+        if not self.given or (of_motion and self.bus != VIRTUAL):
+            with asking("a person answers it at a terminal" if of_motion and self.bus != VIRTUAL else _ANSWER):
+                answer = typer.prompt(question, type=float)
+        else:
+            answer = self._of_file(joint, key)
         is_number = isinstance(answer, int | float) and not isinstance(answer, bool)
-        if not is_number or not abs(answer) <= LARGEST_OFFSET:
-            allowed = f"{-LARGEST_OFFSET:g} to {LARGEST_OFFSET:g} rad"
+        if not is_number or not abs(answer) <= largest:
+            allowed = f"{-largest:g} to {largest:g} {unit}"
             raise CommandError(f"{joint}.{key}: found {answer!r}, allowed is {allowed}")
         return float(answer)
 
@@ -144,7 +148,7 @@ def _commission(
             if joint is None and record.passed(chosen.name):
                 report(f"{chosen.name} has passed already: `rtcp commission {chosen.name}` repeats it")
                 continue
-            _require_ready(robot)
+            require_ready(robot)
             entry: dict[str, Any] = {
                 "at": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
                 "slave": chosen.slave,
@@ -172,11 +176,11 @@ def _chosen(config: ArmConfig, name: str | None) -> list[tuple[int, Joint]]:
     return joints
 
 
-def _require_ready(robot: Robot) -> None:
+def require_ready(robot: Robot) -> None:
     """Raise CommandError unless the platform is in state ready."""
     if (state := robot.status().state) is not State.READY:
         raise CommandError(
-            f"the state is {state.name.lower().replace('_', ' ')}: a joint is commissioned from state ready, with the "
+            f"the state is {state.name.lower().replace('_', ' ')}: the first motion begins in state ready, with the "
             "drives disabled (`rtcp disable`, after a fault `rtcp reset`)",
             ExitCode.REFUSED,
         )
@@ -194,7 +198,9 @@ def _first_motion(robot: Robot, place: int, angle: float, speed: float, asked: A
     if not asked.yes(name, "encoder_calibrated", f"{name}: was the encoder calibrated in the drive's own tool?"):
         raise CommandError(f"{name}: calibrate its encoder first: docs/commissioning.md", ExitCode.REFUSED)
     entry["encoder_calibrated"] = True
-    entry["electrical_offset"] = asked.offset(name, f"{name}: electrical offset angle that the tool shows, rad")
+    entry["electrical_offset"] = asked.number(
+        name, "electrical_offset", f"{name}: electrical offset angle that the tool shows, rad", LARGEST_OFFSET, "rad"
+    )
 
     start = robot.status().positions
     if start[place] + angle > limits.max:

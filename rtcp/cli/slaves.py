@@ -25,6 +25,7 @@ from rtcp.cli.output import (
     new_file,
     report,
     show,
+    signals_raise,
     table,
     transfer,
 )
@@ -234,7 +235,7 @@ def _state(
 @commands.command("capture")
 def _capture(
     out: Annotated[Path, option("--out", "FILE.pcapng", "File for Wireshark or tshark.")],
-    seconds: Annotated[float | None, option("--seconds", "Duration, s. Default: until Ctrl-C.")] = None,
+    seconds: Annotated[float | None, option("--seconds", "Duration, s. Default: until Ctrl-C or SIGTERM.")] = None,
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
@@ -243,7 +244,8 @@ def _capture(
 
     positive("--seconds", seconds, "s")
     interface, pid = place_of_bus(bus, config)
-    with new_file(out) as file, Capture(interface, pid, file) as capture:
+    # SIGTERM and SIGHUP end it as Ctrl-C does: the file is complete.
+    with signals_raise(), new_file(out) as file, Capture(interface, pid, file) as capture:
         report(f"capturing on {interface}; Ctrl-C ends it")
         counted = capture.wait(seconds)
     lost = f", {counted.lost} lost: the host was too slow" if counted.lost else ""

@@ -379,6 +379,8 @@ def check_sii(image: bytes) -> tuple[str, ...]:
     size = (int.from_bytes(image[124:126], "little") + 1) * 128
     if size < HEADER_BYTES or size > MAX_BYTES:
         mistakes.append(f"Its size is given as {size} bytes; allowed are {HEADER_BYTES} to {MAX_BYTES}.")
+    if image[56:58] != b"\0\0" and image[50:52] == b"\0\0":
+        mistakes.append("It lists mailbox protocols and no mailbox size (word 0x19): SOEM and IgH see no mailbox.")
     categories = list(_split(image))
     numbers = [number for number, *_ in categories]
     mistakes += [f"Category {number} is longer than the image." for number, _, whole in categories if not whole]

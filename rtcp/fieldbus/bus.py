@@ -63,6 +63,8 @@ class MailboxInfo:
     send_start: int
     send_size: int
     protocols: tuple[str, ...]
+    of_sync_managers: bool = False
+    """True: words 0x18 to 0x1B have no sizes, and those of the EEPROM's sync managers are used."""
 
     @property
     def has_coe(self) -> bool:

@@ -12,7 +12,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from enum import IntEnum
 from typing import NamedTuple, TypeVar
 
@@ -27,7 +27,7 @@ _DATA_AT = 26
 _SMALLEST_FRAME = 60
 _SO_ATTACH_FILTER = 26
 _HEADER = struct.Struct("<6s6s2sHBBHHHH")
-_SOURCE = bytes((0x02, 0, 0, 0x52, 0x54, 0x43))
+SOURCE = bytes((0x02, 0, 0, 0x52, 0x54, 0x43))
 
 
 class DatagramCommand(IntEnum):
@@ -103,7 +103,7 @@ class Answer(NamedTuple):
 def build_frame(command: DatagramCommand, index: int, station: int, address: int, data: bytes) -> bytes:
     """Return an Ethernet frame with one datagram."""
     header = _HEADER.pack(
-        b"\xff" * 6, _SOURCE, ETHERTYPE.to_bytes(2, "big"), 0x1000 | (12 + len(data)),
+        b"\xff" * 6, SOURCE, ETHERTYPE.to_bytes(2, "big"), 0x1000 | (12 + len(data)),
         command, index, station, address, len(data), 0,
     )  # fmt: skip
     return (header + data + b"\0\0").ljust(_SMALLEST_FRAME, b"\0")
@@ -133,9 +133,14 @@ def attach_filter(port: socket.socket, first: int, last: int) -> None:
     """Limit packet socket `port` to frames whose first datagram's index is in `first`..`last`."""
     # Classic BPF: A = byte 17; below `first` or above `last`: drop; else accept.
     lines = ((0x30, 0, 0, _INDEX_AT), (0x35, 0, 2, first), (0x25, 1, 0, last), (0x06, 0, 0, 0xFFFF), (0x06, 0, 0, 0))
+    attach_program(port, lines)
+
+
+def attach_program(port: socket.socket, lines: Sequence[tuple[int, int, int, int]]) -> None:
+    """Filter the frames of packet socket `port` by a program of classic BPF: operation, two jumps, constant."""
     program = b"".join(struct.pack("=HBBI", *line) for line in lines)
     buffer = ctypes.create_string_buffer(program, len(program))
-    port.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", 5, ctypes.addressof(buffer)))
+    port.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(lines), ctypes.addressof(buffer)))
 
 
 def _answers(frame: bytes, sent: bytes, length: int) -> bool:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import struct
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from rtcp.esi.model import SyncManager, SyncManagerType
 from rtcp.esi.sii import END, HEADER_BYTES, SYNC_MANAGERS, read_sync_managers
 from rtcp.fieldbus.al_state import AlState, read_al
 from rtcp.fieldbus.bus import MailboxInfo, PdoInfo, SlaveInfo, SyncManagerInfo
@@ -33,16 +35,25 @@ _MOST_CATEGORIES, _SYNC_MANAGERS_WORDS = 64, 32
 """Most categories of an EEPROM that are read; size of eight sync managers in it, words."""
 
 
-def read_mailbox(slave: Any) -> MailboxInfo | None:
-    """Return the mailbox according to the EEPROM of pysoem's `slave`, None where it has no valid one."""
+def read_mailbox(slave: Any, sync_managers: Callable[[], Sequence[SyncManager]]) -> MailboxInfo | None:
+    """Return the mailbox according to the EEPROM of pysoem's `slave`, None where it has no valid one.
+
+    Some EEPROMs list the protocols and no sizes (SOEM#459): the sizes are then those of its `sync_managers`.
+    """
     receive_start, receive_size = struct.unpack("<HH", slave.eeprom_read(_SII_RECEIVE, _EEPROM_US))
     send_start, send_size = struct.unpack("<HH", slave.eeprom_read(_SII_SEND, _EEPROM_US))
     send_size = send_size or receive_size
-    if min(receive_size, send_size) < _SMALLEST_MAILBOX:
-        return None
     bits = slave.eeprom_read(_SII_PROTOCOLS, _EEPROM_US)[0]
     protocols = tuple(name for i, name in enumerate(_PROTOCOLS) if bits >> i & 1)
-    return MailboxInfo(receive_start, receive_size, send_start, send_size, protocols)
+    if sizeless := bool(not receive_size and protocols):
+        managers = sync_managers()[:2]
+        kinds = (SyncManagerType.MAILBOX_RECEIVE, SyncManagerType.MAILBOX_SEND)
+        if tuple(manager.type for manager in managers) == kinds:
+            receive_start, receive_size = managers[0].start, managers[0].length
+            send_start, send_size = managers[1].start, managers[1].length
+    if min(receive_size, send_size) < _SMALLEST_MAILBOX:
+        return None
+    return MailboxInfo(receive_start, receive_size, send_start, send_size, protocols, sizeless)
 
 
 def name_of(slave: Any) -> str:
@@ -91,8 +102,8 @@ def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, .
     return tuple(managers)
 
 
-def watchdog_off(port: RegisterPort, station: int) -> tuple[int, ...]:
-    """Return the sync managers whose outputs, by the EEPROM, do not trigger the watchdog; none if it is unreadable."""
+def eeprom_sync_managers(port: RegisterPort, station: int) -> tuple[SyncManager, ...]:
+    """Return the sync managers in a slave's EEPROM; none if it is unreadable."""
 
     def read(word: int) -> bytes:
         return finish(reading_words(port, station, word, ""))[:4]
@@ -107,13 +118,18 @@ def watchdog_off(port: RegisterPort, station: int) -> tuple[int, ...]:
                 break
             if number == SYNC_MANAGERS:
                 content = b"".join(read(at) for at in range(word, word + min(words, _SYNC_MANAGERS_WORDS), 2))
-                return tuple(n for n, manager in enumerate(read_sync_managers(content)) if manager.lacks_watchdog)
+                return read_sync_managers(content)
             word += words
     except BusError:
         pass
     finally:
         eeprom_to_device(port, station)
     return ()
+
+
+def watchdog_off(port: RegisterPort, station: int) -> tuple[int, ...]:
+    """Return the sync managers whose outputs, by the EEPROM, do not trigger the watchdog; none if it is unreadable."""
+    return tuple(n for n, manager in enumerate(eeprom_sync_managers(port, station)) if manager.lacks_watchdog)
 
 
 def describe(

@@ -6,8 +6,10 @@ import contextlib
 import json
 import os
 import socket
-from collections.abc import Callable, Iterable, Sequence
+import struct
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +33,17 @@ from rtcp.fieldbus.eeprom import (
     read_eeprom,
     write_eeprom,
 )
-from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.errors import BusError, Refused
 from rtcp.fieldbus.foe import FoeClient, bootstrap_mailbox, enter_boot
 from rtcp.fieldbus.image import MOST_SLAVES, Places, limit_faults, read_places
 from rtcp.fieldbus.interface import PromiscuousMode, check_interface, check_name, claim, enter
 from rtcp.fieldbus.mailbox import Mailbox, Mailboxes, SdoClient
 from rtcp.fieldbus.master import Master
+from rtcp.fieldbus.other_masters import OtherMasters, other_master_words
 from rtcp.fieldbus.pdo import ASSIGN, ImageLayout, assignments, entries_of, layout, mapping_of, mapping_text
 from rtcp.fieldbus.process_data import FrameBarrier, ReferenceFrame, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
-from rtcp.fieldbus.scan import describe, name_of, read_mailbox, read_serial, watchdog_off
+from rtcp.fieldbus.scan import describe, eeprom_sync_managers, name_of, read_mailbox, read_serial, watchdog_off
 from rtcp.fieldbus.slave_setup import (
     SlaveRestorer,
     by_alias,
@@ -62,6 +65,9 @@ _DISCOVERY_ATTEMPTS = 4
 """Attempts of `_PATIENCE_US` each: a host that runs master and slaves may stall for longer than one."""
 _MAILBOXES, _MAILBOXES_SIZE = 2, 16
 """Sync managers of a slave's mailboxes, and the bytes of their registers (ETG.1000.4, 6.7)."""
+_SYNC_MANAGER = struct.Struct("<HHBBBB")
+_RECEIVES, _SENDS = 0x26, 0x22
+"""Control byte of a mailbox's sync manager: one buffer, written by the master with an event for the slave, or read."""
 
 
 _SOEM_LAST_INDEX = 15
@@ -101,6 +107,7 @@ class SoemBus:
         self._socket: socket.socket | None = None
         self._claim: socket.socket | None = None
         self._promiscuous: PromiscuousMode | None = None
+        self._others: OtherMasters | None = None
         self._port: RegisterPort | None = None
         self._barrier: FrameBarrier | None = None
         self._reference: ReferenceFrame | None = None
@@ -144,6 +151,7 @@ class SoemBus:
         check_interface(self.interface)
         self._claim = claim(self.interface)
         try:
+            self._others = OtherMasters(self.interface)
             self._port = RegisterPort(self.interface)
             self._port.tries = PATIENT_TRIES
             self._barrier = FrameBarrier(self.interface)
@@ -152,6 +160,22 @@ class SoemBus:
         except BaseException:
             self.close()
             raise
+
+    def other_master(self) -> str:
+        """Return the sentence for a second master that was heard since the bus was opened; empty: none was."""
+        address = "" if self._others is None else self._others.address()
+        return other_master_words(address) if address else ""
+
+    @contextlib.contextmanager
+    def naming_other_master(self) -> Iterator[None]:
+        """Add `other_master` to a BusError as its probable cause."""
+        try:
+            yield
+        except BusError as error:
+            cause = self.other_master()
+            if not cause or isinstance(error, Refused):
+                raise
+            raise BusError(*error.sentences, cause) from error
 
     def scan(self) -> tuple[SlaveInfo, ...]:
         """Find the slaves, bring them to PRE-OP, measure delays; return their descriptions.
@@ -248,12 +272,24 @@ class SoemBus:
         if faults:
             raise BusError(*faults)
         self._names[:] = [config.name for config in slaves]
-        for position, info in enumerate(self._infos, 1):
-            if info is not None and not info.fits:
+        for position, (info, config) in enumerate(zip(self._infos, slaves, strict=True), 1):
+            label = slave_label(position, config.name)
+            if config.device.coe and (info is None or "CoE" not in info.protocols):
+                faults.append(
+                    f"{label}: its EEPROM lists no CoE mailbox (words 0x18 to 0x1C, and category 41), but its device's "
+                    "file says `coe: true`: write the maker's image with `rtcp eeprom write`, or, if the device has no "
+                    "CoE, say `coe: false`"
+                )
+            elif info is not None and not info.fits:
                 size = max(info.receive_size, info.send_size)
                 faults.append(
-                    f"{slave_label(position, self._names[position - 1])}: its EEPROM gives a mailbox of {size} bytes; "
-                    f"SOEM has room for {LARGEST_MAILBOX}"
+                    f"{label}: its EEPROM gives a mailbox of {size} bytes; SOEM has room for {LARGEST_MAILBOX}"
+                )
+            elif info is not None and info.of_sync_managers:
+                self.notes.append(
+                    f"{label}: its EEPROM gives no mailbox sizes (words 0x18 to 0x1B); those of its sync managers are "
+                    f"used: {info.receive_size} bytes at 0x{info.receive_start:04X} to the slave, "
+                    f"{info.send_size} bytes at 0x{info.send_start:04X} from it"
                 )
         if faults:
             raise BusError(*faults)
@@ -311,15 +347,28 @@ class SoemBus:
         """Let SOEM forget the mailbox of a slave that is in INIT; its registers keep it. Raises BusError."""
         if self._infos[position - 1] is None:
             return
-        station, label = station_of(position), slave_label(position, self._names[position - 1])
-        registers = self.port.read(station, Register.SYNC_MANAGER, _MAILBOXES_SIZE)
+        label = slave_label(position, self._names[position - 1])
+        registers = self.port.read(station_of(position), Register.SYNC_MANAGER, _MAILBOXES_SIZE)
         if registers is None:
             raise BusError(f"{label} stopped answering while it was set up")
-        for mailbox in ("out", "in"):
+        self._amend_mailbox(slave, position, (0, 0), (0, 0), registers)
+
+    def _set_mailbox(self, position: int, info: MailboxInfo) -> None:
+        """Program the mailbox of a slave in INIT whose EEPROM gave SOEM no sizes, and tell SOEM. Raises BusError."""
+        receive, send = (info.receive_start, info.receive_size), (info.send_start, info.send_size)
+        registers = _SYNC_MANAGER.pack(*receive, _RECEIVES, 0, 1, 0) + _SYNC_MANAGER.pack(*send, _SENDS, 0, 1, 0)
+        self._amend_mailbox(self._master.slaves[position - 1], position, receive, send, registers)
+
+    def _amend_mailbox(
+        self, slave: Any, position: int, receive: tuple[int, int], send: tuple[int, int], registers: bytes
+    ) -> None:
+        """Change start and size of the mailboxes that SOEM knows of a slave; then write the registers of both."""
+        station, label = station_of(position), slave_label(position, self._names[position - 1])
+        for mailbox, area in (("out", receive), ("in", send)):
             # This writes the registers first, in a frame that is not repeated; SOEM's own data change only after that.
             for _ in range(PATIENT_TRIES):
                 with contextlib.suppress(pysoem.WkcError):
-                    slave.amend_mbx(mailbox, 0, 0)
+                    slave.amend_mbx(mailbox, *area)
                     break
         # An ESC takes address and length of a sync manager only while it is off.
         self.port.put(station, Register.SYNC_MANAGER, bytes(_MAILBOXES_SIZE), label)
@@ -336,11 +385,16 @@ class SoemBus:
             raise BusError(f"no slave answers on {self.interface}: check the cable and the slaves' supply")
         slaves = self._master.slaves
         self._names = [name_of(slave) for slave in slaves]
-        self._infos = [read_mailbox(slave) for slave in slaves]
+        self._infos = [
+            read_mailbox(slave, partial(eeprom_sync_managers, self.port, station_of(position)))
+            for position, slave in enumerate(slaves, 1)
+        ]
         self._serials = [read_serial(slave) for slave in slaves]
         self._boxes = Mailboxes(self.port, self._names, self._infos)
-        for position in range(1, len(slaves) + 1):
+        for position, info in enumerate(self._infos, 1):
             eeprom_to_device(self.port, station_of(position))
+            if info is not None and info.of_sync_managers:
+                self._set_mailbox(position, info)
         left = self.port.read_all(Register.DC_ACTIVATION, 1).data
         if any(left):
             raise BusError(f"SYNC0 of a slave on {self.interface} is still active and cannot be switched off")
@@ -357,7 +411,12 @@ class SoemBus:
         SOEM corrects many errors by reading again.
         """
         reported: dict[int, list[str]] = {}
-        stations = [station_of(position) for position, entry in enumerate(slaves, 1) if not entry.device.coe]
+        # Where words 0x18 to 0x1B of the EEPROM are 0, SOEM knows no protocol, and takes the PDOs from the EEPROM, too.
+        stations = [
+            station_of(position)
+            for position, (entry, info) in enumerate(zip(slaves, self._infos, strict=True), 1)
+            if not entry.device.coe or (info is not None and info.of_sync_managers)
+        ]
         for station in stations:
             # Their PDOs are in the EEPROM only, and SOEM assumes that the master still owns it after reading.
             eeprom_to_master(self.port, station)
@@ -559,7 +618,7 @@ class SoemBus:
     def watcher(self, report: Callable[[Event], None]) -> SlaveWatcher:
         """Return the watcher of the configured slaves, all of them in OP; `report` receives its events."""
         assert self._restorer is not None, "only a configured bus has something to restore"
-        return SlaveWatcher(self.port, len(self._names), self._restorer, report, self._topology)
+        return SlaveWatcher(self.port, len(self._names), self._restorer, report, self._topology, self._others)
 
     def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
         wanted = range(1, len(self._names) + 1) if positions is None else positions
@@ -574,12 +633,11 @@ class SoemBus:
             self.notes.append(f"the slaves on {self.interface} could not be brought back to INIT: {error}")
         finally:
             # The claim last: the next master must not start while this one still cleans up.
-            for part in (
-                self._port, self._barrier, self._reference, self._socket, self._master, self._promiscuous, self._claim,
-            ):  # fmt: skip
+            sockets = (self._others, self._port, self._barrier, self._reference, self._socket)
+            for part in (*sockets, self._master, self._promiscuous, self._claim):
                 if part is not None:
                     part.close()
-            self._port = self._barrier = self._reference = None
+            self._others = self._port = self._barrier = self._reference = None
             self._socket = self._claim = self._promiscuous = self._master = None
             self._names = []
 
@@ -626,15 +684,21 @@ class SoemMaster(Master):
         """Find the slaves, compare them with the configuration, bring them to SAFE-OP."""
         bus = self._bus
         bus.open()
+        with bus.naming_other_master():
+            data = self._configure(directory, report)
+        for note in (*bus.notes, *filter(None, [bus.other_master()])):
+            report(note)
+        report("all slaves in SAFE-OP")
+        return data
+
+    def _configure(self, directory: Path, report: Callable[[str], None]) -> SoemProcessData:
+        bus = self._bus
         slaves = bus.scan()
         report(f"{len(slaves)} slaves on {self.interface}")
         (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in slaves]))
         self.config = replace(self.config, slaves=by_alias(self.config.slaves, slaves))
         data = bus.configure(with_limits(self.config), round(self.config.cycle.period_us * 1000))
         self.config = self.config.with_devices(bus.devices)
-        for note in bus.notes:
-            report(note)
-        report("all slaves in SAFE-OP")
         return data
 
     def close(self) -> None:

@@ -14,13 +14,14 @@ from typing import Protocol
 from rtcp.fieldbus.al_state import AlState, parse_al
 from rtcp.fieldbus.bus import Bus
 from rtcp.fieldbus.mailbox import SdoClient
+from rtcp.fieldbus.other_masters import OtherMasters
 from rtcp.fieldbus.port_errors import REPORT_INTERVAL_S, ErrorCounters
 from rtcp.fieldbus.recovery import LONG_AGO, MonitoredSlave, SlaveRecovery
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, T
 from rtcp.fieldbus.slave_setup import SlaveRestorer
 from rtcp.fieldbus.system_time import SystemTime
 from rtcp.fieldbus.topology import Topology
-from rtcp.ipc.events import Event, NoSlaveAnswers, SlavesAnswerAgain, SlavesBackInOp, SlavesLeftOp
+from rtcp.ipc.events import Event, NoSlaveAnswers, OtherMaster, SlavesAnswerAgain, SlavesBackInOp, SlavesLeftOp
 
 _PARK_S = 3.0
 _SILENCE_S = 0.25
@@ -46,6 +47,7 @@ class SlaveWatcher:
         restorer: sets up a slave again.
         report: receives the events.
         topology: the tree of the slaves; None: a chain.
+        others: hears a second master; None: nothing listens.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class SlaveWatcher:
         restorer: SlaveRestorer,
         report: Callable[[Event], None],
         topology: Topology | None = None,
+        others: OtherMasters | None = None,
     ) -> None:
         self._port = port
         self._topology = topology or Topology.chain(count)
@@ -62,6 +65,8 @@ class SlaveWatcher:
         self.slaves = tuple(MonitoredSlave(position) for position in range(1, count + 1))
         self.errors = ErrorCounters(port, count, report, self._topology)
         self._recovery = SlaveRecovery(port, self.slaves, restorer, report, self._topology)
+        self._others = others
+        self._other_reported_at = LONG_AGO
         self._rarely_at = 0.0
         self._answered_at = time.monotonic()
         self._silent_since: float | None = None
@@ -109,6 +114,8 @@ class SlaveWatcher:
             BusError: the interface is gone.
         """
         now = time.monotonic()
+        if now >= self._rarely_at:
+            self._note_other_master(now)
         data, wkc = self._port.exchange(DatagramCommand.BRD, 0, Register.AL_STATUS, bytes(2), timeout_s=0.01, tries=1)
         if wkc < 0:
             self._note_silence(now)
@@ -206,6 +213,15 @@ class SlaveWatcher:
             self._report(SlavesBackInOp(first, last, after_s))
         for slave in back:
             slave.left_at = None
+
+    def _note_other_master(self, now: float) -> None:
+        # Also while no slave answers: a second master may be why.
+        if self._others is None or now - self._other_reported_at < REPORT_INTERVAL_S:
+            return
+        if address := self._others.address():
+            self._other_reported_at = now
+            self._report(OtherMaster(address))
+            self._others.forget()
 
     def _note_silence(self, now: float) -> None:
         self._silent_since = self._silent_since or now

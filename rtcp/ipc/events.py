@@ -301,6 +301,13 @@ class SlavesAnswerAgain(ServiceEvent, number=63):
     silent_s: float
 
 
+class OtherMaster(ServiceEvent, number=90):
+    """frames that this platform did not send come from {address}: disconnect or stop the second EtherCAT master"""
+
+    address: str
+    """Source address of the frames, as 01:23:45:67:89:ab."""
+
+
 class StateNotReached(ServiceEvent, number=64):
     """{refusal_words}; it is asked again"""
 

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import select
+import signal
 import socket
 import struct
 import subprocess
@@ -21,7 +22,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.session import SessionError, is_running, read_processes, read_session
 from rtcp.launch.offline import configuration
-from rtcp.launch.platform import defer_signals
+from rtcp.launch.platform import SIGNALS, defer_signals
 
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 """Block types (pcapng, draft-ietf-opsawg-pcapng)."""
@@ -37,6 +38,7 @@ _SOL_PACKET = 263
 _BUFFER_BYTES = 1 << 24
 _TIME = struct.Struct("@ll")
 _FRAMES_AT_ONCE = 1000
+_END_S = 5.0
 
 
 class Counted(NamedTuple):
@@ -142,15 +144,19 @@ class Capture:
         self._end()
 
     def _end(self) -> None:
-        if self._child.poll() is None:
+        """End the child by the end of its input, so that the file ends with a whole block; after a time by SIGKILL."""
+        assert self._child.stdin is not None
+        assert self._child.stdout is not None
+        self._child.stdin.close()
+        try:
+            self._child.wait(_END_S)
+        except subprocess.TimeoutExpired:
             self._child.kill()
             self._child.wait()
-        for pipe in (self._child.stdin, self._child.stdout):
-            if pipe is not None:
-                pipe.close()
+        self._child.stdout.close()
 
     def wait(self, seconds: float | None) -> Counted:
-        """Let it run for a time, s, or until Ctrl-C (None); end it and return the counts of its frames.
+        """Let it run for a time, s, or until a signal that raises KeyboardInterrupt; end it, return its counts.
 
         Raises:
             RtcpError: a frame could not be written or received.
@@ -164,6 +170,9 @@ class Capture:
 
 def main() -> int:
     """Capture until standard input ends: the child's side."""
+    # A service manager signals every process of a unit: the command alone ends this one.
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     question = json.loads(sys.argv[1])
     try:
         with open(question["file"], "wb") as file:

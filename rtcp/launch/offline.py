@@ -273,29 +273,35 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
     bus = SoemBus(question["interface"], namespace_pid=question["namespace_pid"])
     bus.open()
     try:
-        do = question["do"]
-        # Requests for EEPROM or state need no slave in PRE-OP, which a wrong EEPROM may prevent.
-        slaves = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
-        if do == "scan":
-            return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(info)) for info in slaves]}
-
-        def position_of(slave: int | str) -> int:
-            return int(slave) if named is None else bus.position_of(str(slave), named.slaves, slaves)
-
-        positions = [position_of(slave) for slave in asked or [question["slave"]]]
-        for position in positions:
-            if not 1 <= position <= len(slaves):
-                missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
-                return {"error": missing, "kind": "invalid"}
-        if asked:
-            pairs = zip(positions, question["objects"], strict=True)
-            return {"found": [_read_objects(bus, position, objects) for position, (_, objects) in pairs]}
-        position = positions[0]
-        device = slaves[position - 1]
-        label = f"slave {position} ({device.name}, serial {device.serial})"
-        return {"position": position, "label": label, **_ANSWERS[do](bus, position, question)}
+        with bus.naming_other_master():
+            return _ask_bus(bus, question, named)
     finally:
         bus.close()
+
+
+def _ask_bus(bus: SoemBus, question: dict[str, Any], named: ArmConfig | None) -> dict[str, Any]:
+    do = question["do"]
+    # Requests for EEPROM or state need no slave in PRE-OP, which a wrong EEPROM may prevent.
+    slaves = bus.discover() if do in ("eeprom_read", "eeprom_write", "eeprom_beginnings", "state") else bus.scan()
+    if do == "scan":
+        return {"slaves": [dataclasses.asdict(bus.with_eeprom_pdos(info)) for info in slaves]}
+    asked = question.get("objects", ()) if do == "read_objects" else ()
+
+    def position_of(slave: int | str) -> int:
+        return int(slave) if named is None else bus.position_of(str(slave), named.slaves, slaves)
+
+    positions = [position_of(slave) for slave, _ in asked] or [position_of(question["slave"])]
+    for position in positions:
+        if not 1 <= position <= len(slaves):
+            missing = f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}"
+            return {"error": missing, "kind": "invalid"}
+    if asked:
+        pairs = zip(positions, asked, strict=True)
+        return {"found": [_read_objects(bus, position, objects) for position, (_, objects) in pairs]}
+    position = positions[0]
+    device = slaves[position - 1]
+    label = f"slave {position} ({device.name}, serial {device.serial})"
+    return {"position": position, "label": label, **_ANSWERS[do](bus, position, question)}
 
 
 def _report_progress(done: float) -> None:

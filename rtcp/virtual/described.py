@@ -5,16 +5,18 @@ A behaviour gives the device its function; without one it only serves its dictio
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
+from rtcp.config.findings import Finding
 from rtcp.esi import types
 from rtcp.esi.dictionary import complete
 from rtcp.esi.model import Device, ObjectEntry, Pdo, PdoEntry
 from rtcp.esi.sii import crc
 from rtcp.virtual.behaviour import Behaviour, Runner
-from rtcp.virtual.device import CoeFeatures, DeviceModel, Identity
+from rtcp.virtual.device import CoeFeatures, DeviceModel, Identity, OptionError
 from rtcp.virtual.foe import FoeServer
 from rtcp.virtual.objects import (
     AbortCode,
@@ -26,6 +28,7 @@ from rtcp.virtual.objects import (
     ObjectDictionary,
     SdoAbort,
     Value,
+    bounds,
 )
 from rtcp.virtual.pdo import (
     ASSIGN,
@@ -42,6 +45,7 @@ from rtcp.virtual.protocol import RAM_SIZE, REGISTER_SPACE, MailboxType
 LARGEST_RAM = 0xF000
 """Upper bound on the RAM, bytes: addresses have 16 bits."""
 _LONGEST_GAP = 248
+_OBJECT = re.compile(r"0x([0-9A-Fa-f]{4})(?::(\d{1,3}))?")
 _FIRST_OBJECT = 0x1000
 """Lowest object index; a PDO maps the data types below it as padding (ETG.1000.6, table 64)."""
 _BEYOND = 0x1_0000
@@ -61,7 +65,7 @@ class DescribedDevice(DeviceModel):
         device: the description, with its modules.
         image: its EEPROM image; `alias` and checksum are inserted.
         behaviour: class of its behaviour, or None.
-        options: of the behaviour, and those of every model.
+        options: of the behaviour, those of every model, and, as `0x6091:1`, values of objects that it has stored.
     """
 
     def __init__(self, device: Device, image: Callable[[int], bytes], behaviour: type[Behaviour] | None = None,
@@ -81,6 +85,8 @@ class DescribedDevice(DeviceModel):
         self.options = {} if behaviour is None else behaviour.options
         self._assignments: dict[int, list[int]] = {}
         """Numbers of the default PDOs of each sync manager."""
+        self._stored = {name: options.pop(name) for name in tuple(options) if name.startswith("0x")}
+        """Values of objects that the device has stored, by `0xINDEX` or `0xINDEX:SUB`."""
         super().__init__(**options)
         self.runner = Runner(self, behaviour)
         self.files = None if mailbox is None or not mailbox.foe else FoeServer(self.runner)
@@ -119,6 +125,27 @@ class DescribedDevice(DeviceModel):
             define_sync_manager_types(objects, self.sync_managers)
         for index in self.roles.outputs + self.roles.inputs:
             self._define_assignment(objects, index, numbers)
+        self._store(objects)
+
+    def _store(self, objects: ObjectDictionary) -> None:
+        """Give the objects that options name their stored values; raises OptionError."""
+        findings = []
+        for name, value in self._stored.items():
+            match = _OBJECT.fullmatch(name)
+            address = (int(match[1], 16), int(match[2] or "0")) if match else (-1, 0)
+            if address not in objects or objects[address].is_bytes or objects[address].is_float:
+                text = f"{self.description.name} has no object {name!r} with a number; written as 0x6091:1"
+                findings.append(Finding(("options", name), "unknown_option", text=text))
+                continue
+            entry = objects[address]
+            low, high = bounds(entry)
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+                allowed = f"a whole number from {low} to {high}"
+                findings.append(Finding(("options", name), "range", found=value, allowed=allowed))
+                continue
+            entry.value = value
+        if findings:
+            raise OptionError(*findings)
 
     def _define_pdos(self, objects: ObjectDictionary) -> dict[int, Pdo]:
         """Add the mapping object of every PDO and its mapped entries; return the PDOs by the number of this object."""

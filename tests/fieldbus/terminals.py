@@ -113,7 +113,16 @@ DEVICES = {
         31, [(2, 0x1100, 16), (4, 0x1300, 24)], [(3, 0x1200, 16), (5, 0x1800, 24)], mailbox=True,
         modes=[model.DcMode("DC", 0x0730)],
     ),
+    # Words 0x18 to 0x1B of its EEPROM, start and size of the mailboxes, are 0.
+    "sizeless": device(50, [(2, 0x1100, 16)], [(3, 0x1200, 16)], mailbox=True),
+    # Its EEPROM has no mailbox at all.
+    "unlisted": device(51, [(2, 0x1100, 16)], [(3, 0x1200, 16)], mailbox=True),
 }  # fmt: skip
+
+
+def _image(kind: str) -> bytes:
+    image = write_sii(replace(DEVICES[kind], mailbox=None) if kind == "unlisted" else DEVICES[kind])
+    return image[:48] + bytes(8) + image[56:] if kind == "sizeless" else image
 
 
 def slave(name: str, kind: str, alias: int = 0) -> SlaveConfig:
@@ -149,7 +158,7 @@ def write_segment(file: Path, *entries: str) -> None:
             lines.append(f"- {{esi: {ESI_FILES / entry}}}\n")
             continue
         kind, _, more = entry.partition(",")
-        (file.parent / f"{kind}.bin").write_bytes(write_sii(DEVICES[kind]))
+        (file.parent / f"{kind}.bin").write_bytes(_image(kind))
         echo = f"behaviour: 'tests.fieldbus.terminals:{'Bootable' if kind == 'files' else 'Echo'}'"
         lines.append(f"- {{sii: {kind}.bin, {echo}{',' if more else ''}{more}}}\n")
     file.write_text("slaves:\n" + "".join(lines))

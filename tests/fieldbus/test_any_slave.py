@@ -47,6 +47,25 @@ def test_several_sync_managers_of_a_direction_each_get_their_fmmu(start_segment:
     assert result["sync"] == "3007"
 
 
+def test_mailbox_sizes_of_0_in_the_eeprom_are_replaced_by_its_sync_managers(
+    start_segment: StartSegment,
+) -> None:
+    kinds = ("sizeless", "bits3", "sizeless")
+    answer = start_segment(kinds).master("terminals", kinds=kinds)
+    result = answer["result"]
+    assert result["states"] == ["OP"] * 3
+    assert all(received == sent for sent, received in result["patterns"])
+    used = "its EEPROM gives no mailbox sizes (words 0x18 to 0x1B); those of its sync managers are used: 128 bytes at "
+    assert [note for note in answer["left"] if "mailbox" in note] == [
+        f"slave {n} (t{n - 1}): {used}0x1000 to the slave, 128 bytes at 0x1080 from it" for n in (1, 3)
+    ]
+
+
+def test_a_device_file_with_coe_for_a_slave_whose_eeprom_has_no_mailbox_is_refused(start_segment: StartSegment) -> None:
+    (error,) = start_segment(("unlisted",)).master("terminals", kinds=("unlisted",))["error"]
+    assert error.startswith("slave 1 (t0): its EEPROM lists no CoE mailbox (words 0x18 to 0x1C, and category 41), but ")
+
+
 def test_registers_that_a_virtual_sync_manager_stands_for_are_process_data(start_segment: StartSegment) -> None:
     result = start_segment(("clock", "bits3")).master("terminals", kinds=("clock", "bits3"))["result"]
     assert result["states"] == ["OP"] * 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import struct
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
 from rtcp.ipc.errors import RtcpError
@@ -86,3 +88,23 @@ def test_a_capture_ends_with_the_command_that_is_killed(segment: Segment, tmp_pa
     select.select([child], [], [])
     os.close(child)
     assert [kind for kind, _ in blocks(out)] == [SECTION, INTERFACE]
+
+
+def test_sigterm_to_all_its_processes_ends_a_capture_with_a_complete_file(segment: Segment, tmp_path: Path) -> None:
+    program = (
+        "import sys; from rtcp.launch import capturing\n"
+        "capturing.place_of_bus = lambda bus, config: ('ecat0', int(sys.argv[1]))\n"
+        "from rtcp.cli.__main__ import main; raise SystemExit(main(['capture', '--out', sys.argv[2]]))"
+    )
+    out = tmp_path / "x.pcapng"
+    arguments = [sys.executable, "-c", program, str(segment.pid), str(out)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as command:
+        assert "capturing on ecat0" in command.stdout.readline()
+        assert len(segment.master("scan")["result"]) == 3
+        # As a service manager does it: the command, and the child that captures for it.
+        for pid in (*(child.pid for child in psutil.Process(command.pid).children()), command.pid):
+            os.kill(pid, signal.SIGTERM)
+        reported = command.stdout.read()
+    frames = sum(kind == PACKET for kind, _ in blocks(out))
+    assert (command.returncode, reported) == (0, f"{frames} frames written to {out}\n")
+    assert frames > 500

@@ -63,7 +63,7 @@ def test_a_map_is_judged_by_its_images_and_names_what_soem_reported_of_a_slave_w
             raise pysoem.ConfigMapError(errors)
 
     bus = SoemBus("nonsense0")
-    bus._master = Master()
+    bus._master, bus._infos = Master(), [None, None]
     assert bus._map(arm(2)) == {
         2: [
             "slave 2 (drive1): SOEM could not read the PDO mapping assigned through 0x1C12 (key `rpdo`): expected 15 "

@@ -261,6 +261,17 @@ def branches(bus: SoemBus, count: int, control: str, kinds: list[str]) -> Any:
         return watched.episode([{"fault": "power", "slave": 4, "lasts": 0.05}], other_branch)
 
 
+def other_master(bus: SoemBus, count: int, control: str) -> Any:
+    """Watch a sound segment, then one with a second master's frames; return both reports."""
+    with SegmentClient(Path(control)) as client:
+        watched = Watched(bus, count, client)
+        alone = watched.episode([], lambda watching: watching.during(0.5))
+        noise = [{"fault": "noise", "rate_hz": 2000}, {"fault": "noise", "protocol": "other_master", "rate_hz": 1000}]
+        joined = watched.episode(noise, lambda watching: watching.during(0.5))
+        return {"alone": alone["reported"], "joined": joined["reported"]}
+
+
+master_child.SCENARIOS["other master"] = other_master
 master_child.SCENARIOS["episodes"] = episodes
 master_child.SCENARIOS["branches"] = branches
 

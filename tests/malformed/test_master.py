@@ -72,7 +72,7 @@ def test_a_mailbox_that_no_frame_can_carry_is_not_used() -> None:
             0x1A: b"\x80\x10" + send.to_bytes(2, "little"),
             0x1C: b"\x04\x00\x00\x00",
         }
-        mailbox = read_mailbox(Eeprom(words))
+        mailbox = read_mailbox(Eeprom(words), lambda: ())
         return mailbox is not None and mailbox.has_coe
 
     assert usable(128, 128)

@@ -81,6 +81,7 @@ NOT_REACHED: tuple[NotReached, ...] = (
             events.SlavesBackInOp,
             events.NoSlaveAnswers,
             events.SlavesAnswerAgain,
+            events.OtherMaster,
             events.StateNotReached,
             events.OtherSlaveAnswers,
             events.SlaveSetUpAgain,

@@ -164,12 +164,12 @@ class Delay(AnswerFault):
 
 @dataclass
 class Noise(FrameFault):
-    """Frames of other protocols, and malformed EtherCAT frames, at `rate_hz`."""
+    """Frames of other protocols, malformed EtherCAT frames (any of these), or a second master's, at `rate_hz`."""
 
     name = "noise"
     strikes_passing = False
     rate_hz: Annotated[float, Gt(0), Le(10_000)] = 100.0
-    protocol: Literal["arp", "ip", "lldp", "ethercat", "any"] = "any"
+    protocol: Literal["arp", "ip", "lldp", "ethercat", "other_master", "other_soem", "any"] = "any"
     seed: Seed = 0
 
     def prepare(self, t: int) -> None:
@@ -187,7 +187,7 @@ class Noise(FrameFault):
             if self.due > now:
                 break
             self.due += self._period
-            protocol = self._random.choice(tuple(MAKERS)) if self.protocol == "any" else self.protocol
+            protocol = self._random.choice(_NOISE) if self.protocol == "any" else self.protocol
             send(MAKERS[protocol](self._random))
             self.counts["sent"] += 1
 
@@ -258,7 +258,20 @@ def ethercat(random: Random) -> bytes:
     return _ethernet(random, _BROADCAST, ETHERTYPE, random.choice(forms))[:_LONGEST]
 
 
+def other_master(random: Random, source: bytes = bytes.fromhex("00155d2a4b01")) -> bytes:
+    """Return a frame that a second master sent: it reads the AL status of all slaves (ETG.1000.4, 5.4.3)."""
+    datagram = HEADER.pack(7, random.randrange(16), 0, 0x0130, 2, 0) + bytes(4)
+    frame = _BROADCAST + source + ETHERTYPE.to_bytes(2, "big") + (len(datagram) | 1 << 12).to_bytes(2, "little")
+    return (frame + datagram).ljust(_SHORTEST, b"\0")
+
+
+def other_soem(random: Random) -> bytes:
+    """Return a frame of a second master that is SOEM, which sends from an address of its own, not the card's."""
+    return other_master(random, b"\x01" * 6)
+
+
+_NOISE = ("arp", "ip", "lldp", "ethercat")
 MAKERS: MappingProxyType[str, Callable[[Random], bytes]] = MappingProxyType(
-    {"arp": arp, "ip": ip, "lldp": lldp, "ethercat": ethercat}
+    {"arp": arp, "ip": ip, "lldp": lldp, "ethercat": ethercat, "other_master": other_master, "other_soem": other_soem}
 )
 """Protocol -> function that makes a frame."""

@@ -61,6 +61,7 @@ _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
     "peak_torque": Option(None, 0.001, 30_000.0, "Nm; left out: twice the rated torque"),
     "max_speed": Option(10.0, 0.01, 1000.0, "speed above which the drive fails, rad/s"),
     "counts_per_turn": Option(None, 1.0, 2.0**40, "counts of a turn of the joint; left out: by 0x608F, 0x6091, 0x6092"),
+    "encoder_ratio": Option(1.0, -1e4, 1e4, "what 0x6063 and 0x6064 show of each turn, beside 1 a wrong encoder"),
     "velocity_ratio": Option(None, 1e-3, 1e6, "turns that 0x60A9 counts in for one of the joint; left out: by 0x6091"),
     "torque_ratio": Option(None, 1e-6, 1e6, "Nm at the joint for 1000 of 0x6076; left out: by 0x6091"),
     "rated_current": Option(_MODEL.rated_current, 0.001, 10_000.0, "A (0x6075)"),
@@ -155,6 +156,7 @@ class _StandardAxis:
         )
         self._read_units()
         self._feedback = BoundedFeedback(objects, size.rated_torque)
+        self._feedback.encoder_ratio = self._option("encoder_ratio")
         condition = Condition(size, drive.option("temperature"), drive.option("bus_voltage"))
         errors = ErrorLog(objects, drive.device.emergencies)
         self.servo = ServoAxis(

@@ -114,6 +114,8 @@ class Feedback:
     """Actual and demand values of a drive; keeps the entries, to avoid look-ups in a step."""
 
     def __init__(self, objects: AxisObjects, rated_torque: float) -> None:
+        self.encoder_ratio = 1.0
+        """Part of each turn that 0x6063 and 0x6064 show: another number than 1 plays a wrong encoder."""
         self._units = objects.units
         self._rated_torque = rated_torque
         self._statusword = objects.number(0x6041)
@@ -139,7 +141,7 @@ class Feedback:
         """Write the statusword and the measurements; `following`: following error, rad."""
         mechanics = axis.mechanics
         per_rad, positions, velocities = self._increments_per_rad, self._positions, self._velocities
-        increments = round(mechanics.position * per_rad)
+        increments = round(mechanics.position * per_rad * self.encoder_ratio)
         self._statusword.value = status
         self._increments.value = increments
         self._position.value = round((increments / per_rad + axis.offset) * positions)

@@ -174,7 +174,7 @@ def test_noise_that_is_late_by_a_stop_of_the_process_is_left_out(cable: Cable) -
 
 @pytest.mark.parametrize(
     ("protocol", "ethertypes"),
-    [("arp", {0x0806}), ("ip", {0x0800}), ("lldp", {0x88CC}), ("ethercat", {0x88A4}),
+    [("arp", {0x0806}), ("ip", {0x0800}), ("lldp", {0x88CC}), ("ethercat", {0x88A4}), ("other_master", {0x88A4}),
      ("any", {0x0806, 0x0800, 0x88CC, 0x88A4})],
 )  # fmt: skip
 def test_noise_is_of_the_protocol_asked_for_and_fits_the_cable(
@@ -204,4 +204,4 @@ def test_the_same_seed_makes_the_same_noise() -> None:
         return cable.received
 
     assert noise(1) == noise(1) != noise(2)
-    assert set(MAKERS) == {"arp", "ip", "lldp", "ethercat"}
+    assert set(MAKERS) == {"arp", "ip", "lldp", "ethercat", "other_master", "other_soem"}

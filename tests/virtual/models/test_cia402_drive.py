@@ -105,6 +105,23 @@ def test_a_turn_of_the_joint_has_the_counts_that_the_drives_objects_say(
     assert bench[0x6064] == counts // 2
 
 
+@pytest.mark.parametrize(
+    ("options", "reported", "turned"),
+    [({}, 1.0, 1.0), ({"counts_per_turn": 655.36}, 1.0, 100.0), ({"encoder_ratio": -2.0}, -2.0, 1.0)],
+    ids=["sound", "a gear that is not there", "an encoder that counts twice, and backwards"],
+)
+def test_options_play_a_wrong_gear_and_a_wrong_encoder(options: dict[str, Any], reported: float, turned: float) -> None:
+    degree = 65536 / 360
+    bench = Bench(**options)
+    bench.enable(8)
+    for step in range(1, 101):
+        bench[0x607A] = round(step * degree / 100)
+        bench.run(0.02)
+    bench.run(0.5)
+    assert bench[0x6064] == pytest.approx(reported * degree, abs=3)
+    assert bench.device.servos[0].mechanics.position == pytest.approx(turned * 2 * pi / 360, rel=0.02)
+
+
 def test_csp_follows_its_targets_at_any_speed_and_csv_keeps_counts_a_second() -> None:
     bench = Bench(ratio(0x608F, 10_000, 1))
     bench.enable(8)
