@@ -22,6 +22,7 @@ from rtcp.api.results import (
     Channel,
     EventRecord,
     GripperRest,
+    HomingMethod,
     JointLimits,
     Levels,
     Pose,
@@ -701,8 +702,17 @@ class Methods:
 
     @Method
     def home(self, joint: str, progress: OnProgress | None = None) -> Call[float]:
-        """Run the homing of a joint's drive; return its position afterwards, rad."""
+        """Run the homing of a joint's drive; return its position afterwards, rad. `homing_method` says what it does.
+
+        Raises:
+            Faulted: the drive reports an error, or success at a position that is not its home offset.
+        """
         return Call("home", {"joint": joint}, lambda answer: float(answer["position"]), progress)
+
+    @Method
+    def homing_method(self, joint: str) -> Call[HomingMethod]:
+        """Read from a joint's drive what `home` would do; nothing moves."""
+        return Call("homing_method", {"joint": joint}, partial(result, HomingMethod))
 
     @Method
     def sdo_read(self, slave: int, index: int, subindex: int = 0) -> Call[bytes]:

@@ -248,11 +248,24 @@ def _zero(
 
 
 @commands.command("home")
-def _home(joint: Joint) -> None:
-    """Run the homing of a joint's drive, as its start-up SDOs configure it. Ctrl-C stops it."""
+def _home(
+    joint: Joint,
+    yes: Annotated[bool, option("--yes", "Do not ask before the present position becomes the home.")] = False,
+) -> None:
+    """Run the homing of a joint's drive, as its object 0x6098 says. Ctrl-C stops it.
+
+    It says first what the drive will do, and asks where the drive declares its present position to be the home.
+    """
     with stoppable("home") as robot:
+        method = robot.homing_method(joint)
+        number = "" if method.method is None else f", by method {method.method} (0x6098)"
+        report(
+            f"the drive of {method.joint} {method.text}{number}; there it counts {method.home_offset:.6g} rad (0x607C)"
+        )
+        if method.declares_present and not yes:
+            confirm(f"Is {method.joint} where its drive shall count {method.home_offset:.6g} rad?")
         position = robot.home(joint)
-    report(f"{f'joint {joint}' if joint.isdecimal() else joint} is homed and stands at {position:.6f} rad")
+    report(f"{method.joint} is homed and stands at {position:.6f} rad")
 
 
 @commands.command("move", context_settings=NUMBERS_AS_WRITTEN)

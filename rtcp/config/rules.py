@@ -226,7 +226,8 @@ def _sync_managers(device: DeviceDescription) -> Iterator[Finding]:
 
 @rule(DeviceDescription, "rpdo", "tpdo", "sdo", "kind")
 def _drive_mode(device: DeviceDescription) -> Iterator[Finding]:
-    """Without a mode of operation in its PDOs a drive stays in the mode of a start-up SDO, which must be CSP."""
+    """A drive whose PDOs do not have the mode of operation, or do not show it, stays in the mode of a start-up SDO, which
+    must be CSP."""
     if device.kind != "cia402":
         return
     for axis in device.axes:
@@ -239,10 +240,11 @@ def _drive_mode(device: DeviceDescription) -> Iterator[Finding]:
         index = MODES_OF_OPERATION + (axis - 1) * OBJECTS_PER_AXIS
         if len(device.axes) > 1 and not (sent and received):
             yield Finding(("tpdo" if sent else "rpdo",), "one_direction", of=of)
-        elif "modes_of_operation" not in sent and device.startup(MODES_OF_OPERATION, axis) != CSP:
-            yield Finding(("rpdo",), "no_csp", of=of, index=index, value=CSP)
-        elif "modes_of_operation" in sent and "modes_of_operation_display" not in received:
-            yield Finding(("tpdo",), "mode_not_shown", of=of)
+        elif "modes_of_operation" in sent and "modes_of_operation_display" in received:
+            continue
+        elif device.startup(MODES_OF_OPERATION, axis) != CSP:
+            key, kind = ("tpdo", "mode_not_shown") if "modes_of_operation" in sent else ("rpdo", "no_csp")
+            yield Finding((key,), kind, of=of, index=index, value=CSP)
 
 
 @rule(DeviceDescription, "rpdo", "tpdo", "scaling", "kind")

@@ -198,7 +198,12 @@ class DeviceModel:
         self.objects = ObjectDictionary()
         self._define_identity()
         self.define(self.objects)
-        self._defaults = [(entry, entry.value) for obj in self.objects for entry in obj.entries.values()]
+        self._defaults: list[tuple[Entry, Value]] = []
+        self.keep_defaults(entry for obj in self.objects for entry in obj.entries.values())
+
+    def keep_defaults(self, entries: Iterable[Entry]) -> None:
+        """Take the present values of entries for those at power-on."""
+        self._defaults += [(entry, entry.value) for entry in entries]
 
     def join(self, devices: Sequence[DeviceModel]) -> None:
         """Receive all devices of the segment, in the order of the cable; called once before the first step."""
