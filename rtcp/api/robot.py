@@ -294,17 +294,17 @@ class Methods:
         return Call("move_joints", params, _arrival, progress)
 
     @Method
-    def move_home(self, speed: float | None = None, progress: OnProgress | None = None) -> Call[Arrival]:
-        """Move the joints to `home` of the arm's file.
+    def move_to_rest_pose(self, speed: float | None = None, progress: OnProgress | None = None) -> Call[Arrival]:
+        """Move the joints to `rest_pose` of the arm's file.
 
         Args:
             speed: of the fastest joint, rad/s; None: its limit.
             progress: called about ten times a second meanwhile.
 
         Raises:
-            Refused: as `move_joints`; reason `no_home`: the file has none.
+            Refused: as `move_joints`; reason `no_rest_pose`: the file has none.
         """
-        return Call("move_home", {"speed": speed}, _arrival, progress)
+        return Call("move_to_rest_pose", {"speed": speed}, _arrival, progress)
 
     @Method
     def move_pose(

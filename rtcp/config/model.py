@@ -1196,8 +1196,8 @@ class ArmSettings:
     """Timeout until all drives are enabled, or without torque, s."""
     lease_s: Positive = 0.5
     """Silence of the commander that ends its lease, s; see [whose silence](motion.md#whose-silence-stops-the-arm)."""
-    home: Annotated[tuple[Angle, ...], MinLen(1), MaxLen(MOST_AXES)] | None = None
-    """Joint positions to which `rtcp move --home` and the panel lead, rad."""
+    rest_pose: Annotated[tuple[Angle, ...], MinLen(1), MaxLen(MOST_AXES)] | None = None
+    """Joint positions to which `rtcp move --rest-pose` and the panel lead, rad."""
     cartesian: CartesianConfig = field(default_factory=CartesianConfig)
     jog: JogConfig = field(default_factory=JogConfig)
     guiding: GuidingConfig = field(default_factory=GuidingConfig)

@@ -676,13 +676,13 @@ def _beyond_the_wire(
             )
 
 
-@rule(ArmFile, "home", "joints")
-def _home(arm: ArmFile) -> Iterator[Finding]:
-    home, joints = arm.home or (), arm.joints
-    if home and len(home) != len(joints):
-        yield Finding(("home",), "count", found=len(home), allowed=len(joints), of="one a joint")
-    for i, (q, joint) in enumerate(zip(home, joints)):  # noqa: B905 the count is checked above
-        yield from _within(("home", i), q, joint.position.min, joint.position.max, f"the position of {joint.name}")
+@rule(ArmFile, "rest_pose", "joints")
+def _rest_pose(arm: ArmFile) -> Iterator[Finding]:
+    pose, joints = arm.rest_pose or (), arm.joints
+    if pose and len(pose) != len(joints):
+        yield Finding(("rest_pose",), "count", found=len(pose), allowed=len(joints), of="one a joint")
+    for i, (q, joint) in enumerate(zip(pose, joints)):  # noqa: B905 the count is checked above
+        yield from _within(("rest_pose", i), q, joint.position.min, joint.position.max, f"the position of {joint.name}")
 
 
 # -- geometry and boxes ------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Final
 from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.bus import slave_label
 from rtcp.fieldbus.errors import BusError, SdoAborted
-from rtcp.fieldbus.mailbox import ABSENT, SdoClient
+from rtcp.fieldbus.mailbox import ABSENT, SdoClient, abort_meaning
 from rtcp.fieldbus.registers import Steps
 
 INTERPOLATION_TIME: Final = 0x60C2
@@ -46,7 +46,7 @@ def set_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Ste
         value = yield from sdo.reading(index, _VALUE)
     except SdoAborted as error:
         if error.code in ABSENT:
-            return [f"{where} has no interpolation time (0x{index:04X})"]
+            return [f"{where} has no interpolation time (0x{index:04X}:1)"]
         raise
     try:
         exponent: bytes | None = yield from sdo.reading(index, _EXPONENT)
@@ -70,7 +70,7 @@ def set_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Ste
                 yield from _write(sdo, index, _EXPONENT, power, len(exponent))
             why = "it does not keep what is written"
         except SdoAborted as error:
-            why = error.sentences[0]
+            why = f"a write is refused ({abort_meaning(error.code)})"
         value = yield from sdo.reading(index, _VALUE)
         exponent = exponent and (yield from sdo.reading(index, _EXPONENT))
         kept_ns = _time_ns(value, exponent)

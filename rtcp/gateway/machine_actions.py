@@ -293,7 +293,7 @@ class MachineActions:
         """
         axis = self._axis(joint)
         data = await self._read_of(axis, HOMING_METHOD)
-        number = None if data is None else int.from_bytes(data, "little", signed=True)
+        number = None if data is None else int.from_bytes(data[:1], "little", signed=True)
         return {
             "joint": self._config.axes[axis].name,
             "method": number,
