@@ -761,7 +761,7 @@ class SettleConfig:
 
 @dataclass(frozen=True)
 class HomingConfig:
-    """Waits and bounds of `rtcp home`: [homing](drives.md#homing)."""
+    """Waits and bounds of `rtcp home`: [homing](homing.md#homing)."""
 
     settle_ms: Annotated[float, Gt(0), Le(10_000)] = 100.0
     """Longest delay of a drive's statusword and position behind its mode display and its controlword, ms. The start bit

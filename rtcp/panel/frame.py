@@ -139,7 +139,9 @@ def _commands(view: View) -> None:
             dialog.close()
             await view.act(lambda robot: robot.move_to_rest_pose(), "The arm is in its rest pose")
 
-        with view.question("Move the arm to its rest pose?", "All joints move there at once, from where they are.") as dialog:
+        with view.question(
+            "Move the arm to its rest pose?", "All joints move there at once, from where they are."
+        ) as dialog:
             button("Move to rest pose", move, when="holding")
             button("Leave it", dialog.close, plain=True)
 

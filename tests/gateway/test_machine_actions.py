@@ -16,7 +16,16 @@ from rtcp.config.drive_limits import BEYOND_RANGE_RAD
 from rtcp.config.model import LARGEST, GripperConfig, Joint, Range
 from rtcp.config.zero import read_zeros, state_directory, zero_file
 from rtcp.ipc import commands
-from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, Homed, HomedElsewhere, HomingFailed, OverSpeed, ZeroSet
+from rtcp.ipc.events import (
+    Disabled,
+    GripperAtRest,
+    GripperCloses,
+    Homed,
+    HomedElsewhere,
+    HomingFailed,
+    OverSpeed,
+    ZeroSet,
+)
 from rtcp.ipc.layout import EVENTS
 from rtcp.ipc.refusals import GripperDisabled, Refusal, TorquePresent, WrongState
 from rtcp.ipc.schema import Field

@@ -10,7 +10,7 @@ from math import ceil
 from typing import Final
 
 from rtcp.virtual.models.cia402 import STATE_BITS, DriveState, DriveStateMachine, Status
-from rtcp.virtual.models.cyclic_modes import ERROR, LIMIT, Motion, Profile, Stop
+from rtcp.virtual.models.cyclic_modes import ERROR, LIMIT, REACHED, Motion, Profile, Stop
 from rtcp.virtual.models.mechanics import ActuatorSize, Axis, Mechanics
 from rtcp.virtual.models.protection import AT_ONCE, Condition, ErrorCode, ErrorLog, Feedback
 from rtcp.virtual.models.units import AxisObjects
@@ -261,9 +261,11 @@ class ServoAxis:
         elif before is DriveState.QUICK_STOP_ACTIVE:
             self._control_quick_stop(transition)
         elif self._reset_left > 0.0:
-            self._reset_left = self._reset_left - dt if controlword & _FAULT_RESET else 0.0
-            if controlword & _FAULT_RESET and self._reset_left <= 0.0:
+            self._reset_left -= dt
+            if self._reset_left <= 0.0:
                 self._reset()
+            elif not controlword & _FAULT_RESET:
+                self._reset_left = 0.0
         elif transition is not None:
             self._follow_transition(*transition)
         elif self._pending and controlword & 0x8F == 0x0F:
@@ -342,7 +344,8 @@ class ServoAxis:
         if wanted not in self._modes or wanted == 0:
             return
         running = self._motion is self._modes[self._mode]
-        self._lag_left, self._former_bits = self.mode_bits_lag, self._mode_bits
+        # Some drives show that the target is reached in CSP too.
+        self._lag_left, self._former_bits = self.mode_bits_lag, self._mode_bits | REACHED
         self._mode = self._mode_display.value = wanted
         if running:
             self._start_mode()
