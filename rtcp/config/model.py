@@ -801,7 +801,7 @@ class DriveWaitsConfig:
     time, at the end of the platform after twice this time."""
 
     def answer_cycles(self, period_s: float) -> int:
-        """Return the number of cycles of `period_s` after which a drive has answered, the way of the frames included."""
+        """Return the number of cycles after which a drive has answered, the way of the frames included."""
         return math.ceil(self.answer_ms * 1e-3 / period_s - 1e-9) + _FRAME_CYCLES
 
 

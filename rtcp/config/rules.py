@@ -226,8 +226,7 @@ def _sync_managers(device: DeviceDescription) -> Iterator[Finding]:
 
 @rule(DeviceDescription, "rpdo", "tpdo", "sdo", "kind")
 def _drive_mode(device: DeviceDescription) -> Iterator[Finding]:
-    """A drive whose PDOs do not have the mode of operation, or do not show it, stays in the mode of a start-up SDO, which
-    must be CSP."""
+    """A drive whose PDOs lack the mode of operation, or its display, stays in the mode of a start-up SDO: CSP."""
     if device.kind != "cia402":
         return
     for axis in device.axes:

@@ -7,7 +7,7 @@ start-up SDOs of its description. Afterwards it counts from its home; the joint'
 from __future__ import annotations
 
 from enum import Enum
-from math import ceil, nan
+from math import ceil, isnan, nan
 from typing import Final
 
 from rtcp.config.model import ArmConfig, HomingConfig
@@ -223,7 +223,7 @@ class Homing:
         Makers read the sign of 0x607C both ways, and some drives turn on to their zero after they have found the home.
         """
         home, shown, tolerance = self._home, drive.position + drive.zero, self._tolerance
-        return home != home or min(abs(shown - home), abs(shown + home), abs(shown)) <= tolerance
+        return isnan(home) or min(abs(shown - home), abs(shown + home), abs(shown)) <= tolerance
 
     def _fail(self, drive: Cia402Drive, outcome: HomingPhase) -> None:
         self.shown = drive.statusword

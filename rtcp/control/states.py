@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import Enum
 from math import ceil, nan
-from typing import ClassVar, Final
+from typing import ClassVar
 
 from rtcp.control.context import Context
 from rtcp.devices.drive import TargetState
@@ -799,7 +799,7 @@ class Closing(MachineState):
         return self._stop(ctx) and self._remove_torque(ctx)
 
     def _longest(self, ctx: Context) -> int:
-        """Return the cycles for the drives to stop and disable, from standstill of the setpoints; then the loop ends."""
+        """Return the longest time of the end from standstill of the setpoints on, in cycles."""
         return ctx.cycles(ctx.config.drive_waits.off_ms * 2e-3)
 
     def _decelerates(self, ctx: Context) -> bool:

@@ -107,9 +107,9 @@ class Cia402Drive(Drive):
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 
     `encode` also takes `controlword`. A velocity that is not mapped is the mean one over 20 ms. In CSP the drive takes
-    `speed_limit` from the field of the target velocity. A drive whose PDOs have no mode of operation, or do not show it,
-    stays in CSP, to which a start-up SDO sets it. The offsets 0x60B1 and 0x60B2 are those of `offsets` while the drive is enabled in CSP
-    and CSV, else 0. Whatever else is mapped has its safe value, 0.
+    `speed_limit` from the field of the target velocity. A drive whose PDOs lack the mode of operation, or its display,
+    stays in CSP, to which a start-up SDO sets it. The offsets 0x60B1 and 0x60B2 are those of `offsets` while the drive
+    is enabled in CSP and CSV, else 0. Whatever else is mapped has its safe value, 0.
 
     Args:
         slave: the slave's name and description.
@@ -201,8 +201,8 @@ class Cia402Drive(Drive):
                 self.latch()
             self._was_enabled = state is _ENABLED
         elif word == FAULT_RESET:
-            # A rising edge resets (CiA 402-2, transition 15), in some drives only a bit that stays set for some ms: hold
-            # it, clear it for as long, then try again.
+            # A rising edge resets (CiA 402-2, transition 15), in some drives only a bit that stays set for some ms: set
+            # it for a while, clear it for as long, then try again.
             pulse = ceil(self.reset_pulse_s / self.period_s - _EXACT)
             if self._reset_calls >= pulse:
                 word = DISABLE_VOLTAGE

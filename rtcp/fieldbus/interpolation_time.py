@@ -24,7 +24,7 @@ _MS: Final = -3
 
 
 def expressions(period_ns: int, bits: int = 8) -> Iterator[tuple[int, int]]:
-    """Yield each (value, exponent) with value * 10^exponent s = `period_ns` whose value has `bits`, smallest value first.
+    """Yield each (value, exponent) with value * 10^exponent s = `period_ns`, a value of `bits`, smallest value first.
 
     500 us is (5, -4) and (50, -5); no byte expresses 333 us.
     """
@@ -106,4 +106,4 @@ def _time_ns(value: bytes, exponent: bytes | None) -> int:
     """Return the time, ns; a part of 1 ns counts as 1 ns, so that it equals no cycle."""
     power = 9 + (_MS if exponent is None else _signed(exponent))
     number = int.from_bytes(value, "little")
-    return number * 10**power if power >= 0 else -(-number // 10**-power)
+    return int(number * 10**power if power >= 0 else -(-number // 10**-power))

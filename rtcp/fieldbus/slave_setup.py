@@ -20,10 +20,10 @@ from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted, ValueNotKept
+from rtcp.fieldbus.interpolation_time import set_interpolation_time
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
 from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, write_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
-from rtcp.fieldbus.interpolation_time import set_interpolation_time
 from rtcp.fieldbus.scaling import check_quick_stop, compare_scaling
 from rtcp.fieldbus.scan import name_of
 from rtcp.ipc.codes import ERROR_BIT, refusal

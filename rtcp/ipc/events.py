@@ -601,7 +601,8 @@ class VelocityDisagrees(FaultEvent, number=156):
 
 
 class HomingStillMoving(FaultEvent, number=39):
-    """{joint} still turns at {velocity:.6g} rad/s {rest_s:g} s (homing.rest_s) after its homing: {reaction}; then `rtcp reset`"""
+    """{joint} still turns at {velocity:.6g} rad/s {rest_s:g} s (homing.rest_s) after its homing: {reaction}; then
+    `rtcp reset`"""
 
     axis: int
     velocity: float

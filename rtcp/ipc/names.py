@@ -184,7 +184,7 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     ),
     "homing_reason": lambda names, about: (
         names.lacks("homing")
-        or "its drive stays in CSP: its PDOs lack modes_of_operation or modes_of_operation_display"
+        or "the PDOs of its drive lack modes_of_operation or modes_of_operation_display, so it stays in CSP"
     ),
     "homing_tolerance": lambda names, about: names.config.homing.tolerance,
     "rest_s": lambda names, about: names.config.homing.rest_s,

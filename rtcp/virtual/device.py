@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple, cast
 from rtcp.config.find import load_class, registered
 from rtcp.config.findings import Finding
 from rtcp.config.model import PluginError
-from rtcp.virtual.objects import DataType, Entry, ObjectDictionary, SdoAbort
+from rtcp.virtual.objects import DataType, Entry, ObjectDictionary, SdoAbort, Value
 from rtcp.virtual.pdo import ASSIGN, PdoImage, SyncManager, SyncManagerLayout, SyncManagerType, room
 from rtcp.virtual.protocol import RAM_SIZE, REGISTER_SPACE, MailboxType
 

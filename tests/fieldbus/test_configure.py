@@ -9,8 +9,8 @@ import pytest
 
 from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.interpolation_time import expressions
 from rtcp.fieldbus.image import limit_faults
+from rtcp.fieldbus.interpolation_time import expressions
 from rtcp.fieldbus.pdo import layout, mapping_of, mapping_text
 from rtcp.fieldbus.slave_setup import by_alias, identity_faults
 from rtcp.fieldbus.topology import PortState, Topology

@@ -25,7 +25,7 @@ RECORD: Form = ((U8, 2, RW), (I8, -3, RW))
 
 
 def started(form: Form, period_us: int, only: Callable[[Entry, Value], bool] | None = None) -> tuple[float, list[str]]:
-    """Start a drive with the object in this form, which takes `only` some values; return its time, us, and the notes."""
+    """Start a drive with the object in this form, which takes `only` some values; return its time, us, and notes."""
     model = create("cubemars-orh70")
     assert isinstance(model, CubemarsDrive)
 

@@ -273,7 +273,8 @@ class ServoAxis:
             self._start_mode()
         if self._machine.state is DriveState.OPERATION_ENABLED and not self._pending:
             self._control_halt(controlword)
-        self._busy = self._pending or self._reset_left > 0.0 or self._machine.state is not before or self._machine.state in (
+        changes = self._pending or self._reset_left > 0.0 or self._machine.state is not before
+        self._busy = changes or self._machine.state in (
             DriveState.NOT_READY_TO_SWITCH_ON, DriveState.FAULT_REACTION_ACTIVE, DriveState.QUICK_STOP_ACTIVE,
         )  # fmt: skip
 
