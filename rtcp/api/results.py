@@ -286,6 +286,21 @@ class Zero:
 
 
 @dataclass(frozen=True)
+class HomingMethod:
+    """What the homing of a joint's drive does."""
+
+    joint: str
+    method: int | None
+    """Object 0x6098; None: the drive has no such object."""
+    text: str
+    """What the drive does, as a verb with its object."""
+    declares_present: bool
+    """Whether the drive declares its present position to be the home, or does not tell its method."""
+    home_offset: float
+    """What the drive counts at its home (0x607C), rad."""
+
+
+@dataclass(frozen=True)
 class RecorderStatus:
     """Files and counts of a recorder; final once it has ended."""
 

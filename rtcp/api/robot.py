@@ -22,6 +22,7 @@ from rtcp.api.results import (
     Channel,
     EventRecord,
     GripperRest,
+    HomingMethod,
     JointLimits,
     Levels,
     Pose,
@@ -293,17 +294,17 @@ class Methods:
         return Call("move_joints", params, _arrival, progress)
 
     @Method
-    def move_home(self, speed: float | None = None, progress: OnProgress | None = None) -> Call[Arrival]:
-        """Move the joints to `home` of the arm's file.
+    def move_to_rest_pose(self, speed: float | None = None, progress: OnProgress | None = None) -> Call[Arrival]:
+        """Move the joints to `rest_pose` of the arm's file.
 
         Args:
             speed: of the fastest joint, rad/s; None: its limit.
             progress: called about ten times a second meanwhile.
 
         Raises:
-            Refused: as `move_joints`; reason `no_home`: the file has none.
+            Refused: as `move_joints`; reason `no_rest_pose`: the file has none.
         """
-        return Call("move_home", {"speed": speed}, _arrival, progress)
+        return Call("move_to_rest_pose", {"speed": speed}, _arrival, progress)
 
     @Method
     def move_pose(
@@ -701,8 +702,17 @@ class Methods:
 
     @Method
     def home(self, joint: str, progress: OnProgress | None = None) -> Call[float]:
-        """Run the homing of a joint's drive; return its position afterwards, rad."""
+        """Run the homing of a joint's drive; return its position afterwards, rad. `homing_method` says what it does.
+
+        Raises:
+            Faulted: the drive reports an error, or success at a position that is not its home offset.
+        """
         return Call("home", {"joint": joint}, lambda answer: float(answer["position"]), progress)
+
+    @Method
+    def homing_method(self, joint: str) -> Call[HomingMethod]:
+        """Read from a joint's drive what `home` would do; nothing moves."""
+        return Call("homing_method", {"joint": joint}, partial(result, HomingMethod))
 
     @Method
     def sdo_read(self, slave: int, index: int, subindex: int = 0) -> Call[bytes]:

@@ -50,11 +50,11 @@ def moveit_package(arm: Path) -> MoveItPackage:
     solver = to_c(model)
     urdf = to_urdf(model, [joint.torque for joint in settings if joint.torque < UNLIMITED_TORQUE] or None)
     package = f"{solver.prefix}_moveit_config"
-    home = [min(max(0.0, limit.lower), limit.upper) for limit in model.limits]
+    zero = [min(max(0.0, limit.lower), limit.upper) for limit in model.limits]
     joints = [
         {
             "name": name,
-            "home": home[number],
+            "zero": zero[number],
             "velocity": limit.velocity if isfinite(limit.velocity) else None,
             "acceleration": settings[number].acceleration if settings else None,
             "jerk": settings[number].jerk if settings else None,
@@ -71,7 +71,7 @@ def moveit_package(arm: Path) -> MoveItPackage:
         "joints": joints,
         "names": model.joint_names,
         "links": [link.get("name") for link in tree.findall("link")],
-        "touching": _touching(model, tree, home),
+        "touching": _touching(model, tree, zero),
         "cartesian": config.cartesian if config else CartesianConfig(),
     }
     files = {f"src/{name}": text for name, text in solver.files.items()}
@@ -81,8 +81,8 @@ def moveit_package(arm: Path) -> MoveItPackage:
     return MoveItPackage(package, dict(sorted(files.items())))
 
 
-def _touching(model: ArmModel, urdf: ET.Element, home: list[float]) -> list[tuple[str, str, str]]:
-    """Return links that are no neighbours and overlap in every configuration (Always) or at home (Default).
+def _touching(model: ArmModel, urdf: ET.Element, zero: list[float]) -> list[tuple[str, str, str]]:
+    """Return links that are no neighbours and overlap in every configuration (Always) or at zero (Default).
 
     MoveIt would reject every plan because of them. It still checks pairs that never touch.
     """
@@ -104,10 +104,10 @@ def _touching(model: ArmModel, urdf: ET.Element, home: list[float]) -> list[tupl
 
         return {pair for pair in pairs if overlap(*pair)}
 
-    at_home, always = overlapping(home), set(pairs)
+    at_zero, always = overlapping(zero), set(pairs)
     for q in sampled.tolist():
         always &= overlapping(q)
-    return [(names[i], names[j], "Always" if (i, j) in always else "Default") for i, j in sorted(at_home | always)]
+    return [(names[i], names[j], "Always" if (i, j) in always else "Default") for i, j in sorted(at_zero | always)]
 
 
 def _balls(link: ET.Element) -> Array:

@@ -248,11 +248,24 @@ def _zero(
 
 
 @commands.command("home")
-def _home(joint: Joint) -> None:
-    """Run the homing of a joint's drive, as its start-up SDOs configure it. Ctrl-C stops it."""
+def _home(
+    joint: Joint,
+    yes: Annotated[bool, option("--yes", "Do not ask before the present position becomes the home.")] = False,
+) -> None:
+    """Run the homing of a joint's drive, as its object 0x6098 says. Ctrl-C stops it.
+
+    It says first what the drive will do, and asks where the drive declares its present position to be the home.
+    """
     with stoppable("home") as robot:
+        method = robot.homing_method(joint)
+        number = "" if method.method is None else f", by method {method.method} (0x6098)"
+        report(
+            f"the drive of {method.joint} {method.text}{number}; there it counts {method.home_offset:.6g} rad (0x607C)"
+        )
+        if method.declares_present and not yes:
+            confirm(f"Is {method.joint} where its drive shall count {method.home_offset:.6g} rad?")
         position = robot.home(joint)
-    report(f"{f'joint {joint}' if joint.isdecimal() else joint} is homed and stands at {position:.6f} rad")
+    report(f"{method.joint} is homed and stands at {position:.6f} rad")
 
 
 @commands.command("move", context_settings=NUMBERS_AS_WRITTEN)
@@ -261,7 +274,7 @@ def _move(
         list[str] | None,
         as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool; see --pose."),
     ] = None,
-    home: Annotated[bool, option("--home", "Instead of numbers: to `home` of the arm's file.")] = False,
+    rest_pose: Annotated[bool, option("--rest-pose", "Instead of numbers: to `rest_pose` of the arm's file.")] = False,
     pose: Annotated[bool, option("--pose", "The numbers are a tool pose, X Y Z RX RY RZ: m, and rad of Rx Ry Rz.")] = (
         False
     ),
@@ -280,12 +293,12 @@ def _move(
         raise CommandError("--line is for a pose: give --pose X Y Z RX RY RZ --line")
     if unsynchronized and pose:
         raise CommandError("--unsynchronized is for joint positions, not for --pose")
-    if home == bool(numbers) or (home and (pose or unsynchronized)):
-        raise CommandError("give joint positions, or --pose X Y Z RX RY RZ, or --home alone")
+    if rest_pose == bool(numbers) or (rest_pose and (pose or unsynchronized)):
+        raise CommandError("give joint positions, or --pose X Y Z RX RY RZ, or --rest-pose alone")
     target = pose_values(numbers or ()) if pose else joint_values(numbers or ())
     with stoppable("move") as robot, progress() as show_progress:
-        if home:
-            arrived = robot.move_home(speed, show_progress)
+        if rest_pose:
+            arrived = robot.move_to_rest_pose(speed, show_progress)
         elif pose:
             arrived = robot.move_pose(target, speed, line, show_progress)
         else:

@@ -64,8 +64,9 @@ _SENTENCES = {
     "one_direction": "found no channels{of}; an axis needs some in both directions",
     "no_csp": "found no channel named modes_of_operation{of}; without it the start-up SDO {{index: {index:#x}, "
     "sub_index: 0, type: int8, value: {value}}} (CSP) must be in sdo",
-    "mode_not_shown": "found no channel named modes_of_operation_display{of} beside modes_of_operation in rpdo; "
-    "allowed are both, or neither: else it is unknown in which mode the drive is",
+    "mode_not_shown": "found no channel named modes_of_operation_display{of} beside modes_of_operation in rpdo: it is "
+    "unknown in which mode the drive is; map it (0x6061), or let the drive stay in CSP by the start-up SDO "
+    "{{index: {index:#x}, sub_index: 0, type: int8, value: {value}}} in sdo",
     "scaling_of_kind": "found with kind {kind}, allowed is kind cia402",
     "axes_with_gap": "found channels of axis {axes}; axes are counted from 1, without a gap",
     "several_axes": "found channels of {axes} axes, allowed is kind cia402 for a device with several",

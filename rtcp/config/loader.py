@@ -43,13 +43,14 @@ from rtcp.config.scaling import FACTOR_TOLERANCE, QUANTITIES, DriveScaling
 from rtcp.config.validation import EVERY_KEY, Checker, FileRule, allowed, keys, rule
 
 RENAMED = {
+    "home": "rest_pose",
     "mode": "drive_mode",
     "motion": "control_mode",
     "watch": "supervision",
     "bus.virtual_patience": "bus.timeout_scale",
     "stops.watch": "stops.supervision",
 }
-"""Keys of the arm's file in version 0.1, and their names now."""
+"""Former keys of the arm's file, and their names now."""
 _SYNC_ERROR_LIMIT = (0x10F1, 2)
 _LONGEST_SCALED_LEASE_S, _LONGEST_SCALED_UNLOCKED_S = 3.0, 5.0
 _LONGEST_WATCHDOG_MS = 6000.0

@@ -87,8 +87,8 @@ AxisNumber = Annotated[int, Ge(1), Le(8)]
 DriveModeName = Literal["csp", "csv", "cst"]
 MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "csp": ((), ()),
-    "csv": (("target_velocity", "modes_of_operation"), ("velocity",)),
-    "cst": (("target_torque", "modes_of_operation"), ("velocity", "torque")),
+    "csv": (("target_velocity", "modes_of_operation"), ("velocity", "modes_of_operation_display")),
+    "cst": (("target_torque", "modes_of_operation"), ("velocity", "torque", "modes_of_operation_display")),
 }
 """Channels of rpdo and of tpdo that a drive mode needs beside those of every CiA 402 drive."""
 DRIVEN_OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
@@ -793,6 +793,52 @@ class SettleConfig:
 
 
 @dataclass(frozen=True)
+class HomingConfig:
+    """Waits and bounds of `rtcp home`: [homing](homing.md#homing)."""
+
+    settle_ms: Annotated[float, Gt(0), Le(10_000)] = 100.0
+    """Longest delay of a drive's statusword and position behind its mode display and its controlword, ms. The start bit
+    follows the mode display after this time; bits that were never clear are believed this time after the start bit."""
+    search_s: Annotated[float, Gt(0), Le(3600)] = 60.0
+    """Longest search of a drive for its home, s."""
+    rest_s: Annotated[float, Gt(0), Le(60)] = 3.0
+    """Longest time in which a drive comes to rest after its homing has ended, s."""
+    tolerance: Annotated[float, Gt(0), Le(1000)] = 0.2
+    """Largest distance of a homed drive's position from its home offset (0x607C), rad: a drive that brakes behind its
+    switch or index pulse stands beside its home."""
+
+
+_FRAME_CYCLES: Final = 3
+"""Cycles from a command to the status that answers it, in a drive that needs no time: frame, SYNC0, frame."""
+
+
+@dataclass(frozen=True)
+class DriveWaitsConfig:
+    """How long the platform waits for its drives. The times are the same for any cycle."""
+
+    answer_ms: Annotated[float, Gt(0), Le(1000)] = 10.0
+    """Longest delay of a drive's statusword and velocity behind its controlword, ms: standstill and the absence of
+    torque count this long after the command."""
+    reset_pulse_ms: Annotated[float, Gt(0), Le(1000)] = 10.0
+    """Time for which the fault reset bit (bit 7 of the controlword) is set, ms; it is then clear for as long, and set
+    again, until the drive has left its fault."""
+    reset_ms: Annotated[float, Gt(0), Le(60_000)] = 3000.0
+    """Longest time of `rtcp reset` until slaves, clock and drives are ready again, ms; the debounce time of the
+    emergency stop is added."""
+    mode_ms: Annotated[float, Gt(0), Le(60_000)] = 1000.0
+    """Longest time until a drive shows a commanded mode of operation (0x6061), ms."""
+    brake_ms: Annotated[float, Gt(0), Le(10_000)] = 100.0
+    """Time in which the drives take the weight of the arm after all are enabled, ms: brakes open in it."""
+    off_ms: Annotated[float, Gt(0), Le(10_000)] = 1000.0
+    """Longest time until a drive shows no torque, ms: then the slaves leave OP anyway, in an emergency stop after this
+    time, at the end of the platform after twice this time."""
+
+    def answer_cycles(self, period_s: float) -> int:
+        """Return the number of cycles after which a drive has answered, the way of the frames included."""
+        return math.ceil(self.answer_ms * 1e-3 / period_s - 1e-9) + _FRAME_CYCLES
+
+
+@dataclass(frozen=True)
 class StopsConfig:
     """The stop reaction to each event. Stop categories are those of IEC 60204-1."""
 
@@ -1183,14 +1229,16 @@ class ArmSettings:
     """Timeout until all drives are enabled, or without torque, s."""
     lease_s: Positive = 0.5
     """Silence of the commander that ends its lease, s; see [whose silence](motion.md#whose-silence-stops-the-arm)."""
-    home: Annotated[tuple[Angle, ...], MinLen(1), MaxLen(MOST_AXES)] | None = None
-    """Joint positions to which `rtcp move --home` and the panel lead, rad."""
+    rest_pose: Annotated[tuple[Angle, ...], MinLen(1), MaxLen(MOST_AXES)] | None = None
+    """Joint positions to which `rtcp move --rest-pose` and the panel lead, rad."""
     cartesian: CartesianConfig = field(default_factory=CartesianConfig)
     jog: JogConfig = field(default_factory=JogConfig)
     guiding: GuidingConfig = field(default_factory=GuidingConfig)
     supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
     feed_forward: FeedForwardConfig = field(default_factory=FeedForwardConfig)
     settle: SettleConfig = field(default_factory=SettleConfig)
+    homing: HomingConfig = field(default_factory=HomingConfig)
+    drive_waits: DriveWaitsConfig = field(default_factory=DriveWaitsConfig)
     stops: StopsConfig = field(default_factory=StopsConfig)
     inputs: InputsConfig = field(default_factory=InputsConfig)
     outputs: OutputsConfig = field(default_factory=OutputsConfig)

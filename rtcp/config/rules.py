@@ -226,7 +226,7 @@ def _sync_managers(device: DeviceDescription) -> Iterator[Finding]:
 
 @rule(DeviceDescription, "rpdo", "tpdo", "sdo", "kind")
 def _drive_mode(device: DeviceDescription) -> Iterator[Finding]:
-    """Without a mode of operation in its PDOs a drive stays in the mode of a start-up SDO, which must be CSP."""
+    """A drive whose PDOs lack the mode of operation, or its display, stays in the mode of a start-up SDO: CSP."""
     if device.kind != "cia402":
         return
     for axis in device.axes:
@@ -239,10 +239,11 @@ def _drive_mode(device: DeviceDescription) -> Iterator[Finding]:
         index = MODES_OF_OPERATION + (axis - 1) * OBJECTS_PER_AXIS
         if len(device.axes) > 1 and not (sent and received):
             yield Finding(("tpdo" if sent else "rpdo",), "one_direction", of=of)
-        elif "modes_of_operation" not in sent and device.startup(MODES_OF_OPERATION, axis) != CSP:
-            yield Finding(("rpdo",), "no_csp", of=of, index=index, value=CSP)
-        elif "modes_of_operation" in sent and "modes_of_operation_display" not in received:
-            yield Finding(("tpdo",), "mode_not_shown", of=of)
+        elif "modes_of_operation" in sent and "modes_of_operation_display" in received:
+            continue
+        elif device.startup(MODES_OF_OPERATION, axis) != CSP:
+            key, kind = ("tpdo", "mode_not_shown") if "modes_of_operation" in sent else ("rpdo", "no_csp")
+            yield Finding((key,), kind, of=of, index=index, value=CSP)
 
 
 @rule(DeviceDescription, "rpdo", "tpdo", "scaling", "kind")
@@ -683,13 +684,13 @@ def _beyond_the_wire(
             )
 
 
-@rule(ArmFile, "home", "joints")
-def _home(arm: ArmFile) -> Iterator[Finding]:
-    home, joints = arm.home or (), arm.joints
-    if home and len(home) != len(joints):
-        yield Finding(("home",), "count", found=len(home), allowed=len(joints), of="one a joint")
-    for i, (q, joint) in enumerate(zip(home, joints)):  # noqa: B905 the count is checked above
-        yield from _within(("home", i), q, joint.position.min, joint.position.max, f"the position of {joint.name}")
+@rule(ArmFile, "rest_pose", "joints")
+def _rest_pose(arm: ArmFile) -> Iterator[Finding]:
+    pose, joints = arm.rest_pose or (), arm.joints
+    if pose and len(pose) != len(joints):
+        yield Finding(("rest_pose",), "count", found=len(pose), allowed=len(joints), of="one a joint")
+    for i, (q, joint) in enumerate(zip(pose, joints)):  # noqa: B905 the count is checked above
+        yield from _within(("rest_pose", i), q, joint.position.min, joint.position.max, f"the position of {joint.name}")
 
 
 # -- geometry and boxes ------------------------------------------------------------------------------------------------

@@ -103,7 +103,9 @@ class Context(PartContext):
         """Position on the cable and driver of each configured box; None: the driver is not an IO box's."""
         self.blackboard = blackboard
         self.service = service
-        self.homing = HomingSequence(arm, self.joints, self.period_s)
+        self.homing = HomingSequence(arm, self.joints, config)
+        self.answer_cycles = config.drive_waits.answer_cycles(self.period_s)
+        """Cycles after which the values of the drives answer a command: earlier ones may be older."""
         self.reactions = reactions(config.stops)
         self._discipline = discipline
         self._good_for_lost = good_for_lost(config)

@@ -7,13 +7,15 @@ start-up SDOs of its description. Afterwards it counts from its home; the joint'
 from __future__ import annotations
 
 from enum import Enum
+from math import ceil, isnan, nan
 from typing import Final
 
+from rtcp.config.model import ArmConfig, HomingConfig
 from rtcp.control.arm import Arm
 from rtcp.control.joint_group import Joints
 from rtcp.devices.cia402 import ENABLE_OPERATION, Cia402Drive
 from rtcp.devices.drive import CSP
-from rtcp.ipc.events import Event, Homed, HomingFailed, Stopped
+from rtcp.ipc.events import Event, Homed, HomedElsewhere, HomingFailed, Stopped
 
 HOMING: Final = 6
 """Mode of operation (CiA 402-2, object 0x6060)."""
@@ -48,7 +50,7 @@ HOMING_STATUS: dict[int, HomingStatus] = {
 
 
 class HomingPhase(Enum):
-    """Phase of a homing; the last five end it."""
+    """Phase of a homing; the last six end it."""
 
     IDLE = "idle"
     ENTERING = "the drive changes to mode 6"
@@ -57,20 +59,16 @@ class HomingPhase(Enum):
     LEAVING = "the drive changes back to CSP"
     HOMED = "homed"
     FAILED = "the drive reports a homing error, or found no home in time"
+    ELSEWHERE = "the drive reports success at a position that is not its home offset"
     STOPPED = "stopped before it was at home"
     STUCK = "the drive does not change its mode"
     RUNNING = "the drive does not come to rest"
 
 
-ENDED = frozenset({HomingPhase.HOMED, HomingPhase.FAILED, HomingPhase.STOPPED, HomingPhase.STUCK, HomingPhase.RUNNING})
-
 _P = HomingPhase
-_MODE_S: Final = 1.0
-_REST_S: Final = 3.0
-_LONGEST_S: Final = 60.0
+ENDED = frozenset({_P.HOMED, _P.FAILED, _P.ELSEWHERE, _P.STOPPED, _P.STUCK, _P.RUNNING})
+
 _STILL_RAD_S: Final = 0.01
-_LAG_CYCLES: Final = 10
-"""Cycles for which the statusword may still show the end of an earlier homing: it lags behind the controlword."""
 
 
 class Homing:
@@ -80,25 +78,38 @@ class Homing:
     sets its controlword and its mode, and the joint's setpoint is `position`: at the home the drive begins to count
     anew, and `position` jumps with it. The caller supervises that the drive stays in Operation Enabled, else it calls
     `abandon`.
+
+    Drives show mode 6 before they update bits 10, 12 and 13 of the statusword: until then these are the bits of CSP, or
+    of an earlier homing. So the start bit follows the mode display after `settle_ms`, and an end counts once all three
+    bits were clear after the start, or, because a homing at the present position never clears them, after `settle_ms`.
+    A success that lasts `settle_ms` ends the homing, if the position agrees.
     """
 
     __slots__ = (
-        "_cycles", "_drive", "_latched", "_longest", "_mode_cycles", "_outcome", "_rest", "_turned", "phase", "shown",
-        "shown_mode",
+        "_attained", "_clear", "_cycles", "_drive", "_home", "_latched", "_mode_cycles", "_outcome", "_rest", "_search",
+        "_settle", "_tolerance", "_turned", "phase", "shown", "shown_mode",
     )  # fmt: skip
 
-    def __init__(self, period_s: float, longest_s: float = _LONGEST_S) -> None:
+    def __init__(self, config: HomingConfig, mode_s: float, period_s: float) -> None:
         """Prepare to home one drive at a time.
 
         Args:
+            config: delays of the drives, and bounds.
+            mode_s: longest time of a change of the mode, s.
             period_s: period of the cycle, s.
-            longest_s: longest search of a drive for its home, s.
         """
-        self._longest = round(longest_s / period_s)
-        self._mode_cycles = round(_MODE_S / period_s)
-        self._rest = round(_REST_S / period_s)
+        self._settle = ceil(config.settle_ms * 1e-3 / period_s - 1e-9)
+        self._search = round(config.search_s / period_s)
+        self._rest = round(config.rest_s / period_s)
+        self._mode_cycles = round(mode_s / period_s)
+        self._tolerance = config.tolerance
         self._drive: Cia402Drive | None = None
+        self._home = nan
         self._cycles = 0
+        self._clear = False
+        """Whether bits 10, 12 and 13 were clear since the start bit rose."""
+        self._attained = 0
+        """Cycles for which the drive has reported success."""
         self._latched = False
         self._turned = False
         """Whether the drive has displayed mode 6: until then it may still follow its target."""
@@ -123,9 +134,15 @@ class Homing:
             return 0.0
         return drive.position if self._turned and not self._latched else drive.target_position
 
-    def start(self, drive: Cia402Drive) -> None:
-        """Begin to home `drive`, which is enabled, in CSP and at standstill."""
+    def start(self, drive: Cia402Drive, home: float = nan) -> None:
+        """Begin to home `drive`, which is enabled, in CSP and at standstill.
+
+        Args:
+            drive: the drive.
+            home: its home offset (0x607C), rad, in which its position must end; NaN: not known, any position will do.
+        """
         self._drive = drive
+        self._home = home
         self._latched = self._turned = False
         self._outcome = _P.STOPPED
         self.shown, self.shown_mode = 0, HOMING
@@ -134,7 +151,7 @@ class Homing:
 
     def stop(self) -> None:
         """Bring the drive to rest and back to CSP; no effect once it is at its home, or has ended."""
-        if self.phase in (_P.ENTERING, _P.SEARCHING):
+        if self.phase is _P.ENTERING or (self.phase is _P.SEARCHING and not self._attained):
             self._enter(_P.STOPPING)
 
     def abandon(self) -> None:
@@ -149,24 +166,27 @@ class Homing:
         if drive is None or self.ended:
             return self.phase
         self._cycles += 1
-        if drive.mode_display == HOMING:
+        if drive.mode_display == HOMING and not self._turned:
             self._turned = True
+            if self.phase is _P.ENTERING:
+                self._cycles = 0
         drive.controlword = ENABLE_OPERATION
         phase = self.phase
         if phase is _P.ENTERING:
-            if drive.mode_display == HOMING:
-                # The start bit was low in mode 6 for a cycle; its rising edge starts the search.
+            if drive.mode_display == HOMING and self._cycles >= self._settle:
+                # The start bit was low in mode 6; its rising edge starts the search.
+                self._clear, self._attained = False, 0
                 self._enter(_P.SEARCHING)
                 drive.controlword = START
-            elif self._cycles > self._mode_cycles:
+            elif self._cycles > self._mode_cycles + self._settle * self._turned:
                 self.shown, self.shown_mode = drive.statusword, drive.mode_display
                 self._leave(_P.FAILED)
         elif phase is _P.SEARCHING:
-            self._search(drive)
+            self._look(drive)
         elif phase is _P.STOPPING:
-            if abs(drive.velocity) < _STILL_RAD_S and self._cycles > _LAG_CYCLES:
+            if abs(drive.velocity) < _STILL_RAD_S and self._cycles > self._settle:
                 self._leave(self._outcome)
-            elif self._cycles > self._rest:
+            elif self._cycles > self._rest + self._settle:
                 # CSP would stop a turning joint with a jerk, so it is stopped otherwise.
                 self._enter(_P.RUNNING)
         elif drive.mode_display == CSP and self._cycles > 1:
@@ -175,19 +195,35 @@ class Homing:
             self._enter(_P.STUCK)
         return self.phase
 
-    def _search(self, drive: Cia402Drive) -> None:
+    def _look(self, drive: Cia402Drive) -> None:
+        """Look whether the search has ended: by bits that the drive has updated since the start."""
         drive.controlword = START
-        if self._cycles <= _LAG_CYCLES:
-            return
         status = HOMING_STATUS[drive.statusword & _BITS]
+        if status is HomingStatus.UNDER_WAY:
+            self._clear = True
+        if not self._clear and self._cycles <= self._settle:
+            return
         if drive.mode_display != HOMING:
             # The drive left the mode by itself; the bits have another meaning there.
             self._fail(drive, _P.STUCK)
         elif status is HomingStatus.ATTAINED:
-            self.shown = drive.statusword
-            self._leave(_P.HOMED)
-        elif status in (HomingStatus.FAILED, HomingStatus.FAILING) or self._cycles > self._longest:
+            # The position jumps as the drive begins to count anew: late in some drives, and others show a speed then.
+            self._attained += 1
+            if self._attained > self._settle and not self._is_home(drive):
+                self._fail(drive, _P.ELSEWHERE)
+            elif self._attained > self._settle:
+                self.shown = drive.statusword
+                self._leave(_P.HOMED)
+        elif status in (HomingStatus.FAILED, HomingStatus.FAILING) or self._cycles > self._search:
             self._fail(drive, _P.FAILED)
+
+    def _is_home(self, drive: Cia402Drive) -> bool:
+        """Whether the drive counts from the home that it has found, where the home offset is known.
+
+        Makers read the sign of 0x607C both ways, and some drives turn on to their zero after they have found the home.
+        """
+        home, shown, tolerance = self._home, drive.position + drive.zero, self._tolerance
+        return isnan(home) or min(abs(shown - home), abs(shown + home), abs(shown)) <= tolerance
 
     def _fail(self, drive: Cia402Drive, outcome: HomingPhase) -> None:
         self.shown = drive.statusword
@@ -218,21 +254,22 @@ class HomingSequence:
     Args:
         arm: enabled, at rest, in CSP.
         joints: all joints of the platform; those beside the arm's move on.
-        period_s: period of the cycle, s.
+        config: waits and bounds.
     """
 
-    def __init__(self, arm: Arm, joints: Joints, period_s: float) -> None:
+    def __init__(self, arm: Arm, joints: Joints, config: ArmConfig) -> None:
         self._arm = arm
         self._joints = joints
-        self._homing = Homing(period_s)
+        self._homing = Homing(config.homing, config.drive_waits.mode_ms * 1e-3, config.cycle.period_us * 1e-6)
         self.axis = 0
+        self._home = nan
 
-    def begin(self, axis: int) -> None:
-        """Start the homing of a joint's drive."""
+    def begin(self, axis: int, home: float = nan) -> None:
+        """Start the homing of a joint's drive; `home`: its home offset, rad, NaN where it is not known."""
         drive = self._arm.drives[axis]
         assert isinstance(drive, Cia402Drive), "the command is refused for another"
-        self.axis = axis
-        self._homing.start(drive)
+        self.axis, self._home = axis, home
+        self._homing.start(drive, home)
 
     def stop(self) -> None:
         """Bring the drive to rest and back to CSP."""
@@ -294,6 +331,8 @@ class HomingSequence:
         homing = self._homing
         if homing.phase is HomingPhase.HOMED:
             return Homed(self.axis, homing.position)
+        if homing.phase is HomingPhase.ELSEWHERE:
+            return HomedElsewhere(self.axis, homing.position + self._arm.drives[self.axis].zero, self._home)
         return (
             HomingFailed(self.axis, homing.shown, homing.shown_mode)
             if homing.phase is HomingPhase.FAILED

@@ -39,7 +39,8 @@ from rtcp.ipc.session import EXIT_INCOMPLETE, Session, SessionError, launch_argu
 from rtcp.ipc.stop_reactions import quick_stop_s
 from rtcp.realtime import scheduling
 
-_DISABLE_CYCLES = 20
+_DISABLE_STEPS = 3
+"""State changes of a drive from Operation Enabled to Switch On Disabled (CiA 402-2, figure 7)."""
 
 
 class Report:
@@ -195,8 +196,9 @@ def stop_blindly(
             device.encode(data)
     period_s = config.cycle.period_us * 1e-6
     ramp_cycles = math.ceil(quick_stop_s(config) / period_s)
+    off_cycles = _DISABLE_STEPS * config.drive_waits.answer_cycles(period_s)
     due = time.monotonic()
-    for goal, cycles in ((TargetState.QUICK_STOPPED, ramp_cycles), (TargetState.DISABLED, _DISABLE_CYCLES)):
+    for goal, cycles in ((TargetState.QUICK_STOPPED, ramp_cycles), (TargetState.DISABLED, off_cycles)):
         for _ in range(cycles):
             for slot, drive in drives:
                 with contextlib.suppress(Exception):

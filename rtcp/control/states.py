@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import Enum
 from math import ceil, nan
-from typing import ClassVar, Final
+from typing import ClassVar
 
 from rtcp.control.context import Context
 from rtcp.devices.drive import TargetState
@@ -30,6 +30,7 @@ from rtcp.ipc.events import (
     Event,
     FaultEvent,
     Homed,
+    HomedElsewhere,
     HomingFailed,
     HomingStillMoving,
     LeaseExpired,
@@ -73,11 +74,6 @@ class Signal(Enum):
 
 
 Cause = Message | Signal
-
-FIRST_CYCLES: Final = 10
-"""Cycles before standstill counts: a drive's values are older than its commands."""
-SETTLE_CYCLES: Final = 5
-"""Cycles before a drive counts as disabled."""
 
 _TARGETS = {
     StopReaction.CONTROLLED_STOP: TargetState.ENABLED,
@@ -190,9 +186,6 @@ class Enabling(MachineState):
     drives = "drives advance to Operation Enabled; target = actual until each is there"
     leads_to = {**_PERMITTED, Enabled: State.HOLDING}
 
-    _CARRY_S = 0.1
-    """Time in which the drives take the weight of the arm after their brakes have opened, s: a torque motion and CST
-    begin with the torque that holds it."""
     _REPORTED_RAD = 0.001
     """Distance from its range, rad, below which a joint returns without a report: it sagged at the edge."""
 
@@ -261,7 +254,8 @@ class Enabling(MachineState):
                         ctx.publish(ReturningToRange(group.first + i, beyond, min(BACK_RAD_S, fastest)))
         if joints.first_returning() >= 0:
             return None
-        if ctx.cycle - self._enabled < ctx.cycles(self._CARRY_S):
+        if ctx.cycle - self._enabled < ctx.cycles(ctx.config.drive_waits.brake_ms * 1e-3):
+            # A torque motion and CST begin with the torque that holds the arm.
             return None
         arm = ctx.arm
         if arm.wanted_mode is DriveMode.CST:
@@ -287,9 +281,6 @@ class Holding(MachineState):
         DisabledUnattended: State.DISABLING,
         Home: State.HOMING,
     }
-
-    _MODE_S = 1.0
-    """Time for the drives to show a new mode, s."""
 
     def __init__(self) -> None:
         self.changing_mode = False
@@ -325,7 +316,7 @@ class Holding(MachineState):
         if self.changing_mode:
             axis = joints.first_in_another_mode()
             self.changing_mode = axis >= 0 or arm.is_braking
-            if axis >= 0 and ctx.cycle - self._since > ctx.cycles(self._MODE_S):
+            if axis >= 0 and ctx.cycle - self._since > ctx.cycles(ctx.config.drive_waits.mode_ms * 1e-3):
                 return ctx.wrong_drive_mode(axis)
             return None
         return Signal.JOYSTICK_DEFLECTED if ctx.operator.jog_by_joystick(arm, ctx.blackboard) else None
@@ -434,12 +425,13 @@ class HomingState(MachineState):
 
     state = State.HOMING
     drives = "one drive homes by itself (mode of operation 6), the others hold"
-    leads_to = {**_PERMITTED, Homed: State.HOLDING, HomingFailed: State.HOLDING, Stopped: State.HOLDING}
+    leads_to = {**_PERMITTED, Homed: State.HOLDING, HomingFailed: State.HOLDING, HomedElsewhere: State.HOLDING,
+                Stopped: State.HOLDING}  # fmt: skip
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Start the homing of a joint."""
         assert isinstance(cause, Home)
-        ctx.homing.begin(cause.axis)
+        ctx.homing.begin(cause.axis, cause.home_offset)
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Run the homing, then return the joint to its range if its home is slightly outside."""
@@ -483,7 +475,7 @@ class Disabling(MachineState):
         self._commanded += 1
         axis = joints.first_with_torque()
         if axis < 0:
-            return Disabled() if self._commanded > SETTLE_CYCLES else None
+            return Disabled() if self._commanded > ctx.answer_cycles else None
         if ctx.cycle - self._since > ctx.cycles(ctx.config.enable_timeout_s):
             ctx.service.explain_drive(axis)
             return DisableTimeout(axis, joints.drives[axis].state, joints.drives[axis].statusword)
@@ -525,7 +517,7 @@ class Standstill:
         self._cycles += 1
         if not ctx.good:
             self._lost += 1
-        stands = ctx.good and self._cycles > FIRST_CYCLES and ctx.joints.first_moving() < 0
+        stands = ctx.good and self._cycles > ctx.answer_cycles and ctx.joints.first_moving() < 0
         return stands or self.unobservable or self._cycles > self._stand_cycles
 
 
@@ -665,9 +657,6 @@ class EmergencyStopState(MachineState):
     drives = "the stop reaction of its cause; torque off and brakes closed at standstill; then the slaves to PRE-OP"
     leads_to = {Reset: State.RESETTING, Disable: State.EMERGENCY_STOP, Shutdown: State.CLOSING}
 
-    _OFF_S = 1.0
-    """Time after which the slaves are parked even if a drive still shows torque, s."""
-
     def __init__(self, reaction: FaultReaction) -> None:
         self._reaction = reaction
         self._off = TargetState.DISABLED
@@ -701,8 +690,8 @@ class EmergencyStopState(MachineState):
         else:
             joints.advance(self._off)
             waited = ctx.cycle - self._since
-            off = ctx.good and waited > FIRST_CYCLES and joints.first_with_torque() < 0
-            if not self._parked and (off or waited > ctx.cycles(self._OFF_S)):
+            off = ctx.good and waited > ctx.answer_cycles and joints.first_with_torque() < 0
+            if not self._parked and (off or waited > ctx.cycles(ctx.config.drive_waits.off_ms * 1e-3)):
                 self._parked = True
                 ctx.service.park()
                 ctx.publish(SlavesParked())
@@ -724,9 +713,6 @@ class Resetting(MachineState):
         Shutdown: State.CLOSING,
     }
 
-    _RESET_S = 3.0
-    """Time for slaves, clock and drives to be ready again, s; the debounce time of the emergency stop is added."""
-
     def __init__(self, reaction: FaultReaction) -> None:
         self._reaction = reaction
 
@@ -737,7 +723,7 @@ class Resetting(MachineState):
         ctx.service.recover()
 
     def update(self, ctx: Context) -> Event | Signal | None:
-        """Reset the drives that are back; fail after `_RESET_S`."""
+        """Reset the drives that are back; fail after `drive_waits.reset_ms`."""
         joints = ctx.joints
         if ctx.reported is not None:
             return ctx.reported
@@ -753,8 +739,8 @@ class Resetting(MachineState):
 
     def _failure(self, ctx: Context) -> Event | None:
         button = ctx.config.inputs.emergency_stop
-        settling_s = 0.0 if button is None else button.debounce_ms * 1e-3
-        if ctx.waited <= ctx.cycles(self._RESET_S + settling_s):
+        settling_ms = 0.0 if button is None else button.debounce_ms
+        if ctx.waited <= ctx.cycles((ctx.config.drive_waits.reset_ms + settling_ms) * 1e-3):
             return None
         joints, all_op = ctx.joints, ctx.service.all_op
         axis = joints.first_moving()
@@ -778,9 +764,6 @@ class Closing(MachineState):
     drives = "a controlled stop, drives disabled; then INIT"
     leads_to = {Shutdown: State.CLOSING, Signal.CLOSED: State.OFF}
 
-    _CLOSING_S = 2.0
-    """Time for the drives to stop and disable, from standstill of the setpoints, s; then the loop ends."""
-
     def __init__(self, standstill: Standstill) -> None:
         self._standstill = standstill
         self._target = TargetState.QUICK_STOPPED
@@ -800,8 +783,8 @@ class Closing(MachineState):
         if ctx.lost >= lost_limit:
             # Slaves that still receive frames stay in OP until standstill.
             joints.advance(self._target if self._hard else _TARGETS[ctx.reactions[ProcessDataLost]])
-            return ctx.lost >= lost_limit + ceil(quick_stop_s(ctx.config) / ctx.period_s) + SETTLE_CYCLES
-        if self._cycles > ctx.cycles(self._CLOSING_S):
+            return ctx.lost >= lost_limit + ceil(quick_stop_s(ctx.config) / ctx.period_s) + ctx.answer_cycles
+        if self._cycles > self._longest(ctx):
             return True
         if not ctx.good:
             return False
@@ -814,6 +797,10 @@ class Closing(MachineState):
                 self._stop_hard(ctx, HomingStillMoving(homing.axis, joints.drives[homing.axis].velocity))
             return False
         return self._stop(ctx) and self._remove_torque(ctx)
+
+    def _longest(self, ctx: Context) -> int:
+        """Return the longest time of the end from standstill of the setpoints on, in cycles."""
+        return ctx.cycles(ctx.config.drive_waits.off_ms * 2e-3)
 
     def _decelerates(self, ctx: Context) -> bool:
         """React to the emergency stop or a measurement beyond its limit; return whether the arm still decelerates."""
@@ -831,7 +818,7 @@ class Closing(MachineState):
         self._standstill.reached(ctx)
         if self._standstill.unobservable:
             self._target = TargetState.TORQUE_OFF
-        if joints.first_moving() < 0 or self._cycles > ctx.cycles(self._CLOSING_S):
+        if joints.first_moving() < 0 or self._cycles > self._longest(ctx):
             return False
         joints.advance(self._target)
         if ctx.good:
@@ -869,4 +856,4 @@ class Closing(MachineState):
         joints.advance(TargetState.QUICK_STOPPED if ramping else TargetState.DISABLED)
         joints.track_actual()
         self._commanded = 0 if ramping else self._commanded + 1
-        return self._commanded > SETTLE_CYCLES and joints.first_with_torque() < 0
+        return self._commanded > ctx.answer_cycles and joints.first_with_torque() < 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import ceil
 from typing import ClassVar, Final, cast
 
 from rtcp.config.model import DRIVEN_OUTPUTS, MODE_CHANNELS, SlaveConfig
@@ -65,8 +66,6 @@ _STATE_OF = tuple(
     next((state for (mask, value), state in STATES.items() if word & mask == value), DriveState.UNKNOWN)
     for word in range(0x80)
 )
-_RESET_HOLD: Final = 5
-"""Calls of `advance` for which the fault reset bit stays set before the next edge: a drive answers cycles later."""
 _EXACT: Final = 1e-9
 """Largest round-off of a conversion between counts and SI units, in either unit."""
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
@@ -107,10 +106,10 @@ class Cia402Drive(Drive):
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 
     `encode` also takes `controlword`. A velocity that is not mapped is the mean one over 20 ms. In CSP the drive takes
-    `speed_limit` from the field of the target velocity. A drive whose PDOs have no mode of operation stays in CSP, to
-    which a start-up SDO sets it. With feed-forward, the offsets 0x60B1 and 0x60B2 are those of `offsets` while the
-    drive is enabled in CSP and CSV, else 0. Whatever else is mapped has its safe value, which the bus takes from the
-    drive where the description states none.
+    `speed_limit` from the field of the target velocity. A drive whose PDOs lack the mode of operation, or its display,
+    stays in CSP, to which a start-up SDO sets it. With feed-forward, the offsets 0x60B1 and 0x60B2 are those of
+    `offsets` while the drive is enabled in CSP and CSV, else 0. Whatever else is mapped has its safe value, which the
+    bus takes from the drive where the description states none.
 
     Args:
         slave: the slave's name and description.
@@ -135,10 +134,8 @@ class Cia402Drive(Drive):
         for slot in (self._in[0], self._in[4]):
             if slot >= 0:
                 integer_range(self.tpdo.channels[slot])  # statusword and mode: raises where one is no integer
-        self.changes_mode = self._out[4] >= 0
-        """True: its mode of operation can be commanded; False: it stays in CSP."""
-        if self.changes_mode and self._in[4] < 0:
-            raise DeviceError(f"{self.device}: `rpdo` maps modes_of_operation, `tpdo` no modes_of_operation_display")
+        self.changes_mode = self._out[4] >= 0 and self._in[4] >= 0
+        """True: its mode of operation can be commanded, and is shown; False: it stays in CSP."""
         self._limits = tuple((0, 0) if channel is None else integer_range(channel) for channel in targets)
         self._scales = tuple(0.0 if channel is None else 1.0 / channel.factor for channel in targets)
         self._in_factors = tuple(0.0 if slot < 0 else self.tpdo.channels[slot].factor for slot in self._in[1:4])
@@ -158,6 +155,7 @@ class Cia402Drive(Drive):
         """Mode and controlword of the present outputs, and whether the drive's state has changed since."""
         self._was_enabled = False
         self._reset_calls = 0
+        """Calls of `advance` since the fault reset bit was first set."""
 
     def supports(self, mode: int) -> bool:
         """Whether the process data has the channels of a mode (CSP, CSV, CST)."""
@@ -203,11 +201,12 @@ class Cia402Drive(Drive):
                 self.latch()
             self._was_enabled = state is _ENABLED
         elif word == FAULT_RESET:
-            # Only a rising edge resets (CiA 402-2, transition 15): hold the bit for a while, then try again.
-            self._reset_calls += 1
-            if self._reset_calls > _RESET_HOLD:
-                self._reset_calls = 0
+            # A rising edge resets (CiA 402-2, transition 15), in some drives only a bit that stays set for some ms: set
+            # it for a while, clear it for as long, then try again.
+            pulse = ceil(self.reset_pulse_s / self.period_s - _EXACT)
+            if self._reset_calls >= pulse:
                 word = DISABLE_VOLTAGE
+            self._reset_calls = (self._reset_calls + 1) % (2 * pulse)
         else:
             self._reset_calls = 0
         self.controlword = word

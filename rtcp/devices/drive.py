@@ -10,7 +10,7 @@ from typing import ClassVar, Final
 
 from mypy_extensions import mypyc_attr
 
-from rtcp.config.model import ArmConfig, Joint, SlaveConfig
+from rtcp.config.model import ArmConfig, DriveWaitsConfig, Joint, SlaveConfig
 from rtcp.devices.driver import DeviceError, Driver, integer_range, make_driver
 from rtcp.fieldbus.pdo import ImageLayout
 from rtcp.ipc.states import DriveState, Missing
@@ -118,6 +118,8 @@ class Drive(Driver):
         """Deceleration of a quick stop ramped by this driver, rad/s^2."""
         self.low, self.high = -math.inf, math.inf
         """Ends of that ramp, rad."""
+        self.reset_pulse_s = DriveWaitsConfig.reset_pulse_ms * 1e-3
+        """Time for which the fault reset bit is set, s."""
         self.slave: SharedSlave | None = None
         """Set if other axes of its slave move joints too: its outputs are a part of the slave's."""
         self.offsets: DriveOffsets | None = None
@@ -220,6 +222,7 @@ def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     drive.speed_limit = joint.velocity
     drive.deceleration = joint.acceleration
     drive.low, drive.high = joint.position.min, joint.position.max
+    drive.reset_pulse_s = config.drive_waits.reset_pulse_ms * 1e-3
     drive.zero = zero
     if drive.HAS_STATUSWORD and any(map(drive.rpdo.find, config.feed_forward.channels)):
         drive.offsets = DriveOffsets(drive.rpdo, config.feed_forward.channels)

@@ -15,12 +15,12 @@ from functools import partial
 from typing import Any
 
 from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
-from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.fieldbus.al_state import AlState, read_al, request_state
 from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted, ValueNotKept
+from rtcp.fieldbus.interpolation_time import set_interpolation_time
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
 from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, write_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
@@ -235,7 +235,6 @@ class SlaveRestorer:
 
 _DIVIDER = 2498
 """Watchdog divider of 100 us: (2498 + 2) * 40 ns (ETG.1000.4, 6.3)."""
-_INTERPOLATION = 0x60C2
 
 
 def by_alias(slaves: Sequence[SlaveConfig], present: Sequence[SlaveInfo]) -> tuple[SlaveConfig, ...]:
@@ -332,7 +331,7 @@ def configure_slave(
         # Before any motion: a drive with other units must not come to SAFE-OP.
         notes += yield from compare_scaling(sdo, config)
         for axis in device.axes:
-            notes += yield from write_interpolation_time(sdo, period_ns, axis)
+            notes += yield from set_interpolation_time(sdo, period_ns, axis)
     return notes
 
 
@@ -393,37 +392,6 @@ def _value_text(data: bytes, kind: str) -> str:
     if kind.startswith("float"):
         return str(struct.unpack("<" + STRUCT_CODES[kind], data)[0])
     return str(int.from_bytes(data, "little", signed=kind.startswith("int")))
-
-
-def interpolation_time(period_ns: int) -> tuple[int, int] | None:
-    """Return (value, exponent) of 0x60C2 with value * 10^exponent s = `period_ns`, None where it cannot be expressed.
-
-    The value has 8 bits (CiA 402-2, object 0x60C2): 500 us is 5, -4; 333 us cannot be expressed.
-    """
-    value, exponent = period_ns, -9
-    while value and value % 10 == 0:
-        value, exponent = value // 10, exponent + 1
-    return (value, exponent) if 0 < value <= 255 else None
-
-
-def write_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Steps[list[str]]:
-    """Set 0x60C2 of an axis to the period; return a note where the drive lacks it or cannot express the period."""
-    where = slave_label(sdo.position, sdo.name)
-    value = interpolation_time(period_ns)
-    index = _INTERPOLATION + (axis - 1) * OBJECTS_PER_AXIS
-    if value is None:
-        us = period_ns / 1000
-        return [f"{where}: its interpolation time (0x{index:04X}) cannot express {us:g} us and was left as it is"]
-    try:
-        for sub_index, (number, kind) in enumerate(zip(value, ("uint8", "int8"), strict=True), 1):
-            label = f"0x{index:04X}:{sub_index} (interpolation time)"
-            data = number.to_bytes(1, "little", signed=kind == "int8")
-            yield from _write_and_verify(sdo, index, sub_index, data, label, kind)
-    except SdoAborted as error:
-        if error.code in ABSENT:
-            return [f"{where} has no interpolation time (0x{index:04X})"]
-        raise
-    return []
 
 
 def trigger_watchdog(port: RegisterPort, position: int, config: SlaveConfig, mailboxes: int) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from math import nan
 from typing import Annotated
 
 import numpy as np
@@ -11,6 +12,7 @@ from annotated_types import Ge
 
 from rtcp.config.drive_limits import joint_limits
 from rtcp.config.model import ConfigError, Joint
+from rtcp.config.scaling import OBJECTS_PER_AXIS
 from rtcp.config.zero import read_zeros, store_zero
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.mailbox import ABSENT
@@ -18,7 +20,17 @@ from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
 from rtcp.gateway.method import Numbers, check_count, index_of, method
 from rtcp.ipc import commands
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, GripperOpens, Homed, HomingFailed, ZeroSet
+from rtcp.ipc.events import (
+    Disabled,
+    GripperAtRest,
+    GripperCloses,
+    GripperOpens,
+    Homed,
+    HomedElsewhere,
+    HomingFailed,
+    ZeroSet,
+)
+from rtcp.ipc.homing_methods import HOME_OFFSET, HOMING_METHOD, PRESENT_POSITION, homing_text
 from rtcp.ipc.states import WITH_TORQUE, ControlMode, DriveMode, DriveState, State
 from rtcp.ipc.stop_reactions import longest_s
 
@@ -33,16 +45,15 @@ _HOMING = frozenset({State.HOMING})
 _RESETTABLE = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 _PARKED = (AlState.INIT, AlState.PREOP)
 """AL states in which a drive has no process data, and thus no torque."""
-_SETTLE_CYCLES = 5
-"""Cycles before a drive counts as without torque: its status is older than the command."""
 _CONFIRM_S = 2.0
 """Time beyond the longest stop until a drive must show that its torque is off, s."""
 _STOP_S = 30.0
-_MODE_S = 3.0
-_RESET_S = 6.0
+_BEYOND_S = 3.0
+"""Time beyond the loop's own timeout, s, so that the loop's reason is the answer."""
 _SERVICE_S = 5.0
 _GRIPPER_S = 5.0
-_HOMING_S = 180.0
+_HOMING_S = 120.0
+"""Time beyond the search of a drive for its home, s."""
 _SAME_RAD = 1e-3
 
 
@@ -63,7 +74,7 @@ class MachineActions:
     @method()
     async def enable(self, caller: Caller) -> Json:
         """Enable all drives; returns when the arm holds."""
-        channel, timeout_s = self._channel, self._config.enable_timeout_s + 3.0
+        channel, timeout_s = self._channel, self._config.enable_timeout_s + _BEYOND_S
         channel.check_loop()
         if channel.state is not State.HOLDING:
             async with channel.lease(caller) as lease:
@@ -104,8 +115,9 @@ class MachineActions:
             if before is State.STOPPED_BY_LIMIT:
                 await channel.send(lease, commands.Reset())
             else:
+                reset_s = self._config.drive_waits.reset_ms * 1e-3 + _BEYOND_S
                 is_reset = channel.reaching(State.READY, _RESETTING, "reset", channel.observer.last_event)
-                await channel.run(lease, commands.Reset(), is_reset, _RESET_S, "reset")
+                await channel.run(lease, commands.Reset(), is_reset, reset_s, "reset")
         return {"from": before.name.lower()}
 
     @method(at_once=True, stops=commands.Halt)
@@ -135,7 +147,8 @@ class MachineActions:
             since = channel.observer.last_event
             wanted = State.HOLDING if channel.state is State.HOLDING else State.READY
             changed = channel.reaching(wanted, frozenset(), "the mode change", since)
-            await channel.run(lease, command, changed, _MODE_S, "the mode change")
+            mode_s = self._config.drive_waits.mode_ms * 1e-3 + _BEYOND_S
+            await channel.run(lease, command, changed, mode_s, "the mode change")
         return {"mode": name}
 
     @method()
@@ -256,18 +269,62 @@ class MachineActions:
 
     @method()
     async def home(self, caller: Caller, joint: str) -> Json:
-        """Run the homing of a joint's drive. Returns its `position`, rad."""
+        """Run the homing of a joint's drive: what it does says `homing_method`. Returns its `position`, rad."""
         axis, channel = self._axis(joint), self._channel
         since = channel.observer.last_event
         async with channel.lease(caller) as lease:
+            offset = nan if channel.config.bus.LACKS.get("sdo") else await self._home_offset(axis)
             homed = channel.reaching(State.HOLDING, _HOMING, "homing", since)
-            await channel.run(lease, commands.Home(axis), homed, _HOMING_S, "homing")
+            longest_s = self._config.homing.search_s + _HOMING_S
+            await channel.run(lease, commands.Home(axis, offset), homed, longest_s, "homing")
         for event in (record.event for record in channel.events(since)):
             if isinstance(event, Homed) and event.axis == axis:
                 return {"joint": self._config.axes[axis].name, "position": channel.joints("actual_position")[axis]}
-            if isinstance(event, HomingFailed):
+            if isinstance(event, HomingFailed | HomedElsewhere):
                 raise channel.error("fault", event)
         raise RtcpError("fault", f"{joint}: homing was interrupted; the arm holds")
+
+    @method(streams=True)
+    async def homing_method(self, caller: Caller, joint: str) -> Json:
+        """Read what `home` would do, from the joint's drive; nothing moves.
+
+        Returns `method` (0x6098; null: the drive has no such object), `text`: what the drive then does,
+        `declares_present`: whether it declares the present position to be its home, and `home_offset` (0x607C), rad.
+        """
+        axis = self._axis(joint)
+        data = await self._read_of(axis, HOMING_METHOD)
+        number = None if data is None else int.from_bytes(data[:1], "little", signed=True)
+        return {
+            "joint": self._config.axes[axis].name,
+            "method": number,
+            "text": homing_text(number),
+            "declares_present": number is None or number in PRESENT_POSITION,
+            "home_offset": await self._home_offset(axis),
+        }
+
+    async def _home_offset(self, axis: int) -> float:
+        """Return the home offset of a joint's drive, rad; 0 where it has none (CiA 402-2, object 0x607C)."""
+        data = await self._read_of(axis, HOME_OFFSET)
+        counts = 0 if data is None else int.from_bytes(data, "little", signed=True)
+        joint = self._config.axes[axis]
+        device = next(slave.device for slave in self._config.slaves if slave.name == joint.slave).of_axis(joint.axis)
+        factor = next((entry.factor for entry in device.inputs if entry.name == "position"), None)
+        if factor is None:
+            raise RtcpError("refused", f"{_drive(joint)} sends no position: it has no homing here")
+        return counts * factor
+
+    async def _read_of(self, axis: int, index: int) -> bytes | None:
+        """Return an object of a joint's drive by the index of the first axis; None: the drive lacks it."""
+        joint = self._config.axes[axis]
+        position = next(place for place, slave in enumerate(self._config.slaves, 1) if slave.name == joint.slave)
+        index += (joint.axis - 1) * OBJECTS_PER_AXIS
+        try:
+            answer = await self.service({"do": "sdo_read", "slave": position, "index": index, "subindex": 0})
+        except RtcpError as error:
+            if error.fields.get("code") in ABSENT:
+                return None
+            raise
+        return bytes.fromhex(answer["hex"])
 
     def _axis(self, joint: str) -> int:
         names = [axis.name for axis in self._config.axes]
@@ -331,7 +388,9 @@ class _Confirmation:
     def __init__(self, channel: CommandChannel) -> None:
         self._channel = channel
         self._config = channel.config
-        self._seen = channel.observer.head + _SETTLE_CYCLES
+        config = channel.config
+        # Earlier statuses are older than the command.
+        self._seen = channel.observer.head + config.drive_waits.answer_cycles(config.cycle.period_us * 1e-6)
         self._shown: np.void | None = None
         self._parked = False
 

@@ -271,12 +271,12 @@ class MotionActions:
         return lambda: caller.report({**self._channel.progress(), "accepted": True})
 
     @method()
-    async def move_home(self, caller: Caller, speed: float | None = None) -> Json:
-        """Move the joints to `home` of the arm's file; `speed` and result as of `move_joints`."""
+    async def move_to_rest_pose(self, caller: Caller, speed: float | None = None) -> Json:
+        """Move the joints to `rest_pose` of the arm's file; `speed` and result as of `move_joints`."""
         config = self._channel.config
-        if config.home is None:
-            raise RtcpError("refused", f"the key home is missing in {config.source}", "no_home")
-        return await self.move_joints(caller, config.home, speed)
+        if config.rest_pose is None:
+            raise RtcpError("refused", f"the key rest_pose is missing in {config.source}", "no_rest_pose")
+        return await self.move_joints(caller, config.rest_pose, speed)
 
     @method()
     async def move_pose(self, caller: Caller, pose: Numbers, speed: float | None = None, line: bool = False) -> Json:

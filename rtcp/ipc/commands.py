@@ -7,6 +7,7 @@ subclassing; the controller or handler that names a command receives it.
 
 from __future__ import annotations
 
+from math import nan
 from typing import ClassVar
 
 from rtcp.ipc.message import Joints, Kinds, Message
@@ -217,6 +218,8 @@ class Home(Command):
     states = frozenset({State.HOLDING})
     waits_for_drive_mode = True
     axis: int
+    home_offset: float = nan
+    """What the drive must show at its home (0x607C), rad; NaN: not known, and not compared."""
 
 
 # -- motion commands: each is accepted by the controller that names it ------------------------------------------------

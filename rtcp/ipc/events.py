@@ -250,6 +250,18 @@ class HomingFailed(Event, number=36):
     """Mode of operation display; not 6: the drive does not home."""
 
 
+class HomedElsewhere(Event, number=167):
+    """{joint}: the drive reports that it is homed, but it shows {shown:.6g} rad and its home offset (0x607C) is
+    {home_offset:.6g} rad, allowed are homing.tolerance = {homing_tolerance:g} rad between them: it has not homed, or it
+    counts otherwise; the arm holds"""
+
+    is_warning = True
+    axis: int
+    shown: float
+    """What the drive itself shows, without the joint's zero offset."""
+    home_offset: float
+
+
 class HomingInBox(Event, number=42):
     """homing was stopped: by the old zero the arm is in {box_name}"""
 
@@ -596,7 +608,8 @@ class VelocityDisagrees(FaultEvent, number=156):
 
 
 class HomingStillMoving(FaultEvent, number=39):
-    """{joint} still turns at {velocity:.6g} rad/s 3 s after its homing: {reaction}; then `rtcp reset`"""
+    """{joint} still turns at {velocity:.6g} rad/s {rest_s:g} s (homing.rest_s) after its homing: {reaction}; then
+    `rtcp reset`"""
 
     axis: int
     velocity: float

@@ -183,8 +183,11 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
         names.lacks("torque") or "it has no process data for that (rpdo and tpdo in its device file)"
     ),
     "homing_reason": lambda names, about: (
-        names.lacks("homing") or "the PDOs of its drive have no modes_of_operation, so it stays in CSP"
+        names.lacks("homing")
+        or "the PDOs of its drive lack modes_of_operation or modes_of_operation_display, so it stays in CSP"
     ),
+    "homing_tolerance": lambda names, about: names.config.homing.tolerance,
+    "rest_s": lambda names, about: names.config.homing.rest_s,
     "all_in_op": lambda names, about: "the controller sends" if names.lacks("states") else "all slaves are in OP",
     "not_in_op": lambda names, about: (
         "the robot controller sends nothing" if names.lacks("states") else "not all slaves are in OP"

@@ -134,13 +134,15 @@ class Frame:
 
 
 def _commands(view: View) -> None:
-    async def home() -> None:
+    async def rest_pose() -> None:
         async def move() -> None:
             dialog.close()
-            await view.act(lambda robot: robot.move_home(), "The arm is at home")
+            await view.act(lambda robot: robot.move_to_rest_pose(), "The arm is in its rest pose")
 
-        with view.question("Move the arm home?", "All joints move there at once, from where they are.") as dialog:
-            button("Move home", move, when="holding")
+        with view.question(
+            "Move the arm to its rest pose?", "All joints move there at once, from where they are."
+        ) as dialog:
+            button("Move to rest pose", move, when="holding")
             button("Leave it", dialog.close, plain=True)
 
     with ui.element("div").classes("commands").props('role=group aria-label="Machine"'):
@@ -156,7 +158,7 @@ def _commands(view: View) -> None:
             # Two buttons, each with one meaning: a second press of the first starts nothing.
             ("Pause", view.pause, "moving holding"),
             ("Go on", view.go_on, "moving holding"),
-            ("Home", home, "holding"),
+            ("Rest pose", rest_pose, "holding"),
         ):
             button(label, handler, when=when, plain=True).props["data-do"] = label.lower()
 

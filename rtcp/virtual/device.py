@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple, cast
 from rtcp.config.find import load_class, registered
 from rtcp.config.findings import Finding
 from rtcp.config.model import PluginError
-from rtcp.virtual.objects import DataType, Entry, ObjectDictionary, SdoAbort
+from rtcp.virtual.objects import DataType, Entry, ObjectDictionary, SdoAbort, Value
 from rtcp.virtual.pdo import ASSIGN, PdoImage, SyncManager, SyncManagerLayout, SyncManagerType, room
 from rtcp.virtual.protocol import RAM_SIZE, REGISTER_SPACE, MailboxType
 
@@ -198,7 +198,12 @@ class DeviceModel:
         self.objects = ObjectDictionary()
         self._define_identity()
         self.define(self.objects)
-        self._defaults = [(entry, entry.value) for obj in self.objects for entry in obj.entries.values()]
+        self._defaults: list[tuple[Entry, Value]] = []
+        self.keep_defaults(entry for obj in self.objects for entry in obj.entries.values())
+
+    def keep_defaults(self, entries: Iterable[Entry]) -> None:
+        """Take the present values of entries for those at power-on."""
+        self._defaults += [(entry, entry.value) for entry in entries]
 
     def join(self, devices: Sequence[DeviceModel]) -> None:
         """Receive all devices of the segment, in the order of the cable; called once before the first step."""

@@ -253,6 +253,10 @@ class ObjectDictionary:
         """Add an object; it replaces one with the same index."""
         self._objects[obj.index] = obj
 
+    def remove(self, index: int) -> None:
+        """Remove an object, if there is one."""
+        self._objects.pop(index, None)
+
     def __getitem__(self, key: tuple[int, int]) -> Entry:
         """Return the entry.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import pty
 import signal
@@ -171,10 +172,34 @@ def test_a_joint_is_zeroed_by_its_name_or_its_number(platform: Any, rtcp: Callab
     assert "/state/zero.yaml" in ended.out
 
 
-def test_a_joint_is_homed_and_reported_where_it_stands(platform: Any, rtcp: Callable[..., Any]) -> None:
-    platform.answers["home"] = {"joint": "joint6", "position": 0.5}
-    ended = rtcp("home", "joint6")
-    assert (ended.code, ended.out) == (0, "joint6 is homed and stands at 0.500000 rad\n")
+SWITCH = {"joint": "joint6", "method": 17, "text": "turns to a switch", "declares_present": False, "home_offset": 0.25}
+PRESENT = {**SWITCH, "method": 37, "text": "does not move", "declares_present": True}
+
+
+def test_homing_says_what_the_drive_will_do_and_reports_where_it_stands(
+    platform: Any, rtcp: Callable[..., Any]
+) -> None:
+    platform.answers |= {"homing_method": SWITCH, "home": {"joint": "joint6", "position": 0.5}}
+    ended = rtcp("home", "6")
+    assert (ended.code, ended.out) == (
+        0,
+        "the drive of joint6 turns to a switch, by method 17 (0x6098); there it counts 0.25 rad (0x607C)\n"
+        "joint6 is homed and stands at 0.500000 rad\n",
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "answer", "homed"), [((), "n\n", False), ((), "", False), ((), "y\n", True), (("--yes",), "", True)]
+)
+def test_homing_asks_before_the_present_position_becomes_the_home(
+    platform: Any, rtcp: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], answer: str,
+    homed: bool,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(sys, "stdin", io.StringIO(answer))
+    platform.answers |= {"homing_method": PRESENT, "home": {"joint": "joint6", "position": 0.25}}
+    ended = rtcp("home", "joint6", *arguments)
+    assert bool(platform.asked("home")) is (ended.code == 0) is homed
+    assert ("Is joint6 where its drive shall count 0.25 rad?" in ended.out + ended.trouble) is not bool(arguments)
 
 
 # -- move -----------------------------------------------------------------------------------------------------------

@@ -54,8 +54,8 @@ MISTAKES: list[tuple[str, Changes, str]] = [
     (ARM, [("lost_cycles: 40", "lost_cycles: 2.5")], "bus.lost_cycles: type"),
     (ARM, [("velocity: 0.5", "velocity: .inf")], "joints[0].velocity: range"),
     (ARM, [("# cpu: 3", "cpu: -1")], "cycle.cpu: range"),
-    (ARM, [("home: [0, 0.3, pi/2, 0, 0.5, 0]", "home: [0, 0.3, pi/2, 0, 0.5]")], "home: count"),
-    (ARM, [("home: [0, 0.3, pi/2,", "home: [0, 0.3, pi,")], "home[2]: outside low=-2.4 high=2.4"),
+    (ARM, [("rest_pose: [0, 0.3, pi/2, 0, 0.5, 0]", "rest_pose: [0, 0.3, pi/2, 0, 0.5]")], "rest_pose: count"),
+    (ARM, [("rest_pose: [0, 0.3, pi/2,", "rest_pose: [0, 0.3, pi,")], "rest_pose[2]: outside low=-2.4 high=2.4"),
     (ARM, [("lease_s: 0.5", "source: here")], "source: unknown"),
     (ARM, [("{min: -3.1, max: 3.1}", "{min: 3.1, max: -3.1}")], "joints[0].position: out_of_order"),
     (DRIVE, [("int32, name: position, factor: 0.0001", "int32, name: position, factor: 0.0001, modulo: 62832")],
@@ -216,6 +216,7 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      "joints[0].position.min: below low=-1.5707963267948966"),
     (ARM, [("kinematics:\n", MECHANICAL.replace("velocity: 1.0", "velocity: 0.25", 1))],
      "joints[0].velocity: above high=0.25"),
+    (ARM, [("rest_pose: [", "home: [")], "home: renamed new=rest_pose"),
     (ARM, [("drive_mode: csp", "mode: csp")], "mode: renamed new=drive_mode"),
     (ARM, [("control_mode: joint", "motion: joint")], "motion: renamed new=control_mode"),
     (ARM, [("\nsupervision:", "\nwatch:")], "watch: renamed new=supervision"),
@@ -327,7 +328,7 @@ def test_there_is_room_for_ten_axes(directory: Path, findings_after: Callable[..
     )
     text = Path(ARM).read_text().replace(GEOMETRY, "\n").replace(SIXTH, SIXTH + slaves)
     text = text.replace("    cst_integral: 250\n", f"    cst_integral: 250{more}\n")
-    Path(ARM).write_text(text.split("\nhome:")[0] + "\njog:" + text.split("\njog:")[1])
+    Path(ARM).write_text(text.split("\nrest_pose:")[0] + "\njog:" + text.split("\njog:")[1])
     assert len(load(Path(ARM)).axes) == 10
     (finding,) = findings_after(ARM, (ON_AN_OUTPUT, DRIVEN))
     assert summary(finding, " joints=") == "gripper.joint: too_many_axes joints=10"
@@ -335,12 +336,12 @@ def test_there_is_room_for_ten_axes(directory: Path, findings_after: Callable[..
     assert summary(finding, " found=") == "joints: size found=11"
 
 
-HOME = "home: [0, 0.3, pi/2, 0, 0.5, 0]"
+REST_POSE = "rest_pose: [0, 0.3, pi/2, 0, 0.5, 0]"
 
 
 def test_an_arm_of_another_number_of_joints_has_no_kinematics(findings_after: Callable[..., list[Finding]]) -> None:
     sixth = "  - name: joint6\n" + Path(ARM).read_text().split("  - name: joint6\n")[1].split("\n\n")[0]
-    (finding,) = findings_after(ARM, (sixth, ""), (HOME, ""))
+    (finding,) = findings_after(ARM, (sixth, ""), (REST_POSE, ""))
     assert summary(finding, " joints=") == "kinematics: too_many_axes joints=5"
 
 

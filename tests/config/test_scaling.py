@@ -154,7 +154,9 @@ def test_a_drive_without_a_mode_in_its_pdos_is_set_to_csp_by_a_start_up_sdo(writ
             "found no channel named modes_of_operation; without it the start-up SDO {index: 0x6060, "
             "sub_index: 0, type: int8, value: 8} (CSP) must be in sdo"
         )
-    assert summary(findings(tpdo=pdos("tpdo", without=mode))[0], "") == "tpdo: mode_not_shown"
+    not_shown = {"tpdo": pdos("tpdo", without=mode)}
+    assert summary(findings(**not_shown)[0], " value=") == "tpdo: mode_not_shown value=8"
+    assert written(**not_shown, sdo=[CSP]).startup(0x6060) == 8
 
 
 @pytest.mark.parametrize(

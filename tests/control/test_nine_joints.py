@@ -44,7 +44,7 @@ def nine_joints(directory: Path) -> Path:
     shutil.copytree(default_config().parent, directory, dirs_exist_ok=True)
     yaml, file, segment_file = YAML(typ="safe"), directory / "assistive_arm.yaml", directory / "segment.yaml"
     arm, segment = yaml.load(file.read_text()), yaml.load(segment_file.read_text())
-    for key in ("kinematics", "cartesian", "jog", "home"):
+    for key in ("kinematics", "cartesian", "jog", "rest_pose"):
         del arm[key]
     for number in range(7, JOINTS + 1):
         arm["joints"].append({**arm["joints"][-1], "name": f"joint{number}", "slave": f"drive{number}"})

@@ -63,7 +63,8 @@ def test_every_other_mode_is_refused_with_the_reason(arm: Simulation) -> None:
     refusal = arm.send(Home(2)).refusal
     assert refusal == HomingUnsupported(2)
     assert names.message(refusal) == (
-        "joint3 has no homing here: the PDOs of its drive have no modes_of_operation, so it stays in CSP"
+        "joint3 has no homing here: the PDOs of its drive lack modes_of_operation or modes_of_operation_display, "
+        "so it stays in CSP"
     )
     assert arm.state is State.HOLDING
 

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import math
 import struct
+from itertools import groupby
+from math import ceil
 
 import pytest
 
@@ -88,15 +90,21 @@ def test_advance_tells_whether_the_goal_is_reached(
     assert drive.advance(goal) is reached
 
 
-def test_the_fault_reset_is_repeated_as_an_edge(drive: Cia402Drive, wire: Wire) -> None:
+@pytest.mark.parametrize("pulse_s", [0.01, 0.2])
+@pytest.mark.parametrize("period_s", [0.00025, 0.001, 0.004, 0.033])
+def test_the_fault_reset_is_a_pulse_of_a_given_time_for_any_cycle_and_is_repeated(
+    period_s: float, pulse_s: float
+) -> None:
+    drive = Cia402Drive(slave(), period_s)
+    drive.reset_pulse_s = pulse_s
     words = []
-    for _ in range(24):
-        wire.receive(FAULT)
+    for _ in range(5 * ceil(pulse_s / period_s)):
+        drive.decode(struct.pack("<Hiiib", FAULT, 0, 0, 0, 8))
         drive.advance(T.RESET)
-        words.append(wire.sent()[0])
-    edges = sum(1 for before, now in zip([0, *words], words, strict=False) if now & 0x80 and not before & 0x80)
-    assert set(words) == {0x00, 0x80}
-    assert edges == 4
+        words.append(drive.controlword)
+    pulses = [(word, len(list(group)) * period_s) for word, group in groupby(words)]
+    assert [word for word, _ in pulses[:4]] == [0x80, 0x00, 0x80, 0x00]
+    assert all(pulse_s - 1e-9 <= length < pulse_s + period_s for _, length in pulses[:4])
 
 
 def test_the_target_follows_the_position_until_the_drive_is_enabled(drive: Cia402Drive, wire: Wire) -> None:
@@ -280,8 +288,6 @@ def test_widths_and_order_are_those_of_the_description() -> None:
 def test_missing_channels_are_all_named_at_the_start() -> None:
     with pytest.raises(DeviceError, match=r"`rpdo` maps no target_position; kind cia402"):
         Cia402Drive(slave(rpdo=RPDO[:1]), 0.001)
-    with pytest.raises(DeviceError, match=r"`tpdo` no modes_of_operation_display"):
-        Cia402Drive(slave(tpdo=TPDO[:4]), 0.001)
 
 
 CSP_ONLY = slave((*RPDO[:2], RPDO[4]), (*TPDO[:2], TPDO[4]))
@@ -295,6 +301,17 @@ def test_a_drive_with_the_entries_of_csp_alone_is_driven_in_csp() -> None:
     drive.target_position = 1.5
     assert drive.encode() == struct.pack("<Hib", 0x0F, 15000, 8)
     assert [drive.supports(mode) for mode in (8, 9, 10)] == [True, False, False]
+
+
+def test_a_drive_that_does_not_show_its_mode_is_always_sent_csp() -> None:
+    drive = Cia402Drive(slave(tpdo=TPDO[:4]), 0.001, speed_limit=0.5)
+    assert [drive.supports(mode) for mode in (8, 9, 10)] == [True, False, False]
+    assert not drive.changes_mode
+    for status in (SWITCHED_ON, ENABLED):
+        drive.decode(struct.pack("<Hiii", status, 10000, 0, 0))
+        assert drive.encode()[-1] == 8
+        drive.advance(T.ENABLED)
+    assert drive.mode_display == 8
 
 
 def test_a_drive_without_a_mode_in_its_pdos_stays_in_csp() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from rtcp.config.model import HomingConfig
 from rtcp.control.homing import ENDED, HOMING, HOMING_STATUS, START, Homing, HomingPhase, HomingStatus
 from rtcp.devices import Cia402Drive, DriveState, TargetState
 from rtcp.virtual.models import CubemarsDrive, create
@@ -17,11 +18,15 @@ from .conftest import Wire, slave
 PERIOD_S = 0.0005
 ENABLED, SWITCHED_ON = 0x0237, 0x0233
 REST, UNDER_WAY, FOUND, ATTAINED, FAILING, FAILED = 0x0637, 0x0237, 0x1237, 0x1637, 0x2237, 0x2637
-LATE = 10
-"""Cycles after the start whose statusword does not answer it yet."""
+SETTLE = round(HomingConfig.settle_ms * 1e-3 / PERIOD_S)
+"""Cycles for which the statusword may lag."""
 INDEX_PITCH = 2 * math.pi / 100
 P = HomingPhase
 VELOCITIES = pytest.mark.parametrize("velocity", [500, -500])
+
+
+def made(**keys: float) -> Homing:
+    return Homing(HomingConfig(**keys), 1.0, PERIOD_S)
 
 
 # -- the words ---------------------------------------------------------------------------------------------------------
@@ -31,12 +36,13 @@ VELOCITIES = pytest.mark.parametrize("velocity", [500, -500])
 def homing(drive: Cia402Drive, wire: Wire) -> Homing:
     """A homing whose drive is in mode 6 and has just received the start."""
     enabled(drive, wire)
-    homing = Homing(PERIOD_S)
+    homing = made()
     homing.start(drive)
     wire.receive(ENABLED, 700, mode=8)
     homing.step()
-    wire.receive(REST, 700, mode=6)
-    homing.step()
+    for _ in range(SETTLE + 1):
+        wire.receive(REST, 700, mode=6)
+        homing.step()
     return homing
 
 
@@ -63,13 +69,15 @@ def test_every_pattern_of_the_three_bits_says_something() -> None:
     }
 
 
-def test_the_start_bit_rises_only_when_the_drive_shows_mode_6(drive: Cia402Drive, wire: Wire) -> None:
+def test_the_start_bit_rises_only_when_the_drive_has_shown_mode_6_for_a_while(drive: Cia402Drive, wire: Wire) -> None:
     enabled(drive, wire)
-    homing = Homing(PERIOD_S)
+    homing = made()
     homing.start(drive)
     for _ in range(50):
         assert show(homing, wire, ENABLED, mode=8) is P.ENTERING
         assert (wire.sent()[0], wire.sent()[4]) == (0x0F, 6)
+    assert show(homing, wire, REST, SETTLE) is P.ENTERING
+    assert wire.sent()[0] == 0x0F
     assert show(homing, wire, REST) is P.SEARCHING
     assert wire.sent()[0] == START == 0x1F
 
@@ -81,17 +89,59 @@ def test_the_start_bit_stays_for_as_long_as_the_homing_is_under_way(homing: Homi
 
 
 @pytest.mark.parametrize("stale", [ATTAINED, FAILED, FAILING])
-def test_what_an_earlier_homing_left_is_no_answer(homing: Homing, wire: Wire, stale: int) -> None:
-    assert show(homing, wire, stale, LATE) is P.SEARCHING
+def test_bits_count_once_they_were_clear_after_the_start(homing: Homing, wire: Wire, stale: int) -> None:
+    assert show(homing, wire, stale, SETTLE) is P.SEARCHING
     assert show(homing, wire, UNDER_WAY, 500) is P.SEARCHING
+    assert show(homing, wire, ATTAINED, SETTLE) is P.SEARCHING
     assert show(homing, wire, ATTAINED) is P.LEAVING
+
+
+def test_bits_that_are_never_clear_count_after_a_while(homing: Homing, wire: Wire) -> None:
+    assert show(homing, wire, ATTAINED, 2 * SETTLE) is P.SEARCHING
+    assert show(homing, wire, ATTAINED) is P.LEAVING
+
+
+def test_a_success_that_does_not_last_is_none(homing: Homing, wire: Wire) -> None:
+    show(homing, wire, UNDER_WAY)
+    assert show(homing, wire, ATTAINED, SETTLE) is P.SEARCHING
+    assert show(homing, wire, FAILED) is P.STOPPING
+
+
+@pytest.mark.parametrize(
+    ("home", "shown", "phase"),
+    [(0.0, 0.0, P.HOMED), (0.0, 0.19, P.HOMED), (0.0, -0.21, P.ELSEWHERE), (1.5, 1.5, P.HOMED), (1.5, -1.5, P.HOMED),
+     (1.5, 0.0, P.HOMED), (1.5, 0.7, P.ELSEWHERE), (math.nan, 5.0, P.HOMED)],
+)  # fmt: skip
+def test_a_homed_drive_shows_its_home_offset(
+    drive: Cia402Drive, wire: Wire, home: float, shown: float, phase: HomingPhase
+) -> None:
+    enabled(drive, wire)
+    homing = made()
+    homing.start(drive, home)
+    position = round(shown * 1e4)
+    show(homing, wire, REST, SETTLE + 1, position)
+    show(homing, wire, UNDER_WAY, 1, position)
+    show(homing, wire, ATTAINED, 3 * SETTLE, position)
+    assert homing.phase is P.LEAVING
+    assert show(homing, wire, ENABLED, 2, position, mode=8) is phase
+
+
+def test_a_position_that_comes_later_than_its_bits_is_waited_for(drive: Cia402Drive, wire: Wire) -> None:
+    enabled(drive, wire)
+    homing = made()
+    homing.start(drive, 0.0)
+    show(homing, wire, REST, SETTLE + 1, 9000)
+    show(homing, wire, UNDER_WAY, 1, 9000)
+    show(homing, wire, ATTAINED, SETTLE, 9000)
+    show(homing, wire, ATTAINED, 1, 0)
+    assert show(homing, wire, ENABLED, 2, 0, mode=8) is P.HOMED
 
 
 def test_a_drive_at_its_home_goes_back_to_csp_with_its_place_as_target(
     homing: Homing, drive: Cia402Drive, wire: Wire
 ) -> None:
     show(homing, wire, UNDER_WAY, 20, position=900)
-    assert show(homing, wire, ATTAINED, position=-2500) is P.LEAVING
+    assert show(homing, wire, ATTAINED, SETTLE + 1, position=-2500) is P.LEAVING
     for position in range(-2500, -2510, -1):
         # A target copied from the position would sag with the drive.
         assert show(homing, wire, ATTAINED, position=position) is P.LEAVING
@@ -107,7 +157,7 @@ def test_the_set_point_stands_until_the_drive_is_in_mode_6(drive: Cia402Drive, w
     enabled(drive, wire)
     drive.target_position = drive.position + 0.01
     before = drive.target_position
-    homing = Homing(PERIOD_S)
+    homing = made()
     homing.start(drive)
     for position in (700, 650):
         assert show(homing, wire, ENABLED, position=position, mode=8) is P.ENTERING
@@ -120,7 +170,7 @@ def test_a_drive_that_never_shows_mode_6_keeps_its_target(drive: Cia402Drive, wi
     enabled(drive, wire)
     drive.target_position = drive.position + 0.01
     before = drive.target_position
-    homing = Homing(PERIOD_S)
+    homing = made()
     homing.start(drive)
     show(homing, wire, ENABLED, 20, mode=8)
     homing.stop()
@@ -154,7 +204,7 @@ def test_a_homing_error_takes_the_start_bit_away_and_ends_in_csp(
 def test_a_stop_takes_the_start_bit_away_and_waits_for_rest(homing: Homing, wire: Wire, velocity: int) -> None:
     show(homing, wire, UNDER_WAY, 20, velocity=velocity)
     homing.stop()
-    assert show(homing, wire, UNDER_WAY, 100, velocity=velocity) is P.STOPPING
+    assert show(homing, wire, UNDER_WAY, SETTLE, velocity=velocity) is P.STOPPING
     assert (wire.sent()[0], wire.sent()[4]) == (0x0F, 6)
     assert show(homing, wire, REST) is P.LEAVING
     assert show(homing, wire, ENABLED, 2, mode=8) is P.STOPPED
@@ -164,7 +214,7 @@ def test_a_stop_takes_the_start_bit_away_and_waits_for_rest(homing: Homing, wire
 def test_a_drive_that_does_not_come_to_rest_runs_on_and_keeps_mode_6(homing: Homing, wire: Wire, velocity: int) -> None:
     show(homing, wire, UNDER_WAY, 20, velocity=velocity)
     homing.stop()
-    assert show(homing, wire, UNDER_WAY, 6000, velocity=velocity) is P.STOPPING
+    assert show(homing, wire, UNDER_WAY, 6000 + SETTLE, velocity=velocity) is P.STOPPING
     assert show(homing, wire, UNDER_WAY, velocity=velocity) is P.RUNNING
     assert wire.sent()[4] == 6
 
@@ -172,7 +222,7 @@ def test_a_drive_that_does_not_come_to_rest_runs_on_and_keeps_mode_6(homing: Hom
 def test_rest_counts_only_when_the_drive_has_had_time_to_answer_the_stop(homing: Homing, wire: Wire) -> None:
     show(homing, wire, UNDER_WAY, 20)
     homing.stop()
-    assert show(homing, wire, UNDER_WAY, LATE) is P.STOPPING
+    assert show(homing, wire, UNDER_WAY, SETTLE) is P.STOPPING
     assert show(homing, wire, UNDER_WAY) is P.LEAVING
 
 
@@ -182,16 +232,17 @@ def test_after_a_stop_the_target_is_where_the_drive_came_to_rest(homing: Homing,
     for position in range(900, 950):
         show(homing, wire, UNDER_WAY, position=position, velocity=500)
         assert homing.position == pytest.approx(position * 1e-4)
-    show(homing, wire, REST, position=955)
+    show(homing, wire, REST, SETTLE, position=955)
     show(homing, wire, ENABLED, 2, position=955, mode=8)
     assert wire.sent()[1] == 955
     assert homing.position == pytest.approx(0.0955)
 
 
 def test_a_stop_at_the_home_changes_nothing(homing: Homing, wire: Wire) -> None:
-    show(homing, wire, ATTAINED, LATE + 1)
+    show(homing, wire, UNDER_WAY)
+    show(homing, wire, ATTAINED)
     homing.stop()
-    assert homing.phase is P.LEAVING
+    assert show(homing, wire, ATTAINED, SETTLE) is P.LEAVING
     assert show(homing, wire, ENABLED, 2, mode=8) is P.HOMED
     homing.stop()
     assert homing.phase is P.HOMED
@@ -199,7 +250,7 @@ def test_a_stop_at_the_home_changes_nothing(homing: Homing, wire: Wire) -> None:
 
 def test_a_drive_that_knows_no_homing_stays_in_csp(drive: Cia402Drive, wire: Wire) -> None:
     enabled(drive, wire)
-    homing = Homing(PERIOD_S)
+    homing = made()
     homing.start(drive)
     assert show(homing, wire, ENABLED, 1999, mode=8) is P.ENTERING
     assert show(homing, wire, ENABLED, 4, mode=8) is P.FAILED
@@ -208,25 +259,26 @@ def test_a_drive_that_knows_no_homing_stays_in_csp(drive: Cia402Drive, wire: Wir
 
 
 def test_a_drive_that_does_not_come_back_to_csp_is_stuck(homing: Homing, wire: Wire) -> None:
-    assert show(homing, wire, ATTAINED, 2000) is P.LEAVING
+    show(homing, wire, UNDER_WAY)
+    assert show(homing, wire, ATTAINED, SETTLE + 2000) is P.LEAVING
     assert show(homing, wire, ATTAINED, 20) is P.STUCK
 
 
 def test_a_drive_that_leaves_mode_6_by_itself_has_not_homed(homing: Homing, wire: Wire) -> None:
     show(homing, wire, UNDER_WAY, 20)
     # In CSP bit 12 says that the drive follows its targets.
-    show(homing, wire, ATTAINED, 30, mode=8)
+    show(homing, wire, ATTAINED, SETTLE + 30, mode=8)
     assert homing.phase is P.STUCK
 
 
 def test_a_search_without_end_fails(drive: Cia402Drive, wire: Wire) -> None:
     enabled(drive, wire)
-    homing = Homing(PERIOD_S, longest_s=1.0)
+    homing = made(search_s=1.0)
     homing.start(drive)
-    show(homing, wire, REST)
+    show(homing, wire, REST, SETTLE + 1)
     assert show(homing, wire, UNDER_WAY, 2000) is P.SEARCHING
     assert show(homing, wire, UNDER_WAY, 2) is P.STOPPING
-    assert show(homing, wire, REST, 20) is P.LEAVING
+    assert show(homing, wire, REST, SETTLE + 1) is P.LEAVING
     assert show(homing, wire, ENABLED, 2, mode=8) is P.FAILED
 
 
@@ -242,27 +294,27 @@ def test_a_drive_that_is_let_go_is_in_csp_when_it_is_enabled_again(
 
 
 def test_a_homing_can_follow_another(homing: Homing, drive: Cia402Drive, wire: Wire) -> None:
-    show(homing, wire, ATTAINED, LATE + 1)
+    show(homing, wire, UNDER_WAY)
+    show(homing, wire, ATTAINED, SETTLE + 1)
     show(homing, wire, ENABLED, 2, mode=8)
     homing.start(drive)
     assert not homing.ended
     assert show(homing, wire, ENABLED, position=750, mode=8) is P.ENTERING
     assert homing.position == pytest.approx(0.07)
-    assert show(homing, wire, REST) is P.SEARCHING
+    assert show(homing, wire, REST, SETTLE + 1) is P.SEARCHING
     show(homing, wire, UNDER_WAY, position=800)
     assert homing.position == pytest.approx(0.08)
-    show(homing, wire, FAILED, LATE + 1)
-    show(homing, wire, FAILED, 20)
+    show(homing, wire, FAILED, SETTLE + 2)
     assert show(homing, wire, ENABLED, 2, mode=8) is P.FAILED
     homing.start(drive)
     assert (homing.shown, homing.shown_mode) == (0, HOMING)
     homing.stop()
-    show(homing, wire, ENABLED, LATE + 1, mode=8)
+    show(homing, wire, ENABLED, SETTLE + 1, mode=8)
     assert show(homing, wire, ENABLED, 2, mode=8) is P.STOPPED
 
 
 def test_nothing_happens_before_the_start() -> None:
-    homing = Homing(PERIOD_S)
+    homing = made()
     homing.stop()
     homing.abandon()
     assert homing.step() is P.IDLE
@@ -327,7 +379,7 @@ def test_where_it_stands_becomes_its_home(method: int, home_offset: int) -> None
     line = Line(initial_position=0.7)
     line[0x6098, 0], line[0x607C, 0] = method, home_offset
     before = line.model.mechanics.position
-    assert run(line, Homing(PERIOD_S))[-1] is P.HOMED
+    assert run(line, made())[-1] is P.HOMED
     assert line.drive.position == pytest.approx(home_offset * 1e-4, abs=2e-4)
     assert line.model.mechanics.position == pytest.approx(before, abs=2e-4)
 
@@ -336,7 +388,7 @@ def test_where_it_stands_becomes_its_home(method: int, home_offset: int) -> None
 def test_the_next_index_in_its_direction_becomes_its_home(method: int, turns: int) -> None:
     line = Line(initial_position=4.5 * INDEX_PITCH)
     line[0x6098, 0], line[0x607C, 0] = method, 1000
-    assert run(line, Homing(PERIOD_S))[-1] is P.HOMED
+    assert run(line, made())[-1] is P.HOMED
     home = line.model.mechanics.position - line.drive.position + 0.1
     assert home == pytest.approx(turns * INDEX_PITCH, abs=2e-4)
 
@@ -345,7 +397,7 @@ def test_the_next_index_in_its_direction_becomes_its_home(method: int, turns: in
 def test_the_zero_offset_counts_on_from_the_home(method: int) -> None:
     line = Line(zero=0.25, initial_position=4.5 * INDEX_PITCH)
     line[0x6098, 0] = method
-    homing = Homing(PERIOD_S)
+    homing = made()
     assert run(line, homing)[-1] is P.HOMED
     assert line.drive.position == pytest.approx(line.model.axis.position - 0.25, abs=2e-4)
     assert homing.position == pytest.approx(line.drive.position, abs=2e-4)
@@ -356,7 +408,7 @@ def test_the_zero_offset_counts_on_from_the_home(method: int) -> None:
 def test_the_joint_makes_no_jump_on_the_way_there_and_back(method: int, mass: float) -> None:
     line = Line(initial_position=4.5 * INDEX_PITCH, load_mass_moment=mass, gravity_phase=1.2)
     line[0x6098, 0], line[0x607C, 0] = method, -3000
-    homing, last, fastest = Homing(PERIOD_S), line.model.mechanics.position, 0.0
+    homing, last, fastest = made(), line.model.mechanics.position, 0.0
     for phase in line.home(homing):
         now = line.model.mechanics.position
         fastest, last = max(fastest, abs(now - last) / PERIOD_S), now
@@ -373,10 +425,10 @@ def test_the_joint_makes_no_jump_on_the_way_there_and_back(method: int, mass: fl
 
 def test_it_may_be_stopped_at_any_time() -> None:
     seen = set()
-    for at in (1, 2, 3, 5, 8, 30, 200, 400, 600):
+    for at in (1, 2, 3, 5, 8, 30, 200, 210, 400, 800, 1200):
         line = Line(initial_position=4.5 * INDEX_PITCH)
         line[0x6098, 0] = 34
-        homing = Homing(PERIOD_S)
+        homing = made()
         for cycles, _ in enumerate(line.home(homing)):
             if cycles == at:
                 homing.stop()
@@ -393,7 +445,7 @@ def test_it_may_be_stopped_at_any_time() -> None:
 def test_a_search_at_speed_zero_fails_and_the_arm_holds() -> None:
     line = Line()
     line[0x6098, 0], line[0x6099, 2] = 34, 0
-    homing = Homing(PERIOD_S)
+    homing = made()
     assert run(line, homing)[-1] is P.FAILED
     assert homing.shown & 0x2000
     assert line.drive.state is DriveState.OPERATION_ENABLED
@@ -403,7 +455,7 @@ def test_a_search_at_speed_zero_fails_and_the_arm_holds() -> None:
 def test_after_a_fault_in_mid_search_it_is_enabled_in_csp() -> None:
     line = Line(initial_position=4.5 * INDEX_PITCH)
     line[0x6098, 0] = 34
-    homing = Homing(PERIOD_S)
+    homing = made()
     for cycles, _ in enumerate(line.home(homing)):
         if cycles == 100:
             line.model.inject_fault(0x7305)
@@ -424,7 +476,7 @@ def test_after_a_fault_in_mid_search_it_is_enabled_in_csp() -> None:
 
 def test_two_homings_in_a_row_find_the_same_home() -> None:
     line = Line(initial_position=4.5 * INDEX_PITCH)
-    homing = Homing(PERIOD_S)
+    homing = made()
     homes = []
     for method in (34, 33, 34):
         line[0x6098, 0] = method

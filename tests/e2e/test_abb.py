@@ -89,7 +89,7 @@ def test_seven_axes_are_moved_the_external_one_third(platform: Platform) -> None
     arm, _, _ = (config / "abb_irb120.yaml").read_text().partition("kinematics:")
     rail = "  - {name: rail, position: {min: -1.5, max: 1.5}, velocity: 1.0, acceleration: 2.0, jerk: 20.0}\n"
     file = platform.directory / "seven.yaml"
-    arm = arm.replace("home: [0, 0, 0, ", "home: [0, 0, 0, 0, ")
+    arm = arm.replace("rest_pose: [0, 0, 0, ", "rest_pose: [0, 0, 0, 0, ")
     file.write_text(arm.replace("  - {name: joint_3,", f"{rail}  - {{name: joint_3,"))
     platform.environment["RTCP_CONFIG"] = str(file)
     platform.rtcp("start", "--detach")

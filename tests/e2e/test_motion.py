@@ -67,9 +67,9 @@ def test_the_tool_moves_to_a_pose_on_a_line_and_a_step_along_its_axis(bent: Plat
     ends = [f"{number:.5f}" for number in (x, y + 0.03, z + 0.03, x, y + 0.06, z)]
     bent.rtcp("arc", *ends[3:], *rpy, "--via", *ends[:3], "--speed", "0.1")
     assert far(tool(bent.status()), [x, y + 0.06, z]) < 1e-4
-    bent.rtcp("move", "--home")
-    home = load(default_config()).home
-    assert far(bent.status()["joints"]["commanded_position"], list(home)) < 1e-4
+    bent.rtcp("move", "--rest-pose")
+    rest_pose = load(default_config()).rest_pose
+    assert far(bent.status()["joints"]["commanded_position"], list(rest_pose)) < 1e-4
     bent.rtcp("speed", "50")
     bent.rtcp("disable")
     assert bent.status()["speed_override"] == 0.5

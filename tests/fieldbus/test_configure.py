@@ -10,8 +10,9 @@ import pytest
 from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.image import limit_faults
+from rtcp.fieldbus.interpolation_time import expressions
 from rtcp.fieldbus.pdo import layout, mapping_of, mapping_text
-from rtcp.fieldbus.slave_setup import by_alias, identity_faults, interpolation_time
+from rtcp.fieldbus.slave_setup import by_alias, identity_faults
 from rtcp.fieldbus.topology import PortState, Topology
 
 
@@ -50,12 +51,16 @@ def test_a_surplus_slave_is_told_with_its_place() -> None:
 
 
 @pytest.mark.parametrize(
-    ("period_ns", "expected"),
-    [(500_000, (5, -4)), (250_000, (25, -5)), (1_000_000, (1, -3)), (125_000, (125, -6)), (2_000_000, (2, -3)),
-     (100_000_000, (1, -1)), (333_000, None)],
+    ("period_ns", "bits", "first", "count"),
+    [(500_000, 8, (5, -4), 2), (250_000, 8, (25, -5), 2), (1_000_000, 8, (1, -3), 3), (125_000, 8, (125, -6), 1),
+     (100_000_000, 8, (1, -1), 3), (333_000, 8, None, 0), (333_000, 16, (333, -6), 3)],
 )  # fmt: skip
-def test_the_interpolation_time_is_a_byte_and_a_power_of_ten(period_ns: int, expected: tuple[int, int] | None) -> None:
-    assert interpolation_time(period_ns) == expected
+def test_the_interpolation_time_is_a_number_and_a_power_of_ten(
+    period_ns: int, bits: int, first: tuple[int, int] | None, count: int
+) -> None:
+    found = list(expressions(period_ns, bits))
+    assert (found[0] if found else None, len(found)) == (first, count)
+    assert all(value * 10.0**exponent == pytest.approx(period_ns * 1e-9) for value, exponent in found)
 
 
 def test_a_mapping_lists_index_subindex_and_bits() -> None:

@@ -47,6 +47,8 @@ class FakeLoop:
         self.refusals: dict[type[Command], Refusal] = {}
         self.ends: dict[type[Command], Sequence[float]] = {}
         self.reports: dict[type[Command], Sequence[Event]] = {}
+        self.objects: dict[int, dict[str, Any]] = {}
+        """Answers to SDO reads by index."""
         self.event_at_the_end: Event | None = Arrived()
         self.ends_in = State.HOLDING
         self.moves_for = 40
@@ -148,7 +150,8 @@ class FakeLoop:
         if words[SERVICE_STATE_AT] != 1:
             return
         self.requests.append(json.loads(bytes(memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + words[SERVICE_LENGTH_AT]])))
-        answer = b'{"hex": "2a"}'
+        request = self.requests[-1]
+        answer = json.dumps(self.objects.get(request.get("index", 0), {"hex": "2a"})).encode()
         memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(answer)] = answer
         words[SERVICE_LENGTH_AT] = len(answer)
         words[SERVICE_STATE_AT] = 2

@@ -16,7 +16,16 @@ from rtcp.config.drive_limits import BEYOND_RANGE_RAD
 from rtcp.config.model import LARGEST, GripperConfig, Joint, Range
 from rtcp.config.zero import read_zeros, state_directory, zero_file
 from rtcp.ipc import commands
-from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, Homed, HomingFailed, OverSpeed, ZeroSet
+from rtcp.ipc.events import (
+    Disabled,
+    GripperAtRest,
+    GripperCloses,
+    Homed,
+    HomedElsewhere,
+    HomingFailed,
+    OverSpeed,
+    ZeroSet,
+)
 from rtcp.ipc.layout import EVENTS
 from rtcp.ipc.refusals import GripperDisabled, Refusal, TorquePresent, WrongState
 from rtcp.ipc.schema import Field
@@ -25,6 +34,7 @@ from tests.gateway import fake_loop
 from tests.gateway.fake_platform import FakePlatform, fake_platform
 from tests.two_boxes import two_boxes
 
+ABSENT_OBJECT = {"error": "no such object", "kind": "refused", "fields": {"code": 0x06020000}}
 Q = [0.25, 0.2, 1.0, 0.0, 0.4, 0.0]
 AXIS = 6
 CONFIG = load(default_config())
@@ -365,6 +375,43 @@ def test_the_gripper_with_a_drive_has_a_zero_too(driven: FakePlatform) -> None:
     answer = driven.ask("zero", joint="finger", at=0.1)
     assert (answer["joint"], answer["offset"]) == ("finger", pytest.approx(0.3))
     assert read_zeros(driven.config)[6] == pytest.approx(0.3)
+
+
+def test_what_homing_will_do_is_read_from_the_drive(arm: FakePlatform) -> None:
+    objects = arm.loop.objects
+    objects[0x6098], objects[0x607C] = {"hex": "23"}, {"hex": "f0d8ffff"}
+    assert arm.ask("homing_method", joint="2") == {
+        "joint": "joint2",
+        "method": 35,
+        "text": "does not move: it declares the present position to be its home",
+        "declares_present": True,
+        "home_offset": pytest.approx(-1.0),
+    }
+    objects[0x6098] = {"hex": "12"}
+    answer = arm.ask("homing_method", joint="joint2")
+    assert (answer["method"], answer["declares_present"]) == (18, False)
+    assert answer["text"] == (
+        "turns in positive direction to the positive limit switch, then back: its home is the edge of the positive "
+        "limit switch, approached from the negative side"
+    )
+    objects[0x6098], objects[0x607C] = ABSENT_OBJECT, ABSENT_OBJECT
+    answer = arm.ask("homing_method", joint="joint2")
+    assert (answer["method"], answer["declares_present"], answer["home_offset"]) == (None, True, 0.0)
+    assert {request["slave"] for request in arm.loop.requests} == {3}
+    assert arm.loop.commands == []
+
+
+def test_homing_gives_the_loop_the_home_offset_and_fails_where_the_drive_shows_another_position(
+    arm: FakePlatform,
+) -> None:
+    arm.loop.objects[0x607C] = {"hex": "f0d8ffff"}
+    arm.loop.reports[commands.Home] = [HomedElsewhere(1, 0.5, -1.0)]
+    error = arm.error("home", joint="joint2")
+    assert arm.loop.received(commands.Home) == [commands.Home(1, -1.0)]
+    assert (error.kind, error.reason) == ("fault", "homed_elsewhere")
+    assert "it shows 0.5 rad and its home offset (0x607C) is -1 rad, allowed are homing.tolerance = 0.2 rad" in str(
+        error
+    )
 
 
 def test_homing_returns_the_position_or_fails_with_the_drives_answer(arm: FakePlatform) -> None:

@@ -91,21 +91,21 @@ def test_targets_are_planned_sent_or_refused_and_kept_under_names(drawing: Page,
     until(lambda: float(field.input_value()) == pytest.approx(before + 0.01, abs=2e-3), "the field follows the slider")
 
 
-def test_home_is_reached_when_it_is_confirmed_and_the_override_slows_what_the_page_moves(
+def test_the_rest_pose_is_reached_when_it_is_confirmed_and_the_override_slows_what_the_page_moves(
     browser: Browser, panel: str, page: Page, holding: Platform
 ) -> None:
     holding.call("move_joints", q=[0.3, *BENT[1:]])
     show(page, "/health")
-    page.get_by_role("button", name="Home", exact=True).click()
+    page.get_by_role("button", name="Rest pose", exact=True).click()
     page.get_by_role("button", name="Leave it").click()
     expect(page.get_by_role("button", name="Leave it")).to_have_count(0)
-    page.get_by_role("button", name="Home", exact=True).click()
-    page.get_by_role("button", name="Move home").click()
+    page.get_by_role("button", name="Rest pose", exact=True).click()
+    page.get_by_role("button", name="Move to rest pose").click()
     holding.until(lambda status: status["state"] == "moving", "on the way")
-    home = load(Path(holding.environment["RTCP_CONFIG"])).home
-    assert home is not None
-    expect(page.get_by_text("The arm is at home")).to_be_visible()
-    assert holding.status()["joints"]["actual_position"] == pytest.approx(home, abs=1e-3)
+    rest_pose = load(Path(holding.environment["RTCP_CONFIG"])).rest_pose
+    assert rest_pose is not None
+    expect(page.get_by_text("The arm is in its rest pose")).to_be_visible()
+    assert holding.status()["joints"]["actual_position"] == pytest.approx(rest_pose, abs=1e-3)
     show_targets(page)
     page.get_by_label("joint1, rad").fill("1.2")
     page.get_by_role("spinbutton", name="Speed").fill("0.02")  # a minute

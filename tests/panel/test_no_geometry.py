@@ -37,7 +37,7 @@ def without_geometry(platform: Platform, joints: int) -> None:
     yaml, directory = YAML(typ="safe"), platform.directory / "config"
     arm = yaml.load((directory / "assistive_arm.yaml").read_text())
     segment = yaml.load((directory / "segment.yaml").read_text())
-    for key in ("kinematics", "cartesian", "jog", "home"):
+    for key in ("kinematics", "cartesian", "jog", "rest_pose"):
         del arm[key]
     last = arm["joints"][-1]
     names = [f"drive{n}" for n in range(1, joints + 1)]

@@ -145,7 +145,9 @@ NOT_REACHED: tuple[NotReached, ...] = (
             events.NotSettled,
         ),
     ),
-    NotReached("the virtual drives home where they stand, and do not fail", (events.HomingFailed,)),
+    NotReached(
+        "the virtual drives home where they stand, and do not fail", (events.HomingFailed, events.HomedElsewhere)
+    ),
     NotReached("the hands of a session are too weak to guide the tool so fast", (events.GuidedTooFast,)),
     NotReached("a spherical wrist has joint positions for each pose in reach", (events.NoSolution,)),
     NotReached(

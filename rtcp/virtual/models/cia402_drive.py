@@ -27,7 +27,7 @@ from rtcp.virtual.protocol import AlState
 
 MOST_AXES = 8
 """Upper bound on the axes of a drive: their objects fill 0x6000 to 0x9FFF (ETG.6010)."""
-_CONTROLWORD = 0x6040
+_CONTROLWORD, _MODE_DISPLAY, _INTERPOLATION_TIME = 0x6040, 0x6061, 0x60C2
 _COUNTS_PER_TURN = 65536
 _ACCELERATION = 20.0
 """Default acceleration of profiles, rad/s^2."""
@@ -83,6 +83,14 @@ _AXIS_OPTIONS: Mapping[str, Option] = MappingProxyType({
 })  # fmt: skip
 
 
+_DICTIONARY_OPTIONS: Mapping[str, Option] = MappingProxyType({
+    "interpolation_ms": Option(None, 0.0, 255.0, "ms at power-on; 0x60C2 then has subindex 1 alone, in ms"),
+    "interpolation_read_only": Option(None, 0.0, 255_000.0, "us; 0x60C2 then has this time and cannot be written"),
+    "no_mode_display": Option(0.0, 0.0, 1.0, "1: there is no 0x6061"),
+})  # fmt: skip
+"""Options of the whole drive on its object dictionary, which is otherwise that of its description."""
+
+
 def _options() -> Mapping[str, Option]:
     """Return the options: those of all axes, and with an axis number as prefix those of one axis."""
     own = {
@@ -90,7 +98,7 @@ def _options() -> Mapping[str, Option]:
         for n in range(1, MOST_AXES + 1)
         for name, option in _AXIS_OPTIONS.items()
     }
-    return MappingProxyType({**_AXIS_OPTIONS, **CONDITION_OPTIONS, **own})
+    return MappingProxyType({**_AXIS_OPTIONS, **_DICTIONARY_OPTIONS, **CONDITION_OPTIONS, **own})
 
 
 class Cia402Drive(Behaviour):
@@ -106,8 +114,26 @@ class Cia402Drive(Behaviour):
         )
         if not count:
             raise ValueError(f"cia402 moves a drive, and {device.identity.name} has no controlword (0x6040)")
+        for shift in range(0, AXIS_STRIDE * count, AXIS_STRIDE):
+            if self.option("no_mode_display"):
+                device.objects.remove(_MODE_DISPLAY + shift)
+            self._define_interpolation_time(_INTERPOLATION_TIME + shift)
         self.axes = [_StandardAxis(self, n) for n in range(count)]
         device.servos = [axis.servo for axis in self.axes]
+
+    def _define_interpolation_time(self, index: int) -> None:
+        """Replace 0x60C2 by the one that an option describes, if any."""
+        ms, fixed_us = self.option("interpolation_ms", -1.0), self.option("interpolation_read_only", -1.0)
+        value, exponent = "Interpolation time period value", "Interpolation time index"
+        if ms >= 0.0:
+            entries = [Entry(index, 1, value, DataType.UNSIGNED8, round(ms), Access.RW)]
+        elif fixed_us >= 0.0:
+            entries = [Entry(index, 1, value, DataType.UNSIGNED32, round(fixed_us)),
+                       Entry(index, 2, exponent, DataType.INTEGER8, -6)]  # fmt: skip
+        else:
+            return
+        self.device.objects.record(index, "Interpolation time period", entries)
+        self.device.keep_defaults(entries)
 
     def on_start(self) -> None:
         """Set up the axes at power-on."""
@@ -164,6 +190,7 @@ class _StandardAxis:
             _POSITION_LIMIT * objects.units.position,
         )  # fmt: skip
         self.servo.axis.velocity_share = self._option("velocity_share", 1.0)
+        self.servo.mode_bits_lag, self.servo.reset_pulse = self._option("mode_bits_lag"), self._option("reset_pulse")
 
     def _option(self, name: str, otherwise: float = 0.0) -> float:
         drive = self._drive
@@ -277,11 +304,14 @@ class _StandardAxis:
 
     def _modes(self, axis: Axis, objects: AxisObjects) -> dict[int, Motion]:
         unlimited = Number(LIMITLESS)
+        period = objects.number(_INTERPOLATION_TIME, 1)
+        in_ms = (_INTERPOLATION_TIME, 2) not in objects
+        exponent = Number(-3) if in_ms else objects.number(_INTERPOLATION_TIME, 2)
         modes: dict[int, Motion] = {
             1: ProfilePosition(axis, objects),
             3: ProfileVelocity(axis, objects),
             6: Homing(axis, objects, self._gear_ratio),
-            8: CyclicPosition(axis, objects, unlimited, unlimited, Number(0), Number(0)),
+            8: CyclicPosition(axis, objects, unlimited, unlimited, period, exponent),
             9: CyclicVelocity(axis, objects),
             10: CyclicTorque(axis, objects),
         }

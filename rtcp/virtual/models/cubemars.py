@@ -29,6 +29,8 @@ SERVO_OPTIONS = MappingProxyType({
     "holding_torque": Option(None, 0.0, 500.0, "torque of the brake that closes with the power stage off, Nm"),
     "initial_position": Option(0.0, -20.0, 20.0, "position of the encoder at power-on, rad"),
     "velocity_share": Option(1.0, 0.0, 1.0, "fraction of the demand's speed that the position loop adds by itself"),
+    "mode_bits_lag": Option(0.0, 0.0, 10.0, "time for which bits 10, 12 and 13 stay those of the former mode, s"),
+    "reset_pulse": Option(0.0, 0.0, 10.0, "time for which the fault reset bit must stay set, s"),
 })  # fmt: skip
 """Options of every axis."""
 CONDITION_OPTIONS = MappingProxyType({
@@ -83,6 +85,7 @@ class CubemarsDrive(DeviceModel):
         self.servos = (self.servo,)
         self.mechanics, self.condition, self.axis = mechanics, self.servo.condition, self.servo.axis
         self.axis.velocity_share = option("velocity_share")
+        self.servo.mode_bits_lag, self.servo.reset_pulse = option("mode_bits_lag"), option("reset_pulse")
         # Kept for fast access in a step.
         self.step = self.servo.step  # type: ignore[method-assign]
         self.power_on()

@@ -10,7 +10,7 @@ from math import ceil
 from typing import Final
 
 from rtcp.virtual.models.cia402 import STATE_BITS, DriveState, DriveStateMachine, Status
-from rtcp.virtual.models.cyclic_modes import ERROR, LIMIT, Motion, Profile, Stop
+from rtcp.virtual.models.cyclic_modes import ERROR, LIMIT, REACHED, Motion, Profile, Stop
 from rtcp.virtual.models.mechanics import ActuatorSize, Axis, Mechanics
 from rtcp.virtual.models.protection import AT_ONCE, Condition, ErrorCode, ErrorLog, Feedback
 from rtcp.virtual.models.units import AxisObjects
@@ -19,6 +19,9 @@ from rtcp.virtual.objects import Number
 SELF_TEST = 0.1
 """Duration of Not Ready To Switch On after power-on, s."""
 _HALT: Final = 0x100
+_FAULT_RESET: Final = 0x80
+_MODE_BITS: Final = 0x3400
+"""Bits 10, 12 and 13 of the statusword, whose meaning depends on the mode."""
 # Plain ints: enum arithmetic is slow.
 _VOLTAGE_ENABLED: Final = int(Status.VOLTAGE_ENABLED)
 _WARNING: Final = int(Status.WARNING)
@@ -54,6 +57,10 @@ class ServoAxis:
         self._make_modes = modes
         self._max_speed = max_speed
         self._range = encoder_range
+        self.mode_bits_lag = 0.0
+        """Time for which bits 10, 12 and 13 of the statusword stay those of the former mode, s."""
+        self.reset_pulse = 0.0
+        """Time for which the fault reset bit must stay set, s; 0: its rising edge resets."""
         # Kept, to avoid look-ups in `step`.
         self._controlword = objects.number(0x6040)
         self._mode_wanted = objects.number(0x6060)
@@ -96,6 +103,9 @@ class ServoAxis:
         """True: a ramp is in progress that ends in transition 5 or 8."""
         self._busy = True
         self._last_controlword = 0
+        self._mode_bits = self._former_bits = 0
+        """Bits 10, 12 and 13 now, and those of the former mode."""
+        self._lag_left = self._reset_left = 0.0
         self.outputs_valid = False
         self._self_test = SELF_TEST
         self._following_time = 0.0
@@ -193,6 +203,10 @@ class ServoAxis:
         if self._motion is not motion:
             # A fault ended the mode; its bits are void.
             bits = 0
+        if self._lag_left > 0.0:
+            self._lag_left -= dt
+            bits = bits & ~_MODE_BITS | self._former_bits
+        self._mode_bits = bits & _MODE_BITS
         self._feedback.publish(self._bits | bits, axis, following)
 
     def _stand(self, dt: float) -> None:
@@ -250,6 +264,12 @@ class ServoAxis:
                 self._switch_off(DriveState.FAULT)
         elif before is DriveState.QUICK_STOP_ACTIVE:
             self._control_quick_stop(transition)
+        elif self._reset_left > 0.0:
+            self._reset_left -= dt
+            if self._reset_left <= 0.0:
+                self._reset()
+            elif not controlword & _FAULT_RESET:
+                self._reset_left = 0.0
         elif transition is not None:
             self._follow_transition(*transition)
         elif self._pending and controlword & 0x8F == 0x0F:
@@ -257,7 +277,8 @@ class ServoAxis:
             self._start_mode()
         if self._machine.state is DriveState.OPERATION_ENABLED and not self._pending:
             self._control_halt(controlword)
-        self._busy = self._pending or self._machine.state is not before or self._machine.state in (
+        changes = self._pending or self._reset_left > 0.0 or self._machine.state is not before
+        self._busy = changes or self._machine.state in (
             DriveState.NOT_READY_TO_SWITCH_ON, DriveState.FAULT_REACTION_ACTIVE, DriveState.QUICK_STOP_ACTIVE,
         )  # fmt: skip
 
@@ -279,6 +300,8 @@ class ServoAxis:
             self._start_stop(quick=self._quick_stop_option.value in (2, 6))
         elif transition == 11:
             self._switch_off(DriveState.SWITCH_ON_DISABLED)
+        elif transition == 15 and self.reset_pulse:
+            self._reset_left = self.reset_pulse
         elif transition == 15:
             self._reset()
         else:
@@ -326,6 +349,8 @@ class ServoAxis:
         if wanted not in self._modes or wanted == 0:
             return
         running = self._motion is self._modes[self._mode]
+        # Some drives show that the target is reached in CSP too.
+        self._lag_left, self._former_bits = self.mode_bits_lag, self._mode_bits | REACHED
         self._mode = self._mode_display.value = wanted
         if running:
             self._start_mode()
