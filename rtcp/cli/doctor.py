@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from rtcp.cli.arguments import AsJson, ConfigFile, option
-from rtcp.cli.output import CommandError, ExitCode, complain, emit, emit_json, show, table
+from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, show, table
 from rtcp.config.model import VIRTUAL
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.realtime.doctor import Case, Finding, Severity, examine
@@ -52,8 +52,6 @@ def _case(bus: str | None, config: Path | None) -> Case:
     from rtcp.config import find_config, load  # the validator loads slowly
 
     arm = load(find_config(config))
-    for warning in arm.warnings:
-        complain(f"warning: {warning}")
     name = arm.bus.interface if bus is None else bus
     # dev_valid_name of the kernel's net/core/dev.c
     if name != VIRTUAL and (not re.fullmatch(r"[^\s/:]{1,15}", name) or name in (".", "..")):

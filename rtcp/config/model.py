@@ -1196,8 +1196,6 @@ class ArmConfig(ArmSettings):
     """Position of each drive at its axis' zero, rad, in the order of `axes`; empty: all 0."""
     source: Path = Path()
     """The file it was read from."""
-    warnings: tuple[str, ...] = ()
-    """Values that are allowed but implausible: file, line, key, value and the likely mistake."""
 
     @property
     def models(self) -> tuple[ArmModel, ...]:
