@@ -3,9 +3,10 @@
     python benchmarks/esi_op.py DIR [--only WORD] [--batch 16] [--json FILE]
                                 [--slaveinfo PROGRAM] [--simple-test PROGRAM]
 
-Each device hangs on the software segment by its description, gets the file that `rtcp device new` makes of it, and is
-configured and brought to OP by the master over a real socket, where its process data are exchanged. Several at a time;
-one that a message names is tried again alone: then the reason counts. Where a message names none, the batch is halved.
+Each device hangs on the software segment by its description and gets the file that `rtcp device new` makes of it, with
+some value for each figure that it asks for. The master configures it and brings it to OP over a real socket, where its
+process data are exchanged. Several at a time; one that a message names is tried again alone: then the reason counts.
+Where a message names none, the batch is halved.
 Devices without a product code are no slaves; a device that stands in several files counts once.
 
 SOEM's own programs, compiled from its sources, find the same slaves on the same segment without our master (as root):
@@ -47,6 +48,7 @@ from rtcp.fieldbus import BusError
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.virtual.server import run
 from tests.fieldbus.master_child import INTERFACE, Cycle, to_op
+from tests.required import filled
 
 PERIOD_NS = 5_000_000
 PATIENCE_S = 60.0
@@ -95,7 +97,7 @@ def candidates(folder: Path, only: str, reasons: dict[str, str]) -> Iterator[Can
             seen.add(key)
             try:
                 whole = assemble(device, file.modules) if device.slots else device
-                text = file_text(whole)
+                text = filled(file_text(whole))
                 outputs, inputs = (sum(pdo.bits for pdo in whole.assigned(out)) for out in (True, False))
             except EsiError as error:
                 reasons[label] = str(error)

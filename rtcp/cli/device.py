@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,12 @@ import typer
 
 from rtcp.cli.arguments import AsJson, BusName, ConfigFile, option
 from rtcp.cli.bus import open_bus, parse_integer
-from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, new_file, report, show, table, transfer
+from rtcp.cli.output import CommandError, ExitCode, asking, emit, emit_json, new_file, report, show, table, transfer
 from rtcp.cli.slaves import own_bus
 from rtcp.launch.offline import OfflineBus
 
 if TYPE_CHECKING:
+    from rtcp.config.findings import Finding
     from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, StartupSdo
     from rtcp.esi.model import Device, DeviceFile
 
@@ -82,27 +84,36 @@ def _facts(device: Device) -> dict[str, Any]:
 
 @device.command("new")
 def _new(
-    out: Annotated[Path, option("--out", "FILE", "The device's file to write, as config/devices/NAME.yaml.")],
+    out: Annotated[
+        Path | None, option("--out", "FILE", "The device's file to write, config/devices/NAME.yaml.")
+    ] = None,
     esi: Annotated[Path | None, option("--esi", "FILE", "ESI file of the device's maker.")] = None,
     sii: Annotated[Path | None, option("--sii", "FILE", "EEPROM image, as `rtcp eeprom read` writes it.")] = None,
     from_bus: Annotated[str | None, option("--from-bus", "BUS", "Ask a slave that is there; with --slave.")] = None,
     slave: Annotated[int | None, option("--slave", "N", "Its position on the cable, from 1.")] = None,
     product: Annotated[str | None, option("--product", "CODE", "Product code, where the file has several.")] = None,
     revision: Annotated[str | None, option("--revision", "NUMBER", "Revision. Default: the newest.")] = None,
+    choice: Annotated[
+        int | None, option("--choice", "N", "Which of several devices that fit, from 1. Default: asks.")
+    ] = None,
     module: Annotated[list[str] | None, option("--module", "SLOT=IDENT", "Module in a slot; again for more.")] = None,
     kind: Annotated[str | None, option("--kind", "KIND", "Driver. Default: the one that fits.")] = None,
     mode: Annotated[str | None, option("--mode", "NAME", "Clock mode, and the PDOs that it assigns.")] = None,
     samples: Annotated[
         int | None, option("--samples", "N", "Values a cycle (oversampling). Default: the mode's.")
     ] = None,
+    pdo: Annotated[
+        list[str] | None,
+        option("--pdo", "INDEX", "PDO in place of the default ones; again for more; `list` shows all."),
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
-    """Write a device's file that a person reads: process data with types and units, start-up SDOs, clocks, watchdog."""
+    """Write a device's file that a person reads: process data with types and units, start-up SDOs, clocks, watchdog.
+
+    A figure that the description lacks is a key without a value: the file is refused until it is filled in.
+    """
     from rtcp.config.device_file import file_text
-    from rtcp.config.loader import load_device
-    from rtcp.config.model import ConfigError
     from rtcp.esi.modules import assemble
-    from rtcp.esi.reader import find_device
 
     sources = [name for name, value in (("--esi", esi), ("--sii", sii), ("--from-bus", from_bus)) if value is not None]
     if len(sources) != 1:
@@ -113,35 +124,103 @@ def _new(
         raise CommandError(f"--slave {slave} is not allowed: a position on the cable, from 1")
     if samples is not None and mode is None:
         raise CommandError("--samples needs --mode: the clock mode that takes several values a cycle")
+    if choice is not None and esi is None:
+        raise CommandError("--choice needs --esi: an EEPROM and a slave are one device")
     chosen = _slots(module or ())
-    with new_file(out) as file:
+    lists, indices = (
+        pdo == ["list"],
+        () if pdo in (None, ["list"]) else tuple(_number("--pdo", text) or 0 for text in pdo),
+    )
+    if (out is None) is not lists:
+        raise CommandError(
+            "--out names the file to write" if out is None else "--pdo list writes no file: without --out"
+        )
+
+    def described() -> Device:
         if esi is not None:
             content = _read(esi)
-            bare = find_device(content, product=_number("--product", product), revision=_number("--revision", revision))
-            result = assemble(bare, content.modules, chosen) if bare.slots or chosen else bare
-        elif chosen:
+            bare = _choose(content, _number("--product", product), _number("--revision", revision), choice)
+            return assemble(bare, content.modules, chosen) if bare.slots or chosen else bare
+        if chosen:
             raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
-        else:
-            result = _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
-        text = file_text(result, kind, mode, samples)
+        return _of_image(sii) if sii is not None else _of_bus(str(from_bus), slave or 0, config)
+
+    if out is None:
+        _show_pdos(described())
+        return
+    with new_file(out) as file:
+        result = described()
+        text = file_text(result, kind, mode, samples, indices)
         file.write(text.encode())
         file.flush()
         try:
-            load_device(out)
-        except ConfigError:
+            missing = _mistakes(out)
+        except BaseException:
             file.truncate(0)  # and with that no file is left
             raise
     marks = text.count("CHECK:")
     report(f"{out}: {result.name}" + (f"; lines marked CHECK, {marks} of them, need a person" if marks else ""))
+    if missing:
+        listed = "".join(f"\n  {finding}" for finding in missing)
+        report(f"it is refused until these {len(missing)} values are filled in; then: rtcp device check {out}{listed}")
 
 
-@device.command("check")
-def _check(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A device's file.")],
-    bus: BusName = None,
-    config: ConfigFile = None,
-) -> None:
-    """Check a device's file; with --bus compare it with the slaves of its identity that are there."""
+def _choose(content: DeviceFile, product: int | None, revision: int | None, choice: int | None) -> Device:
+    """Return the device of a file; ask which, if several fit and someone can answer.
+
+    Raises:
+        LookupFailure: none or several fit.
+    """
+    from rtcp.esi.model import LookupFailure
+    from rtcp.esi.reader import find_device
+
+    try:
+        return find_device(content, product=product, revision=revision, choice=choice)
+    except LookupFailure as failure:
+        if not failure.several or choice is not None or sys.stdin is None or not sys.stdin.isatty():
+            hint = "; give one by --product, --revision or --choice" if failure.several else ""
+            raise CommandError(f"{failure}{hint}") from failure
+        for number, text in enumerate(failure.candidates, 1):
+            emit(f"{number}: {text}")
+        with asking("pass --choice"):
+            choice = typer.prompt("Which of these devices", type=int)
+    return find_device(content, product=product, revision=revision, choice=choice)
+
+
+def _show_pdos(device: Device) -> None:
+    """Print the PDOs that can be assigned, with their entries."""
+    for direction, pdos in (("rpdo", device.rx_pdos), ("tpdo", device.tx_pdos)):
+        for pdo in pdos:
+            marks = [] if pdo.sync_manager is None else ["default"]
+            marks += [word for word, holds in (("fixed", pdo.fixed), ("mandatory", pdo.mandatory)) if holds]
+            if pdo.excludes:
+                marks.append("excludes " + " ".join(f"0x{index:04X}" for index in sorted(pdo.excludes)))
+            emit(f"{direction} 0x{pdo.index:04X} {pdo.name}, {pdo.bits} bits" + "".join(f"; {mark}" for mark in marks))
+            for entry in pdo.entries:
+                of = f"0x{entry.index:04X}:{entry.sub_index} {entry.name}" if entry.index else "padding"
+                emit(f"    {of}, {entry.bits} bits {entry.type}".rstrip())
+
+
+def _mistakes(file: Path) -> list[Finding]:
+    """Check a device's file as `rtcp device check` does; return the values that are missing.
+
+    Raises:
+        ConfigError: it has other mistakes.
+        CommandError: its driver refuses it.
+    """
+    from rtcp.config.model import ConfigError
+
+    try:
+        _checked(file)
+    except ConfigError as error:
+        if any(finding.code != "no_value" for finding in error.findings):
+            raise
+        return list(error.findings)
+    return []
+
+
+def _checked(file: Path) -> DeviceDescription:
+    """Read a device's file and make its driver; raises ConfigError, CommandError."""
     from rtcp.config.loader import load_device
     from rtcp.config.model import SlaveConfig
     from rtcp.devices.driver import DeviceError, make_driver
@@ -151,6 +230,17 @@ def _check(
         make_driver(SlaveConfig(file.stem, described, str(file)), 1e-3)
     except DeviceError as error:
         raise CommandError(f"{file}: {error}") from error
+    return described
+
+
+@device.command("check")
+def _check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A device's file.")],
+    bus: BusName = None,
+    config: ConfigFile = None,
+) -> None:
+    """Check a device's file; with --bus compare it with the slaves of its identity that are there."""
+    described = _checked(file)
     bits = ", ".join(f"{name} {sum(_bits(pdo) for pdo in pdos)} bits" for name, pdos in _images(described))
     report(f"{file}: {described.name}, kind {described.kind}, {bits}: no mistake in it")
     if bus is None:

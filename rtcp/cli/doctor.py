@@ -11,7 +11,7 @@ import typer
 
 from rtcp.cli.arguments import AsJson, ConfigFile, option
 from rtcp.cli.drive_settings import exit_code, settings_of_drives, show_drives
-from rtcp.cli.output import CommandError, ExitCode, complain, emit, emit_json, show, table
+from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, show, table
 from rtcp.config.model import VIRTUAL
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.realtime.doctor import Case, Finding, Severity, examine
@@ -63,8 +63,6 @@ def _case(bus: str | None, config: Path | None) -> Case:
     from rtcp.config import find_config, load  # the validator loads slowly
 
     arm = load(find_config(config))
-    for warning in arm.warnings:
-        complain(f"warning: {warning}")
     name = arm.bus.interface if bus is None else bus
     # dev_valid_name of the kernel's net/core/dev.c
     if name != VIRTUAL and (not re.fullmatch(r"[^\s/:]{1,15}", name) or name in (".", "..")):

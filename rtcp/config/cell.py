@@ -15,7 +15,7 @@ from rtcp.config.model import ArmConfig, ConfigError
 from rtcp.config.numbers import Name, Turn, Vector
 from rtcp.config.serialization import to_json
 
-_PATHS = ("source", "directory", "file", "warnings")
+_PATHS = ("source", "directory", "file")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}", re.ASCII)
 
 
@@ -153,7 +153,7 @@ class CellConfig(CellSettings):
 
 
 def _without_paths(value: Any) -> Any:
-    """Return a JSON value without the paths and warnings of files."""
+    """Return a JSON value without the paths of files."""
     if isinstance(value, dict):
         return {key: _without_paths(item) for key, item in value.items() if key not in _PATHS}
     return [_without_paths(item) for item in value] if isinstance(value, list) else value

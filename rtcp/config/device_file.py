@@ -14,19 +14,20 @@ from rtcp.config.scaling import (
     BOUNDING_OBJECTS,
     OBJECTS_PER_AXIS,
     QUICK_STOP_OPTION,
+    SOURCES,
     TORQUE_UNITS,
     VELOCITY_UNITS,
     TorqueUnit,
 )
 from rtcp.esi import units
 from rtcp.esi.dictionary import complete
-from rtcp.esi.model import DcMode, Device, EsiError, ObjectEntry, Pdo, PdoEntry, SyncManagerType
+from rtcp.esi.model import DcMode, Device, EsiError, ObjectEntry, Pdo, PdoEntry, Source, SyncManagerType
 from rtcp.esi.types import Kind, decode, resolve
 
 _DRIVE_PROFILE = 402
 MAPPINGS = {True: range(0x1600, 0x1800), False: range(0x1A00, 0x1C00)}
 """Usual indices of PDOs, by whether they are outputs (ETG.1000.6)."""
-_MOST_AXES, _WORD = 8, 16
+_MOST_AXES, _BYTE, _WORD = 8, 8, 16
 _AXES = range(0x6000, 0x6000 + _MOST_AXES * OBJECTS_PER_AXIS)
 _MAPPED_OBJECTS = {
     True: (0x6040, 0x607A, 0x60FF, 0x6071, 0x6060),
@@ -34,27 +35,32 @@ _MAPPED_OBJECTS = {
 }
 """Objects of a drive that are mapped if the device allows it, by whether they are outputs."""
 _DRIVE_CHANNELS = {
-    (0x6040, 0): "controlword",
-    (0x6041, 0): "statusword",
-    (0x6060, 0): "modes_of_operation",
-    (0x6061, 0): "modes_of_operation_display",
-    (0x6064, 0): "position",
-    (0x606C, 0): "velocity",
-    (0x6071, 0): "target_torque",
-    (0x6077, 0): "torque",
-    (0x607A, 0): "target_position",
-    (0x60B0, 0): "position_offset",
-    (0x60B1, 0): "velocity_offset",
-    (0x60B2, 0): "torque_offset",
-    (0x60F4, 0): "following_error",
-    (0x60FF, 0): "target_velocity",
+    0x6040: "controlword",
+    0x6041: "statusword",
+    0x6060: "modes_of_operation",
+    0x6061: "modes_of_operation_display",
+    0x6064: "position",
+    0x606C: "velocity",
+    0x6071: "target_torque",
+    0x6077: "torque",
+    0x607A: "target_position",
+    0x60B0: "position_offset",
+    0x60B1: "velocity_offset",
+    0x60B2: "torque_offset",
+    0x60F4: "following_error",
+    0x60FF: "target_velocity",
 }
-"""Channel names of a drive's objects (IEC 61800-7-201), those of the first axis."""
+"""Channel names of a drive's objects (IEC 61800-7-201), those of the first axis. All are variables of whole numbers;
+some descriptions give them a subindex, or the type of an array."""
+_UNSIGNED, _MODES = (0x6040, 0x6041), (0x6060, 0x6061)
+"""Those of them without a sign, and those of one byte. The others have a sign, whatever a description says."""
+_STATE_WORDS = tuple(index % OBJECTS_PER_AXIS for index in _UNSIGNED)
 _NEEDED = {True: (0x6040, 0x607A), False: (0x6041, 0x6064)}
 """Objects that the driver of a drive needs, by whether they are outputs."""
 _MODE_OBJECT, _CSP = 0x6060, 8
-_MOST_SPEED, _RATED = 0x6080, 1000
-"""The limit of a drive that is a speed (all others are torques), and the rated torque in the unit of a torque limit."""
+_MOTOR_SPEED = 0x6080
+_TORQUES, _VELOCITIES = (0x6071, 0x6077, 0x60B2), (0x606C, 0x60FF, 0x60B1)
+"""Objects whose factor needs the rated torque, and the unit of velocities."""
 _RAMP_AND_HOLD = 6
 """Value of the quick stop option code, 0x605A."""
 _SYNC0 = 0x0200
@@ -67,19 +73,27 @@ _CHANNEL = re.compile(r"(?:channel|ch\.?)\s*(\d+)", re.IGNORECASE)
 _WIDTH = 118
 
 
-def file_text(device: Device, kind: str | None = None, mode: str | None = None, samples: int | None = None) -> str:
-    """Return the text of the device's file.
+def file_text(
+    device: Device,
+    kind: str | None = None,
+    mode: str | None = None,
+    samples: int | None = None,
+    pdos: Sequence[int] = (),
+) -> str:
+    """Return the text of the device's file. A figure that the description lacks is a required key without a value.
 
     Args:
         device: its description, with its modules in place.
         kind: the driver; None: the one that fits its process data.
         mode: name of the clock mode; None: the one that fits.
         samples: values a cycle of the PDOs of that mode that take several; None: as the mode says.
+        pdos: indices of the PDOs to assign in place of the default ones of their direction; empty: those that fit.
 
     Raises:
-        EsiError: it has no such mode, or does not take so many values.
+        EsiError: it has no such mode or PDO, or does not take so many values.
     """
-    completed = complete(for_drive(device if mode is None else _in_mode(device, mode, samples)))
+    in_mode = device if mode is None else _in_mode(device, mode, samples)
+    completed = complete(with_pdos(in_mode, pdos) if pdos else for_drive(in_mode))
     return "\n".join(_lines(completed, kind or kind_of(completed), mode is not None)) + "\n"
 
 
@@ -124,14 +138,46 @@ def _with_samples(device: Device, mode: DcMode, count: int) -> DcMode:
     return replace(mode, samples=samples, sync0_factor=-count, sync0_cycle=0, sync1_factor=sync1)
 
 
+def with_pdos(device: Device, indices: Sequence[int]) -> Device:
+    """Return a device with these PDOs assigned in their order, in place of the default ones of their direction.
+
+    Raises:
+        EsiError: it has no such PDO, or two of them exclude each other.
+    """
+    known = {pdo.index: pdo for pdo in (*device.rx_pdos, *device.tx_pdos) if not pdo.virtual}
+    listed = ", ".join(f"0x{index:04X}" for index in known) or "none"
+    for index in indices:
+        if index not in known:
+            raise EsiError(device.origin, f"it has no PDO 0x{index:04X}; there are: {listed}")
+        if clash := known[index].excludes & set(indices):
+            those = " and ".join(f"0x{other:04X}" for other in sorted(clash))
+            raise EsiError(device.origin, f"PDO 0x{index:04X} excludes {those}: choose one of them")
+
+    def assigned(pdos: tuple[Pdo, ...], outputs: bool) -> tuple[Pdo, ...]:
+        own = {pdo.index: pdo for pdo in pdos}
+        chosen = [own[index] for index in dict.fromkeys(indices) if index in own]
+        if not chosen:
+            return pdos
+        usual = _usual_sync_manager(device, outputs)
+        first = [replace(p, sync_manager=usual if p.sync_manager is None else p.sync_manager) for p in chosen]
+        # A mandatory PDO stays, before those that were chosen.
+        kept = [pdo for pdo in pdos if pdo.mandatory and pdo.sync_manager is not None and pdo not in chosen]
+        others = [pdo for pdo in pdos if pdo not in chosen and pdo not in kept]
+        return (*kept, *first, *(replace(pdo, sync_manager=None) for pdo in others))
+
+    return replace(device, rx_pdos=assigned(device.rx_pdos, True), tx_pdos=assigned(device.tx_pdos, False))
+
+
 def kind_of(device: Device) -> str:
     """Return the driver that fits a device by its default process data."""
     rx, tx = (entries_of(device.assigned(outputs)) for outputs in (True, False))
     if not rx and not tx:
         return "coupler"
     coe = device.coe
-    if _axes(device) and (coe is not None or {_MODE_OBJECT, _MODE_OBJECT + 1} <= {entry.index for entry in (*rx, *tx)}):
+    if _axes(device) and (coe is not None or {*_MODES} <= {entry.index for entry in (*rx, *tx)}):
         return "cia402"
+    if _is_drive(device):
+        return "generic"
     if _counter(device) is not None:
         return "encoder"
     values = [entry for entry in (*rx, *tx) if entry.bits >= _ANALOG_BITS]
@@ -226,14 +272,14 @@ def _lines(device: Device, kind: str, has_mode: bool) -> Iterator[str]:
         + (f", {device.vendor_name}" if device.vendor_name else "")
         + f": revision 0x{identity.revision:08X}, by {device.source.value}, {_file_name(device.origin)}."
     )
-    yield from _comment("Made by `rtcp device new`. Lines marked CHECK need a person.")
+    yield from _comment("Made by `rtcp device new`. Lines marked REQUIRED need a value, lines marked CHECK a person.")
     yield ""
     yield f"name: {_quoted(device.name or f'0x{identity.product_code:08X}')}"
     yield f"kind: {kind}" + _kind_note(device, kind)
     yield f"vendor_id: 0x{identity.vendor_id:08X}"
     yield f"product_id: 0x{identity.product_code:08X}"
     yield ""
-    yield from _clock_lines(device, kind == "cia402" and not has_mode)
+    yield from _clock_lines(device, kind == "cia402", has_mode)
     watchdog = _DRIVE_WATCHDOG_MS if kind == "cia402" else _WATCHDOG_MS
     note = (
         "CHECK: without outputs for so long the drive stops; 5 to 10 cycles" if kind == "cia402" else "without outputs"
@@ -269,10 +315,13 @@ def _kind_note(device: Device, kind: str) -> str:
     return "     # CHECK: by the names of its inputs; else generic" if kind == "encoder" else ""
 
 
-def _clock_lines(device: Device, wants_clock: bool) -> Iterator[str]:
+def _clock_lines(device: Device, is_drive: bool, has_mode: bool) -> Iterator[str]:
     modes = device.dc_modes
     chosen = modes[0] if modes else None
-    if wants_clock:
+    if chosen is None and is_drive and device.source is not Source.ESI:
+        yield from _required("assign_activate", "its EEPROM names no clock mode")
+        return
+    if is_drive and not has_mode:
         chosen = next((mode for mode in modes if mode.assign_activate & 0x0100), chosen)
     if chosen is not None and not chosen.assign_activate & _SYNC0:
         chosen = next((mode for mode in modes if not mode.assign_activate), replace(chosen, assign_activate=0))
@@ -333,14 +382,14 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
             + (f", name: {_quoted(name)}" if name else "")
             + "}"
         )
-    mapped = {entry.index for entry in entries_of(device.assigned(True))}
-    displayed = {axis for axis in _axes(device) if _shows_mode(device, axis)}
     axes = (_axes(device) or (1,)) if kind == "cia402" else ()
     for axis in axes:
         index = _MODE_OBJECT + (axis - 1) * OBJECTS_PER_AXIS
-        if index not in mapped or axis not in displayed:
+        if not _switches_mode(device, axis):
+            mode = _object(device, index, 0)
+            bits = _BYTE if mode is None else mode.bits
             written.append(
-                f"  - {{index: 0x{index:04X}, sub_index: 0, type: int8, value: {_CSP}, name: modes of operation}}"
+                f"  - {{index: 0x{index:04X}, sub_index: 0, type: int{bits}, value: {_CSP}, name: modes of operation}}"
                 "   # CSP"
             )
     set_by_file = {command.index for command in device.init_commands}
@@ -360,27 +409,60 @@ def _startup_lines(device: Device, kind: str) -> Iterator[str]:
 
 
 def _scaling_lines(device: Device) -> Iterator[str]:
-    yield "# CHECK: what the drive counts in; compared with the drive's own objects at the start (docs/drives.md)."
+    yield "# What the drive counts in; compared with the drive's own objects at the start (docs/drives.md)."
     yield "scaling:"
     for axis in _axes(device) or (1,):
         base = (axis - 1) * OBJECTS_PER_AXIS
-
-        increments, where = _ratio(device, 0x608F + base, 65536)
-        yield f"  - encoder_increments: {increments:.10g}     # per motor revolution; {where}"
-        gear, where = _ratio(device, 0x6091 + base, 1)
-        yield f"    gear_ratio: {gear:.10g}     # motor revolutions per revolution of the output; {where}"
-        yield from _velocity_lines(device, 0x60A9 + base)
-        rated = _default(device, 0x6076 + base, 0)
-        unit = _torque_unit(device, 0x6076 + base)
-        if rated:
-            yield f"    rated_torque: {rated * TORQUE_UNITS[unit]:.10g}     # Nm; 0x{0x6076 + base:04X}, default"
-        else:
-            yield f"    rated_torque: 1.0     # CHECK: Nm; 0x{0x6076 + base:04X} has no default: read it from the drive"
-        if unit != "mNm":
-            yield f"    rated_torque_unit: {unit}"
-        yield "    torque_at: motor     # CHECK: or output; no object tells the shaft of the rated torque. Where motor"
-        yield "                         # is wrong the torques shown are too large by the gear, and the arm stops."
+        mapped = {entry.index - base for outputs in (True, False) for entry in entries_of(device.assigned(outputs))}
+        yield from _ratio_line(device, 0x608F + base, "  - encoder_increments", "increments per motor revolution")
+        gear = _ratio(device, 0x6091 + base)
+        yield from _ratio_line(device, 0x6091 + base, "    gear_ratio", "motor revolutions per output revolution")
+        if gear in (None, 1.0):
+            yield from _required(
+                "    external_gear_ratio", "output revolutions per joint revolution, by a further gear"
+            )
+        if _has_object(device, 0x6092 + base):
+            yield from _ratio_line(device, 0x6092 + base, "    feed_constant", "position counts per output revolution")
+        if mapped & {*_VELOCITIES}:
+            yield from _velocity_lines(device, 0x60A9 + base, gear)
+        if speed := _default(device, _MOTOR_SPEED + base, 0):
+            where = f"{_origin(device, _MOTOR_SPEED + base)}, which by the standard is in rpm"
+            yield f"    max_motor_speed: {speed:.10g}     # CHECK: rpm; {where}"
+        if mapped & {*_TORQUES}:
+            yield from _torque_lines(device, 0x6076 + base)
     yield ""
+
+
+def _required(key: str, said: str) -> Iterator[str]:
+    """Yield a key whose value the description lacks, below a comment on where it is: the file is refused without."""
+    indent = key[: len(key) - len(key.lstrip())]
+    text = f"{said}: see {SOURCES[key.lstrip(' -')]}"
+    yield from textwrap.wrap(text, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
+    yield f"{key}:     # REQUIRED"
+
+
+def _ratio_line(device: Device, index: int, key: str, said: str) -> Iterator[str]:
+    ratio = _ratio(device, index)
+    # A feed constant of 1 is what a drive shows that does not use the object.
+    if ratio is None or (ratio == 1.0 and key.endswith("feed_constant")):
+        yield from _required(key, said)
+    else:
+        yield f"{key}: {ratio:.10g}     # {said}; {_origin(device, index)}"
+
+
+def _origin(device: Device, index: int) -> str:
+    return f"0x{index:04X}, " + ("read from the drive" if device.source is Source.BUS else "default")
+
+
+def _torque_lines(device: Device, index: int) -> Iterator[str]:
+    rated, unit = _default(device, index, 0), _torque_unit(device, index)
+    if rated:
+        yield f"    rated_torque: {rated * TORQUE_UNITS[unit]:.10g}     # Nm; {_origin(device, index)}"
+    else:
+        yield from _required("    rated_torque", "Nm")
+    if unit != "mNm":
+        yield f"    rated_torque_unit: {unit}"
+    yield from _required("    torque_at", "motor or output, the shaft of the rated torque, which no object tells")
 
 
 def _torque_unit(device: Device, index: int) -> TorqueUnit:
@@ -390,24 +472,35 @@ def _torque_unit(device: Device, index: int) -> TorqueUnit:
     return next(fitting, "mNm") if unit is not None and unit.si == "Nm" else "mNm"
 
 
-def _velocity_lines(device: Device, index: int) -> Iterator[str]:
+def _velocity_lines(device: Device, index: int, gear: float | None) -> Iterator[str]:
     code = _default(device, index, 0)
-    if code is not None and (unit := VELOCITY_UNITS.get(int(code))) not in (None, "counts/s"):
-        yield f"    velocity_unit: {unit}     # 0x{index:04X}, default"
+    unit = None if code is None else VELOCITY_UNITS.get(int(code))
+    if unit is not None:
+        yield f"    velocity_unit: {unit}     # {_origin(device, index)}"
+    else:
+        found = "" if code is None else f"; 0x{index:04X} is 0x{int(code):08X}, a unit that is not known here"
+        yield from _required("    velocity_unit", f"one of {', '.join(sorted(VELOCITY_UNITS.values()))}{found}")
+    if unit not in ("counts/s", "0.1 counts/s") and gear != 1.0:
+        yield from _required("    velocity_at", "motor or output, the shaft whose revolutions per minute they are")
 
 
-def _shows_mode(device: Device, axis: int) -> bool:
-    index = _MODE_OBJECT + 1 + (axis - 1) * OBJECTS_PER_AXIS
-    return any(entry.index == index for entry in entries_of(device.assigned(False)))
+def _switches_mode(device: Device, axis: int) -> bool:
+    """Whether the process data of an axis set its mode, and show it, as bytes: else it stays in one mode."""
+    shift = (axis - 1) * OBJECTS_PER_AXIS
+    return all(
+        any((entry.index, entry.bits) == (index + shift, _BYTE) for entry in entries_of(device.assigned(outputs)))
+        for outputs, index in zip((True, False), _MODES, strict=True)
+    )
 
 
-def _ratio(device: Device, index: int, otherwise: float) -> tuple[float, str]:
-    """Return the default of a ratio, subindex 1 by 2, and its origin; `otherwise` if there is none."""
+def _ratio(device: Device, index: int) -> float | None:
+    """Return the value of a ratio, subindex 1 by 2; None: unknown."""
     above, below = _default(device, index, 1), _default(device, index, 2)
-    if not above:
-        mark = "" if otherwise == 1 else "CHECK: "
-        return otherwise, f"{mark}0x{index:04X} has no default: read it from the drive or its manual"
-    return above / (below or 1.0), f"0x{index:04X}, default"
+    return None if above is None else above / (below or 1.0)
+
+
+def _has_object(device: Device, index: int) -> bool:
+    return any(described.index == index for described in device.objects)
 
 
 def _default(device: Device, index: int, sub: int) -> float | None:
@@ -424,7 +517,7 @@ def _axes(device: Device) -> tuple[int, ...]:
         (entry.index, outputs)
         for outputs in (True, False)
         for entry in entries_of(device.assigned(outputs))
-        if entry.bits >= _WORD and not entry.sub_index
+        if (entry.bits == _WORD if entry.index % OBJECTS_PER_AXIS in _STATE_WORDS else entry.bits >= _WORD)
     }
     bases = range(0, _MOST_AXES * OBJECTS_PER_AXIS, OBJECTS_PER_AXIS)
     return tuple(
@@ -482,40 +575,54 @@ def _channel_lines(
     if not entry.index:
         yield f"      - {{index: 0, sub_index: 0, {_type_keys('', entry.bits)}}}"
         return
-    known = None
+    known, first = None, entry.index - (axis - 1) * OBJECTS_PER_AXIS
+    types = _type_keys(entry.type, entry.bits)
     if kind == "cia402" and entry.index in _AXES:
-        known = _DRIVE_CHANNELS.get((entry.index - (axis - 1) * OBJECTS_PER_AXIS, entry.sub_index))
+        known = _DRIVE_CHANNELS.get(first)
     elif kind == "encoder" and key == "tpdo" and (entry.index, entry.sub_index) == _place_of(_counter(device)):
         known = "position"
-    is_constant = known == "modes_of_operation" and not _shows_mode(device, axis)
+    is_constant = known == "modes_of_operation" and not _switches_mode(device, axis)
     if is_constant:
         known = "mode_sent"
-    name = known or _unique(_identifier(entry), names, key, axis)
+    if kind == "cia402" and known is not None and (first not in _MODES or entry.bits == _BYTE):
+        types = _drive_type(first, entry)
+    elif known == _DRIVE_CHANNELS[0x6061]:
+        known = None
+    if known and names[f"{key}.{axis}.{known}"]:
+        known = None  # an object that is mapped twice
+    own = _identifier(entry)
+    if kind == "cia402" and own in _DRIVE_CHANNELS.values():
+        own += f"_{entry.index:04x}"  # the driver would take it for the drive's own object
+    name = known or _unique(own, names, key, axis)
     if known:
         names[f"{key}.{axis}.{known}"] += 1
-    keys = f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {_type_keys(entry.type, entry.bits)}, "
-    keys += f"name: {_quoted(name)}"
+    keys = f"index: 0x{entry.index:04X}, sub_index: {entry.sub_index}, {types}, name: {_quoted(name)}"
     if is_constant:
         keys += f", safe: {_CSP}"  # no PDO shows the mode: it is not changed
     described = _object(device, entry.index, entry.sub_index)
-    is_bound = kind == "cia402" and key == "rpdo" and entry.index - (axis - 1) * OBJECTS_PER_AXIS in BOUNDING_OBJECTS
+    is_bound = kind == "cia402" and key == "rpdo" and first in BOUNDING_OBJECTS
+    bound = _default(device, entry.index, entry.sub_index) if is_bound else None
     if is_bound:
-        keys += f", safe: {_default(device, entry.index, entry.sub_index) or _widest(entry, axis):.10g}"
+        keys += ", safe: " + ("" if bound is None else f"{bound:.10g}")
     unit = None if described is None or described.unit is None or known or is_bound else units.unit(described.unit)
     if unit is not None and unit.si:
         keys += f", factor: {unit.factor:.10g}, unit: {_quoted(unit.si)}"
     said = [_clean(entry.name), entry.type if entry.type.upper() not in ("", "BOOL") else ""]
     if described is not None:
         said += _range_text(described)
-    if is_bound:
+    if is_bound and bound is None:
+        said.append(f"REQUIRED: safe, which is always sent; see {SOURCES['safe']}")
+    elif is_bound:
         said.append("CHECK: always sent; at 0 the drive has no torque")
     yield f"      - {{{keys}}}   # {', '.join(text for text in said if text)}".rstrip(" #")
 
 
-def _widest(entry: PdoEntry, axis: int) -> int:
-    """Return the widest limit of a drive: its rated torque, or the largest speed that the object can hold."""
-    is_speed = entry.index - (axis - 1) * OBJECTS_PER_AXIS == _MOST_SPEED
-    return (1 << entry.bits - 1) - 1 if is_speed else _RATED
+def _drive_type(first: int, entry: PdoEntry) -> str:
+    """Return the type keys of a drive's object by the standard, which fixes its sign; `first`: its index in axis 1."""
+    if resolve(entry.type, entry.bits).kind is Kind.REAL:
+        return _type_keys(entry.type, entry.bits)
+    written = f"{'uint' if first in _UNSIGNED else 'int'}{entry.bits}"
+    return f"type: {written}" if written in BITS else _type_keys(entry.type, entry.bits)
 
 
 def prefix_of(pdo: Pdo) -> str:
@@ -544,7 +651,7 @@ def _others(device: Device, key: str, outputs: bool) -> Iterator[str]:
     others = [pdo for pdo in (device.rx_pdos if outputs else device.tx_pdos) if pdo.index not in there]
     if others:
         listed = "; ".join(f"0x{pdo.index:04X} {_clean(pdo.name)} ({pdo.bits} bits)" for pdo in others)
-        yield from _comment(f"Further PDOs of {key}: {listed}")
+        yield from _comment(f"Further PDOs of {key} (`rtcp device new --pdo`): {listed}")
         yield ""
 
 

@@ -59,6 +59,8 @@ class Document:
     data: Any = None
     lines: dict[KeyPath, int] = field(default_factory=dict)
     """Line (from 1) of each key or list entry."""
+    unusual: set[KeyPath] = field(default_factory=set)
+    """Keys whose value is marked as intended although it looks like one in another unit, see `take_marks`."""
 
     def line(self, where: KeyPath) -> int:
         """Return the line of a key, or of the nearest one above it that exists."""
@@ -66,10 +68,36 @@ class Document:
             where = where[:-1]
         return self.lines.get(where, 1)
 
+    def take_marks(self) -> None:
+        """Replace each `{value: VALUE, unusual: true}` by its value, and add its key to `unusual`."""
+        self.data = self._unmarked(self.data, ())
+
+    def _unmarked(self, value: Any, where: KeyPath) -> Any:
+        if isinstance(value, list):
+            return [self._unmarked(entry, (*where, i)) for i, entry in enumerate(value)]
+        if not isinstance(value, dict):
+            return value
+        if value.keys() == {"value", "unusual"} and value["unusual"] is True:
+            self.unusual.add(where)
+            return value["value"]
+        return {key: self._unmarked(entry, (*where, key)) for key, entry in value.items()}
+
+    def empty_keys(self) -> set[KeyPath]:
+        """Return the keys that have no value."""
+        return set(_empty(self.data, ()))
+
     def placed(self, findings: Iterable[Finding]) -> list[Finding]:
         """Return the findings with file and line, in the order of the lines."""
         placed = [finding.at(self.path, self.line(finding.where)) for finding in findings]
         return sorted(placed, key=lambda finding: finding.line or 0)
+
+
+def _empty(value: Any, where: KeyPath) -> Iterator[KeyPath]:
+    if value is None:
+        yield where
+    elif isinstance(value, list | dict):
+        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _empty(entry, (*where, key))
 
 
 def read(path: Path) -> Document:

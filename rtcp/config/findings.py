@@ -47,7 +47,10 @@ _SENTENCES = {
     "one_of_both": "found {found}, allowed is {allowed}",
     "names_no_file": "found {found!v}, but there is no file {file}",
     "implausible": "found {found:g} {unit}, plausible is at most {high:.4g} {unit}: if this is in {likely}, write "
-    "{instead:.6g}",
+    "{instead:.6g}; if it is right, write {{value: {found:g}, unusual: true}}",
+    "never_unusual": "this value is marked as unusual, but the key has no limit of what is usual; "
+    "write the value alone",
+    "no_value": "this key has no value yet; {need}{where_from}",
     # devices
     "bool_scaled": "found {found:g} with the type bool, allowed is none: it is 0 or 1; leave it out",
     "modulo_of_type": "found {found} with the type {type}, allowed is an integer type",
@@ -101,6 +104,8 @@ _SENTENCES = {
     "no_offset": "its device {device} maps no {lacking}, which feed_forward needs",
     "no_box_at_all": "found {kind} {found}, but no slave is of kind io; leave it out for such an arm",
     "no_box": "found {found!v}, which is no IO box; allowed is {allowed}",
+    "above_drive": "found {found:g} rad/s, but the drive turns the joint with at most {high:.4g} rad/s: "
+    "max_motor_speed of {device} is {rpm:g} rpm; lower it, or if it is right write {{value: {found:g}, unusual: true}}",
     "beyond_wire": "found {sign}{found:g}, allowed is {low:g} to {high:g}: {of}",
     "tool_and_tools": "found beside tools: move it into the list, as its first",
     "mass_without_links": "found {found:g} beside links of unknown mass: it needs the key links",

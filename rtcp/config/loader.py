@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -39,8 +39,8 @@ from rtcp.config.model import (
     SlaveConfig,
 )
 from rtcp.config.numbers import Name
-from rtcp.config.scaling import FACTOR_TOLERANCE, QUANTITIES, DriveScaling
-from rtcp.config.validation import EVERY_KEY, Checker, FileRule, allowed, keys, rule
+from rtcp.config.scaling import FACTOR_TOLERANCE, QUANTITIES, SOURCES, DriveScaling
+from rtcp.config.validation import EVERY_KEY, Checker, FileRule, allowed, annotation, keys, rule
 
 RENAMED = {
     "home": "rest_pose",
@@ -104,7 +104,7 @@ def load(path: Path) -> ArmConfig:
         ConfigError: with one sentence for every mistake in all of these files: file, line, key, what was found and
             what is allowed.
     """
-    document = read(path)
+    document = _read(path)
     cycle, _ = _CYCLE.check(document.data.get("cycle", {}))
     kind, bus, missing = _bus_of(document)
     nodes = _nodes(document.data, bus, cycle)
@@ -122,13 +122,17 @@ def load(path: Path) -> ArmConfig:
             devices[key] = load_device(file, cycle.period_us if cycle else None)
         except ConfigError as error:
             in_devices += error.findings
-    drives = FileRule(("slaves", "joints", "gripper", "feed_forward"), partial(rules.drive_findings, devices=devices))
+    drives = FileRule(
+        ("slaves", "joints", "gripper", "feed_forward"),
+        partial(rules.drive_findings, devices=devices, unusual=document.unusual),
+    )
     terminals = FileRule(("slaves", "inputs", "outputs", "gripper"), partial(rules.terminal_findings, devices=devices))
     suits = FileRule((EVERY_KEY,), lambda arm: arm.bus.findings(arm))
+    usual = [_usual(needs, magnitudes, document) for needs, magnitudes in rules.OF_ARM.items()]
     checker: Checker[ArmFile] = _arm_checker(kind)  # type: ignore[arg-type]
     processes, wrong = _processes_of(document)
     data = {key: value for key, value in document.data.items() if key != "processes"}
-    arm, findings = checker.check(data, drives, terminals, suits)
+    arm, findings = checker.check(data, drives, terminals, suits, *usual)
     findings += missing + wrong
     if "joints" not in data and not document.data.get("processes"):
         wanted = f"a list of 1 to {MOST_AXES} mappings with the keys {', '.join(keys(Joint))}"
@@ -137,6 +141,8 @@ def load(path: Path) -> ArmConfig:
     elif data.get("joints") == [] and not document.data.get("processes"):
         findings.append(Finding(("joints",), "size", found=0, allowed=f"1 to {MOST_AXES} joints"))
     if arm is not None:
+        limited = [place for magnitudes in rules.OF_ARM.values() for place in magnitudes(arm)]
+        findings += rules.useless_marks(limited, document.unusual)
         described = {slave.name: slave.device for slave in nodes} or {
             slave.name: devices[slave.device] for slave in arm.slaves if slave.device in devices
         }
@@ -160,7 +166,6 @@ def load(path: Path) -> ArmConfig:
         arm=models[0] if models else None,
         other_tools=models[1:],
         source=path,
-        warnings=tuple(map(str, document.placed(rules.implausible(arm)))),
     )
 
 
@@ -260,14 +265,44 @@ def load_device(path: Path, period_us: float | None = None) -> DeviceDescription
     Raises:
         ConfigError: with one sentence for every mistake.
     """
-    document = read(path)
+    document = _read(path)
     timing = partial(rules.period_findings, period_us=period_us or 0.0)
     more = [FileRule(("kind", "watchdog_ms", "sync0_shift_us"), timing)] if period_us is not None else []
-    document.data, missing = _with_factors(document.data)
-    device, findings = _DEVICE.check(document.data, *more)
-    if device is None or missing:
+    empty = [*_without_value(document)]
+    data, missing = _with_factors(document.data)
+    device, findings = _DEVICE.check(data, _usual(("scaling",), rules.of_scaling, document), *more)
+    if empty:
+        # What follows from the missing values is not named beside them.
+        places = {finding.where for finding in empty}
+        findings, missing = [*empty, *(finding for finding in findings if finding.where not in places)], []
+    elif device is not None:
+        findings += rules.useless_marks(rules.of_scaling(device), document.unusual)
+    if device is None or findings or missing:
         raise ConfigError(document.placed(findings + missing))
     return device
+
+
+def _read(path: Path) -> Document:
+    """Read a file in which values may be marked as unusual; raises as `read`."""
+    document = read(path)
+    document.take_marks()
+    return document
+
+
+def _usual(needs: tuple[str, ...], magnitudes: Callable[[Any], Iterator[rules.Magnitude]], of: Document) -> FileRule:
+    """Return the rule that these values are plausible in their unit, or marked."""
+    return FileRule(needs, partial(rules.implausible, magnitudes=magnitudes, unusual=of.unusual))
+
+
+def _without_value(document: Document) -> Iterator[Finding]:
+    """Yield the keys of a device's file that `rtcp device new` left for a person to fill in."""
+    for where in sorted(document.empty_keys(), key=document.line):
+        try:
+            need = f"it must be {allowed(annotation(DeviceDescription, where))}"
+        except (KeyError, IndexError):
+            continue  # of an unknown key, which the checker names
+        source = SOURCES.get(str(where[-1]))
+        yield Finding(where, "no_value", need=need, where_from=f"; see {source}" if source else "")
 
 
 def _with_factors(data: Any) -> tuple[Any, list[Finding]]:
@@ -322,14 +357,14 @@ def load_kinematics(path: Path) -> ArmModel:
     Raises:
         ConfigError: with one sentence for every mistake: file, line, key, what was found and what is allowed.
     """
-    document = read(path)
+    document = _read(path)
     if _is_whole_arm(document):
         arm = load(path).arm
         if arm is None:
             finding = Finding((), "missing", key="kinematics", need=f"it must be {allowed(Kinematics)}")
             raise ConfigError(document.placed([finding]))
         return arm
-    file = _KINEMATICS.read(document)
+    file = _KINEMATICS.read(document, _usual(("kinematics",), rules.of_kinematics, document))
     return _arm_models(document, file.name, file.kinematics, ())[0]
 
 
@@ -340,7 +375,7 @@ def load_mechanics(path: Path) -> ArmModel:
         ConfigError: as `load_kinematics`.
     """
     model = load_kinematics(path)
-    part, _ = Checker(Kinematics).check(read(path).data["kinematics"])
+    part, _ = Checker(Kinematics).check(_read(path).data["kinematics"])
     return model if part is None or part.limits is None else replace(model, limits=_mechanical(part.limits))
 
 

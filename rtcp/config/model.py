@@ -1277,8 +1277,6 @@ class ArmConfig(ArmSettings):
     """Position of each drive at its axis' zero, rad, in the order of `axes`; empty: all 0."""
     source: Path = Path()
     """The file it was read from."""
-    warnings: tuple[str, ...] = ()
-    """Values that are allowed but implausible: file, line, key, value and the likely mistake."""
 
     def with_devices(self, devices: Sequence[DeviceDescription]) -> ArmConfig:
         """Return the configuration with other descriptions of its slaves, in their order."""

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from typing import Any, Protocol
 
 from rtcp.config.drive_limits import factor_of
 from rtcp.config.find import registered
@@ -19,6 +20,7 @@ from rtcp.config.model import (
     MODE_CHANNELS,
     MOST_AXES,
     PLATFORM_PARTS,
+    UNLIMITED_TORQUE,
     VIRTUAL,
     AnalogStickConfig,
     ArmConfig,
@@ -564,8 +566,16 @@ def _repeated_by_box(terminals: Terminals, noun: str) -> Iterator[Finding]:
         yield from repeated(of_box, noun)
 
 
-def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
-    """Yield the mistakes between joints and the slaves that move them; `devices`: the valid ones by name."""
+def drive_findings(
+    arm: ArmFile, devices: Mapping[str, DeviceDescription], unusual: Container[KeyPath]
+) -> Iterator[Finding]:
+    """Yield the mistakes between joints and the slaves that move them.
+
+    Args:
+        arm: the arm's file.
+        devices: the valid ones by name.
+        unusual: keys whose value is marked as intended.
+    """
     slaves = {slave.name: slave for slave in arm.slaves}
     for where, joint in axes_of(arm):
         slave = slaves.get(joint.slave)
@@ -590,7 +600,17 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
             mapped = {entry.name for entry in device.outputs}
             if where[0] == "joints" and (missing := [n for n in arm.feed_forward.channels if n not in mapped]):
                 yield Finding((*where, "slave"), "no_offset", lacking=missing, device=slave.device)
+            if (*where, "velocity") not in unusual:
+                yield from _above_the_drive(where, joint, device)
             yield from _beyond_the_wire(where, joint, device, arm.feed_forward.channels if where[0] == "joints" else ())
+
+
+def _above_the_drive(axis: KeyPath, joint: Joint, device: DeviceDescription) -> Iterator[Finding]:
+    """Yield a speed limit that the motor cannot reach: it is in another unit, or the gear ratio is wrong."""
+    scaling = device.scaling_of(joint.axis)
+    if scaling is not None and scaling.max_speed is not None and joint.velocity > scaling.max_speed:
+        of = {"device": device.name, "rpm": scaling.max_motor_speed, "high": scaling.max_speed}
+        yield Finding((*axis, "velocity"), "above_drive", found=joint.velocity, **of)
 
 
 def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
@@ -865,24 +885,49 @@ def _holds(outer: KeepOut, inner: Box) -> bool:
 
 _TWO_TURNS = 4 * math.pi
 _DEGREES, _MILLIMETRES, _GRAMS = ("degrees", math.radians(1)), ("millimetres", 1e-3), ("grams", 1e-3)
+_MILLI_NM = ("mNm", 1e-3)
+_MOST_TORQUE, _MOST_RATED_TORQUE = 3000.0, 1000.0
+"""Largest usual torque limit of a joint, and rated torque of a drive, Nm."""
 Magnitude = tuple[KeyPath, float, float, str, tuple[str, float]]
 """Key, value, largest plausible magnitude, unit, and the likely other unit with its factor."""
 
 
-def implausible(arm: ArmFile) -> Iterator[Finding]:
-    """Yield a warning for each value that is allowed, but plausible only in another unit."""
-    for where, value, most, unit, (likely, factor) in _magnitudes(arm):
-        if abs(value) > most:
+def implausible(
+    of: Any, magnitudes: Callable[[Any], Iterator[Magnitude]], unusual: Container[KeyPath]
+) -> Iterator[Finding]:
+    """Yield a finding for each value that is plausible only in another unit, and is not marked as `unusual`."""
+    for where, value, most, unit, (likely, factor) in magnitudes(of):
+        if abs(value) > most and where not in unusual:
             instead = {"likely": likely, "instead": value * factor}
             yield Finding(where, "implausible", found=value, high=most, unit=unit, **instead)
 
 
-def _magnitudes(arm: ArmFile) -> Iterator[Magnitude]:
+class HasKinematics(Protocol):
+    """An arm's file, or one of kinematics alone."""
+
+    @property
+    def kinematics(self) -> Kinematics | None:
+        """Its geometry."""
+
+
+def useless_marks(places: Iterable[Magnitude], unusual: Iterable[KeyPath]) -> Iterator[Finding]:
+    """Yield the keys that are marked as unusual and have no limit of what is usual."""
+    limited = {where for where, *_ in places}
+    yield from (Finding(where, "never_unusual") for where in unusual if where not in limited)
+
+
+def _of_joints(arm: ArmFile) -> Iterator[Magnitude]:
     for where, joint in axes_of(arm):
         yield (*where, "position", "min"), joint.position.min, _TWO_TURNS, "rad", _DEGREES
         yield (*where, "position", "max"), joint.position.max, _TWO_TURNS, "rad", _DEGREES
         yield (*where, "velocity"), joint.velocity, _TWO_TURNS, "rad/s", _DEGREES
         yield (*where, "acceleration"), joint.acceleration, 200.0, "rad/s^2", _DEGREES
+        if joint.torque != UNLIMITED_TORQUE:
+            yield (*where, "torque"), joint.torque, _MOST_TORQUE, "Nm", _MILLI_NM
+        yield (*where, "drive_torque"), joint.drive_torque or 0.0, _MOST_TORQUE, "Nm", _MILLI_NM
+
+
+def _of_cartesian(arm: ArmFile) -> Iterator[Magnitude]:
     least = arm.cartesian.singularity
     for key, value, unit, likely in (
         ("shoulder", least.shoulder, "m", _MILLIMETRES),
@@ -891,27 +936,47 @@ def _magnitudes(arm: ArmFile) -> Iterator[Magnitude]:
     ):
         yield ("cartesian", "singularity", key), value, 1.0, unit, likely
     yield ("cartesian", "clearance"), arm.cartesian.clearance, 1.0, "m", _MILLIMETRES
-    if arm.kinematics is None:
+
+
+def of_kinematics(file: HasKinematics) -> Iterator[Magnitude]:
+    """Yield the lengths, angles, speeds and masses of an arm's geometry."""
+    part = file.kinematics
+    if part is None:
         return
-    for i, row in enumerate(arm.kinematics.dh):
+    for i, row in enumerate(part.dh):
         for key in ("a", "d"):
             yield ("kinematics", "dh", i, key), getattr(row, key), 5.0, "m", _MILLIMETRES
-    for i, limit in enumerate(arm.kinematics.limits or ()):
+    for i, limit in enumerate(part.limits or ()):
         for key in ("min", "max"):
             yield ("kinematics", "limits", i, key), getattr(limit, key), _TWO_TURNS, "rad", _DEGREES
         yield ("kinematics", "limits", i, "velocity"), limit.velocity or 0.0, _TWO_TURNS, "rad/s", _DEGREES
-    for i, link in enumerate(arm.kinematics.links or ()):
+    for i, link in enumerate(part.links or ()):
         yield ("kinematics", "links", i, "mass"), link.mass, 200.0, "kg", _GRAMS
         yield ("kinematics", "links", i, "centre"), max(map(abs, link.centre)), 5.0, "m", _MILLIMETRES
-    yield ("kinematics", "tool", "position"), max(map(abs, arm.kinematics.tool.position)), 5.0, "m", _MILLIMETRES
-    for i, tool in enumerate(arm.kinematics.tools):
+    yield ("kinematics", "tool", "position"), max(map(abs, part.tool.position)), 5.0, "m", _MILLIMETRES
+    for i, tool in enumerate(part.tools):
         yield ("kinematics", "tools", i, "mass"), tool.mass, 200.0, "kg", _GRAMS
         for key in ("position", "centre"):
             yield ("kinematics", "tools", i, key), max(map(abs, getattr(tool, key))), 5.0, "m", _MILLIMETRES
-    for i, body in enumerate(arm.kinematics.bodies or ()):
+    for i, body in enumerate(part.bodies or ()):
         for key in ("start", "end"):
             yield ("kinematics", "bodies", i, key), max(map(abs, getattr(body, key))), 5.0, "m", _MILLIMETRES
         yield ("kinematics", "bodies", i, "radius"), body.radius, 1.0, "m", _MILLIMETRES
+
+
+def of_scaling(device: DeviceDescription) -> Iterator[Magnitude]:
+    """Yield the torques and currents of a drive."""
+    for i, scaling in enumerate(device.scaling):
+        where = ("scaling", i)
+        yield (*where, "rated_torque"), scaling.rated_torque or 0.0, _MOST_RATED_TORQUE, "Nm", _MILLI_NM
+        yield (*where, "rated_current"), scaling.rated_current or 0.0, 500.0, "A", ("milliamperes", 1e-3)
+        yield (*where, "torque_constant"), scaling.torque_constant or 0.0, 50.0, "Nm/A", ("mNm/A", 1e-3)
+
+
+OF_ARM: dict[tuple[str, ...], Callable[[Any], Iterator[Magnitude]]] = {
+    ("joints", "gripper"): _of_joints, ("cartesian",): _of_cartesian, ("kinematics",): of_kinematics,
+}  # fmt: skip
+"""Values of an arm's file that have a limit of what is usual, by the sections that hold them."""
 
 
 # -- motion files ------------------------------------------------------------------------------------------------------

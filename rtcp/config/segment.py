@@ -47,6 +47,8 @@ class SegmentSlave:
     """Product code of the device in the ESI file; left out: the only one."""
     revision: U32 | None = None
     """Revision number of the device in the ESI file; left out: the one that no other replaces."""
+    choice: Annotated[int, Ge(1)] | None = None
+    """Which of several devices of this product code and revision, in the order of the ESI file, from 1."""
     modules: tuple[U32 | None, ...] = ()
     """Ident of the module at each place of the device, from place 0 on; null leaves a place empty."""
     behaviour: Annotated[str, MinLen(1), MaxLen(256)] | None = None
@@ -104,7 +106,7 @@ def _options(slave: SegmentSlave) -> Iterator[Finding]:
         keys = " and ".join(sources) or "none of them"
         yield Finding((), "one_of_keys", found=keys, allowed="model, esi and sii")
     elif sources != ["esi"]:
-        for key in ("product", "revision", "modules"):
+        for key in ("product", "revision", "choice", "modules"):
             if getattr(slave, key) not in (None, ()):
                 yield Finding((key,), "key_of_esi")
     if sources == ["model"] and slave.behaviour is not None:

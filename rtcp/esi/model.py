@@ -20,11 +20,12 @@ class EsiError(Exception):
 
 
 class LookupFailure(EsiError):
-    """No device, or several, match; `candidates` lists the existing ones."""
+    """No device, or several, match; `candidates` lists those that match, or where there are none the existing ones."""
 
-    def __init__(self, origin: str, problem: str, candidates: tuple[str, ...]) -> None:
+    def __init__(self, origin: str, problem: str, candidates: tuple[str, ...], several: bool) -> None:
         super().__init__(origin, problem)
         self.candidates = candidates
+        self.several = several
 
 
 class Source(Enum):

@@ -392,23 +392,35 @@ def find_devices(
 
 
 def find_device(
-    file: model.DeviceFile, *, product: int | None = None, revision: int | None = None, name: str | None = None
+    file: model.DeviceFile,
+    *,
+    product: int | None = None,
+    revision: int | None = None,
+    name: str | None = None,
+    choice: int | None = None,
 ) -> model.Device:
     """Return the single matching device; of several revisions the one not hidden by another.
 
-    Raises LookupFailure with the candidates if none or several match.
+    With `choice`, which counts from 1, it is one of those that match. Raises LookupFailure with the candidates if none
+    or several match.
     """
     fitting = find_devices(file, product=product, revision=revision, name=name)
     if len(fitting) > 1:
         fitting = tuple(device for device in fitting if not device.hidden) or fitting
-    if len(fitting) == 1:
+    if choice is not None and 1 <= choice <= len(fitting):
+        return fitting[choice - 1]
+    if len(fitting) == 1 and choice is None:
         return fitting[0]
     candidates = tuple(describe(device) for device in fitting or file.devices)
     criteria = [
         f"{key} 0x{value:08X}" for key, value in (("product", product), ("revision", revision)) if value is not None
     ]
     criteria += [f"name {name}"] if name is not None else []
-    listed = "; ".join(candidates[:20]) + (f"; and {len(candidates) - 20} more" if len(candidates) > 20 else "")
+    criteria += [f"choice {choice}"] if choice is not None else []
+    numbered = [f"{number}: {text}" for number, text in enumerate(candidates, 1)] if fitting else candidates
+    listed = "; ".join(numbered[:20]) + (f"; and {len(candidates) - 20} more" if len(candidates) > 20 else "")
     failed = f"; not readable: {'; '.join(file.failures[:5])}" if file.failures else ""
     problem = f"{len(fitting) or 'no'} devices fit {', '.join(criteria) or 'without a choice'}"
-    raise model.LookupFailure(file.path, f"{problem}; there are: {listed or 'none'}{failed}", candidates)
+    raise model.LookupFailure(
+        file.path, f"{problem}; there are: {listed or 'none'}{failed}", candidates, several=len(fitting) > 1
+    )

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+from rtcp.config.scaling import BOUNDING_OBJECTS, OBJECTS_PER_AXIS
 from rtcp.esi import model, types
 from rtcp.esi.sii import read_sii
 from rtcp.fieldbus.bus import PdoEntryInfo, PdoInfo, slave_label
@@ -26,6 +27,9 @@ _READ, _WRITE, _RX, _TX = 0x07, 0x38, 0x40, 0x80
 """Access: read and write in PRE-OP, SAFE-OP and OP, mappable in RxPDOs and TxPDOs."""
 _WRITE_STATES = ((0x08, "P"), (0x10, "S"), (0x20, "O"))
 _CODES = {code.value: code for code in model.ObjectCode}
+_AXES = range(0x6000, 0xA000)
+_UNITS = {0x6075, 0x6076, 0x608F, 0x6091, 0x6092, 0x60A9, *BOUNDING_OBJECTS}
+"""Objects of the first axis of a drive with its units and bounds, whose values a device's file needs."""
 _COUNT = 0
 """Subindex of the number of entries."""
 
@@ -42,7 +46,7 @@ def pdos_of_eeprom(device: model.Device) -> tuple[tuple[PdoInfo, ...], tuple[Pdo
 
 
 def describe_device(sdo: SdoClient, has_coe: bool, eeprom: bytes, origin: str, progress: Progress) -> model.Device:
-    """Return the description of a slave in PRE-OP, with its present PDO assignment.
+    """Return the description of a slave in PRE-OP, with its present PDO assignment, and a drive's present units.
 
     Args:
         sdo: SDO access to it.
@@ -131,8 +135,25 @@ def _read_objects(sdo: SdoClient, progress: Progress) -> Iterator[model.Dictiona
         except SdoAborted:
             item = None
         if item is not None:
-            yield item
+            yield _with_values(sdo, item) if _is_unit(index) else item
         progress(at / len(indices))
+
+
+def _is_unit(index: int) -> bool:
+    """Whether an object states what an axis of a drive counts in, or limits it."""
+    return index in _AXES and _AXES.start + index % OBJECTS_PER_AXIS in _UNITS
+
+
+def _with_values(sdo: SdoClient, item: model.DictionaryObject) -> model.DictionaryObject:
+    """Return an object with the values that the slave has now."""
+
+    def value(entry: model.ObjectEntry) -> bytes | None:
+        try:
+            return finish(sdo.reading(item.index, entry.sub_index)) if entry.readable else None
+        except SdoAborted:
+            return None
+
+    return replace(item, entries=tuple(replace(entry, default=value(entry)) for entry in item.entries))
 
 
 def _read_object(sdo: SdoClient, index: int) -> model.DictionaryObject | None:

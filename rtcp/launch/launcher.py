@@ -114,8 +114,6 @@ def start(options: StartOptions, report: Report, check_segment: CheckSegment = l
         if not is_running(pids.loop):
             clear(directory, pids)
             config = _configure(options)
-            for warning in config.warnings:
-                report(f"warning: {warning}")
             _check_bus(config, check_segment)
             return _start_all(directory, config, options, began_ns, report)
         if is_running(pids.gateway):

@@ -51,7 +51,7 @@ class Descriptions:
         except EsiError as error:
             raise _mistake("esi", error) from error
         try:
-            device = find_device(file, product=slave.product, revision=slave.revision)
+            device = find_device(file, product=slave.product, revision=slave.revision, choice=slave.choice)
         except EsiError as error:
             raise _mistake("esi" if slave.product is None else "product", error) from error
         try:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,17 +17,27 @@ from rtcp.config import default_config
 from rtcp.config.device_file import file_text, kind_of
 from rtcp.config.loader import load_device
 from rtcp.config.model import PdoEntry
+from rtcp.config.segment import SegmentSlave
+from rtcp.esi.model import Pdo, Source
 from rtcp.esi.modules import assemble
 from rtcp.esi.reader import find_device, read_esi
 from rtcp.fieldbus.clocks import sync_cycles
 from rtcp.launch import offline
+from rtcp.virtual.descriptions import Descriptions
 from tests.drive_esi import write_esi
 from tests.fieldbus.terminals import write_segment
+from tests.required import filled
 
 FILES = Path(__file__).parents[1] / "esi" / "files"
+MAKERS = Path(__file__).parents[1] / "makers"
 DRIVE, AXES, TERMINALS, ANALOG, SAMPLING = (
     FILES / f"{name}.xml" for name in ("drive", "axes", "terminals", "analog", "sampling")
 )
+
+
+def fill(file: Path) -> None:
+    """Fill in what a device's file asks for."""
+    file.write_text(filled(file.read_text()))
 
 
 def test_a_file_is_listed_with_its_devices_modules_and_what_is_hidden(rtcp: Callable[..., Any]) -> None:
@@ -43,6 +55,7 @@ def test_a_drive_becomes_a_file_that_the_platform_reads(rtcp: Callable[..., Any]
     done = rtcp("device", "new", "--esi", str(DRIVE), "--out", str(out))
     assert done.code == 0
     assert "CHECK" in done.out
+    fill(out)
     device, described = load_device(out), find_device(read_esi(DRIVE))
     assert (device.kind, device.vendor_id) == ("cia402", described.identity.vendor_id)
     assert device.product_id == described.identity.product_code
@@ -97,13 +110,140 @@ def test_what_cannot_be_made_is_refused_in_a_sentence_and_nothing_is_written(
     assert not (tmp_path / "x.yaml").exists()
 
 
+def test_the_figures_that_nothing_states_are_listed_at_once_and_the_file_is_refused_until_they_are_there(
+    rtcp: Callable[..., Any], tmp_path: Path
+) -> None:
+    out = tmp_path / "drive.yaml"
+    made = rtcp("device", "new", "--esi", str(MAKERS / "copley_bel.xml"), "--out", str(out))
+    keys = (
+        "encoder_increments", "gear_ratio", "external_gear_ratio", "feed_constant", "velocity_unit", "velocity_at",
+        "rated_torque", "torque_at",
+    )  # fmt: skip
+    assert (made.code, "refused until these 8 values are filled in" in made.out + made.trouble) == (0, True)
+    refused = rtcp("device", "check", str(out))
+    assert refused.code == 2
+    for key in keys:
+        assert f"scaling[0].{key}: this key has no value yet; it must be " in refused.trouble
+    assert "see 0x608F of the drive (subindex 1 by 2), or the encoder's data sheet" in refused.trouble
+    assert refused.trouble.count("this key has no value yet") == len(keys)
+    fill(out)
+    assert rtcp("device", "check", str(out)).code == 0
+
+
+def test_the_pdos_that_can_be_assigned_are_listed_with_their_entries_and_chosen(
+    rtcp: Callable[..., Any], tmp_path: Path
+) -> None:
+    esi, out = ("--esi", str(MAKERS / "inovance_is620n.xml")), tmp_path / "drive.yaml"
+    listed = rtcp("device", "new", *esi, "--pdo", "list")
+    assert listed.code == 0
+    assert "rpdo 0x1701 Outputs 1701, 96 bits; default; fixed; excludes 0x1600 0x1702" in listed.out
+    assert "    0x6060:0 Mode, 8 bits SINT" in listed.out
+    assert rtcp("device", "new", *esi, "--pdo", "0x1702", "--pdo", "0x1B02", "--out", str(out)).code == 0
+    fill(out)
+    device = load_device(out)
+    assert [pdo.index for pdo in (*device.rpdo, *device.tpdo)] == [0x1702, 0x1B02]
+    assert {"modes_of_operation", "target_velocity"} <= {entry.name for entry in device.outputs}
+    for chosen, sentence in (
+        (("0x1702", "0x1701"), "PDO 0x1702 excludes 0x1701: choose one of them"),
+        (("0x1777",), "it has no PDO 0x1777; there are: 0x1600, 0x1701, 0x1702, 0x1A00, 0x1B01, 0x1B02"),
+    ):
+        options = [text for index in chosen for text in ("--pdo", index)]
+        refused = rtcp("device", "new", *esi, *options, "--out", str(tmp_path / "x.yaml"))
+        assert (refused.code, sentence in refused.trouble) == (2, True), refused.trouble
+        assert not (tmp_path / "x.yaml").exists()
+
+
+def test_a_clock_mode_that_an_eeprom_lacks_is_asked_for_and_a_terminal_without_one_has_none() -> None:
+    drive = replace(find_device(read_esi(DRIVE), product=0x402), dc_modes=())
+    assert "\nassign_activate:     # REQUIRED\n" in file_text(replace(drive, source=Source.SII))
+    assert "\nassign_activate: 0x0000 " in file_text(drive)
+    terminal = find_device(read_esi(TERMINALS), product=0x7D43052)
+    assert "\nassign_activate: 0x0000 " in file_text(replace(terminal, source=Source.SII))
+
+
+@pytest.mark.parametrize(
+    ("sizes", "kind"),
+    [
+        ({0x6060: 16}, "cia402"),  # a mode of two bytes is sent as a constant
+        ({0x6061: 16}, "cia402"),
+        ({0x6040: 32}, "generic"),
+        ({0x607A: 8}, "generic"),
+    ],
+)
+def test_a_drive_whose_objects_have_unusual_lengths_gives_a_file_that_is_accepted(
+    tmp_path: Path, sizes: dict[int, int], kind: str
+) -> None:
+    drive = find_device(read_esi(MAKERS / "synapticon_somanet.xml"))
+
+    def resized(pdos: tuple[Pdo, ...]) -> tuple[Pdo, ...]:
+        entries = [
+            replace(entry, bits=sizes.get(entry.index, entry.bits), type="") for pdo in pdos for entry in pdo.entries
+        ]
+        return (replace(pdos[0], entries=tuple(entries)),)
+
+    drive = replace(drive, rx_pdos=resized(drive.rx_pdos), tx_pdos=resized(drive.tx_pdos), objects=())
+    file = tmp_path / "drive.yaml"
+    file.write_text(filled(file_text(drive)))
+    device = load_device(file)
+    assert device.kind == kind
+    if kind == "cia402":
+        assert device.startup(0x6060) == 8
+
+
+def test_only_the_objects_of_the_standard_have_the_names_that_the_driver_reads(tmp_path: Path) -> None:
+    text = (MAKERS / "inovance_is620n.xml").read_text().replace("<Name>Error code</Name>", "<Name>Position</Name>")
+    (tmp_path / "drive.xml").write_text(text)
+    file = tmp_path / "drive.yaml"
+    file.write_text(filled(file_text(find_device(read_esi(tmp_path / "drive.xml")))))
+    assert {entry.name: entry.index for entry in load_device(file).inputs if "position" in entry.name} == {
+        "position_603f": 0x603F, "position": 0x6064, "probe_position_1": 0x60BA, "probe_position_2": 0x60BC,
+    }  # fmt: skip
+
+
+def test_of_several_devices_of_one_identity_one_is_chosen_and_without_a_choice_all_are_listed(
+    rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (MAKERS / "elmo_gold.xml").read_text()
+    begin, end = text.index("    <Device "), text.index("</Device>") + len("</Device>")
+    other = text[begin:end].replace(">Gold drive<", ">Gold drive in boot<").replace("#x160C", "#x160D")
+    twice, out = tmp_path / "twice.xml", tmp_path / "drive.yaml"
+    twice.write_text(text[:end] + "\n" + other + text[end:])
+    new = ("device", "new", "--esi", str(twice), "--out", str(out))
+    refused = rtcp(*new)
+    assert refused.code == 2
+    assert (
+        "2 devices fit without a choice; there are: 1: Gold drive (Gold drive), product 0x00030924" in refused.trouble
+    )
+    assert "2: Gold drive in boot" in refused.trouble
+    assert "give one by --product, --revision or --choice" in refused.trouble
+    assert not out.exists()
+    assert "no devices" not in rtcp(*new, "--choice", "3").trouble
+    assert rtcp(*new, "--choice", "2").code == 0
+    assert "name: Gold drive in boot" in out.read_text()
+    out.unlink()
+    virtual = Descriptions(tmp_path).make(SegmentSlave(esi="twice.xml", choice=2))
+    assert virtual.identity.name == "Gold drive in boot"
+    # At a terminal it asks.
+    monkeypatch.setattr("sys.stdin", Terminal("1\n"))
+    asked = rtcp(*new)
+    assert (asked.code, "Which of these devices" in asked.out) == (0, True), asked.trouble
+    assert "name: Gold drive\n" in out.read_text()
+
+
+class Terminal(io.StringIO):
+    """An input at which somebody answers."""
+
+    def isatty(self) -> bool:
+        return True
+
+
 def test_every_sample_becomes_a_file_that_can_be_read(tmp_path: Path) -> None:
     for path in sorted(FILES.glob("*.xml")):
         content = read_esi(path)
         for number, device in enumerate(content.devices):
             whole = assemble(device, content.modules) if device.slots else device
             out = tmp_path / f"{path.stem}-{number}.yaml"
-            out.write_text(file_text(whole))
+            out.write_text(filled(file_text(whole)))
             load_device(out)
 
 
@@ -180,10 +320,11 @@ def test_a_drive_that_bounds_itself_by_process_data_is_not_sent_0_and_holds_afte
     write_esi(tmp_path / "drive.xml", bounding, {0x6872: ("UINT", 800)})
     out = tmp_path / "drive.yaml"
     out.write_text(text := file_text(find_device(read_esi(tmp_path / "drive.xml"))))
+    assert text.count("REQUIRED: safe, which is always sent") == 2
+    fill(out)
     device = load_device(out)
-    assert {entry.index: entry.safe for entry in device.outputs[-2:]} == {0x6872: 1000, 0x6880: 2**31 - 1}
+    assert {entry.index: entry.safe for entry in device.outputs[-2:]} == {0x6872: 1000, 0x6880: 1000}
     assert [device.startup(0x605A, axis) for axis in (1, 2)] == [6, 6]
-    assert text.count("CHECK: always sent; at 0 the drive has no torque") == 2
 
 
 def test_names_that_mean_something_to_others_are_names_here(rtcp: Callable[..., Any], tmp_path: Path) -> None:
@@ -238,6 +379,11 @@ def test_a_slave_that_is_there_becomes_a_file_and_each_difference_from_it_is_nam
     out, config = arm.parent / "devices" / "drive.yaml", ("--config", str(arm))
     done = rtcp("device", "new", "--from-bus", "virtual", "--slave", "2", "--out", str(out), *config)
     assert done.code == 0, done.trouble
+    # What the drive holds itself is read, and no guess stands for the rest.
+    text = out.read_text()
+    assert re.search(r"encoder_increments: (\d+) +# increments per motor revolution; 0x608F, read from the drive", text)
+    assert re.search(r"torque_at: +# REQUIRED", text)
+    fill(out)
     shipped, written = load_device(arm.parent / "devices" / "cubemars-orh.yaml"), load_device(out)
     assert (written.kind, written.vendor_id, written.product_id, written.coe) == (
         "cia402",

@@ -211,7 +211,7 @@ def test_three_drives_of_two_axes_move_six_joints(tmp_path: Path) -> None:
     [
         ({"axis": 1}, "joints[1].slave: repeated of=joints[0].slave"),
         ({"axis": 3}, "joints[1].axis: axis found=3"),
-        ({"torque": 2000.0, "drive_torque": 4000.0}, "joints[1].torque: beyond_wire found=2000.0"),
+        ({"torque": 2000.0, "drive_torque": 2500.0}, "joints[1].torque: beyond_wire found=2000.0"),
     ],
 )
 def test_a_joint_that_names_a_wrong_axis_or_what_the_drive_cannot_express_is_refused(

@@ -14,6 +14,7 @@ from rtcp.ipc.runtime_directory import control_socket
 from tests.drive_esi import write_esi
 from tests.e2e.arms import replace_drives
 from tests.e2e.conftest import CUBEMARS, Platform
+from tests.required import filled
 
 pytestmark = [pytest.mark.platform, CUBEMARS]
 
@@ -88,7 +89,8 @@ def test_an_arm_built_from_the_file_of_its_drives_maker_moves_and_stops_and_its_
     add_valves(folder)
     made, arm = folder / "devices" / "made.yaml", folder / "assistive_arm.yaml"
     assert "CHECK" in platform.rtcp("device", "new", "--esi", str(folder / "drive.xml"), "--out", str(made)).stdout
-    made.write_text(made.read_text().replace("torque_at: motor", "torque_at: output"))
+    figures = {"torque_at": "output", "velocity_unit": "counts/s", "velocity_at": "motor"}
+    made.write_text(filled(made.read_text(), figures))
     arm.write_text(arm.read_text().replace("device: two-axis-drive", "device: made"))
     platform.rtcp("start", "--detach")
     with rtcp.connect("a test", control_socket(platform.directory)) as robot:

@@ -202,7 +202,7 @@ def test_of_several_revisions_the_one_that_none_hides_is_found() -> None:
 def test_a_device_that_is_ambiguous_or_absent_is_refused_with_what_there_is() -> None:
     file = read_esi(FILES / "terminals.xml")
     with pytest.raises(
-        model.LookupFailure, match=r"3 devices fit without a choice; there are: 2 digital outputs \(DO-2\)"
+        model.LookupFailure, match=r"3 devices fit without a choice; there are: 1: 2 digital outputs \(DO-2\)"
     ) as target:
         find_device(file)
     assert len(target.value.candidates) == 3
