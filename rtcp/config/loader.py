@@ -121,7 +121,9 @@ def load(path: Path) -> ArmConfig:
             devices[key] = load_device(file, cycle.period_us if cycle else None)
         except ConfigError as error:
             in_devices += error.findings
-    drives = FileRule(("slaves", "joints", "gripper", "feed_forward"), partial(rules.drive_findings, devices=devices))
+    drives = FileRule(
+        ("slaves", "joints", "gripper", "external_axes", "feed_forward"), partial(rules.drive_findings, devices=devices)
+    )
     terminals = FileRule(("slaves", "inputs", "outputs", "gripper"), partial(rules.terminal_findings, devices=devices))
     suits = FileRule((EVERY_KEY,), lambda arm: arm.bus.findings(arm))
     checker: Checker[ArmFile] = _arm_checker(kind)  # type: ignore[arg-type]
@@ -129,11 +131,12 @@ def load(path: Path) -> ArmConfig:
     data = {key: value for key, value in document.data.items() if key != "processes"}
     arm, findings = checker.check(data, drives, terminals, suits)
     findings += missing + wrong
-    if "joints" not in data and not document.data.get("processes"):
+    alone = document.data.get("processes") or data.get("external_axes")
+    if "joints" not in data and not alone:
         wanted = f"a list of 1 to {MOST_AXES} mappings with the keys {', '.join(keys(Joint))}"
-        need = f"it must be {wanted}; a platform of processes has none"
+        need = f"it must be {wanted}; a platform of processes or external axes alone has none"
         findings.append(Finding((), "missing", key="joints", need=need))
-    elif data.get("joints") == [] and not document.data.get("processes"):
+    elif data.get("joints") == [] and not alone:
         findings.append(Finding(("joints",), "size", found=0, allowed=f"1 to {MOST_AXES} joints"))
     if arm is not None:
         described = {slave.name: slave.device for slave in nodes} or {

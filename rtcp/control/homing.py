@@ -83,17 +83,19 @@ class Homing:
     """
 
     __slots__ = (
-        "_cycles", "_drive", "_latched", "_longest", "_mode_cycles", "_outcome", "_rest", "_turned", "phase", "shown",
-        "shown_mode",
+        "_back", "_cycles", "_drive", "_latched", "_longest", "_mode_cycles", "_outcome", "_rest", "_turned", "phase",
+        "shown", "shown_mode",
     )  # fmt: skip
 
-    def __init__(self, period_s: float, longest_s: float = _LONGEST_S) -> None:
+    def __init__(self, period_s: float, longest_s: float = _LONGEST_S, back: int = CSP) -> None:
         """Prepare to home one drive at a time.
 
         Args:
             period_s: period of the cycle, s.
             longest_s: longest search of a drive for its home, s.
+            back: mode of operation before and after.
         """
+        self._back = back
         self._longest = round(longest_s / period_s)
         self._mode_cycles = round(_MODE_S / period_s)
         self._rest = round(_REST_S / period_s)
@@ -140,7 +142,7 @@ class Homing:
     def abandon(self) -> None:
         """Release the drive: it has faulted, or another stop takes over."""
         if self._drive is not None and not self.ended:
-            self._drive.mode = CSP
+            self._drive.mode = self._back
             self._enter(_P.STOPPED)
 
     def step(self) -> HomingPhase:
@@ -169,7 +171,7 @@ class Homing:
             elif self._cycles > self._rest:
                 # CSP would stop a turning joint with a jerk, so it is stopped otherwise.
                 self._enter(_P.RUNNING)
-        elif drive.mode_display == CSP and self._cycles > 1:
+        elif drive.mode_display == self._back and self._cycles > 1:
             self._enter(self._outcome)
         elif self._cycles > self._mode_cycles:
             self._enter(_P.STUCK)
@@ -200,7 +202,7 @@ class Homing:
         drive = self._drive
         if drive is not None:
             drive.controlword = ENABLE_OPERATION
-            drive.mode = CSP
+            drive.mode = self._back
             if self._turned:
                 drive.latch()
             self._latched = True
