@@ -14,6 +14,7 @@ import rtcp
 from rtcp.api import RtcpError
 from rtcp.cli import (
     arm,
+    axis,
     bus,
     cell,
     commission,
@@ -77,8 +78,8 @@ def _root(
 
 
 _GROUPS = (
-    platform, status, cell, commission, motion, process, jog, arm, bus, device, slaves, segment, irc5, demo, service,
-    doctor, soak, faults, record, recorded, live, experiment, user_trial, panel, ros, shape_set,
+    platform, status, cell, commission, motion, axis, process, jog, arm, bus, device, slaves, segment, irc5, demo,
+    service, doctor, soak, faults, record, recorded, live, experiment, user_trial, panel, ros, shape_set,
 )  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)
