@@ -424,8 +424,7 @@ def _described(step: Step) -> str:
     if step.gripper is not None:
         return f"gripper: {step.gripper}"
     if step.axis is not None:
-        what = "home" if step.home else f"to {step.position:g}" if step.position is not None else ""
-        return f"axis {step.axis}: {what or f'velocity {step.velocity:g}'}"
+        return axis_motion(step)
     if step.output is not None:
         return f"output {step.output}: {'on' if step.value else 'off'}"
     if step.wait_for is not None:
@@ -446,6 +445,17 @@ def _act(robot: Robot, step: Step) -> None:
         robot.io.wait(step.wait_for, step.value, step.timeout_s)
     elif step.tool is not None:
         robot.set_tool(step.tool)
+
+
+def axis_motion(step: Step) -> str:
+    """Return the step of an external axis in words."""
+    if step.home:
+        return f"axis {step.axis}: home"
+    if step.position is not None:
+        return f"axis {step.axis}: to {step.position:g}"
+    if step.velocity:
+        return f"axis {step.axis}: velocity {step.velocity:g} for {step.time_s:g} s"
+    return f"axis {step.axis}: stop"
 
 
 def _act_axis(robot: Robot, step: Step, axis: str) -> None:

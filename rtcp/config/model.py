@@ -495,6 +495,16 @@ class Joint:
         return self.slave if self.axis == 1 else f"{self.slave}, axis {self.axis}"
 
 
+@dataclass(frozen=True)
+class Travel(Range):
+    """The range of an external axis; `min < max`."""
+
+    min: float
+    """Lower end, m or rad."""
+    max: float
+    """Upper end, m or rad; greater than `min`."""
+
+
 AxisMode = Literal["position", "velocity", "homing"]
 """Modes of operation of an external axis: profile position (1), profile velocity (3), homing (6); CiA 402-2."""
 
@@ -510,19 +520,19 @@ class ExternalAxis:
     slave: Name
     """Drive that moves the axis: a name under `slaves` of kind `cia402`; unique, or with another `axis`."""
     velocity: Rate
-    """Speed limit; also of a motion without a speed."""
+    """Speed limit, m/s or rad/s; also the speed of a motion without one."""
     acceleration: Rate
-    """Acceleration and deceleration of the drive's profile (0x6083, 0x6084 among the start-up SDOs)."""
+    """Acceleration of the drive's profile, m/s² or rad/s²: what 0x6083 and 0x6084 are among its start-up SDOs."""
     unit: Literal["m", "rad"] = "rad"
     """Unit of its positions; the factors in the device file are of the same unit."""
-    position: Range | None = None
+    position: Travel | None = None
     """Range of its positions; left out: the axis has no ends, as a conveyor."""
     modes: Annotated[tuple[AxisMode, ...], MinLen(1)] = ("position",)
     """What it is used for. It rests in profile position, without `position` in profile velocity at speed 0. With
     `homing` it moves only after it was homed since the start, the last emergency stop and the last loss of its drive.
     """
     tolerance: Positive = 1e-3
-    """Largest distance from its target at which it has arrived."""
+    """Largest distance from its target at which it has arrived, m or rad."""
     axis: AxisNumber = 1
     """Axis of `slave`, where its drive has several."""
 

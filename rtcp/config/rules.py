@@ -48,6 +48,7 @@ from rtcp.config.model import (
     Step,
     Stop,
     Tool,
+    Travel,
     integer_range,
 )
 from rtcp.config.scaling import BOUNDING_OBJECTS, FACTOR_TOLERANCE, OBJECTS_PER_AXIS, QUANTITIES, DriveScaling
@@ -403,6 +404,7 @@ def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Fin
 
 
 @rule(Range)
+@rule(Travel)
 @rule(MechanicalLimit)
 def _range(limits: Range | MechanicalLimit) -> Iterator[Finding]:
     return _order(limits.min, limits.max)
@@ -468,6 +470,15 @@ def _external_axis(axis: ExternalAxis) -> Iterator[Finding]:
             yield Finding(("position",), "range", found=max(-low, high), allowed=f"less than {ENDLESS:g}")
 
 
+@rule(ArmFile, "slaves", "external_axes", "processes")
+def _parts_of_axes(arm: ArmFile) -> Iterator[Finding]:
+    """Yield external axes with the name of another part: both would have the same fields in the record."""
+    taken = PLATFORM_PARTS | {part.name for part in (*arm.slaves, *arm.processes)}
+    for i, axis in enumerate(arm.external_axes):
+        if axis.name in taken:
+            yield Finding(("external_axes", i, "name"), "name_of_part", found=axis.name)
+
+
 @rule(ArmFile, "joints", "gripper", "external_axes")
 def _axis_names(arm: ArmFile) -> Iterator[Finding]:
     axes = list(axes_of(arm))
@@ -475,10 +486,6 @@ def _axis_names(arm: ArmFile) -> Iterator[Finding]:
     yield from repeated((((*where, "slave"), joint.place) for where, joint in axes), "slave")
     if len(axes) > MOST_AXES:
         yield Finding(axes[-1][0], "too_many_axes", joints=len(axes) - 1, allowed=f"{MOST_AXES} in all")
-    taken = PLATFORM_PARTS | {slave.name for slave in arm.slaves}
-    for i, axis in enumerate(arm.external_axes):
-        if axis.name in taken:
-            yield Finding(("external_axes", i, "name"), "name_of_part", found=axis.name)
     for where, joint in axes:
         if joint.name == _ALL_JOINTS:
             yield Finding((*where, "name"), "limit_key", found=_ALL_JOINTS, means="all joints")

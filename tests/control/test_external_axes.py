@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,7 +13,16 @@ from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.control.external_axis import ExternalAxisGroup
 from rtcp.ipc.commands import Command, Disable, Halt, HomeAxis, MoveAxis, Reset, RunAxis, StopAxis
-from rtcp.ipc.events import AxisAtRest, AxisFailed, AxisModeLost, AxisNotReplaced, Event, Homed, LeaseExpired
+from rtcp.ipc.events import (
+    AxisAtRest,
+    AxisFailed,
+    AxisModeLost,
+    AxisNotReplaced,
+    AxisStillMoving,
+    Event,
+    Homed,
+    LeaseExpired,
+)
 from rtcp.ipc.states import State
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
@@ -246,5 +256,18 @@ def test_a_drive_that_leaves_its_mode_is_a_fault(bench: Bench) -> None:
     bench.bring_to(State.FAULT, 2.0)
     lost = bench.last_of(AxisModeLost)
     assert "shows mode 8, commanded is profile velocity" in bench.names.message(lost)
+    bench.run(1.0)
+    assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> None:
+    servo = bench.drives[BELT].servo
+    servo._control_halt = lambda controlword: None  # type: ignore[method-assign]
+    bench.do(RunAxis(BELT, 0.15, 0.3))
+    # The target velocity of 0 is lost too.
+    servo._modes[3]._target = SimpleNamespace(value=15000)  # type: ignore[attr-defined]
+    bench.bring_to(State.FAULT, 6.0)
+    still = bench.last_of(AxisStillMoving)
+    assert bench.names.message(still).startswith("belt does not come to rest although it is halted: 0.15")
     bench.run(1.0)
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
