@@ -303,13 +303,15 @@ class GripperRest:
 
 @dataclass(frozen=True)
 class Zero:
-    """The zero of a joint, rad of its drive."""
+    """The zero of a joint, rad of its drive; of an external axis in its unit."""
 
     joint: str
     offset: float
     before: float
     file: str
     """File in which it is kept."""
+    unit: str = "rad"
+    """m or rad"""
 
 
 @dataclass(frozen=True)

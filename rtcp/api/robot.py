@@ -682,7 +682,7 @@ class Methods:
                 `axis_disabled`, `axis_mode_missing`; `axis_stopped` (`position`): it was stopped on its way.
             Fault: reason `axis_failed`: its drive did not carry it out.
         """
-        params = {"axis": axis, "position": position, "speed": speed or 0.0}
+        params = {"axis": axis, "position": position, "speed": speed}
         return Call("move_axis", params, lambda answer: float(answer["position"]))
 
     @Method

@@ -470,10 +470,10 @@ def _external_axis(axis: ExternalAxis) -> Iterator[Finding]:
             yield Finding(("position",), "range", found=max(-low, high), allowed=f"less than {ENDLESS:g}")
 
 
-@rule(ArmFile, "slaves", "external_axes", "processes")
+@rule(ArmFile, "slaves", "external_axes")
 def _parts_of_axes(arm: ArmFile) -> Iterator[Finding]:
     """Yield external axes with the name of another part: both would have the same fields in the record."""
-    taken = PLATFORM_PARTS | {part.name for part in (*arm.slaves, *arm.processes)}
+    taken = PLATFORM_PARTS | {slave.name for slave in arm.slaves}
     for i, axis in enumerate(arm.external_axes):
         if axis.name in taken:
             yield Finding(("external_axes", i, "name"), "name_of_part", found=axis.name)

@@ -193,6 +193,8 @@ class CommandHandler:
 
     def _home(self, command: commands.Home, lease: int) -> refusals.Refusal | None:
         arm = self._arm
+        if self._external_axis(command.axis) is not None:
+            return refusals.IsExternalAxis(command.axis)
         if not 0 <= command.axis < len(arm.drives):
             return refusals.UnknownAxis(command.axis, len(arm.drives) - 1)
         drive = arm.drives[command.axis]

@@ -34,6 +34,7 @@ from rtcp.ipc.events import (
     LeftRange,
 )
 from rtcp.ipc.refusals import (
+    AxisAtEnd,
     AxisBusy,
     AxisDisabled,
     AxisHoldOutOfRange,
@@ -172,7 +173,7 @@ class ExternalAxisGroup(JointGroup):
         if not 0.0 < hold_s <= LONGEST_HOLD_S:
             return AxisHoldOutOfRange(self.first, hold_s, LONGEST_HOLD_S)
         if self._reaches_end(velocity):
-            return AxisOutOfRange(self.first, self.drive.position)
+            return AxisAtEnd(self.first, self.drive.position)
         self._velocity, self.lease = velocity, lease
         self._held = self._cycles(hold_s)
         self._reports, self._reached = True, False

@@ -7,7 +7,7 @@ import dataclasses
 import math
 from typing import Annotated
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Gt, Le
 
 from rtcp.gateway.command_channel import BROKEN, Caller, CommandChannel, Json, Lease
 from rtcp.gateway.method import HOLD_S, index_of, left, method
@@ -39,10 +39,12 @@ class AxisActions:
         """The lease of the axes that run, by connection."""
 
     @method()
-    async def move_axis(self, caller: Caller, axis: str, position: float, speed: Annotated[float, Ge(0)] = 0.0) -> Json:
-        """Move an external axis to a position, m or rad; `speed`: m/s or rad/s, 0: its limit. Returns `position`."""
+    async def move_axis(
+        self, caller: Caller, axis: str, position: float, speed: Annotated[float, Gt(0)] | None = None
+    ) -> Json:
+        """Move an external axis to a position, m or rad, at `speed`, m/s or rad/s. Returns its `position`."""
         number = self._number(axis)
-        end = await self._moved(caller, number, MoveAxis(number, position, speed))
+        end = await self._moved(caller, number, MoveAxis(number, position, 0.0 if speed is None else speed))
         if isinstance(end, AxisAtRest) and not end.reached:
             unit = self._channel.config.unit_of(number)
             message = f"{axis} was stopped at {end.position:.6g} {unit}, before it was at {position:.6g} {unit}"

@@ -199,10 +199,23 @@ class AxisBusy(Refusal):
 
 
 class AxisOutOfRange(Refusal):
-    """{joint}: {value:.6g} rad is outside its range, or the axis would leave its range there: {axis_range}"""
+    """{joint}: {value:.6g} rad is outside its range: {axis_range}"""
 
     axis: int
     value: float
+
+
+class AxisAtEnd(Refusal):
+    """{joint} stands at {value:.6g} rad and would leave its range at this velocity: {axis_range}"""
+
+    axis: int
+    value: float
+
+
+class IsExternalAxis(Refusal):
+    """{joint} is an external axis, no joint: `rtcp axis home {joint}`"""
+
+    axis: int
 
 
 class AxisSpeedOutOfRange(Refusal):

@@ -12,7 +12,7 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.control.external_axis import ExternalAxisGroup
-from rtcp.ipc.commands import Command, Disable, Halt, HomeAxis, MoveAxis, Reset, RunAxis, StopAxis
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, HomeAxis, MoveAxis, Reset, RunAxis, StopAxis
 from rtcp.ipc.events import (
     AxisAtRest,
     AxisFailed,
@@ -26,6 +26,7 @@ from rtcp.ipc.events import (
 from rtcp.ipc.states import State
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
+from tests.control.rig import about
 
 SHIPPED = load(default_config().parent / "linear_axis.yaml")
 CONFIG = replace(SHIPPED, cycle=replace(SHIPPED.cycle, period_us=2000.0))
@@ -80,7 +81,7 @@ class Bench(Simulation):
         return self.names.message(refusal)
 
     def field(self, name: str) -> float:
-        return float(self.observer.latest()[0][name])  # type: ignore[index]
+        return float(self.observer.latest()[0][name])
 
 
 @pytest.fixture
@@ -97,7 +98,7 @@ def test_an_axis_moves_to_a_position_at_a_speed_and_says_that_it_is_there(bench:
     bench.rest(RAIL)
     assert bench.at(RAIL) == pytest.approx(0.3, abs=1e-3)
     rest = bench.last_of(AxisAtRest)
-    assert rest == AxisAtRest(RAIL, pytest.approx(0.3, abs=1e-3), True)
+    assert rest == AxisAtRest(RAIL, about(0.3, abs=1e-3), True)
     assert bench.names.message(rest).endswith(" m")
     assert not bench.field("rail_moving")
     assert bench.field("rail_actual_position") == pytest.approx(0.3, abs=1e-3)
@@ -121,7 +122,7 @@ def test_a_stopped_axis_does_not_continue_to_its_former_target(bench: Bench, sto
     bench.rest(RAIL)
     stood = bench.at(RAIL)
     assert stood < 0.4
-    assert bench.last_of(AxisAtRest) == AxisAtRest(RAIL, pytest.approx(stood, abs=1e-3), False)
+    assert bench.last_of(AxisAtRest) == AxisAtRest(RAIL, about(stood, abs=1e-3), False)
     assert any(sent[0] & HALT for sent in bench.sent[RAIL])
     bench.run(2.0)
     # Not halted any more, and it stands: the set-point was replaced.
@@ -222,10 +223,10 @@ def test_what_an_axis_may_not_do_is_refused_and_nothing_is_sent(bench: Bench) ->
     bench.sent[RAIL].clear()
     nan = float("nan")
     assert bench.refused(MoveAxis(RAIL, 0.9)) == (
-        "rail: 0.9 m is outside its range, or the axis would leave its range there: allowed is -0.1 to 0.8 m "
-        "(external_axes[0].position in linear_axis.yaml)"
+        "rail: 0.9 m is outside its range: allowed is -0.1 to 0.8 m (external_axes[0].position in linear_axis.yaml)"
     )
     assert "rail: 0.3 m/s is not allowed: at most 0.25 m/s" in bench.refused(MoveAxis(RAIL, 0.1, 0.3))
+    assert bench.refused(Home(RAIL)) == "rail is an external axis, no joint: `rtcp axis home rail`"
     assert "belt is not used in profile position" in bench.refused(MoveAxis(BELT, 0.1))
     assert "rail is not used in homing" in bench.refused(HomeAxis(RAIL))
     assert "belt is not used in homing" in bench.refused(HomeAxis(BELT))
@@ -240,7 +241,7 @@ def test_what_an_axis_may_not_do_is_refused_and_nothing_is_sent(bench: Bench) ->
 def test_an_axis_whose_drive_takes_no_set_point_is_stopped(bench: Bench) -> None:
     model = bench.drives[RAIL]
     position = model.servo._modes[1]
-    position._handshake = lambda controlword: None  # type: ignore[method-assign]
+    setattr(position, "_handshake", lambda controlword: None)  # noqa: B010 a drive that takes none
     bench.do(MoveAxis(RAIL, 0.3))
     bench.bring_to(State.FAULT, 5.0)
     assert isinstance(bench.last_of(AxisFailed), AxisFailed)
@@ -271,3 +272,14 @@ def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> 
     assert bench.names.message(still).startswith("belt does not come to rest although it is halted: 0.15")
     bench.run(1.0)
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_drive_that_does_not_show_the_mode_in_which_its_axis_rests_is_not_enabled() -> None:
+    with Simulation(ABSOLUTE, follow_clock=False) as bench:
+        del bench.bus.slaves[1].device.servo._modes[1]
+        bench.bring_to(State.READY)
+        bench.acquire()
+        bench.do(Enable())
+        bench.bring_to(State.FAULT, 10.0)
+        (lost,) = [record.event for record in bench.events if isinstance(record.event, AxisModeLost)]
+        assert bench.names.message(lost).startswith("the drive of rail shows mode 0, commanded is profile position")
