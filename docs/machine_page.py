@@ -8,7 +8,7 @@ from typing import TypeVar
 from rtcp.config.model import ArmConfig
 from rtcp.control.machine import STATES
 from rtcp.control.states import Signal
-from rtcp.ipc.commands import COMMANDS, Shutdown
+from rtcp.ipc.commands import ANYWHERE, COMMANDS, Shutdown
 from rtcp.ipc.events import EVENTS, EmergencyStop, FaultEvent
 from rtcp.ipc.message import Message
 from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, watchdog_bounds
@@ -70,7 +70,9 @@ def commands() -> str:
     rows = []
     for command in _ours(COMMANDS):
         accepted = ", ".join(state.state.words for state in STATES if state.state in command.states)
-        rows.append([f"`{command.name}`", "the holder of the lease" if command.needs_lease else "anyone", accepted])
+        if command.states == ANYWHERE:
+            accepted = "any"
+        rows.append([f"`{command.name}`", "lease holder" if command.needs_lease else "anyone", accepted])
     return _table(["command", "who may send it", "in the states"], rows)
 
 

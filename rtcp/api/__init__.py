@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rtcp.api.results import (
     Arrival,
+    AxisStatus,
     Buffered,
     Channel,
     EventRecord,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Arrival",
     "AsyncRobot",
+    "AxisStatus",
     "Buffered",
     "Cell",
     "Channel",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -134,6 +135,7 @@ class Program:
         """
         self._check_tool(robot, start)
         self._check_terminals(robot, start, end)
+        self._check_axes(robot, start, end)
         places = self._places(robot)
         q: Sequence[float] = robot.status().commanded_positions
         with_tool: dict[str, Any] = {}
@@ -190,6 +192,21 @@ class Program:
         else:
             self._check_tool(robot, start)
             self._check_terminals(robot, start, end)
+            self._check_axes(robot, start, end)
+        try:
+            self._run_units(robot, say, start, end, between, expected)
+        finally:
+            self._stop_axes(robot)
+
+    def _run_units(
+        self,
+        robot: Robot,
+        say: Callable[[Begun], None],
+        start: int,
+        end: int | None,
+        between: Callable[[], None],
+        expected: _Expected,
+    ) -> None:
         for unit in self._units(self._places(robot), None, start, end):
             between()
             line = self.line_of(unit.where)
@@ -205,6 +222,13 @@ class Program:
                     self._wait(unit.step.wait_s, between, partial(self._check_undisturbed, robot, line, expected))
                 _act(robot, unit.step)
                 expected.tool = unit.step.tool or expected.tool
+
+    def _stop_axes(self, robot: Robot) -> None:
+        """Stop the axes that steps of the program run."""
+        every = [*self._motion.program, *(step for part in self._motion.parts for step in part.steps)]
+        for axis in dict.fromkeys(step.axis for step in every if step.axis is not None and step.velocity):
+            with contextlib.suppress(RtcpError):  # the connection that has ended has stopped them
+                robot.stop_axis(axis)
 
     def step_back(self, robot: Robot, number: int) -> None:
         """Move back to where step `number`, from 0, began: along its line or arc, else by the joints.
@@ -276,6 +300,15 @@ class Program:
             if name not in allowed:
                 text = f'{key}: found the text "{name}", allowed is one of {", ".join(allowed) or "none"}'
                 raise RtcpError("refused", f"{self.file}:{self.line_of(where)}: {text}", "unknown_terminal")
+
+    def _check_axes(self, robot: Robot, start: int, end: int | None) -> None:
+        """Raise where a step names an external axis that does not exist."""
+        named = [(where, step.axis) for _, where, step in self._steps(start, end, 1) if step is not None and step.axis]
+        known = robot.status().axes if named else {}
+        for where, axis in named:
+            if axis not in known:
+                text = f'axis: found the text "{axis}", allowed is one of {", ".join(known) or "none"}'
+                raise RtcpError("refused", f"{self.file}:{self.line_of(where)}: {text}", "unknown_axis")
 
     @staticmethod
     def _wait(seconds: float, between: Callable[[], None], check: Callable[[], None]) -> None:
@@ -390,6 +423,8 @@ def _carry_out(robot: Robot, stops: Sequence[dict[str, Any]], speed: float | Non
 def _described(step: Step) -> str:
     if step.gripper is not None:
         return f"gripper: {step.gripper}"
+    if step.axis is not None:
+        return axis_motion(step)
     if step.output is not None:
         return f"output {step.output}: {'on' if step.value else 'off'}"
     if step.wait_for is not None:
@@ -402,9 +437,33 @@ def _described(step: Step) -> str:
 def _act(robot: Robot, step: Step) -> None:
     if step.gripper is not None:
         robot.gripper(step.gripper == "open")
+    elif step.axis is not None:
+        _act_axis(robot, step, step.axis)
     elif step.output is not None:
         robot.io[step.output] = step.value
     elif step.wait_for is not None:
         robot.io.wait(step.wait_for, step.value, step.timeout_s)
     elif step.tool is not None:
         robot.set_tool(step.tool)
+
+
+def axis_motion(step: Step) -> str:
+    """Return the step of an external axis in words."""
+    if step.home:
+        return f"axis {step.axis}: home"
+    if step.position is not None:
+        return f"axis {step.axis}: to {step.position:g}"
+    if step.velocity:
+        return f"axis {step.axis}: velocity {step.velocity:g} for {step.time_s:g} s"
+    return f"axis {step.axis}: stop"
+
+
+def _act_axis(robot: Robot, step: Step, axis: str) -> None:
+    if step.home:
+        robot.home_axis(axis)
+    elif step.position is not None:
+        robot.move_axis(axis, step.position, step.speed)
+    elif step.velocity and step.time_s:
+        robot.run_axis(axis, step.velocity, step.time_s)
+    else:
+        robot.stop_axis(axis)

@@ -40,6 +40,30 @@ class Payload:
 
 
 @dataclass(frozen=True)
+class AxisStatus:
+    """An external axis."""
+
+    unit: str
+    """Unit of its positions, m or rad."""
+    position: float
+    """Measured position."""
+    velocity: float
+    """Measured velocity, unit/s."""
+    target_position: float
+    """Last set-point of profile position."""
+    target_velocity: float
+    """Target velocity of profile velocity, unit/s."""
+    mode: int
+    """Mode of operation that its drive displays: 1 profile position, 3 profile velocity, 6 homing."""
+    drive_state: str
+    """State of its drive in words."""
+    moving: bool
+    """Whether a motion is under way, or the axis comes to rest."""
+    homed: bool
+    """Whether its positions count from its home, or it needs none."""
+
+
+@dataclass(frozen=True)
 class Status:
     """The platform at one instant."""
 
@@ -80,6 +104,8 @@ class Status:
     """Name of the tool in use."""
     payload: Payload
     """The load in the tool."""
+    axes: Mapping[str, AxisStatus]
+    """External axes by name."""
     raw: Mapping[str, Any]
     """Everything that `rtcp status --json` prints."""
 
@@ -107,6 +133,7 @@ class Status:
             speed_override=answer["speed_override"],
             tool=answer["tool_name"],
             payload=result(Payload, answer["payload"]),
+            axes={name: result(AxisStatus, axis) for name, axis in answer["axes"].items()},
             raw=answer,
         )
 
@@ -276,13 +303,15 @@ class GripperRest:
 
 @dataclass(frozen=True)
 class Zero:
-    """The zero of a joint, rad of its drive."""
+    """The zero of a joint, rad of its drive; of an external axis in its unit."""
 
     joint: str
     offset: float
     before: float
     file: str
     """File in which it is kept."""
+    unit: str = "rad"
+    """m or rad"""
 
 
 @dataclass(frozen=True)

@@ -670,6 +670,56 @@ class Methods:
         return Call("move_gripper", {"open": open}, lambda end: GripperRest(end.get("position"), end.get("holds")))
 
     @Method
+    def move_axis(self, axis: str, position: float, speed: float | None = None) -> Call[float]:
+        """Move an external axis by its drive's profile; return its position when it is there, m or rad.
+
+        Args:
+            axis: its name.
+            position: m or rad.
+            speed: m/s or rad/s; None: its limit.
+
+        Raises:
+            Refused: reasons `axis_out_of_range`, `axis_speed_out_of_range`, `axis_not_homed`, `axis_busy`,
+                `axis_disabled`, `axis_mode_missing`; `axis_stopped` (`position`): it was stopped on its way.
+            Fault: reason `axis_failed`: its drive did not carry it out.
+        """
+        params = {"axis": axis, "position": position, "speed": speed}
+        return Call("move_axis", params, lambda answer: float(answer["position"]))
+
+    @Method
+    def run_axis(self, axis: str, velocity: float, hold_s: float = 0.25, sent_s: float | None = None) -> Call[None]:
+        """Run an external axis at a velocity for `hold_s`; return at once. Other motions may follow meanwhile.
+
+        The axis stops when `hold_s` has passed since the last of these calls, when it comes to an end of its range, and
+        when this robot is closed.
+
+        Args:
+            axis: its name.
+            velocity: m/s or rad/s.
+            hold_s: s, at most 3600.
+            sent_s: as for `jog`.
+
+        Raises:
+            Refused: as `move_axis`.
+        """
+        return Call("run_axis", {"axis": axis, "velocity": velocity, **_expiry(hold_s, sent_s)}, _nothing)
+
+    @Method
+    def home_axis(self, axis: str) -> Call[float]:
+        """Let the drive of an external axis search its home; return its position afterwards, m or rad.
+
+        Raises:
+            Refused: reasons `axis_mode_missing`, `axis_busy`, `axis_disabled`, `axis_stopped`.
+            Fault: reason `homing_failed`.
+        """
+        return Call("home_axis", {"axis": axis}, lambda answer: float(answer["position"]))
+
+    @Method
+    def stop_axis(self, axis: str) -> Call[None]:
+        """Halt an external axis; return when it rests. Needs no lease."""
+        return Call("stop_axis", {"axis": axis}, _nothing)
+
+    @Method
     def limits(self) -> Call[Json]:
         """Return the limits in force beside the configured ones, as `rtcp limits show --json` prints them."""
         return Call("limits", {}, _as_is)

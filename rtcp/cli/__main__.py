@@ -16,6 +16,7 @@ from rtcp.cli import (
     arm,
     arm_new,  # noqa: F401  registers `rtcp arm new`
     bench,  # noqa: F401  registers `rtcp device try`
+    axis,
     bus,
     cell,
     commission,
@@ -79,8 +80,8 @@ def _root(
 
 
 _GROUPS = (
-    platform, status, cell, commission, motion, process, jog, arm, bus, device, slaves, segment, irc5, demo, service,
-    doctor, soak, faults, record, recorded, live, experiment, user_trial, panel, ros, shape_set,
+    platform, status, cell, commission, motion, axis, process, jog, arm, bus, device, slaves, segment, irc5, demo,
+    service, doctor, soak, faults, record, recorded, live, experiment, user_trial, panel, ros, shape_set,
 )  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)

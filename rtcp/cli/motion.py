@@ -241,8 +241,9 @@ def _zero(
     finite("--at", at, "rad")
     with connect("zero") as robot:
         zero = robot.zero(joint, at)
+    unit = zero.unit
     report(
-        f"{zero.joint} is at {at:g} rad: its zero is at {zero.offset:.6f} rad of the drive "
+        f"{zero.joint} is at {at:g} {unit}: its zero is at {zero.offset:.6f} {unit} of the drive "
         f"(before: {zero.before:.6f}), saved in {zero.file}"
     )
 

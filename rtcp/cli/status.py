@@ -219,6 +219,10 @@ def _facts(status: Json) -> Table:
     rows.add_row("frames", _frames(status))
     if status["dc"] is not None:
         rows.add_row("clocks", _clocks(status))
+    for name, axis in status["axes"].items():
+        doing = "moves" if axis["moving"] else "at rest" if axis["homed"] else "at rest, not homed"
+        unit = axis["unit"]
+        rows.add_row(Text(name), Text(f"{axis['position']:+.4f} {unit}, {axis['velocity']:+.4f} {unit}/s, {doing}"))
     for name, process in status["processes"].items():
         rows.add_row(Text(name), Text(process["state"] or process["kind"]))
     for device, fields in status["devices"].items():

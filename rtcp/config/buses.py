@@ -126,6 +126,8 @@ class ControllerBus(BusConfig):
                 yield Finding(("stops", key), "torque_off_on_bus", found=reaction, bus=self.kind)
         if arm.gripper is not None and arm.gripper.joint is not None:
             yield Finding(("gripper", "joint"), "drive_on_bus", bus=self.kind)
+        if arm.external_axes:
+            yield Finding(("external_axes",), "drive_on_bus", bus=self.kind)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ from rtcp.config.model import (
 
 BEYOND_RANGE_RAD: Final = 0.05
 """How far the drive's position limits lie outside the joint's range, rad: a joint that sagged out of it is led back."""
+BEYOND_RANGE_M: Final = 0.005
+"""The same of an external axis in metres, m."""
 BEYOND_SUPERVISION: Final = 1.5
 """The drive's speed limit, multiple of the supervision's threshold."""
 SLOWEST_QUICK_STOP_S: Final = 2.0
@@ -68,7 +70,9 @@ def joint_limits(config: ArmConfig, slave: SlaveConfig, joint: Joint, zero: floa
         zero: position of the drive at joint position 0, rad.
     """
     widest, supervision = joint.absolute.position or joint.position, config.supervision
-    low, high = widest.min - BEYOND_RANGE_RAD + zero, widest.max + BEYOND_RANGE_RAD + zero
+    metres = any(axis.name == joint.name and axis.unit == "m" for axis in config.external_axes)
+    beyond = BEYOND_RANGE_M if metres else BEYOND_RANGE_RAD
+    low, high = widest.min - beyond + zero, widest.max + beyond + zero
     threshold = (joint.absolute.velocity or joint.velocity) * (supervision.absolute.speed or supervision.speed)
     velocity = threshold * BEYOND_SUPERVISION
     for entry in slave.device.limits:

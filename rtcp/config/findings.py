@@ -100,6 +100,8 @@ _SENTENCES = {
     "no_slave": "found {found!v}, which is no slave; allowed are the names under slaves: {allowed}",
     "moves_no_joint": "found {found!v}, which moves no joint: its device {device} is of kind {kind}; allowed is kind "
     "cia402",
+    "axis_not_mapped": "its device {device} maps no {lacking}, which an external axis with modes {modes} needs",
+    "home_without_ends": "found position and homing without a range, allowed with both is a range: give position",
     "not_mapped": "its device {device} maps no {lacking}, which drive_mode {drive_mode} needs",
     "no_offset": "its device {device} maps no {lacking}, which feed_forward needs",
     "no_box_at_all": "found {kind} {found}, but no slave is of kind io; leave it out for such an arm",

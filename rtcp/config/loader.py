@@ -123,7 +123,7 @@ def load(path: Path) -> ArmConfig:
         except ConfigError as error:
             in_devices += error.findings
     drives = FileRule(
-        ("slaves", "joints", "gripper", "feed_forward"),
+        ("slaves", "joints", "gripper", "external_axes", "feed_forward"),
         partial(rules.drive_findings, devices=devices, unusual=document.unusual),
     )
     terminals = FileRule(("slaves", "inputs", "outputs", "gripper"), partial(rules.terminal_findings, devices=devices))
@@ -134,11 +134,12 @@ def load(path: Path) -> ArmConfig:
     data = {key: value for key, value in document.data.items() if key != "processes"}
     arm, findings = checker.check(data, drives, terminals, suits, *usual)
     findings += missing + wrong
-    if "joints" not in data and not document.data.get("processes"):
+    alone = document.data.get("processes") or data.get("external_axes")
+    if "joints" not in data and not alone:
         wanted = f"a list of 1 to {MOST_AXES} mappings with the keys {', '.join(keys(Joint))}"
-        need = f"it must be {wanted}; a platform of processes has none"
+        need = f"it must be {wanted}; a platform of processes or external axes alone has none"
         findings.append(Finding((), "missing", key="joints", need=need))
-    elif data.get("joints") == [] and not document.data.get("processes"):
+    elif data.get("joints") == [] and not alone:
         findings.append(Finding(("joints",), "size", found=0, allowed=f"1 to {MOST_AXES} joints"))
     if arm is not None:
         limited = [place for magnitudes in rules.OF_ARM.values() for place in magnitudes(arm)]

@@ -61,6 +61,10 @@ JOINTS = 6
 """Joints of an arm that has `kinematics`."""
 MOST_AXES = 10
 """Most joints, a gripper's among them, that commands, plans and recordings can hold."""
+ENDLESS = 1e9
+"""End of the range of an external axis without ends, m or rad."""
+_PROFILE_JERK: Final = 1000.0
+"""Jerk of an external axis for each unit of its acceleration, 1/s: the profiles of drives are trapezoidal."""
 UNLIMITED_TORQUE = 1e9
 """Limit of joints whose torque is not measured, Nm."""
 MOST_TOOLS = 16
@@ -522,6 +526,57 @@ class Joint:
     def place(self) -> str:
         """The drive that moves it, in words: slave, and axis if it is not the first."""
         return self.slave if self.axis == 1 else f"{self.slave}, axis {self.axis}"
+
+
+@dataclass(frozen=True)
+class Travel(Range):
+    """The range of an external axis; `min < max`."""
+
+    min: float
+    """Lower end, m or rad."""
+    max: float
+    """Upper end, m or rad; greater than `min`."""
+
+
+AxisMode = Literal["position", "velocity", "homing"]
+"""Modes of operation of an external axis: profile position (1), profile velocity (3), homing (6); CiA 402-2."""
+
+
+@dataclass(frozen=True)
+class ExternalAxis:
+    """An axis that is no joint of the arm, as a linear axis or a conveyor: its drive makes the profile of each motion.
+
+    Positions are in `unit`, speeds in `unit`/s."""
+
+    name: Name
+    """Axis name, unique among joints and slaves too; its fields of the record begin with it."""
+    slave: Name
+    """Drive that moves the axis: a name under `slaves` of kind `cia402`; unique, or with another `axis`."""
+    velocity: Rate
+    """Speed limit, m/s or rad/s; also the speed of a motion without one."""
+    acceleration: Rate
+    """Acceleration of the drive's profile, m/s² or rad/s²: what 0x6083 and 0x6084 are among its start-up SDOs."""
+    unit: Literal["m", "rad"] = "rad"
+    """Unit of its positions; the factors in the device file are of the same unit."""
+    position: Travel | None = None
+    """Range of its positions; left out: the axis has no ends, as a conveyor."""
+    modes: Annotated[tuple[AxisMode, ...], MinLen(1)] = ("position",)
+    """What it is used for. It rests in profile position, without `position` in profile velocity at speed 0. With
+    `homing` it moves only after it was homed since the start, the last emergency stop and the last loss of its drive.
+    """
+    tolerance: Positive = 1e-3
+    """Largest distance from its target at which it has arrived, m or rad."""
+    axis: AxisNumber = 1
+    """Axis of `slave`, where its drive has several."""
+
+    @property
+    def joint(self) -> Joint:
+        """The same axis with the keys of a joint, in its own unit."""
+        ends = self.position or Range(-ENDLESS, ENDLESS)
+        jerk = _PROFILE_JERK * self.acceleration
+        return Joint(
+            self.name, self.slave, ends, self.velocity, self.acceleration, jerk, UNLIMITED_TORQUE, axis=self.axis
+        )
 
 
 @dataclass(frozen=True)
@@ -1243,6 +1298,8 @@ class ArmSettings:
     inputs: InputsConfig = field(default_factory=InputsConfig)
     outputs: OutputsConfig = field(default_factory=OutputsConfig)
     gripper: GripperConfig | None = None
+    external_axes: Annotated[tuple[ExternalAxis, ...], MaxLen(MOST_AXES)] = ()
+    """Axes that are no joints of the arm: [external axes](external_axes.md)."""
     payload: PayloadConfig = field(default_factory=PayloadConfig)
     recording: RecordingConfig | None = None
     ros: RosConfig | None = None
@@ -1251,9 +1308,19 @@ class ArmSettings:
 
     @property
     def axes(self) -> tuple[Joint, ...]:
-        """All driven axes: the joints, from base to tool, then the gripper's if it has a drive."""
+        """All driven axes: the joints, from base to tool, the gripper's if it has a drive, then the external axes."""
         driven = self.gripper.joint if self.gripper else None
-        return self.joints if driven is None else (*self.joints, driven)
+        return (*self.joints, *(() if driven is None else (driven,)), *(axis.joint for axis in self.external_axes))
+
+    @property
+    def first_external(self) -> int:
+        """Number of the first external axis among `axes`."""
+        return len(self.axes) - len(self.external_axes)
+
+    def unit_of(self, axis: int) -> str:
+        """Return the unit of the positions of an axis by its number among `axes`: m or rad."""
+        external = axis - self.first_external
+        return self.external_axes[external].unit if 0 <= external < len(self.external_axes) else "rad"
 
 
 @dataclass(frozen=True)
@@ -1398,7 +1465,8 @@ class NamedPose:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of a program: one of `move`, `line`, `arc`, `gripper`, `output`, `wait_for`, `wait_s`, `tool`, `run`."""
+    """A step of a program: one of `move`, `line`, `arc`, `gripper`, `axis`, `output`, `wait_for`, `wait_s`, `tool`,
+    `run`."""
 
     move: Name | None = None
     """Move to this pose by the joints."""
@@ -1411,11 +1479,21 @@ class Step:
     angle: Angle | None = None
     """Angle to travel on the circle through the three places, rad; None: up to the pose."""
     speed: Positive | None = None
-    """Speed of the tool, m/s; None: that of the file. By the joints: of the fastest one, rad/s."""
+    """Speed of the tool, m/s; None: that of the file. By the joints: of the fastest one, rad/s. Of an axis: its own."""
     blend: NotNegative = 0.0
     """Radius within which the corner to the next motion is rounded, m; 0: the tool rests."""
     gripper: Literal["open", "close"] | None = None
     """Open or close the gripper."""
+    axis: Name | None = None
+    """Move this external axis: to `position`, with `velocity` for `time_s`, or to its home with `home`."""
+    position: float | None = None
+    """Target of an axis, m or rad."""
+    velocity: float | None = None
+    """Velocity of an axis, m/s or rad/s; the next steps begin at once. 0: the axis stops."""
+    time_s: Positive | None = None
+    """How long an axis runs, s; it also stops where the program ends."""
+    home: bool = False
+    """Search the home of an axis."""
     output: Name | None = None
     """Set this output to `value`."""
     wait_for: Name | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Protocol
 
 from rtcp.config.drive_limits import factor_of
@@ -17,6 +17,7 @@ from rtcp.config.findings import Finding, KeyPath, dotted
 from rtcp.config.model import (
     BEYOND_FULL,
     BITS,
+    ENDLESS,
     MODE_CHANNELS,
     MOST_AXES,
     PLATFORM_PARTS,
@@ -25,9 +26,11 @@ from rtcp.config.model import (
     AnalogStickConfig,
     ArmConfig,
     ArmFile,
+    AxisMode,
     Box,
     DeviceDescription,
     EthercatBus,
+    ExternalAxis,
     GripperConfig,
     HasBox,
     InputsConfig,
@@ -47,6 +50,7 @@ from rtcp.config.model import (
     Step,
     Stop,
     Tool,
+    Travel,
     integer_range,
 )
 from rtcp.config.scaling import BOUNDING_OBJECTS, FACTOR_TOLERANCE, OBJECTS_PER_AXIS, QUANTITIES, DriveScaling
@@ -405,6 +409,7 @@ def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Fin
 
 
 @rule(Range)
+@rule(Travel)
 @rule(MechanicalLimit)
 def _range(limits: Range | MechanicalLimit) -> Iterator[Finding]:
     return _order(limits.min, limits.max)
@@ -443,10 +448,11 @@ def _gripper(gripper: GripperConfig) -> Iterator[Finding]:
 
 
 def axes_of(arm: ArmFile | ArmConfig) -> Iterator[tuple[KeyPath, Joint]]:
-    """Yield all driven axes with their places: the joints, then the gripper's joint if it has one."""
+    """Yield all driven axes with their places: joints, the gripper's joint if it has one, external axes."""
     yield from ((("joints", i), joint) for i, joint in enumerate(arm.joints))
     if arm.gripper and arm.gripper.joint:
         yield ("gripper", "joint"), arm.gripper.joint
+    yield from ((("external_axes", i), axis.joint) for i, axis in enumerate(arm.external_axes))
 
 
 @rule(ArmFile, "slaves")
@@ -459,13 +465,32 @@ def _slave_names(arm: ArmFile) -> Iterator[Finding]:
             yield Finding(("slaves", i, "name"), "name_of_part", found=slave.name)
 
 
-@rule(ArmFile, "joints", "gripper")
+@rule(ExternalAxis)
+def _external_axis(axis: ExternalAxis) -> Iterator[Finding]:
+    if axis.position is None and "position" in axis.modes and "homing" in axis.modes:
+        yield Finding(("modes",), "home_without_ends")
+    elif axis.position is not None:
+        low, high = axis.position.min, axis.position.max
+        if max(-low, high) >= ENDLESS:
+            yield Finding(("position",), "range", found=max(-low, high), allowed=f"less than {ENDLESS:g}")
+
+
+@rule(ArmFile, "slaves", "external_axes")
+def _parts_of_axes(arm: ArmFile) -> Iterator[Finding]:
+    """Yield external axes with the name of another part: both would have the same fields in the record."""
+    taken = PLATFORM_PARTS | {slave.name for slave in arm.slaves}
+    for i, axis in enumerate(arm.external_axes):
+        if axis.name in taken:
+            yield Finding(("external_axes", i, "name"), "name_of_part", found=axis.name)
+
+
+@rule(ArmFile, "joints", "gripper", "external_axes")
 def _axis_names(arm: ArmFile) -> Iterator[Finding]:
     axes = list(axes_of(arm))
     yield from repeated((((*where, "name"), joint.name) for where, joint in axes), "name")
     yield from repeated((((*where, "slave"), joint.place) for where, joint in axes), "slave")
     if len(axes) > MOST_AXES:
-        yield Finding(("gripper", "joint"), "too_many_axes", joints=len(axes) - 1, allowed=f"{MOST_AXES} in all")
+        yield Finding(axes[-1][0], "too_many_axes", joints=len(axes) - 1, allowed=f"{MOST_AXES} in all")
     for where, joint in axes:
         if joint.name == _ALL_JOINTS:
             yield Finding((*where, "name"), "limit_key", found=_ALL_JOINTS, means="all joints")
@@ -591,6 +616,9 @@ def drive_findings(
         elif device is not None:
             device = device.of_axis(joint.axis)
             missing: list[str] = []
+            if where[0] == "external_axes":
+                yield from _external_drive(where, arm.external_axes[int(where[1])], slave.device, device)
+                continue
             for needed, pdos in zip(MODE_CHANNELS[arm.drive_mode], (device.rpdo, device.tpdo), strict=True):
                 mapped = {entry.name for pdo in pdos for entry in pdo.channels}
                 missing += [name for name in needed if name not in mapped]
@@ -611,6 +639,32 @@ def _above_the_drive(axis: KeyPath, joint: Joint, device: DeviceDescription) -> 
     if scaling is not None and scaling.max_speed is not None and joint.velocity > scaling.max_speed:
         of = {"device": device.name, "rpm": scaling.max_motor_speed, "high": scaling.max_speed}
         yield Finding((*axis, "velocity"), "above_drive", found=joint.velocity, **of)
+
+
+_AXIS_CHANNELS: dict[AxisMode, tuple[str, ...]] = {
+    "position": ("target_position", "profile_velocity"),
+    "velocity": ("target_velocity",),
+    "homing": (),
+}
+"""Channels of rpdo that a mode of an external axis needs, beside `modes_of_operation`."""
+
+
+def _external_drive(where: KeyPath, axis: ExternalAxis, key: str, device: DeviceDescription) -> Iterator[Finding]:
+    """Yield the channels that the drive of an external axis lacks, and limits that its process data cannot express."""
+    sent = {entry.name for entry in device.outputs}
+    shown = {entry.name for pdo in device.tpdo for entry in pdo.channels}
+    needed = [name for mode in axis.modes for name in _AXIS_CHANNELS[mode]]
+    missing = [name for name in dict.fromkeys(["modes_of_operation", *needed]) if name not in sent]
+    missing += [name for name in ("velocity", "modes_of_operation_display") if name not in shown]
+    if device.kind != "cia402":
+        of = {"device": key, "kind": device.kind}
+        yield Finding((*where, "slave"), "moves_no_joint", found=axis.slave, **of)
+    elif missing:
+        yield Finding((*where, "slave"), "axis_not_mapped", lacking=missing, device=key, modes=axis.modes)
+    else:
+        # No target of torque is sent, and an axis without ends has no largest target.
+        joint = replace(axis.joint, position=axis.position or Range(0.0, 0.0), torque=0.0)
+        yield from _beyond_the_wire(where, joint, device, ())
 
 
 def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
@@ -917,7 +971,12 @@ def useless_marks(places: Iterable[Magnitude], unusual: Iterable[KeyPath]) -> It
 
 
 def _of_joints(arm: ArmFile) -> Iterator[Magnitude]:
+    for i, axis in enumerate(arm.external_axes):
+        if axis.unit == "m":
+            yield ("external_axes", i, "velocity"), axis.velocity, 20.0, "m/s", _MILLIMETRES
     for where, joint in axes_of(arm):
+        if where[0] == "external_axes":
+            continue
         yield (*where, "position", "min"), joint.position.min, _TWO_TURNS, "rad", _DEGREES
         yield (*where, "position", "max"), joint.position.max, _TWO_TURNS, "rad", _DEGREES
         yield (*where, "velocity"), joint.velocity, _TWO_TURNS, "rad/s", _DEGREES
@@ -974,7 +1033,7 @@ def of_scaling(device: DeviceDescription) -> Iterator[Magnitude]:
 
 
 OF_ARM: dict[tuple[str, ...], Callable[[Any], Iterator[Magnitude]]] = {
-    ("joints", "gripper"): _of_joints, ("cartesian",): _of_cartesian, ("kinematics",): of_kinematics,
+    ("joints", "gripper", "external_axes"): _of_joints, ("cartesian",): _of_cartesian, ("kinematics",): of_kinematics,
 }  # fmt: skip
 """Values of an arm's file that have a limit of what is usual, by the sections that hold them."""
 
@@ -1012,11 +1071,15 @@ MOST_PLANNED_STEPS = 10_000
 """Most steps of a program, with those of its parts."""
 _MOST_DEPTH = 50
 """Most levels of parts in parts."""
-_VERBS = ("move", "line", "arc", "gripper", "output", "wait_for", "wait_s", "tool", "run")
+_VERBS = ("move", "line", "arc", "gripper", "axis", "output", "wait_for", "wait_s", "tool", "run")
 _OF_VERBS = {
     "via": ("arc",),
     "angle": ("arc",),
-    "speed": ("move", "line", "arc"),
+    "speed": ("move", "line", "arc", "axis"),
+    "position": ("axis",),
+    "velocity": ("axis",),
+    "time_s": ("axis",),
+    "home": ("axis",),
     "blend": ("move", "line", "arc"),
     "value": ("output", "wait_for"),
     "timeout_s": ("wait_for",),
@@ -1037,6 +1100,20 @@ def _step(step: Step) -> Iterator[Finding]:
             yield Finding((key,), "beside", found=chosen[0], allowed=" or ".join(verbs))
     if step.arc is not None and step.via is None:
         yield Finding(("arc",), "needs_beside", found="an arc", need="via")
+    if step.axis is not None:
+        yield from _axis_step(step)
+
+
+def _axis_step(step: Step) -> Iterator[Finding]:
+    what = [key for key in ("position", "velocity", "home") if getattr(step, key) not in (None, False)]
+    if len(what) != 1:
+        yield Finding((), "one_of_keys", found=" and ".join(what) or "none of them", allowed="position, velocity, home")
+    elif step.speed is not None and step.position is None:
+        yield Finding(("speed",), "beside", found=what[0], allowed="position")
+    elif step.time_s is not None and not step.velocity:
+        yield Finding(("time_s",), "beside", found=what[0], allowed="a velocity other than 0")
+    elif step.velocity and step.time_s is None:
+        yield Finding(("velocity",), "needs_beside", found="a velocity other than 0", need="time_s")
 
 
 @rule(MotionFile, "poses", "program", "parts")

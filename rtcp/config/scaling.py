@@ -37,6 +37,7 @@ QUANTITIES: dict[str, str] = {
     "target_velocity": "velocity",
     "velocity": "velocity",
     "velocity_offset": "velocity",
+    "profile_velocity": "velocity",
     "target_torque": "torque",
     "torque": "torque",
     "torque_offset": "torque",

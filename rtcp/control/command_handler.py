@@ -15,6 +15,7 @@ from typing import Any, Final
 from kinematics.model import LinkMass
 from rtcp.config.find import is_foreign
 from rtcp.config.model import ConfigError
+from rtcp.control.external_axis import ExternalAxisGroup
 from rtcp.control.machine import StateMachine
 from rtcp.control.part import Device, Part
 from rtcp.control.processes import ProcessPart
@@ -67,6 +68,10 @@ class CommandHandler:
             commands.SetOutput: self._set_output,
             commands.SetChannel: self._set_channel,
             commands.MoveGripper: self._move_gripper,
+            commands.MoveAxis: self._move_axis,
+            commands.RunAxis: self._move_axis,
+            commands.HomeAxis: self._move_axis,
+            commands.StopAxis: self._stop_axis,
             commands.SetLimits: self._set_limits,
             commands.SetSpeedOverride: self._set_speed_override,
             commands.Pause: self._pause,
@@ -154,7 +159,7 @@ class CommandHandler:
     def _move(self, command: commands.MotionCommand, lease: int) -> refusals.Refusal | None:
         arm, machine = self._arm, self._machine
         controller = arm.controllers.get(type(command))
-        if not self._joints.drives:
+        if not arm.drives:
             return refusals.NoArm()
         if controller is None:
             return refusals.NoGeometry()
@@ -188,6 +193,8 @@ class CommandHandler:
 
     def _home(self, command: commands.Home, lease: int) -> refusals.Refusal | None:
         arm = self._arm
+        if self._external_axis(command.axis) is not None:
+            return refusals.IsExternalAxis(command.axis)
         if not 0 <= command.axis < len(arm.drives):
             return refusals.UnknownAxis(command.axis, len(arm.drives) - 1)
         drive = arm.drives[command.axis]
@@ -430,13 +437,43 @@ class CommandHandler:
         device = next(part for part in self._context.parts if isinstance(part, Device) and part.slot + 1 == position)
         return device.set_channel(output.name, command.value)
 
-    def _move_gripper(self, command: commands.MoveGripper, lease: int) -> refusals.Refusal | None:
+    def _not_permitted(self) -> refusals.Refusal | None:
+        """Return why nothing beside the arm may begin to move, or None."""
         if self._operator.emergency_stop:
             return refusals.EmergencyStopPressed()
         if (refused := self._refused_by_partner()) is not None:
             return refused
-        if not self._operator.permitted:
-            return refusals.NotPermitted()
+        return None if self._operator.permitted else refusals.NotPermitted()
+
+    def _external_axis(self, number: int) -> ExternalAxisGroup | None:
+        return next((axis for axis in self._context.axes if axis.first == number), None)
+
+    def _move_axis(
+        self, command: commands.MoveAxis | commands.RunAxis | commands.HomeAxis, lease: int
+    ) -> refusals.Refusal | None:
+        axis = self._external_axis(command.axis)
+        if axis is None:
+            return refusals.UnknownExternalAxis(command.axis)
+        if (refusal := self._not_permitted()) is not None:
+            return refusal
+        if isinstance(command, commands.MoveAxis):
+            return axis.move(command.position, command.speed, lease)
+        return (
+            axis.home(lease)
+            if isinstance(command, commands.HomeAxis)
+            else axis.run(command.velocity, command.hold_s, lease)
+        )
+
+    def _stop_axis(self, command: commands.StopAxis, lease: int) -> refusals.Refusal | None:
+        axis = self._external_axis(command.axis)
+        if axis is None:
+            return refusals.UnknownExternalAxis(command.axis)
+        axis.stop()
+        return None
+
+    def _move_gripper(self, command: commands.MoveGripper, lease: int) -> refusals.Refusal | None:
+        if (refusal := self._not_permitted()) is not None:
+            return refusal
         gripper = self._context.gripper
         if gripper is not None:
             if not gripper.grip(not command.open, lease):

@@ -8,15 +8,18 @@ from typing import Final
 from rtcp.config.model import VIRTUAL, ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
+from rtcp.control.external_axis import ExternalAxisGroup
 from rtcp.control.gripper import DrivenGripper
 from rtcp.control.homing import HomingSequence
 from rtcp.control.joint_group import Joints
 from rtcp.control.operator import Operator
 from rtcp.control.part import Device, Part, PartContext, PluginTimer
 from rtcp.control.partners import Partners
+from rtcp.devices.drive import CSP
 from rtcp.devices.io_box import IoBox
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import (
+    AxisModeLost,
     ClockLost,
     ControllerFailed,
     ControllerRaised,
@@ -59,6 +62,7 @@ class Context(PartContext):
         timer: names plug-ins that take too long.
         arm: its joints.
         gripper: a gripper with a drive, or None.
+        axes: the external axes.
         operator: the inputs and outputs with a function.
         devices: the slaves that are no drives.
         blackboard: receives events, provides the lease.
@@ -74,6 +78,7 @@ class Context(PartContext):
         timer: PluginTimer,
         arm: Arm,
         gripper: DrivenGripper | None,
+        axes: Sequence[ExternalAxisGroup],
         operator: Operator,
         devices: Sequence[Device],
         blackboard: Blackboard,
@@ -87,7 +92,8 @@ class Context(PartContext):
         self.timer = timer
         self.arm = arm
         self.gripper = gripper
-        self.joints = Joints(arm, [] if gripper is None else [gripper])
+        self.axes = list(axes)
+        self.joints = Joints(arm, [*([] if gripper is None else [gripper]), *self.axes])
         self.joints.time_foreign(timer)
         self.operator = operator
         if partners is not None:
@@ -253,6 +259,8 @@ class Context(PartContext):
     def wrong_drive_mode(self, axis: int) -> Event:
         """Return the event of a drive that does not change its drive mode."""
         drive = self.joints.drives[axis]
+        if drive.mode < CSP:
+            return AxisModeLost(axis, drive.mode_display, drive.mode)
         return DriveModeTimeout(axis, drive.mode_display, DriveMode(drive.mode))
 
     # -- one cycle of an enabled arm ------------------------------------------------------------------------------
@@ -269,7 +277,7 @@ class Context(PartContext):
         axis = joints.first_not_enabled()
         if axis >= 0:
             return self.drive_event(DriveLeftEnabled, axis)
-        event = joints.beyond_limits() or arm.pushed() or self._supervise_gripper()
+        event = joints.beyond_limits() or arm.pushed() or self._supervise_others()
         if event is not None:
             return event
         result = joints.command()
@@ -308,7 +316,7 @@ class Context(PartContext):
         homing.step()
         if self.arm.feed_forward is not None:
             self.arm.feed_forward.update(self.arm.state, self.arm.mode)
-        event = joints.beyond_limits() or self._supervise_gripper()
+        event = joints.beyond_limits() or self._supervise_others()
         if event is not None:
             return event
         if homing.stuck:
@@ -322,6 +330,25 @@ class Context(PartContext):
         if not homing.leaving and (box := self.arm.trajectory_guard.zone_at(self.arm.state.actual)) is not None:
             self.publish(HomingInBox(box))
             homing.stop()
+        return None
+
+    def _supervise_others(self) -> Event | None:
+        return self._supervise_gripper() or self._supervise_axes()
+
+    def _supervise_axes(self) -> Event | None:
+        """Stop external axes without a commander; return the event that ends the state."""
+        for axis in self.axes:
+            if axis.problem is not None:
+                return axis.problem
+            if not axis.moves_by_command:
+                continue
+            event = self.permission_lost(axis.lease)
+            if event is None:
+                continue
+            if not self.is_controlled(event):
+                return event
+            self.publish(event)
+            axis.stop()
         return None
 
     def _supervise_gripper(self) -> Event | None:

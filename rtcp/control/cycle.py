@@ -17,6 +17,7 @@ from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
 from rtcp.control.command_handler import CommandHandler
 from rtcp.control.context import Context
+from rtcp.control.external_axis import ExternalAxisGroup
 from rtcp.control.gripper import make_gripper
 from rtcp.control.machine import StateMachine
 from rtcp.control.operator import Operator
@@ -42,6 +43,7 @@ from rtcp.ipc.schema import (
     OPERATOR_FIELDS,
     RecordSchema,
     arm_fields,
+    axis_fields,
     schema_of,
 )
 from rtcp.realtime.discipline import Discipline
@@ -82,13 +84,15 @@ class Cycle:
     ) -> None:
         self.devices = devices = make_devices(config)
         gripper = make_gripper(config)
+        external = enumerate(config.external_axes, config.first_external)
+        axes = [ExternalAxisGroup(config, axis, number) for number, axis in external]
         group = None if partners is None else partners.group
         self.arm = Arm(config, make_drives(config), blackboard.plan, group)
         self.operator = Operator(config, {device.name: device.driver for device in devices}, gripper)
         self._period_ns = round(config.cycle.period_us * 1000)
         context = Context(
-            config, PluginTimer(now, self._period_ns, blackboard.event), self.arm, gripper, self.operator, devices,
-            blackboard, service, discipline, partners,
+            config, PluginTimer(now, self._period_ns, blackboard.event), self.arm, gripper, axes, self.operator,
+            devices, blackboard, service, discipline, partners,
             make_processes(config, devices, partners),
         )  # fmt: skip
         self.joints = context.joints
@@ -310,7 +314,8 @@ def record_schema(config: ArmConfig, partners: Partners | None = None) -> Record
         SchemaError: two slaves have names that give the same field names.
     """
     driven = config.gripper is not None and config.gripper.joint is not None
-    arm = (arm_fields(len(config.joints)), GRIPPER_FIELDS if driven else (), OPERATOR_FIELDS)
+    axes = map(axis_fields, config.external_axes)
+    arm = (arm_fields(len(config.joints)), GRIPPER_FIELDS if driven else (), *axes, OPERATOR_FIELDS)
     cell = () if partners is None else (partners.fields,)
     devices = make_devices(config)
     parts = (*make_processes(config, devices, partners), *devices)

@@ -33,7 +33,7 @@ class DrivenGripper(JointGroup):
     """
 
     def __init__(self, config: ArmConfig, motion: GripperMotion, axis: int) -> None:
-        zero = config.zero_offsets[-1] if config.zero_offsets else 0.0
+        zero = config.zero_offsets[axis] if config.zero_offsets else 0.0
         config = replace(config, supervision=replace(config.supervision, torque=inf, acceleration=inf))
         super().__init__("gripper", GRIPPER_FIELDS, config, [drive_of(config, config.joints[0], zero)], axis)
         self.drive = self.drives[0]

@@ -86,18 +86,20 @@ class Homing:
     """
 
     __slots__ = (
-        "_attained", "_clear", "_cycles", "_drive", "_home", "_latched", "_mode_cycles", "_outcome", "_rest", "_search",
-        "_settle", "_tolerance", "_turned", "phase", "shown", "shown_mode",
+        "_attained", "_back", "_clear", "_cycles", "_drive", "_home", "_latched", "_mode_cycles", "_outcome", "_rest",
+        "_search", "_settle", "_tolerance", "_turned", "phase", "shown", "shown_mode",
     )  # fmt: skip
 
-    def __init__(self, config: HomingConfig, mode_s: float, period_s: float) -> None:
+    def __init__(self, config: HomingConfig, mode_s: float, period_s: float, back: int = CSP) -> None:
         """Prepare to home one drive at a time.
 
         Args:
             config: delays of the drives, and bounds.
             mode_s: longest time of a change of the mode, s.
             period_s: period of the cycle, s.
+            back: mode of operation before and after.
         """
+        self._back = back
         self._settle = ceil(config.settle_ms * 1e-3 / period_s - 1e-9)
         self._search = round(config.search_s / period_s)
         self._rest = round(config.rest_s / period_s)
@@ -157,7 +159,7 @@ class Homing:
     def abandon(self) -> None:
         """Release the drive: it has faulted, or another stop takes over."""
         if self._drive is not None and not self.ended:
-            self._drive.mode = CSP
+            self._drive.mode = self._back
             self._enter(_P.STOPPED)
 
     def step(self) -> HomingPhase:
@@ -189,7 +191,7 @@ class Homing:
             elif self._cycles > self._rest + self._settle:
                 # CSP would stop a turning joint with a jerk, so it is stopped otherwise.
                 self._enter(_P.RUNNING)
-        elif drive.mode_display == CSP and self._cycles > 1:
+        elif drive.mode_display == self._back and self._cycles > 1:
             self._enter(self._outcome)
         elif self._cycles > self._mode_cycles:
             self._enter(_P.STUCK)
@@ -236,7 +238,7 @@ class Homing:
         drive = self._drive
         if drive is not None:
             drive.controlword = ENABLE_OPERATION
-            drive.mode = CSP
+            drive.mode = self._back
             if self._turned:
                 drive.latch()
             self._latched = True

@@ -147,6 +147,8 @@ class JointGroup(Part):
         self.drives = [drive for _, drive in drives]
         self.foreign = {i: ForeignDrive(slot, drive) for i, (slot, drive) in enumerate(drives) if is_foreign(drive)}
         """Joints, counted within the group, whose drive has a driver of another package."""
+        self.returns_to_range = True
+        """Whether a joint slightly outside its range returns to it when it is enabled; else it may stand anywhere."""
         self.shares_slaves = False
         """Whether one of its drives is one of several axes of a slave."""
         self.state = ArmState(len(config.joints))
@@ -246,6 +248,8 @@ class JointGroup(Part):
 
     def beyond_range(self, i: int) -> float:
         """Return how far the target of joint `i`, counted within the group, is beyond its range, rad; 0 inside."""
+        if not self.returns_to_range:
+            return 0.0
         last, limits = self.output_limiter.sent[i], self.limits
         return max(last - limits.high[i], limits.low[i] - last, 0.0)
 
@@ -387,6 +391,8 @@ class Joints:
     def first_outside(self) -> int:
         """Return the first joint outside its range by more than `RANGE_MARGIN_RAD`."""
         for group in self.groups:
+            if not group.returns_to_range:
+                continue
             low, high = group.limits.low, group.limits.high
             for i, drive in enumerate(group.drives):
                 if not low[i] - RANGE_MARGIN_RAD <= drive.position <= high[i] + RANGE_MARGIN_RAD:

@@ -207,15 +207,20 @@ def share_slaves(pairs: Sequence[tuple[int, Drive]]) -> None:
             SharedSlave(drives)
 
 
+def slave_of(config: ArmConfig, joint: Joint) -> tuple[int, SlaveConfig]:
+    """Return index and description of the slave that moves `joint`, with the channels of its axis alone."""
+    slot = next(slot for slot, slave in enumerate(config.slaves) if slave.name == joint.slave)
+    slave = config.slaves[slot]
+    return slot, replace(slave, device=slave.device.of_axis(joint.axis))
+
+
 def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     """Return the driver of the drive that moves `joint`, with the index of its slave; `zero` as in `Drive`.
 
     Raises:
         DeviceError: the description is not usable, or the device is not a drive.
     """
-    slot = next(slot for slot, slave in enumerate(config.slaves) if slave.name == joint.slave)
-    slave = config.slaves[slot]
-    slave = replace(slave, device=slave.device.of_axis(joint.axis))
+    slot, slave = slave_of(config, joint)
     drive = make_driver(slave, config.cycle.period_us * 1e-6)
     if not isinstance(drive, Drive):
         raise DeviceError(f"slave {slave.name} (kind {slave.device.kind}) is no drive: it cannot move {joint.name}")

@@ -217,7 +217,7 @@ class MachineActions:
 
     @method()
     async def zero(self, caller: Caller, joint: str, at: float = 0.0) -> Json:
-        """Define the present position of a joint as `at`, rad. Returns `joint`, `offset`, `before`, `file`."""
+        """Define the present position of an axis as `at`, rad. Returns `joint`, `offset`, `before`, `file`, `unit`."""
         axis, channel, config = self._axis(joint), self._channel, self._config
         async with channel.lease(caller) as lease:
             try:
@@ -240,7 +240,8 @@ class MachineActions:
                     raise
             except ConfigError as error:
                 raise RtcpError("refused", str(error)) from None
-        return {"joint": config.axes[axis].name, "offset": offset, "before": before, "file": str(path)}
+        unit = config.unit_of(axis)
+        return {"joint": config.axes[axis].name, "offset": offset, "before": before, "file": str(path), "unit": unit}
 
     async def _move_drive_limits(self, axis: int, zero: float) -> None:
         """Write the limits of an axis to its drive anew: its position limits count from the drive's own zero.

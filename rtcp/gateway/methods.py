@@ -21,6 +21,7 @@ from annotated_types import Ge, Le
 
 from rtcp.config.find import load_messages
 from rtcp.config.validation import Checker
+from rtcp.gateway.axis_actions import AxisActions
 from rtcp.gateway.cell_actions import CellActions
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json, StreamingCommands
 from rtcp.gateway.joystick_override import JoystickOverride
@@ -97,13 +98,14 @@ class Methods:
         planners = [Planner(config, limits, number) for number in range(len(config.tool_names))]
         self._motion = MotionActions(channel, planners)
         self._processes = ProcessActions(channel, config)
+        self._axes = AxisActions(channel)
         self._cell = CellActions(session, self._motion, limits)
         self._paused_by: set[int] = set()
         """Connections that have paused a motion."""
         self._restoring: asyncio.Task[None] | None = None
         load_messages()
         own = methods_of(
-            self, self.machine, self._motion, self._cell, self.joystick_override, self.recordings,
+            self, self.machine, self._axes, self._motion, self._cell, self.joystick_override, self.recordings,
             Terminals(channel), LimitSettings(channel, limits, directory),
         )  # fmt: skip
         by_command = (self._command_method(kind) for kind in COMMANDS if kind.name not in own and kind not in _INTERNAL)
@@ -122,6 +124,7 @@ class Methods:
         """End the motion and the forced inputs of a connection that has closed."""
         self._paused_by.discard(connection)
         self._streaming.end(connection)
+        await self._axes.end_connection(connection)
         await self._motion.end_connection(connection)
         await self.joystick_override.end(connection)
 
@@ -309,7 +312,15 @@ class Methods:
 def documented() -> list[Documented]:
     """Return every method of this package, by name."""
     methods = documented_of(
-        Methods, MachineActions, MotionActions, CellActions, JoystickOverride, Recordings, Terminals, LimitSettings
+        Methods,
+        MachineActions,
+        AxisActions,
+        MotionActions,
+        CellActions,
+        JoystickOverride,
+        Recordings,
+        Terminals,
+        LimitSettings,
     )
     names = {entry.name for entry in methods}
     methods += [

@@ -264,8 +264,9 @@ class StatusSnapshot:
     def _devices(self, record: np.void) -> dict[str, dict[str, dict[str, Any]]]:
         """Return value and unit of the fields of each slave that is no drive, by slave and field."""
         devices: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in self._session.config.boxes}
+        others = PLATFORM_PARTS | {axis.name for axis in self._session.config.external_axes}
         for field in self._observer.schema.fields:
-            if field.part in PLATFORM_PARTS:
+            if field.part in others:
                 continue
             value = record[field.name].tolist()
             numbers = value if field.shape else [value]
@@ -273,6 +274,24 @@ class StatusSnapshot:
             entry = {"value": known if field.shape else known[0], "unit": field.unit}
             devices.setdefault(field.part, {})[field.local_name] = entry
         return devices
+
+    def _axes(self, record: np.void) -> dict[str, dict[str, Any]]:
+        """Return unit, measurements and state of each external axis, by name."""
+        axes = {}
+        for axis in self._session.config.external_axes:
+            part = identifier(axis.name)
+            axes[axis.name] = {
+                "unit": axis.unit,
+                "position": round(float(record[f"{part}_actual_position"]), 7),
+                "velocity": round(float(record[f"{part}_actual_velocity"]), 7),
+                "target_position": round(float(record[f"{part}_target_position"]), 7),
+                "target_velocity": round(float(record[f"{part}_target_velocity"]), 7),
+                "mode": int(record[f"{part}_mode"]),
+                "drive_state": DriveState(int(record[f"{part}_drive_state"])).words,
+                "moving": bool(record[f"{part}_moving"]),
+                "homed": bool(record[f"{part}_homed"]),
+            }
+        return axes
 
     def _processes(self, record: np.void) -> dict[str, dict[str, Any]]:
         """Return kind, state in words, and names of the commands of each process, by name."""
@@ -351,6 +370,7 @@ class StatusSnapshot:
             else [round(value, 7) for value in goal],
             "drive_states": [DriveState(state).words for state in record["drive_state"].tolist()],
             "statuswords": [int(word) for word in record["statusword"]],
+            "axes": self._axes(record),
             "devices": self._devices(record),
             "processes": self._processes(record),
             "wakeup_us": figures["wakeup"].as_json(),

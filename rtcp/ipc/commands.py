@@ -146,6 +146,44 @@ class MoveGripper(Command):
     open: bool
 
 
+class MoveAxis(Command):
+    """Move an external axis to a position by its drive's profile."""
+
+    states = CALM | {State.STOPPING}
+    axis: int
+    """Its number among all axes: joints, the gripper's, external ones."""
+    position: float
+    """m or rad."""
+    speed: float = 0.0
+    """m/s or rad/s; 0: its speed limit."""
+
+
+class RunAxis(Command):
+    """Run an external axis at a velocity for `hold_s`."""
+
+    states = CALM | {State.STOPPING}
+    axis: int
+    velocity: float
+    """m/s or rad/s."""
+    hold_s: float
+
+
+class HomeAxis(Command):
+    """Search the home of an external axis (mode of operation 6)."""
+
+    states = CALM | {State.STOPPING}
+    axis: int
+
+
+class StopAxis(Command):
+    """Halt an external axis; its drive stays enabled."""
+
+    states = ANYWHERE
+    superseded_by_stop = False
+    needs_lease = False
+    axis: int
+
+
 class SetLimits(Command):
     """Replace the limits by those of a slot of the plan area, all or none."""
 

@@ -225,6 +225,49 @@ class GripperAtRest(Event, number=40):
     """An object keeps it from its end position."""
 
 
+class AxisAtRest(Event, number=190):
+    """{joint} rests at {position:.6g} rad"""
+
+    axis: int
+    position: float
+    reached: bool
+    """It is at the target of its motion."""
+
+
+class AxisFailed(Event, number=191):
+    """{joint} is halted: its drive did not carry out the motion (mode {mode}, statusword 0x{statusword:04X})"""
+
+    is_warning = True
+    axis: int
+    statusword: int
+    mode: int
+    """Mode of operation display."""
+
+
+class AxisStillMoving(FaultEvent, number=192):
+    """{joint} does not come to rest although it is halted: {velocity:.6g} rad/s; its drive stops it by a quick stop"""
+
+    axis: int
+    velocity: float
+
+
+class AxisNotReplaced(FaultEvent, number=193):
+    """{joint} is halted, and its drive does not acknowledge the set-point that replaces the former one (statusword
+    0x{statusword:04X}); it is stopped by a quick stop"""
+
+    axis: int
+    statusword: int
+
+
+class AxisModeLost(FaultEvent, number=194):
+    """the drive of {joint} shows mode {shown}, commanded is {mode_words}: check 0x6060 and 0x6502 of the drive"""
+
+    axis: int
+    shown: int
+    """Mode of operation display."""
+    mode: int
+
+
 class ZeroSet(Event, number=34):
     """{joint}: its zero is at {offset:.6g} rad of the drive, it stands at {position:.6g} rad"""
 

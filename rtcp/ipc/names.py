@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import string
 import time
 from collections.abc import Callable, Sequence
@@ -31,6 +32,9 @@ MISSING_WORDS = {
     "\\SampleRate in the controller's program",
 }
 """Remedies at a robot controller."""
+_RAD = re.compile(r"\brad\b")
+"""The unit in messages about one axis, which an external axis may have in metres."""
+_MODE_WORDS = {1: "profile position", 3: "profile velocity", 6: "homing"}
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -66,7 +70,20 @@ class Names:
 
     def key(self, axis: int) -> str:
         """Return the key of an axis in the file."""
+        external = axis - self.config.first_external
+        if 0 <= external < len(self.config.external_axes):
+            return f"external_axes[{external}]"
         return f"joints[{axis}]" if axis < len(self.config.joints) else "gripper.joint"
+
+    def axis_range(self, axis: int) -> str:
+        """Return the range of an axis in words, with the key that sets it."""
+        external = axis - self.config.first_external
+        axes = self.config.external_axes
+        ends = axes[external].position if 0 <= external < len(axes) else None
+        if ends is None:
+            return f"allowed is what target_position of its drive can express ({self.key(axis)} in {self.file})"
+        unit, key = self.config.unit_of(axis), self.key(axis)
+        return f"allowed is {ends.min:.6g} to {ends.max:.6g} {unit} ({key}.position in {self.file})"
 
     def lacks(self, capability: Capability) -> str:
         """Return why the bus lacks a capability; empty: it has it."""
@@ -168,6 +185,8 @@ class Names:
     def message(self, about: Message) -> str:
         """Return the text of an event or a refusal: what happened, where, and what to do."""
         template = " ".join(inspect.cleandoc(type(about).__doc__ or about.name).split())
+        if self.config.unit_of(getattr(about, "axis", -1)) == "m":
+            template = _RAD.sub("m", template)
         return _Template(self, about).format(template)
 
 
@@ -178,6 +197,8 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
         names.joint(about.axis) if about.axis >= 0 else ("the supervision", "the Cartesian limits")[about.axis + 2]
     ),
     "key": lambda names, about: names.key(about.axis),
+    "mode_words": lambda names, about: _MODE_WORDS.get(about.mode, f"mode {about.mode}"),
+    "axis_range": lambda names, about: names.axis_range(about.axis),
     "drive_words": lambda names, about: names.drive(about),
     "mode_reason": lambda names, about: (
         names.lacks("torque") or "it has no process data for that (rpdo and tpdo in its device file)"

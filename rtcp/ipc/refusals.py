@@ -164,6 +164,76 @@ class GripperDisabled(Refusal):
     """the drive of the gripper is not enabled: `rtcp enable` first"""
 
 
+# -- external axes ----------------------------------------------------------------------------------------------------
+
+
+class UnknownExternalAxis(Refusal):
+    """axis {axis} is no external axis (external_axes in {file})"""
+
+    axis: int
+
+
+class AxisDisabled(Refusal):
+    """the drive of {joint} is not enabled: `rtcp enable` first"""
+
+    axis: int
+
+
+class AxisModeMissing(Refusal):
+    """{joint} is not used in {mode_words} ({key}.modes in {file})"""
+
+    axis: int
+    mode: int
+
+
+class AxisNotHomed(Refusal):
+    """{joint} is not homed: `rtcp axis home {joint}` first"""
+
+    axis: int
+
+
+class AxisBusy(Refusal):
+    """{joint} moves in another mode: `rtcp axis stop {joint}` first"""
+
+    axis: int
+
+
+class AxisOutOfRange(Refusal):
+    """{joint}: {value:.6g} rad is outside its range: {axis_range}"""
+
+    axis: int
+    value: float
+
+
+class AxisAtEnd(Refusal):
+    """{joint} stands at {value:.6g} rad and would leave its range at this velocity: {axis_range}"""
+
+    axis: int
+    value: float
+
+
+class IsExternalAxis(Refusal):
+    """{joint} is an external axis, no joint: `rtcp axis home {joint}`"""
+
+    axis: int
+
+
+class AxisSpeedOutOfRange(Refusal):
+    """{joint}: {value:.6g} rad/s is not allowed: at most {limit:.6g} rad/s ({key}.velocity in {file})"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+class AxisHoldOutOfRange(Refusal):
+    """{joint}: a hold time of {value:.6g} s is not allowed: more than 0 and at most {limit:.6g} s"""
+
+    axis: int
+    value: float
+    limit: float
+
+
 # -- motion -----------------------------------------------------------------------------------------------------------
 
 

@@ -10,6 +10,10 @@ import re
 import struct
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rtcp.config.model import ExternalAxis
 
 CODES = {"uint8": "B", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q",
          "float32": "f", "float64": "d"}  # fmt: skip
@@ -235,6 +239,27 @@ GRIPPER_FIELDS = _fields_of(
     ("gripper_statusword", "uint16", "", "Statusword of the drive (CiA 402, 0x6041)."),
 )
 """Fields of a gripper with a drive of its own."""
+
+
+_AXIS_FIELDS = (
+    ("actual_position", "float64", "{unit}", "Measured position."),
+    ("actual_velocity", "float64", "{unit}/s", "Measured velocity."),
+    ("target_position", "float64", "{unit}", "Last set-point of profile position."),
+    ("target_velocity", "float64", "{unit}/s", "Target velocity of profile velocity."),
+    ("mode", "int16", "", "Mode of operation that the drive displays (CiA 402, 0x6061)."),
+    ("drive_state", "uint8", "", "State of the drive (rtcp.ipc.states.DriveState)."),
+    ("statusword", "uint16", "", "Statusword of the drive (CiA 402, 0x6041)."),
+    ("moving", "uint8", "", "1: a motion is under way, or the axis comes to rest."),
+    ("homed", "uint8", "", "1: its positions count from its home, or it needs none."),
+)
+
+
+def axis_fields(axis: ExternalAxis) -> tuple[Field, ...]:
+    """Return the fields of an external axis."""
+    return tuple(
+        device_field(axis.name, Field(name, kind, unit.format(unit=axis.unit), about))
+        for name, kind, unit, about in _AXIS_FIELDS
+    )
 
 
 def schema_of(parts: Iterable[Sequence[Field]]) -> RecordSchema:

@@ -79,6 +79,7 @@ class NotingRobot:
             {"name": name, "box": "box", "number": number, "value": False, "has_function": name == "state_lamp"}
             for number, name in enumerate(("lamp", "state_lamp"), 1)
         ]
+        self.axes = {"rail": None, "belt": None}
         self.terminals = Terminals(Levels([{**levels[0], "name": "start"}]), Levels(levels))
 
     def happens(self, number: int, name: str, severity: str = "note") -> None:
@@ -91,7 +92,7 @@ class NotingRobot:
         return [event for event in self.happened if event.number > since]
 
     def status(self) -> Any:
-        return SimpleNamespace(commanded_positions=self.positions, tool=self.tool)
+        return SimpleNamespace(commanded_positions=self.positions, tool=self.tool, axes=self.axes)
 
     def fk(self, q: Sequence[float]) -> list[float]:
         return [9.0, 8.0, 7.0, *q[:3]]
@@ -107,6 +108,18 @@ class NotingRobot:
 
     def gripper(self, opened: bool) -> None:
         self.done.append(f"gripper {opened}")
+
+    def move_axis(self, axis: str, position: float, speed: float | None) -> None:
+        self.done.append(f"{axis} to {position:g} at {speed}")
+
+    def run_axis(self, axis: str, velocity: float, hold_s: float) -> None:
+        self.done.append(f"{axis} runs {velocity:g} for {hold_s:g}")
+
+    def home_axis(self, axis: str) -> None:
+        self.done.append(f"{axis} home")
+
+    def stop_axis(self, axis: str) -> None:
+        self.done.append(f"{axis} stops")
 
     def __setitem__(self, name: str, value: bool) -> None:
         self.done.append(f"{name} {value}")
@@ -132,6 +145,48 @@ def test_steps_are_carried_out_in_order_and_blended_ones_are_one_motion(program:
     rounds = [[0.1, 0.2, 0]] * 3
     assert robot.done == [[0], *rounds, "gripper True", "lamp False", "wait start True 2"]
     assert [line for line, _ in begun_steps] == [8, 17, 17, 17, 10, 11, 12, 13]
+
+
+AXES = """
+program:
+  - {axis: rail, home: true}
+  - {axis: belt, velocity: 0.1, time_s: 20}
+  - {axis: rail, position: 0.3, speed: 0.1}
+  - {wait_s: 0.001}
+"""
+
+
+def test_steps_of_axes_are_carried_out_and_one_that_runs_stops_where_the_program_ends(
+    program: Callable[..., Program],
+) -> None:
+    robot: Any = NotingRobot()
+    begun: list[str] = []
+    program(AXES).run(robot, lambda step: begun.append(step.text))
+    assert robot.done == ["rail home", "belt runs 0.1 for 20", "rail to 0.3 at 0.1", "belt stops"]
+    assert begun[:3] == ["axis rail: home", "axis belt: velocity 0.1 for 20 s", "axis rail: to 0.3"]
+
+
+def test_a_program_that_fails_stops_the_axes_that_it_runs(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+
+    def fail(*arguments: object) -> None:
+        raise RtcpError("refused", "rail is not homed")
+
+    robot.move_axis = fail
+    with pytest.raises(RtcpError, match="not homed"):
+        program(AXES).run(robot)
+    assert robot.done[-1] == "belt stops"
+
+
+def test_a_step_of_an_axis_that_does_not_exist_keeps_all_from_beginning(program: Callable[..., Program]) -> None:
+    robot: Any = NotingRobot()
+    del robot.axes["belt"]
+    with pytest.raises(
+        RtcpError, match=r'program\.yaml:4: axis: found the text "belt", allowed is one of rail'
+    ) as error:
+        program(AXES).run(robot)
+    assert error.value.reason == "unknown_axis"
+    assert not robot.done
 
 
 def test_all_is_planned_from_where_the_motion_before_ends_and_loops_twice(program: Callable[..., Program]) -> None:
@@ -364,6 +419,14 @@ def test_a_part_that_runs_again_is_a_motion_of_its_own_also_where_its_last_step_
         ("via: home, ", "", "18 parts[0].steps[1].arc: needs_beside need=via"),
         ("{gripper: open}", "{gripper: open, speed: 1}", "10 program[2].speed: beside found=gripper"),
         ("{gripper: open}", "{gripper: open, wait_s: 1}", "10 program[2]: one_of_keys found=gripper and wait_s"),
+        (
+            "{gripper: open}",
+            "{axis: rail, position: 1, home: true}",
+            "10 program[2]: one_of_keys found=position and home",
+        ),
+        ("{gripper: open}", "{axis: rail, velocity: 0.1}", "10 program[2].velocity: needs_beside need=time_s"),
+        ("{gripper: open}", "{axis: rail, home: true, speed: 1}", "10 program[2].speed: beside found=home"),
+        ("{gripper: open}", "{gripper: open, home: true}", "10 program[2].home: beside found=gripper"),
         ("{gripper: open}", "{}", "10 program[2]: one_of_keys found=none of them"),
         ("name: below", "name: right", "6 poses[2].name: name_twice found=right"),
         ("times: 3", "times: -1", "9 program[1].times: range"),

@@ -110,6 +110,7 @@ def status() -> dict[str, Any]:
             "commanded_position": position,
             "sent_position": position,
         },
+        "axes": {},
         "devices": {"io": {"inputs": {"value": 63, "unit": ""}, "outputs": {"value": 0x8001, "unit": ""}}},
         "processes": {},
         "wakeup_us": times,

@@ -17,7 +17,7 @@ PERIOD = ("--cycle-us", "4000")
 
 FIELDS = {
     "state": str, "drive_mode": str, "bus": str, "cycle_ns": int, "cycles": int, "missed": int, "wkc": dict,
-    "slaves": list, "joints": dict, "tool": dict, "devices": dict, "processes": dict, "wakeup_us": dict,
+    "slaves": list, "joints": dict, "tool": dict, "axes": dict, "devices": dict, "processes": dict, "wakeup_us": dict,
     "exchange_us": dict, "compute_us": dict, "dc": dict, "realtime": dict, "pids": dict, "speed_override": float,
     "tool_name": str, "payload": dict,
 }  # fmt: skip

@@ -49,6 +49,15 @@ def driven(old: str, new: str) -> Changes:
     return [(SIXTH, SIXTH + SIXTH.replace("drive6", "drive7")), (ON_AN_OUTPUT, DRIVEN.replace(old, new, 1))]
 
 
+def external(old: str, new: str) -> Changes:
+    """The changes that give the arm an external axis, with one text in them replaced."""
+    axis = "{name: belt, slave: drive7, velocity: 0.5, acceleration: 1.0, modes: [velocity]}"
+    assert old in axis
+    axis, slave = axis.replace(old, new, 1), SIXTH.replace("drive6", "drive7")
+    return [(SIXTH, SIXTH + slave),
+            (ON_AN_OUTPUT, f"{ON_AN_OUTPUT}\nexternal_axes: [{axis}]")]  # fmt: skip
+
+
 MISTAKES: list[tuple[str, Changes, str]] = [
     (ARM, [("priority: 80", "priority: true")], "cycle.priority: type"),
     (ARM, [("lost_cycles: 40", "lost_cycles: 2.5")], "bus.lost_cycles: type"),
@@ -159,6 +168,16 @@ MISTAKES: list[tuple[str, Changes, str]] = [
     (ARM, driven("1.4", "1.6"), "gripper.open_position: outside low=-0.1 high=1.5 of=gripper.joint.position"),
     (ARM, driven("closed_position: 0.0", "closed_position: 1.4"), "gripper.closed_position: ends_alike"),
     (ARM, driven("drive7", "drive6"), "gripper.joint.slave: repeated of=joints[5].slave"),
+    (ARM, external("[velocity]", "[position]"), "external_axes[0].slave: axis_not_mapped lacking=['profile_velocity']"),
+    (ARM, external("[velocity]", "[]"), "external_axes[0].modes: length"),
+    (ARM, external("[velocity]", "[position, homing]"), "external_axes[0].modes: home_without_ends"),
+    (ARM, external("name: belt", "name: drive2"), "external_axes[0].name: name_of_part"),
+    (ARM, external("name: belt", "name: joint2"), "external_axes[0].name: repeated of=joints[1].name"),
+    (ARM, external("drive7", "drive6"), "external_axes[0].slave: repeated of=joints[5].slave"),
+    (ARM, external("drive7", "io"), "external_axes[0].slave: moves_no_joint"),
+    (ARM, external("velocity: 0.5", "velocity: 0.5, position: {min: 1, max: -1}"),
+     "external_axes[0].position: out_of_order"),
+    (ARM, external("velocity: 0.5", "velocity: 1.0e+9"), "external_axes[0].velocity: beyond_wire"),
     (BOX, [("kind: io", "kind: cia402")], "rpdo: channels_lacking kind=cia402"),
     (DRIVE, [("type: uint16, name: controlword", "type: uint32, name: controlword")],
      "rpdo[0].channels[0].type: type_of_channel channel=controlword"),
@@ -316,6 +335,16 @@ def test_the_error_reads_as_its_sentences_line_by_line(directory: Path) -> None:
         load(Path(ARM))
     assert str(caught.value).splitlines() == caught.value.problems
     assert [finding.fields["key"] for finding in caught.value.findings] == ["name", "slaves", "joints"]
+
+
+def test_an_external_axis_is_the_last_of_all_axes_in_its_own_unit(directory: Path) -> None:
+    text = Path(ARM).read_text()
+    for old, new in external("modes", "unit: m, modes"):
+        text = text.replace(old, new, 1)
+    Path(ARM).write_text(text)
+    arm = load(Path(ARM))
+    assert [axis.name for axis in arm.axes] == [*(joint.name for joint in arm.joints), "belt"]
+    assert (arm.first_external, arm.unit_of(6), arm.unit_of(5)) == (6, "m", "rad")
 
 
 def test_there_is_room_for_ten_axes(directory: Path, findings_after: Callable[..., list[Finding]]) -> None:

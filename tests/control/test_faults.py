@@ -242,7 +242,8 @@ def test_every_fault_and_every_key_has_a_case() -> None:
     faults = {kind for kind in own if kind.is_fault and not kind.is_emergency}
     # A reset without frames: test_clock_lost.py; without a robot controller: tests/faults/egm.py; a process:
     # test_processes.py; a push towards a box: test_torque_in_boxes.py; a controller: test_wrong_plugins.py; a load in
-    # CST: test_compliant_joints.py; positions and speed that disagree: test_measurements.py.
+    # CST: test_compliant_joints.py; positions and speed that disagree: test_measurements.py; an external
+    # axis: test_external_axes.py.
     assert faults <= {case.kind for case in CASES} | {
         events.ResetWithoutFrames,
         events.ResetWithoutController,
@@ -252,6 +253,9 @@ def test_every_fault_and_every_key_has_a_case() -> None:
         events.ControllerRaised,
         events.TooHeavyForCst,
         events.VelocityDisagrees,
+        events.AxisStillMoving,
+        events.AxisNotReplaced,
+        events.AxisModeLost,
     }
     assert set(REACTIONS) == {kind.stop_key for kind in own} - {""} == set(STOPS)
 

@@ -58,6 +58,8 @@ class FakeLoop:
         self.state = state
         self.q = list(q)
         self.inputs = self.outputs = 0
+        self.fields: dict[str, Any] = {}
+        """Further fields of the records."""
 
     def clear(self) -> None:
         """Reset received commands and settings."""
@@ -109,7 +111,7 @@ class FakeLoop:
         record: dict[str, Any] = {"time_ns": time.monotonic_ns(), "state": self.state}
         record |= {"control_mode": self.control_mode, "speed_override": self.speed_override}
         record |= dict.fromkeys(("actual_position", "commanded_position", "sent_position"), self.q)
-        record |= {"io_inputs": self.inputs, "io_outputs": self.outputs}
+        record |= {"io_inputs": self.inputs, "io_outputs": self.outputs, **self.fields}
         self.board.publish(numbers(self.board.schema, **record))
 
     def _handle(self) -> None:

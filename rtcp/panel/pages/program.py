@@ -11,7 +11,7 @@ from typing import Any, Final
 from nicegui import ui
 
 from rtcp.api import Program, ProgramFile, Robot, RtcpError
-from rtcp.api.program import Begun
+from rtcp.api.program import Begun, axis_motion
 from rtcp.config.model import ConfigError, NamedPose, Step
 from rtcp.config.zero import state_directory
 from rtcp.panel.page import ProgramSession, View, button, choice, field, no_platform, number, row, table, text
@@ -428,6 +428,8 @@ def described(step: Step) -> str:
         return f"{verb} to {name}{speed}{angle}" + (f", blend {step.blend:g} m" if step.blend else "")
     if step.gripper is not None:
         return f"gripper: {step.gripper}"
+    if step.axis is not None:
+        return axis_motion(step)
     if step.tool is not None:
         return f"tool: {step.tool}"
     level = "on" if step.value else "off"
