@@ -15,8 +15,8 @@ from rtcp.api import RtcpError
 from rtcp.cli import (
     arm,
     arm_new,  # noqa: F401  registers `rtcp arm new`
-    bench,  # noqa: F401  registers `rtcp device try`
     axis,
+    bench,  # noqa: F401  registers `rtcp device try`
     bus,
     cell,
     commission,
