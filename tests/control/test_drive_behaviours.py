@@ -44,7 +44,7 @@ def arm_of(
         outputs=type(SHIPPED.outputs)(),
         drive_waits=waits or DriveWaitsConfig(),
     )
-    scale = {"counts_per_turn": 524288.0 * 100, "initial_position": 0.5, "load_inertia": 0.1}
+    scale: dict[str, object] = {"counts_per_turn": 524288.0 * 100, "initial_position": 0.5, "load_inertia": 0.1}
     slave = SegmentSlave(esi="drive.xml", behaviour="cia402", options=scale | dict(options))
     return Simulation(config, follow_clock=False, segment=SegmentConfig((slave,), source=directory / "segment.yaml"))
 
