@@ -19,6 +19,8 @@ from rtcp.fieldbus.registers import Steps
 INTERPOLATION_TIME: Final = 0x60C2
 _VALUE, _EXPONENT = 1, 2
 """Subindices."""
+_LARGEST: Final = 8
+"""Most bytes of a value that count."""
 _MS: Final = -3
 """Exponent of a drive without subindex 2."""
 
@@ -46,7 +48,7 @@ def set_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Ste
         value = yield from sdo.reading(index, _VALUE)
     except SdoAborted as error:
         if error.code in ABSENT:
-            return [f"{where} has no interpolation time (0x{index:04X}:1)"]
+            return [f"{where} has no interpolation time (0x{index:04X})"]
         raise
     try:
         exponent: bytes | None = yield from sdo.reading(index, _EXPONENT)
@@ -57,7 +59,7 @@ def set_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Ste
     kept_ns = _time_ns(value, exponent)
     present = _MS if exponent is None else _signed(exponent)
     # A drive takes most likely a time in the unit that it has.
-    pairs = sorted(expressions(period_ns, 8 * len(value)), key=lambda pair: pair[1] != present)
+    pairs = sorted(expressions(period_ns, 8 * min(len(value), _LARGEST)), key=lambda pair: pair[1] != present)
     if exponent is None:
         pairs = [pair for pair in pairs if pair[1] == _MS]
     why = f"{len(value) * 8} bits{' in ms' if exponent is None else ''} cannot express the cycle"
@@ -105,5 +107,5 @@ def _signed(exponent: bytes) -> int:
 def _time_ns(value: bytes, exponent: bytes | None) -> int:
     """Return the time, ns; a part of 1 ns counts as 1 ns, so that it equals no cycle."""
     power = 9 + (_MS if exponent is None else _signed(exponent))
-    number = int.from_bytes(value, "little")
+    number = int.from_bytes(value[:_LARGEST], "little")
     return int(number * 10**power if power >= 0 else -(-number // 10**-power))

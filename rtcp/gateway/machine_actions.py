@@ -293,6 +293,8 @@ class MachineActions:
         `declares_present`: whether it declares the present position to be its home, and `home_offset` (0x607C), rad.
         """
         axis = self._axis(joint)
+        if why := self._channel.config.bus.LACKS.get("homing"):
+            raise RtcpError("refused", f"{joint} has no homing here: {why}", "homing_unsupported")
         data = await self._read_of(axis, HOMING_METHOD)
         number = None if data is None else int.from_bytes(data[:1], "little", signed=True)
         return {

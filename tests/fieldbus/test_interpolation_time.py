@@ -97,5 +97,5 @@ def test_another_time_than_the_cycle_that_stays_is_refused_with_both(
 
 
 def test_no_such_object_and_one_that_is_0_are_noted() -> None:
-    assert started((), 1000)[1] == ["slave 1 (drive1) has no interpolation time (0x60C2:1)"]
+    assert started((), 1000)[1] == ["slave 1 (drive1) has no interpolation time (0x60C2)"]
     assert "is 0 and was left as it is" in started(((U8, 0, RW),), 500)[1][0]
