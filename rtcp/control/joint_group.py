@@ -62,7 +62,7 @@ class ForeignDrive:
         self._failed = self._retries = False
         self._error: BaseException | None = None
         self._goal = TargetState.DISABLED
-        self._sent = bytes(drive.output_bytes)
+        self._sent = drive.safe_outputs
 
     def decode(self, data: bytes) -> None:
         """Let the driver read the inputs of the slave."""

@@ -212,7 +212,7 @@ def stop_blindly(
 
 
 def _outputs(drive: Drive, data: ProcessData, slot: int, goal: TargetState) -> bytes:
-    """Return a drive's outputs one step towards `goal`; where its driver raises: a controlword, all other fields 0."""
+    """Return a drive's outputs one step towards `goal`; if its driver raises, a controlword and its safe outputs."""
     try:
         drive.decode(data.input(slot))
         drive.advance(goal)
@@ -221,7 +221,7 @@ def _outputs(drive: Drive, data: ProcessData, slot: int, goal: TargetState) -> b
             raise ValueError(f"encode returned {len(own)} bytes, allowed are {drive.output_bytes}")
     except BaseException as error:
         plugin_error(error)
-        own = blind_outputs(drive, goal, bytes(drive.output_bytes))
+        own = blind_outputs(drive, goal, drive.safe_outputs)
     return own if drive.slave is None else drive.slave.outputs(drive, own)
 
 

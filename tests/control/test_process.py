@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from rtcp.config.model import ArmConfig, SlaveConfig
+from rtcp.config.model import ArmConfig, PdoEntry, SlaveConfig
 from rtcp.control.cycle import make_drives
 from rtcp.control.process import stop_blindly
 from rtcp.devices.drive import Drive
@@ -126,6 +126,17 @@ def with_reversed_outputs(slave: SlaveConfig) -> SlaveConfig:
     """The same drive with its outputs mapped in reverse order: the controlword last."""
     pdos = [replace(pdo, channels=tuple(reversed(pdo.channels))) for pdo in slave.device.rpdo]
     return replace(slave, device=replace(slave.device, rpdo=tuple(reversed(pdos))))
+
+
+def test_a_torque_limit_in_the_outputs_is_sent_too_where_the_driver_raises() -> None:
+    slave = CONFIG.slaves[1]
+    (pdo,) = slave.device.rpdo
+    limit = PdoEntry(0x6072, 0, "uint16", "max_torque", safe=1500.0)
+    device = replace(slave.device, rpdo=(replace(pdo, channels=(*pdo.channels, limit)),))
+    config = replace(CONFIG, slaves=(CONFIG.slaves[0], replace(slave, device=device), *CONFIG.slaves[2:]))
+    data = Sent(config)
+    stop_blindly(cast(ProcessData, data), config, make_drives(config))
+    assert {frame[1][-2:] for frame in data.frames} == {struct.pack("<H", 1500)}
 
 
 def test_the_controlword_of_a_drive_whose_driver_raises_is_at_its_place_in_its_own_image() -> None:
