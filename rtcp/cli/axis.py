@@ -48,8 +48,8 @@ def _run(
     speed = number(velocity, "VELOCITY")
     with stoppable("axis run", _ENDS) as robot:
         end = None if seconds is None else time.monotonic() + seconds
-        while (remaining_s := _HOLD_S if end is None else end - time.monotonic()) > 0.0:
-            robot.run_axis(name, speed, min(_HOLD_S, remaining_s))
+        while (remaining_s := _AGAIN_S if end is None else end - time.monotonic()) > 0.0:
+            robot.run_axis(name, speed, _HOLD_S)
             time.sleep(min(_AGAIN_S, remaining_s))
         robot.stop_axis(name)
         status = robot.status().axes[name]
