@@ -25,8 +25,11 @@ from rtcp.ipc.session import read_session
 LARGEST_ANGLE_DEG = 30.0
 SPEED_DEG_S = 1.0
 _LARGEST_SEEN_DEG = 36_000.0
-_NOTHING_REPORTED, _NOTHING_SEEN = 0.01, 0.1
-"""Part of the commanded angle below which nothing has turned, by the drive and by the eye."""
+_SMALLEST_ANGLE_DEG = 0.5
+_NOTHING_SEEN_DEG = 0.1
+"""Angle that nobody sees, degrees."""
+_NOTHING_REPORTED = 0.01
+"""Part of the commanded angle below which the drive reports no motion."""
 _REPORTED_WITHIN, _SEEN_WITHIN = 0.1, 0.3
 """Largest relative difference of the reported angle, and of an angle that a person has estimated."""
 _INCREMENTS_PER_LINE = 4
@@ -58,15 +61,16 @@ def diagnose(
     Args:
         commanded: angle by which the joint was to turn; not 0.
         reported: angle by which it turned by the drive's own position.
-        seen: angle by which a person saw its shaft turn; all three in one unit, positive in the joint's sense.
+        seen: angle by which a person saw its shaft turn; all three in degrees, positive in the joint's sense.
         scaling: of the axis, in the device's file.
         ended_early: a fault or a stop ended the motion, so that less was turned than commanded.
     """
     by_drive, by_eye = reported / commanded, seen / commanded
+    unseen = abs(seen) < _NOTHING_SEEN_DEG
+    if unseen and abs(reported) < 2 * _NOTHING_SEEN_DEG:
+        remedy = "too little was turned to be compared: check the brake, the motor's phases and 0x6072"
+        return [Diagnosis(Cause.NO_MOTION, remedy)]
     if abs(by_drive) < _NOTHING_REPORTED:
-        if abs(by_eye) < _NOTHING_SEEN:
-            remedy = "neither the drive nor the eye saw a motion: check the brake, the motor's phases and 0x6072"
-            return [Diagnosis(Cause.NO_MOTION, remedy)]
         remedy = (
             "the shaft turned, and the drive reports none of it: its `position` is not that of this shaft's encoder"
         )
@@ -83,7 +87,7 @@ def diagnose(
         found.append(Diagnosis(Cause.ENCODER, remedy))
     if found and _near(by_eye, 1.0, _SEEN_WITHIN):
         return found  # the drive turned the shaft as commanded, and reports something else
-    if abs(by_eye) < min(_NOTHING_SEEN, abs(by_drive) / 2):
+    if unseen:
         remedy = (
             "the drive reports a motion that the shaft did not make: check the coupling between motor and shaft; or "
             "`gear_ratio` is far too small, so that the turn was too small to be seen"
@@ -146,6 +150,8 @@ def _try(
     again. Ctrl-C stops and disables it.
     """
     positive("--angle", angle, "degrees", LARGEST_ANGLE_DEG)
+    if angle < _SMALLEST_ANGLE_DEG:
+        raise CommandError(f"--angle {angle:g} is not allowed: at least {_SMALLEST_ANGLE_DEG:g} degrees, to be seen")
     with stoppable("device try", "the shaft comes to a stop, and the drive is disabled") as robot:
         config = read_session(runtime_directory()).config
         joint = _joint(config, name, axis)

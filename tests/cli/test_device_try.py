@@ -59,6 +59,8 @@ def test_a_motion_that_a_fault_ended_early_is_judged_by_what_was_turned_until_th
     (gear,) = diagnose(1.0, 0.026, 1.3, DriveScaling(131072, 50), ended_early=True)
     assert gear.cause is Cause.GEAR
     assert diagnose(1.0, 0.4, 0.4, GEARED, ended_early=True) == []
+    (too_little,) = diagnose(1.0, 0.026, 0.0, GEARED, ended_early=True)
+    assert too_little.cause is Cause.NO_MOTION
 
 
 @pytest.fixture
