@@ -8,10 +8,10 @@ from collections.abc import Mapping
 FIGURES: Mapping[str, object] = {
     "encoder_increments": 65536, "gear_ratio": 1, "external_gear_ratio": 1, "feed_constant": 0,
     "velocity_unit": "counts/s", "velocity_at": "motor", "rated_torque": 1.0, "torque_at": "motor",
-    "assign_activate": 0x0300, "safe": 1000,
+    "assign_activate": 0x0300,
 }  # fmt: skip
 """Of a drive about which nothing is to be said."""
-_EMPTY = re.compile(r"(\w+):(?= +# REQUIRED| \}.*REQUIRED)")
+_EMPTY = re.compile(r"(\w+):(?= +# REQUIRED)")
 
 
 def filled(text: str, figures: Mapping[str, object] = FIGURES) -> str:

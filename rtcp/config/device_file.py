@@ -602,8 +602,8 @@ def _channel_lines(
     described = _object(device, entry.index, entry.sub_index)
     is_bound = kind == "cia402" and key == "rpdo" and first in BOUNDING_OBJECTS
     bound = _default(device, entry.index, entry.sub_index) if is_bound else None
-    if is_bound:
-        keys += ", safe: " + ("" if bound is None else f"{bound:.10g}")
+    if bound is not None:
+        keys += f", safe: {bound:.10g}"
     unit = None if described is None or described.unit is None or known or is_bound else units.unit(described.unit)
     if unit is not None and unit.si:
         keys += f", factor: {unit.factor:.10g}, unit: {_quoted(unit.si)}"
@@ -611,7 +611,7 @@ def _channel_lines(
     if described is not None:
         said += _range_text(described)
     if is_bound and bound is None:
-        said.append(f"REQUIRED: safe, which is always sent; see {SOURCES['safe']}")
+        said.append("always sent: the drive's own value, unless the channel has a `safe`")
     elif is_bound:
         said.append("CHECK: always sent; at 0 the drive has no torque")
     yield f"      - {{{keys}}}   # {', '.join(text for text in said if text)}".rstrip(" #")

@@ -52,7 +52,6 @@ SOURCES = {
     "velocity_at": "the drive's manual at 0x606C; without effect for counts/s",
     "rated_torque": "0x6076 of the drive, mostly in mNm, or the name plate; or write rated_current and torque_constant",
     "torque_at": "the drive's manual at 0x6077; of an actuator with a gear mostly its output",
-    "safe": "the drive's own value of this object; at 0 the drive has no torque",
     "assign_activate": "AssignActivate in the maker's ESI file, as 0x0300; 0 for no distributed clock",
 }
 """Where a person finds the value of a key of a device's file that no description states."""

@@ -320,10 +320,10 @@ def test_a_drive_that_bounds_itself_by_process_data_is_not_sent_0_and_holds_afte
     write_esi(tmp_path / "drive.xml", bounding, {0x6872: ("UINT", 800)})
     out = tmp_path / "drive.yaml"
     out.write_text(text := file_text(find_device(read_esi(tmp_path / "drive.xml"))))
-    assert text.count("REQUIRED: safe, which is always sent") == 2
+    assert text.count("always sent: the drive's own value") == 2
     fill(out)
     device = load_device(out)
-    assert {entry.index: entry.safe for entry in device.outputs[-2:]} == {0x6872: 1000, 0x6880: 1000}
+    assert {entry.index: entry.safe for entry in device.outputs[-2:]} == {0x6872: None, 0x6880: None}
     assert [device.startup(0x605A, axis) for axis in (1, 2)] == [6, 6]
 
 

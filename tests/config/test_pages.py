@@ -31,6 +31,7 @@ OWN = [
     "descriptions.md",
     "channels.md",
     "drives.md",
+    "drive_behaviours.md",
     "drive_settings.md",
     "homing.md",
     "segment.md",
