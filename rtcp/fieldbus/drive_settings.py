@@ -13,7 +13,14 @@ from typing import Final, Literal
 
 from rtcp.config.drive_limits import channel_factor, factor_of
 from rtcp.config.model import DRIVEN_OUTPUTS, AxisNeeds, DeviceDescription, Pdo, PdoEntry, SlaveConfig
-from rtcp.config.scaling import BOUNDING_OBJECTS, OBJECTS_PER_AXIS, TORQUE_UNITS, VELOCITY_UNITS, DriveScaling
+from rtcp.config.scaling import (
+    BOUNDING_OBJECTS,
+    OBJECTS_PER_AXIS,
+    QUICK_STOP_OPTION,
+    TORQUE_UNITS,
+    VELOCITY_UNITS,
+    DriveScaling,
+)
 from rtcp.fieldbus.bus import slave_label
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
@@ -29,7 +36,7 @@ _WINDOW, _QUICK_STOP_RATE, _OFFSET = 0x6065, 0x6085, 0x60B0
 _TORQUES: Final = (0x6072, 0x60E0, 0x60E1)
 _SPEEDS: Final = (0x607F, 0x6080)
 _RANGE_LOW, _RANGE_HIGH = (0x607B, 1), (0x607B, 2)
-_QUICK_STOP, _FAULT_REACTION = 0x605A, 0x605E
+_QUICK_STOP, _FAULT_REACTION = QUICK_STOP_OPTION, 0x605E
 _ADDED: Final = (0x60B1, 0x60B2)
 """Offsets that a drive adds to the output of its loops."""
 _LIMITS: Mapping[tuple[int, int], tuple[str, Quantity]] = {
