@@ -276,7 +276,7 @@ def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> 
 
 def test_a_drive_that_does_not_show_the_mode_in_which_its_axis_rests_is_not_enabled() -> None:
     with Simulation(ABSOLUTE, follow_clock=False) as bench:
-        del bench.bus.slaves[1].device.servo._modes[1]  # type: ignore[attr-defined]
+        del bench.bus.slaves[1].device.servos[0]._modes[1]
         bench.bring_to(State.READY)
         bench.acquire()
         bench.do(Enable())
