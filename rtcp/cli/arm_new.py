@@ -11,6 +11,7 @@ import typer
 
 from rtcp.cli import arm
 from rtcp.cli.arguments import option, positive
+from rtcp.cli.device import choose
 from rtcp.cli.output import CommandError, asking, new_file, report
 from rtcp.config.model import MOST_AXES
 from rtcp.config.numbers import angle, plain_number
@@ -26,6 +27,9 @@ def _new(
     esi: Annotated[
         Path | None, option("--esi", "FILE", "The maker's ESI file: writes the segment's file, too.")
     ] = None,
+    choice: Annotated[
+        int | None, option("--choice", "N", "Which of several devices of one identity, as for `device new`.")
+    ] = None,
     answers: Annotated[
         Path | None, option("--answers", "FILE", "The numbers by name, one for all joints or a list. Default: asks.")
     ] = None,
@@ -38,20 +42,23 @@ def _new(
     from rtcp.config.arm_file import arm_text, segment_text
     from rtcp.config.document import read
     from rtcp.config.loader import load, load_device, segment_path
-    from rtcp.esi.reader import find_device, read_esi
+    from rtcp.esi.reader import choice_of, read_esi
     from rtcp.virtual.segment import check_segment
 
     positive("--period-us", period_us, "us")
     if not 1 <= joints <= MOST_AXES:
         raise CommandError(f"--joints {joints} is not allowed: 1 to {MOST_AXES}")
     described = load_device(out.parent / "devices" / f"{device}.yaml")
-    description = None if esi is None else find_device(read_esi(esi), product=described.product_id)
+    if choice is not None and esi is None:
+        raise CommandError("--choice needs --esi: it says which device of that file the drive is")
+    content = None if esi is None else read_esi(esi)
+    description = None if content is None else choose(content, described.product_id, None, choice)
     numbers = _numbers(joints, None if answers is None else read(answers).data)
     segment = "" if esi is None else f"{out.stem}_segment.yaml"
     written = [(out, arm_text(out.stem, device, described, numbers, period_us, segment))]
-    if esi is not None and description is not None:
-        relative = os.path.relpath(esi, out.parent)
-        written.append((out.parent / segment, segment_text(relative, description, described, joints)))
+    if esi is not None and content is not None and description is not None:
+        relative, number = os.path.relpath(esi, out.parent), choice_of(content, description)
+        written.append((out.parent / segment, segment_text(relative, description, described, joints, number)))
     with new_file(out) as first:
         first.write(written[0][1].encode())
         first.flush()

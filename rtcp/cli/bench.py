@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from enum import Enum
 from pathlib import Path
@@ -162,17 +161,17 @@ def _try(
 
 def _joint(config: ArmConfig, name: str, axis: int) -> Joint:
     """Return the joint that an axis of a drive moves, which is the only one; raises CommandError."""
-    joints = config.joints
+    joints, axes = config.joints, config.axes
     if not isinstance(config.bus, EthercatBus):
         raise CommandError("`rtcp device try` is for EtherCAT drives: a robot controller moves its own arm")
     found = [joint for joint in joints if (joint.slave, joint.axis) == (name, axis)]
     if not found:
         known = "; ".join(f"{joint.slave} --axis {joint.axis}" for joint in joints) or "none"
         raise CommandError(f"no joint of {config.source} is moved by {name}, axis {axis}: found are {known}")
-    if len(joints) > 1:
-        others = ", ".join(joint.name for joint in joints if joint is not found[0])
+    if len(axes) > 1:
+        others = ", ".join(joint.name for joint in axes if joint is not found[0])
         raise CommandError(
-            f"{config.source} has further joints, which would get torque too: {others}. Start the platform with a file "
+            f"{config.source} has further drives, which would get torque too: {others}. Start the platform with a file "
             "of this one joint, as `rtcp arm new --joints 1` writes it, and with this drive alone on the cable",
             ExitCode.REFUSED,
         )
@@ -218,7 +217,7 @@ def _turn_and_compare(robot: Robot, config: ArmConfig, joint: Joint, angle: floa
     if found or failure:
         causes = ", ".join(dict.fromkeys(cause.value for cause, _ in found)) or failure
         raise CommandError(f"{place} did not turn as commanded: {causes}; see docs/drives.md#scaling", ExitCode.FAULT)
-    report(f"{place}: commanded, reported and seen motion agree; the drive is disabled")
+    report(f"{place}: commanded, reported and seen motion agree")
 
 
 def _there_and_back(robot: Robot, angle: float, speed: float) -> tuple[list[float], str]:
@@ -228,6 +227,7 @@ def _there_and_back(robot: Robot, angle: float, speed: float) -> tuple[list[floa
 
     Raises:
         RtcpError: the drive cannot be enabled, or the motion was refused.
+        CommandError: the drive cannot be disabled.
     """
     reached: list[float] = []
     try:
@@ -241,6 +241,9 @@ def _there_and_back(robot: Robot, angle: float, speed: float) -> tuple[list[floa
                 raise
             return [*reached, robot.status().positions[0]], error.message
     finally:
-        with contextlib.suppress(RtcpError):
+        try:
             robot.disable()
+        except RtcpError as error:
+            problem = f"the drive may still have torque, it could not be disabled: {error.message}"
+            raise CommandError(problem, ExitCode.FAULT) from error
     return reached, ""

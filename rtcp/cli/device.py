@@ -139,7 +139,7 @@ def _new(
     def described() -> Device:
         if esi is not None:
             content = _read(esi)
-            bare = _choose(content, _number("--product", product), _number("--revision", revision), choice)
+            bare = choose(content, _number("--product", product), _number("--revision", revision), choice)
             return assemble(bare, content.modules, chosen) if bare.slots or chosen else bare
         if chosen:
             raise CommandError("--module needs --esi: an EEPROM and a bus have no list of modules")
@@ -165,7 +165,7 @@ def _new(
         report(f"it is refused until these {len(missing)} values are filled in; then: rtcp device check {out}{listed}")
 
 
-def _choose(content: DeviceFile, product: int | None, revision: int | None, choice: int | None) -> Device:
+def choose(content: DeviceFile, product: int | None, revision: int | None, choice: int | None) -> Device:
     """Return the device of a file; ask which, if several fit and someone can answer.
 
     Raises:

@@ -82,15 +82,17 @@ def _joint(number: int, drive: str, axis: int, values: Mapping[str, float]) -> s
     if axis != 1:
         lines.append(f"    axis: {axis}")
     low, high = values["position_min"], values["position_max"]
-    rows = {"position": f"{{min: {low:g}, max: {high:g}}}"} | {
-        key: f"{values[key]:g}" for key in ("velocity", "acceleration", "jerk", "torque")
+    rows = {"position": f"{{min: {low:.15g}, max: {high:.15g}}}"} | {
+        key: f"{values[key]:.15g}" for key in ("velocity", "acceleration", "jerk", "torque")
     }
     units = _UNITS | {"position": "rad"}
     lines += [f"    {f'{key}: {value}':32}# {units[key]}" for key, value in rows.items()]
     return "\n".join(lines) + "\n"
 
 
-def segment_text(esi: str, description: Device, device: DeviceDescription, joints: int) -> str:
+def segment_text(
+    esi: str, description: Device, device: DeviceDescription, joints: int, choice: int | None = None
+) -> str:
     """Return the text of a segment's file whose drives behave as the drives' file says.
 
     Args:
@@ -98,6 +100,7 @@ def segment_text(esi: str, description: Device, device: DeviceDescription, joint
         description: the device in it.
         device: the drives' file.
         joints: number of joints.
+        choice: number of the device among those of its identity; None: it is the only one.
     """
     options: dict[str, float] = {"sync_error_limit": 0}
     for axis in device.axes:
@@ -113,7 +116,7 @@ def segment_text(esi: str, description: Device, device: DeviceDescription, joint
     )
     slave = (
         f"  - esi: {esi}\n    product: 0x{identity.product_code:X}\n    revision: 0x{identity.revision:X}\n"
-        f"    behaviour: cia402\n    options:\n{lines}"
+        f"{'' if choice is None else f'    choice: {choice}' + chr(10)}    behaviour: cia402\n    options:\n{lines}"
     )
     return f"""# The drives in software, in the order of the cable, written by `rtcp arm new` from the drives' file.
 # All options: docs/behaviours.md.

@@ -391,6 +391,18 @@ def find_devices(
     )
 
 
+def _shown(fitting: tuple[model.Device, ...]) -> tuple[model.Device, ...]:
+    """Return the devices that no other one hides, or all where each is hidden."""
+    return tuple(device for device in fitting if not device.hidden) or fitting
+
+
+def choice_of(file: model.DeviceFile, device: model.Device) -> int | None:
+    """Return the `choice` by which `find_device` finds a device by its identity; None: it needs none."""
+    identity = device.identity
+    fitting = _shown(find_devices(file, product=identity.product_code, revision=identity.revision))
+    return fitting.index(device) + 1 if len(fitting) > 1 and device in fitting else None
+
+
 def find_device(
     file: model.DeviceFile,
     *,
@@ -404,9 +416,7 @@ def find_device(
     With `choice`, which counts from 1, it is one of those that match. Raises LookupFailure with the candidates if none
     or several match.
     """
-    fitting = find_devices(file, product=product, revision=revision, name=name)
-    if len(fitting) > 1:
-        fitting = tuple(device for device in fitting if not device.hidden) or fitting
+    fitting = _shown(find_devices(file, product=product, revision=revision, name=name))
     if choice is not None and 1 <= choice <= len(fitting):
         return fitting[choice - 1]
     if len(fitting) == 1 and choice is None:

@@ -107,6 +107,29 @@ def test_what_it_writes_has_the_limits_given_with_their_units(rtcp: Rtcp, folder
     ]  # fmt: skip
 
 
+def test_of_several_devices_of_one_identity_the_segment_plays_the_chosen_one(rtcp: Rtcp, folder: Path) -> None:
+    describe(rtcp, folder)
+    file = folder / "maker.xml"
+    text = file.read_text()
+    begin, end = text.index("<Device "), text.index("</Devices>")
+    file.write_text(text[:end] + text[begin:end].replace("Servo S7", "Servo S7 with brake") + text[end:])
+    arguments = (
+        "arm",
+        "new",
+        "--out",
+        "b.yaml",
+        "--device",
+        "my-drive",
+        "--esi",
+        "maker.xml",
+        "--answers",
+        "numbers.yaml",
+    )
+    assert "give one by --product, --revision or --choice" in rtcp(*arguments).trouble
+    assert rtcp(*arguments, "--choice", "2").code == 0
+    assert (folder / "b_segment.yaml").read_text().count("choice: 2") == 6
+
+
 def test_without_a_file_it_asks_and_enter_repeats_the_number_of_the_joint_before(
     rtcp: Rtcp, rtcp_process: Callable[..., Any], folder: Path
 ) -> None:

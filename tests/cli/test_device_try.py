@@ -146,7 +146,7 @@ def test_an_arm_of_several_joints_and_an_axis_that_moves_none_are_refused(
     Session(load(arm), "virtual", "ecat0", 0, time.monotonic_ns()).write(directory)
     ended = rtcp("device", "try", "drive1", "--answers", answers())
     assert ended.code == ExitCode.REFUSED
-    assert "further joints, which would get torque too: joint2, joint3" in ended.trouble
+    assert "further drives, which would get torque too: joint2, joint3" in ended.trouble
     assert not {"enable", "move_by"} & set(bench.methods)
 
 
@@ -159,6 +159,15 @@ def test_a_motion_that_ends_in_a_fault_is_diagnosed_and_the_drive_disabled(
     assert "the motion ended with: drive1 reports following-error" in ended.out
     assert "encoder: the shaft turned, and the drive reports none of it" in ended.out
     assert "disable" in bench.methods
+
+
+def test_a_drive_that_cannot_be_disabled_afterwards_is_a_fault(
+    bench: Any, rtcp: Rtcp, answers: Callable[..., str]
+) -> None:
+    bench.refusals["disable"] = ("timeout", "no answer")
+    ended = rtcp("device", "try", "drive1", "--answers", answers())
+    assert ended.code == ExitCode.FAULT
+    assert "the drive may still have torque, it could not be disabled: no answer" in ended.trouble
 
 
 def test_ctrl_c_stops_and_disables(bench: Any, rtcp_process: Callable[..., Any], answers: Callable[..., str]) -> None:
