@@ -115,6 +115,7 @@ class ExternalAxisGroup(JointGroup):
         drive.zero = zero
         super().__init__(axis.name, axis_fields(axis), config, [(slot, drive)], number)
         self.returns_to_range = False
+        drive.still = _STILL * axis.velocity
         self.drive = drive
         self.axis = axis
         self.phase = AxisPhase.REST
@@ -153,8 +154,9 @@ class ExternalAxisGroup(JointGroup):
         speed = speed or self.axis.velocity
         if not (self._low <= position <= self._high and self.drive.can_target(position)):
             return AxisOutOfRange(self.first, position)
-        if not 0.0 < speed <= self.axis.velocity:
-            return AxisSpeedOutOfRange(self.first, speed, self.axis.velocity)
+        least = self.drive.least_profile_velocity
+        if not least <= speed <= self.axis.velocity:
+            return AxisSpeedOutOfRange(self.first, speed, least, self.axis.velocity)
         self._target, self.lease = position, lease
         self.drive.profile_velocity = speed
         distance = abs(position - self.drive.position)
@@ -169,7 +171,7 @@ class ExternalAxisGroup(JointGroup):
         if refusal is not None:
             return refusal
         if not abs(velocity) <= self.axis.velocity:
-            return AxisSpeedOutOfRange(self.first, velocity, self.axis.velocity)
+            return AxisSpeedOutOfRange(self.first, velocity, 0.0, self.axis.velocity)
         if not 0.0 < hold_s <= LONGEST_HOLD_S:
             return AxisHoldOutOfRange(self.first, hold_s, LONGEST_HOLD_S)
         if self._reaches_end(velocity):
@@ -311,7 +313,7 @@ class ExternalAxisGroup(JointGroup):
     def _halt(self) -> None:
         drive = self.drive
         drive.controlword = HALT
-        if abs(drive.velocity) < _STILL * self.axis.velocity and self._waited > self._lag:
+        if abs(drive.velocity) < drive.still and self._waited > self._lag:
             self._velocity = 0.0
             if drive.mode != self._rest_mode:
                 self._enter(_P.RETURNING)
@@ -370,7 +372,7 @@ class ExternalAxisGroup(JointGroup):
         self._astray = self._astray + 1 if self.phase in _IN_MODE and drive.mode_display != drive.mode else 0
         if self._astray > self._lag:
             self._lose_mode()
-        here, velocity, still = drive.position, drive.velocity, _STILL * self.axis.velocity
+        here, velocity, still = drive.position, drive.velocity, drive.still
         if (here > self._high + _BEYOND and velocity > still) or (here < self._low - _BEYOND and velocity < -still):
             self.problem = LeftRange(self.first, here)
 

@@ -68,7 +68,6 @@ class HomingPhase(Enum):
 _P = HomingPhase
 ENDED = frozenset({_P.HOMED, _P.FAILED, _P.ELSEWHERE, _P.STOPPED, _P.STUCK, _P.RUNNING})
 
-_STILL_RAD_S: Final = 0.01
 
 
 class Homing:
@@ -186,7 +185,7 @@ class Homing:
         elif phase is _P.SEARCHING:
             self._look(drive)
         elif phase is _P.STOPPING:
-            if abs(drive.velocity) < _STILL_RAD_S and self._cycles > self._settle:
+            if abs(drive.velocity) < drive.still and self._cycles > self._settle:
                 self._leave(self._outcome)
             elif self._cycles > self._rest + self._settle:
                 # CSP would stop a turning joint with a jerk, so it is stopped otherwise.

@@ -27,7 +27,6 @@ RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_O
 _ENABLED = DriveState.OPERATION_ENABLED
 _HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 """Drive states with torque, in which the target stays."""
-_STILL_RAD_S: Final = 0.01
 RANGE_MARGIN_RAD: Final = 0.02
 """Largest distance of a joint from its range, rad, at which it can be enabled, to return to the edge: an overshoot in
 CST must not leave an arm that no command can move."""
@@ -377,7 +376,7 @@ class Joints:
     def first_moving(self) -> int:
         """Return the first joint that does not stand still."""
         for axis, drive in enumerate(self.drives):
-            if abs(drive.velocity) > _STILL_RAD_S:
+            if abs(drive.velocity) > drive.still:
                 return axis
         return -1
 

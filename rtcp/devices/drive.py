@@ -107,6 +107,8 @@ class Drive(Driver):
         self.position = self.velocity = self.torque = 0.0
         self.resolution = self.velocity_resolution = 0.0
         """One count of the position, rad, and of a measured velocity, rad/s; 0: unknown."""
+        self.still = 0.01
+        """Speed below which it stands, rad/s, or m/s of an axis in m."""
         self.temperature = math.nan
         self.statusword = self.mode_display = 0
         self.state = DriveState.NOT_READY_TO_SWITCH_ON

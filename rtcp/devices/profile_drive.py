@@ -45,6 +45,8 @@ class ProfileDrive(Cia402Drive):
         entry = self.rpdo.find("profile_velocity")
         self._profile_slot = -1 if entry is None else self.rpdo.channels.index(entry)
         self._profile_scale = 0.0 if entry is None else 1.0 / abs(entry.factor)
+        self.least_profile_velocity = 0.0 if entry is None else abs(entry.factor)
+        """Least speed of a set-point, one count of 0x6081, unit/s: at 0 drives stand, or take another speed."""
         self._profile_range = (0, 0) if entry is None else integer_range(entry)
 
     def advance(self, target: TargetState) -> bool:

@@ -219,10 +219,11 @@ class IsExternalAxis(Refusal):
 
 
 class AxisSpeedOutOfRange(Refusal):
-    """{joint}: {value:.6g} rad/s is not allowed: at most {limit:.6g} rad/s ({key}.velocity in {file})"""
+    """{joint}: {value:.6g} rad/s is not allowed: {least:.3g} to {limit:.6g} rad/s ({key}.velocity in {file})"""
 
     axis: int
     value: float
+    least: float
     limit: float
 
 
