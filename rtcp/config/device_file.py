@@ -607,7 +607,7 @@ def _channel_lines(
     unit = None if described is None or described.unit is None or known or is_bound else units.unit(described.unit)
     if unit is not None and unit.si:
         keys += f", factor: {unit.factor:.10g}, unit: {_quoted(unit.si)}"
-    said = [_clean(entry.name), entry.type if entry.type.upper() not in ("", "BOOL") else ""]
+    said = [_clean(entry.name), _clean(entry.type) if entry.type.upper() not in ("", "BOOL") else ""]
     if described is not None:
         said += _range_text(described)
     if is_bound and bound is None:
@@ -711,7 +711,7 @@ def _file_name(origin: str) -> str:
 
 
 def _clean(text: str) -> str:
-    return " ".join(re.sub(r'["\\\x00-\x1f\x7f-\x9f]', " ", text).split())
+    return " ".join(re.sub(r'["\\\x00-\x1f\x7f-\x9f\u2028\u2029\ufeff]', " ", text).split())
 
 
 def _comment(text: str) -> list[str]:

@@ -69,7 +69,6 @@ _P = HomingPhase
 ENDED = frozenset({_P.HOMED, _P.FAILED, _P.ELSEWHERE, _P.STOPPED, _P.STUCK, _P.RUNNING})
 
 
-
 class Homing:
     """Controls the homing of a drive: `start` once, then `step` every cycle after `decode`, until it has `ended`.
 

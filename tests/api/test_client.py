@@ -6,6 +6,7 @@ import json
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -70,11 +71,15 @@ OK = b'{"jsonrpc": "2.0", "id": 1, "result": {"cycles": 5}}\n'
 
 def test_a_connection_gives_its_name_once_and_numbers_its_requests(listener: socket.socket) -> None:
     peer = Peer(listener, OK, b'{"jsonrpc": "2.0", "id": 2, "result": {}}\n', requests=2)
+    began_ns = time.monotonic_ns()
     with ControlClient("a test") as client:
         assert client.call("mode", {"name": "csv"}) == {"cycles": 5}
         client.call("status")
-    assert peer.join() == [
-        {"jsonrpc": "2.0", "method": "identify", "params": {"name": "a test"}},
+    greeting, *requests = peer.join()
+    assert greeting == {"jsonrpc": "2.0", "method": "identify", "params": {"name": "a test"}}
+    first, second = (request.pop("requested_ns") for request in requests)
+    assert began_ns <= first < second <= time.monotonic_ns()
+    assert requests == [
         {"jsonrpc": "2.0", "id": 1, "method": "mode", "params": {"name": "csv"}},
         {"jsonrpc": "2.0", "id": 2, "method": "status", "params": {}},
     ]

@@ -38,12 +38,13 @@ def test_every_mistake_of_a_configuration_has_a_line_of_its_own(rtcp: Callable[.
 
 
 @pytest.mark.parametrize("command", ["start", "doctor"])
-def test_an_implausible_value_is_a_warning_with_its_file_key_and_likely_mistake(
+def test_an_implausible_value_is_refused_with_its_file_key_and_likely_mistake(
     rtcp: Callable[..., Any], arm: Path, command: str
 ) -> None:
     arm.write_text(arm.read_text().replace("velocity: 0.5", "velocity: 30", 1))
     ended = rtcp(command, "--config", str(arm), "--bus", "nosuch0")
-    assert f"warning: {arm}:" in ended.out + ended.err
+    assert f"{arm}:" in ended.out + ended.err
+    assert "if it is right, write {value: 30, unusual: true}" in ended.out + ended.err
     sentence = "joints[0].velocity: found 30 rad/s, plausible is at most 12.57 rad/s: if this is in degrees, write 0.5"
     assert sentence in ended.out + ended.err
 

@@ -19,14 +19,17 @@ from rtcp.ipc.commands import (
     Guide,
     Halt,
     Home,
+    HomeAxis,
     Jog,
     MoveAtVelocity,
+    MoveAxis,
     MoveGripper,
     MoveJoints,
     OpenStream,
     Pause,
     Reset,
     Resume,
+    RunAxis,
     RunInStep,
     RunLines,
     RunTrajectory,
@@ -51,7 +54,7 @@ from .rig import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, LoopRig, Step, 
 
 HEARTBEAT = 0x0004
 """Output 3, which is toggled each cycle."""
-ANYONE = {"disable", "halt", "pause", "set_speed_override", "shutdown"}
+ANYONE = {"disable", "halt", "pause", "set_speed_override", "shutdown", "stop_axis"}
 """Commands that need no lease: they make the arm safer."""
 READY: list[Command] = [
     SetOutput(5, True), SetZero(0, 0.0), Enable(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT),
@@ -61,7 +64,7 @@ HOLDING: list[Command] = [
     move_to(0.1, 0.1), RunTrajectory(0, 1), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
     RunInStep(0, 1, 1, 0, 0, 1, 0.1),
     Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2),
-    Guide(), Home(0), SetChannel(1, 0, 1.0), *READY[3:],
+    Guide(), Home(0), MoveAxis(2, 0.1), RunAxis(2, 0.1, 0.2), HomeAxis(2), SetChannel(1, 0, 1.0), *READY[3:],
 ]  # fmt: skip
 WITH_LEASE: dict[State, list[Command]] = {State.READY: READY, State.HOLDING: HOLDING, State.FAULT: [Reset()]}
 """Commands that need the lease, in a state that accepts them."""

@@ -47,6 +47,10 @@ halt             .     =     disab =     stop  =     =     =     =     .     .  
 set_output       .     =     =     =     =     =     =     =     .     =     .     .     .
 set_channel      .     =     =     =     =     =     =     =     .     .     .     .     .
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
+move_axis        .     =     .     =     =     =     =     .     .     .     .     .     .
+run_axis         .     =     .     =     =     =     =     .     .     .     .     .     .
+home_axis        .     =     .     =     =     =     =     .     .     .     .     .     .
+stop_axis        =     =     =     =     =     =     =     =     =     =     =     =     =
 set_limits       .     =     .     =     =     .     =     .     .     =     =     .     .
 set_speed_override = = =     =     =     =     =     =     =     =     =     =     =
 pause            .     .     .     .     =     .     .     .     .     .     .     .     .
@@ -83,6 +87,7 @@ COMMANDS: dict[str, commands.Command] = {
         commands.MoveAtVelocity((0.0, 0.0), 0.2), commands.ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), commands.Guide(),
         commands.Halt(),
         commands.SetOutput(5, True), commands.SetChannel(1, 0, 1.0),
+        commands.MoveAxis(2, 0.1), commands.RunAxis(2, 0.1, 0.2), commands.HomeAxis(2), commands.StopAxis(2),
         commands.MoveGripper(False), commands.SetLimits(0, 1), commands.SetSpeedOverride(0.5), commands.Pause(),
         commands.Resume(), commands.SetTool(0), commands.SetPayload(0.1),
         commands.SetZero(0, 0.0), commands.Home(0), commands.Shutdown(),
@@ -102,6 +107,9 @@ FOR_OTHER_REASONS: dict[type[commands.Command], tuple[type[refusals.Refusal], ..
     commands.SetLimits: (refusals.WrongRowCount,),
     commands.SetPayload: (refusals.MassesUnknown,),
     commands.Reset: (refusals.EmergencyStopPressed,),
+    **dict.fromkeys(
+        (commands.MoveAxis, commands.RunAxis, commands.HomeAxis, commands.StopAxis), (refusals.UnknownExternalAxis,)
+    ),
 }
 """Other refusals of `COMMANDS` in states that accept them; tested elsewhere."""
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import tempfile
 from dataclasses import replace
 from math import pi
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +21,19 @@ from rtcp.ipc.errors import Invalid, Refused
 from rtcp.processes import rod
 from rtcp.processes.rod.bending import _check_between, _check_curves, _Holder, plan_approach
 
-CELL = load_cell(default_config().parent / "cell_shape_setting.yaml")
+
+def roomy_cell() -> CellConfig:
+    """Return the shipped cell with 1.2 m between the arms: at 0.914 m they bend a rod to one side only."""
+    shipped = default_config().parent / "cell_shape_setting.yaml"
+    text = re.sub(r"config: (\w)", rf"config: {shipped.parent}/\1", shipped.read_text())
+    assert text.count("0.457, 0]") == 2
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "cell.yaml"
+        file.write_text(text.replace("0.457, 0]", "0.6, 0]"))
+        return load_cell(file)
+
+
+CELL = roomy_cell()
 ROD = rod.Rod(0.3, 1e-3)
 CHUCK = rod.Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.12, 0.0, -pi / 2, 0.0), 0.02)
 CHUCKS = {"left": CHUCK, "right": CHUCK}

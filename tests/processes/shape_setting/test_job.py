@@ -33,7 +33,9 @@ def test_the_example_is_a_job_with_its_profile() -> None:
 
 
 ARC = "arc: {angle: 0.9, side: [0, 1]}"
-LEFT = "{arm: left, pose: {position: [0, 0, 0.12], rpy: [0, -pi/2, 0]}, radius: 0.02, near: [0, 0, 0.8, 0, -0.77, 0]}"
+LEFT = (
+    "{arm: left, pose: {position: [0, 0, 0.12], rpy: [0, -pi/2, 0]}, radius: 0.02, near: [0, -0.8, 0.96, 0, -0.16, 0]}"
+)
 ROD = "rod: {length: 0.3, diameter: 0.001}"
 
 
