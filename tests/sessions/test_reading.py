@@ -56,7 +56,7 @@ def test_sessions_of_other_arms_move_them_and_break_no_limit(name: str, tmp_path
         sent = session.commander.simulation.observer.latest()["sent_position"][0]
         assert session.commander.commanded == pytest.approx(list(sent), abs=2e-3)
 
-    results = [run_session(seed, config, 1.0, segment, compare) for seed in (1, 4, 6)]
+    results = [run_session(seed, config, 1.5, segment, compare) for seed in (4, 7, 13)]
     assert [(result.outcome, result.violation) for result in results] == [("passed", "")] * 3
     assert max(result.largest_speed for result in results) > 0.1
 
@@ -64,7 +64,7 @@ def test_sessions_of_other_arms_move_them_and_break_no_limit(name: str, tmp_path
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
     """Every frame of a session in which the arm moves."""
-    session = Session(Random(8), configuration())
+    session = Session(Random(13), configuration())
     seen: list[Frame] = []
     check = session.commander.simulation.on_frame
 
