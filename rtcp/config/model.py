@@ -426,27 +426,31 @@ class SlaveEntry:
 
 @dataclass(frozen=True)
 class AxisNeeds:
-    """What a joint needs of the settings that its drive holds itself, SI units at the joint."""
+    """What an axis needs of the settings that its drive holds itself, in its `unit` and Nm."""
 
     joint: Name
     axis: AxisNumber
     """Axis of the drive."""
     position: tuple[float, float]
-    """Lowest and highest position that the drive shows within the joint's range, rad."""
+    """Lowest and highest position that the drive shows within the joint's range."""
     velocity: float
-    """Speed limit of the joint, rad/s."""
+    """Speed limit of the joint, `unit`/s."""
     following_error: float
-    """Following error at which the supervision stops the arm, rad."""
+    """Following error at which the supervision stops the arm; infinite: it is not supervised."""
     holding_torque: float
     """Torque that carries the arm itself in the worst pose of its range, Nm; 0: unknown."""
     supervised_torque: float
     """Measured torque at which the supervision stops the arm, Nm; infinite: the torque is not measured."""
     deceleration: float
-    """Least deceleration of a quick stop, rad/s²: it ends within the time that the platform waits for it."""
+    """Least deceleration of a quick stop, `unit`/s²: it ends within the time that the platform waits for it."""
     quick_stops: tuple[str, ...] = ()
     """Keys of `stops` whose reaction is a quick stop."""
     feed_forward: tuple[str, ...] = ()
     """Output channels that feed-forward drives."""
+    halt_deceleration: float = 0.0
+    """Deceleration from which the platform computes where an external axis must be halted, `unit`/s²; 0: a joint."""
+    unit: Literal["m", "rad"] = "rad"
+    """Unit of its positions."""
 
 
 @dataclass(frozen=True)
@@ -463,6 +467,10 @@ class SlaveConfig:
     """Limits of its joints, written after the start-up SDOs (`rtcp.config.drive_limits.with_limits`)."""
     needs: tuple[AxisNeeds, ...] = ()
     """What its joints need of it (`rtcp.config.drive_limits.with_limits`)."""
+
+    def unit_of(self, axis: int) -> str:
+        """Return the unit of the positions of an axis of the drive; it needs `needs`."""
+        return next((needs.unit for needs in self.needs if needs.axis == axis), "rad")
 
 
 @dataclass(frozen=True)
