@@ -708,6 +708,8 @@ class Methods:
     def home_axis(self, axis: str) -> Call[float]:
         """Let the drive of an external axis search its home; return its position afterwards, m or rad.
 
+        `homing_method` says what it does.
+
         Raises:
             Refused: reasons `axis_mode_missing`, `axis_busy`, `axis_disabled`, `axis_stopped`.
             Fault: reason `homing_failed`.
@@ -761,7 +763,7 @@ class Methods:
 
     @Method
     def homing_method(self, joint: str) -> Call[HomingMethod]:
-        """Read from a joint's drive what `home` would do; nothing moves."""
+        """Read from a drive what `home`, or of an external axis `home_axis`, would do; nothing moves."""
         return Call("homing_method", {"joint": joint}, partial(result, HomingMethod))
 
     @Method

@@ -239,19 +239,20 @@ def _limit_notes(found: Mapping[tuple[int, int], Setting], values: Values, needs
     for index in _SPEEDS:
         limit = found.get((index, 0))
         if limit is not None and limit.value is not None and limit.value < needs.velocity * (1 - _ROUNDING):
-            yield f"{limit.text}, and the speed limit of {joint} is {needs.velocity:.4g} {limit.unit}, which it does not reach"
+            wanted = f"{needs.velocity:.4g} {limit.unit}"
+            yield f"{limit.text}, and the speed limit of {joint} is {wanted}, which it does not reach"
     window = found.get((_WINDOW, 0))
     allowed = needs.following_error
     if window is not None and window.value is not None and not window.meaning and window.value < allowed < math.inf:
         yield (
-            f"{window.text}, and the supervision of {joint} allows {allowed:.4g} {window.unit}: the drive goes to fault "
-            "first"
+            f"{window.text}, and the supervision of {joint} allows {allowed:.4g} {window.unit}: the drive goes to "
+            "fault first"
         )
     rate = found.get((_QUICK_STOP_RATE, 0))
     if rate is not None and rate.value is not None and rate.value < needs.deceleration:
         yield (
-            f"{rate.text}, and a quick stop of {joint} needs at least {needs.deceleration:.4g} {rate.unit} to end while "
-            "the platform waits for it"
+            f"{rate.text}, and a quick stop of {joint} needs at least {needs.deceleration:.4g} {rate.unit} to end "
+            "while the platform waits for it"
         )
     profile = found.get((_PROFILE_RATE, 0)) if needs.halt_deceleration else None
     for unscaled in (rate, profile):
@@ -259,8 +260,8 @@ def _limit_notes(found: Mapping[tuple[int, int], Setting], values: Values, needs
             continue
         unit = int.from_bytes(values[_ACCELERATION_UNIT], "little")
         yield (
-            f"{unscaled.text} counts of the unit 0x{unit:08X} (0x60AA), which is not that of velocities by the second: the "
-            f"times and distances of the stop reactions do not hold for {joint}"
+            f"{unscaled.text} counts of the unit 0x{unit:08X} (0x60AA), which is not that of velocities by the "
+            f"second: the times and distances of the stop reactions do not hold for {joint}"
         )
     for index in _ADDED:
         offset = found.get((index, 0))
@@ -286,10 +287,10 @@ def _faults(found: Mapping[tuple[int, int], Setting], needs: AxisNeeds, remedy: 
     ends, (lowest, highest) = sorted((low.value, high.value)), needs.position
     if not ends[0] <= lowest <= highest <= ends[1]:
         yield (
-            f"its position wraps at {ends[0]:.4g} and {ends[1]:.4g} {low.unit} ({low.text}; {high.text}), and {joint} uses "
-            f"{lowest:.4g} to {highest:.4g} {low.unit} there: it would turn the other way round. Allowed is a range of the "
-            "joint, with its zero offset, that does not reach the ends; or write 0 to both, where the drive then "
-            "counts on"
+            f"its position wraps at {ends[0]:.4g} and {ends[1]:.4g} {low.unit} ({low.text}; {high.text}), and {joint} "
+            f"uses {lowest:.4g} to {highest:.4g} {low.unit} there: it would turn the other way round. Allowed is a "
+            "range of the joint, with its zero offset, that does not reach the ends; or write 0 to both, where the drive "
+            "then counts on"
         )
 
 
@@ -306,8 +307,8 @@ def _halt_faults(found: Mapping[tuple[int, int], Setting], needs: AxisNeeds, rem
         rate = found.get((index, 0))
         if rate is not None and rate.value is not None and rate.value < needs.halt_deceleration * (1 - _ROUNDING):
             yield (
-                f"{rate.text}, and `acceleration` of {axis} is {needs.halt_deceleration:.4g} {rate.unit}: halted, it would "
-                f"need a longer way than is kept to the end of its range: {remedy}, or lower `acceleration`"
+                f"{rate.text}, and `acceleration` of {axis} is {needs.halt_deceleration:.4g} {rate.unit}: halted, it "
+                f"would need a longer way than is kept to the end of its range: {remedy}, or lower `acceleration`"
             )
 
 

@@ -11,7 +11,7 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.ipc import commands
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.events import AxisAtRest, AxisFailed, Event, Homed, HomingFailed
+from rtcp.ipc.events import AxisAtRest, AxisFailed, Event, Homed, HomedElsewhere, HomingFailed
 from rtcp.ipc.refusals import AxisNotHomed
 from rtcp.ipc.schema import axis_fields
 from rtcp.ipc.states import State
@@ -36,8 +36,9 @@ def test_a_motion_returns_where_the_axis_is(bench: FakePlatform) -> None:
     bench.loop.reports[commands.MoveAxis] = [AxisAtRest(RAIL, 0.3, True), AxisAtRest(BELT, 0.9, False)]
     bench.loop.reports[commands.HomeAxis] = [Homed(RAIL, 0.01)]
     assert bench.ask("move_axis", axis="rail", position=0.3, speed=0.1) == {"position": 0.3}
+    bench.loop.objects[0x607C] = {"hex": "f0d8ffff"}
     assert bench.ask("home_axis", axis="rail") == {"position": 0.01}
-    assert bench.loop.commands == [commands.MoveAxis(RAIL, 0.3, 0.1), commands.HomeAxis(RAIL)]
+    assert bench.loop.commands == [commands.MoveAxis(RAIL, 0.3, 0.1), commands.HomeAxis(RAIL, pytest.approx(-1.0))]
 
 
 @pytest.mark.parametrize(
@@ -47,6 +48,7 @@ def test_a_motion_returns_where_the_axis_is(bench: FakePlatform) -> None:
         ("move_axis", [AxisFailed(RAIL, 0x27, 1), AxisAtRest(RAIL, 0.0, False)], "fault", "rail is halted: its drive"),
         ("move_axis", [], "refused", "move_axis was ended by another command: the drives are disabled"),
         ("home_axis", [HomingFailed(RAIL, 0x27, 6)], "fault", "rail: homing failed"),
+        ("home_axis", [HomedElsewhere(RAIL, 0.5, 0.0)], "fault", "it shows 0.5 m and its home offset (0x607C) is 0 m"),
         ("home_axis", [AxisAtRest(RAIL, 0.1, False)], "refused", "rail: homing was stopped; it is not homed"),
     ],
 )
