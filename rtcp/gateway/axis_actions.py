@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import math
 from typing import Annotated
 
@@ -77,8 +76,8 @@ class AxisActions:
     ) -> Json:
         """Run an external axis at a velocity, m/s or rad/s, for `hold_s`; returns when it was accepted.
 
-        The connection holds the lease until the axis rests: it may command other motions meanwhile, and when it closes
-        the axis stops.
+        The connection holds the lease until the axis rests: it may command other motions meanwhile. Progress reports
+        follow the answer; when the client no longer reads them, or the connection closes, the axis stops.
         """
         number, connection = self._number(axis), caller.connection
         run = self._runs.get(connection)
@@ -152,8 +151,8 @@ class _Run:
         self._head: float = math.inf
         """Number of the last record before the newest command's effect; infinite while a command is under way."""
         self._lease: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        # No reports: the request has its answer.
-        self.task = asyncio.create_task(self._keep(dataclasses.replace(caller, report=lambda progress: None)))
+        # It reports on beyond the answer: a client that no longer reads must not keep the axis running.
+        self.task = asyncio.create_task(self._keep(caller))
 
     async def send(self, caller: Caller, command: Command) -> None:
         """Send a command with the lease."""

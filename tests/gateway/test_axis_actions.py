@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.gateway.command_channel import Caller
 from rtcp.ipc import commands
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.events import AxisAtRest, AxisFailed, Event, Homed, HomedElsewhere, HomingFailed
@@ -92,6 +94,26 @@ def test_a_run_keeps_the_lease_until_the_axis_rests_and_other_motions_share_it(b
         commands.RunAxis, commands.RunAxis, commands.MoveJoints, commands.StopAxis,
     ]  # fmt: skip
     assert bench.observer.holder() == ""
+
+
+def test_a_run_reports_on_and_a_client_that_no_longer_reads_loses_its_lease(bench: FakePlatform) -> None:
+    reports: list[object] = []
+    hung = False
+
+    async def run() -> None:
+        nonlocal hung
+        bench.loop.fields = {"belt_moving": 1}
+        caller = Caller("one", 1, reports.append, lambda seconds: hung)
+        await bench.methods.call("run_axis", caller, {"axis": "belt", "velocity": 0.1, "hold_s": 3600.0})
+        answered = len(reports)
+        await asyncio.sleep(0.6)
+        assert len(reports) > answered
+        assert bench.observer.holder() == "one"
+        hung = True
+        await asyncio.sleep(0.6)
+        assert not bench.observer.holder()
+
+    bench.run(run)
 
 
 def test_a_connection_that_closes_releases_the_lease_of_its_runs(bench: FakePlatform) -> None:
