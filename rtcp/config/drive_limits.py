@@ -134,7 +134,7 @@ def _needs(config: ArmConfig, zeros: Sequence[float]) -> Iterator[AxisNeeds]:
             joint.torque * config.supervision.torque if measured else inf,
             joint.velocity / SLOWEST_QUICK_STOP_S,
             quick,
-            config.feed_forward.channels,
+            ("profile_velocity",) if axis else config.feed_forward.channels if joint in config.joints else (),
             0.0 if axis is None else axis.acceleration,
             "rad" if axis is None else axis.unit,
         )

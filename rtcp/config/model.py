@@ -96,7 +96,7 @@ MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 """Channels of rpdo and of tpdo that a drive mode needs beside those of every CiA 402 drive."""
 DRIVEN_OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
-"""Channels of rpdo that the driver of a CiA 402 drive commands; feed-forward adds the offsets."""
+"""Channels of rpdo that the driver of a CiA 402 drive commands; an axis may have more (`AxisNeeds.driven`)."""
 ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
 FrameName = Literal["base", "tool"]
 Level = Literal["high", "low"]
@@ -445,8 +445,9 @@ class AxisNeeds:
     """Least deceleration of a quick stop, `unit`/s²: it ends within the time that the platform waits for it."""
     quick_stops: tuple[str, ...] = ()
     """Keys of `stops` whose reaction is a quick stop."""
-    feed_forward: tuple[str, ...] = ()
-    """Output channels that feed-forward drives."""
+    driven: tuple[str, ...] = ()
+    """Output channels that are driven beside `DRIVEN_OUTPUTS`: the offsets of feed-forward, or 0x6081 of an external
+    axis."""
     halt_deceleration: float = 0.0
     """Deceleration from which the platform computes where an external axis must be halted, `unit`/s²; 0: a joint."""
     unit: Literal["m", "rad"] = "rad"

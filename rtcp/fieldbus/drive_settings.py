@@ -266,7 +266,7 @@ def _limit_notes(found: Mapping[tuple[int, int], Setting], values: Values, needs
     for index in _ADDED:
         offset = found.get((index, 0))
         named = "velocity_offset" if index == _ADDED[0] else "torque_offset"
-        if offset is not None and offset.raw and named not in needs.feed_forward:
+        if offset is not None and offset.raw and named not in needs.driven:
             yield f"{offset.text}, which it adds to the output of its loops"
 
 
@@ -289,8 +289,8 @@ def _faults(found: Mapping[tuple[int, int], Setting], needs: AxisNeeds, remedy: 
         yield (
             f"its position wraps at {ends[0]:.4g} and {ends[1]:.4g} {low.unit} ({low.text}; {high.text}), and {joint} "
             f"uses {lowest:.4g} to {highest:.4g} {low.unit} there: it would turn the other way round. Allowed is a "
-            "range of the joint, with its zero offset, that does not reach the ends; or write 0 to both, where the drive "
-            "then counts on"
+            "range of the joint, with its zero offset, that does not reach the ends; or write 0 to both, where the "
+            "drive then counts on"
         )
 
 
@@ -462,11 +462,11 @@ def _outputs(device: DeviceDescription) -> Iterator[tuple[Pdo, PdoEntry]]:
 def _with_own_values(sdo: SdoClient, config: SlaveConfig, read: Read) -> Steps[tuple[DeviceDescription, list[str]]]:
     """Return the description with the drive's own values, and a sentence for each that it cannot tell."""
     device, faults = config.device, []
-    fed = {name for needs in config.needs for name in needs.feed_forward}
+    driven = {(needs.axis, name) for needs in config.needs for name in needs.driven}
     own: dict[tuple[int, int], float] = {}
     remedy = f"state `safe` at the channel in {config.file or 'its device file'}"
     for pdo, entry in _outputs(device):
-        if entry.safe is not None or entry.name in fed:
+        if entry.safe is not None or (pdo.axis_of(entry), entry.name) in driven:
             continue
         data = yield from read(entry.index, entry.sub_index)
         where, axis = f"0x{entry.index:04X}:{entry.sub_index} ({entry.name})", pdo.axis_of(entry)

@@ -12,14 +12,17 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.drive_limits import with_limits
-from rtcp.config.model import ArmConfig, DeviceDescription, Pdo, PdoEntry
+from rtcp.config.model import ArmConfig, DeviceDescription, FeedForwardConfig, Pdo, PdoEntry
 from rtcp.config.segment import SegmentConfig
 from rtcp.fieldbus.drive_settings import check_settings, compare, settings_of
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.registers import finish
+from rtcp.testing.bus import InProcessBus
 from rtcp.testing.simulation import Simulation
+from rtcp.virtual.models import CubemarsDrive, create
 from rtcp.virtual.models.servo import ServoAxis
+from rtcp.virtual.objects import Access, DataType, Entry
 from tests.control.test_standard_drives import BENT, arm_of
 from tests.drive_esi import ARMS
 
@@ -236,3 +239,47 @@ def test_the_settings_of_an_axis_in_metres_are_compared_in_metres() -> None:
         (note,) = (note for note in made.bus.notes if "drive1" in note)
     assert "quick stop deceleration (0x6085) is 1000, 0.01 m/s^2, and a quick stop of rail needs at least" in note
     assert "m/s^2 to end" in note
+
+
+def test_an_offset_that_feed_forward_does_not_drive_keeps_the_drives_own_value() -> None:
+    """Feed-forward is of the arm's joints; the speed of a profile is driven, though its object may be write-only."""
+    own = PdoEntry(0x60B2, 0, "int16", "torque_offset")
+
+    class Slave:
+        position, name = 2, "drive1"
+
+        def reading(self, index: int, subindex: int) -> Iterator[None]:
+            if index == 0x60B2:
+                return (7).to_bytes(2, "little")  # type: ignore[return-value]
+            raise SdoAborted("attempt to read a write only object", 0x06010001)
+            yield
+
+    def safe(config: ArmConfig) -> float | None:
+        slave = next(slave for slave in with_limits(config) if slave.name == "drive1")
+        slave = replace(slave, device=replace(slave.device, rpdo=mapped(slave.device, own)))
+        device, _ = finish(check_settings(cast(SdoClient, Slave()), slave))
+        return device.rpdo[0].channels[-1].safe
+
+    gravity = FeedForwardConfig(gravity=1.0)
+    assert safe(rail({}, feed_forward=gravity)) == 7.0
+    assert safe(replace(SHIPPED, feed_forward=gravity)) is None
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_drive_that_makes_its_own_profiles_need_not_interpolate_over_the_cycle(moves: bool) -> None:
+    model = create("cubemars-orh60")
+    assert isinstance(model, CubemarsDrive)
+    model.objects.remove(0x60C2)
+    model.objects.record(0x60C2, "Interpolation time period", [
+        Entry(0x60C2, 1, "Value", DataType.UNSIGNED8, 4, Access.RO),
+        Entry(0x60C2, 2, "Exponent", DataType.INTEGER8, -3, Access.RO),
+    ])  # fmt: skip
+    slave, bus = with_limits(RAIL)[1], InProcessBus([model])
+    if moves:
+        bus.configure([slave], 1_000_000)
+        (note,) = (note for note in bus.notes if "0x60C2" in note)
+        assert "is 4000 us, the cycle (`cycle.period_us`) is 1000 us" in note
+        assert note.endswith("; its own profiles do not use it")
+    else:
+        with pytest.raises(BusError, match="they must be equal"):
+            bus.configure([replace(slave, needs=())], 1_000_000)
