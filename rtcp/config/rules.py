@@ -975,7 +975,7 @@ def useless_marks(places: Iterable[Magnitude], unusual: Iterable[KeyPath]) -> It
 
 
 def _of_joints(arm: ArmFile) -> Iterator[Magnitude]:
-    external = {("external_axes", i): axis for i, axis in enumerate(arm.external_axes)}
+    external: dict[KeyPath, ExternalAxis] = {("external_axes", i): axis for i, axis in enumerate(arm.external_axes)}
     for where, joint in axes_of(arm):
         axis = external.get(where)
         unit = "rad" if axis is None else axis.unit
