@@ -6,6 +6,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -223,8 +224,8 @@ def test_homing_gives_the_rail_its_positions_and_is_needed_before_a_motion_and_a
 
 def test_a_rail_whose_drive_says_it_is_homed_where_it_is_not_has_not_homed() -> None:
     with Bench(replace(CONFIG, homing=replace(CONFIG.homing, tolerance=0.01))) as bench:
-        homing = bench.drives[RAIL].servo._modes[6]
-        setattr(homing, "_begin", lambda: setattr(homing, "_phase", Phase.ATTAINED))
+        homing: Any = bench.drives[RAIL].servo._modes[6]
+        homing._begin = lambda: setattr(homing, "_phase", Phase.ATTAINED)
         bench.do(HomeAxis(RAIL, 0.0))
         bench.rest(RAIL)
         assert bench.last_of(HomedElsewhere) == HomedElsewhere(RAIL, about(0.05, abs=1e-3), 0.0)
