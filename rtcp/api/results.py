@@ -316,7 +316,7 @@ class Zero:
 
 @dataclass(frozen=True)
 class HomingMethod:
-    """What the homing of a joint's drive does."""
+    """What the homing of a drive does."""
 
     joint: str
     method: int | None
@@ -326,7 +326,9 @@ class HomingMethod:
     declares_present: bool
     """Whether the drive declares its present position to be the home, or does not tell its method."""
     home_offset: float
-    """What the drive counts at its home (0x607C), rad."""
+    """What the drive counts at its home (0x607C), in `unit`."""
+    unit: str
+    """rad, or m of an external axis."""
 
 
 @dataclass(frozen=True)

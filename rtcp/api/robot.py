@@ -690,8 +690,9 @@ class Methods:
     def run_axis(self, axis: str, velocity: float, hold_s: float = 0.25, sent_s: float | None = None) -> Call[None]:
         """Run an external axis at a velocity for `hold_s`; return at once. Other motions may follow meanwhile.
 
-        The axis stops when `hold_s` has passed since the last of these calls, when it comes to an end of its range, and
-        when this robot is closed.
+        A `Robot` that only sleeps meanwhile has to call `status` at least every 0.5 s: the axis of a client that reads
+        no reports stops. It also stops when `hold_s` has passed since the last of these calls, when it comes to an end
+        of its range, and when this robot is closed.
 
         Args:
             axis: its name.
@@ -707,6 +708,8 @@ class Methods:
     @Method
     def home_axis(self, axis: str) -> Call[float]:
         """Let the drive of an external axis search its home; return its position afterwards, m or rad.
+
+        `homing_method` says what it does.
 
         Raises:
             Refused: reasons `axis_mode_missing`, `axis_busy`, `axis_disabled`, `axis_stopped`.
@@ -761,7 +764,7 @@ class Methods:
 
     @Method
     def homing_method(self, joint: str) -> Call[HomingMethod]:
-        """Read from a joint's drive what `home` would do; nothing moves."""
+        """Read from a drive what `home`, or of an external axis `home_axis`, would do; nothing moves."""
         return Call("homing_method", {"joint": joint}, partial(result, HomingMethod))
 
     @Method

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, as_written, number, option, positive
+from rtcp.cli.motion import PresentIsHome, announce_homing
 from rtcp.cli.output import report
 from rtcp.cli.platform import connect, stoppable
 
@@ -57,9 +58,13 @@ def _run(
 
 
 @axis.command("home")
-def _home(name: Axis) -> None:
-    """Let the drive of an axis search its home, as its start-up SDOs configure it. Ctrl-C stops it."""
+def _home(name: Axis, yes: PresentIsHome = False) -> None:
+    """Let the drive of an axis search its home, as its object 0x6098 says. Ctrl-C stops it.
+
+    It says first what the drive will do, and asks where the drive declares its present position to be the home.
+    """
     with stoppable("axis home", _ENDS) as robot:
+        announce_homing(robot, name, yes)
         position = robot.home_axis(name)
         unit = robot.status().axes[name].unit
     report(f"{name} is homed and stands at {position:.6g} {unit}")

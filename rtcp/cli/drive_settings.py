@@ -81,12 +81,16 @@ def settings_of_slave(
     axes = [n for n in range(1, 9) if _STATUSWORD + (n - 1) * OBJECTS_PER_AXIS in indices]
     if not axes:
         return []
-    identity, slaves, position = device["identity"], configuration(config).slaves, access.position
-    known = slaves[position - 1].device if position <= len(slaves) else None
-    if known is None or (known.vendor_id, known.product_id) != (identity["vendor_id"], identity["product_code"]):
-        known = None
-    name = str(device["name"])
-    return [AxisSettings(name, n, settings_of(held, n, known)) for _, n, held in read_values(access, {slave: axes})]
+    identity, slaves, position = device["identity"], with_limits(configuration(config)), access.position
+    entry = slaves[position - 1] if position <= len(slaves) else None
+    ids = identity["vendor_id"], identity["product_code"]
+    if entry is not None and (entry.device.vendor_id, entry.device.product_id) != ids:
+        entry = None
+    known, name = None if entry is None else entry.device, str(device["name"])
+    return [
+        AxisSettings(name, n, settings_of(held, n, known, "rad" if entry is None else entry.unit_of(n)))
+        for _, n, held in read_values(access, {slave: axes})
+    ]
 
 
 def settings_of_drives(bus: str | None, config: Path | None) -> list[AxisSettings]:
@@ -110,7 +114,9 @@ def _compared(held: Values, slave: SlaveConfig, axis: int) -> AxisSettings:
     needs = next((needs for needs in slave.needs if needs.axis == axis), None)
     where = slave.name if slave.device.axes == (1,) else f"{slave.name}, axis {axis}"
     warnings, refusals = compare(values, slave.device, needs, where, slave.file or "its device file", axis)
-    return AxisSettings(slave.name, axis, settings_of(values, axis, slave.device), warnings, refusals)
+    return AxisSettings(
+        slave.name, axis, settings_of(values, axis, slave.device, slave.unit_of(axis)), warnings, refusals
+    )
 
 
 def settings_table(drives: Sequence[AxisSettings]) -> Table:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rtcp.api import Arrival, State
+from rtcp.api import Arrival, Robot, State
 from rtcp.api.results import Channel
 from rtcp.cli.arguments import (
     NUMBERS_AS_WRITTEN,
@@ -33,6 +33,7 @@ from rtcp.ipc.session import read_session
 from rtcp.ipc.stops import requested
 
 Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Configured name, as joint2, or number from 1.")]
+PresentIsHome = Annotated[bool, option("--yes", "Do not ask before the present position becomes the home.")]
 COLUMNS = (
     ("min", "rad"), ("max", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s^2"), ("jerk", "rad/s^3"),
     ("torque", "Nm"),
@@ -248,25 +249,28 @@ def _zero(
     )
 
 
+def announce_homing(robot: Robot, joint: str, yes: bool) -> str:
+    """Report what the homing of a drive will do; ask where it declares the present position to be its home, unless
+    `yes`. Return the name of the joint or axis."""
+    method = robot.homing_method(joint)
+    number = "" if method.method is None else f", by method {method.method} (0x6098)"
+    count = f"{method.home_offset:.6g} {method.unit}"
+    report(f"the drive of {method.joint} {method.text}{number}; there it counts {count} (0x607C)")
+    if method.declares_present and not yes:
+        confirm(f"Is {method.joint} where its drive shall count {count}?")
+    return method.joint
+
+
 @commands.command("home")
-def _home(
-    joint: Joint,
-    yes: Annotated[bool, option("--yes", "Do not ask before the present position becomes the home.")] = False,
-) -> None:
+def _home(joint: Joint, yes: PresentIsHome = False) -> None:
     """Run the homing of a joint's drive, as its object 0x6098 says. Ctrl-C stops it.
 
     It says first what the drive will do, and asks where the drive declares its present position to be the home.
     """
     with stoppable("home") as robot:
-        method = robot.homing_method(joint)
-        number = "" if method.method is None else f", by method {method.method} (0x6098)"
-        report(
-            f"the drive of {method.joint} {method.text}{number}; there it counts {method.home_offset:.6g} rad (0x607C)"
-        )
-        if method.declares_present and not yes:
-            confirm(f"Is {method.joint} where its drive shall count {method.home_offset:.6g} rad?")
+        name = announce_homing(robot, joint, yes)
         position = robot.home(joint)
-    report(f"{method.joint} is homed and stands at {position:.6f} rad")
+    report(f"{name} is homed and stands at {position:.6f} rad")
 
 
 @commands.command("move", context_settings=NUMBERS_AS_WRITTEN)

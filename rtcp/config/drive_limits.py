@@ -121,17 +121,20 @@ def _needs(config: ArmConfig, zeros: Sequence[float]) -> Iterator[AxisNeeds]:
         if model.links and len(ranges) == JOINTS:
             weights[: len(ranges)] = map(max, weights, worst_torques(model, ranges))
     quick = tuple(key.name for key in fields(config.stops) if getattr(config.stops, key.name) == "quick_stop")
+    external = {axis.name: axis for axis in config.external_axes}
     for joint, zero, weight in zip(config.axes, zeros, weights, strict=True):
-        measured = joint.torque < UNLIMITED_TORQUE
+        measured, axis = joint.torque < UNLIMITED_TORQUE, external.get(joint.name)
         yield AxisNeeds(
             joint.name,
             joint.axis,
             (joint.position.min + zero, joint.position.max + zero),
             joint.velocity,
-            config.supervision.following_error,
+            config.supervision.following_error if axis is None else inf,
             weight,
             joint.torque * config.supervision.torque if measured else inf,
             joint.velocity / SLOWEST_QUICK_STOP_S,
             quick,
-            config.feed_forward.channels,
+            ("profile_velocity",) if axis else config.feed_forward.channels if joint in config.joints else (),
+            0.0 if axis is None else axis.acceleration,
+            "rad" if axis is None else axis.unit,
         )

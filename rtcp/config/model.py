@@ -96,7 +96,7 @@ MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 """Channels of rpdo and of tpdo that a drive mode needs beside those of every CiA 402 drive."""
 DRIVEN_OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
-"""Channels of rpdo that the driver of a CiA 402 drive commands; feed-forward adds the offsets."""
+"""Channels of rpdo that the driver of a CiA 402 drive commands; an axis may have more (`AxisNeeds.driven`)."""
 ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
 FrameName = Literal["base", "tool"]
 Level = Literal["high", "low"]
@@ -426,27 +426,32 @@ class SlaveEntry:
 
 @dataclass(frozen=True)
 class AxisNeeds:
-    """What a joint needs of the settings that its drive holds itself, SI units at the joint."""
+    """What an axis needs of the settings that its drive holds itself, in its `unit` and Nm."""
 
     joint: Name
     axis: AxisNumber
     """Axis of the drive."""
     position: tuple[float, float]
-    """Lowest and highest position that the drive shows within the joint's range, rad."""
+    """Lowest and highest position that the drive shows within the joint's range."""
     velocity: float
-    """Speed limit of the joint, rad/s."""
+    """Speed limit of the joint, `unit`/s."""
     following_error: float
-    """Following error at which the supervision stops the arm, rad."""
+    """Following error at which the supervision stops the arm; infinite: it is not supervised."""
     holding_torque: float
     """Torque that carries the arm itself in the worst pose of its range, Nm; 0: unknown."""
     supervised_torque: float
     """Measured torque at which the supervision stops the arm, Nm; infinite: the torque is not measured."""
     deceleration: float
-    """Least deceleration of a quick stop, rad/s²: it ends within the time that the platform waits for it."""
+    """Least deceleration of a quick stop, `unit`/s²: it ends within the time that the platform waits for it."""
     quick_stops: tuple[str, ...] = ()
     """Keys of `stops` whose reaction is a quick stop."""
-    feed_forward: tuple[str, ...] = ()
-    """Output channels that feed-forward drives."""
+    driven: tuple[str, ...] = ()
+    """Output channels that are driven beside `DRIVEN_OUTPUTS`: the offsets of feed-forward, or 0x6081 of an external
+    axis."""
+    halt_deceleration: float = 0.0
+    """Deceleration from which the platform computes where an external axis must be halted, `unit`/s²; 0: a joint."""
+    unit: Literal["m", "rad"] = "rad"
+    """Unit of its positions."""
 
 
 @dataclass(frozen=True)
@@ -463,6 +468,10 @@ class SlaveConfig:
     """Limits of its joints, written after the start-up SDOs (`rtcp.config.drive_limits.with_limits`)."""
     needs: tuple[AxisNeeds, ...] = ()
     """What its joints need of it (`rtcp.config.drive_limits.with_limits`)."""
+
+    def unit_of(self, axis: int) -> str:
+        """Return the unit of the positions of an axis of the drive; it needs `needs`."""
+        return next((needs.unit for needs in self.needs if needs.axis == axis), "rad")
 
 
 @dataclass(frozen=True)

@@ -616,6 +616,10 @@ def drive_findings(
         elif device is not None:
             device = device.of_axis(joint.axis)
             missing: list[str] = []
+            # The scaling of a drive is in rad.
+            in_metres = where[0] == "external_axes" and arm.external_axes[int(where[1])].unit == "m"
+            if not in_metres and (*where, "velocity") not in unusual:
+                yield from _above_the_drive(where, joint, device)
             if where[0] == "external_axes":
                 yield from _external_drive(where, arm.external_axes[int(where[1])], slave.device, device)
                 continue
@@ -628,8 +632,6 @@ def drive_findings(
             mapped = {entry.name for entry in device.outputs}
             if where[0] == "joints" and (missing := [n for n in arm.feed_forward.channels if n not in mapped]):
                 yield Finding((*where, "slave"), "no_offset", lacking=missing, device=slave.device)
-            if (*where, "velocity") not in unusual:
-                yield from _above_the_drive(where, joint, device)
             yield from _beyond_the_wire(where, joint, device, arm.feed_forward.channels if where[0] == "joints" else ())
 
 
@@ -940,6 +942,8 @@ def _holds(outer: KeepOut, inner: Box) -> bool:
 _TWO_TURNS = 4 * math.pi
 _DEGREES, _MILLIMETRES, _GRAMS = ("degrees", math.radians(1)), ("millimetres", 1e-3), ("grams", 1e-3)
 _MILLI_NM = ("mNm", 1e-3)
+_USUAL = {"rad": (_TWO_TURNS, _TWO_TURNS, 200.0, _DEGREES), "m": (20.0, 20.0, 50.0, _MILLIMETRES)}
+"""Largest usual position, speed and acceleration of a joint or external axis by its unit, and the likely other unit."""
 _MOST_TORQUE, _MOST_RATED_TORQUE = 3000.0, 1000.0
 """Largest usual torque limit of a joint, and rated torque of a drive, Nm."""
 Magnitude = tuple[KeyPath, float, float, str, tuple[str, float]]
@@ -971,16 +975,18 @@ def useless_marks(places: Iterable[Magnitude], unusual: Iterable[KeyPath]) -> It
 
 
 def _of_joints(arm: ArmFile) -> Iterator[Magnitude]:
-    for i, axis in enumerate(arm.external_axes):
-        if axis.unit == "m":
-            yield ("external_axes", i, "velocity"), axis.velocity, 20.0, "m/s", _MILLIMETRES
+    external: dict[KeyPath, ExternalAxis] = {("external_axes", i): axis for i, axis in enumerate(arm.external_axes)}
     for where, joint in axes_of(arm):
-        if where[0] == "external_axes":
+        axis = external.get(where)
+        unit = "rad" if axis is None else axis.unit
+        furthest, fastest, hardest, likely = _USUAL[unit]
+        if axis is None or axis.position is not None:
+            yield (*where, "position", "min"), joint.position.min, furthest, unit, likely
+            yield (*where, "position", "max"), joint.position.max, furthest, unit, likely
+        yield (*where, "velocity"), joint.velocity, fastest, f"{unit}/s", likely
+        yield (*where, "acceleration"), joint.acceleration, hardest, f"{unit}/s^2", likely
+        if axis is not None:
             continue
-        yield (*where, "position", "min"), joint.position.min, _TWO_TURNS, "rad", _DEGREES
-        yield (*where, "position", "max"), joint.position.max, _TWO_TURNS, "rad", _DEGREES
-        yield (*where, "velocity"), joint.velocity, _TWO_TURNS, "rad/s", _DEGREES
-        yield (*where, "acceleration"), joint.acceleration, 200.0, "rad/s^2", _DEGREES
         if joint.torque != UNLIMITED_TORQUE:
             yield (*where, "torque"), joint.torque, _MOST_TORQUE, "Nm", _MILLI_NM
         yield (*where, "drive_torque"), joint.drive_torque or 0.0, _MOST_TORQUE, "Nm", _MILLI_NM

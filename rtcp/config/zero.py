@@ -15,7 +15,7 @@ from typing import Any
 
 from rtcp.config.document import Document, read
 from rtcp.config.findings import Finding
-from rtcp.config.model import ArmConfig, ConfigError
+from rtcp.config.model import ArmConfig, ConfigError, Range
 
 LARGEST = 100.0
 """Largest offset, rad; a larger one is in degrees."""
@@ -165,14 +165,17 @@ def _wrong(config: ArmConfig, axis: int, offset: object) -> Finding | None:
     joint = config.axes[axis]
     where = ("offsets", joint.name)
     if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= LARGEST:
-        wanted = f"a number from {-LARGEST:g} to {LARGEST:g} (rad)"
+        wanted = f"a number from {-LARGEST:g} to {LARGEST:g} ({config.unit_of(axis)})"
         return Finding(where, "range", found=offset, allowed=wanted)
     device = next(slave.device for slave in config.slaves if slave.name == joint.slave).of_axis(joint.axis)
     ranges = [device.wire_range(name) for name in ("target_position", "position")]
     low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
-    ends = (joint.position.min + offset, joint.position.max + offset)
+    # An axis without ends has no largest position: only where it is now must be one of the drive's.
+    endless = any(external.name == joint.name and external.position is None for external in config.external_axes)
+    position = Range(0.0, 0.0) if endless else joint.position
+    ends = (position.min + offset, position.max + offset)
     if all(low <= end <= high for end in ends):
         return None
-    reach = f"position {joint.position.min:g} to {joint.position.max:g} would be {ends[0]:g} to {ends[1]:g} there"
+    reach = f"position {position.min:g} to {position.max:g} would be {ends[0]:g} to {ends[1]:g} there"
     of = {"joint": joint.name, "reach": reach, "device": device.name}
     return Finding(where, "offset_beyond_wire", found=offset, low=low, high=high, **of)

@@ -459,7 +459,7 @@ class CommandHandler:
         if isinstance(command, commands.MoveAxis):
             return axis.move(command.position, command.speed, lease)
         return (
-            axis.home(lease)
+            axis.home(command.home_offset, lease)
             if isinstance(command, commands.HomeAxis)
             else axis.run(command.velocity, command.hold_s, lease)
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from enum import Enum
-from math import inf
+from math import inf, nan
 from typing import Any, Final
 
 from rtcp.config.model import ArmConfig, ExternalAxis
@@ -30,6 +30,7 @@ from rtcp.ipc.events import (
     AxisStillMoving,
     Event,
     Homed,
+    HomedElsewhere,
     HomingFailed,
     LeftRange,
 )
@@ -133,6 +134,7 @@ class ExternalAxisGroup(JointGroup):
         self._halt_cycles = self._cycles(_HALT_S + axis.velocity / axis.acceleration)
         self._waited = self._longest = self._held = self._astray = 0
         self._target = self._velocity = 0.0
+        self._home_offset = nan
         self._raised = self._set_point = False
         """Whether bit 4 offers a set-point; whether the drive has one that it has not reached."""
         self._reports = self._reached = False
@@ -183,8 +185,8 @@ class ExternalAxisGroup(JointGroup):
             self._enter(_P.CHANGING)
         return None
 
-    def home(self, lease: int) -> Refusal | None:
-        """Search the home of the axis, for the commander of `lease`."""
+    def home(self, home: float, lease: int) -> Refusal | None:
+        """Search the home of the axis, where its drive counts `home` (0x607C; NaN: not known), for `lease`."""
         if "homing" not in self.axis.modes:
             return AxisModeMissing(self.first, HOMING)
         if self.drive.state is not DriveState.OPERATION_ENABLED:
@@ -192,7 +194,8 @@ class ExternalAxisGroup(JointGroup):
         if self.phase is not _P.REST:
             return AxisBusy(self.first)
         self.homed, self.lease = False, lease
-        self._homing.start(self.drive)
+        self._home_offset = home
+        self._homing.start(self.drive, home)
         self._enter(_P.HOMING)
         return None
 
@@ -350,6 +353,8 @@ class ExternalAxisGroup(JointGroup):
             self.homed = phase is HomingPhase.HOMED
             if self.homed:
                 self._ended = Homed(self.first, drive.position)
+            elif phase is HomingPhase.ELSEWHERE:
+                self._ended = HomedElsewhere(self.first, drive.position + drive.zero, self._home_offset)
             elif phase is HomingPhase.FAILED:
                 self._ended = HomingFailed(self.first, homing.shown, homing.shown_mode)
             else:

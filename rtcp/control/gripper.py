@@ -6,7 +6,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import ArmConfig, FeedForwardConfig
 from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import PartContext
 from rtcp.devices.drive import drive_of
@@ -34,7 +34,9 @@ class DrivenGripper(JointGroup):
 
     def __init__(self, config: ArmConfig, motion: GripperMotion, axis: int) -> None:
         zero = config.zero_offsets[axis] if config.zero_offsets else 0.0
-        config = replace(config, supervision=replace(config.supervision, torque=inf, acceleration=inf))
+        supervision = replace(config.supervision, torque=inf, acceleration=inf)
+        # Feed-forward is the arm's: offsets that are mapped here keep their safe values.
+        config = replace(config, supervision=supervision, feed_forward=FeedForwardConfig())
         super().__init__("gripper", GRIPPER_FIELDS, config, [drive_of(config, config.joints[0], zero)], axis)
         self.drive = self.drives[0]
         self.motion = motion

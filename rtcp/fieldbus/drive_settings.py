@@ -32,11 +32,11 @@ Read = Callable[[int, int], Steps[bytes | None]]
 """Reads an object by index and subindex; None: the drive lacks it, or it cannot be read."""
 Quantity = Literal["position", "velocity", "motor speed", "acceleration", "torque", "time"]
 
-_WINDOW, _QUICK_STOP_RATE, _OFFSET = 0x6065, 0x6085, 0x60B0
+_WINDOW, _PROFILE_RATE, _QUICK_STOP_RATE, _OFFSET = 0x6065, 0x6084, 0x6085, 0x60B0
 _TORQUES: Final = (0x6072, 0x60E0, 0x60E1)
 _SPEEDS: Final = (0x607F, 0x6080)
 _RANGE_LOW, _RANGE_HIGH = (0x607B, 1), (0x607B, 2)
-_QUICK_STOP, _FAULT_REACTION = QUICK_STOP_OPTION, 0x605E
+_QUICK_STOP, _HALT, _FAULT_REACTION = QUICK_STOP_OPTION, 0x605D, 0x605E
 _ADDED: Final = (0x60B1, 0x60B2)
 """Offsets that a drive adds to the output of its loops."""
 _LIMITS: Mapping[tuple[int, int], tuple[str, Quantity]] = {
@@ -47,6 +47,7 @@ _LIMITS: Mapping[tuple[int, int], tuple[str, Quantity]] = {
     _RANGE_HIGH: ("highest position before it wraps", "position"),
     (0x607F, 0): ("max profile velocity", "velocity"),
     (0x6080, 0): ("max motor speed", "motor speed"),
+    (_PROFILE_RATE, 0): ("profile deceleration", "acceleration"),
     (_QUICK_STOP_RATE, 0): ("quick stop deceleration", "acceleration"),
     (_OFFSET, 0): ("position offset", "position"),
     (0x60B1, 0): ("velocity offset", "velocity"),
@@ -55,11 +56,11 @@ _LIMITS: Mapping[tuple[int, int], tuple[str, Quantity]] = {
     (0x60E1, 0): ("negative torque limit", "torque"),
 }
 """Name and quantity of an object (IEC 61800-7-201)."""
-_SIGNED: Final = {0x605A, 0x605B, 0x605C, 0x605D, 0x605E, 0x607B, _OFFSET, *_ADDED}
+_SIGNED: Final = {0x605A, 0x605B, 0x605C, _HALT, _FAULT_REACTION, 0x607B, _OFFSET, *_ADDED}
 _SI: Mapping[Quantity, str] = {
-    "position": "rad", "velocity": "rad/s", "motor speed": "rad/s", "acceleration": "rad/s^2", "torque": "Nm",
-    "time": "s",
+    "position": "{}", "velocity": "{}/s", "motor speed": "{}/s", "acceleration": "{}/s^2", "torque": "Nm", "time": "s",
 }  # fmt: skip
+"""SI unit of a quantity; {}: the unit of positions."""
 _OFF, _SLOW_DOWN, _RAMP = "the torque goes off at once", "slows down by 0x6084", "slows down by 0x6085"
 _AT_CURRENT, _AT_VOLTAGE = "slows down at the current limit", "slows down at the voltage limit"
 _STOPS: Final = (_SLOW_DOWN, _RAMP, _AT_CURRENT, _AT_VOLTAGE)
@@ -71,7 +72,7 @@ OPTIONS: Mapping[int, tuple[str, Mapping[int, str]]] = {
     }),
     0x605B: ("shutdown option code", {0: _OFF, 1: f"{_SLOW_DOWN}, then the torque goes off"}),
     0x605C: ("disable operation option code", {0: _OFF, 1: f"{_SLOW_DOWN}, then the torque goes off"}),
-    0x605D: ("halt option code", {code: f"{stop}, then holds" for code, stop in enumerate(_STOPS, 1)}),
+    _HALT: ("halt option code", {code: f"{stop}, then holds" for code, stop in enumerate(_STOPS, 1)}),
     _FAULT_REACTION: ("fault reaction option code", {
         0: _OFF, **{code: f"{stop}, then the torque goes off" for code, stop in enumerate(_STOPS, 1)},
     }),
@@ -79,6 +80,8 @@ OPTIONS: Mapping[int, tuple[str, Mapping[int, str]]] = {
 """Name of each option code, and its values in words (IEC 61800-7-201)."""
 _HOLDING: Final = range(5, 9)
 """Quick stop option codes after which the drive stays in quick stop active, with torque."""
+_HALT_RATES: Mapping[int, int] = {1: _PROFILE_RATE, 2: _QUICK_STOP_RATE}
+"""Halt option code that ramps down and holds -> the object with its deceleration."""
 _BY_RATE: Final = (2, 6)
 """Quick stop option codes that use 0x6085."""
 _ENCODER, _GEAR, _FEED = 0x608F, 0x6091, 0x6092
@@ -131,13 +134,14 @@ class Setting:
         return f"0x{self.index:04X}" + (f":{self.sub_index}" if self.sub_index else "")
 
 
-def settings_of(values: Values, axis: int, device: DeviceDescription | None = None) -> list[Setting]:
+def settings_of(values: Values, axis: int, device: DeviceDescription | None = None, unit: str = "rad") -> list[Setting]:
     """Return the settings of an axis.
 
     Args:
         values: objects of the axis, some of `OBJECTS`.
         axis: number of the axis, from 1.
         device: the drive's file, whose scale is used; None: that of its own objects, at its output shaft.
+        unit: unit of the positions in that file, rad or m.
     """
     shift = (axis - 1) * OBJECTS_PER_AXIS
     settings = []
@@ -145,10 +149,10 @@ def settings_of(values: Values, axis: int, device: DeviceDescription | None = No
         if (data := values.get((index, sub_index))) is None:
             continue
         raw = _number(index, data)
-        factor = _factor(index, quantity, values, axis, device)
+        factor = _factor(index, quantity, values, axis, device, unit)
         value = None if factor is None else raw * factor
         meaning = "not supervised" if index == _WINDOW and _is_off(data) else ""
-        settings.append(Setting(index + shift, sub_index, name, raw, value, _SI[quantity], meaning))
+        settings.append(Setting(index + shift, sub_index, name, raw, value, _SI[quantity].format(unit), meaning))
     for index, (name, meanings) in OPTIONS.items():
         if (data := values.get((index, 0))) is not None:
             code = _number(index, data)
@@ -189,7 +193,7 @@ def compare(
     values = {**values, **sent}
     found = {
         (setting.index - (axis - 1) * OBJECTS_PER_AXIS, setting.sub_index): setting
-        for setting in settings_of(values, axis, device)
+        for setting in settings_of(values, axis, device, "rad" if needs is None else needs.unit)
     }
     remedy = f"write another value among the start-up SDOs of {file}"
     notes = [f"{where}: {text}" for text in _stop_notes(found, needs, remedy)]
@@ -235,29 +239,34 @@ def _limit_notes(found: Mapping[tuple[int, int], Setting], values: Values, needs
     for index in _SPEEDS:
         limit = found.get((index, 0))
         if limit is not None and limit.value is not None and limit.value < needs.velocity * (1 - _ROUNDING):
-            yield f"{limit.text}, and the speed limit of {joint} is {needs.velocity:.4g} rad/s, which it does not reach"
+            wanted = f"{needs.velocity:.4g} {limit.unit}"
+            yield f"{limit.text}, and the speed limit of {joint} is {wanted}, which it does not reach"
     window = found.get((_WINDOW, 0))
-    if window is not None and window.value is not None and not window.meaning and window.value < needs.following_error:
+    allowed = needs.following_error
+    if window is not None and window.value is not None and not window.meaning and window.value < allowed < math.inf:
         yield (
-            f"{window.text}, and the supervision of {joint} allows {needs.following_error:.4g} rad: the drive goes to "
+            f"{window.text}, and the supervision of {joint} allows {allowed:.4g} {window.unit}: the drive goes to "
             "fault first"
         )
     rate = found.get((_QUICK_STOP_RATE, 0))
     if rate is not None and rate.value is not None and rate.value < needs.deceleration:
         yield (
-            f"{rate.text}, and a quick stop of {joint} needs at least {needs.deceleration:.4g} rad/s^2 to end while "
-            "the platform waits for it"
+            f"{rate.text}, and a quick stop of {joint} needs at least {needs.deceleration:.4g} {rate.unit} to end "
+            "while the platform waits for it"
         )
-    if rate is not None and rate.value is None and _ACCELERATION_UNIT in values:
+    profile = found.get((_PROFILE_RATE, 0)) if needs.halt_deceleration else None
+    for unscaled in (rate, profile):
+        if unscaled is None or unscaled.value is not None or _ACCELERATION_UNIT not in values:
+            continue
         unit = int.from_bytes(values[_ACCELERATION_UNIT], "little")
         yield (
-            f"{rate.text} counts of the unit 0x{unit:08X} (0x60AA), which is not that of velocities by the second: the "
-            f"times and distances of the stop reactions do not hold for {joint}"
+            f"{unscaled.text} counts of the unit 0x{unit:08X} (0x60AA), which is not that of velocities by the "
+            f"second: the times and distances of the stop reactions do not hold for {joint}"
         )
     for index in _ADDED:
         offset = found.get((index, 0))
         named = "velocity_offset" if index == _ADDED[0] else "torque_offset"
-        if offset is not None and offset.raw and named not in needs.feed_forward:
+        if offset is not None and offset.raw and named not in needs.driven:
             yield f"{offset.text}, which it adds to the output of its loops"
 
 
@@ -270,21 +279,41 @@ def _faults(found: Mapping[tuple[int, int], Setting], needs: AxisNeeds, remedy: 
     offset = found.get((_OFFSET, 0))
     if offset is not None and offset.raw:
         yield f"{offset.text}: enabled, {joint} would move by it: write 0"
+    if needs.halt_deceleration:
+        yield from _halt_faults(found, needs, remedy)
     low, high = found.get(_RANGE_LOW), found.get(_RANGE_HIGH)
     if low is None or high is None or not low.raw < high.raw or low.value is None or high.value is None:
         return
     ends, (lowest, highest) = sorted((low.value, high.value)), needs.position
     if not ends[0] <= lowest <= highest <= ends[1]:
         yield (
-            f"its position wraps at {ends[0]:.4g} and {ends[1]:.4g} rad ({low.text}; {high.text}), and {joint} uses "
-            f"{lowest:.4g} to {highest:.4g} rad there: it would turn the other way round. Allowed is a range of the "
-            "joint, with its zero offset, that does not reach the ends; or write 0 to both, where the drive then "
-            "counts on"
+            f"its position wraps at {ends[0]:.4g} and {ends[1]:.4g} {low.unit} ({low.text}; {high.text}), and {joint} "
+            f"uses {lowest:.4g} to {highest:.4g} {low.unit} there: it would turn the other way round. Allowed is a "
+            "range of the joint, with its zero offset, that does not reach the ends; or write 0 to both, where the "
+            "drive then counts on"
         )
 
 
+def _halt_faults(found: Mapping[tuple[int, int], Setting], needs: AxisNeeds, remedy: str) -> Iterator[str]:
+    """Yield why an external axis that is halted before the end of its range would not be at rest there."""
+    axis, halt = needs.joint, found.get((_HALT, 0))
+    code = 1 if halt is None else halt.raw
+    if halt is not None and code not in _HALT_RATES:
+        yield (
+            f"{halt.text}, and {axis} is halted before the end of its range: allowed are 1 and 2, which ramp down by "
+            f"0x6084 and 0x6085, and hold: {remedy}"
+        )
+    for index in dict.fromkeys((_PROFILE_RATE, _HALT_RATES.get(code, _PROFILE_RATE))):
+        rate = found.get((index, 0))
+        if rate is not None and rate.value is not None and rate.value < needs.halt_deceleration * (1 - _ROUNDING):
+            yield (
+                f"{rate.text}, and `acceleration` of {axis} is {needs.halt_deceleration:.4g} {rate.unit}: halted, it "
+                f"would need a longer way than is kept to the end of its range: {remedy}, or lower `acceleration`"
+            )
+
+
 def _factor(
-    index: int, quantity: Quantity, values: Values, axis: int, device: DeviceDescription | None
+    index: int, quantity: Quantity, values: Values, axis: int, device: DeviceDescription | None, unit: str
 ) -> float | None:
     """Return the SI units per count of an object; None: unknown."""
     if quantity == "time":
@@ -294,7 +323,8 @@ def _factor(
         shifted = index + (axis - 1) * OBJECTS_PER_AXIS
         # A file that names an object says what it counts in: makers differ from the standard there.
         stated = [factor_of(device, entry) for entry in device.limits if entry.index == shifted]
-        stated += [e.factor for _, e in _outputs(device) if e.index == shifted and e.unit == _SI[quantity]]
+        wanted = _SI[quantity].format(unit)
+        stated += [e.factor for _, e in _outputs(device) if e.index == shifted and e.unit == wanted]
         if stated and stated[0] is not None:
             return abs(stated[0])
     if quantity == "motor speed":
@@ -432,11 +462,11 @@ def _outputs(device: DeviceDescription) -> Iterator[tuple[Pdo, PdoEntry]]:
 def _with_own_values(sdo: SdoClient, config: SlaveConfig, read: Read) -> Steps[tuple[DeviceDescription, list[str]]]:
     """Return the description with the drive's own values, and a sentence for each that it cannot tell."""
     device, faults = config.device, []
-    fed = {name for needs in config.needs for name in needs.feed_forward}
+    driven = {(needs.axis, name) for needs in config.needs for name in needs.driven}
     own: dict[tuple[int, int], float] = {}
     remedy = f"state `safe` at the channel in {config.file or 'its device file'}"
     for pdo, entry in _outputs(device):
-        if entry.safe is not None or entry.name in fed:
+        if entry.safe is not None or (pdo.axis_of(entry), entry.name) in driven:
             continue
         data = yield from read(entry.index, entry.sub_index)
         where, axis = f"0x{entry.index:04X}:{entry.sub_index} ({entry.name})", pdo.axis_of(entry)

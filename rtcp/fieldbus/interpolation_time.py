@@ -36,11 +36,16 @@ def expressions(period_ns: int, bits: int = 8) -> Iterator[tuple[int, int]]:
             yield value, exponent
 
 
+class OtherInterpolationTime(BusError):
+    """A drive whose interpolation time is not the cycle."""
+
+
 def set_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Steps[list[str]]:
     """Let the interpolation time of an axis be the cycle; return a note where the drive has none, or keeps 0.
 
     Raises:
-        BusError: the drive has another time and does not take the cycle, or it does not answer.
+        OtherInterpolationTime: the drive has another time and does not take the cycle.
+        BusError: it does not answer.
     """
     where = slave_label(sdo.position, sdo.name)
     index = INTERPOLATION_TIME + (axis - 1) * OBJECTS_PER_AXIS
@@ -80,7 +85,7 @@ def set_interpolation_time(sdo: SdoClient, period_ns: int, axis: int = 1) -> Ste
         return []
     if kept_ns == 0:
         return [f"{where}: its interpolation time (0x{index:04X}) is 0 and was left as it is, by SYNC0: {why}"]
-    raise BusError(
+    raise OtherInterpolationTime(
         f"{where}: its interpolation time (0x{index:04X}) is {kept_ns / 1000:g} us, the cycle (`cycle.period_us`) is "
         f"{period_ns / 1000:g} us, and they must be equal: {why}; change the one that is wrong"
     )

@@ -20,7 +20,7 @@ from rtcp.fieldbus.bus import SlaveInfo, slave_label, station_of
 from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.eeprom import eeprom_to_device, eeprom_to_master, reading_words
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted, ValueNotKept
-from rtcp.fieldbus.interpolation_time import set_interpolation_time
+from rtcp.fieldbus.interpolation_time import OtherInterpolationTime, set_interpolation_time
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
 from rtcp.fieldbus.pdo import ASSIGN, STRUCT_CODES, assignments, compare_mapping, write_mapping
 from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
@@ -330,8 +330,14 @@ def configure_slave(
     if device.kind == "cia402":
         # Before any motion: a drive with other units must not come to SAFE-OP.
         notes += yield from compare_scaling(sdo, config)
+        profiles = {needs.axis for needs in config.needs if needs.halt_deceleration}
         for axis in device.axes:
-            notes += yield from set_interpolation_time(sdo, period_ns, axis)
+            try:
+                notes += yield from set_interpolation_time(sdo, period_ns, axis)
+            except OtherInterpolationTime as error:
+                if axis not in profiles:
+                    raise
+                notes.append(f"{error}; its own profiles do not use it")
     return notes
 
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import math
 from typing import Annotated
 
 from annotated_types import Gt, Le
 
 from rtcp.gateway.command_channel import BROKEN, Caller, CommandChannel, Json, Lease
+from rtcp.gateway.machine_actions import MachineActions
 from rtcp.gateway.method import HOLD_S, index_of, left, method
 from rtcp.ipc.commands import Command, HomeAxis, MoveAxis, RunAxis, StopAxis
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.events import AxisAtRest, AxisFailed, Homed, HomingFailed
+from rtcp.ipc.events import AxisAtRest, AxisFailed, Homed, HomedElsewhere, HomingFailed
 from rtcp.ipc.schema import identifier
 
-_ENDS = (AxisAtRest, AxisFailed, Homed, HomingFailed)
+_ENDS = (AxisAtRest, AxisFailed, Homed, HomedElsewhere, HomingFailed)
 _LONGEST_HOLD_S = 3600.0
 
 
@@ -29,10 +29,12 @@ class AxisActions:
 
     Args:
         channel: to the loop.
+        machine: reads the home offsets of the drives.
     """
 
-    def __init__(self, channel: CommandChannel) -> None:
+    def __init__(self, channel: CommandChannel, machine: MachineActions) -> None:
         self._channel = channel
+        self._machine = machine
         self._axes = channel.config.external_axes
         self._first = channel.config.first_external
         self._runs: dict[int, _Run] = {}
@@ -53,9 +55,12 @@ class AxisActions:
 
     @method()
     async def home_axis(self, caller: Caller, axis: str) -> Json:
-        """Let the drive of an external axis search its home. Returns its `position` afterwards, m or rad."""
+        """Let the drive of an external axis search its home: what it does says `homing_method`.
+
+        Returns its `position` afterwards, m or rad.
+        """
         number = self._number(axis)
-        end = await self._moved(caller, number, HomeAxis(number))
+        end = await self._moved(caller, number, HomeAxis(number, await self._machine.home_offset(number)))
         if not isinstance(end, Homed):
             raise RtcpError("refused", f"{axis}: homing was stopped; it is not homed", "axis_stopped")
         return {"position": end.position}
@@ -71,8 +76,8 @@ class AxisActions:
     ) -> Json:
         """Run an external axis at a velocity, m/s or rad/s, for `hold_s`; returns when it was accepted.
 
-        The connection holds the lease until the axis rests: it may command other motions meanwhile, and when it closes
-        the axis stops.
+        The connection holds the lease until the axis rests: it may command other motions meanwhile. Progress reports
+        follow the answer; when the client no longer reads them, or the connection closes, the axis stops.
         """
         number, connection = self._number(axis), caller.connection
         run = self._runs.get(connection)
@@ -126,7 +131,7 @@ class AxisActions:
         ends = [event for event in events if isinstance(event, _ENDS) and event.axis == number]
         if not ends:
             raise RtcpError("refused", f"{command.name} was ended by another command: the drives are disabled")
-        failed = next((event for event in ends if isinstance(event, AxisFailed | HomingFailed)), None)
+        failed = next((event for event in ends if isinstance(event, AxisFailed | HomedElsewhere | HomingFailed)), None)
         if failed is not None:
             raise channel.error("fault", failed)
         assert isinstance(ends[-1], AxisAtRest | Homed)
@@ -146,8 +151,8 @@ class _Run:
         self._head: float = math.inf
         """Number of the last record before the newest command's effect; infinite while a command is under way."""
         self._lease: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        # No reports: the request has its answer.
-        self.task = asyncio.create_task(self._keep(dataclasses.replace(caller, report=lambda progress: None)))
+        # It reports on beyond the answer: a client that no longer reads must not keep the axis running.
+        self.task = asyncio.create_task(self._keep(caller))
 
     async def send(self, caller: Caller, command: Command) -> None:
         """Send a command with the lease."""

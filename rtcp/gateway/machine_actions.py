@@ -274,7 +274,7 @@ class MachineActions:
         axis, channel = self._axis(joint), self._channel
         since = channel.observer.last_event
         async with channel.lease(caller) as lease:
-            offset = nan if channel.config.bus.LACKS.get("sdo") else await self._home_offset(axis)
+            offset = await self.home_offset(axis)
             homed = channel.reaching(State.HOLDING, _HOMING, "homing", since)
             longest_s = self._config.homing.search_s + _HOMING_S
             await channel.run(lease, commands.Home(axis, offset), homed, longest_s, "homing")
@@ -287,10 +287,11 @@ class MachineActions:
 
     @method(streams=True)
     async def homing_method(self, caller: Caller, joint: str) -> Json:
-        """Read what `home` would do, from the joint's drive; nothing moves.
+        """Read what `home`, or of an external axis `home_axis`, would do, from its drive; nothing moves.
 
         Returns `method` (0x6098; null: the drive has no such object), `text`: what the drive then does,
-        `declares_present`: whether it declares the present position to be its home, and `home_offset` (0x607C), rad.
+        `declares_present`: whether it declares the present position to be its home, and `home_offset` (0x607C), in
+        `unit`.
         """
         axis = self._axis(joint)
         if why := self._channel.config.bus.LACKS.get("homing"):
@@ -302,11 +303,15 @@ class MachineActions:
             "method": number,
             "text": homing_text(number),
             "declares_present": number is None or number in PRESENT_POSITION,
-            "home_offset": await self._home_offset(axis),
+            "home_offset": await self.home_offset(axis),
+            "unit": self._config.unit_of(axis),
         }
 
-    async def _home_offset(self, axis: int) -> float:
-        """Return the home offset of a joint's drive, rad; 0 where it has none (CiA 402-2, object 0x607C)."""
+    async def home_offset(self, axis: int) -> float:
+        """Return the home offset of an axis' drive, rad or m; 0 where it has none (CiA 402-2, object 0x607C), NaN where
+        the bus has no SDOs."""
+        if self._config.bus.LACKS.get("sdo"):
+            return nan
         data = await self._read_of(axis, HOME_OFFSET)
         counts = 0 if data is None else int.from_bytes(data, "little", signed=True)
         joint = self._config.axes[axis]

@@ -98,7 +98,7 @@ class Methods:
         planners = [Planner(config, limits, number) for number in range(len(config.tool_names))]
         self._motion = MotionActions(channel, planners)
         self._processes = ProcessActions(channel, config)
-        self._axes = AxisActions(channel)
+        self._axes = AxisActions(channel, self.machine)
         self._cell = CellActions(session, self._motion, limits)
         self._paused_by: set[int] = set()
         """Connections that have paused a motion."""

@@ -173,6 +173,8 @@ class HomeAxis(Command):
 
     states = CALM | {State.STOPPING}
     axis: int
+    home_offset: float = nan
+    """As of `Home`, m or rad."""
 
 
 class StopAxis(Command):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -24,7 +26,6 @@ def rail(platform: Any) -> None:
         (("move", "rail", "-0.3", "--speed", "0.1"), "move_axis", {"axis": "rail", "position": -0.3, "speed": 0.1},
          "rail is at 0.25 m\n"),
         (("move", "rail", "0.3"), "move_axis", {"axis": "rail", "position": 0.3, "speed": None}, "rail is at 0.25 m\n"),
-        (("home", "rail"), "home_axis", {"axis": "rail"}, "rail is homed and stands at 0.25 m\n"),
         (("stop", "rail"), "stop_axis", {"axis": "rail"}, "rail rests\n"),
     ],
 )  # fmt: skip
@@ -35,6 +36,26 @@ def test_a_command_is_passed_on_and_answered_with_the_unit_of_the_axis(
     ended = rtcp("axis", *arguments)
     assert (ended.code, ended.out) == (0, said)
     assert platform.asked(method) == [params]
+
+
+@pytest.mark.parametrize(("method", "arguments", "answer", "homed"), [
+    (33, (), "", True), (35, (), "n\n", False), (35, (), "y\n", True), (35, ("--yes",), "", True),
+])  # fmt: skip
+def test_homing_says_what_the_drive_will_do_and_asks_before_the_present_position_becomes_the_home(
+    platform: Any, rtcp: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, method: int, arguments: tuple[str, ...],
+    answer: str, homed: bool,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(sys, "stdin", io.StringIO(answer))
+    platform.answers["homing_method"] = {
+        "joint": "rail", "method": method, "text": "homes", "declares_present": method == 35, "home_offset": 0.1,
+        "unit": "m",
+    }  # fmt: skip
+    platform.answers["home_axis"] = {"position": 0.25}
+    ended = rtcp("axis", "home", "rail", *arguments)
+    assert f"the drive of rail homes, by method {method} (0x6098); there it counts 0.1 m (0x607C)\n" in ended.out
+    assert platform.asked("homing_method") == [{"joint": "rail"}]
+    assert bool(platform.asked("home_axis")) is (ended.code == 0) is homed
+    assert ended.out.endswith("rail is homed and stands at 0.25 m\n") is homed
 
 
 def test_a_run_is_renewed_until_its_time_has_passed_and_then_stopped(platform: Any, rtcp: Callable[..., Any]) -> None:

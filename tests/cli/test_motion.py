@@ -172,7 +172,14 @@ def test_a_joint_is_zeroed_by_its_name_or_its_number(platform: Any, rtcp: Callab
     assert "/state/zero.yaml" in ended.out
 
 
-SWITCH = {"joint": "joint6", "method": 17, "text": "turns to a switch", "declares_present": False, "home_offset": 0.25}
+SWITCH = {
+    "joint": "joint6",
+    "method": 17,
+    "text": "turns to a switch",
+    "declares_present": False,
+    "home_offset": 0.25,
+    "unit": "rad",
+}
 PRESENT = {**SWITCH, "method": 37, "text": "does not move", "declares_present": True}
 
 

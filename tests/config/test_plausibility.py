@@ -95,3 +95,40 @@ def test_a_speed_that_the_motor_cannot_reach_is_refused_unless_it_is_marked(dire
         (directory / ARM).read_text().replace("velocity: 0.5", "velocity: {value: 0.5, unusual: true}")
     )
     load(Path(ARM))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("max: 0.8}", "max: 800}", "external_axes[0].position.max: found 800 m, plausible is at most 20 m: if this is "
+         "in millimetres, write 0.8;"),
+        ("acceleration: 0.5 ", "acceleration: 500 ", "external_axes[0].acceleration: found 500 m/s^2, "),
+        ("velocity: 0.2\n", "velocity: 200\n", "external_axes[1].velocity: found 200 m/s, "),
+        ("velocity: 0.2\n", "velocity: 30\n    position: {min: -180, max: 3.1}\n    unit: rad\n",
+         "external_axes[1].position.min: found -180 rad, plausible is at most 12.57 rad: if this is in degrees"),
+    ],
+)  # fmt: skip
+def test_an_external_axis_in_another_unit_is_refused(directory: Path, old: str, new: str, sentence: str) -> None:
+    file = directory / "linear_axis.yaml"
+    change(file, old, new)
+    if "unit: rad" in new:
+        before, belt = file.read_text().split("- name: belt")
+        file.write_text(f"{before}- name: belt{belt.replace('    unit: m ', '    # ', 1)}")
+    with pytest.raises(ConfigError) as refused:
+        load(file)
+    assert any(sentence in str(finding) for finding in refused.value.findings), refused.value.findings
+
+
+def test_a_speed_of_a_rotary_axis_that_its_motor_cannot_reach_is_refused(directory: Path) -> None:
+    change(directory / DRIVE, "    rated_torque: 40", "    max_motor_speed: 200\n    rated_torque: 40")
+    file = directory / "linear_axis.yaml"
+    change(file, "drive2, device: cubemars-orh-linear", "drive2, device: two-axis-drive")
+    change(file, "unit: m                 # no position", "unit: rad    # no position")
+    change(file, "velocity: 0.2\n", "velocity: 0.5\n")
+    sentence = (
+        r"external_axes\[1\]\.velocity: found 0\.5 rad/s, but the drive turns the joint with at most 0\.4189 rad/s"
+    )
+    with pytest.raises(ConfigError, match=sentence):
+        load(file)
+    change(file, "velocity: 0.5\n", "velocity: {value: 0.5, unusual: true}\n")
+    load(file)

@@ -322,3 +322,10 @@ def test_two_writers_wait_for_each_other(state: Path) -> None:
     writers = [subprocess.Popen([sys.executable, "-c", code, str(axis)]) for axis in range(2)]
     assert [writer.wait() for writer in writers] == [0, 0]
     assert read_zeros(ARM) == (19 / 64, 19 / 64, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_an_axis_without_ends_has_a_zero_beside_one_with_ends() -> None:
+    config = load(default_config().parent / "linear_axis.yaml")
+    store_zero(config, 0, 0.1)
+    store_zero(config, 1, -0.25)
+    assert read_zeros(config) == (0.1, -0.25)

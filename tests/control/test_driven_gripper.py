@@ -11,8 +11,18 @@ from typing import Any, TypeVar
 import pytest
 
 from rtcp.config import default_config, load, load_segment, segment_path
-from rtcp.config.model import ArmConfig, GripperConfig, InputConfig, Joint, Range, SlaveConfig
+from rtcp.config.model import (
+    ArmConfig,
+    FeedForwardConfig,
+    GripperConfig,
+    InputConfig,
+    Joint,
+    PdoEntry,
+    Range,
+    SlaveConfig,
+)
 from rtcp.config.segment import SegmentSlave
+from rtcp.control.gripper import DrivenGripper
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.ipc import events
 from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, SetZero, Shutdown
@@ -20,6 +30,7 @@ from rtcp.ipc.events import Event
 from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import GripperDisabled, NoLease, NotPermitted
 from rtcp.ipc.states import State
+from rtcp.motion.controllers.gripper import GripperMotion
 from rtcp.motion.guards.output_limiter import BACK_RAD_S
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
@@ -496,3 +507,14 @@ def test_its_zero_is_set_and_the_loop_says_where_it_stands_then(hand: Hand) -> N
     assert (event.axis, event.position) == (AXIS, pytest.approx(0.2, abs=2e-3))
     hand.run(0.1)
     assert hand.gripper.drive.position == pytest.approx(0.2, abs=2e-3)
+
+
+def test_feed_forward_of_the_arm_leaves_an_offset_of_the_grippers_drive_as_it_is() -> None:
+    device = CONFIG.slaves[-1].device
+    first, *others = device.rpdo
+    offset = PdoEntry(0x60B2, 0, "int16", "torque_offset", safe=3.0)
+    device = replace(device, rpdo=(replace(first, channels=(*first.channels, offset)), *others))
+    slaves = (*CONFIG.slaves[:-1], replace(CONFIG.slaves[-1], device=device))
+    config = replace(CONFIG, slaves=slaves, feed_forward=FeedForwardConfig(gravity=1.0), joints=(FINGER,))
+    drive = DrivenGripper(config, GripperMotion(FINGER, OPEN, CLOSED, PERIOD_S), AXIS).drive
+    assert drive.encode()[-2:] == b"\x03\x00"

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -21,11 +22,13 @@ from rtcp.ipc.events import (
     AxisStillMoving,
     Event,
     Homed,
+    HomedElsewhere,
     LeaseExpired,
 )
 from rtcp.ipc.states import State
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
+from rtcp.virtual.models.profile_modes import Phase
 from tests.control.rig import about
 
 SHIPPED = load(default_config().parent / "linear_axis.yaml")
@@ -217,6 +220,16 @@ def test_homing_gives_the_rail_its_positions_and_is_needed_before_a_motion_and_a
         bench.bring_to(State.READY)
         bench.hold()
         assert bench.refused(MoveAxis(RAIL, 0.1)) == "rail is not homed: `rtcp axis home rail` first"
+
+
+def test_a_rail_whose_drive_says_it_is_homed_where_it_is_not_has_not_homed() -> None:
+    with Bench(replace(CONFIG, homing=replace(CONFIG.homing, tolerance=0.01))) as bench:
+        homing: Any = bench.drives[RAIL].servo._modes[6]
+        homing._begin = lambda: setattr(homing, "_phase", Phase.ATTAINED)
+        bench.do(HomeAxis(RAIL, 0.0))
+        bench.rest(RAIL)
+        assert bench.last_of(HomedElsewhere) == HomedElsewhere(RAIL, about(0.05, abs=1e-3), 0.0)
+        assert "is not homed" in bench.refused(MoveAxis(RAIL, 0.1))
 
 
 def test_what_an_axis_may_not_do_is_refused_and_nothing_is_sent(bench: Bench) -> None:

@@ -12,18 +12,22 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.drive_limits import with_limits
-from rtcp.config.model import ArmConfig, DeviceDescription, Pdo, PdoEntry
+from rtcp.config.model import ArmConfig, DeviceDescription, FeedForwardConfig, Pdo, PdoEntry
 from rtcp.config.segment import SegmentConfig
-from rtcp.fieldbus.drive_settings import check_settings, settings_of
+from rtcp.fieldbus.drive_settings import check_settings, compare, settings_of
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.registers import finish
+from rtcp.testing.bus import InProcessBus
 from rtcp.testing.simulation import Simulation
+from rtcp.virtual.models import CubemarsDrive, create
 from rtcp.virtual.models.servo import ServoAxis
+from rtcp.virtual.objects import Access, DataType, Entry
 from tests.control.test_standard_drives import BENT, arm_of
 from tests.drive_esi import ARMS
 
 SHIPPED = load(default_config())
+RAIL = load(default_config().parent / "linear_axis.yaml")
 REMEDY = "write another value among the start-up SDOs of synapticon-somanet.yaml"
 
 
@@ -186,3 +190,96 @@ def test_a_drive_without_a_device_file_is_shown_in_its_own_units() -> None:
         "quick stop deceleration (0x6885) is 9549, 10 rad/s^2",
     ]
     assert "quick stop deceleration (0x6085) is 9549" in words({**units, **held, (0x60AA, 0): (0x00B55700, 4)})
+
+
+def rail(sdos: Mapping[int, int], rpdo: Sequence[PdoEntry] = (), **keys: object) -> ArmConfig:
+    """The platform of a rail and a conveyor; values of their start-up SDOs and further outputs differ."""
+
+    def changed(device: DeviceDescription) -> DeviceDescription:
+        startup = tuple(replace(sdo, value=sdos.get(sdo.index, sdo.value)) for sdo in device.sdo)
+        return replace(device, sdo=startup, rpdo=mapped(device, *rpdo) if rpdo else device.rpdo)
+
+    slaves = tuple(
+        replace(slave, device=changed(slave.device)) if slave.device.kind == "cia402" else slave
+        for slave in RAIL.slaves
+    )
+    return replace(RAIL, slaves=slaves, **keys)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("sdos", "said"),
+    [
+        ({0x6084: 5000}, "profile deceleration (0x6084) is 5000, 0.05 m/s^2, and `acceleration` of rail is 0.5 m/s^2: "
+         "halted, it would need a longer way than is kept to the end of its range"),
+        ({0x605D: 2, 0x6085: 20000}, "quick stop deceleration (0x6085) is 20000, 0.2 m/s^2, and `acceleration`"),
+    ],
+)  # fmt: skip
+def test_an_external_axis_whose_drive_halts_otherwise_than_the_platform_computes_is_refused(
+    sdos: Mapping[int, int], said: str
+) -> None:
+    with pytest.raises(BusError) as refused:
+        Simulation(rail(sdos), follow_clock=False).close()
+    assert any(f"slave 2 (drive1): {said}" in sentence for sentence in refused.value.sentences)
+
+
+def test_a_halt_whose_deceleration_nothing_states_is_refused_for_an_external_axis_alone() -> None:
+    held = {(0x605D, 0): b"\x03\x00"}
+    slave = with_limits(RAIL)[1]
+    _, (refused,) = compare(held, slave.device, slave.needs[0], "drive1", "its file")
+    assert refused.startswith(
+        "drive1: halt option code (0x605D) is 3, slows down at the current limit, then holds, and rail is halted "
+        "before the end of its range: allowed are 1 and 2"
+    )
+    joint = with_limits(SHIPPED)[1]
+    assert compare(held, joint.device, joint.needs[0], "drive1", "its file") == ([], [])
+
+
+def test_the_settings_of_an_axis_in_metres_are_compared_in_metres() -> None:
+    with Simulation(rail({0x6065: 2000, 0x6085: 1000}), follow_clock=False) as made:
+        (note,) = (note for note in made.bus.notes if "drive1" in note)
+    assert "quick stop deceleration (0x6085) is 1000, 0.01 m/s^2, and a quick stop of rail needs at least" in note
+    assert "m/s^2 to end" in note
+
+
+def test_an_offset_that_feed_forward_does_not_drive_keeps_the_drives_own_value() -> None:
+    """Feed-forward is of the arm's joints; the speed of a profile is driven, though its object may be write-only."""
+    own = PdoEntry(0x60B2, 0, "int16", "torque_offset")
+
+    class Slave:
+        position, name = 2, "drive1"
+
+        def reading(self, index: int, subindex: int) -> Iterator[None]:
+            if index == 0x60B2:
+                return (7).to_bytes(2, "little")  # type: ignore[return-value]
+            raise SdoAborted("attempt to read a write only object", 0x06010001)
+            yield
+
+    def safe(config: ArmConfig) -> float | None:
+        slave = next(slave for slave in with_limits(config) if slave.name == "drive1")
+        slave = replace(slave, device=replace(slave.device, rpdo=mapped(slave.device, own)))
+        device, _ = finish(check_settings(cast(SdoClient, Slave()), slave))
+        return device.rpdo[0].channels[-1].safe
+
+    gravity = FeedForwardConfig(gravity=1.0)
+    assert safe(rail({}, feed_forward=gravity)) == 7.0
+    assert safe(replace(SHIPPED, feed_forward=gravity)) is None
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_drive_that_makes_its_own_profiles_need_not_interpolate_over_the_cycle(moves: bool) -> None:
+    model = create("cubemars-orh60")
+    assert isinstance(model, CubemarsDrive)
+    model.objects.remove(0x60C2)
+    model.objects.record(0x60C2, "Interpolation time period", [
+        Entry(0x60C2, 1, "Value", DataType.UNSIGNED8, 4, Access.RO),
+        Entry(0x60C2, 2, "Exponent", DataType.INTEGER8, -3, Access.RO),
+    ])  # fmt: skip
+    slave, bus = with_limits(RAIL)[1], InProcessBus([model])
+    if moves:
+        bus.configure([slave], 1_000_000)
+        (note,) = (note for note in bus.notes if "0x60C2" in note)
+        assert "is 4000 us, the cycle (`cycle.period_us`) is 1000 us" in note
+        assert note.endswith("; its own profiles do not use it")
+    else:
+        with pytest.raises(BusError, match="they must be equal"):
+            bus.configure([replace(slave, needs=())], 1_000_000)

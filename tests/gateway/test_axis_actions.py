@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.gateway.command_channel import Caller
 from rtcp.ipc import commands
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.events import AxisAtRest, AxisFailed, Event, Homed, HomingFailed
+from rtcp.ipc.events import AxisAtRest, AxisFailed, Event, Homed, HomedElsewhere, HomingFailed
 from rtcp.ipc.refusals import AxisNotHomed
 from rtcp.ipc.schema import axis_fields
 from rtcp.ipc.states import State
@@ -36,8 +38,9 @@ def test_a_motion_returns_where_the_axis_is(bench: FakePlatform) -> None:
     bench.loop.reports[commands.MoveAxis] = [AxisAtRest(RAIL, 0.3, True), AxisAtRest(BELT, 0.9, False)]
     bench.loop.reports[commands.HomeAxis] = [Homed(RAIL, 0.01)]
     assert bench.ask("move_axis", axis="rail", position=0.3, speed=0.1) == {"position": 0.3}
+    bench.loop.objects[0x607C] = {"hex": "f0d8ffff"}
     assert bench.ask("home_axis", axis="rail") == {"position": 0.01}
-    assert bench.loop.commands == [commands.MoveAxis(RAIL, 0.3, 0.1), commands.HomeAxis(RAIL)]
+    assert bench.loop.commands == [commands.MoveAxis(RAIL, 0.3, 0.1), commands.HomeAxis(RAIL, -1.0)]
 
 
 @pytest.mark.parametrize(
@@ -47,6 +50,7 @@ def test_a_motion_returns_where_the_axis_is(bench: FakePlatform) -> None:
         ("move_axis", [AxisFailed(RAIL, 0x27, 1), AxisAtRest(RAIL, 0.0, False)], "fault", "rail is halted: its drive"),
         ("move_axis", [], "refused", "move_axis was ended by another command: the drives are disabled"),
         ("home_axis", [HomingFailed(RAIL, 0x27, 6)], "fault", "rail: homing failed"),
+        ("home_axis", [HomedElsewhere(RAIL, 0.5, 0.0)], "fault", "it shows 0.5 m and its home offset (0x607C) is 0 m"),
         ("home_axis", [AxisAtRest(RAIL, 0.1, False)], "refused", "rail: homing was stopped; it is not homed"),
     ],
 )
@@ -90,6 +94,26 @@ def test_a_run_keeps_the_lease_until_the_axis_rests_and_other_motions_share_it(b
         commands.RunAxis, commands.RunAxis, commands.MoveJoints, commands.StopAxis,
     ]  # fmt: skip
     assert bench.observer.holder() == ""
+
+
+def test_a_run_reports_on_and_a_client_that_no_longer_reads_loses_its_lease(bench: FakePlatform) -> None:
+    reports: list[object] = []
+    hung = False
+
+    async def run() -> None:
+        nonlocal hung
+        bench.loop.fields = {"belt_moving": 1}
+        caller = Caller("one", 1, reports.append, lambda seconds: hung)
+        await bench.methods.call("run_axis", caller, {"axis": "belt", "velocity": 0.1, "hold_s": 3600.0})
+        answered = len(reports)
+        await asyncio.sleep(0.6)
+        assert len(reports) > answered
+        assert bench.observer.holder() == "one"
+        hung = True
+        await asyncio.sleep(0.6)
+        assert not bench.observer.holder()
+
+    bench.run(run)
 
 
 def test_a_connection_that_closes_releases_the_lease_of_its_runs(bench: FakePlatform) -> None:

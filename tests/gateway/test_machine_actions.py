@@ -386,6 +386,7 @@ def test_what_homing_will_do_is_read_from_the_drive(arm: FakePlatform) -> None:
         "text": "does not move: it declares the present position to be its home",
         "declares_present": True,
         "home_offset": pytest.approx(-1.0),
+        "unit": "rad",
     }
     objects[0x6098] = {"hex": "12"}
     answer = arm.ask("homing_method", joint="joint2")
