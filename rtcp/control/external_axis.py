@@ -132,8 +132,9 @@ class ExternalAxisGroup(JointGroup):
         self._halt_cycles = self._cycles(_HALT_S + axis.velocity / axis.acceleration)
         self._waited = self._longest = self._held = self._astray = 0
         self._target = self._velocity = 0.0
-        self._raised = self._set_point = False
-        """Whether bit 4 offers a set-point; whether the drive has one that it has not reached."""
+        self._raised = self._outdated = self._set_point = False
+        """Whether bit 4 offers a set-point; whether another one has replaced that; whether the drive has one that it
+        has not reached."""
         self._reports = self._reached = False
         """Whether the end of a motion is to be published; whether the axis has reached its target."""
         self._ended: Event | None = None
@@ -159,7 +160,9 @@ class ExternalAxisGroup(JointGroup):
         self.drive.profile_velocity = speed
         distance = abs(position - self.drive.position)
         self._longest = self._cycles(2.0 * (distance / speed + speed / self.axis.acceleration) + _SPARE_S)
-        self._raised, self._set_point, self._reports, self._reached = False, True, True, False
+        # The drive may have taken the former set-point and not yet acknowledged it.
+        self._raised = self._outdated = self._raised and self.phase is _P.OFFERING
+        self._set_point, self._reports, self._reached = True, True, False
         self._enter(_P.OFFERING)
         return None
 
@@ -270,6 +273,9 @@ class ExternalAxisGroup(JointGroup):
         acknowledged = drive.statusword & ACKNOWLEDGED
         if not self._raised:
             self._raised = not acknowledged
+        elif acknowledged and self._outdated:
+            # This acknowledges the former one: bit 4 rises anew once bit 12 has fallen.
+            self._raised = self._outdated = False
         elif acknowledged:
             self._enter(_P.REST if self.phase is _P.STAYING else _P.MOVING)
             return
@@ -316,7 +322,8 @@ class ExternalAxisGroup(JointGroup):
             if drive.mode != self._rest_mode:
                 self._enter(_P.RETURNING)
             elif self._set_point:
-                self._target, self._raised, self._set_point = drive.position, False, False
+                self._target = drive.position
+                self._raised = self._outdated = self._set_point = False
                 self._enter(_P.STAYING)
             else:
                 self._enter(_P.REST)

@@ -113,6 +113,16 @@ def test_a_new_target_on_the_way_replaces_the_former_one(bench: Bench) -> None:
     assert [record.event.reached for record in bench.events if isinstance(record.event, AxisAtRest)] == [True]
 
 
+@pytest.mark.parametrize("gap_s", [0.0, 0.002, 0.006])
+def test_a_target_that_comes_before_the_former_one_is_acknowledged_replaces_it(bench: Bench, gap_s: float) -> None:
+    bench.do(MoveAxis(RAIL, 0.6))
+    bench.run(gap_s)
+    bench.do(MoveAxis(RAIL, 0.1))
+    bench.rest(RAIL)
+    assert bench.at(RAIL) == pytest.approx(0.1, abs=1e-3)
+    assert bench.last_of(AxisAtRest) == AxisAtRest(RAIL, about(0.1, abs=1e-3), True)
+
+
 @pytest.mark.parametrize("stop", [StopAxis(RAIL), Halt()], ids=["stop", "halt"])
 def test_a_stopped_axis_does_not_continue_to_its_former_target(bench: Bench, stop: Command) -> None:
     bench.do(MoveAxis(RAIL, 0.6))
@@ -217,6 +227,16 @@ def test_homing_gives_the_rail_its_positions_and_is_needed_before_a_motion_and_a
         bench.bring_to(State.READY)
         bench.hold()
         assert bench.refused(MoveAxis(RAIL, 0.1)) == "rail is not homed: `rtcp axis home rail` first"
+
+
+def test_an_axis_that_has_found_its_home_can_be_stopped_and_the_end_of_the_lease_is_published_once() -> None:
+    with Bench(CONFIG) as bench:
+        bench.do(HomeAxis(RAIL))
+        assert bench.until(lambda: bool(bench.axes[RAIL]._homing._attained), 30.0)
+        bench.observer.release(bench.lease)
+        bench.rest(RAIL)
+        assert [type(record.event) for record in bench.events].count(LeaseExpired) == 1
+        assert not bench.field("rail_homed")
 
 
 def test_what_an_axis_may_not_do_is_refused_and_nothing_is_sent(bench: Bench) -> None:
