@@ -791,10 +791,13 @@ class Closing(MachineState):
         homing = ctx.homing
         if homing.under_way and joints.first_not_enabled() < 0:
             homing.stop()
+            joints.stop_others()
             homing.step()
             self._cycles = 0
             if homing.still_moving:
                 self._stop_hard(ctx, HomingStillMoving(homing.axis, joints.drives[homing.axis].velocity))
+            elif (problem := ctx.axis_problem()) is not None:
+                self._stop_hard(ctx, problem)
             return False
         return self._stop(ctx) and self._remove_torque(ctx)
 
@@ -842,7 +845,9 @@ class Closing(MachineState):
             return True
         self._cycles = 0
         result = joints.command()
-        event = ctx.controller_raised()
+        event: Event | None = ctx.controller_raised()
+        if event is None:
+            event = ctx.axis_problem()
         if event is not None:
             self._stop_hard(ctx, event)
         elif result is GuardResult.STOPPED:

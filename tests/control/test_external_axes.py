@@ -12,13 +12,26 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.control.external_axis import ExternalAxisGroup
-from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, HomeAxis, MoveAxis, Reset, RunAxis, StopAxis
+from rtcp.ipc.commands import (
+    Command,
+    Disable,
+    Enable,
+    Halt,
+    Home,
+    HomeAxis,
+    MoveAxis,
+    Reset,
+    RunAxis,
+    Shutdown,
+    StopAxis,
+)
 from rtcp.ipc.events import (
     AxisAtRest,
     AxisFailed,
     AxisModeLost,
     AxisNotReplaced,
     AxisStillMoving,
+    ClockLost,
     Event,
     Homed,
     LeaseExpired,
@@ -292,6 +305,30 @@ def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> 
     assert bench.names.message(still).startswith("belt does not come to rest although it is halted: 0.15")
     bench.run(1.0)
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_closing_stops_an_axis_by_its_drive_where_its_set_point_cannot_be_replaced(bench: Bench) -> None:
+    bench.do(MoveAxis(RAIL, 0.6))
+    bench.run(1.0)
+    setattr(bench.drives[RAIL].servo._modes[1], "_handshake", lambda controlword: None)  # noqa: B010
+    bench.send(Shutdown())
+    bench.bring_to(State.OFF, 10.0)
+    assert isinstance(bench.last_of(AxisNotReplaced), AxisNotReplaced)
+    assert not bench.drives[RAIL].powered
+
+
+def test_no_axis_begins_to_move_while_a_fault_waits_for_standstill() -> None:
+    stops = replace(ABSOLUTE.stops, clock_lost="controlled_stop")
+    with Bench(replace(ABSOLUTE, stops=stops)) as bench:
+        bench.do(RunAxis(BELT, 0.15, 30.0))
+        bench.run(1.0)
+        bench.loop.machine._handle(ClockLost(1.0))
+        bench.run(0.01)
+        for command in (MoveAxis(RAIL, 0.6), RunAxis(RAIL, 0.1, 30.0), HomeAxis(RAIL)):
+            assert bench.refused(command).startswith("a fault has stopped all motion and begins at standstill")
+        stood = bench.at(RAIL)
+        bench.bring_to(State.FAULT, 3.0)
+        assert bench.at(RAIL) == pytest.approx(stood, abs=1e-3)
 
 
 def test_a_drive_that_does_not_show_the_mode_in_which_its_axis_rests_is_not_enabled() -> None:
