@@ -39,6 +39,7 @@ from rtcp.ipc.events import (
 from rtcp.ipc.states import State
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
+from rtcp.virtual.models.profile_modes import SetPoint
 from tests.control.rig import about
 
 SHIPPED = load(default_config().parent / "linear_axis.yaml")
@@ -55,6 +56,8 @@ OUTPUTS = struct.Struct("<HiIib")
 """Controlword, target position, profile velocity, target velocity and mode, as the device file maps them."""
 NEW_SETPOINT, HALT = 0x10, 0x100
 EMERGENCY_STOP_INPUT = 9
+SET_POINT = SetPoint(6.0, 2.0, 5.0, 5.0, limited=False)
+"""0.6 m, rad of the drive."""
 
 
 class Bench(Simulation):
@@ -307,14 +310,51 @@ def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> 
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
 
 
-def test_closing_stops_an_axis_by_its_drive_where_its_set_point_cannot_be_replaced(bench: Bench) -> None:
-    bench.do(MoveAxis(RAIL, 0.6))
+def test_closing_stops_an_axis_that_ignores_its_halt_by_its_drive(bench: Bench) -> None:
+    servo = bench.drives[BELT].servo
+    servo._control_halt = lambda controlword: None  # type: ignore[method-assign]
+    bench.do(RunAxis(BELT, 0.15, 30.0))
     bench.run(1.0)
-    setattr(bench.drives[RAIL].servo._modes[1], "_handshake", lambda controlword: None)  # noqa: B010
+    servo._modes[3]._target = SimpleNamespace(value=15000)  # type: ignore[attr-defined]
     bench.send(Shutdown())
     bench.bring_to(State.OFF, 10.0)
-    assert isinstance(bench.last_of(AxisNotReplaced), AxisNotReplaced)
-    assert not bench.drives[RAIL].powered
+    assert isinstance(bench.last_of(AxisStillMoving), AxisStillMoving)
+    assert not bench.drives[BELT].powered
+    assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("way", ["disabled", "run", "emergency"])
+def test_a_drive_that_keeps_its_set_point_does_not_go_on_to_it(bench: Bench, way: str) -> None:
+    bench.drives[RAIL].servo.keeps_set_point = True
+    bench.do(MoveAxis(RAIL, 0.6))
+    bench.run(1.0)
+    if way == "run":
+        bench.do(StopAxis(RAIL))
+        bench.rest(RAIL)
+        bench.drives[RAIL].servo._modes[1]._active = SET_POINT  # type: ignore[attr-defined]
+        bench.do(RunAxis(RAIL, 0.1, 0.3))
+        bench.rest(RAIL)
+    elif way == "disabled":
+        bench.do(Disable())
+        bench.bring_to(State.READY)
+        # As a drive that was at its target, and was then pushed.
+        bench.drives[RAIL].servo._modes[1]._active = SET_POINT  # type: ignore[attr-defined]
+        bench.hold()
+    else:
+        assert bench.box is not None
+        bench.box.set_input(EMERGENCY_STOP_INPUT, False)
+        bench.bring_to(State.EMERGENCY_STOP)
+        bench.run(1.5)
+        bench.box.set_input(EMERGENCY_STOP_INPUT, True)
+        bench.run(0.1)
+        bench.do(Reset())
+        bench.bring_to(State.READY)
+        bench.hold()
+    stood = bench.at(RAIL)
+    bench.run(2.0)
+    assert bench.at(RAIL) == pytest.approx(stood, abs=1e-3)
+    assert stood < 0.4
+    bench.do(MoveAxis(RAIL, stood + 0.02))
 
 
 def test_no_axis_begins_to_move_while_a_fault_waits_for_standstill() -> None:
