@@ -12,7 +12,7 @@ from rtcp.control.homing import Homing, HomingPhase
 from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import PartContext
 from rtcp.devices.cia402 import ENABLE_OPERATION
-from rtcp.devices.drive import slave_of
+from rtcp.devices.drive import configure_drive, slave_of
 from rtcp.devices.profile_drive import (
     ACKNOWLEDGED,
     HALT,
@@ -66,7 +66,7 @@ _STILL: Final = 0.01
 """Speed below which a halted axis is at rest: a part of its speed limit."""
 _BEYOND: Final = 0.02
 """Distance beyond the end of its range, m or rad, at which an axis that still moves outward is a fault."""
-_UNKNOWN: Final = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP})
+_UNKNOWN: Final = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 
 
 class AxisPhase(Enum):
@@ -112,8 +112,7 @@ class ExternalAxisGroup(JointGroup):
         config = replace(config, joints=(axis.joint,), supervision=supervision)
         slot, slave = slave_of(config, axis.joint)
         drive = ProfileDrive(slave, config.cycle.period_us * 1e-6)
-        drive.low, drive.high = config.joints[0].position.min, config.joints[0].position.max
-        drive.zero = zero
+        configure_drive(drive, config, axis.joint, zero)
         super().__init__(axis.name, axis_fields(axis), config, [(slot, drive)], number)
         self.returns_to_range = False
         self.drive = drive
@@ -449,6 +448,7 @@ class ExternalAxisGroup(JointGroup):
             self._homing.abandon()
         self._velocity = 0.0
         self._set_point = self._positions
+        self.problem = None
         self._enter(_P.REST)
 
     def latch(self) -> None:

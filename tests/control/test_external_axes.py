@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import ArmConfig, DriveWaitsConfig
 from rtcp.control.external_axis import ExternalAxisGroup
 from rtcp.ipc.commands import (
     Command,
@@ -245,6 +245,22 @@ def test_homing_gives_the_rail_its_positions_and_is_needed_before_a_motion_and_a
         assert bench.refused(MoveAxis(RAIL, 0.1)) == "rail is not homed: `rtcp axis home rail` first"
 
 
+def test_a_drive_that_loses_its_supply_during_a_reset_is_homed_no_more() -> None:
+    with Bench(CONFIG) as bench:
+        bench.do(HomeAxis(RAIL))
+        bench.rest(RAIL)
+        bench.drives[BELT].inject_fault(0x2310)
+        bench.bring_to(State.FAULT)
+        bench.run(0.5)
+        assert bench.axes[RAIL].homed
+        bench.do(Reset())
+        bench.bring_to(State.RESETTING)
+        bench.bus.restart(2)
+        bench.run(0.004)
+        assert bench.state is State.RESETTING
+        assert not bench.axes[RAIL].homed
+
+
 def test_an_axis_that_has_found_its_home_can_be_stopped_and_the_end_of_the_lease_is_published_once() -> None:
     with Bench(CONFIG) as bench:
         bench.do(HomeAxis(RAIL))
@@ -308,6 +324,12 @@ def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> 
     assert bench.names.message(still).startswith("belt does not come to rest although it is halted: 0.15")
     bench.run(1.0)
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
+    # Once the drive obeys again, the fault is forgotten.
+    del servo._control_halt  # type: ignore[attr-defined]
+    servo._modes[3]._target = SimpleNamespace(value=0)  # type: ignore[attr-defined]
+    bench.do(Reset())
+    bench.bring_to(State.READY)
+    bench.hold()
 
 
 def test_closing_stops_an_axis_that_ignores_its_halt_by_its_drive(bench: Bench) -> None:
@@ -369,6 +391,18 @@ def test_no_axis_begins_to_move_while_a_fault_waits_for_standstill() -> None:
         stood = bench.at(RAIL)
         bench.bring_to(State.FAULT, 3.0)
         assert bench.at(RAIL) == pytest.approx(stood, abs=1e-3)
+
+
+@pytest.mark.parametrize(("pulse_ms", "state"), [(10.0, State.FAULT), (50.0, State.READY)])
+def test_the_drive_of_an_axis_is_reset_by_the_configured_pulse(pulse_ms: float, state: State) -> None:
+    with Bench(replace(ABSOLUTE, drive_waits=DriveWaitsConfig(reset_pulse_ms=pulse_ms, reset_ms=500.0))) as bench:
+        servo = bench.drives[RAIL].servo
+        servo.reset_pulse = 0.03
+        servo.inject_fault(0x2310)
+        bench.bring_to(State.FAULT)
+        bench.run(0.5)
+        bench.do(Reset())
+        bench.bring_to(state)
 
 
 def test_a_drive_that_does_not_show_the_mode_in_which_its_axis_rests_is_not_enabled() -> None:
