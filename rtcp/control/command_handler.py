@@ -443,6 +443,8 @@ class CommandHandler:
             return refusals.EmergencyStopPressed()
         if (refused := self._refused_by_partner()) is not None:
             return refused
+        if self._context.pending is not None:
+            return refusals.FaultFollows()
         return None if self._operator.permitted else refusals.NotPermitted()
 
     def _external_axis(self, number: int) -> ExternalAxisGroup | None:

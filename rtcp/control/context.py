@@ -335,11 +335,19 @@ class Context(PartContext):
     def _supervise_others(self) -> Event | None:
         return self._supervise_gripper() or self._supervise_axes()
 
-    def _supervise_axes(self) -> Event | None:
-        """Stop external axes without a commander; return the event that ends the state."""
+    def axis_problem(self) -> Event | None:
+        """Return the fault of an external axis in this cycle, or None."""
         for axis in self.axes:
             if axis.problem is not None:
                 return axis.problem
+        return None
+
+    def _supervise_axes(self) -> Event | None:
+        """Stop external axes without a commander; return the event that ends the state."""
+        problem = self.axis_problem()
+        if problem is not None:
+            return problem
+        for axis in self.axes:
             if not axis.moves_by_command:
                 continue
             event = self.permission_lost(axis.lease)

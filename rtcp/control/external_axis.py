@@ -12,7 +12,7 @@ from rtcp.control.homing import Homing, HomingPhase
 from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import PartContext
 from rtcp.devices.cia402 import ENABLE_OPERATION
-from rtcp.devices.drive import slave_of
+from rtcp.devices.drive import configure_drive, slave_of
 from rtcp.devices.profile_drive import (
     ACKNOWLEDGED,
     HALT,
@@ -67,7 +67,7 @@ _STILL: Final = 0.01
 """Speed below which a halted axis is at rest: a part of its speed limit."""
 _BEYOND: Final = 0.02
 """Distance beyond the end of its range, m or rad, at which an axis that still moves outward is a fault."""
-_UNKNOWN: Final = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP})
+_UNKNOWN: Final = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 
 
 class AxisPhase(Enum):
@@ -94,8 +94,9 @@ class ExternalAxisGroup(JointGroup):
     """The drive of an external axis: enabled and disabled with the arm, moved independently.
 
     The drive makes the profiles, so that there is no setpoint here: the commanded position is the actual one. The
-    axis is at rest with no set-point under way; a set-point that was stopped is replaced before it rests, so that
-    nothing can begin anew. Positions and speeds are in the axis' unit.
+    axis is at rest with no set-point under way; a set-point that was stopped, or that the drive may have kept while it
+    was disabled or in another mode, is replaced before it rests, so that nothing can begin anew. Positions and speeds
+    are in the axis' unit.
 
     Args:
         config: configuration with the axis' joint alone.
@@ -112,8 +113,7 @@ class ExternalAxisGroup(JointGroup):
         config = replace(config, joints=(axis.joint,), supervision=supervision)
         slot, slave = slave_of(config, axis.joint)
         drive = ProfileDrive(slave, config.cycle.period_us * 1e-6)
-        drive.low, drive.high = config.joints[0].position.min, config.joints[0].position.max
-        drive.zero = zero
+        configure_drive(drive, config, axis.joint, zero)
         super().__init__(axis.name, axis_fields(axis), config, [(slot, drive)], number)
         self.returns_to_range = False
         drive.still = _STILL * axis.velocity
@@ -128,20 +128,23 @@ class ExternalAxisGroup(JointGroup):
         """Fault of the axis in this cycle."""
         self._low = -inf if axis.position is None else axis.position.min
         self._high = inf if axis.position is None else axis.position.max
-        self._rest_mode = PROFILE_POSITION if "position" in axis.modes else PROFILE_VELOCITY
+        self._positions = "position" in axis.modes
+        self._rest_mode = PROFILE_POSITION if self._positions else PROFILE_VELOCITY
         self._homing = Homing(config.homing, config.drive_waits.mode_ms * 1e-3, self.period_s, self._rest_mode)
         self._answer, self._lag = self._cycles(_ANSWER_S), self._cycles(_LAG_S)
         self._halt_cycles = self._cycles(_HALT_S + axis.velocity / axis.acceleration)
         self._waited = self._longest = self._held = self._astray = 0
         self._target = self._velocity = 0.0
         self._home_offset = nan
-        self._raised = self._set_point = False
-        """Whether bit 4 offers a set-point; whether the drive has one that it has not reached."""
+        self._raised = self._outdated = self._set_point = False
+        """Whether bit 4 offers a set-point; whether another one has replaced that; whether the drive may have one that
+        is not where the axis stands."""
         self._reports = self._reached = False
         """Whether the end of a motion is to be published; whether the axis has reached its target."""
         self._ended: Event | None = None
         """How a motion has failed, or a homing ended."""
         drive.mode = self._rest_mode
+        drive.profile_velocity = axis.velocity
 
     def _cycles(self, seconds: float) -> int:
         return max(1, round(seconds / self.period_s))
@@ -150,7 +153,7 @@ class ExternalAxisGroup(JointGroup):
 
     def move(self, position: float, speed: float, lease: int) -> Refusal | None:
         """Move to a position, at most at `speed`, for the commander of `lease`; 0: at the speed limit."""
-        refusal = self._refusal(PROFILE_POSITION, "position" in self.axis.modes)
+        refusal = self._refusal(PROFILE_POSITION, self._positions)
         if refusal is not None:
             return refusal
         speed = speed or self.axis.velocity
@@ -163,7 +166,9 @@ class ExternalAxisGroup(JointGroup):
         self.drive.profile_velocity = speed
         distance = abs(position - self.drive.position)
         self._longest = self._cycles(2.0 * (distance / speed + speed / self.axis.acceleration) + _SPARE_S)
-        self._raised, self._set_point, self._reports, self._reached = False, True, True, False
+        # The drive may have taken the former set-point and not yet acknowledged it.
+        self._raised = self._outdated = self._raised and self.phase is _P.OFFERING
+        self._set_point, self._reports, self._reached = True, True, False
         self._enter(_P.OFFERING)
         return None
 
@@ -262,6 +267,11 @@ class ExternalAxisGroup(JointGroup):
             self._halt()
         elif phase is _P.RETURNING:
             self._return()
+        elif self._set_point:
+            # Enabled anew: some drives have kept their set-point.
+            drive.controlword = HALT
+            if drive.mode_display == self._rest_mode:
+                self._rest()
         self._supervise()
         return GuardResult.PASS
 
@@ -275,8 +285,15 @@ class ExternalAxisGroup(JointGroup):
         acknowledged = drive.statusword & ACKNOWLEDGED
         if not self._raised:
             self._raised = not acknowledged
+        elif acknowledged and self._outdated:
+            # This acknowledges the former one: bit 4 rises anew once bit 12 has fallen.
+            self._raised = self._outdated = False
         elif acknowledged:
-            self._enter(_P.REST if self.phase is _P.STAYING else _P.MOVING)
+            if self.phase is _P.STAYING:
+                self._set_point = False
+                self._enter(_P.REST)
+            else:
+                self._enter(_P.MOVING)
             return
         if self._raised:
             # The first one after a halt also ends the halt: the drive never continues to the former set-point.
@@ -320,21 +337,27 @@ class ExternalAxisGroup(JointGroup):
             self._velocity = 0.0
             if drive.mode != self._rest_mode:
                 self._enter(_P.RETURNING)
-            elif self._set_point:
-                self._target, self._raised, self._set_point = drive.position, False, False
-                self._enter(_P.STAYING)
             else:
-                self._enter(_P.REST)
+                self._rest()
         elif self._waited > self._halt_cycles:
             self.problem = AxisStillMoving(self.first, drive.velocity)
+
+    def _rest(self) -> None:
+        """Rest where the axis stands; a set-point that the drive may have elsewhere is replaced first."""
+        self._target = self.drive.position
+        if self._set_point:
+            self._raised = self._outdated = False
+            self._enter(_P.STAYING)
+        else:
+            self._enter(_P.REST)
 
     def _return(self) -> None:
         drive = self.drive
         drive.controlword = HALT
         drive.mode = self._rest_mode
         if drive.mode_display == self._rest_mode:
-            self._target = drive.position
-            self._enter(_P.REST)
+            self._set_point = self._positions
+            self._rest()
         elif self._waited > self._answer:
             self._lose_mode()
 
@@ -342,9 +365,11 @@ class ExternalAxisGroup(JointGroup):
         homing, drive = self._homing, self.drive
         homing.step()
         if not homing.ended:
+            if homing.phase is HomingPhase.LEAVING:
+                # In profile position it could continue to a set-point of before.
+                drive.controlword = HALT
             return
         phase = homing.phase
-        self._target = drive.position
         if phase is HomingPhase.RUNNING:
             self.problem = AxisStillMoving(self.first, drive.velocity)
         elif phase is HomingPhase.STUCK:
@@ -359,7 +384,9 @@ class ExternalAxisGroup(JointGroup):
                 self._ended = HomingFailed(self.first, homing.shown, homing.shown_mode)
             else:
                 self._reports, self._reached = True, False
-            self._enter(_P.REST)
+            drive.controlword = HALT
+            self._set_point = self._positions
+            self._rest()
 
     def _fail(self) -> None:
         """Halt an axis whose drive does not carry out its motion."""
@@ -407,7 +434,12 @@ class ExternalAxisGroup(JointGroup):
 
     @property
     def at_rest(self) -> bool:
-        """Whether no motion is under way."""
+        """Whether the axis stands, so that its torque may go; its set-point is replaced when it is next enabled."""
+        return self.phase is _P.REST or self.phase is _P.STAYING
+
+    @property
+    def ready(self) -> bool:
+        """Whether a motion can begin."""
         return self.phase is _P.REST
 
     def stop(self) -> None:
@@ -422,7 +454,8 @@ class ExternalAxisGroup(JointGroup):
         if self.phase is _P.HOMING:
             self._homing.abandon()
         self._velocity = 0.0
-        self._set_point = False
+        self._set_point = self._positions
+        self.problem = None
         self._enter(_P.REST)
 
     def latch(self) -> None:

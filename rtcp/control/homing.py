@@ -80,7 +80,8 @@ class Homing:
     Drives show mode 6 before they update bits 10, 12 and 13 of the statusword: until then these are the bits of CSP, or
     of an earlier homing. So the start bit follows the mode display after `settle_ms`, and an end counts once all three
     bits were clear after the start, or, because a homing at the present position never clears them, after `settle_ms`.
-    A success that lasts `settle_ms` ends the homing, if the position agrees.
+    A success that lasts `settle_ms` without interruption ends the homing, if the position agrees; until then it can be
+    stopped.
     """
 
     __slots__ = (
@@ -109,7 +110,7 @@ class Homing:
         self._clear = False
         """Whether bits 10, 12 and 13 were clear since the start bit rose."""
         self._attained = 0
-        """Cycles for which the drive has reported success."""
+        """Consecutive cycles in which the drive has reported success."""
         self._latched = False
         self._turned = False
         """Whether the drive has displayed mode 6: until then it may still follow its target."""
@@ -150,8 +151,8 @@ class Homing:
         self._enter(_P.ENTERING)
 
     def stop(self) -> None:
-        """Bring the drive to rest and back to CSP; no effect once it is at its home, or has ended."""
-        if self.phase is _P.ENTERING or (self.phase is _P.SEARCHING and not self._attained):
+        """Bring the drive to rest and back to CSP; no effect once the search has ended."""
+        if self.phase in (_P.ENTERING, _P.SEARCHING):
             self._enter(_P.STOPPING)
 
     def abandon(self) -> None:
@@ -203,12 +204,13 @@ class Homing:
             self._clear = True
         if not self._clear and self._cycles <= self._settle:
             return
+        # One report of success may be a stale one, and some drives turn on to their zero after it.
+        self._attained = self._attained + 1 if status is HomingStatus.ATTAINED else 0
         if drive.mode_display != HOMING:
             # The drive left the mode by itself; the bits have another meaning there.
             self._fail(drive, _P.STUCK)
         elif status is HomingStatus.ATTAINED:
             # The position jumps as the drive begins to count anew: late in some drives, and others show a speed then.
-            self._attained += 1
             if self._attained > self._settle and not self._is_home(drive):
                 self._fail(drive, _P.ELSEWHERE)
             elif self._attained > self._settle:

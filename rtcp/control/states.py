@@ -235,6 +235,8 @@ class Enabling(MachineState):
         axis = joints.first_in_fault()
         if axis >= 0:
             return ctx.drive_event(DriveFault, axis)
+        if (problem := ctx.axis_problem()) is not None:
+            return problem
         for axis, drive in enumerate(joints.drives):
             if drive.state is DriveState.OPERATION_ENABLED:
                 self._were_enabled |= 1 << axis
@@ -252,7 +254,7 @@ class Enabling(MachineState):
                     beyond = group.beyond_range(i)
                     if beyond > self._REPORTED_RAD:
                         ctx.publish(ReturningToRange(group.first + i, beyond, min(BACK_RAD_S, fastest)))
-        if joints.first_returning() >= 0:
+        if joints.first_returning() >= 0 or not all(axis.ready for axis in ctx.axes):
             return None
         if ctx.cycle - self._enabled < ctx.cycles(ctx.config.drive_waits.brake_ms * 1e-3):
             # A torque motion and CST begin with the torque that holds the arm.
@@ -791,10 +793,13 @@ class Closing(MachineState):
         homing = ctx.homing
         if homing.under_way and joints.first_not_enabled() < 0:
             homing.stop()
+            joints.stop_others()
             homing.step()
             self._cycles = 0
             if homing.still_moving:
                 self._stop_hard(ctx, HomingStillMoving(homing.axis, joints.drives[homing.axis].velocity))
+            elif (problem := ctx.axis_problem()) is not None:
+                self._stop_hard(ctx, problem)
             return False
         return self._stop(ctx) and self._remove_torque(ctx)
 
@@ -842,7 +847,9 @@ class Closing(MachineState):
             return True
         self._cycles = 0
         result = joints.command()
-        event = ctx.controller_raised()
+        event: Event | None = ctx.controller_raised()
+        if event is None:
+            event = ctx.axis_problem()
         if event is not None:
             self._stop_hard(ctx, event)
         elif result is GuardResult.STOPPED:

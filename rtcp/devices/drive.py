@@ -216,6 +216,15 @@ def slave_of(config: ArmConfig, joint: Joint) -> tuple[int, SlaveConfig]:
     return slot, replace(slave, device=slave.device.of_axis(joint.axis))
 
 
+def configure_drive(drive: Drive, config: ArmConfig, joint: Joint, zero: float) -> None:
+    """Give a drive the limits of the joint that it moves, its zero as in `Drive`, and the waits of all drives."""
+    drive.speed_limit = joint.velocity
+    drive.deceleration = joint.acceleration
+    drive.low, drive.high = joint.position.min, joint.position.max
+    drive.reset_pulse_s = config.drive_waits.reset_pulse_ms * 1e-3
+    drive.zero = zero
+
+
 def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     """Return the driver of the drive that moves `joint`, with the index of its slave; `zero` as in `Drive`.
 
@@ -226,11 +235,7 @@ def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
     drive = make_driver(slave, config.cycle.period_us * 1e-6)
     if not isinstance(drive, Drive):
         raise DeviceError(f"slave {slave.name} (kind {slave.device.kind}) is no drive: it cannot move {joint.name}")
-    drive.speed_limit = joint.velocity
-    drive.deceleration = joint.acceleration
-    drive.low, drive.high = joint.position.min, joint.position.max
-    drive.reset_pulse_s = config.drive_waits.reset_pulse_ms * 1e-3
-    drive.zero = zero
+    configure_drive(drive, config, joint, zero)
     if drive.HAS_STATUSWORD and any(map(drive.rpdo.find, config.feed_forward.channels)):
         drive.offsets = DriveOffsets(drive.rpdo, config.feed_forward.channels)
     return slot, drive

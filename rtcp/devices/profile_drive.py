@@ -50,12 +50,12 @@ class ProfileDrive(Cia402Drive):
         self._profile_range = (0, 0) if entry is None else integer_range(entry)
 
     def advance(self, target: TargetState) -> bool:
-        """Take the next step towards `target`; an enabled drive that nobody moves is halted.
+        """Take the next step towards `target`; a drive is halted from the moment on in which it is enabled.
 
         It would otherwise continue to its set-point, which no cycle sends anew.
         """
         reached = super().advance(target)
-        if target is TargetState.ENABLED and self.state is DriveState.OPERATION_ENABLED:
+        if self.controlword == ENABLE_OPERATION:
             self.controlword = HALT
         return reached
 

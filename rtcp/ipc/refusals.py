@@ -75,6 +75,10 @@ class NotPermitted(Refusal):
     """the enabling switch is not pressed (inputs.enabling_switch in {file})"""
 
 
+class FaultFollows(Refusal):
+    """a fault has stopped all motion and begins at standstill (`rtcp status` names it): then `rtcp reset`"""
+
+
 class NotAtStandstill(Refusal):
     """{joint} turns at {velocity:.6g} rad/s: wait until the joint stands still"""
 

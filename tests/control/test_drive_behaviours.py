@@ -13,7 +13,7 @@ from rtcp.config import default_config, load, load_device
 from rtcp.config.model import DeviceDescription, DriveWaitsConfig, Pdo, SlaveConfig, StartupSdo
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus.errors import BusError
-from rtcp.ipc.commands import Home, MoveJoints, Reset
+from rtcp.ipc.commands import Halt, Home, MoveJoints, Reset
 from rtcp.ipc.events import Homed, HomedElsewhere, ResetTimeout
 from rtcp.ipc.states import State
 from rtcp.testing.simulation import Simulation
@@ -68,6 +68,21 @@ def test_a_drive_whose_bits_come_late_is_homed_when_it_is_at_its_home(
         turns = servo(arm).mechanics.position / INDEX_PITCH
         assert homed.position == pytest.approx(0.0, abs=0.02)
         assert turns - homed.position / INDEX_PITCH == pytest.approx(7.0, abs=0.01)
+
+
+def test_a_halt_stops_a_search_whose_bits_still_show_an_earlier_success(tmp_path: Path) -> None:
+    with arm_of(tmp_path, {"mode_bits_lag": 0.25}) as arm:
+        arm.hold()
+        arm.run(0.5)
+        arm.do(Home(0, 0.0))
+        assert arm.until(lambda: servo(arm).mechanics.velocity < -0.01, 2.0)
+        # Longer than settle_ms after the start bit, the bits of CSP count as a success.
+        arm.run(0.12)
+        before = servo(arm).mechanics.position
+        arm.do(Halt())
+        arm.bring_to(State.HOLDING, 2.0)
+        assert servo(arm).mechanics.position == pytest.approx(before, abs=0.01)
+        assert not any(isinstance(record.event, Homed) for record in arm.events)
 
 
 def test_a_drive_that_says_it_is_homed_where_it_is_not_has_not_homed(tmp_path: Path) -> None:

@@ -11,15 +11,28 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import ArmConfig, DriveWaitsConfig
 from rtcp.control.external_axis import ExternalAxisGroup
-from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, HomeAxis, MoveAxis, Reset, RunAxis, StopAxis
+from rtcp.ipc.commands import (
+    Command,
+    Disable,
+    Enable,
+    Halt,
+    Home,
+    HomeAxis,
+    MoveAxis,
+    Reset,
+    RunAxis,
+    Shutdown,
+    StopAxis,
+)
 from rtcp.ipc.events import (
     AxisAtRest,
     AxisFailed,
     AxisModeLost,
     AxisNotReplaced,
     AxisStillMoving,
+    ClockLost,
     Event,
     Homed,
     HomedElsewhere,
@@ -28,7 +41,7 @@ from rtcp.ipc.events import (
 from rtcp.ipc.states import State
 from rtcp.testing.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
-from rtcp.virtual.models.profile_modes import Phase
+from rtcp.virtual.models.profile_modes import Phase, SetPoint
 from tests.control.rig import about
 
 SHIPPED = load(default_config().parent / "linear_axis.yaml")
@@ -45,6 +58,8 @@ OUTPUTS = struct.Struct("<HiIib")
 """Controlword, target position, profile velocity, target velocity and mode, as the device file maps them."""
 NEW_SETPOINT, HALT = 0x10, 0x100
 EMERGENCY_STOP_INPUT = 9
+SET_POINT = SetPoint(6.0, 2.0, 5.0, 5.0, limited=False)
+"""0.6 m, rad of the drive."""
 
 
 class Bench(Simulation):
@@ -114,6 +129,16 @@ def test_a_new_target_on_the_way_replaces_the_former_one(bench: Bench) -> None:
     bench.rest(RAIL)
     assert bench.at(RAIL) == pytest.approx(0.1, abs=1e-3)
     assert [record.event.reached for record in bench.events if isinstance(record.event, AxisAtRest)] == [True]
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 0.002, 0.006])
+def test_a_target_that_comes_before_the_former_one_is_acknowledged_replaces_it(bench: Bench, gap_s: float) -> None:
+    bench.do(MoveAxis(RAIL, 0.6))
+    bench.run(gap_s)
+    bench.do(MoveAxis(RAIL, 0.1))
+    bench.rest(RAIL)
+    assert bench.at(RAIL) == pytest.approx(0.1, abs=1e-3)
+    assert bench.last_of(AxisAtRest) == AxisAtRest(RAIL, about(0.1, abs=1e-3), True)
 
 
 @pytest.mark.parametrize("stop", [StopAxis(RAIL), Halt()], ids=["stop", "halt"])
@@ -232,6 +257,32 @@ def test_a_rail_whose_drive_says_it_is_homed_where_it_is_not_has_not_homed() -> 
         assert "is not homed" in bench.refused(MoveAxis(RAIL, 0.1))
 
 
+def test_a_drive_that_loses_its_supply_during_a_reset_is_homed_no_more() -> None:
+    with Bench(CONFIG) as bench:
+        bench.do(HomeAxis(RAIL))
+        bench.rest(RAIL)
+        bench.drives[BELT].inject_fault(0x2310)
+        bench.bring_to(State.FAULT)
+        bench.run(0.5)
+        assert bench.axes[RAIL].homed
+        bench.do(Reset())
+        bench.bring_to(State.RESETTING)
+        bench.bus.restart(2)
+        bench.run(0.004)
+        assert bench.state is State.RESETTING
+        assert not bench.axes[RAIL].homed
+
+
+def test_an_axis_that_has_found_its_home_can_be_stopped_and_the_end_of_the_lease_is_published_once() -> None:
+    with Bench(CONFIG) as bench:
+        bench.do(HomeAxis(RAIL))
+        assert bench.until(lambda: bool(bench.axes[RAIL]._homing._attained), 30.0)
+        bench.observer.release(bench.lease)
+        bench.rest(RAIL)
+        assert [type(record.event) for record in bench.events].count(LeaseExpired) == 1
+        assert not bench.field("rail_homed")
+
+
 def test_what_an_axis_may_not_do_is_refused_and_nothing_is_sent(bench: Bench) -> None:
     bench.sent[RAIL].clear()
     nan = float("nan")
@@ -287,6 +338,85 @@ def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> 
     assert bench.names.message(still).startswith("belt does not come to rest although it is halted: 0.15")
     bench.run(1.0)
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
+    # Once the drive obeys again, the fault is forgotten.
+    del servo._control_halt  # type: ignore[attr-defined]
+    servo._modes[3]._target = SimpleNamespace(value=0)  # type: ignore[attr-defined]
+    bench.do(Reset())
+    bench.bring_to(State.READY)
+    bench.hold()
+
+
+def test_closing_stops_an_axis_that_ignores_its_halt_by_its_drive(bench: Bench) -> None:
+    servo = bench.drives[BELT].servo
+    servo._control_halt = lambda controlword: None  # type: ignore[method-assign]
+    bench.do(RunAxis(BELT, 0.15, 30.0))
+    bench.run(1.0)
+    servo._modes[3]._target = SimpleNamespace(value=15000)  # type: ignore[attr-defined]
+    bench.send(Shutdown())
+    bench.bring_to(State.OFF, 10.0)
+    assert isinstance(bench.last_of(AxisStillMoving), AxisStillMoving)
+    assert not bench.drives[BELT].powered
+    assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("way", ["disabled", "run", "emergency"])
+def test_a_drive_that_keeps_its_set_point_does_not_go_on_to_it(bench: Bench, way: str) -> None:
+    bench.drives[RAIL].servo.keeps_set_point = True
+    bench.do(MoveAxis(RAIL, 0.6))
+    bench.run(1.0)
+    if way == "run":
+        bench.do(StopAxis(RAIL))
+        bench.rest(RAIL)
+        bench.drives[RAIL].servo._modes[1]._active = SET_POINT  # type: ignore[attr-defined]
+        bench.do(RunAxis(RAIL, 0.1, 0.3))
+        bench.rest(RAIL)
+    elif way == "disabled":
+        bench.do(Disable())
+        bench.bring_to(State.READY)
+        # As a drive that was at its target, and was then pushed.
+        bench.drives[RAIL].servo._modes[1]._active = SET_POINT  # type: ignore[attr-defined]
+        bench.hold()
+    else:
+        assert bench.box is not None
+        bench.box.set_input(EMERGENCY_STOP_INPUT, False)
+        bench.bring_to(State.EMERGENCY_STOP)
+        bench.run(1.5)
+        bench.box.set_input(EMERGENCY_STOP_INPUT, True)
+        bench.run(0.1)
+        bench.do(Reset())
+        bench.bring_to(State.READY)
+        bench.hold()
+    stood = bench.at(RAIL)
+    bench.run(2.0)
+    assert bench.at(RAIL) == pytest.approx(stood, abs=1e-3)
+    assert stood < 0.4
+    bench.do(MoveAxis(RAIL, stood + 0.02))
+
+
+def test_no_axis_begins_to_move_while_a_fault_waits_for_standstill() -> None:
+    stops = replace(ABSOLUTE.stops, clock_lost="controlled_stop")
+    with Bench(replace(ABSOLUTE, stops=stops)) as bench:
+        bench.do(RunAxis(BELT, 0.15, 30.0))
+        bench.run(1.0)
+        bench.loop.machine._handle(ClockLost(1.0))
+        bench.run(0.01)
+        for command in (MoveAxis(RAIL, 0.6), RunAxis(RAIL, 0.1, 30.0), HomeAxis(RAIL)):
+            assert bench.refused(command).startswith("a fault has stopped all motion and begins at standstill")
+        stood = bench.at(RAIL)
+        bench.bring_to(State.FAULT, 3.0)
+        assert bench.at(RAIL) == pytest.approx(stood, abs=1e-3)
+
+
+@pytest.mark.parametrize(("pulse_ms", "state"), [(10.0, State.FAULT), (50.0, State.READY)])
+def test_the_drive_of_an_axis_is_reset_by_the_configured_pulse(pulse_ms: float, state: State) -> None:
+    with Bench(replace(ABSOLUTE, drive_waits=DriveWaitsConfig(reset_pulse_ms=pulse_ms, reset_ms=500.0))) as bench:
+        servo = bench.drives[RAIL].servo
+        servo.reset_pulse = 0.03
+        servo.inject_fault(0x2310)
+        bench.bring_to(State.FAULT)
+        bench.run(0.5)
+        bench.do(Reset())
+        bench.bring_to(state)
 
 
 def test_a_drive_that_does_not_show_the_mode_in_which_its_axis_rests_is_not_enabled() -> None:

@@ -238,14 +238,30 @@ def test_after_a_stop_the_target_is_where_the_drive_came_to_rest(homing: Homing,
     assert homing.position == pytest.approx(0.0955)
 
 
-def test_a_stop_at_the_home_changes_nothing(homing: Homing, wire: Wire) -> None:
+@pytest.mark.parametrize("then", [ATTAINED, FOUND, UNDER_WAY])
+def test_a_drive_that_has_reported_success_for_less_than_a_while_can_be_stopped(
+    homing: Homing, wire: Wire, then: int
+) -> None:
     show(homing, wire, UNDER_WAY)
     show(homing, wire, ATTAINED)
+    show(homing, wire, then, 5)
     homing.stop()
+    assert show(homing, wire, then) is P.STOPPING
+    assert wire.sent()[0] == 0x0F
     assert show(homing, wire, ATTAINED, SETTLE) is P.LEAVING
-    assert show(homing, wire, ENABLED, 2, mode=8) is P.HOMED
+    assert show(homing, wire, ENABLED, 2, mode=8) is P.STOPPED
     homing.stop()
-    assert homing.phase is P.HOMED
+    assert homing.phase is P.STOPPED
+
+
+def test_a_success_that_is_interrupted_must_last_anew(homing: Homing, wire: Wire) -> None:
+    show(homing, wire, UNDER_WAY)
+    show(homing, wire, ATTAINED, SETTLE)
+    show(homing, wire, FOUND)
+    assert show(homing, wire, ATTAINED, SETTLE) is P.SEARCHING
+    assert show(homing, wire, ATTAINED) is P.LEAVING
+    homing.stop()
+    assert show(homing, wire, ENABLED, 2, mode=8) is P.HOMED
 
 
 def test_a_drive_that_knows_no_homing_stays_in_csp(drive: Cia402Drive, wire: Wire) -> None:

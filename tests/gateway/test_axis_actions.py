@@ -47,6 +47,7 @@ def test_a_motion_returns_where_the_axis_is(bench: FakePlatform) -> None:
     ("method", "events", "kind", "message"),
     [
         ("move_axis", [AxisAtRest(RAIL, 0.21, False)], "refused", "rail was stopped at 0.21 m, before it was at 0.3 m"),
+        ("move_axis", [AxisAtRest(RAIL, 0.1, True)], "refused", "rail was stopped at 0.1 m, before it was at 0.3 m"),
         ("move_axis", [AxisFailed(RAIL, 0x27, 1), AxisAtRest(RAIL, 0.0, False)], "fault", "rail is halted: its drive"),
         ("move_axis", [], "refused", "move_axis was ended by another command: the drives are disabled"),
         ("home_axis", [HomingFailed(RAIL, 0x27, 6)], "fault", "rail: homing failed"),

@@ -73,7 +73,13 @@ NOT_REACHED: tuple[NotReached, ...] = (
     NotReached("simulated time stands still during a cycle", (events.PluginSlow,)),
     NotReached(
         "the loop of a session follows no reference clock, so that its start takes less time",
-        (events.ClockLocked, events.ClockUnlocked, events.ClockLost, refusals.ClockNotLocked),
+        (
+            events.ClockLocked,
+            events.ClockUnlocked,
+            events.ClockLost,
+            refusals.ClockNotLocked,
+            refusals.FaultFollows,
+        ),
     ),
     NotReached(
         "only the thread that supervises a real bus reports this",

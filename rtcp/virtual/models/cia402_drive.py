@@ -191,6 +191,7 @@ class _StandardAxis:
         )  # fmt: skip
         self.servo.axis.velocity_share = self._option("velocity_share", 1.0)
         self.servo.mode_bits_lag, self.servo.reset_pulse = self._option("mode_bits_lag"), self._option("reset_pulse")
+        self.servo.keeps_set_point = bool(self._option("keeps_set_point"))
 
     def _option(self, name: str, otherwise: float = 0.0) -> float:
         drive = self._drive

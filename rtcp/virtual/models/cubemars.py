@@ -31,6 +31,7 @@ SERVO_OPTIONS = MappingProxyType({
     "velocity_share": Option(1.0, 0.0, 1.0, "fraction of the demand's speed that the position loop adds by itself"),
     "mode_bits_lag": Option(0.0, 0.0, 10.0, "time for which bits 10, 12 and 13 stay those of the former mode, s"),
     "reset_pulse": Option(0.0, 0.0, 10.0, "time for which the fault reset bit must stay set, s"),
+    "keeps_set_point": Option(0.0, 0.0, 1.0, "1: profile position goes on to its set-point when it begins anew"),
 })  # fmt: skip
 """Options of every axis."""
 CONDITION_OPTIONS = MappingProxyType({
@@ -86,6 +87,7 @@ class CubemarsDrive(DeviceModel):
         self.mechanics, self.condition, self.axis = mechanics, self.servo.condition, self.servo.axis
         self.axis.velocity_share = option("velocity_share")
         self.servo.mode_bits_lag, self.servo.reset_pulse = option("mode_bits_lag"), option("reset_pulse")
+        self.servo.keeps_set_point = bool(option("keeps_set_point"))
         # Kept for fast access in a step.
         self.step = self.servo.step  # type: ignore[method-assign]
         self.power_on()

@@ -45,6 +45,9 @@ class Motion:
         """Continue after a halt."""
         self.enter()
 
+    def watch(self, controlword: int) -> None:
+        """See the last controlword of a halt, after `resume`."""
+
     def update(self, controlword: int, h: float, count: int) -> None:
         """Advance by `count` times `h` seconds."""
         raise NotImplementedError

@@ -84,6 +84,10 @@ class ProfilePosition(Motion):
         """Continue to the active set-point."""
         self._inside = 0.0
 
+    def watch(self, controlword: int) -> None:
+        """Remember bit 4, whose next rise offers a set-point."""
+        self._start = controlword & _START
+
     def update(self, controlword: int, h: float, count: int) -> None:
         """Accept an offered set-point; move towards the active one."""
         self._handshake(controlword)

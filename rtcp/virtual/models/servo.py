@@ -61,6 +61,8 @@ class ServoAxis:
         """Time for which bits 10, 12 and 13 of the statusword stay those of the former mode, s."""
         self.reset_pulse = 0.0
         """Time for which the fault reset bit must stay set, s; 0: its rising edge resets."""
+        self.keeps_set_point = False
+        """Whether profile position goes on to its set-point when it begins anew."""
         # Kept, to avoid look-ups in `step`.
         self._controlword = objects.number(0x6040)
         self._mode_wanted = objects.number(0x6060)
@@ -159,8 +161,8 @@ class ServoAxis:
             return
         controlword: int = self._controlword.value if self.outputs_valid else 0
         if self._busy or controlword != self._last_controlword:
-            self._last_controlword = controlword
             self._control(controlword, dt)
+            self._last_controlword = controlword
         mode: int = self._mode_wanted.value
         if mode != self._mode:
             self._choose_mode(mode)
@@ -325,13 +327,21 @@ class ServoAxis:
             self._motion = self._modes[self._mode]
             self.axis.synchronise()
             self._motion.resume()
+            self._motion.watch(self._last_controlword)
 
     def _start_mode(self) -> None:
         self._pending = False
         self._following_time = 0.0
         self.axis.synchronise()
         self._motion = self._modes[self._mode]
-        self._motion.enter()
+        self._begin_mode()
+
+    def _begin_mode(self) -> None:
+        motion = self._modes[self._mode]
+        if self.keeps_set_point and self._mode == 1:
+            motion.resume()
+        else:
+            motion.enter()
 
     def _start_stop(self, *, quick: bool) -> None:
         quickest = max(1, self._quick_deceleration.value) * self._units.acceleration
@@ -355,7 +365,7 @@ class ServoAxis:
         if running:
             self._start_mode()
         else:
-            self._modes[wanted].enter()
+            self._begin_mode()
 
     def _fail(self, code: int) -> None:
         """Transition 13: report the fault and begin the fault reaction (0x605E)."""
