@@ -247,6 +247,7 @@ def test_homing_gives_the_rail_its_positions_and_is_needed_before_a_motion_and_a
         assert bench.refused(MoveAxis(RAIL, 0.1)) == "rail is not homed: `rtcp axis home rail` first"
 
 
+@pytest.mark.interpreted
 def test_a_rail_whose_drive_says_it_is_homed_where_it_is_not_has_not_homed() -> None:
     with Bench(replace(CONFIG, homing=replace(CONFIG.homing, tolerance=0.01))) as bench:
         homing: Any = bench.drives[RAIL].servo._modes[6]
@@ -304,6 +305,7 @@ def test_what_an_axis_may_not_do_is_refused_and_nothing_is_sent(bench: Bench) ->
     assert not any(sent[0] & NEW_SETPOINT for sent in bench.sent[RAIL])
 
 
+@pytest.mark.interpreted
 def test_an_axis_whose_drive_takes_no_set_point_is_stopped(bench: Bench) -> None:
     model = bench.drives[RAIL]
     position = model.servo._modes[1]
@@ -327,6 +329,7 @@ def test_a_drive_that_leaves_its_mode_is_a_fault(bench: Bench) -> None:
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.interpreted
 def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> None:
     servo = bench.drives[BELT].servo
     servo._control_halt = lambda controlword: None  # type: ignore[method-assign]
@@ -339,13 +342,14 @@ def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> 
     bench.run(1.0)
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
     # Once the drive obeys again, the fault is forgotten.
-    del servo._control_halt  # type: ignore[attr-defined]
+    del servo._control_halt
     servo._modes[3]._target = SimpleNamespace(value=0)  # type: ignore[attr-defined]
     bench.do(Reset())
     bench.bring_to(State.READY)
     bench.hold()
 
 
+@pytest.mark.interpreted
 def test_closing_stops_an_axis_that_ignores_its_halt_by_its_drive(bench: Bench) -> None:
     servo = bench.drives[BELT].servo
     servo._control_halt = lambda controlword: None  # type: ignore[method-assign]
