@@ -325,7 +325,7 @@ def test_an_axis_that_ignores_its_halt_is_stopped_by_its_drive(bench: Bench) -> 
     bench.run(1.0)
     assert bench.speed(BELT) == pytest.approx(0.0, abs=1e-3)
     # Once the drive obeys again, the fault is forgotten.
-    del servo._control_halt  # type: ignore[attr-defined]
+    del servo._control_halt
     servo._modes[3]._target = SimpleNamespace(value=0)  # type: ignore[attr-defined]
     bench.do(Reset())
     bench.bring_to(State.READY)
