@@ -304,6 +304,8 @@ def abort_meaning(code: int) -> str:
 _SM0_STATUS, _SM1_STATUS, _FULL = Register.SYNC_MANAGER + 5, Register.SYNC_MANAGER + 13, 0x08
 _SM1_ACTIVATE, _SM1_PDI_CONTROL, _REPEAT = Register.SYNC_MANAGER + 14, Register.SYNC_MANAGER + 15, 0x02
 """Repeat request, and repeat acknowledge, which the slave toggles (ETG.1000.4, 6.7.1)."""
+_ENABLED = 0x01
+"""Bit of the same register: the sync manager works."""
 _MOST_READS = 20
 """Most reads of the repeat acknowledge."""
 _HEADER = struct.Struct("<HHBB")
@@ -411,7 +413,8 @@ class Mailbox:
             control = self._port.read(self._station, _SM1_ACTIVATE, 1)
             if control is None:
                 return None
-            toggled = bytes((control[0] ^ _REPEAT,))
+            # Of what was read only the bit to toggle is used: a false bit 0 would switch the mailbox off.
+            toggled = bytes((_ENABLED | (control[0] ^ _REPEAT) & _REPEAT,))
             if not self._port.write(self._station, _SM1_ACTIVATE, toggled):
                 return None
             states = (self._port.read(self._station, _SM1_PDI_CONTROL, 1) for _ in range(_MOST_READS))
