@@ -688,7 +688,7 @@ class Methods:
 
     @Method
     def run_axis(self, axis: str, velocity: float, hold_s: float = 0.25, sent_s: float | None = None) -> Call[None]:
-        """Run an external axis at a velocity for `hold_s`; return at once. Other motions may follow meanwhile.
+        """Run an external axis at a velocity for `hold_s`; return at once, so that other motions can begin.
 
         A `Robot` that only sleeps meanwhile has to call `status` at least every 0.5 s: the axis of a client that reads
         no reports stops. It also stops when `hold_s` has passed since the last of these calls, when it comes to an end

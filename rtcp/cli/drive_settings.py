@@ -111,9 +111,10 @@ def settings_of_drives(bus: str | None, config: Path | None) -> list[AxisSetting
 
 def _compared(held: Values, slave: SlaveConfig, axis: int) -> AxisSettings:
     values = after_start(held, slave, axis)
-    needs = next((needs for needs in slave.needs if needs.axis == axis), None)
     where = slave.name if slave.device.axes == (1,) else f"{slave.name}, axis {axis}"
-    warnings, refusals = compare(values, slave.device, needs, where, slave.file or "its device file", axis)
+    warnings, refusals = compare(
+        values, slave.device, slave.needs_of(axis), where, slave.file or "its device file", axis
+    )
     return AxisSettings(
         slave.name, axis, settings_of(values, axis, slave.device, slave.unit_of(axis)), warnings, refusals
     )

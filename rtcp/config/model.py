@@ -469,9 +469,14 @@ class SlaveConfig:
     needs: tuple[AxisNeeds, ...] = ()
     """What its joints need of it (`rtcp.config.drive_limits.with_limits`)."""
 
+    def needs_of(self, axis: int) -> AxisNeeds | None:
+        """Return what the joint that an axis of the drive moves needs of it; None: it moves none."""
+        return next((needs for needs in self.needs if needs.axis == axis), None)
+
     def unit_of(self, axis: int) -> str:
         """Return the unit of the positions of an axis of the drive; it needs `needs`."""
-        return next((needs.unit for needs in self.needs if needs.axis == axis), "rad")
+        needs = self.needs_of(axis)
+        return "rad" if needs is None else needs.unit
 
 
 @dataclass(frozen=True)

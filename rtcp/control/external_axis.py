@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from enum import Enum
-from math import inf, nan
+from math import inf
 from typing import Any, Final
 
 from rtcp.config.model import ArmConfig, ExternalAxis
-from rtcp.control.homing import Homing, HomingPhase
+from rtcp.control.homing import HOMING, Homing, HomingPhase
 from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import PartContext
 from rtcp.devices.cia402 import ENABLE_OPERATION
@@ -22,6 +22,7 @@ from rtcp.devices.profile_drive import (
     TARGET_REACHED,
     ProfileDrive,
 )
+from rtcp.ipc.commands import LONGEST_RUN_S
 from rtcp.ipc.events import (
     AxisAtRest,
     AxisFailed,
@@ -29,9 +30,6 @@ from rtcp.ipc.events import (
     AxisNotReplaced,
     AxisStillMoving,
     Event,
-    Homed,
-    HomedElsewhere,
-    HomingFailed,
     LeftRange,
 )
 from rtcp.ipc.refusals import (
@@ -49,9 +47,6 @@ from rtcp.ipc.schema import axis_fields
 from rtcp.ipc.states import DriveState, State
 from rtcp.motion.guards.trajectory_guard import GuardResult
 
-HOMING: Final = 6
-LONGEST_HOLD_S: Final = 3600.0
-"""Longest run of an axis by one command, s."""
 _ANSWER_S: Final = 1.0
 """Time for a drive to acknowledge a set-point, or to display a mode, s."""
 _HALT_S: Final = 3.0
@@ -135,7 +130,6 @@ class ExternalAxisGroup(JointGroup):
         self._halt_cycles = self._cycles(_HALT_S + axis.velocity / axis.acceleration)
         self._waited = self._longest = self._held = self._astray = 0
         self._target = self._velocity = 0.0
-        self._home_offset = nan
         self._raised = self._outdated = self._set_point = False
         """Whether bit 4 offers a set-point; whether another one has replaced that; whether the drive may have one that
         is not where the axis stands."""
@@ -179,8 +173,8 @@ class ExternalAxisGroup(JointGroup):
             return refusal
         if not abs(velocity) <= self.axis.velocity:
             return AxisSpeedOutOfRange(self.first, velocity, 0.0, self.axis.velocity)
-        if not 0.0 < hold_s <= LONGEST_HOLD_S:
-            return AxisHoldOutOfRange(self.first, hold_s, LONGEST_HOLD_S)
+        if not 0.0 < hold_s <= LONGEST_RUN_S:
+            return AxisHoldOutOfRange(self.first, hold_s, LONGEST_RUN_S)
         if self._reaches_end(velocity):
             return AxisAtEnd(self.first, self.drive.position)
         self._velocity, self.lease = velocity, lease
@@ -199,7 +193,6 @@ class ExternalAxisGroup(JointGroup):
         if self.phase is not _P.REST:
             return AxisBusy(self.first)
         self.homed, self.lease = False, lease
-        self._home_offset = home
         self._homing.start(self.drive, home)
         self._enter(_P.HOMING)
         return None
@@ -235,7 +228,7 @@ class ExternalAxisGroup(JointGroup):
         """Write what its drive shows and was sent."""
         drive, at = self.drive, self.at
         values[at : at + 9] = (
-            drive.position, drive.velocity, self._target if self._rest_mode == PROFILE_POSITION else drive.position,
+            drive.position, drive.velocity, self._target if self._positions else drive.position,
             self._velocity if self.phase is _P.RUNNING else 0.0, drive.mode_display, drive.state, drive.statusword,
             self.phase is not _P.REST, self.homed,
         )  # fmt: skip
@@ -376,13 +369,8 @@ class ExternalAxisGroup(JointGroup):
             self._lose_mode()
         else:
             self.homed = phase is HomingPhase.HOMED
-            if self.homed:
-                self._ended = Homed(self.first, drive.position)
-            elif phase is HomingPhase.ELSEWHERE:
-                self._ended = HomedElsewhere(self.first, drive.position + drive.zero, self._home_offset)
-            elif phase is HomingPhase.FAILED:
-                self._ended = HomingFailed(self.first, homing.shown, homing.shown_mode)
-            else:
+            self._ended = homing.end_of(self.first)
+            if self._ended is None:
                 self._reports, self._reached = True, False
             drive.controlword = HALT
             self._set_point = self._positions
@@ -427,9 +415,7 @@ class ExternalAxisGroup(JointGroup):
         return (
             self.phase is not _P.REST
             and self.phase not in _STOPPING
-            and not (
-                self.phase is _P.HOMING and self._homing.phase not in (HomingPhase.ENTERING, HomingPhase.SEARCHING)
-            )
+            and not (self.phase is _P.HOMING and self._homing.leaving)
         )
 
     @property

@@ -127,6 +127,20 @@ class Homing:
         return self.phase in ENDED
 
     @property
+    def leaving(self) -> bool:
+        """Whether the search has ended: the drive comes to rest, or returns to its mode."""
+        return self.phase is not _P.ENTERING and self.phase is not _P.SEARCHING
+
+    def end_of(self, axis: int) -> Homed | HomedElsewhere | HomingFailed | None:
+        """Return the event of the end, with the number of the drive's axis; None: it was stopped."""
+        drive = self._drive
+        if self.phase is _P.HOMED:
+            return Homed(axis, self.position)
+        if self.phase is _P.ELSEWHERE and drive is not None:
+            return HomedElsewhere(axis, self.position + drive.zero, self._home)
+        return HomingFailed(axis, self.shown, self.shown_mode) if self.phase is _P.FAILED else None
+
+    @property
     def position(self) -> float:
         """Setpoint of the joint, rad: the last one until the drive is in mode 6, then its actual position, and from the
         change back to CSP on the position at that time."""
@@ -264,13 +278,12 @@ class HomingSequence:
         self._joints = joints
         self._homing = Homing(config.homing, config.drive_waits.mode_ms * 1e-3, config.cycle.period_us * 1e-6)
         self.axis = 0
-        self._home = nan
 
     def begin(self, axis: int, home: float = nan) -> None:
         """Start the homing of a joint's drive; `home`: its home offset, rad, NaN where it is not known."""
         drive = self._arm.drives[axis]
         assert isinstance(drive, Cia402Drive), "the command is refused for another"
-        self.axis, self._home = axis, home
+        self.axis = axis
         self._homing.start(drive, home)
 
     def stop(self) -> None:
@@ -320,7 +333,7 @@ class HomingSequence:
     @property
     def leaving(self) -> bool:
         """Whether the search has ended: the drive comes to rest, or returns to CSP."""
-        return self._homing.phase not in (HomingPhase.ENTERING, HomingPhase.SEARCHING)
+        return self._homing.leaving
 
     @property
     def ended(self) -> bool:
@@ -330,13 +343,4 @@ class HomingSequence:
     @property
     def outcome(self) -> Event:
         """Event of its end."""
-        homing = self._homing
-        if homing.phase is HomingPhase.HOMED:
-            return Homed(self.axis, homing.position)
-        if homing.phase is HomingPhase.ELSEWHERE:
-            return HomedElsewhere(self.axis, homing.position + self._arm.drives[self.axis].zero, self._home)
-        return (
-            HomingFailed(self.axis, homing.shown, homing.shown_mode)
-            if homing.phase is HomingPhase.FAILED
-            else Stopped()
-        )
+        return self._homing.end_of(self.axis) or Stopped()

@@ -437,8 +437,8 @@ def check_settings(sdo: SdoClient, config: SlaveConfig) -> Steps[tuple[DeviceDes
     notes: list[str] = []
     for axis in device.axes:
         values = yield from reading_values(read, axis)
-        needs = next((needs for needs in config.needs if needs.axis == axis), None)
-        noted, refused = compare(values, device, needs, axis_label(sdo, config, axis), file, axis)
+        where = axis_label(sdo, config, axis)
+        noted, refused = compare(values, device, config.needs_of(axis), where, file, axis)
         notes += noted
         faults += refused
     if faults:

@@ -11,13 +11,12 @@ from annotated_types import Gt, Le
 from rtcp.gateway.command_channel import BROKEN, Caller, CommandChannel, Json, Lease
 from rtcp.gateway.machine_actions import MachineActions
 from rtcp.gateway.method import HOLD_S, index_of, left, method
-from rtcp.ipc.commands import Command, HomeAxis, MoveAxis, RunAxis, StopAxis
+from rtcp.ipc.commands import LONGEST_RUN_S, Command, HomeAxis, MoveAxis, RunAxis, StopAxis
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.events import AxisAtRest, AxisFailed, Homed, HomedElsewhere, HomingFailed
 from rtcp.ipc.schema import identifier
 
 _ENDS = (AxisAtRest, AxisFailed, Homed, HomedElsewhere, HomingFailed)
-_LONGEST_HOLD_S = 3600.0
 
 
 def _endless() -> RtcpError:
@@ -73,7 +72,7 @@ class AxisActions:
         caller: Caller,
         axis: str,
         velocity: float,
-        hold_s: Annotated[float, Gt(0), Le(_LONGEST_HOLD_S)] = HOLD_S,
+        hold_s: Annotated[float, Gt(0), Le(LONGEST_RUN_S)] = HOLD_S,
         sent_s: float | None = None,
     ) -> Json:
         """Run an external axis at a velocity, m/s or rad/s, for `hold_s`; returns when it was accepted.

@@ -158,6 +158,10 @@ class MoveAxis(Command):
     """m/s or rad/s; 0: its speed limit."""
 
 
+LONGEST_RUN_S = 3600.0
+"""Longest run of an external axis by one command, s."""
+
+
 class RunAxis(Command):
     """Run an external axis at a velocity for `hold_s`."""
 

@@ -90,6 +90,18 @@ class Bench(Simulation):
         assert self.until(lambda: self.axes[axis].at_rest, seconds), self.axes[axis].phase
         self.run(0.1)
 
+    def recover_from_emergency_stop(self) -> None:
+        """Press and release the emergency stop, reset, and enable again."""
+        assert self.box is not None
+        self.box.set_input(EMERGENCY_STOP_INPUT, False)
+        self.bring_to(State.EMERGENCY_STOP)
+        self.run(1.5)
+        self.box.set_input(EMERGENCY_STOP_INPUT, True)
+        self.run(0.1)
+        self.do(Reset())
+        self.bring_to(State.READY)
+        self.hold()
+
     def last_of(self, kind: type[Event]) -> Event:
         return [record.event for record in self.events if isinstance(record.event, kind)][-1]
 
@@ -235,15 +247,7 @@ def test_homing_gives_the_rail_its_positions_and_is_needed_before_a_motion_and_a
         bench.do(MoveAxis(RAIL, 0.05))
         bench.rest(RAIL)
         assert bench.at(RAIL) == pytest.approx(0.05, abs=1e-3)
-        assert bench.box is not None
-        bench.box.set_input(EMERGENCY_STOP_INPUT, False)
-        bench.bring_to(State.EMERGENCY_STOP)
-        bench.run(1.5)
-        bench.box.set_input(EMERGENCY_STOP_INPUT, True)
-        bench.run(0.1)
-        bench.do(Reset())
-        bench.bring_to(State.READY)
-        bench.hold()
+        bench.recover_from_emergency_stop()
         assert bench.refused(MoveAxis(RAIL, 0.1)) == "rail is not homed: `rtcp axis home rail` first"
 
 
@@ -381,15 +385,7 @@ def test_a_drive_that_keeps_its_set_point_does_not_go_on_to_it(bench: Bench, way
         bench.drives[RAIL].servo._modes[1]._active = SET_POINT  # type: ignore[attr-defined]
         bench.hold()
     else:
-        assert bench.box is not None
-        bench.box.set_input(EMERGENCY_STOP_INPUT, False)
-        bench.bring_to(State.EMERGENCY_STOP)
-        bench.run(1.5)
-        bench.box.set_input(EMERGENCY_STOP_INPUT, True)
-        bench.run(0.1)
-        bench.do(Reset())
-        bench.bring_to(State.READY)
-        bench.hold()
+        bench.recover_from_emergency_stop()
     stood = bench.at(RAIL)
     bench.run(2.0)
     assert bench.at(RAIL) == pytest.approx(stood, abs=1e-3)

@@ -244,7 +244,7 @@ def test_targets_of_each_width_are_exact_within_it_and_cut_to_its_ends(kind: Dat
     drive.mode, drive.controlword = 9, 0x0F
 
     def sent(count: float) -> tuple[int, int]:
-        """Position and velocity as the drive gets them, for a target of so many counts."""
+        """Return the position and the velocity that the drive gets, for a target in counts."""
         inputs = struct.pack("<H", ENABLED) + min(max(round(count), low), high).to_bytes(
             bits // 8, "little", signed=signed
         )

@@ -1,4 +1,4 @@
-"""A second master on the cable is named by its address, before the first frame of ours and beside the cycle."""
+"""The start, and the watcher beside the cycle, name the address of a second master on the cable."""
 
 from __future__ import annotations
 
